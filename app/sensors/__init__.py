@@ -1,0 +1,1 @@
+"""Where measurements come from: recordings, the simulator, and the sequencer that pairs them."""

@@ -1,0 +1,1 @@
+"""The engine's process, its mailbox, and the one public port."""

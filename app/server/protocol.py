@@ -1,0 +1,212 @@
+"""What crosses the border of the engine's process: commands one way, snapshots the other.
+
+Both are plain frozen values. A command is data, so that it can be written to a journal and played
+again. A snapshot is cumulative: a reader that misses ten of them loses nothing.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from app.slam.params import Params
+from app.slam.types import F32, F64, I64, U8, U16, StepResult
+
+
+# --- commands ------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class Play:
+    """Go on at the chosen speed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """Stop after the frame that is being worked on."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepFrame:
+    """Pause and process this many frames."""
+
+    frames: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class SetSpeed:
+    """Replay speed as a multiple of real time; inf is as fast as it can."""
+
+    factor: float
+
+
+@dataclass(frozen=True, slots=True)
+class Seek:
+    """Go to a frame: run on to a later one; an earlier one starts again from the beginning."""
+
+    frame: int
+
+
+@dataclass(frozen=True, slots=True)
+class SetParams:
+    """Change parameters by dotted name, for example {"ground.alpha": 30}."""
+
+    values: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class LoadParams:
+    """Replace all parameters by those of a YAML text."""
+
+    yaml: str
+
+
+@dataclass(frozen=True, slots=True)
+class OpenRecording:
+    """Leave the present recording and open another one from its first frame."""
+
+    path: Path
+    truth: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Restart:
+    """Start the present recording again with the present parameters."""
+
+
+@dataclass(frozen=True, slots=True)
+class Save:
+    """Write trajectory.tum, timings.csv, map.ply and report.json of what was processed so far."""
+
+    folder: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Shutdown:
+    """End the engine's process cleanly."""
+
+
+Command = (
+    Play | Pause | StepFrame | SetSpeed | Seek | SetParams | LoadParams | OpenRecording | Restart | Save | Shutdown
+)
+
+
+# --- snapshots -----------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """One keyframe's points, thinned for display, in the LiDAR frame of that keyframe.
+
+    Sent once. T_imu_lidar is fixed per chunk; the keyframe's pose is in `Snapshot.keyframe_poses`.
+
+    Attributes:
+        index: of the keyframe. stamp_ns: its time.
+        points: (n, 3) float32 m. labels: (n,) uint8. intensity: (n,) float32. ring: (n,) uint16.
+        T_imu_lidar: (4, 4).
+    """
+
+    index: int
+    stamp_ns: int
+    points: F32
+    labels: U8
+    intensity: F32
+    ring: U16
+    T_imu_lidar: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the recording doctor.
+
+    Attributes:
+        subject: what was looked at, e.g. "point time". verdict: as named.
+        text: what was found and how that was decided, in one sentence with units.
+        option: the exact option that settles it, e.g. "--set recording.time_unit=us"; "" if none.
+    """
+
+    subject: str
+    verdict: Literal["fine", "corrected", "needs you"]
+    text: str
+    option: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedRecording:
+    """What the page knows of the recording that is open."""
+
+    path: Path
+    start_ns: int
+    duration_s: float
+    frames: int
+    findings: tuple[Finding, ...]
+    truth_stamps_ns: I64 | None = None
+    truth_positions: F64 | None = None
+    """(m, 3) truth positions of the IMU, in the truth's own frame, if truth was given."""
+
+
+@dataclass(frozen=True, slots=True)
+class Transport:
+    playing: bool = False
+    speed: float = 1.0
+    frame: int = -1
+    """Index of the newest processed frame; -1 before the first."""
+    stamp_ns: int = 0
+    finished: bool = False
+    frames_per_second: float = 0.0
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Long work under way in the engine's process. fraction is 0-1; nan while unknown."""
+
+    title: str
+    fraction: float
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """Something to tell the user once. `number` increases by one with every notice."""
+
+    number: int
+    level: Literal["info", "warning", "error"]
+    text: str
+
+
+SERIES = (
+    "stamp_s", "planarity", "seeds", "ground_share", "points_in", "points_reduced", "points_filter",
+    "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "total_ms",
+    "iterations", "inliers", "residual_rms", "degeneracy", "speed", "gyro_bias", "accel_bias", "distance", "error_m",
+)  # fmt: skip
+"""Per-frame readouts, one float64 array each, nan where there is none. `degeneracy` is the smallest
+eigenvalue of the pose information; `speed` m/s; `distance` m walked; `error_m` to aligned truth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """All that the page draws, as one immutable value.
+
+    Attributes:
+        session: grows when a recording is opened or restarted: the scene starts empty.
+        revision: grows with every snapshot.
+        params: as the engine uses them from its next frame on.
+        pending_restart: names of parameters that were changed but act on restart.
+        result: newest frame, already relabelled with the present ground parameters.
+        chunks: append-only within a session.
+        keyframe_poses: (k, 4, 4) T_map_imu of each keyframe.
+        trajectory: (n, 3) positions of the IMU in the map, every processed frame.
+        series: (n,) arrays by SERIES name.
+        progress: what takes long just now, or None. notices: the newest 50.
+        engine_alive: False when the engine's process has died.
+    """
+
+    session: int = 0
+    revision: int = 0
+    params: Params = field(default_factory=Params)
+    pending_restart: tuple[str, ...] = ()
+    recording: OpenedRecording | None = None
+    transport: Transport = Transport()
+    result: StepResult | None = None
+    chunks: tuple[Chunk, ...] = ()
+    keyframe_poses: F64 | None = None
+    trajectory: F64 | None = None
+    series: dict[str, F64] = field(default_factory=dict)
+    progress: Progress | None = None
+    notices: tuple[Notice, ...] = ()
+    engine_alive: bool = True

@@ -1,0 +1,1 @@
+"""The SLAM engine: headless, deterministic, without threads or clocks of its own."""

@@ -1,0 +1,265 @@
+"""Values that pass between the rooms. Frozen; their arrays are read-only.
+
+Conventions (all of hemislam):
+- `T_target_source` maps coordinates of `source` into `target`; 4x4 float64, or (R, p).
+- Frames: `lidar` and `imu` are the sensors' own axes; `odom` is the filter's world: its origin is
+  the first IMU pose, its +z axis points up (against gravity); `map` is `odom` after corrections by
+  loop closures, identical to it while there are none.
+- Time is integer nanoseconds since the Unix epoch; differences alone are floats, in seconds.
+- Units are SI; angles are radians in code and degrees where a person sets them.
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+U8 = npt.NDArray[np.uint8]
+U16 = npt.NDArray[np.uint16]
+
+NON_GROUND, GROUND, SEED = 0, 1, 2
+"""Point labels. A seed is a ground point that also helped to fit the plane."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """One LiDAR revolution as measured, in firing order or not, invalid returns already removed.
+
+    Attributes:
+        stamp_ns: time of the FIRST point.
+        points: (n, 3) float32, metres, LiDAR frame at each point's own time (not deskewed).
+        offsets_ns: (n,) int32, each point's time after `stamp_ns`, >= 0.
+        intensity: (n,) float32, the sensor's own scale (0-255 for RoboSense).
+        ring: (n,) uint16, rank of the scan line's elevation; 0 = lowest = outermost cone.
+        truth_ground: (n,) uint8, 1 where the recording itself says "ground"; None if it does not.
+    """
+
+    stamp_ns: int
+    points: F32
+    offsets_ns: I32
+    intensity: F32
+    ring: U16
+    truth_ground: U8 | None = None
+
+    @property
+    def end_ns(self) -> int:
+        """Time of the last point; the pose of a frame is the pose at this time."""
+        return self.stamp_ns + (int(self.offsets_ns.max()) if self.offsets_ns.size else 0)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSamples:
+    """Consecutive IMU samples, strictly increasing in time.
+
+    Attributes:
+        stamps_ns: (k,) int64.
+        gyro: (k, 3) float64, rad/s, IMU frame.
+        accel: (k, 3) float64, specific force in m/s^2, IMU frame (+9.81 upwards at rest).
+    """
+
+    stamps_ns: I64
+    gyro: F64
+    accel: F64
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """A scan with the IMU samples that cover it.
+
+    `imu` runs from the last sample at or before the previous scan's end (for the first scan: from
+    the first sample there is) to the first sample at or after this scan's end, so that both ends
+    can be interpolated. `notices` tells what pairing met on the way (gaps, back-steps).
+    """
+
+    scan: Scan
+    imu: ImuSamples
+    notices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class DroppedScan:
+    """A scan that is not handed to the engine, and why, in a few words fit for a report."""
+
+    stamp_ns: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class NavState:
+    """The filter's state (paper eq. 4) at `stamp_ns`.
+
+    Attributes:
+        R_odom_imu: (3, 3). p_odom_imu: (3,) m. v_odom_imu: (3,) m/s.
+        b_gyro: (3,) rad/s and b_accel: (3,) m/s^2, IMU frame.
+        g_odom: (3,) m/s^2, gravity (pointing down, norm fixed).
+        R_imu_lidar: (3, 3). p_imu_lidar: (3,) m.
+    """
+
+    stamp_ns: int
+    R_odom_imu: F64
+    p_odom_imu: F64
+    v_odom_imu: F64
+    b_gyro: F64
+    b_accel: F64
+    g_odom: F64
+    R_imu_lidar: F64
+    p_imu_lidar: F64
+
+    @property
+    def T_odom_imu(self) -> F64:
+        T = np.eye(4)
+        T[:3, :3] = self.R_odom_imu
+        T[:3, 3] = self.p_odom_imu
+        return T
+
+    @property
+    def T_imu_lidar(self) -> F64:
+        T = np.eye(4)
+        T[:3, :3] = self.R_imu_lidar
+        T[:3, 3] = self.p_imu_lidar
+        return T
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """A deskewed scan: what is drawn, stored in keyframes and exported.
+
+    Attributes:
+        points: (n, 3) float32, metres, LiDAR frame at the scan's end.
+        labels: (n,) uint8 of NON_GROUND, GROUND, SEED.
+        intensity: (n,) float32. ring: (n,) uint16. offsets_ns: (n,) int32, as in `Scan`.
+    """
+
+    points: F32
+    labels: U8
+    intensity: F32
+    ring: U16
+    offsets_ns: I32
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class GroundResult:
+    """What ground segmentation found in one scan (paper 2.2).
+
+    Attributes:
+        labels: (n,) uint8 of NON_GROUND, GROUND, SEED.
+        found: whether a plane was accepted. reason: why not, in words; "" if it was.
+        normal: (3,) unit normal of the plane, LiDAR frame, pointing up. centroid: (3,) m.
+        down: (3,) unit direction of gravity in the LiDAR frame, as used.
+        planarity: lambda3 / lambda2 of the seeds (nan without seeds); accepted below the limit.
+        seeds: number of seed points. share: ground points over all points, 0-1.
+    """
+
+    labels: U8
+    found: bool
+    reason: str
+    normal: F64
+    centroid: F64
+    down: F64
+    planarity: float
+    seeds: int
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """How the filter's update went (paper eq. 5-7). A result that explains itself.
+
+    Attributes:
+        converged, iterations: of the iterated update.
+        used: points offered to the update. inliers: points with an accepted plane.
+        residual_rms: m, point to plane, of the inliers after the update.
+        eigenvalues: (6,) ascending, of the 6x6 pose information (rotation, translation blocks
+            scaled by their expected units), the smaller, the less that direction is observed.
+        degenerate: whether a direction was not observed by this scan alone. reason: in words.
+    """
+
+    converged: bool
+    iterations: int
+    used: int
+    inliers: int
+    residual_rms: float
+    eigenvalues: F64
+    degenerate: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A cloud that stays in its own frame; only its pose moves when loops are closed.
+
+    Attributes:
+        index: 0, 1, 2, ... frame: index of the frame it was taken from. stamp_ns: scan end.
+        T_odom_imu: (4, 4) pose by odometry. T_imu_lidar: (4, 4) at that moment.
+        covariance: (6, 6) of the pose, rotation then translation, error in the IMU frame/odom.
+        cloud: in the LiDAR frame at `stamp_ns`.
+    """
+
+    index: int
+    frame: int
+    stamp_ns: int
+    T_odom_imu: F64
+    T_imu_lidar: F64
+    covariance: F64
+    cloud: Cloud
+
+
+class FrameStatus(StrEnum):
+    INITIALISING = "initialising"
+    """Waiting for enough IMU samples at the start; the pose is the origin."""
+    TRACKING = "tracking"
+    LOST = "lost"
+    """Too few points matched the map; the pose is the IMU's prediction."""
+
+
+STAGES = ("propagate", "deskew", "ground", "downsample", "update", "insert", "keyframe")
+"""Stages of `Engine.step`, in order; keys of `StepResult.timings_ms` beside "total"."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """Everything that one frame produced.
+
+    Attributes:
+        index: frame number from 0. stamp_ns: scan end, the time of `state`.
+        T_map_odom: (4, 4); the pose to show is T_map_odom @ state.T_odom_imu.
+        cloud: deskewed points with labels. ground, registration: how those went.
+        points_in: points of the scan. points_reduced: after ground downsampling.
+        points_filter: handed to the filter after the scan voxel.
+        timings_ms: of STAGES and "total". keyframe: if this frame became one.
+        notices: what a user should know about this frame, in sentences.
+    """
+
+    index: int
+    stamp_ns: int
+    status: FrameStatus
+    state: NavState
+    T_map_odom: F64
+    cloud: Cloud
+    ground: GroundResult
+    registration: Registration
+    points_in: int
+    points_reduced: int
+    points_filter: int
+    timings_ms: dict[str, float]
+    keyframe: Keyframe | None = None
+    notices: tuple[str, ...] = field(default=())
+    truth_ground: U8 | None = None
+
+    @property
+    def T_map_imu(self) -> F64:
+        return self.T_map_odom @ self.state.T_odom_imu

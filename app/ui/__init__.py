@@ -1,0 +1,1 @@
+"""The page: viser widgets that draw snapshots and enqueue commands."""
