@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from app.sensors.doctor import Finding
 from app.slam.params import Params
 from app.slam.types import F32, F64, I64, U8, U16, StepResult
 
@@ -108,22 +109,6 @@ class Chunk:
     intensity: F32
     ring: U16
     T_imu_lidar: F64
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One line of the recording doctor.
-
-    Attributes:
-        subject: what was looked at, e.g. "point time". verdict: as named.
-        text: what was found and how that was decided, in one sentence with units.
-        option: the exact option that settles it, e.g. "--set recording.time_unit=us"; "" if none.
-    """
-
-    subject: str
-    verdict: Literal["fine", "corrected", "needs you"]
-    text: str
-    option: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.config import JsonDict
 
 from app.slam.errors import HemislamError
 
@@ -29,7 +30,7 @@ def _param(
     effect: Effect = "frame",
     symbol: str = "",
 ) -> Any:
-    extra = {"unit": unit, "step": step, "effect": effect, "symbol": symbol}
+    extra: JsonDict = {"unit": unit, "step": step, "effect": effect, "symbol": symbol}
     return Field(default, description=meaning, ge=ge, le=le, json_schema_extra=extra)
 
 
