@@ -1,0 +1,228 @@
+"""How far a trajectory is from the truth, and how well ground was told from the rest.
+
+Errors follow Sturm et al. (IROS 2012, "A benchmark for the evaluation of RGB-D SLAM systems") and
+equal those of the `evo` tool, except that truth is interpolated at our stamps.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
+
+from app.slam.errors import HemislamError
+from app.slam.trajectory import Trajectory, count_text, read_tum, write_tum
+from app.slam.types import F64, I64, NON_GROUND, U8
+
+__all__ = ["Ate", "Errors", "GroundScore", "Rpe", "Trajectory", "ate", "read_tum", "rpe", "write_tum"]
+
+MAX_TRUTH_GAP_S = 1.0
+"""Truth is not interpolated between poses farther apart than this."""
+
+
+# --- association and alignment -------------------------------------------------------------------
+def interpolate(truth: Trajectory, stamps_ns: I64) -> tuple[Trajectory, npt.NDArray[np.bool_]]:
+    """Truth at the given stamps: positions linearly, orientations by slerp.
+
+    Returns the interpolated poses and a mask over `stamps_ns` of those that have one: inside the
+    truth's time and not in a gap longer than MAX_TRUTH_GAP_S.
+    """
+    right = np.searchsorted(truth.stamps_ns, stamps_ns).clip(1, len(truth) - 1)
+    gap = truth.stamps_ns[right] - truth.stamps_ns[right - 1]
+    inside = (stamps_ns >= truth.stamps_ns[0]) & (stamps_ns <= truth.stamps_ns[-1])
+    exact = (stamps_ns == truth.stamps_ns[right]) | (stamps_ns == truth.stamps_ns[right - 1])
+    usable = inside & (exact | (gap <= MAX_TRUTH_GAP_S * 1e9))
+    stamps, right = stamps_ns[usable], right[usable]
+    fraction = ((stamps - truth.stamps_ns[right - 1]) / gap[usable])[:, None]
+    positions = (1 - fraction) * truth.positions[right - 1] + fraction * truth.positions[right]
+    if not len(stamps):
+        return Trajectory(stamps, positions, np.zeros((0, 4))), usable
+    since_start = (truth.stamps_ns - truth.stamps_ns[0]) * 1e-9
+    quaternions = Slerp(since_start, truth.rotations)((stamps - truth.stamps_ns[0]) * 1e-9).as_quat()
+    return Trajectory(stamps, positions, quaternions), usable
+
+
+def paired(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """Estimated and true poses at the same stamps.
+
+    Raises:
+        HemislamError: fewer than 3 stamps of the estimate have a truth.
+    """
+    there, usable = interpolate(truth, estimate.stamps_ns)
+    if len(there) >= 3:
+        return estimate.chosen(usable), there
+    if len(estimate) < 3:
+        raise HemislamError(
+            f"The trajectory holds {count_text(len(estimate))}, but at least 3 are needed to compare it."
+        )
+    raise HemislamError(
+        f"The truth ({_span(truth)}) covers {count_text(len(there))} of the trajectory ({_span(estimate)}),"
+        " but at least 3 are needed; both must be stamped by the same clock, in seconds."
+    )
+
+
+def umeyama(source: F64, target: F64) -> F64:
+    """The rigid T_target_source (4, 4) that brings points (n, 3) closest, without scale (Umeyama 1991).
+
+    Raises:
+        HemislamError: the points do not determine a rotation.
+    """
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    u, spread, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean) / len(source))
+    if spread[1] <= np.finfo(np.float64).eps:
+        raise HemislamError(
+            "The trajectory and its truth stand still or lie on one straight line, so they can not be aligned to each"
+            " other; compare a longer walk."
+        )
+    handed = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    transform = np.eye(4)
+    transform[:3, :3] = u @ handed @ vt
+    transform[:3, 3] = target_mean - transform[:3, :3] @ source_mean
+    return transform
+
+
+# --- errors --------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """A set of error lengths as root mean square, mean and maximum."""
+
+    rmse: float
+    mean: float
+    max: float
+
+    @classmethod
+    def of(cls, values: F64) -> "Errors":
+        return cls(float(np.sqrt(np.mean(values**2))), float(values.mean()), float(values.max()))
+
+
+@dataclass(frozen=True, slots=True)
+class Ate:
+    """Absolute trajectory error after one rigid alignment.
+
+    Attributes:
+        position: m. rotation: deg. poses: compared. distance: true path length over them, m.
+        T_truth_estimate: (4, 4), the alignment.
+    """
+
+    position: Errors
+    rotation: Errors
+    poses: int
+    distance: float
+    T_truth_estimate: F64
+
+
+def ate(estimate: Trajectory, truth: Trajectory) -> Ate:
+    """Align `estimate` to `truth` by position (SE(3), no scale) and measure what is left.
+
+    Raises:
+        HemislamError: fewer than 3 stamps of the estimate have a truth, or nothing moved.
+    """
+    ours, theirs = paired(estimate, truth)
+    transform = umeyama(ours.positions, theirs.positions)
+    aligned = ours.positions @ transform[:3, :3].T + transform[:3, 3]
+    turned = theirs.rotations.inv() * Rotation.from_matrix(transform[:3, :3]) * ours.rotations
+    return Ate(
+        position=Errors.of(np.linalg.norm(aligned - theirs.positions, axis=1)),
+        rotation=Errors.of(np.degrees(turned.magnitude())),
+        poses=len(ours),
+        distance=theirs.distance,
+        T_truth_estimate=transform,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Rpe:
+    """Relative pose error over a fixed number of frames or of metres.
+
+    Attributes:
+        position: m. rotation: deg. pairs: compared.
+    """
+
+    position: Errors
+    rotation: Errors
+    pairs: int
+
+
+def rpe(estimate: Trajectory, truth: Trajectory, *, frames: int = 1, metres: float | None = None) -> Rpe | None:
+    """Error of the motion between poses `frames` apart or, if given, `metres` of true path apart.
+
+    Pairs follow one another without overlap, as evo's default. None if the path is too short for
+    a single pair.
+
+    Raises:
+        HemislamError: fewer than 3 stamps of the estimate have a truth.
+    """
+    ours, theirs = paired(estimate, truth)
+    knots = np.arange(0, len(theirs), frames) if metres is None else _every(theirs.positions, metres)
+    if len(knots) < 2:
+        return None
+    i, j = knots[:-1], knots[1:]
+    turned_ours, moved_ours = _motion(ours, i, j)
+    turned_theirs, moved_theirs = _motion(theirs, i, j)
+    return Rpe(
+        position=Errors.of(np.linalg.norm(moved_ours - moved_theirs, axis=1)),
+        rotation=Errors.of(np.degrees((turned_theirs.inv() * turned_ours).magnitude())),
+        pairs=len(i),
+    )
+
+
+def _motion(trajectory: Trajectory, i: I64, j: I64) -> tuple[Rotation, F64]:
+    """Rotation and translation (n, 3) of T_i_j."""
+    back = trajectory.rotations[i].inv()
+    return back * trajectory.rotations[j], back.apply(trajectory.positions[j] - trajectory.positions[i])
+
+
+def _every(positions: F64, metres: float) -> I64:
+    """Indices of the first pose and of each that lies at least `metres` of path after the last one."""
+    knots, walked = [0], 0.0
+    for index, step in enumerate(np.linalg.norm(np.diff(positions, axis=0), axis=1), start=1):
+        walked += float(step)
+        if walked >= metres:
+            knots.append(index)
+            walked = 0.0
+    return np.array(knots, dtype=np.int64)
+
+
+# --- ground --------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class GroundScore:
+    """Points by what they are and were called; scores of frames add up with `+`."""
+
+    true_positive: int = 0
+    false_positive: int = 0
+    false_negative: int = 0
+
+    @classmethod
+    def of(cls, labels: U8, truth_ground: U8) -> "GroundScore":
+        """From labels (n,) of NON_GROUND, GROUND, SEED and the truth (n,), 1 = ground."""
+        called, real = labels != NON_GROUND, truth_ground != 0
+        return cls(int((called & real).sum()), int((called & ~real).sum()), int((~called & real).sum()))
+
+    def __add__(self, other: "GroundScore") -> "GroundScore":
+        return GroundScore(
+            self.true_positive + other.true_positive,
+            self.false_positive + other.false_positive,
+            self.false_negative + other.false_negative,
+        )
+
+    @property
+    def precision(self) -> float:
+        """Of the points called ground, the share that is; nan if none was called so."""
+        called = self.true_positive + self.false_positive
+        return self.true_positive / called if called else float("nan")
+
+    @property
+    def recall(self) -> float:
+        """Of the ground points, the share that was found; nan if there is none."""
+        real = self.true_positive + self.false_negative
+        return self.true_positive / real if real else float("nan")
+
+    @property
+    def f1(self) -> float:
+        """Harmonic mean of precision and recall; nan if there is no ground and none was called so."""
+        sizes = 2 * self.true_positive + self.false_positive + self.false_negative
+        return 2 * self.true_positive / sizes if sizes else float("nan")
+
+
+def _span(trajectory: Trajectory) -> str:
+    return f"{trajectory.stamps_ns[0] * 1e-9:.1f} s to {trajectory.stamps_ns[-1] * 1e-9:.1f} s"

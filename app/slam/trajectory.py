@@ -1,0 +1,138 @@
+"""Poses over time and their TUM text files, `stamp x y z qx qy qz qw` with stamps in seconds."""
+
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from app.slam.errors import HemislamError
+from app.slam.types import F64, I64
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses T_world_imu over time.
+
+    Attributes:
+        stamps_ns: (n,) int64, strictly increasing.
+        positions: (n, 3) float64, m.
+        quaternions: (n, 4) float64, unit, in the order x, y, z, w.
+    """
+
+    stamps_ns: I64
+    positions: F64
+    quaternions: F64
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def distance(self) -> float:
+        """Length of the path, m."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    @property
+    def rotations(self) -> Rotation:
+        rotations: Rotation = Rotation.from_quat(self.quaternions)
+        return rotations
+
+    def chosen(self, which: npt.NDArray[np.bool_]) -> "Trajectory":
+        """Only the poses where `which` (n,) is true."""
+        return Trajectory(self.stamps_ns[which], self.positions[which], self.quaternions[which])
+
+    @classmethod
+    def from_poses(cls, stamps_ns: npt.ArrayLike, poses: npt.ArrayLike) -> "Trajectory":
+        """From (n, 4, 4) matrices T_world_imu."""
+        matrices = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+        quaternions = np.zeros((0, 4)) if not len(matrices) else Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
+        return cls(np.asarray(stamps_ns, dtype=np.int64), matrices[:, :3, 3].copy(), quaternions)
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read `stamp x y z qx qy qz qw` lines; `#` begins a comment.
+
+    Raises:
+        HemislamError: the file can not be read, a line is not eight finite numbers, a quaternion
+            has no unit length, time does not increase, or there are fewer than 3 poses.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise HemislamError(
+            f"{path} is not a text file; a trajectory holds lines of `stamp x y z qx qy qz qw`."
+        ) from None
+    except OSError as error:
+        raise HemislamError(f"The trajectory {path} can not be read: {error.strerror}.") from None
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, start=1):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        stamp, row = _parse_line(words, f"{path}, line {number}")
+        if stamps and stamp <= stamps[-1]:
+            raise HemislamError(
+                f"{path}, line {number}: the time does not increase; sort the file by time and remove doubles."
+            )
+        stamps.append(stamp)
+        rows.append(row)
+    if len(rows) < 3:
+        raise HemislamError(f"{path} holds {count_text(len(rows))}, but at least 3 are needed to compare a trajectory.")
+    table = np.array(rows, dtype=np.float64)
+    quaternions = table[:, 3:] / np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
+    return Trajectory(np.array(stamps, dtype=np.int64), table[:, :3].copy(), quaternions)
+
+
+def _parse_line(words: list[str], where: str) -> tuple[int, list[float]]:
+    """The stamp in ns, exact to the last digit written, and the seven other numbers."""
+    if len(words) != 8:
+        raise HemislamError(f"{where} has {len(words)} columns, not the 8 of `stamp x y z qx qy qz qw`.")
+    try:
+        seconds = Decimal(words[0])
+        row = [float(word) for word in words[1:]]
+    except (InvalidOperation, ValueError):
+        raise HemislamError(f"{where} holds a word that is not a number; write `stamp x y z qx qy qz qw`.") from None
+    if not (seconds.is_finite() and np.isfinite(row).all()):
+        raise HemislamError(f"{where} holds NaN or infinity; remove the line.")
+    if abs(seconds) >= Decimal(2**63).scaleb(-9):
+        raise HemislamError(f"{where}: the stamp {words[0]} is not in seconds; divide the first column.")
+    if abs(np.linalg.norm(row[3:]) - 1) > 0.01:
+        raise HemislamError(
+            f"{where}: the last four columns are no unit quaternion; their order must be `stamp x y z qx qy qz qw`."
+        )
+    return int(seconds.scaleb(9).to_integral_value()), row
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory, stamps and values with 9 decimals; equal trajectories give equal bytes."""
+    path.write_text("".join(f"{line}\n" for line in tum_lines(trajectory)), encoding="utf-8")
+
+
+def tum_lines(trajectory: Trajectory) -> list[str]:
+    """One line a pose, w >= 0 so that a rotation has one spelling."""
+    quaternions = np.where(trajectory.quaternions[:, 3:] < 0, -trajectory.quaternions, trajectory.quaternions)
+    values = np.hstack([trajectory.positions, quaternions]) + 0.0  # no "-0.000000000"
+    return [
+        f"{stamp_text(int(stamp))} " + " ".join(f"{value:.9f}" for value in row)
+        for stamp, row in zip(trajectory.stamps_ns, values, strict=True)
+    ]
+
+
+def stamp_text(stamp_ns: int) -> str:
+    """Nanoseconds as seconds with 9 decimals, without going through a float."""
+    sign, value = ("-", -stamp_ns) if stamp_ns < 0 else ("", stamp_ns)
+    return f"{sign}{value // 1_000_000_000}.{value % 1_000_000_000:09d}"
+
+
+def truth_beside(recording: Path) -> Path | None:
+    """The truth file that lies beside a recording, `<name>_truth.tum`, if there is one."""
+    truth = recording.with_name(f"{recording.stem}_truth.tum")
+    return truth if truth.is_file() else None
+
+
+def count_text(poses: int) -> str:
+    """A number of poses in words fit for a sentence."""
+    return {0: "no pose", 1: "1 pose"}.get(poses, f"{poses} poses")
