@@ -74,9 +74,13 @@ class Restart:
 
 @dataclass(frozen=True, slots=True)
 class Save:
-    """Write trajectory.tum, timings.csv, map.ply and report.json of what was processed so far."""
+    """Write trajectory.tum, timings.csv, map.ply and report.json of what was processed so far.
+
+    Without `map` the map.ply, which takes longest, is left out. `Snapshot.saved` tells when it is done.
+    """
 
     folder: Path
+    map: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +98,7 @@ Command = (
 class Chunk:
     """One keyframe's points, thinned for display, in the LiDAR frame of that keyframe.
 
-    Sent once. T_imu_lidar is fixed per chunk; the keyframe's pose is in `Snapshot.keyframe_poses`.
+    Points are in random order: the first k of them are a fair sample, for a page that must show fewer. Sent once. T_imu_lidar is fixed per chunk; the keyframe's pose is in `Snapshot.keyframe_poses`.
 
     Attributes:
         index: of the keyframe. stamp_ns: its time.
@@ -123,6 +127,7 @@ class OpenedRecording:
     truth_stamps_ns: I64 | None = None
     truth_positions: F64 | None = None
     """(m, 3) truth positions of the IMU, in the truth's own frame, if truth was given."""
+    truth: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +151,14 @@ class Progress:
 
 
 @dataclass(frozen=True, slots=True)
+class Saved:
+    """A `Save` that has ended; `error` says why it failed, "" if it did not."""
+
+    folder: Path
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Notice:
     """Something to tell the user once. `number` increases by one with every notice."""
 
@@ -159,7 +172,8 @@ SERIES = (
     "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "total_ms",
     "iterations", "inliers", "residual_rms", "degeneracy", "speed", "gyro_bias", "accel_bias", "distance", "error_m",
 )  # fmt: skip
-"""Per-frame readouts, one float64 array each, nan where there is none. `degeneracy` is the smallest
+"""Per-frame readouts, one float64 array each, nan where there is none. `stamp_s` counts from the
+start of the recording; `degeneracy` is the smallest
 eigenvalue of the pose information; `speed` m/s; `distance` m walked; `error_m` to aligned truth."""
 
 
@@ -170,14 +184,18 @@ class Snapshot:
     Attributes:
         session: grows when a recording is opened or restarted: the scene starts empty.
         revision: grows with every snapshot.
-        params: as the engine uses them from its next frame on.
-        pending_restart: names of parameters that were changed but act on restart.
-        result: newest frame, already relabelled with the present ground parameters.
+        params: as chosen; the engine uses them from its next frame on, but for
+        pending_restart: names of parameters that were changed and act on restart only.
+        result: newest frame, already relabelled with the present ground parameters. Its `keyframe`
+            is left out, since that is sent as a chunk.
         chunks: append-only within a session.
         keyframe_poses: (k, 4, 4) T_map_imu of each keyframe.
         trajectory: (n, 3) positions of the IMU in the map, every processed frame.
         series: (n,) arrays by SERIES name.
+        T_map_truth: (4, 4) that lays the truth's positions over the map, None until the walk
+            determines it.
         progress: what takes long just now, or None. notices: the newest 50.
+        saved: the newest `Save` that ended.
         engine_alive: False when the engine's process has died.
     """
 
@@ -192,6 +210,8 @@ class Snapshot:
     keyframe_poses: F64 | None = None
     trajectory: F64 | None = None
     series: dict[str, F64] = field(default_factory=dict)
+    T_map_truth: F64 | None = None
     progress: Progress | None = None
     notices: tuple[Notice, ...] = ()
+    saved: Saved | None = None
     engine_alive: bool = True
