@@ -98,7 +98,8 @@ Command = (
 class Chunk:
     """One keyframe's points, thinned for display, in the LiDAR frame of that keyframe.
 
-    Points are in random order: the first k of them are a fair sample, for a page that must show fewer. Sent once. T_imu_lidar is fixed per chunk; the keyframe's pose is in `Snapshot.keyframe_poses`.
+    Sent once. T_imu_lidar is fixed per chunk; the keyframe's pose is in `Snapshot.keyframe_poses`.
+    Points are in random order: the first k are a fair sample, for a page that must show fewer.
 
     Attributes:
         index: of the keyframe. stamp_ns: its time.
@@ -173,8 +174,8 @@ SERIES = (
     "iterations", "inliers", "residual_rms", "degeneracy", "speed", "gyro_bias", "accel_bias", "distance", "error_m",
 )  # fmt: skip
 """Per-frame readouts, one float64 array each, nan where there is none. `stamp_s` counts from the
-start of the recording; `degeneracy` is the smallest
-eigenvalue of the pose information; `speed` m/s; `distance` m walked; `error_m` to aligned truth."""
+start of the recording; `degeneracy` is the smallest eigenvalue of the pose information; `speed` m/s;
+the biases are norms; `distance` m walked; `error_m` to the truth, aligned to the walk so far."""
 
 
 @dataclass(frozen=True, slots=True)
