@@ -1,0 +1,54 @@
+"""Partial parameter trees for known devices, and the order in which settings override each other."""
+
+from pathlib import Path
+from typing import Any
+
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+
+_H2LID_MOUNT = {"translation": [0.0175, 0.0276, -0.1083], "rotation": [0.0, 0.0, 0.0]}
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "rslidar": {"recording": {"lidar_topic": "/rslidar_points"}},
+    "h2lid": {
+        "recording": {"lidar_topic": "/horizontal_laser_3d", "imu_topic": "/imu"},
+        "sensor": _H2LID_MOUNT,
+    },
+    "h2lid-mount": {"sensor": _H2LID_MOUNT},
+}
+"""`rslidar`: the vendor's ROS driver. `h2lid`: the authors' published recordings. `h2lid-mount`: their
+LiDAR-on-IMU extrinsics alone, for recordings of such a device under other topics."""
+
+
+def sidecar(recording: Path) -> Path:
+    """Where a recording's own parameters lie, if it has some: `<stem>.params.yaml` beside it."""
+    return recording.parent / f"{recording.name if recording.is_dir() else recording.stem}.params.yaml"
+
+
+def resolve_params(recording: Path | None, preset: str | None, config: Path | None, assignments: list[str]) -> Params:
+    """Parameters by rising precedence: defaults, preset, sidecar file, config file, assignments.
+
+    Raises:
+        HemislamError: unknown preset, unreadable file, unknown or out-of-range parameter.
+    """
+    params = Params()
+    if preset is not None:
+        if preset not in PRESETS:
+            raise HemislamError(f"There is no preset `{preset}`; choose one of {', '.join(PRESETS)}.")
+        params = params.merged(PRESETS[preset])
+    if recording is not None and sidecar(recording).is_file():
+        params = _with_file(params, sidecar(recording))
+    if config is not None:
+        params = _with_file(params, config)
+    return params.with_assignments(assignments)
+
+
+def _with_file(params: Params, path: Path) -> Params:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise HemislamError(f"There is no parameter file {path}; `hemislam params > {path.name}` writes one.") from None
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise HemislamError(f"The parameter file {path} can not be read ({why}); check the path.") from None
+    return params.merged_yaml(text, str(path))

@@ -1,0 +1,159 @@
+"""Pairs each scan with the IMU samples that cover it; nothing is integrated over silently.
+
+Push-wise, so that a recording and a live source use it alike: `add_imu` and `add_scan` in the order
+of arrival, then `ready()` gives what is complete. Pairing is by measurement time, never by arrival.
+"""
+
+import bisect
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from app.slam.types import DroppedScan, ImuSamples, Measurement, Scan
+
+MAX_WAITING = 64
+"""Scans that may wait for IMU samples; bounds the memory when the IMU falls silent."""
+
+
+@dataclass(slots=True)
+class Counts:
+    """What pairing met so far."""
+
+    imu_samples: int = 0
+    imu_duplicates: int = 0
+    imu_back_steps: int = 0
+    imu_invalid: int = 0
+    imu_gaps: int = 0
+    longest_imu_gap_s: float = 0.0
+    paired: int = 0
+    dropped: int = 0
+
+
+@dataclass(slots=True)
+class Sequencer:
+    """The one place that guarantees IMU coverage of a scan.
+
+    Attributes:
+        max_gap_s: a longer interval between IMU samples is a gap: reported, and a scan that lies
+            mostly inside it is dropped.
+        counts: what was met so far.
+    """
+
+    max_gap_s: float
+    counts: Counts = field(default_factory=Counts)
+    _stamps: list[int] = field(default_factory=list)
+    _values: list[tuple[float, ...]] = field(default_factory=list)
+    _waiting: list[Scan | DroppedScan] = field(default_factory=list)
+    _notices: list[str] = field(default_factory=list)
+    _last_stamp_ns: int | None = None
+    _last_end_ns: int | None = None
+    _intervals_ns: list[int] = field(default_factory=list)
+    _behind: bool = False
+
+    def add_imu(self, stamp_ns: int, gyro: npt.ArrayLike, accel: npt.ArrayLike) -> None:
+        """One IMU sample: rad/s and m/s^2, IMU frame."""
+        values = (*np.asarray(gyro, float).tolist(), *np.asarray(accel, float).tolist())
+        if not np.isfinite(values).all():
+            self._count("imu_invalid", "an IMU sample is NaN or infinite and was left out")
+            return
+        newest = self._stamps[-1] if self._stamps else None
+        if newest is not None and stamp_ns <= newest:
+            if stamp_ns == newest:
+                self.counts.imu_duplicates += 1
+            elif not self._behind:
+                back = (newest - stamp_ns) / 1e9
+                self._count("imu_back_steps", f"IMU time stepped back by {back:.4f} s; samples until then left out")
+                self._behind = True
+            return
+        self._behind = False
+        if newest is not None and stamp_ns - newest > self.max_gap_s * 1e9:
+            gap = (stamp_ns - newest) / 1e9
+            self.counts.longest_imu_gap_s = max(self.counts.longest_imu_gap_s, gap)
+            self._count("imu_gaps", f"no IMU sample for {gap:.3f} s")
+        self.counts.imu_samples += 1
+        self._stamps.append(stamp_ns)
+        self._values.append(values)
+
+    def add_scan(self, scan: Scan | DroppedScan) -> None:
+        """One scan, or the news that one could not be read (it keeps its place in the sequence)."""
+        bisect.insort(self._waiting, scan, key=lambda waiting: waiting.stamp_ns)
+
+    def ready(self) -> Iterator[Measurement | DroppedScan]:
+        """Whatever the samples so far complete, in order of time."""
+        while self._waiting:
+            scan = self._waiting[0]
+            end_ns = scan.end_ns if isinstance(scan, Scan) else scan.stamp_ns
+            covered = bool(self._stamps) and self._stamps[-1] >= end_ns
+            if not covered and len(self._waiting) <= MAX_WAITING:
+                return
+            yield self._take(self._waiting.pop(0))
+
+    def finish(self) -> Iterator[Measurement | DroppedScan]:
+        """The input is over: what still waits, mostly as dropped scans."""
+        yield from self.ready()
+        while self._waiting:
+            yield self._take(self._waiting.pop(0))
+
+    def _take(self, scan: Scan | DroppedScan) -> Measurement | DroppedScan:
+        reason = scan.reason if isinstance(scan, DroppedScan) else self._objection(scan)
+        if reason or isinstance(scan, DroppedScan):
+            self.counts.dropped += 1
+            return DroppedScan(scan.stamp_ns, reason)
+        end_ns = scan.end_ns
+        begin_ns = self._stamps[0] if self._last_end_ns is None else self._last_end_ns
+        first = max(bisect.bisect_right(self._stamps, begin_ns) - 1, 0)
+        last = bisect.bisect_left(self._stamps, end_ns)
+        self._note_missing_scans(scan)
+        measurement = Measurement(scan, self._samples(first, last + 1), tuple(self._notices))
+        self._notices.clear()
+        self._last_stamp_ns, self._last_end_ns = scan.stamp_ns, end_ns
+        keep = max(bisect.bisect_right(self._stamps, end_ns) - 1, 0)
+        del self._stamps[:keep], self._values[:keep]
+        self.counts.paired += 1
+        return measurement
+
+    def _objection(self, scan: Scan) -> str:
+        """Why a scan can not be used; "" if it can."""
+        begin_ns, end_ns = scan.stamp_ns, scan.end_ns
+        if self._last_stamp_ns is not None and self._last_end_ns is not None:
+            if begin_ns == self._last_stamp_ns:
+                return "it repeats the scan before it (same time)"
+            if begin_ns < self._last_stamp_ns or end_ns <= self._last_end_ns:
+                return f"scan time steps back by {(self._last_end_ns - begin_ns) / 1e9:.3f} s"
+        if not self._stamps:
+            return "there is no IMU sample yet"
+        if begin_ns < self._stamps[0]:
+            return f"the IMU starts {(self._stamps[0] - begin_ns) / 1e9:.3f} s after it"
+        if end_ns > self._stamps[-1]:
+            return f"the IMU stops {(end_ns - self._stamps[-1]) / 1e9:.3f} s before its end"
+        first = bisect.bisect_right(self._stamps, begin_ns) - 1
+        last = bisect.bisect_left(self._stamps, end_ns)
+        for before, after in zip(self._stamps[first:last], self._stamps[first + 1 : last + 1], strict=True):
+            inside = min(after, end_ns) - max(before, begin_ns)
+            if after - before > self.max_gap_s * 1e9 and inside > 0.5 * (end_ns - begin_ns):
+                return f"it lies in a gap of {(after - before) / 1e9:.3f} s without IMU"
+        return ""
+
+    def _note_missing_scans(self, scan: Scan) -> None:
+        if self._last_stamp_ns is None:
+            return
+        interval = scan.stamp_ns - self._last_stamp_ns
+        usual = float(np.median(self._intervals_ns)) if len(self._intervals_ns) >= 5 else None
+        if usual is not None and interval > 1.5 * usual:
+            missing = round(interval / usual) - 1
+            self._notices.append(f"no usable scan for {interval / 1e9:.3f} s before this one ({missing} missing)")
+        self._intervals_ns = [*self._intervals_ns[-20:], interval]
+
+    def _samples(self, first: int, stop: int) -> ImuSamples:
+        stamps = np.array(self._stamps[first:stop], np.int64)
+        values = np.array(self._values[first:stop], np.float64).reshape(-1, 6)
+        gyro, accel = np.ascontiguousarray(values[:, :3]), np.ascontiguousarray(values[:, 3:])
+        for array in (stamps, gyro, accel):
+            array.setflags(write=False)
+        return ImuSamples(stamps, gyro, accel)
+
+    def _count(self, name: str, notice: str) -> None:
+        setattr(self.counts, name, getattr(self.counts, name) + 1)
+        self._notices.append(notice)
