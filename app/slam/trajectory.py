@@ -129,7 +129,8 @@ def stamp_text(stamp_ns: int) -> str:
 
 def truth_beside(recording: Path) -> Path | None:
     """The truth file that lies beside a recording, `<name>_truth.tum`, if there is one."""
-    truth = recording.with_name(f"{recording.stem}_truth.tum")
+    name = recording.name if recording.is_dir() else recording.stem
+    truth = recording.with_name(f"{name}_truth.tum")
     return truth if truth.is_file() else None
 
 

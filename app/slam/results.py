@@ -1,0 +1,295 @@
+"""What a run leaves behind: trajectory.tum, timings.csv, map.ply and report.json in one folder.
+
+`RunLog` collects one small row a frame while the run goes on; `save_results` writes the files from
+it, at the end or at any moment in between.
+"""
+
+import hashlib
+import json
+import math
+import os
+import platform
+import resource
+import sys
+from array import array
+from collections import Counter
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from app import __version__
+from app.slam.errors import HemislamError
+from app.slam.metrics import GroundScore, Trajectory, ate, rpe, write_tum
+from app.slam.params import Params
+from app.slam.ply import Keyframes, write_map
+from app.slam.trajectory import stamp_text
+from app.slam.types import F64, I64, NON_GROUND, STAGES, DroppedScan, FrameStatus, StepResult
+
+RESULT_FILES = ("trajectory.tum", "timings.csv", "map.ply", "report.json")
+TIMINGS = (*STAGES, "total")
+RPE_METRES = (1.0, 10.0, 50.0)
+MOST_NOTICES = 200
+
+
+@dataclass(frozen=True, slots=True)
+class RunInfo:
+    """What a run was made from.
+
+    Attributes:
+        recording: the input. params: as used last. start_s, duration_s: the part asked for.
+        truth: to compare with, and truth_path, its file.
+        stopped: why the run ended before the recording did, in a sentence; "" if it did not.
+    """
+
+    recording: Path
+    params: Params
+    start_s: float = 0.0
+    duration_s: float | None = None
+    truth: Trajectory | None = None
+    truth_path: Path | None = None
+    stopped: str = ""
+
+
+class RunLog:
+    """One row a frame (about 150 bytes), and sums over all of them."""
+
+    def __init__(self) -> None:
+        self._stamps = array("q")
+        self._poses = array("d")
+        self._timings = array("d")
+        self._posed = array("b")
+        self.statuses: Counter[FrameStatus] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self.notices: Counter[str] = Counter()
+        self.points = 0
+        self.ground_points = 0
+        self.ground_score: GroundScore | None = None
+        self.T_map_odom: F64 = np.eye(4)
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def add(self, result: StepResult) -> None:
+        """Take in a processed frame."""
+        T_map_imu = result.T_map_imu
+        self._stamps.append(result.stamp_ns)
+        self._poses.extend(T_map_imu[:3, 3])
+        self._poses.extend(Rotation.from_matrix(T_map_imu[:3, :3]).as_quat())
+        self._timings.extend(result.timings_ms.get(stage, 0.0) for stage in TIMINGS)
+        self._posed.append(result.status is not FrameStatus.INITIALISING)
+        self.statuses[result.status] += 1
+        self._count(result.notices)
+        self.points += len(result.cloud)
+        self.ground_points += int(np.count_nonzero(result.cloud.labels != NON_GROUND))
+        if result.truth_ground is not None:
+            score = GroundScore.of(result.cloud.labels, result.truth_ground)
+            self.ground_score = score if self.ground_score is None else self.ground_score + score
+        self.T_map_odom = result.T_map_odom
+
+    def drop(self, scan: DroppedScan) -> None:
+        """Take in a scan that was not processed."""
+        self.dropped[scan.reason] += 1
+
+    def _count(self, notices: tuple[str, ...]) -> None:
+        for notice in notices:
+            if notice in self.notices or len(self.notices) < MOST_NOTICES:
+                self.notices[notice] += 1
+
+    @property
+    def stamps_ns(self) -> I64:
+        """(n,) scan ends of all processed frames."""
+        return np.array(self._stamps, dtype=np.int64)
+
+    @property
+    def timings_ms(self) -> F64:
+        """(n, len(TIMINGS)) milliseconds."""
+        return np.array(self._timings).reshape(-1, len(TIMINGS))
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """T_map_imu at every scan's end, but for the frames before the filter had started."""
+        rows = np.array(self._poses).reshape(-1, 7)
+        every = Trajectory(self.stamps_ns, rows[:, :3], rows[:, 3:])
+        return every.chosen(np.array(self._posed, dtype=bool))
+
+
+def prepare_folder(folder: Path, *, replace: bool = False) -> None:
+    """Make sure that results can be written to `folder`, creating it.
+
+    Raises:
+        HemislamError: it holds results and `replace` is not set, or it can not be written to.
+    """
+    held = [name for name in RESULT_FILES if (folder / name).exists()]
+    if held and not replace:
+        raise HemislamError(
+            f"{folder} already holds results ({', '.join(held)}); choose another folder or add --force."
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HemislamError(f"The folder {folder} can not be made: {error.strerror}; choose another one.") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise HemislamError(f"The folder {folder} can not be written to; choose another one.")
+
+
+def save_results(
+    folder: Path, log: RunLog, keyframes: Keyframes, info: RunInfo, *, replace: bool = False
+) -> dict[str, Any]:
+    """Write the four result files and return what report.json holds.
+
+    Older results in the folder stay until all new files are complete.
+
+    Raises:
+        HemislamError: as `prepare_folder`, or the disk is full or fails.
+    """
+    prepare_folder(folder, replace=replace)
+    parts = {name: folder / f".{name}.part" for name in RESULT_FILES}
+    try:
+        write_tum(parts["trajectory.tum"], log.trajectory)
+        parts["timings.csv"].write_text(_timings_csv(log), encoding="utf-8")
+        map_points = write_map(parts["map.ply"], keyframes, log.T_map_odom)
+        report = make_report(log, info)
+        report["map"] = {"keyframes": len(keyframes), "points": map_points}
+        parts["report.json"].write_text(json.dumps(report, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        for name, part in parts.items():
+            part.replace(folder / name)
+    except OSError as error:
+        raise HemislamError(f"Results can not be written to {folder}: {error.strerror}.") from error
+    finally:
+        for part in parts.values():
+            part.unlink(missing_ok=True)
+    return report
+
+
+def _timings_csv(log: RunLog) -> str:
+    lines = ["frame,stamp_s," + ",".join(f"{stage}_ms" for stage in TIMINGS)]
+    for frame, (stamp, row) in enumerate(zip(log.stamps_ns, log.timings_ms, strict=True)):
+        lines.append(f"{frame},{stamp_text(int(stamp))}," + ",".join(f"{value:.4f}" for value in row))
+    return "\n".join(lines) + "\n"
+
+
+def make_report(log: RunLog, info: RunInfo) -> dict[str, Any]:
+    """What report.json holds; numbers that do not exist are null."""
+    trajectory = log.trajectory
+    score = log.ground_score
+    report = {
+        "hemislam": __version__,
+        "stopped_early": info.stopped or None,
+        "recording": {
+            "path": str(info.recording),
+            "sha256": hash_input(info.recording),
+            "start_s": info.start_s,
+            "duration_s": info.duration_s,
+        },
+        "frames": {
+            "processed": len(log),
+            **{status.value: log.statuses[status] for status in FrameStatus},
+            "dropped": log.dropped.total(),
+            "dropped_reasons": dict(log.dropped.most_common()),
+        },
+        "distance_m": trajectory.distance,
+        "ground": {
+            "share": log.ground_points / log.points if log.points else None,
+            "precision": score.precision if score else None,
+            "recall": score.recall if score else None,
+            "f1": score.f1 if score else None,
+        },
+        "accuracy": _accuracy(trajectory, info),
+        "timings_ms": _timing_summary(log),
+        "peak_memory_mb": peak_memory_mb(),
+        "notices": dict(log.notices.most_common()),
+        "machine": describe_machine(),
+        "parameters": info.params.model_dump(mode="json"),
+    }
+    finite: dict[str, Any] = _finite(report)
+    return finite
+
+
+def _accuracy(trajectory: Trajectory, info: RunInfo) -> dict[str, Any] | None:
+    if info.truth is None:
+        return None
+    truth = {"truth": str(info.truth_path) if info.truth_path else None}
+    try:
+        absolute = ate(trajectory, info.truth)
+        relative = {"1 frame": rpe(trajectory, info.truth)}
+        relative |= {f"{metres:g} m": rpe(trajectory, info.truth, metres=metres) for metres in RPE_METRES}
+    except HemislamError as error:
+        return truth | {"error": str(error)}
+    return truth | {
+        "poses": absolute.poses,
+        "distance_m": absolute.distance,
+        "ate_m": asdict(absolute.position),
+        "ate_deg": asdict(absolute.rotation),
+        "rpe": {
+            over: {"pairs": error.pairs, "m": asdict(error.position), "deg": asdict(error.rotation)} if error else None
+            for over, error in relative.items()
+        },
+    }
+
+
+def _timing_summary(log: RunLog) -> dict[str, dict[str, float]]:
+    if not len(log):
+        return {}
+    timings = log.timings_ms
+    return {
+        stage: {
+            "median": float(np.median(timings[:, column])),
+            "p95": float(np.percentile(timings[:, column], 95)),
+            "max": float(timings[:, column].max()),
+        }
+        for column, stage in enumerate(TIMINGS)
+    }
+
+
+def hash_input(recording: Path) -> str | None:
+    """SHA-256 of a file, or of a folder's files one after the other by name; None once it is gone."""
+    digest = hashlib.sha256()
+    try:
+        files = sorted(path for path in recording.rglob("*") if path.is_file()) if recording.is_dir() else [recording]
+        for path in files:
+            with path.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+    except OSError:
+        return None
+    return digest.hexdigest()
+
+
+def peak_memory_mb() -> float:
+    """The most resident memory that this process has used, in MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def describe_machine() -> dict[str, Any]:
+    """Where the run was made; timings mean nothing without it."""
+    return {
+        "system": platform.platform(),
+        "processor": _processor_name(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "numba": version("numba"),
+    }
+
+
+def _processor_name() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _finite(value: Any) -> Any:
+    """The same tree with NaN and infinity as None, which JSON can hold."""
+    if isinstance(value, dict):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

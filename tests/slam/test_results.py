@@ -1,0 +1,223 @@
+"""What a run writes: complete, readable by others, and never over older results by accident."""
+
+import csv
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.slam.errors import HemislamError
+from app.slam.metrics import Trajectory, read_tum
+from app.slam.params import Params
+from app.slam.ply import VERTEX, write_map
+from app.slam.results import RESULT_FILES, TIMINGS, RunInfo, RunLog, save_results
+from app.slam.types import (
+    GROUND,
+    NON_GROUND,
+    SEED,
+    Cloud,
+    DroppedScan,
+    FrameStatus,
+    GroundResult,
+    Keyframe,
+    NavState,
+    Registration,
+    StepResult,
+)
+
+START_NS = 1_700_000_000_150_000_000
+QUARTER_TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+def cloud(points: list[list[float]], labels: list[int]) -> Cloud:
+    n = len(points)
+    return Cloud(
+        points=np.array(points, dtype=np.float32).reshape(-1, 3),
+        labels=np.array(labels, dtype=np.uint8),
+        intensity=np.arange(n, dtype=np.float32),
+        ring=np.zeros(n, dtype=np.uint16),
+        offsets_ns=np.zeros(n, dtype=np.int32),
+    )
+
+
+def frame(index: int, *, status: FrameStatus = FrameStatus.TRACKING, truth: list[int] | None = None) -> StepResult:
+    """A frame that stands at x = index, y = index² / 10, turned by 90° about z."""
+    labels = np.array([GROUND, SEED, NON_GROUND, NON_GROUND], dtype=np.uint8)
+    state = NavState(
+        stamp_ns=START_NS + index * 100_000_000,
+        R_odom_imu=QUARTER_TURN,
+        p_odom_imu=np.array([float(index), index**2 / 10, 0]),
+        v_odom_imu=np.zeros(3),
+        b_gyro=np.zeros(3),
+        b_accel=np.zeros(3),
+        g_odom=np.array([0, 0, -9.81]),
+        R_imu_lidar=np.eye(3),
+        p_imu_lidar=np.zeros(3),
+    )
+    return StepResult(
+        index=index,
+        stamp_ns=state.stamp_ns,
+        status=status,
+        state=state,
+        T_map_odom=np.eye(4),
+        cloud=cloud([[1, 0, 0]] * 4, labels.tolist()),
+        ground=GroundResult(labels, True, "", np.eye(3)[2], np.zeros(3), -np.eye(3)[2], 0.01, 1, 0.5),
+        registration=Registration(True, 2, 4, 4, 0.01, np.ones(6), False),
+        points_in=4,
+        points_reduced=4,
+        points_filter=4,
+        timings_ms=dict.fromkeys(TIMINGS, 1.0) | {"total": 7.0 + index},
+        truth_ground=None if truth is None else np.array(truth, dtype=np.uint8),
+    )
+
+
+def keyframe(index: int, points: list[list[float]], labels: list[int]) -> Keyframe:
+    T_odom_imu = np.eye(4)
+    T_odom_imu[:3, :3] = QUARTER_TURN
+    T_odom_imu[0, 3] = 10.0 * index
+    T_imu_lidar = np.eye(4)
+    T_imu_lidar[2, 3] = 0.5
+    return Keyframe(index, index, START_NS, T_odom_imu, T_imu_lidar, np.eye(6), cloud(points, labels))
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "walk.mcap"
+    path.write_bytes(b"a recording")
+    return path
+
+
+def logged(frames: int = 6) -> RunLog:
+    log = RunLog()
+    log.add(frame(0, status=FrameStatus.INITIALISING))
+    for index in range(1, frames):
+        log.add(frame(index, truth=[1, 0, 1, 0]))
+    log.drop(DroppedScan(START_NS, "no IMU"))
+    log.drop(DroppedScan(START_NS, "no IMU"))
+    return log
+
+
+def read_ply(path: Path) -> np.ndarray:
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = head.decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
+    assert len(body) == count * VERTEX.itemsize
+    return np.frombuffer(body, dtype=VERTEX)
+
+
+def test_a_run_writes_its_four_files(tmp_path: Path, recording: Path) -> None:
+    folder = tmp_path / "out"
+    report = save_results(folder, logged(), [keyframe(0, [[1, 0, 0]], [GROUND])], RunInfo(recording, Params()))
+    assert sorted(path.name for path in folder.iterdir()) == sorted(RESULT_FILES)
+    assert json.loads((folder / "report.json").read_text()) == report
+
+
+def test_the_trajectory_begins_where_the_filter_had_started(tmp_path: Path, recording: Path) -> None:
+    save_results(tmp_path / "out", logged(), [], RunInfo(recording, Params()))
+    lines = (tmp_path / "out" / "trajectory.tum").read_text().splitlines()
+    assert lines[0] == (
+        "1700000000.250000000 1.000000000 0.100000000 0.000000000 0.000000000 0.000000000 0.707106781 0.707106781"
+    )
+    assert len(read_tum(tmp_path / "out" / "trajectory.tum")) == 5
+
+
+def test_timings_hold_every_processed_frame(tmp_path: Path, recording: Path) -> None:
+    save_results(tmp_path / "out", logged(), [], RunInfo(recording, Params()))
+    rows = list(csv.DictReader((tmp_path / "out" / "timings.csv").open()))
+    assert [float(row["total_ms"]) for row in rows] == [7, 8, 9, 10, 11, 12]
+    assert [row["frame"] for row in rows] == ["0", "1", "2", "3", "4", "5"]
+    assert rows[0]["stamp_s"] == "1700000000.150000000"
+
+
+def test_the_report_counts_frames_ground_and_the_input(tmp_path: Path, recording: Path) -> None:
+    report = save_results(tmp_path / "out", logged(), [], RunInfo(recording, Params()))
+    assert report["recording"]["sha256"] == hashlib.sha256(b"a recording").hexdigest()
+    assert report["frames"] == {
+        "processed": 6,
+        "initialising": 1,
+        "tracking": 5,
+        "lost": 0,
+        "dropped": 2,
+        "dropped_reasons": {"no IMU": 2},
+    }
+    assert report["ground"] == {"share": 0.5, "precision": 0.5, "recall": 0.5, "f1": 0.5}
+    assert report["timings_ms"]["total"]["median"] == 9.5
+    assert report["parameters"]["ground"]["alpha"] == Params().ground.alpha
+    assert report["accuracy"] is None
+    assert report["peak_memory_mb"] > 10
+
+
+def test_the_report_measures_against_truth(tmp_path: Path, recording: Path) -> None:
+    log = logged(8)
+    ours = log.trajectory
+    shifted = Trajectory(ours.stamps_ns, ours.positions + np.array([5.0, 0, 0]), ours.quaternions)
+    report = save_results(tmp_path / "out", log, [], RunInfo(recording, Params(), truth=shifted))
+    assert report["accuracy"]["ate_m"]["rmse"] < 1e-9
+    assert report["accuracy"]["poses"] == 7
+    assert report["accuracy"]["rpe"]["50 m"] is None
+
+
+def test_a_truth_that_does_not_fit_is_told_in_the_report(tmp_path: Path, recording: Path) -> None:
+    log = logged(8)
+    other_day = Trajectory(log.trajectory.stamps_ns + 10**14, log.trajectory.positions, log.trajectory.quaternions)
+    report = save_results(tmp_path / "out", log, [], RunInfo(recording, Params(), truth=other_day))
+    assert "same clock" in report["accuracy"]["error"]
+
+
+def test_a_run_without_a_single_frame_still_has_a_report(tmp_path: Path, recording: Path) -> None:
+    report = save_results(tmp_path / "out", RunLog(), [], RunInfo(recording, Params(), stopped="It was cut."))
+    assert report["stopped_early"] == "It was cut."
+    assert report["ground"]["share"] is None
+    assert (tmp_path / "out" / "trajectory.tum").read_text() == ""
+
+
+def test_the_map_holds_every_keyframe_in_the_map_frame(tmp_path: Path) -> None:
+    keyframes = [keyframe(0, [[1, 0, 0], [0, 2, 0]], [GROUND, NON_GROUND]), keyframe(1, [[1, 0, 0]], [SEED])]
+    T_map_odom = np.eye(4)
+    T_map_odom[1, 3] = 100.0
+    count = write_map(tmp_path / "map.ply", keyframes, T_map_odom)
+    points = read_ply(tmp_path / "map.ply")
+    assert count == len(points) == 3
+    np.testing.assert_allclose(
+        np.stack([points["x"], points["y"], points["z"]], axis=1), [[0, 101, 0.5], [-2, 100, 0.5], [10, 101, 0.5]]
+    )
+    assert points["ground"].tolist() == [1, 0, 1]
+    assert points["intensity"].tolist() == [0, 1, 0]
+
+
+def test_results_are_not_overwritten_unless_asked(tmp_path: Path, recording: Path) -> None:
+    info = RunInfo(recording, Params())
+    save_results(tmp_path / "out", logged(4), [], info)
+    before = (tmp_path / "out" / "trajectory.tum").read_bytes()
+    with pytest.raises(HemislamError, match="already holds results"):
+        save_results(tmp_path / "out", logged(9), [], info)
+    assert (tmp_path / "out" / "trajectory.tum").read_bytes() == before
+    save_results(tmp_path / "out", logged(9), [], info, replace=True)
+    assert len(read_tum(tmp_path / "out" / "trajectory.tum")) == 8
+
+
+def test_older_results_survive_a_write_that_fails(tmp_path: Path, recording: Path) -> None:
+    class BrokenDisk:
+        def __len__(self) -> int:
+            return 1
+
+        def __getitem__(self, index: int) -> Keyframe:
+            raise OSError(28, "No space left on device")
+
+    info = RunInfo(recording, Params())
+    folder = tmp_path / "out"
+    save_results(folder, logged(4), [], info)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(HemislamError, match="No space left"):
+        save_results(folder, logged(9), BrokenDisk(), info, replace=True)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_file_in_the_place_of_the_folder_is_named(tmp_path: Path, recording: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    with pytest.raises(HemislamError, match="out can not be made"):
+        save_results(tmp_path / "out", logged(), [], RunInfo(recording, Params()))
+    assert (tmp_path / "out").read_text() == "mine"
