@@ -4,17 +4,12 @@
 it, at the end or at any moment in between.
 """
 
-import hashlib
 import json
 import math
 import os
-import platform
-import resource
-import sys
 from array import array
 from collections import Counter
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +21,7 @@ from app.slam.errors import HemislamError
 from app.slam.metrics import GroundScore, Trajectory, ate, rpe, write_tum
 from app.slam.params import Params
 from app.slam.ply import Keyframes, write_map
+from app.slam.provenance import describe_machine, hash_input, peak_memory_mb
 from app.slam.trajectory import stamp_text
 from app.slam.types import F64, I64, NON_GROUND, STAGES, DroppedScan, FrameStatus, StepResult
 
@@ -165,6 +161,35 @@ def save_results(
     return report
 
 
+def summarise(report: dict[str, Any], folder: Path) -> str:
+    """The report in a few lines."""
+    frames, ground, accuracy = report["frames"], report["ground"], report["accuracy"]
+    total = report["timings_ms"]["total"]
+    lines = [
+        f"frames     {frames['processed']} processed, {frames['dropped']} dropped, {frames['lost']} lost;"
+        f" {report['distance_m']:.1f} m walked",
+        f"time       {total['median']:.1f} ms a frame (median), {total['p95']:.1f} ms (95 %),"
+        f" {total['max']:.1f} ms (max)",
+        f"map        {report['map']['points']:,} points in {report['map']['keyframes']} keyframes;"
+        f" {100 * (ground['share'] or 0):.0f} % ground",
+    ]
+    lines += [f"dropped    {count} x {reason}" for reason, count in frames["dropped_reasons"].items()]
+    if ground["f1"] is not None:
+        lines.append(
+            f"ground     precision {ground['precision'] or 0:.3f}, recall {ground['recall'] or 0:.3f},"
+            f" F1 {ground['f1']:.3f} against the recording's labels"
+        )
+    if accuracy and "error" in accuracy:
+        lines.append(f"error      not measured: {accuracy['error']}")
+    elif accuracy:
+        lines.append(
+            f"error      ATE {accuracy['ate_m']['rmse']:.4f} m (max {accuracy['ate_m']['max']:.4f}),"
+            f" {accuracy['ate_deg']['rmse']:.3f}° over {accuracy['poses']} poses"
+        )
+    lines += [f"memory     {report['peak_memory_mb']:.0f} MB at most", f"saved in   {folder}"]
+    return "\n".join(lines)
+
+
 def _timings_csv(log: RunLog) -> str:
     lines = ["frame,stamp_s," + ",".join(f"{stage}_ms" for stage in TIMINGS)]
     for frame, (stamp, row) in enumerate(zip(log.stamps_ns, log.timings_ms, strict=True)):
@@ -243,47 +268,6 @@ def _timing_summary(log: RunLog) -> dict[str, dict[str, float]]:
         }
         for column, stage in enumerate(TIMINGS)
     }
-
-
-def hash_input(recording: Path) -> str | None:
-    """SHA-256 of a file, or of a folder's files one after the other by name; None once it is gone."""
-    digest = hashlib.sha256()
-    try:
-        files = sorted(path for path in recording.rglob("*") if path.is_file()) if recording.is_dir() else [recording]
-        for path in files:
-            with path.open("rb") as file:
-                while block := file.read(1 << 20):
-                    digest.update(block)
-    except OSError:
-        return None
-    return digest.hexdigest()
-
-
-def peak_memory_mb() -> float:
-    """The most resident memory that this process has used, in MB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
-
-
-def describe_machine() -> dict[str, Any]:
-    """Where the run was made; timings mean nothing without it."""
-    return {
-        "system": platform.platform(),
-        "processor": _processor_name(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "python": platform.python_version(),
-        "numpy": version("numpy"),
-        "numba": version("numba"),
-    }
-
-
-def _processor_name() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
 
 
 def _finite(value: Any) -> Any:

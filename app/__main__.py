@@ -1,0 +1,180 @@
+"""The command line. The only place that wires the rooms together; it imports them when needed."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from app import __version__
+from app.cli import options
+from app.cli.run import run
+from app.slam.errors import HemislamError
+
+
+class _Commands(TyperGroup):
+    """Ends a command with one sentence on stderr, not a traceback, when the user can mend it."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except HemislamError as error:
+            typer.echo(f"hemislam: {error}", err=True)
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt:
+            typer.echo("\nhemislam: interrupted.", err=True)
+            raise typer.Exit(130) from None
+
+
+cli = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"hemislam {__version__}")
+        raise typer.Exit
+
+
+@cli.callback()
+def hemislam(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Map with a handheld hemispherical LiDAR and an IMU: in the browser, or from the command line.
+
+    \b
+    Try:
+      hemislam serve sample_data/corridor.mcap    watch the map grow in the browser
+      hemislam info walk.bag                      what is in a recording, and what is wrong with it
+      hemislam run walk.bag --preset h2lid        trajectory, map and report, without a browser
+
+    Every command explains itself: hemislam run --help
+    """
+
+
+cli.command()(run)
+
+
+@cli.command()
+def info(
+    recording: options.RecordingPath,
+    preset: options.Preset = None,
+    config: options.Config = None,
+    assignments: options.Assignments = None,
+    lidar_topic: options.LidarTopic = None,
+    imu_topic: options.ImuTopic = None,
+) -> None:
+    """Examine a recording: what is in it, what is wrong.
+
+    Topics, rates, time fields, units, gaps, clocks, gravity; each with what was done about it.
+
+    \b
+    Each finding has a verdict:
+      fine        nothing to do
+      corrected   hemislam settles it by itself and says how
+      needs you   only you can know; the option that settles it stands below
+
+    \b
+    Examples:
+      hemislam info walk.mcap
+      hemislam info indoor1.bag --preset h2lid
+    """
+    from tqdm import tqdm
+
+    from app.sensors.doctor import examine
+
+    params = options.resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
+    with tqdm(
+        total=1.0, desc="Reading", leave=False, disable=None, bar_format="{desc}: {percentage:3.0f}% |{bar}|"
+    ) as bar:
+
+        def show(fraction: float) -> None:
+            bar.update(fraction - bar.n)
+
+        findings = examine(recording, params, progress=show)
+    width = max((len(finding.subject) for finding in findings), default=0)
+    for finding in findings:
+        typer.echo(f"{finding.verdict:<9}  {finding.subject:<{width}}  {finding.text}")
+        if finding.option:
+            typer.echo(f"{'':<9}  {'':<{width}}  -> {finding.option}")
+    waiting = sum(finding.verdict == "needs you" for finding in findings)
+    typer.echo(f"{waiting} of {len(findings)} findings need you." if waiting else "Nothing here needs you.")
+
+
+@cli.command()
+def simulate(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="corridor, room, outdoor, ...")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.mcap", help="The recording to write.")],
+    duration: Annotated[float, typer.Option("--duration", metavar="SECONDS", help="Of the walk.")] = 60.0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed, another walk.")] = 0,
+    rate: Annotated[int, typer.Option("--rate", metavar="HZ", help="Revolutions a second, 10 or 20.")] = 10,
+    every_block: Annotated[
+        int, typer.Option("--every-block", metavar="K", help="Fire every K-th azimuth only, for a small file.")
+    ] = 1,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it is there.")] = False,
+) -> None:
+    """Make a recording of a walk through a modelled scene.
+
+    A person carries an RS-Bpearl and an IMU through it, standing still for the first seconds.
+    Beside FILE.mcap it writes FILE_truth.tum, the true poses, and FILE.params.yaml, where the LiDAR
+    sits on the IMU. The points carry their true label in the field `ground`.
+
+    \b
+    Examples:
+      hemislam simulate corridor --out corridor.mcap
+      hemislam simulate outdoor --out outdoor.mcap --duration 120 --seed 7
+      hemislam simulate room --out small.mcap --duration 20 --every-block 6
+    """
+    from tqdm import tqdm
+
+    from app.sensors.simulator import simulate
+
+    if out.exists() and not force:
+        raise HemislamError(f"{out} is there already; choose another --out or add --force to replace it.")
+    with tqdm(desc="Simulating", unit=" scans", leave=False, disable=None) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        made = simulate(
+            scene, out, duration_s=duration, seed=seed, rate_hz=rate, every_block=every_block, progress=show
+        )
+    typer.echo(
+        f"{made.recording}: {made.scans} scans, {made.points:,} points, {made.duration_s:g} s,"
+        f" {made.distance_m:.1f} m walked, {made.bytes / 1e6:.1f} MB"
+    )
+
+
+@cli.command()
+def params(
+    preset: options.Preset = None, config: options.Config = None, assignments: options.Assignments = None
+) -> None:
+    """Print all parameters as commented YAML.
+
+    With meaning, unit and range; --config reads it back.
+
+    \b
+    Examples:
+      hemislam params > mine.yaml                 edit it, then: hemislam run walk.mcap --config mine.yaml
+      hemislam params --preset h2lid              what a preset sets
+      hemislam params --set ground.alpha=30       check a value
+    """
+    typer.echo(options.resolve(None, preset, config, assignments).to_yaml(), nl=False)
+
+
+def main() -> None:
+    """The console script."""
+    cli(prog_name="hemislam")
+
+
+if __name__ == "__main__":
+    main()

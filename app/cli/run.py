@@ -1,0 +1,141 @@
+"""`hemislam run`: a recording from end to end, without a browser."""
+
+import itertools
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from app.cli.options import (
+    Assignments,
+    Config,
+    Duration,
+    ImuTopic,
+    LidarTopic,
+    Preset,
+    RecordingPath,
+    Start,
+    Truth,
+    resolve,
+)
+from app.slam.errors import HemislamError
+
+if TYPE_CHECKING:
+    from app.server.run import Run
+
+
+def run(
+    recording: RecordingPath,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Where to write; else runs/NAME-1, -2, ...")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace results that DIR already holds.")] = False,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Assignments = None,
+    lidar_topic: LidarTopic = None,
+    imu_topic: ImuTopic = None,
+    start: Start = 0.0,
+    duration: Duration = None,
+    truth: Truth = None,
+) -> None:
+    """Process a recording without a browser and write the results.
+
+    \b
+    Writes into DIR:
+      trajectory.tum   pose of the IMU in the map at each scan's end: stamp x y z qx qy qz qw
+      timings.csv      milliseconds of each stage, frame by frame; reading the file not counted
+      map.ply          the map: x y z intensity ground
+      report.json      parameters, frames processed and dropped, ground share, errors against truth
+
+    \b
+    Examples:
+      hemislam run walk.mcap
+      hemislam run indoor1.bag --preset h2lid --out results/indoor1
+      hemislam run walk.mcap --set ground.alpha=30 --start 10 --duration 60 --truth walk.tum
+    """
+    from app.server.run import open_run
+    from app.slam.results import RunInfo, prepare_folder, save_results, summarise
+    from app.slam.trajectory import read_tum
+
+    params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
+    folder = out or _free_folder(recording)
+    _compile()
+    work = open_run(recording, truth, params, start, duration)
+    try:
+        prepare_folder(folder, replace=force)
+        truth_path = work.opened.truth
+        if truth_path and not truth:
+            typer.echo(f"Using the truth that lies beside the recording: {truth_path}")
+        stop = _process(work)
+        if not len(work.log):
+            if not any(folder.iterdir()):
+                folder.rmdir()
+            raise stop if isinstance(stop, KeyboardInterrupt) else HemislamError(_nothing_processed(work, stop))
+        info = RunInfo(
+            recording=recording,
+            params=params,
+            start_s=start,
+            duration_s=duration,
+            truth=read_tum(truth_path) if truth_path else None,
+            truth_path=truth_path,
+            stopped="" if stop is None else str(stop) or type(stop).__name__,
+        )
+        report = save_results(folder, work.log, work.engine.keyframes, info, replace=force)
+    finally:
+        work.close()
+    typer.echo(summarise(report, folder))
+    if isinstance(stop, HemislamError):
+        raise HemislamError(f"{stop} The frames before that were processed and saved in {folder}.")
+    if stop is not None:
+        typer.echo(f"hemislam: stopped early; the frames so far are saved in {folder}.", err=True)
+        raise stop
+
+
+def _free_folder(recording: Path) -> Path:
+    """The first of runs/NAME-1, runs/NAME-2, ... that does not exist yet."""
+    name = recording.resolve().stem
+    return next(folder for n in itertools.count(1) if not (folder := Path("runs") / f"{name}-{n}").exists())
+
+
+def _compile() -> None:
+    """Compile the kernels behind a progress bar; a moment only, once they are in the cache."""
+    from tqdm import tqdm
+
+    from app.slam.warmup import compile_kernels
+
+    bar_format = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}"
+    with tqdm(total=1.0, desc="Compiling, first start only", leave=False, disable=None, bar_format=bar_format) as bar:
+
+        def show(name: str, fraction: float) -> None:
+            bar.n = fraction
+            bar.set_postfix_str(name)
+
+        compile_kernels(show)
+
+
+def _process(work: "Run") -> BaseException | None:
+    """Run to the end of the recording. What stopped it before, an interruption say, is returned, not raised."""
+    from tqdm import tqdm
+
+    from app.slam.types import Measurement
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with tqdm(total=work.opened.frames, unit=" frames", disable=None) as bar:
+        try:
+            while (entry := work.peek()) is not None:
+                if isinstance(entry, Measurement):
+                    work.step()
+                bar.update()
+        except (Exception, KeyboardInterrupt) as error:  # whatever it was, the frames so far must be saved
+            return error
+    return None
+
+
+def _nothing_processed(work: "Run", stop: BaseException | None) -> str:
+    if stop is not None:
+        return str(stop)
+    reasons = "; ".join(f"{count} x {reason}" for reason, count in work.log.dropped.most_common(3))
+    why = f"all were dropped: {reasons}" if reasons else "there is none in the part asked for"
+    return f"No scan of {work.opened.path} could be processed ({why}); `hemislam info` tells more."
