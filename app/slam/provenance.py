@@ -1,0 +1,51 @@
+"""Where results come from: the input's hash, the machine, the memory that was used."""
+
+import hashlib
+import os
+import platform
+import resource
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+
+def hash_input(recording: Path) -> str | None:
+    """SHA-256 of a file, or of a folder's files one after the other by name; None once it is gone."""
+    digest = hashlib.sha256()
+    try:
+        files = sorted(path for path in recording.rglob("*") if path.is_file()) if recording.is_dir() else [recording]
+        for path in files:
+            with path.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+    except OSError:
+        return None
+    return digest.hexdigest()
+
+
+def peak_memory_mb() -> float:
+    """The most resident memory that this process has used, in MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def describe_machine() -> dict[str, Any]:
+    """Where the run was made; timings mean nothing without it."""
+    return {
+        "system": platform.platform(),
+        "processor": _processor_name(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "numba": version("numba"),
+    }
+
+
+def _processor_name() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
