@@ -1,0 +1,84 @@
+"""Facts about the RoboSense RS-Bpearl: its firing pattern, geometry and units.
+
+Source: the vendor's own open driver (rs_driver: decoder_RSBP.hpp, chan_angles.hpp) and data sheet.
+The simulator fires by these facts; whoever decodes the sensor's packets reads them here too.
+
+Frame of the sensor: x, y in the base plane, +z the pole of the hemisphere; azimuth turns from +x
+towards -y. A block is one firing of all 32 channels; the channels of a block fire one after the
+other while the head turns on, so every firing has its own time and azimuth.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.slam.types import F64, I64, U16
+
+CHANNELS = 32
+
+ELEVATIONS_DEG: F64 = np.array(
+    [
+        89.5, 81.0625, 78.25, 72.625, 67.0, 61.375, 55.75, 50.125, 86.6875, 83.875, 75.4375, 69.8125, 64.1875,
+        58.5625, 52.9375, 47.3125, 44.5, 38.875, 33.25, 27.625, 22.0, 16.375, 10.75, 5.125, 41.6875, 36.0625,
+        30.4375, 24.8125, 19.1875, 13.5625, 7.9375, 2.3125,
+    ]
+)  # fmt: skip
+"""(32,) nominal elevation above the base plane by channel; a unit's own are in its DIFOP packet."""
+
+RINGS: U16 = np.argsort(np.argsort(ELEVATIONS_DEG)).astype(np.uint16)
+"""(32,) the driver's `ring` by channel: rank of the elevation, 0 = lowest = outermost cone."""
+
+MIN_RANGE_M, MAX_RANGE_M = 0.1, 100.0
+RATED_RANGE_M, RATED_REFLECTIVITY = 30.0, 0.1
+"""The data sheet: 30 m on a target that reflects 10 %."""
+
+ROTATION_RATES_HZ = (10, 20)
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What differs between the two generations of the sensor.
+
+    Attributes:
+        range_step: m per count of a packet's distance. block_ns: duration of a block.
+        firing_offsets_ns: (32,) firing time of each channel inside its block.
+        rx, rz: m, lever of the laser: a point is d * direction + (rx cos a, -rx sin a, rz) with
+            the BLOCK's azimuth a.
+    """
+
+    name: str
+    range_step: float
+    block_ns: int
+    firing_offsets_ns: I64
+    rx: float
+    rz: float
+
+    def blocks_per_turn(self, rate_hz: int) -> int:
+        """Whole blocks in one revolution: 1801 at 10 Hz, 900 at 20 Hz."""
+        return 1_000_000_000 // rate_hz // self.block_ns
+
+
+def _offsets_us(*values: float) -> I64:
+    return np.rint(np.array(values) * 1000.0).astype(np.int64)
+
+
+BPEARL = Model(
+    name="RS-Bpearl",
+    range_step=0.005,
+    block_ns=55_520,
+    firing_offsets_ns=_offsets_us(
+        0.00, 2.56, 5.12, 7.68, 10.24, 12.80, 15.36, 17.92, 25.68, 28.24, 30.80, 33.36, 35.92, 38.48, 41.04, 43.60,
+        1.28, 3.84, 6.40, 8.96, 11.52, 14.08, 16.64, 19.20, 26.96, 29.52, 32.08, 34.64, 37.20, 39.76, 42.32, 44.88,
+    ),
+    rx=0.01473,
+    rz=0.09427,
+)  # fmt: skip
+
+BPV4 = Model(
+    name="BPv4",
+    range_step=0.0025,
+    block_ns=55_560,
+    firing_offsets_ns=_offsets_us(*(1.668 * channel for channel in range(CHANNELS))),
+    rx=0.01619,
+    rz=0.09571,
+)

@@ -1,0 +1,122 @@
+"""What a laser beam meets: the still part of a scene and the bodies that move through it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from app.sensors.simulator.mesh import Mesh
+from app.slam.errors import HemislamError
+from app.slam.types import F32, F64, U8
+
+
+@dataclass(frozen=True, slots=True)
+class Mover:
+    """A rigid body that walks or drives upright.
+
+    Attributes:
+        mesh: in the body's own frame, z up, origin at its foot.
+        pose: seconds (n,) -> positions (n, 3) in the world, m, and yaw (n,), rad.
+    """
+
+    mesh: Mesh
+    pose: Callable[[F64], tuple[F64, F64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Hits:
+    """What each of n rays met. Rays that met nothing have infinite distance.
+
+    Attributes:
+        distance: (n,) m. incidence: (n,) cosine of the angle to the surface's normal, 0-1.
+        reflectivity: (n,) 0-1. ground: (n,) 1 = floor or terrain.
+    """
+
+    distance: F64
+    incidence: F32
+    reflectivity: F32
+    ground: U8
+
+
+class Raycaster:
+    """Casts rays at a scene, each at its own time."""
+
+    def __init__(self, mesh: Mesh, movers: tuple[Mover, ...] = ()) -> None:
+        """Raises HemislamError, naming the system packages, where open3d can not be loaded."""
+        self._still = _Target(mesh)
+        self._movers = [(mover, _Target(mover.mesh), *_sphere(mover.mesh)) for mover in movers]
+
+    def cast(self, origins: F64, directions: F64, times: F64) -> Hits:
+        """Rays (n, 3) + s * unit (n, 3) in the world frame, fired at times (n,) s."""
+        hits = self._still.cast(origins, directions)
+        for mover, target, centre, radius in self._movers:
+            where, _ = mover.pose(times[[0, -1]])
+            reach = radius + float(np.linalg.norm(where[1] - where[0]))
+            near = np.flatnonzero(_passes(origins, directions, where[0] + [0.0, 0.0, centre], reach))
+            if not near.size:
+                continue
+            position, yaw = mover.pose(times[near])
+            body = target.cast(_unturned(origins[near] - position, yaw), _unturned(directions[near], yaw))
+            closer = body.distance < hits.distance[near]
+            into = near[closer]
+            hits.distance[into] = body.distance[closer]
+            hits.incidence[into] = body.incidence[closer]
+            hits.reflectivity[into] = body.reflectivity[closer]
+            hits.ground[into] = body.ground[closer]
+        return hits
+
+
+class _Target:
+    """One mesh in open3d's ray casting scene."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        core, scene_type = _open3d()
+        self._core = core
+        self._mesh = mesh
+        self._scene = scene_type()
+        self._scene.add_triangles(
+            core.Tensor(np.ascontiguousarray(mesh.vertices, np.float32)),
+            core.Tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
+        )
+
+    def cast(self, origins: F64, directions: F64) -> Hits:
+        rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
+        answer = self._scene.cast_rays(self._core.Tensor(rays))
+        distance = answer["t_hit"].numpy().astype(np.float64)
+        face = np.where(np.isfinite(distance), answer["primitive_ids"].numpy(), 0).astype(np.int64)
+        incidence = np.abs(np.einsum("ni,ni->n", answer["primitive_normals"].numpy(), rays[:, 3:]))
+        return Hits(distance, incidence, self._mesh.reflectivity[face], self._mesh.ground[face])
+
+
+def _open3d() -> tuple[Any, Any]:
+    try:
+        import open3d.core
+        from open3d.t.geometry import RaycastingScene
+    except (ImportError, OSError) as error:
+        raise HemislamError(
+            f"The simulator needs open3d, which can not be loaded here ({error}); "
+            "on Debian or Ubuntu: apt-get install libusb-1.0-0 libegl1 libgl1."
+        ) from error
+    return open3d.core, RaycastingScene
+
+
+def _sphere(mesh: Mesh) -> tuple[float, float]:
+    """Height of the centre and radius of an upright body's bounding sphere about its own axis."""
+    centre = float(mesh.vertices[:, 2].min() + mesh.vertices[:, 2].max()) / 2
+    return centre, float(np.linalg.norm(mesh.vertices - np.array([0.0, 0.0, centre]), axis=1).max()) + 0.01
+
+
+def _passes(origins: F64, directions: F64, centre: F64, radius: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which rays come within `radius` of `centre`."""
+    to_centre = centre - origins
+    along = np.maximum(np.einsum("ni,ni->n", to_centre, directions), 0.0)
+    off = to_centre - along[:, None] * directions
+    return np.asarray(np.einsum("ni,ni->n", off, off) < radius * radius)
+
+
+def _unturned(vectors: F64, yaw: F64) -> F64:
+    """Vectors (n, 3) in the frame that is turned by `yaw` (n,) about z."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y, z = vectors.T
+    return np.column_stack([c * x + s * y, c * y - s * x, z])

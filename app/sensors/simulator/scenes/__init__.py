@@ -1,0 +1,27 @@
+"""Procedural scenes: a mesh, what moves in it, and the path that the person with the sensor walks."""
+
+import difflib
+from collections.abc import Callable
+
+import numpy as np
+
+from app.sensors.simulator.scenes.corridor import corridor
+from app.sensors.simulator.scenes.scene import Scene
+from app.slam.errors import HemislamError
+
+_BUILDERS: dict[str, Callable[[np.random.Generator], Scene]] = {builder.__name__: builder for builder in (corridor,)}
+
+SCENES: dict[str, str] = {name: (builder.__doc__ or "").splitlines()[0] for name, builder in _BUILDERS.items()}
+"""Name and one-line description of every scene."""
+
+
+def build_scene(name: str, seed: int) -> Scene:
+    """The scene, the same for the same seed. Raises HemislamError, naming the scenes there are."""
+    if name not in _BUILDERS:
+        near = difflib.get_close_matches(name, _BUILDERS, n=1)
+        hint = f"did you mean `{near[0]}`?" if near else f"there are {', '.join(_BUILDERS)}."
+        raise HemislamError(f"There is no scene `{name}`; {hint}")
+    return _BUILDERS[name](np.random.default_rng([seed, 0]))
+
+
+__all__ = ["SCENES", "Scene", "build_scene"]

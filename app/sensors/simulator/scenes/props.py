@@ -1,0 +1,164 @@
+"""Things that stand and walk about in scenes. Sizes in metres, `at` is (x, y, floor z), yaw in radians."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from app.sensors.simulator.mesh import Mesh, MeshBuilder, Vector
+from app.sensors.simulator.raycast import Mover
+from app.slam.types import F64
+
+
+def _place(at: Vector, yaw: float) -> Callable[[float, float, float], tuple[float, float, float]]:
+    """From a prop's own coordinates to the world's."""
+    c, s = float(np.cos(yaw)), float(np.sin(yaw))
+    return lambda x, y, z: (at[0] + c * x - s * y, at[1] + s * x + c * y, at[2] + z)
+
+
+def table(mesh: MeshBuilder, at: Vector, yaw: float = 0.0, size: tuple[float, float, float] = (1.6, 0.8, 0.74)) -> None:
+    p = _place(at, yaw)
+    length, width, height = size
+    mesh.box(p(0, 0, height - 0.02), (length, width, 0.04), 0.55, yaw)
+    for x in (-length / 2 + 0.06, length / 2 - 0.06):
+        for y in (-width / 2 + 0.06, width / 2 - 0.06):
+            mesh.box(p(x, y, (height - 0.04) / 2), (0.06, 0.06, height - 0.04), 0.35, yaw)
+
+
+def chair(mesh: MeshBuilder, at: Vector, yaw: float = 0.0) -> None:
+    """Its back is at -x."""
+    p = _place(at, yaw)
+    mesh.box(p(0, 0, 0.45), (0.45, 0.45, 0.05), 0.4, yaw)
+    mesh.box(p(-0.21, 0, 0.72), (0.04, 0.45, 0.5), 0.4, yaw)
+    for x in (-0.19, 0.19):
+        for y in (-0.19, 0.19):
+            mesh.box(p(x, y, 0.21), (0.04, 0.04, 0.43), 0.3, yaw)
+
+
+def shelf(
+    mesh: MeshBuilder, at: Vector, yaw: float, rng: np.random.Generator, size: tuple[float, float] = (1.2, 2.0)
+) -> None:
+    """Open to +x, with books."""
+    p = _place(at, yaw)
+    width, height = size
+    mesh.box(p(-0.16, 0, height / 2), (0.02, width, height), 0.5, yaw)
+    for y in (-width / 2, width / 2):
+        mesh.box(p(0, y, height / 2), (0.32, 0.03, height), 0.5, yaw)
+    for z in np.arange(0.1, height + 0.01, 0.38):
+        mesh.box(p(0, 0, z), (0.32, width, 0.03), 0.5, yaw)
+        y = -width / 2 + 0.05
+        while y < width / 2 - 0.1 and z < height - 0.3:
+            thick = rng.uniform(0.02, 0.09)
+            mesh.box(p(-0.02, y + thick / 2, z + 0.15), (0.2, thick, rng.uniform(0.2, 0.3)), rng.uniform(0.1, 0.8), yaw)
+            y += thick + (0.0 if rng.random() < 0.8 else 0.15)
+
+
+def sofa(mesh: MeshBuilder, at: Vector, yaw: float = 0.0, width: float = 1.9) -> None:
+    """Its back is at -x."""
+    p = _place(at, yaw)
+    mesh.box(p(0, 0, 0.22), (0.85, width, 0.44), 0.3, yaw)
+    mesh.box(p(-0.36, 0, 0.55), (0.2, width, 0.5), 0.3, yaw)
+    for y in (-width / 2, width / 2):
+        mesh.box(p(0, y, 0.32), (0.85, 0.18, 0.64), 0.28, yaw)
+
+
+def plant(mesh: MeshBuilder, at: Vector, rng: np.random.Generator) -> None:
+    mesh.cylinder(at, 0.18, 0.4, 0.25, top_radius=0.23)
+    mesh.leaves((at[0], at[1], at[2] + 0.9), (0.4, 0.4, 0.5), 160, 0.05, 0.5, rng)
+
+
+def extinguisher(mesh: MeshBuilder, at: Vector) -> None:
+    mesh.cylinder((at[0], at[1], at[2] + 0.5), 0.08, 0.5, 0.6)
+    mesh.cylinder((at[0], at[1], at[2] + 1.0), 0.03, 0.1, 0.2)
+
+
+def door_leaf(mesh: MeshBuilder, hinge: Vector, yaw: float, width: float = 0.9, height: float = 2.1) -> None:
+    """A leaf that reaches from its hinge along +x of `yaw`, with a handle on either side."""
+    p = _place(hinge, yaw)
+    mesh.box(p(width / 2, 0, height / 2), (width, 0.04, height), 0.5, yaw)
+    mesh.box(p(width - 0.1, 0, 1.05), (0.12, 0.14, 0.03), 0.25, yaw)
+
+
+def tree(mesh: MeshBuilder, at: Vector, rng: np.random.Generator, height: float = 7.0) -> None:
+    trunk = height * rng.uniform(0.3, 0.4)
+    mesh.cylinder((at[0], at[1], at[2] - 0.3), 0.025 * height, trunk + 0.3 + height * 0.2, 0.25, top_radius=0.08)
+    crown = (height - trunk) / 2
+    for _ in range(4):
+        shift = rng.normal(scale=0.35 * crown, size=3) * [1, 1, 0.5]
+        centre = np.array([at[0], at[1], at[2] + trunk + crown]) + shift
+        mesh.leaves(centre, crown * rng.uniform(0.5, 0.8, 3), 220, 0.09, 0.45, rng)
+
+
+def bush(mesh: MeshBuilder, at: Vector, rng: np.random.Generator, size: float = 0.9) -> None:
+    mesh.leaves((at[0], at[1], at[2] + 0.4 * size), (size, size, 0.6 * size), 320, 0.06, 0.45, rng)
+
+
+def hedge(mesh: MeshBuilder, start: Vector, end: Vector, rng: np.random.Generator, height: float = 1.0) -> None:
+    a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
+    for share in np.arange(0.0, 1.0, 0.7 / float(np.linalg.norm(b - a))):
+        middle = a + (b - a) * share + [0, 0, height / 2]
+        mesh.leaves(middle, (0.5, 0.5, height / 2), 200, 0.06, 0.45, rng)
+
+
+def car(mesh: MeshBuilder, at: Vector, yaw: float, rng: np.random.Generator) -> None:
+    p = _place(at, yaw)
+    paint = rng.uniform(0.1, 0.7)
+    side = np.array(
+        [(-2.1, 0.3), (-2.15, 0.85), (-1.6, 0.95), (-1.1, 1.42), (0.45, 1.45), (1.1, 0.98), (2.0, 0.8), (2.15, 0.35)]
+    )
+    count = len(side)
+    vertices = np.array([p(x, y, z) for y in (-0.87, 0.87) for x, z in side])
+    i = np.arange(count)
+    j = (i + 1) % count
+    skin = np.vstack([np.column_stack([i, j, j + count]), np.column_stack([i, j + count, i + count])])
+    fan = np.array([[0, k, k + 1] for k in range(1, count - 1)])
+    mesh.add(vertices, np.vstack([skin, fan, fan + count]), paint)
+    for x in (-1.3, 1.35):
+        for y in (-0.8, 0.8):
+            mesh.ellipsoid(p(x, y, 0.32), (0.32, 0.12, 0.32), 0.08, yaw)
+
+
+def bench(mesh: MeshBuilder, at: Vector, yaw: float = 0.0) -> None:
+    p = _place(at, yaw)
+    mesh.box(p(0, 0, 0.44), (0.45, 1.6, 0.06), 0.5, yaw)
+    mesh.box(p(-0.25, 0, 0.72), (0.05, 1.6, 0.3), 0.5, yaw)
+    for y in (-0.65, 0.65):
+        mesh.box(p(0, y, 0.2), (0.4, 0.08, 0.42), 0.3, yaw)
+
+
+def lamp_post(mesh: MeshBuilder, at: Vector, height: float = 4.5) -> None:
+    mesh.cylinder((at[0], at[1], at[2] - 0.3), 0.07, height + 0.3, 0.4, top_radius=0.04)
+    mesh.ellipsoid((at[0], at[1], at[2] + height), (0.25, 0.25, 0.18), 0.7)
+
+
+def person_mesh(height: float = 1.75) -> Mesh:
+    """Mid-stride, facing +x."""
+    mesh = MeshBuilder()
+    scale = height / 1.75
+    mesh.ellipsoid((0, 0, 1.63 * scale), (0.1, 0.08, 0.12), 0.4)
+    mesh.ellipsoid((0, 0, 1.2 * scale), (0.14, 0.21, 0.34), 0.3)
+    mesh.ellipsoid((0, 0, 0.92 * scale), (0.13, 0.18, 0.17), 0.2)
+    for side, swing in ((-1, 0.3), (1, -0.3)):
+        for z, tilt_x in ((0.68, 0.11), (0.25, 0.26)):
+            mesh.ellipsoid((np.sign(swing) * tilt_x, side * 0.1, z * scale), (0.08, 0.08, 0.26), 0.2)
+        mesh.ellipsoid((-np.sign(swing) * 0.12, side * 0.24, 1.05 * scale), (0.06, 0.05, 0.3), 0.3)
+    return mesh.build()
+
+
+def pedestrian(
+    path: F64, speed: float, start: float = 0.0, height: Callable[[F64], F64] | None = None, size: float = 1.75
+) -> Mover:
+    """A person who walks round a closed path of (n, 2) waypoints for ever, `start` metres along it at time 0."""
+    loop = np.vstack([path, path[:1]]).astype(np.float64)
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(loop, axis=0), axis=1))])
+    curve = make_interp_spline(arc, loop, k=3, bc_type="periodic")
+    tangent = curve.derivative()
+
+    def pose(t: F64) -> tuple[F64, F64]:
+        s = (start + speed * t) % arc[-1]
+        xy = curve(s)
+        ahead = tangent(s)
+        z = np.zeros(len(t)) if height is None else height(xy)
+        return np.column_stack([xy, z]), np.arctan2(ahead[:, 1], ahead[:, 0])
+
+    return Mover(person_mesh(size), pose)

@@ -1,0 +1,185 @@
+"""One walk through one scene, measured and written to disk."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from app.sensors.rsbpearl import BPEARL, ROTATION_RATES_HZ
+from app.sensors.simulator import imu as imu_model
+from app.sensors.simulator.imu import ImuNoise
+from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
+from app.sensors.simulator.raycast import Raycaster
+from app.sensors.simulator.recording import TRANSPORT_NS, RecordingWriter
+from app.sensors.simulator.scenes import build_scene
+from app.sensors.simulator.trajectory import Trajectory, Walker, seconds, walk
+from app.slam.errors import HemislamError
+from app.slam.types import I64
+
+START_NS = 1_700_000_000_000_000_000
+"""Every recording starts at this moment."""
+
+_FIRST_TURN_S = 0.05
+_IMU_PERIOD_NS = 1_000_000_000 // imu_model.RATE_HZ
+
+_WALK, _IMU, _LIDAR = 1, 2, 3
+"""Streams of random numbers that do not disturb one another (0 is the scene's)."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimulationSummary:
+    """What was written.
+
+    Attributes:
+        recording, truth, params: the three files. scans, points, imu_samples: how many.
+        duration_s, distance_m: of the walk. bytes: size of the recording.
+    """
+
+    recording: Path
+    truth: Path
+    params: Path
+    scans: int
+    points: int
+    imu_samples: int
+    duration_s: float
+    distance_m: float
+    bytes: int
+
+
+def simulate(
+    scene: str,
+    out: Path,
+    *,
+    duration_s: float = 60.0,
+    seed: int = 0,
+    rate_hz: int = 10,
+    every_block: int = 1,
+    range_step: float = BPEARL.range_step,
+    range_noise: float = 0.005,
+    walker: Walker | None = None,
+    imu_noise: ImuNoise | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> SimulationSummary:
+    """Simulate a handheld walk with an RS-Bpearl and an IMU and write it as a ROS 2 recording.
+
+    Beside `out` (`<stem>.mcap`, streamed scan by scan) it writes the truth `<stem>_truth.tum`
+    (T_world_imu at every scan's end, absolute seconds, exact; the world's z is up) and
+    `<stem>.params.yaml` (the sensor's mounting, loaded by itself with the recording). The same
+    arguments give the same measurements. Existing files are replaced once all is written.
+
+    Args:
+        scene: a name in SCENES. out: ends in .mcap; its folder must exist.
+        duration_s: of the recording, the still start (walker.still) included.
+        seed: of everything random: the scene's details, the walk, noise and biases.
+        rate_hz: 10 or 20 revolutions a second. every_block: fire every k-th azimuth block only,
+            so that a scan has 57,632 / k firings at 10 Hz and the file is small.
+        range_step: m, rounding of distances: 0.005, or 0.0025 for a newer unit; 0 = none.
+        range_noise: m, standard deviation of a distance.
+        walker, imu_noise: how the person walks, how good the IMU is; None = as their defaults.
+        progress: called with (scans done, scans in all).
+
+    Raises:
+        HemislamError: unknown scene, an argument out of range, a file that can not be written,
+            or open3d that can not be loaded.
+    """
+    out = Path(out)
+    _check(out, duration_s, rate_hz, every_block, range_step, range_noise)
+    walker = walker or Walker()
+    place = build_scene(scene, seed)
+    trajectory = walk(
+        place.path,
+        duration_s,
+        _random(seed, _WALK),
+        walker=walker,
+        closed=place.closed,
+        height=place.height,
+    )
+    caster = Raycaster(place.mesh, place.movers)
+    lidar = Lidar(firing_pattern(BPEARL, rate_hz, every_block), range_noise, range_step)
+    imu_stamps = START_NS + np.arange(round(duration_s * imu_model.RATE_HZ) + 1, dtype=np.int64) * _IMU_PERIOD_NS
+    imu = imu_model.measure(trajectory, imu_stamps, START_NS, imu_noise or ImuNoise(), _random(seed, _IMU))
+
+    total = int((duration_s - _FIRST_TURN_S) * rate_hz + 1e-6)
+    points = 0
+    next_imu = 0
+    truth, params = out.with_name(f"{out.stem}_truth.tum"), out.with_name(f"{out.stem}.params.yaml")
+    unfinished = out.with_name(out.name + ".part")
+    ends: list[int] = []
+    try:
+        with RecordingWriter(unfinished) as recording:
+            for index in range(total):
+                start_s = _FIRST_TURN_S + index / rate_hz
+                returns = lidar.turn(caster, trajectory, start_s, START_NS, _random(seed, _LIDAR, index))
+                if not len(returns.points):
+                    continue
+                points += len(returns.points)
+                ends.append(int(returns.stamps_ns.max()))
+                received = ends[-1] + TRANSPORT_NS
+                while next_imu < len(imu) and imu.stamps_ns[next_imu] <= received:
+                    recording.add_imu(int(imu.stamps_ns[next_imu]), imu.gyro[next_imu], imu.accel[next_imu])
+                    next_imu += 1
+                recording.add_cloud(returns, ends[-1])
+                progress(index + 1, total)
+            for k in range(next_imu, len(imu)):
+                recording.add_imu(int(imu.stamps_ns[k]), imu.gyro[k], imu.accel[k])
+        truth.write_text(_tum(trajectory, np.array(ends, np.int64)))
+        params.write_text(_SIDECAR + yaml.safe_dump({"sensor": {"translation": P_IMU_LIDAR.tolist()}}))
+        unfinished.replace(out)
+    except OSError as error:
+        raise HemislamError(f"{out} can not be written ({error.strerror}); choose another place with --out.") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+    path = trajectory.poses(np.arange(0.0, duration_s, 0.02))[0]
+    return SimulationSummary(
+        recording=out,
+        truth=truth,
+        params=params,
+        scans=len(ends),
+        points=points,
+        imu_samples=len(imu),
+        duration_s=duration_s,
+        distance_m=float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
+        bytes=out.stat().st_size,
+    )
+
+
+_SIDECAR = "# Mounting of the simulated scanner (as H2LID); read by itself with the recording beside it.\n"
+
+
+def _random(seed: int, *stream: int) -> np.random.Generator:
+    return np.random.default_rng([seed, *stream])
+
+
+def _tum(trajectory: Trajectory, stamps_ns: I64) -> str:
+    """TUM lines: absolute seconds, x y z, quaternion x y z w."""
+    positions, rotations = trajectory.poses(seconds(stamps_ns - START_NS))
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    lines = [
+        f"{ns // 1_000_000_000}.{ns % 1_000_000_000:09d} " + " ".join(f"{v:.9f}" for v in (*p, *q))
+        for ns, p, q in zip(stamps_ns.tolist(), positions, quaternions, strict=True)
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _check(out: Path, duration_s: float, rate_hz: int, every_block: int, range_step: float, range_noise: float) -> None:
+    if out.suffix != ".mcap":
+        raise HemislamError(f"The recording must be named *.mcap, not `{out.name}`.")
+    if not out.parent.is_dir():
+        raise HemislamError(f"The folder {out.parent} does not exist; make it first or choose another with --out.")
+    if rate_hz not in ROTATION_RATES_HZ:
+        raise HemislamError(f"The RS-Bpearl turns at 10 or 20 Hz, not {rate_hz}.")
+    limits = {
+        "duration": (duration_s, 0.5, 86_400.0, "s"),
+        "every_block": (every_block, 1, 90, "blocks"),
+        "range_step": (range_step, 0.0, 0.1, "m"),
+        "range_noise": (range_noise, 0.0, 1.0, "m"),
+    }
+    for name, (value, low, high, unit) in limits.items():
+        if not low <= value <= high:
+            raise HemislamError(
+                f"The simulator's {name} can not be {value:g}; it lies between {low:g} and {high:g} {unit}."
+            )

@@ -1,0 +1,187 @@
+"""A handheld walk as one smooth curve, and the exact motion an IMU on it feels.
+
+The walk IS a quintic spline through samples of (x, y, z, yaw, pitch, roll), so that every
+derivative is exact: poses, angular rates and specific forces belong to the same curve.
+
+Frames: `world` has z up; `body` has x forward, y left, z up; the IMU is mounted as on H2LID: its
+z looks forward, its x points DOWN, its y left, so that at rest it reads -9.81 m/s^2 on x (gravity
+along -x, as the accelerometer feels it).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
+
+from app.slam.types import F64, I64
+
+GRAVITY = 9.81
+R_BODY_IMU: F64 = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+_SAMPLE_HZ = 50.0
+_STEP_HZ = 1.8
+
+
+def seconds(ns: I64) -> F64:
+    """Differences of integer nanoseconds as seconds, the unit of a trajectory's time."""
+    return ns.astype(np.float64) * 1e-9
+
+
+class Trajectory:
+    """Where the IMU is, at any time. Times are seconds from the recording's start, (n,) arrays."""
+
+    def __init__(self, times: F64, samples: F64) -> None:
+        """Args: times (n,) increasing; samples (n, 6) of x, y, z (m), yaw, pitch, roll (rad) of the body."""
+        self._spline: BSpline = make_interp_spline(times, samples, k=5)
+        self._rate = self._spline.derivative(1)
+        self._acceleration = self._spline.derivative(2)
+
+    def poses(self, t: F64) -> tuple[F64, F64]:
+        """Positions (n, 3) and rotations (n, 3, 3): R_world_imu, p_world_imu in reverse order."""
+        values = self._spline(t)
+        return values[:, :3], _rotation(values[:, 3:]) @ R_BODY_IMU
+
+    def velocities(self, t: F64) -> F64:
+        """(n, 3) m/s, world frame."""
+        return np.asarray(self._rate(t)[:, :3])
+
+    def motion(self, t: F64) -> tuple[F64, F64]:
+        """What a perfect IMU reads: angular rate (n, 3) rad/s and specific force (n, 3) m/s^2, IMU frame."""
+        _, pitch, roll = self._spline(t)[:, 3:].T
+        yaw_rate, pitch_rate, roll_rate = self._rate(t)[:, 3:].T
+        body_rate = np.column_stack(
+            [
+                roll_rate - yaw_rate * np.sin(pitch),
+                pitch_rate * np.cos(roll) + yaw_rate * np.sin(roll) * np.cos(pitch),
+                -pitch_rate * np.sin(roll) + yaw_rate * np.cos(roll) * np.cos(pitch),
+            ]
+        )
+        _, R_world_imu = self.poses(t)
+        force = self._acceleration(t)[:, :3] + np.array([0.0, 0.0, GRAVITY])
+        return body_rate @ R_BODY_IMU, np.einsum("nji,nj->ni", R_world_imu, force)
+
+
+@dataclass(frozen=True, slots=True)
+class Walker:
+    """How the person who carries the sensor walks.
+
+    Attributes:
+        speed: m/s. height: m of the IMU above the ground. still: s of standing at the start.
+        bob, sway: m, half the swing up-down (each step) and left-right (each other step).
+        pitch, roll, yaw: rad, spread of the hand's slow wandering about each axis.
+        wander: m, spread of the slow sideways deviation from the path.
+    """
+
+    speed: float = 1.0
+    height: float = 1.25
+    still: float = 2.5
+    bob: float = 0.02
+    sway: float = 0.015
+    pitch: float = np.deg2rad(2.5)
+    roll: float = np.deg2rad(2.0)
+    yaw: float = np.deg2rad(5.0)
+    wander: float = 0.08
+
+
+def walk(
+    path: F64,
+    duration_s: float,
+    rng: np.random.Generator,
+    *,
+    walker: Walker,
+    closed: bool = True,
+    height: Callable[[F64], F64] | None = None,
+) -> Trajectory:
+    """Walk along waypoints, as often around a closed path as time allows; stop at the end of an open one.
+
+    Args:
+        path: (n, 2) waypoints in plan, m. height: the ground's z at (n, 2) points; None is z = 0.
+    """
+    t = np.arange(-1.0, duration_s + 1.0, 1.0 / _SAMPLE_HZ)
+    awake = _smoothstep((t - walker.still) / 1.5)
+    speed = walker.speed * awake * (1.0 + 0.1 * _wander(t, rng, (0.05, 0.15)))
+    travelled = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2) / _SAMPLE_HZ])
+
+    line, arc = _unrolled(path, closed, travelled[-1] + 5.0)
+    if not closed:
+        travelled = _brake(travelled, arc[-1])
+    xy = np.column_stack([np.interp(travelled, arc, line[:, k]) for k in (0, 1)])
+    xy = np.column_stack([_smoothed(xy[:, k], 0.5 * _SAMPLE_HZ) for k in (0, 1)])
+
+    # The walker looks half a metre ahead, and turns over about as much.
+    step = 0.05
+    s = np.arange(0.0, arc[-1], step)
+    fine = np.column_stack([np.interp(s, arc, line[:, k]) for k in (0, 1)])
+    directions = np.unwrap(np.arctan2(*np.gradient(fine, axis=0).T[::-1]))
+    directions = _smoothed(directions, 0.6 / step)
+    heading = np.interp(travelled + 0.5, s, directions)
+    heading = _smoothed(heading, 0.2 * _SAMPLE_HZ)
+
+    floor = np.zeros(len(t)) if height is None else height(xy)
+    floor = _smoothed(floor, 0.3 * _SAMPLE_HZ)
+
+    steps = 2 * np.pi * _STEP_HZ * (t + 0.3 * _wander(t, rng, (0.05, 0.1)) / _STEP_HZ)
+    sideways = walker.sway * np.sin(steps / 2) + walker.wander * _wander(t, rng, (0.05, 0.2))
+    left = np.column_stack([-np.sin(heading), np.cos(heading)])
+    xy = xy + left * (awake * sideways)[:, None]
+    z = floor + walker.height + awake * walker.bob * np.sin(steps)
+    nod = np.deg2rad(0.5) * np.sin(steps + 1.0)
+    samples = np.column_stack(
+        [
+            xy,
+            z,
+            heading + awake * walker.yaw * _wander(t, rng, (0.15, 0.7)),
+            rng.normal(scale=np.deg2rad(1.0)) + awake * (walker.pitch * _wander(t, rng, (0.2, 1.0)) + nod),
+            rng.normal(scale=np.deg2rad(1.0)) + awake * walker.roll * _wander(t, rng, (0.2, 1.0)),
+        ]
+    )
+    return Trajectory(t, samples)
+
+
+def _rotation(angles: F64) -> F64:
+    """R = Rz(yaw) Ry(pitch) Rx(roll) of (n, 3) yaw, pitch, roll: (n, 3, 3)."""
+    (cy, cp, cr), (sy, sp, sr) = np.cos(angles).T, np.sin(angles).T
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _smoothstep(x: F64) -> F64:
+    x = np.clip(x, 0.0, 1.0)
+    return x**3 * (x * (6.0 * x - 15.0) + 10.0)
+
+
+def _smoothed(values: F64, sigma: float) -> F64:
+    """Convolved with a Gaussian whose spread is `sigma` samples; the ends go on as they are."""
+    reach = round(5 * sigma)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), mode="valid")
+
+
+def _wander(t: F64, rng: np.random.Generator, band_hz: tuple[float, float]) -> F64:
+    """A smooth random function of unit spread: a few sines with frequencies in the band."""
+    frequencies = rng.uniform(*band_hz, 5)
+    phases = rng.uniform(0, 2 * np.pi, 5)
+    return np.asarray(np.sin(2 * np.pi * np.outer(t, frequencies) + phases).sum(axis=1) * np.sqrt(2 / 5))
+
+
+def _unrolled(path: F64, closed: bool, length: float) -> tuple[F64, F64]:
+    """The path as one polyline of at least `length` if closed, and the arc length at each vertex."""
+    line = np.asarray(path, np.float64)
+    if closed:
+        lap = np.vstack([line, line[:1]])
+        lap_length = float(np.linalg.norm(np.diff(lap, axis=0), axis=1).sum())
+        line = np.vstack([line] * (int(length / lap_length) + 2))
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    return line, arc
+
+
+def _brake(travelled: F64, end: float) -> F64:
+    """Come softly to a stop two metres before the end of an open path."""
+    limit = end - 1.0
+    over = np.maximum(travelled - (limit - 1.0), 0.0)
+    return np.where(travelled > limit - 1.0, limit - 1.0 + np.tanh(over), travelled)
