@@ -76,11 +76,12 @@ class Restart:
 class Save:
     """Write trajectory.tum, timings.csv, map.ply and report.json of what was processed so far.
 
-    Without `map` the map.ply, which takes longest, is left out. `Snapshot.saved` tells when it is done.
+    `trajectory_only` leaves out all but the first, which takes no time. Older results in the folder
+    are replaced once the new ones are complete; `Snapshot.saved` tells when.
     """
 
     folder: Path
-    map: bool = True
+    trajectory_only: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +197,7 @@ class Snapshot:
         T_map_truth: (4, 4) that lays the truth's positions over the map, None until the walk
             determines it.
         progress: what takes long just now, or None. notices: the newest 50.
-        saved: the newest `Save` that ended.
+        saved: the newest 10 `Save`s that ended.
         engine_alive: False when the engine's process has died.
     """
 
@@ -214,5 +215,5 @@ class Snapshot:
     T_map_truth: F64 | None = None
     progress: Progress | None = None
     notices: tuple[Notice, ...] = ()
-    saved: Saved | None = None
+    saved: tuple[Saved, ...] = ()
     engine_alive: bool = True
