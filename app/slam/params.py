@@ -42,9 +42,9 @@ class Recording(Section):
     """How a recording is read. `auto` lets the recording doctor decide and say so."""
 
     lidar_topic: str = _param(
-        "", "Topic of the point clouds; empty: the first one of type PointCloud2.", effect="restart"
+        "", "Topic of the point clouds; empty: the one of type PointCloud2 with most messages.", effect="restart"
     )
-    imu_topic: str = _param("", "Topic of the IMU; empty: the first one of type Imu.", effect="restart")
+    imu_topic: str = _param("", "Topic of the IMU; empty: the one of type Imu with most messages.", effect="restart")
     time_field: str = _param(
         "auto", "Name of the per-point time field; `none` derives the time from the azimuth.", effect="restart"
     )
@@ -60,16 +60,14 @@ class Recording(Section):
         0.0,
         "Added to the IMU's stamps, for clocks that are not synchronised.",
         unit="s",
-        ge=-10,
-        le=10,
         step=0.001,
         effect="restart",
     )
     rotation_rate: float = _param(
-        10.0,
-        "Revolutions per second, used only when points carry no time.",
+        0.0,
+        "Revolutions per second, used only when points carry no time; 0: the rate of the clouds.",
         unit="Hz",
-        ge=1,
+        ge=0,
         le=100,
         step=1,
         effect="restart",
