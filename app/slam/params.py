@@ -191,12 +191,26 @@ class Filter(Section):
     point_noise: float = _param(
         0.03, "Standard deviation of a point-to-plane distance.", unit="m", ge=0.001, le=1, step=0.005
     )
+    neighbours: int = _param(
+        5, "Map points that make a plane; more are taken where these lie along one line.", ge=4, le=20, step=1
+    )
+    plane_tilt: float = _param(
+        1.5,
+        "Most uncertainty of a plane's normal; neighbours along one scan line widen the patch until it is met.",
+        unit="deg",
+        ge=0.1,
+        le=20,
+        step=0.1,
+    )
+    gate: float = _param(
+        0.11, "Residuals over this times √range are not used (FAST-LIO2's gate).", unit="m/√m", ge=0.01, le=1, step=0.01
+    )
     max_iterations: int = _param(5, "Most iterations of one update.", ge=1, le=20, step=1)
     plane_threshold: float = _param(
         0.1, "All neighbours must lie within this of their plane.", unit="m", ge=0.01, le=1, step=0.01
     )
     neighbour_distance: float = _param(
-        1.5, "Neighbours farther than this from a point are not used.", unit="m", ge=0.2, le=5, step=0.1
+        1.0, "Neighbours farther than this from a point are not used.", unit="m", ge=0.2, le=5, step=0.1
     )
     estimate_extrinsics: bool = _param(False, "Estimate the LiDAR's pose on the IMU while mapping.")
 
@@ -204,13 +218,29 @@ class Filter(Section):
 class LocalMap(Section):
     """The hashed voxel map that scans are registered to. Its memory is bounded."""
 
-    voxel_size: float = _param(0.5, "Edge of a map voxel.", unit="m", ge=0.1, le=3, step=0.05, effect="restart")
-    points_per_voxel: int = _param(20, "Most points kept in one voxel.", ge=1, le=50, step=1, effect="restart")
+    voxel_size: float = _param(
+        1.0,
+        "Edge of a map voxel; neighbours are looked for within one edge at most.",
+        unit="m",
+        ge=0.1,
+        le=3,
+        step=0.05,
+        effect="restart",
+    )
+    spacing: float = _param(
+        0.2,
+        "No two points of a voxel are nearer than this, so that standing still piles up nothing.",
+        unit="m",
+        ge=0.0,
+        le=1,
+        step=0.05,
+    )
+    points_per_voxel: int = _param(40, "Most points kept in one voxel.", ge=1, le=50, step=1, effect="restart")
     radius: float = _param(
         100.0, "Voxels farther than this from the sensor are dropped.", unit="m", ge=10, le=500, step=5
     )
     max_voxels: int = _param(
-        150_000,
+        100_000,
         "Most voxels kept; memory does not grow beyond them.",
         ge=1000,
         le=2_000_000,

@@ -1,0 +1,220 @@
+"""The engine: one frame in, one result out. Synchronous and deterministic."""
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from app.slam import ground, iekf, imu, keyframes, start
+from app.slam.imu import Belief
+from app.slam.keyframes import KeyframeStore
+from app.slam.local_map import LocalMap, MapState
+from app.slam.params import Params
+from app.slam.types import STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
+from app.slam.voxel import VoxelGrid
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """All that the engine's future depends on. Restoring it restores every later result exactly."""
+
+    params: Params
+    frame: int
+    belief: Belief | None
+    still: ImuSamples | None
+    status: FrameStatus
+    map: MapState
+    keyframes: int
+    last_keyframe: Keyframe | None
+
+
+class Engine:
+    """LiDAR-inertial odometry and mapping of one walk (paper 2.2-2.3).
+
+    Feed it scans in order of time, each with the IMU samples that cover it (`Measurement`). The
+    same scans, samples and parameters give the same results to the last bit.
+
+    Attributes:
+        params: used from the next step on; those that act on restart are read only once, here.
+        keyframes: the full map so far.
+    """
+
+    def __init__(self, params: Params) -> None:
+        self.params = params
+        self.keyframes = KeyframeStore()
+        self._map = LocalMap(params.map)
+        self._grid = VoxelGrid()
+        self._belief: Belief | None = None  # None until the start is over
+        self._still: ImuSamples | None = None
+        self._status = FrameStatus.INITIALISING
+        self._frame = 0
+        self._last_keyframe: Keyframe | None = None
+
+    def step(self, scan: Scan, samples: ImuSamples) -> StepResult:
+        """Process one scan with the samples that cover the time from the previous scan's end to its own."""
+        p, watch = self.params, _Stopwatch()
+        end_ns, notices = scan.end_ns, []
+        scan = _in_range(scan, p.sensor.min_range, p.sensor.max_range)
+
+        belief, waiting = self._belief, False
+        if belief is None:
+            started = start.proceed(self._still, scan, samples, p)
+            belief, waiting, self._still = started.belief, started.waiting, started.still
+            notices += [started.notice] if started.notice else []
+        predicted, path = imu.propagate(belief, samples, end_ns, p.imu)
+        watch.lap("propagate")
+        points = imu.deskew(scan, path, predicted.state)
+        watch.lap("deskew")
+
+        # paper 2.2: the ground, and only the ground, is thinned before the filter's own scan voxel
+        surface = ground.segment(points, scan.ring, _down_in_lidar(predicted), p.ground)
+        watch.lap("ground")
+        reduced = self._grid.downsample(points, p.ground.voxel_size, chosen=surface.labels)
+        sampled = self._grid.downsample(reduced.points, p.scan.voxel_size)
+        watch.lap("downsample")
+
+        # paper 2.3, eq. 5-7
+        posterior, registration = predicted, _NOT_REGISTERED
+        if self._map.voxels:
+            posterior, registration = iekf.update(predicted, sampled.points, self._map, p.filter)
+        status = _status(waiting, self._map.voxels > 0, registration)
+        watch.lap("update")
+
+        if not waiting:
+            self._belief = posterior
+            self._insert(posterior, sampled.points)
+        watch.lap("insert")
+
+        cloud = Cloud(points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns)
+        keyframe = None if waiting else self._keyframe(posterior, cloud)
+        watch.lap("keyframe")
+
+        if status is not self._status and FrameStatus.LOST in (status, self._status):
+            notices.append(f"Lost: {registration.reason}." if status is FrameStatus.LOST else "Tracking again.")
+        result = StepResult(
+            index=self._frame,
+            stamp_ns=end_ns,
+            status=status,
+            state=posterior.state,
+            T_map_odom=np.eye(4),
+            cloud=cloud,
+            ground=surface,
+            registration=registration,
+            points_in=len(scan),
+            points_reduced=len(reduced.points),
+            points_filter=len(sampled.points),
+            timings_ms=watch.laps(),
+            keyframe=keyframe,
+            notices=tuple(notices),
+            truth_ground=scan.truth_ground,
+        )
+        self._status = status
+        self._frame += 1
+        return result
+
+    def relabel(self, result: StepResult) -> StepResult:
+        """The same frame with its ground segmented by the present parameters. Changes nothing else."""
+        cloud, p = result.cloud, self.params.ground
+        surface = ground.segment(cloud.points, cloud.ring, result.ground.down, p)
+        reduced = self._grid.downsample(cloud.points, p.voxel_size, chosen=surface.labels)
+        return replace(
+            result, cloud=replace(cloud, labels=surface.labels), ground=surface, points_reduced=len(reduced.points)
+        )
+
+    def checkpoint(self) -> Checkpoint:
+        return Checkpoint(
+            params=self.params,
+            frame=self._frame,
+            belief=self._belief,
+            still=self._still,
+            status=self._status,
+            map=self._map.checkpoint(),
+            keyframes=len(self.keyframes),
+            last_keyframe=self._last_keyframe,
+        )
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go back to (or, in another engine of the same recording, on from) a checkpoint."""
+        self.params = checkpoint.params
+        self._frame = checkpoint.frame
+        self._belief = checkpoint.belief
+        self._still = checkpoint.still
+        self._status = checkpoint.status
+        self._map.restore(checkpoint.map)
+        self.keyframes.truncate(checkpoint.keyframes)
+        self._last_keyframe = checkpoint.last_keyframe
+
+    def close(self) -> None:
+        """Give the disk space of the keyframes back."""
+        self.keyframes.close()
+
+    def _insert(self, belief: Belief, points: np.ndarray) -> None:
+        T = (belief.state.T_odom_imu @ belief.state.T_imu_lidar).astype(np.float32)
+        self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map)
+
+    def _keyframe(self, belief: Belief, cloud: Cloud) -> Keyframe | None:
+        state = belief.state
+        if not keyframes.is_due(self._last_keyframe, state.T_odom_imu, self.params.keyframe):
+            return None
+        keyframe = Keyframe(
+            index=len(self.keyframes),
+            frame=self._frame,
+            stamp_ns=state.stamp_ns,
+            T_odom_imu=state.T_odom_imu,
+            T_imu_lidar=state.T_imu_lidar,
+            covariance=belief.covariance[:6, :6].copy(),
+            cloud=cloud,
+        )
+        self.keyframes.append(keyframe)
+        self._last_keyframe = keyframe
+        return keyframe
+
+
+_NOT_REGISTERED = Registration(
+    False, 0, 0, 0, float("nan"), np.full(6, np.nan), False, "the map is still empty; this scan begins it"
+)
+
+
+def _status(waiting: bool, mapped: bool, registration: Registration) -> FrameStatus:
+    if waiting:
+        return FrameStatus.INITIALISING
+    if mapped and registration.inliers < iekf.MIN_INLIERS:
+        return FrameStatus.LOST
+    return FrameStatus.TRACKING
+
+
+def _down_in_lidar(belief: Belief) -> np.ndarray:
+    state = belief.state
+    down = (state.R_odom_imu @ state.R_imu_lidar).T @ state.g_odom
+    return np.asarray(down / np.linalg.norm(down))
+
+
+def _in_range(scan: Scan, nearest: float, farthest: float) -> Scan:
+    r2 = np.einsum("ij,ij->i", scan.points, scan.points)
+    keep = (r2 >= nearest * nearest) & (r2 <= farthest * farthest)
+    if keep.all():
+        return scan
+    return Scan(
+        scan.stamp_ns,
+        scan.points[keep],
+        scan.offsets_ns[keep],
+        scan.intensity[keep],
+        scan.ring[keep],
+        None if scan.truth_ground is None else scan.truth_ground[keep],
+    )
+
+
+class _Stopwatch:
+    """Milliseconds of each stage. What it reads never influences a result."""
+
+    def __init__(self) -> None:
+        self._begin = self._last = time.perf_counter()
+        self._laps = dict.fromkeys(STAGES, 0.0)
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self._laps[stage] = (now - self._last) * 1e3
+        self._last = now
+
+    def laps(self) -> dict[str, float]:
+        return {**self._laps, "total": (self._last - self._begin) * 1e3}

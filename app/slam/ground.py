@@ -1,0 +1,91 @@
+"""Seed-point ground segmentation (paper 2.2, eq. 1-3)."""
+
+import numpy as np
+
+from app.slam.kernels import ground as kernels
+from app.slam.params import Ground
+from app.slam.types import F32, F64, NON_GROUND, SEED, U8, U16, GroundResult
+
+MIN_SEEDS = 20
+"""Fewer points than this do not make a plane worth believing."""
+
+
+def segment(points: F32, ring: U16, down: F64, params: Ground) -> GroundResult:
+    """Label the ground of one scan.
+
+    Args:
+        points: (n, 3) float32 m, LiDAR frame.
+        ring: (n,) rank of each point's scan line by elevation; 0 is the outermost.
+        down: (3,) direction of gravity in the LiDAR frame.
+
+    Returns:
+        Labels and the plane; without an acceptable plane every label is NON_GROUND and `reason`
+        says why.
+    """
+    labels = np.zeros(len(points), dtype=np.uint8)
+    down = down / np.linalg.norm(down)
+    if not params.enabled:
+        return _none(labels, down, "ground segmentation is switched off")
+    if len(points) == 0:
+        return _none(labels, down, "the scan has no points")
+
+    present = np.zeros(int(ring.max()) + 1, dtype=np.bool_)
+    present[ring] = True
+    candidate = np.zeros_like(present)
+    candidate[np.flatnonzero(present)[: params.scan_lines]] = True
+    sums = np.zeros(12)
+    seeds = kernels.seed_moments(points, ring, candidate, down, np.cos(np.radians(params.alpha)), labels, sums)
+    if seeds < MIN_SEEDS:
+        labels[:] = NON_GROUND
+        return _none(labels, down, f"only {seeds} seed points; a plane takes {MIN_SEEDS}", seeds=seeds)
+
+    # eq. 1: principal components of the seeds
+    mean = sums[3:6] / seeds
+    xx, xy, xz, yy, yz, zz = sums[6:] / seeds
+    covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - np.outer(mean, mean)
+    values, vectors = np.linalg.eigh(covariance)  # ascending: values[0] is lambda3
+    planarity = float(max(values[0], 0.0) / values[1]) if values[1] > 0 else 1.0
+    normal = vectors[:, 0] * -np.sign(vectors[:, 0] @ down or -1.0)
+    centroid = sums[:3] + mean
+    if planarity >= params.planarity:
+        labels[:] = NON_GROUND
+        reason = f"λ3/λ2 of the seeds is {planarity:.2f}, not below {params.planarity:g}: they form no plane"
+        return _none(labels, down, reason, normal, centroid, planarity, seeds)
+
+    kernels.label(points, centroid, normal, params.sigma, labels)
+    return GroundResult(
+        labels=labels,
+        found=True,
+        reason="",
+        normal=normal,
+        centroid=centroid,
+        down=down,
+        planarity=planarity,
+        seeds=seeds,
+        share=float(np.count_nonzero(labels)) / len(points),
+    )
+
+
+def _none(
+    labels: U8,
+    down: F64,
+    reason: str,
+    normal: F64 | None = None,
+    centroid: F64 | None = None,
+    planarity: float = float("nan"),
+    seeds: int = 0,
+) -> GroundResult:
+    return GroundResult(
+        labels=labels,
+        found=False,
+        reason=reason,
+        normal=-down if normal is None else normal,
+        centroid=np.full(3, np.nan) if centroid is None else centroid,
+        down=down,
+        planarity=planarity,
+        seeds=seeds,
+        share=0.0,
+    )
+
+
+__all__ = ["MIN_SEEDS", "SEED", "segment"]

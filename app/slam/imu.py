@@ -1,0 +1,96 @@
+"""The IMU's part: propagation, and deskew by backward propagation (paper 2.3)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from app.slam import lie
+from app.slam.kernels import motion
+from app.slam.params import Imu
+from app.slam.types import F32, F64, ImuSamples, NavState, Scan
+
+DIM = 23
+ROT, POS, VEL, BG, BA, GRAV, EXT_ROT, EXT_POS = (
+    slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15), slice(15, 17), slice(17, 20), slice(20, 23),
+)  # fmt: skip
+"""Order of the 23 error dimensions: rotation (IMU frame), position, velocity (odom), gyro bias, accel
+bias, gravity (2, tangent of S²), extrinsic rotation (LiDAR frame), extrinsic translation (IMU frame)."""
+
+MAX_KNOT_STEP = 0.0025
+"""s; poses in between are interpolated linearly."""
+GAP_NOISE = (0.5, 3.0)
+"""Densities (rad/s, m/s² per sqrt Hz) for bridging a gap: walking and turning, unseen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """The filter's whole knowledge: a state and the (23, 23) covariance of its error."""
+
+    state: NavState
+    covariance: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Poses of the IMU in odom between two scan ends.
+
+    Attributes:
+        times: (m,) s relative to the later scan end, <= 0, ascending.
+        poses: (m, 3, 4) [R | p].
+    """
+
+    times: F64
+    poses: F64
+
+
+def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: Imu) -> tuple[Belief, Path]:
+    """Carry the belief forward to `end_ns` through the samples that cover the time from its stamp.
+
+    Rates are linear between samples, constant before the first and after the last one.
+    Returns the predicted belief and the path in between.
+    """
+    state = belief.state
+    times, gyro, accel = _clipped(imu, state.stamp_ns, end_ns)
+    R, p, v = state.R_odom_imu.copy(), state.p_odom_imu.copy(), state.v_odom_imu.copy()
+    P = belief.covariance.copy()
+    noise = np.array([params.gyro_noise, params.accel_noise, params.gyro_bias_walk, params.accel_bias_walk, *GAP_NOISE])
+    knots = int(np.sum(np.ceil(np.maximum(np.diff(times), 0) / MAX_KNOT_STEP))) + 2 * len(times)
+    knot_t, knot_T = np.empty(knots), np.empty((knots, 3, 4))
+    basis = lie.tangent_basis(state.g_odom)
+    n = motion.propagate(
+        times, gyro, accel, MAX_KNOT_STEP, params.max_gap, R, p, v,
+        state.b_gyro, state.b_accel, state.g_odom, basis, P, noise, knot_t, knot_T,
+    )  # fmt: skip
+    R = lie.exp(lie.log(R))  # back onto SO(3) after many products
+    P = 0.5 * (P + P.T)
+    moved = replace(state, stamp_ns=end_ns, R_odom_imu=R, p_odom_imu=p, v_odom_imu=v)
+    return Belief(moved, P), Path(knot_t[:n] - times[-1], knot_T[:n])
+
+
+def deskew(scan: Scan, path: Path, state: NavState) -> F32:
+    """Every point as the LiDAR would have seen it at the path's end, the time of `state`.
+
+    Returns (n, 3) float32, LiDAR frame. Times before the path are extrapolated from its first knots.
+
+    Backward propagation: p_end = T_LI T_odom_end^-1 T_odom_t T_IL p_t.
+    """
+    T_imu_lidar = state.T_imu_lidar
+    poses = np.zeros((len(path.times), 4, 4))
+    poses[:, :3] = path.poses
+    poses[:, 3, 3] = 1.0
+    relative = lie.inverse(T_imu_lidar) @ lie.inverse(poses[-1]) @ poses @ T_imu_lidar
+    times = (scan.offsets_ns.astype(np.float64) + (scan.stamp_ns - state.stamp_ns)) * 1e-9
+    out = np.empty_like(scan.points)
+    motion.deskew(scan.points, times, path.times, np.ascontiguousarray(relative[:, :3]), out)
+    return out
+
+
+def _clipped(imu: ImuSamples, begin_ns: int, end_ns: int) -> tuple[F64, F64, F64]:
+    """Samples from begin to end (s after begin), with values interpolated at both ends."""
+    inside = (imu.stamps_ns > begin_ns) & (imu.stamps_ns < end_ns)
+    stamps = np.concatenate([[begin_ns], imu.stamps_ns[inside], [end_ns]])
+    at = (stamps - begin_ns) * 1e-9
+    have = (imu.stamps_ns - begin_ns) * 1e-9
+    gyro = np.stack([np.interp(at, have, imu.gyro[:, i]) for i in range(3)], axis=1)
+    accel = np.stack([np.interp(at, have, imu.accel[:, i]) for i in range(3)], axis=1)
+    return at, gyro, accel

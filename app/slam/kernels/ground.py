@@ -1,0 +1,51 @@
+"""Seed moments and labels of ground segmentation."""
+
+import math
+
+from numba import njit, prange
+
+
+@njit(cache=True)
+def seed_moments(points, ring, candidate, down, cos_alpha, labels, sums):
+    """Mark seeds (label 2) and add up their first and second moments about the first seed.
+
+    points (n, 3) f32; ring (n,) u16; candidate (lines,) bool; down (3,) unit; labels (n,) u8 out;
+    sums (12,) f64 out: origin, sum, xx xy xz yy yz zz. Returns the number of seeds.
+    """
+    count = 0
+    for j in range(len(points)):
+        labels[j] = 0
+        if not candidate[ring[j]]:
+            continue
+        x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
+        along = x * down[0] + y * down[1] + z * down[2]
+        if along <= cos_alpha * math.sqrt(x * x + y * y + z * z):
+            continue
+        labels[j] = 2
+        if count == 0:
+            sums[0], sums[1], sums[2] = x, y, z
+        x, y, z = x - sums[0], y - sums[1], z - sums[2]
+        sums[3] += x
+        sums[4] += y
+        sums[5] += z
+        sums[6] += x * x
+        sums[7] += x * y
+        sums[8] += x * z
+        sums[9] += y * y
+        sums[10] += y * z
+        sums[11] += z * z
+        count += 1
+    return count
+
+
+@njit(cache=True, parallel=True)
+def label(points, centroid, normal, sigma, labels):
+    """Paper eq. 2-3: ground where |(mu - p) . n| < sigma |p|; seeds keep their label where they are ground."""
+    for j in prange(len(points)):
+        x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
+        d = (centroid[0] - x) * normal[0] + (centroid[1] - y) * normal[1] + (centroid[2] - z) * normal[2]
+        ground = abs(d) < sigma * math.sqrt(x * x + y * y + z * z)
+        if not ground:
+            labels[j] = 0
+        elif labels[j] == 0:
+            labels[j] = 1

@@ -1,0 +1,142 @@
+"""SO(3), SE(3) and S² helpers on plain arrays.
+
+Rotations are (..., 3, 3) matrices; tangent vectors are (..., 3), in radians. Perturbations act on
+the right: `R = R_hat @ exp(d)`, so that `d` is expressed in the body frame (Solà et al. 2018,
+"A micro Lie theory"). Near zero the Taylor expansions are written out.
+"""
+
+import numpy as np
+
+from app.slam.types import F64
+
+_SMALL = 1e-8
+"""Squared angle below which series replace the closed forms (their error is under 1e-16 there)."""
+
+
+def hat(v: F64) -> F64:
+    """(..., 3) vector to the (..., 3, 3) skew matrix with hat(v) @ u = v x u."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def exp(v: F64) -> F64:
+    """Exponential map so(3) -> SO(3) (Rodrigues). v: (..., 3) rad; returns (..., 3, 3)."""
+    v = np.asarray(v, dtype=np.float64)
+    t2 = np.sum(v * v, axis=-1)[..., None, None]
+    small = t2 < _SMALL
+    safe = np.where(small, 1.0, t2)
+    t = np.sqrt(safe)
+    a = np.where(small, 1.0 - t2 / 6.0, np.sin(t) / t)
+    b = np.where(small, 0.5 - t2 / 24.0, (1.0 - np.cos(t)) / safe)
+    K = hat(v)
+    return np.eye(3) + a * K + b * (K @ K)
+
+
+def log(R: F64) -> F64:
+    """Logarithm SO(3) -> so(3), angle in [0, pi]. R: (..., 3, 3); returns (..., 3) rad."""
+    R = np.asarray(R, dtype=np.float64)
+    q = quaternion(R)
+    n = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(n, q[..., 3:])
+    scale = np.where(
+        n < 1e-9, 2.0 / np.where(np.abs(q[..., 3:]) < 0.5, 1.0, q[..., 3:]), angle / np.where(n < 1e-9, 1.0, n)
+    )
+    return np.asarray(q[..., :3] * scale)
+
+
+def right_jacobian(v: F64) -> F64:
+    """Right Jacobian of SO(3): exp(v + d) ~ exp(v) exp(Jr d). v: (3,); returns (3, 3)."""
+    t2 = float(v @ v)
+    K = hat(v)
+    if t2 < _SMALL:
+        return np.eye(3) - 0.5 * K + K @ K / 6.0
+    t = np.sqrt(t2)
+    return np.asarray(np.eye(3) - (1.0 - np.cos(t)) / t2 * K + (t - np.sin(t)) / (t2 * t) * (K @ K))
+
+
+def right_jacobian_inverse(v: F64) -> F64:
+    """Inverse of `right_jacobian`, for angles below 2 pi. v: (3,); returns (3, 3)."""
+    t2 = float(v @ v)
+    K = hat(v)
+    if t2 < _SMALL:
+        return np.eye(3) + 0.5 * K + K @ K / 12.0
+    t = np.sqrt(t2)
+    return np.asarray(np.eye(3) + 0.5 * K + (1.0 / t2 - (1.0 + np.cos(t)) / (2.0 * t * np.sin(t))) * (K @ K))
+
+
+def quaternion(R: F64) -> F64:
+    """(..., 3, 3) rotations to (..., 4) unit quaternions x, y, z, w with w >= 0 (Shepperd's method)."""
+    R = np.asarray(R, dtype=np.float64)
+    m = R.reshape(-1, 3, 3)
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    # 4 q_i^2 for i = x, y, z, w; the largest one is divided by, so no precision is lost
+    squares = np.stack([1 + 2 * m[:, i, i] - trace for i in range(3)] + [1 + trace], axis=1)
+    products = np.empty((len(m), 4, 4))
+    for i in range(4):
+        products[:, i, i] = squares[:, i]
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        products[:, i, j] = products[:, j, i] = m[:, i, j] + m[:, j, i]
+        products[:, k, 3] = products[:, 3, k] = m[:, j, i] - m[:, i, j]
+    rows = products[np.arange(len(m)), np.argmax(squares, axis=1)]
+    q = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    q = np.where(q[:, 3:] < 0, -q, q)
+    return np.asarray(q.reshape(*R.shape[:-2], 4))
+
+
+def matrix(q: F64) -> F64:
+    """(..., 4) quaternions x, y, z, w (of any length but zero) to (..., 3, 3) rotations."""
+    q = np.asarray(q, dtype=np.float64)
+    x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def between(a: F64, b: F64) -> F64:
+    """The smallest rotation that turns the direction of `a` (3,) into that of `b` (3,)."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    c = float(a @ b)
+    if c < -1 + 1e-12:  # opposite: half a turn about any axis across
+        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        return exp(np.pi * axis / np.linalg.norm(axis))
+    K = hat(np.cross(a, b))
+    return np.asarray(np.eye(3) + K + K @ K / (1.0 + c))
+
+
+def from_rpy_degrees(rpy: tuple[float, float, float]) -> F64:
+    """Roll, pitch, yaw in degrees to R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    r, p, y = np.radians(rpy)
+    return exp(np.array([0.0, 0.0, y])) @ exp(np.array([0.0, p, 0.0])) @ exp(np.array([r, 0.0, 0.0]))
+
+
+def transform(R: F64, p: F64) -> F64:
+    """(3, 3) and (3,) to the (4, 4) homogeneous matrix."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = p
+    return T
+
+
+def inverse(T: F64) -> F64:
+    """Inverse of (..., 4, 4) rigid transforms, without a general solve."""
+    out = np.zeros_like(T)
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3] = R
+    out[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def tangent_basis(g: F64) -> F64:
+    """(3, 2) orthonormal basis of the plane across `g` (3,): the two directions of S² at g."""
+    u = g / np.linalg.norm(g)
+    e = np.eye(3)[np.argmin(np.abs(u))]
+    b1 = np.cross(u, e)
+    b1 /= np.linalg.norm(b1)
+    return np.stack([b1, np.cross(u, b1)], axis=1)

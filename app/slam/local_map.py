@@ -1,0 +1,105 @@
+"""The local map that scans are registered to: hashed voxels, bounded memory, planes on request."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.slam.kernels import map as kernels
+from app.slam.params import LocalMap as MapParams
+from app.slam.types import F32, F64, I32, U8
+
+
+@dataclass(frozen=True, slots=True)
+class MapState:
+    """A copy of everything in the map; restoring it restores every later result exactly."""
+
+    cells: I32
+    counts: U8
+    store: F32
+    table: I32
+    center: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Planes:
+    """Planes through the neighbourhoods of n query points.
+
+    Attributes:
+        normals: (n, 3) unit. centers: (n, 3) m, odom.
+        variances: (n,) m², spread of each patch across its plane; -1 where there is no plane.
+    """
+
+    normals: F64
+    centers: F64
+    variances: F64
+
+
+class LocalMap:
+    """Points of past scans in a hash of voxels, a bounded number in each, far voxels dropped."""
+
+    def __init__(self, params: MapParams) -> None:
+        self._voxel = params.voxel_size
+        size = params.max_voxels
+        self._table = np.full(1 << int(np.ceil(np.log2(2 * size))), -1, dtype=np.int32)
+        self._cells = np.zeros((size, 3), dtype=np.int32)
+        self._counts = np.zeros(size, dtype=np.uint8)
+        self._store = np.zeros((size, params.points_per_voxel, 3), dtype=np.float32)
+        self._used = 0
+        self._center = np.zeros(3)
+
+    @property
+    def voxels(self) -> int:
+        return self._used
+
+    def insert(self, points: F32, position: F64, params: MapParams) -> None:
+        """Add (n, 3) odom points seen from `position` (3,); drop what is beyond the radius of it.
+
+        When the map is full of voxels, its radius shrinks until there is room again: what is near
+        the sensor is always mapped.
+        """
+        if np.linalg.norm(position - self._center) > 0.1 * params.radius:
+            self._evict(position, params.radius)
+        self._used, refused = self._insert(points, params)
+        radius = params.radius
+        while refused and radius > 1.0:
+            radius *= 0.8
+            self._evict(position, radius)
+            self._used, refused = self._insert(points, params)
+
+    def _insert(self, points: F32, params: MapParams) -> tuple[int, int]:
+        used, refused = kernels.insert(
+            points, self._voxel, params.spacing, self._table, self._cells, self._counts, self._store, self._used
+        )
+        return int(used), int(refused)
+
+    def _evict(self, center: F64, radius: float) -> None:
+        self._used = int(
+            kernels.evict(center, radius, self._voxel, self._table, self._cells, self._counts, self._store, self._used)
+        )
+        self._center = np.array(center)
+
+    def planes(self, queries: F64, reach: float, flat: float, neighbours: int, tilt: float, noise: float) -> Planes:
+        """A plane for each of (n, 3) odom points; see `kernels.map.planes`."""
+        n = len(queries)
+        out = Planes(np.empty((n, 3)), np.empty((n, 3)), np.empty(n))
+        kernels.planes(
+            queries, self._voxel, min(reach, self._voxel), neighbours, flat, tilt, noise,
+            self._table, self._cells, self._counts, self._store, out.normals, out.centers, out.variances,
+        )  # fmt: skip
+        return out
+
+    def checkpoint(self) -> MapState:
+        n = self._used
+        return MapState(
+            self._cells[:n].copy(),
+            self._counts[:n].copy(),
+            self._store[:n].copy(),
+            self._table.copy(),
+            self._center.copy(),
+        )
+
+    def restore(self, state: MapState) -> None:
+        n = self._used = len(state.cells)
+        self._cells[:n], self._counts[:n], self._store[:n] = state.cells, state.counts, state.store
+        self._table[:] = state.table
+        self._center = state.center.copy()

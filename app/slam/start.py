@@ -1,0 +1,112 @@
+"""How the filter starts: standing still if it can, wide open if it must (architecture: "Start")."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.slam import lie
+from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
+from app.slam.params import Params
+from app.slam.types import ImuSamples, NavState, Scan
+
+MOVING_GYRO = 0.05
+MOVING_ACCEL = 0.4
+"""Standard deviations (rad/s, m/s²) above which a device is not standing still: ten to thirty times
+the noise of a consumer IMU at 200-500 Hz, and well below any step."""
+LEAST_STILL = 0.3
+"""s; a shorter rest says too little about the gyroscope's bias."""
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """Outcome of one scan before the filter runs.
+
+    Attributes:
+        belief: where to propagate from; while waiting, the belief at the scan's end.
+        still: samples of the rest so far. waiting: whether more of it is wanted.
+        notice: what to tell the user, once; "" while waiting.
+    """
+
+    belief: Belief
+    still: ImuSamples
+    waiting: bool
+    notice: str
+
+
+def proceed(still: ImuSamples | None, scan: Scan, samples: ImuSamples, params: Params) -> Started:
+    """Go on with the start by one scan: wait for a longer rest, or start from what there is.
+
+    Args:
+        still: samples of the rest before this scan, from the last call; None at the first scan.
+        samples: IMU samples up to this scan's end.
+    """
+    together = samples if still is None else _joined(still, samples)
+    if not is_moving(samples):
+        rest = (together.stamps_ns[-1] - together.stamps_ns[0]) * 1e-9
+        waiting = bool(rest < params.imu.start_duration)
+        belief = standing(together, scan.end_ns, params)
+        return Started(belief, together, waiting, "" if waiting else f"Started after {rest:.1f} s at rest.")
+    if still is not None and (still.stamps_ns[-1] - still.stamps_ns[0]) * 1e-9 >= LEAST_STILL:
+        rest = (still.stamps_ns[-1] - still.stamps_ns[0]) * 1e-9
+        belief = standing(still, int(still.stamps_ns[-1]), params)
+        return Started(belief, still, False, f"Started after only {rest:.1f} s at rest.")
+    notice = "The device was already moving at the start: biases and gravity begin as rough guesses."
+    begin_ns = max(scan.stamp_ns, int(samples.stamps_ns[0]))
+    return Started(moving(together, begin_ns, params), together, False, notice)
+
+
+def is_moving(imu: ImuSamples) -> bool:
+    """Whether the samples spread more than a device standing still would show."""
+    return bool(np.any(imu.gyro.std(axis=0) > MOVING_GYRO) or np.any(imu.accel.std(axis=0) > MOVING_ACCEL))
+
+
+def standing(imu: ImuSamples, stamp_ns: int, params: Params) -> Belief:
+    """Belief at rest: the gyroscope's mean is its bias, the mean specific force points up."""
+    sigma = _sigma()
+    sigma[VEL] = 0.01
+    sigma[BG] = 3.0 * np.maximum(imu.gyro.std(axis=0) / np.sqrt(len(imu)), 1e-5)
+    sigma[GRAV] = 0.05 / params.imu.gravity  # as far as an accelerometer bias tilts it
+    return _belief(imu, stamp_ns, imu.gyro.mean(axis=0), sigma, params)
+
+
+def moving(imu: ImuSamples, stamp_ns: int, params: Params) -> Belief:
+    """Belief in motion: nothing is known but roughly where up is."""
+    sigma = _sigma()
+    sigma[VEL] = 1.5  # walking
+    sigma[BG] = 0.02
+    sigma[GRAV] = 0.15
+    return _belief(imu, stamp_ns, np.zeros(3), sigma, params)
+
+
+def _sigma() -> np.ndarray:
+    sigma = np.zeros(DIM)
+    sigma[ROT] = sigma[POS] = 1e-4  # odom is defined by this very pose
+    sigma[BA] = 0.05  # turn-on bias of a MEMS accelerometer; at rest it can not be told from gravity
+    sigma[EXT_ROT] = 0.01
+    sigma[EXT_POS] = 0.01
+    return sigma
+
+
+def _belief(imu: ImuSamples, stamp_ns: int, b_gyro: np.ndarray, sigma: np.ndarray, params: Params) -> Belief:
+    up = imu.accel.mean(axis=0)
+    state = NavState(
+        stamp_ns=stamp_ns,
+        R_odom_imu=lie.between(up, np.array([0.0, 0.0, 1.0])),
+        p_odom_imu=np.zeros(3),
+        v_odom_imu=np.zeros(3),
+        b_gyro=b_gyro,
+        b_accel=np.zeros(3),
+        g_odom=np.array([0.0, 0.0, -params.imu.gravity]),
+        R_imu_lidar=lie.from_rpy_degrees(params.sensor.rotation),
+        p_imu_lidar=np.array(params.sensor.translation, dtype=np.float64),
+    )
+    return Belief(state, np.diag(sigma**2))
+
+
+def _joined(a: ImuSamples, b: ImuSamples) -> ImuSamples:
+    later = b.stamps_ns > a.stamps_ns[-1]
+    return ImuSamples(
+        np.concatenate([a.stamps_ns, b.stamps_ns[later]]),
+        np.concatenate([a.gyro, b.gyro[later]]),
+        np.concatenate([a.accel, b.accel[later]]),
+    )

@@ -1,0 +1,55 @@
+"""Voxel-grid downsampling (paper 2.2, last paragraph)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.slam.kernels import voxels as kernels
+from app.slam.types import F32, I32, U8
+
+
+@dataclass(frozen=True, slots=True)
+class Downsampled:
+    """Attributes:
+    points: (m, 3) float32 m, centroids (or untouched points), in order of first appearance.
+    source: (m,) int32, index of the first input point that each one stands for.
+    """
+
+    points: F32
+    source: I32
+
+
+class VoxelGrid:
+    """Thins clouds by centroid. Owns its scratch memory, so that a frame allocates nothing large."""
+
+    def __init__(self) -> None:
+        self._generation = 0
+        self._reserve(1 << 16)
+
+    def _reserve(self, n: int) -> None:
+        size = 1 << int(np.ceil(np.log2(max(2 * n, 2))))
+        self._table = np.zeros(size, dtype=np.int32)
+        self._stamp = np.zeros(size, dtype=np.int32)
+        self._cells = np.empty((n, 3), dtype=np.int32)
+        self._sums = np.empty((n, 4))
+        self._order = np.empty(n, dtype=np.int32)
+        self._generation = 0
+
+    def downsample(self, points: F32, voxel_size: float, chosen: U8 | None = None) -> Downsampled:
+        """Replace the points of each voxel by their centroid.
+
+        Args:
+            points: (n, 3) float32, finite, within 1e6 voxels of the origin.
+            voxel_size: edge in the unit of the points.
+            chosen: (n,) uint8; where it is zero a point is kept as it is. None: all take part.
+        """
+        n = len(points)
+        if n > len(self._order):
+            self._reserve(n)
+        self._generation += 1
+        if chosen is None:
+            chosen = np.ones(n, dtype=np.uint8)
+        m = kernels.centroids(
+            points, chosen, voxel_size, self._table, self._stamp, self._generation, self._cells, self._sums, self._order
+        )
+        return Downsampled(self._sums[:m, :3].astype(np.float32), self._order[:m].copy())

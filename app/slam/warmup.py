@@ -1,0 +1,42 @@
+"""Compile every kernel once, with progress: the first start of a fresh installation takes a while."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from app.slam import ground, iekf, imu, start
+from app.slam.local_map import LocalMap
+from app.slam.params import LocalMap as MapParams
+from app.slam.params import Params
+from app.slam.types import ImuSamples, Scan
+from app.slam.voxel import VoxelGrid
+
+
+def compile_kernels(progress: Callable[[str, float], None] = lambda name, fraction: None) -> None:
+    """Run each kernel on a toy frame, which compiles it or loads it from numba's cache.
+
+    Args:
+        progress: called with what comes next and the fraction done, 0-1; finally with 1.
+    """
+    params = Params()
+    u, v = np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-3, 3, 40))
+    floor = np.stack([u.ravel(), v.ravel(), np.full(u.size, -1.3)], axis=1).astype(np.float32)
+    n = len(floor)
+    scan = Scan(0, floor, np.arange(n, dtype=np.int32), np.zeros(n, np.float32), np.zeros(n, np.uint16))
+    samples = ImuSamples(np.array([0, 5_000_000]), np.zeros((2, 3)), np.tile([0.0, 0.0, 9.81], (2, 1)))
+    belief = start.standing(samples, 0, params)
+    local_map, grid = LocalMap(MapParams(max_voxels=1000)), VoxelGrid()
+
+    progress("propagation", 0.0)
+    predicted, path = imu.propagate(belief, samples, 5_000_000, params.imu)
+    progress("deskew", 0.15)
+    points = imu.deskew(scan, path, predicted.state)
+    progress("ground segmentation", 0.3)
+    surface = ground.segment(points, scan.ring, np.array([0.0, 0.0, -1.0]), params.ground)
+    progress("downsampling", 0.45)
+    grid.downsample(points, 0.3, chosen=surface.labels)
+    progress("local map", 0.55)
+    local_map.insert(floor, np.array([100.0, 0.0, 0.0]), params.map)
+    progress("registration", 0.7)
+    iekf.update(predicted, points, local_map, params.filter)
+    progress("done", 1.0)
