@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from app.slam.types import F32, I64, U16
+from app.slam.types import F32, F64, I64, U16
 
 _SLACK = np.radians(10.0)
 """Azimuth may run back by this much (noise, horizontal calibration) without counting as a full turn."""
@@ -17,8 +18,8 @@ class Spin:
     Attributes:
         period_s: of one revolution. clockwise: seen from +z (RoboSense) or not.
         ordered: whether the points of one ring come in firing order in the message.
-        start: (rings,) rad, azimuth at which each ring's revolution begins (channels differ by
-            their horizontal calibration).
+        start: (rings,) rad, azimuth at which each ring's revolution begins (they differ by the
+            channels' horizontal calibration), counted in the sense of rotation.
     """
 
     period_s: float
@@ -28,23 +29,81 @@ class Spin:
 
     def times_ns(self, points: F32, ring: U16) -> I64:
         """(n,) int64 ns after the revolution's begin, of (n, 3) points on rings (n,)."""
-        sense = -1.0 if self.clockwise else 1.0
+        azimuth = turned_azimuth(points, self.clockwise)
         starts = np.asarray(self.start)
-        azimuth = sense * np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
-        from_start = np.mod(azimuth - sense * starts[np.minimum(ring, len(starts) - 1)] + _SLACK, 2 * np.pi) - _SLACK
-        if not self.ordered:
-            turned = np.maximum(from_start, 0.0)
-        else:
-            # Walk along each ring and only ever forward: a ring that sees nothing for half a turn is
-            # still placed rightly, and the last points do not become the first.
-            order = np.argsort(ring, kind="stable")
-            sorted_ring, sorted_azimuth = ring[order], azimuth[order]
-            step = np.mod(np.diff(sorted_azimuth, prepend=sorted_azimuth[0]) + _SLACK, 2 * np.pi) - _SLACK
-            begins = np.flatnonzero(np.diff(sorted_ring, prepend=sorted_ring[0] + np.uint16(1)))
-            step[begins] = 0.0
-            walked = np.cumsum(step)
+        from_start = _forward(azimuth - starts[np.minimum(ring, len(starts) - 1)])
+        if self.ordered:
+            order, begins, walked = _walk(azimuth, ring)
             lengths = np.diff(begins, append=len(order))
             walked += np.repeat(from_start[order[begins]] - walked[begins], lengths)
             turned = np.empty_like(walked)
             turned[order] = walked
-        return np.rint(turned / (2 * np.pi) * self.period_s * 1e9).astype(np.int64)
+        else:
+            turned = np.maximum(from_start, 0.0)
+        times: I64 = np.rint(turned / (2 * np.pi) * self.period_s * 1e9).astype(np.int64)
+        return times
+
+
+def settle_spin(clouds: list[tuple[F32, U16]], period_s: float) -> Spin:
+    """How the sensor turns, from a few clouds ((n, 3) points, (n,) ring) in the order of the message."""
+    senses = [clockwise for clockwise in (True, False) if all(_laps(p, r, clockwise) < 1.1 for p, r in clouds)]
+    if not senses:  # no order to learn from; almost every sensor turns clockwise seen from above
+        return Spin(period_s, clockwise=True, ordered=False, start=(0.0,))
+    clockwise = senses[0]
+    rings = 1 + max(int(ring.max()) for _, ring in clouds)
+    begins: list[list[float]] = [[] for _ in range(rings)]
+    for points, ring in clouds:
+        azimuth = turned_azimuth(points, clockwise)
+        lines, first = np.unique(ring, return_index=True)
+        for line, at in zip(lines, first, strict=True):
+            begins[line].append(float(azimuth[at]))
+    # A ring whose first firings had no return begins late in that cloud: the earliest counts.
+    common = _circular_median(np.array([value for values in begins for value in values]))
+    start = [min((_centred(v - common) for v in values), default=0.0) + common for values in begins]
+    return Spin(period_s, clockwise, ordered=True, start=tuple(start))
+
+
+def turned_azimuth(points: F32, clockwise: bool) -> F64:
+    """(n,) rad, azimuth of (n, 3) points, growing in the sense of rotation."""
+    azimuth: F64 = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
+    return -azimuth if clockwise else azimuth
+
+
+def _laps(points: F32, ring: U16, clockwise: bool) -> float:
+    """Turns that a typical ring makes in the order of the message; about 1 in the right sense."""
+    _, begins, walked = _walk(turned_azimuth(points, clockwise), ring)
+    ends = np.append(begins[1:], len(walked)) - 1
+    full = ends - begins >= 20
+    if not full.any():
+        return np.inf
+    return float(np.median((walked[ends] - walked[begins])[full])) / (2 * np.pi)
+
+
+def _walk(azimuth: F64, ring: U16) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], F64]:
+    """Walk along each ring in the order of the message, and only ever forward.
+
+    So a ring that sees nothing for half a turn is still placed rightly, and the last points of a
+    revolution do not become its first. Returns the points' order by ring, where each ring begins in
+    it, and the angle walked at each of these ordered points (it goes on from ring to ring).
+    """
+    order = np.argsort(ring, kind="stable")
+    lines, sorted_azimuth = ring[order], azimuth[order]
+    step = _forward(np.diff(sorted_azimuth, prepend=sorted_azimuth[:1]))
+    begins = np.flatnonzero(np.append(True, lines[1:] != lines[:-1]))
+    step[begins] = 0.0
+    return order, begins, np.cumsum(step)
+
+
+def _forward(angle: F64) -> F64:
+    """Wrapped to [-slack, 360 deg - slack): a forward angle, but for noise."""
+    wrapped: F64 = np.mod(angle + _SLACK, 2 * np.pi) - _SLACK
+    return wrapped
+
+
+def _centred(angle: float) -> float:
+    return float(np.mod(angle + np.pi, 2 * np.pi) - np.pi)
+
+
+def _circular_median(angles: F64) -> float:
+    mean = float(np.angle(np.exp(1j * angles).sum()))
+    return mean + float(np.median(np.mod(angles - mean + np.pi, 2 * np.pi) - np.pi))

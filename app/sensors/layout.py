@@ -1,20 +1,25 @@
-"""How a recording's clouds and IMU are to be read: each `auto` decided from its first messages.
+"""How a recording is to be read: each `auto` decided from its first messages, with the evidence.
 
-Every decision states its evidence, and names the option that overrules it.
+`settle_cloud` for the point clouds, `settle_imu` for the IMU. Every decision is a `Finding` that
+states its evidence and names the option that overrules it.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from app.sensors.azimuth import settle_spin
 from app.sensors.findings import Finding
-from app.sensors.pointcloud import INTENSITY_NAMES, CloudLayout, CloudMessage, exact_ns
-from app.sensors.rings import Rings
-from app.slam.params import Recording
+from app.sensors.pointcloud import CloudLayout, CloudMessage, valid_points
+from app.sensors.rings import Sample, settle_rings
+from app.sensors.timing import Clocked, settle_timing
+from app.slam import lie
+from app.slam.errors import HemislamError
+from app.slam.params import Params, Recording
+from app.slam.types import F64, I64
 
-TIME_NAMES = ("timestamp", "time", "t", "offset_time", "time_stamp", "timeoffset", "time_offset", "stamp")
-RING_NAMES = ("ring", "line", "channel", "laser_id", "row")
-UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+INTENSITY_NAMES = ("intensity", "intensities", "reflectivity", "reflectance", "i")
+STANDARD_GRAVITY = 9.80665
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,28 +30,131 @@ class Probe:
     cloud: CloudMessage
 
 
-def settle_cloud(probes: list[Probe], chosen: Recording) -> tuple[CloudLayout, list[Finding]]:
-    """Decide a topic's layout from its first clouds (at least one with points)."""
-    findings: list[Finding] = []
-    cloud = probes[0].cloud
-    names = {name.lower(): name for name in cloud.fields}
-    field = next((names[name] for name in TIME_NAMES if name in names), None)
-    assert field is not None
-    stamps = np.array([probe.cloud.stamp_ns for probe in probes])
-    period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1e8
-    column = cloud.column(field)
-    span = float(column.max()) - float(column.min())
-    unit = min(UNITS_NS.values(), key=lambda ns: abs(np.log(max(span, 1e-12) * ns / period)))
-    base, _rel = exact_ns(column, unit)
-    absolute = abs(base - cloud.stamp_ns) < 1_000_000_000
-    ring = next((names[name] for name in RING_NAMES if name in names), None)
+@dataclass(frozen=True, slots=True)
+class ImuProbe:
+    """The first IMU samples: log times and stamps (k,) int64 ns, gyro and accel (k, 3) as recorded."""
+
+    log_ns: I64
+    stamps_ns: I64
+    gyro: F64
+    accel: F64
+
+
+def settle_cloud(probes: list[Probe], chosen: Recording, where: str) -> tuple[CloudLayout, list[Finding]]:
+    """Decide a topic's layout from its first clouds, each with at least one valid point.
+
+    Raises:
+        HemislamError: the clouds have no x, y, z, or the time field that was asked for.
+    """
+    fields = probes[0].cloud.fields
+    names = {name.lower(): name for name in reversed(fields)}
+    if chosen.time_field not in ("auto", "none") and chosen.time_field not in fields:
+        raise HemislamError(
+            f"The clouds of {where} have no field `{chosen.time_field}` for the time; they have "
+            f"{', '.join(fields)}: choose one by --set recording.time_field=NAME, or `none`."
+        )
+    samples, clocked = [], []
+    for probe in probes:
+        points, index = valid_points(probe.cloud.xyz())
+        index = np.arange(len(probe.cloud)) if index is None else index
+        samples.append(Sample(probe.cloud, points, index))
+        columns = {name: probe.cloud.column(name)[index] for name in fields if _may_be_time(name, chosen)}
+        clocked.append(Clocked(probe.log_ns, probe.cloud.stamp_ns, columns))
+    findings = [_fields_finding(probes[0].cloud)]
+    timing, time_findings = settle_timing(clocked, chosen, where)
+    rings, ring_finding = settle_rings(samples, names)
+    spin = None
+    if timing.field is None:
+        clouds = [(s.points, rings.of(s.cloud, s.points, s.index)) for s in samples]
+        spin = settle_spin(clouds, timing.period_ns / 1e9)
     layout = CloudLayout(
-        time_field=field,
-        unit_ns=unit,
-        anchor="absolute" if absolute else "header",
-        shift_ns=0,
-        rings=Rings(ring),
+        time_field=timing.field,
+        unit_ns=timing.unit_ns,
+        anchor=timing.anchor,
+        shift_ns=timing.shift_ns,
+        rings=rings,
+        spin=spin,
         intensity_field=next((names[name] for name in INTENSITY_NAMES if name in names), None),
         ground_field=names.get("ground"),
     )
-    return layout, findings
+    return layout, [*findings, *time_findings, ring_finding]
+
+
+def settle_imu(probe: ImuProbe, chosen: Recording) -> tuple[float, list[Finding]]:
+    """The factor that makes the accelerometer m/s^2, decided from the norm of its first samples."""
+    norm = float(np.median(np.linalg.norm(probe.accel, axis=1)))
+    text = f"the acceleration's norm is {norm:.3f} at the start"
+    if chosen.acceleration_unit != "auto":
+        scale = STANDARD_GRAVITY if chosen.acceleration_unit == "g" else 1.0
+        good = 8.5 < norm * scale < 11.0
+        finding = Finding(
+            "IMU units",
+            "fine" if good else "needs you",
+            f"{chosen.acceleration_unit}, as you set it; {text}" + ("" if good else ", which is no gravity in it"),
+            "" if good else "--set recording.acceleration_unit=auto",
+        )
+    elif 0.8 < norm < 1.25:
+        scale = STANDARD_GRAVITY
+        finding = Finding("IMU units", "corrected", f"g: {text}; scaled to m/s²", "--set recording.acceleration_unit=g")
+    elif 8.5 < norm < 11.0:
+        scale = 1.0
+        finding = Finding("IMU units", "fine", f"m/s²: {text}", "--set recording.acceleration_unit=m/s2")
+    else:
+        scale = STANDARD_GRAVITY if norm < 3.0 else 1.0
+        finding = Finding(
+            "IMU units",
+            "needs you",
+            f"{text}, neither 1 g nor 9.81 m/s²; taken as {'g' if norm < 3.0 else 'm/s²'}",
+            f"--set recording.acceleration_unit={'m/s2' if norm < 3.0 else 'g'}",
+        )
+    findings = [finding]
+    turning = float(np.percentile(np.linalg.norm(probe.gyro, axis=1), 90))
+    if turning > 10.0:
+        text = f"the gyroscope reads {turning:.0f} at the start, which as rad/s no hand does; its driver must publish rad/s"
+        findings.append(Finding("IMU units", "needs you", text))
+    return scale, findings
+
+
+def gravity_findings(probe: ImuProbe, scale: float, params: Params) -> list[Finding]:
+    """Where down is in the LiDAR frame by the IMU's first samples, and whether the mount was given."""
+    first = probe.stamps_ns - probe.stamps_ns[0] <= params.imu.start_duration * 1e9
+    accel, gyro = probe.accel[first] * scale, probe.gyro[first]
+    specific = accel.mean(axis=0)
+    norm = float(np.linalg.norm(specific))
+    findings = []
+    if norm > 1.0:
+        down = -(lie.from_rpy_degrees(params.sensor.rotation).T @ specific) / norm
+        axis = int(np.argmax(np.abs(down)))
+        name = f"{'+' if down[axis] > 0 else '−'}{'xyz'[axis]}"
+        off = np.degrees(np.arccos(min(abs(float(down[axis])), 1.0)))
+        values = ", ".join(f"{value:+.2f}" for value in down)
+        text = f"down is {off:.0f} deg from the LiDAR's {name} axis ({values})"
+        moving = float(np.linalg.norm(gyro.std(axis=0))) > 0.05 or float(np.linalg.norm(accel.std(axis=0))) > 0.5
+        if moving:
+            text += f"; the device moves during the first {params.imu.start_duration:g} s, so that is rough"
+        findings.append(Finding("gravity", "needs you" if moving else "fine", text))
+    if params.sensor.translation == (0, 0, 0) and params.sensor.rotation == (0, 0, 0):
+        findings.append(
+            Finding(
+                "mount",
+                "needs you",
+                "no pose of the LiDAR on the IMU is given; taken as the same axes and origin",
+                "--set 'sensor.translation=[x, y, z]' --set 'sensor.rotation=[roll, pitch, yaw]'",
+            )
+        )
+    else:
+        x, y, z = params.sensor.translation
+        roll, pitch, yaw = params.sensor.rotation
+        text = f"LiDAR in the IMU frame at {x:g}, {y:g}, {z:g} m, turned by {roll:g}, {pitch:g}, {yaw:g} deg"
+        findings.append(Finding("mount", "fine", text))
+    return findings
+
+
+def _may_be_time(name: str, chosen: Recording) -> bool:
+    return name == chosen.time_field or name.lower() not in ("x", "y", "z", "rgb", "ring")
+
+
+def _fields_finding(cloud: CloudMessage) -> Finding:
+    names = ", ".join(f"{name} ({dtype.name})" for name, (_, dtype) in cloud.fields.items())
+    shape = f"{cloud.height}x{cloud.width} points" if cloud.height > 1 else f"{cloud.width} points"
+    return Finding("fields", "fine", f"{names}; {shape} of {cloud.point_step} bytes in the first scan")

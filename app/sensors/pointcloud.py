@@ -18,8 +18,6 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 """PointField.datatype to numpy; 9 and 10 (64-bit integers) are an extension some drivers use."""
 _TYPES |= {9: "i8", 10: "u8"}
 
-INTENSITY_NAMES = ("intensity", "intensities", "reflectivity", "i")
-
 
 class CloudError(ValueError):
     """One point cloud message can not be read; the text says why, fit for `DroppedScan.reason`."""
@@ -68,7 +66,7 @@ class CloudMessage:
         for name, (offset, dtype) in fields.items():
             if offset + dtype.itemsize > point_step and needed:
                 raise CloudError(f"field `{name}` ends after the point_step of {point_step} bytes")
-        return cls(_stamp_ns(message.header.stamp), height, width, point_step, row_step, fields, data)
+        return cls(stamp_ns(message.header.stamp), height, width, point_step, row_step, fields, data)
 
     def __len__(self) -> int:
         return self.height * self.width
@@ -126,20 +124,14 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
     Raises:
         CloudError: no valid point is left, a field is missing, or the times make no scan.
     """
-    xyz = cloud.xyz()
-    finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
-    valid = finite & ((xyz[:, 0] != 0) | (xyz[:, 1] != 0) | (xyz[:, 2] != 0))
     time = cloud.column(layout.time_field) if layout.time_field is not None else None
-    if time is not None and time.dtype.kind == "f":
-        valid &= np.isfinite(time)
-    if not valid.any():
-        raise CloudError(_nothing_left(len(cloud), int(np.count_nonzero(finite))))
-    index = None if valid.all() else np.flatnonzero(valid)
+    points, index = valid_points(cloud.xyz(), time)
+    if not len(points):
+        raise CloudError(_nothing_left(cloud))
 
     def kept(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return values if index is None else values.take(index, axis=0)
 
-    points = np.ascontiguousarray(kept(xyz))
     ring = layout.rings.of(cloud, points, index)
     if time is None:
         assert layout.spin is not None
@@ -171,6 +163,19 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
     return Scan(stamp_ns, points, offsets_ns, intensity, ring, ground)
 
 
+def valid_points(xyz: F32, time: npt.NDArray[Any] | None = None) -> tuple[F32, npt.NDArray[np.intp] | None]:
+    """Points with a return (finite, not all zero, with a finite time), and their indices; None: all are."""
+    x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
+    # Overflow is no finite number either, so the sum tells all three at once.
+    valid = np.isfinite(x + y + z) & ((x != 0) | (y != 0) | (z != 0))
+    if time is not None and time.dtype.kind == "f":
+        valid &= np.isfinite(time)
+    if valid.all():
+        return np.ascontiguousarray(xyz), None
+    index = np.flatnonzero(valid)
+    return xyz.take(index, axis=0), index
+
+
 def exact_ns(time: npt.NDArray[Any], unit_ns: int) -> tuple[int, I64]:
     """Times of any type as (base, (n,) int64 after it), ns, without losing digits of large values."""
     if time.dtype.kind == "f":
@@ -181,13 +186,14 @@ def exact_ns(time: npt.NDArray[Any], unit_ns: int) -> tuple[int, I64]:
     return int(least) * unit_ns, (time - least).astype(np.int64) * unit_ns
 
 
-def _stamp_ns(stamp: Any) -> int:
+def stamp_ns(stamp: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-def _nothing_left(total: int, finite: int) -> str:
-    if total == 0:
+def _nothing_left(cloud: CloudMessage) -> str:
+    if not len(cloud):
         return "the cloud holds no points"
-    if finite == 0:
-        return f"all {total} points are NaN"
-    return f"none of the {total} points is a return (NaN or zero)"
+    share = float(np.isnan(cloud.xyz()).any(axis=1).mean())
+    if share == 1.0:
+        return f"all {len(cloud)} points are NaN"
+    return f"none of its {len(cloud)} points is a return ({share:.0%} NaN, the rest zero or without time)"

@@ -1,47 +1,197 @@
-"""Which scan line a point belongs to: the rank of the line's elevation, 0 = lowest = outermost cone."""
+"""Which scan line a point belongs to: the rank of the line's elevation, 0 = lowest = outermost cone.
+
+The ring comes from a field (put in order of elevation where the driver numbers otherwise), from the
+place of a point in the message, or, failing both, from the elevation itself.
+"""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from app.slam.types import F32, F64, U16
+from app.sensors.findings import Finding
+from app.slam.types import F32, F64, I64, U16
 
-if TYPE_CHECKING:
-    from app.sensors.pointcloud import CloudMessage
+RING_NAMES = ("ring", "line", "channel", "laser_id", "laser")
+_COMMON_LINES = (16, 32, 40, 64, 80, 128)
+
+
+class Columns(Protocol):
+    """What is needed of a point cloud message."""
+
+    @property
+    def height(self) -> int: ...
+
+    @property
+    def width(self) -> int: ...
+
+    def column(self, name: str) -> npt.NDArray[Any]: ...
 
 
 @dataclass(frozen=True, slots=True)
 class Rings:
-    """Where the ring of a point comes from: a field of the message, or the point's elevation.
+    """Where the ring of a point comes from.
 
     Attributes:
-        field: name of the field; None: from the elevation.
-        rank: (lines,) uint16, rank by elevation of each value of the field; None: it is the rank.
-        bounds: (lines - 1,) rad, ascending, elevations between the lines, when there is no field.
-        centre: (radial, height) m, where the beams start from, when there is no field.
+        field: name of a field; None: from the point's place or elevation.
+        place: (step, lines): point i of the message is on line (i // step) % lines.
+        rank: (lines,) uint16, rank by elevation of each value of the field or place; None: it is
+            the rank already.
+        bounds: (lines - 1,) rad, ascending, the elevations that separate the lines.
+        centre: (radial, height) m, where the beams start from as seen by `bounds`.
     """
 
-    field: str | None
+    field: str | None = None
+    place: tuple[int, int] | None = None
     rank: U16 | None = None
     bounds: F64 | None = None
     centre: tuple[float, float] = (0.0, 0.0)
 
-    def of(self, cloud: "CloudMessage", points: F32, index: npt.NDArray[np.intp] | None) -> U16:
+    def of(self, cloud: Columns, points: F32, index: npt.NDArray[np.intp] | None) -> U16:
         """(n,) uint16 ring of the kept points; `index` tells which of the message they are."""
-        if self.field is None:
-            assert self.bounds is not None
+        if self.field is not None:
+            raw = cloud.column(self.field)
+            raw = (raw if index is None else raw.take(index)).astype(np.uint16)
+        elif self.place is not None:
+            step, lines = self.place
+            where = np.arange(cloud.height * cloud.width) if index is None else index
+            raw = (where // step % lines).astype(np.uint16)
+        elif self.bounds is not None:
             return np.searchsorted(self.bounds, elevation(points, self.centre)).astype(np.uint16)
-        raw = cloud.column(self.field)
-        raw = (raw if index is None else raw.take(index)).astype(np.uint16)
-        if self.rank is None:
-            return raw
-        return self.rank[np.minimum(raw, len(self.rank) - 1)]
+        else:
+            return np.zeros(len(points), np.uint16)
+        return raw if self.rank is None else self.rank.take(np.minimum(raw, len(self.rank) - 1))
 
 
-def elevation(points: F32, centre: tuple[float, float] = (0.0, 0.0)) -> F64:
-    """(n,) rad above the sensor's base plane, seen from where the beams start (radial, height) m."""
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Valid points of one probed message: (n, 3) float32 m and their (n,) index in the message."""
+
+    cloud: Columns
+    points: F32
+    index: npt.NDArray[np.intp]
+
+
+def elevation(points: F32, centre: tuple[float, float] = (0.0, 0.0)) -> F32:
+    """(n,) float32 rad above the sensor's base plane, seen from (radial, height) m."""
     radial, height = centre
     level = np.hypot(points[:, 0], points[:, 1]) - np.float32(radial)
-    return np.arctan2(points[:, 2] - np.float32(height), level).astype(np.float64)
+    angle: F32 = np.arctan2(points[:, 2] - np.float32(height), level)
+    return angle
+
+
+def settle_rings(samples: list[Sample], names: dict[str, str]) -> tuple[Rings, Finding]:
+    """Decide where the ring comes from; `names` maps lower-case field names to the real ones."""
+    field = next((names[name] for name in RING_NAMES if name in names), None)
+    points = np.concatenate([sample.points for sample in samples])
+    far = _far(points)
+    if field is not None:
+        raw = np.concatenate([sample.cloud.column(field)[sample.index] for sample in samples]).astype(np.int64)
+        if raw.min() >= 0 and raw.max() < 4096 and raw.max() > raw.min():
+            return _settle_field(field, raw[far], elevation(points[far]), int(raw.max()) + 1)
+        why = f"field `{field}` is always {raw[0]}" if raw.max() == raw.min() else f"field `{field}` is no line number"
+    else:
+        why = "the clouds have no ring field"
+    by_place = _settle_place(samples)
+    if by_place is not None:
+        rings, lines = by_place
+        return rings, Finding(
+            "ring order", "corrected", f"{why}; the order of the points shows {lines} scan lines, ranked by elevation"
+        )
+    bounds, centre = _settle_elevation(points[far])
+    lines = len(bounds) + 1
+    text = f"{why}; {lines} scan lines were told apart by their elevation"
+    if lines < 4:
+        text += ", too few for seed points: the ground needs `ring` or clearly separate lines"
+    return Rings(bounds=bounds, centre=centre), Finding("ring order", "corrected" if lines >= 4 else "needs you", text)
+
+
+def _far(points: F32) -> npt.NDArray[np.intp]:
+    """Indices of the farther half: there the beams' different origins hardly show in the elevation."""
+    distance = np.linalg.norm(points, axis=1)
+    return np.flatnonzero(distance >= np.median(distance))
+
+
+def _settle_field(field: str, raw: I64, angles: F32, lines: int) -> tuple[Rings, Finding]:
+    present, medians = _line_medians(raw, angles)
+    rises = np.diff(medians) > 0
+    share = float(rises.mean()) if len(rises) else 1.0
+    span = f"{np.degrees(medians.min()):.1f} to {np.degrees(medians.max()):.1f} deg"
+    if share >= 0.9:
+        return Rings(field), Finding(
+            "ring order", "fine", f"`{field}` counts {lines} scan lines from the lowest elevation up ({span})"
+        )
+    if share <= 0.1:
+        rank = np.arange(lines - 1, -1, -1, dtype=np.uint16)
+        text = f"`{field}` counts {lines} scan lines from the highest elevation down ({span}); turned round"
+        return Rings(field, rank=rank), Finding("ring order", "corrected", text)
+    text = f"`{field}` numbers {lines} scan lines in no order of elevation ({span}); ranked by elevation"
+    return Rings(field, rank=_ranked(present, medians, lines)), Finding("ring order", "corrected", text)
+
+
+def _settle_place(samples: list[Sample]) -> tuple[Rings, int] | None:
+    """Row-major rows, or lines interleaved in firing order, if either explains the elevations."""
+    first = samples[0].cloud
+    total = first.height * first.width
+    layouts = [(first.width, first.height), (1, first.height)] if 4 <= first.height <= 256 else []
+    layouts += [(1, lines) for lines in _COMMON_LINES if total % lines == 0 and (1, lines) not in layouts]
+    for step, lines in layouts:
+        shapes = {(s.cloud.height, s.cloud.width) for s in samples}
+        if step != 1 and len(shapes) > 1:
+            continue
+        far = [_far(sample.points) for sample in samples]
+        raw = np.concatenate([s.index[f] // step % lines for s, f in zip(samples, far, strict=True)])
+        angles = np.concatenate([elevation(s.points[f]) for s, f in zip(samples, far, strict=True)])
+        present, medians = _line_medians(raw, angles)
+        if len(present) < max(3, lines // 2):
+            continue
+        within = np.median(np.abs(angles - medians[np.searchsorted(present, raw).clip(max=len(present) - 1)]))
+        if within < 0.25 * np.median(np.diff(np.sort(medians))):
+            return Rings(place=(step, lines), rank=_ranked(present, medians, lines)), lines
+    return None
+
+
+def _settle_elevation(points: F32) -> tuple[F64, tuple[float, float]]:
+    """Elevations that separate the lines, seen from the centre that makes the lines sharpest."""
+    points = points[:: max(1, len(points) // 40_000)]
+    edges = np.radians(np.arange(-90.0, 90.05, 0.1))
+
+    def sharpness(centre: tuple[float, float]) -> float:
+        counts = np.histogram(elevation(points, centre), edges)[0].astype(np.float64)
+        return float(counts @ counts)
+
+    heights = np.arange(-0.12, 0.1201, 0.01)
+    # The plain origin wins unless another one is clearly sharper.
+    centre = max([(0.0, 0.0)] + [(r, h) for r in (0.0, 0.015, 0.03) for h in heights], key=sharpness)
+    if sharpness(centre) < 1.1 * sharpness((0.0, 0.0)):
+        centre = (0.0, 0.0)
+    counts = np.histogram(elevation(points, centre), edges)[0].astype(np.float64)
+    smooth = np.convolve(counts, [0.25, 0.5, 0.25], mode="same")
+    floor = 0.1 * np.percentile(smooth[smooth > 0], 90) if smooth.any() else 0.0
+    peaks = np.flatnonzero((smooth > floor) & (smooth >= np.roll(smooth, 1)) & (smooth > np.roll(smooth, -1)))
+    # Two peaks with hardly a dip between them are one line, blurred.
+    kept: list[int] = []
+    for peak in peaks:
+        if kept and smooth[kept[-1] : peak + 1].min() > 0.5 * min(smooth[kept[-1]], smooth[peak]):
+            if smooth[peak] > smooth[kept[-1]]:
+                kept[-1] = int(peak)
+        else:
+            kept.append(int(peak))
+    centres = 0.5 * (edges[kept] + edges[np.asarray(kept, int) + 1])
+    return 0.5 * (centres[1:] + centres[:-1]), centre
+
+
+def _line_medians(raw: I64, angles: F32) -> tuple[I64, F64]:
+    """Lines with enough points, and the median elevation of each."""
+    present, counts = np.unique(raw, return_counts=True)
+    present = present[counts >= 5] if (counts >= 5).any() else present
+    medians = np.array([np.median(angles[raw == line]) for line in present], np.float64)
+    return present, medians
+
+
+def _ranked(present: I64, medians: F64, lines: int) -> U16:
+    """(lines,) rank of each line; a line that the probe never saw comes last, where no seed is looked for."""
+    rank = np.full(lines, len(present), np.uint16)
+    rank[present[np.argsort(medians)]] = np.arange(len(present), dtype=np.uint16)
+    return rank

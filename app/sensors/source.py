@@ -1,6 +1,5 @@
 """Recording files as a stream of messages, and every failure of theirs as one clear sentence."""
 
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +9,20 @@ from typing import Any, Self
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from app.sensors.findings import Finding
+from app.sensors.mcap_stream import McapStream
 from app.slam.errors import HemislamError
 
-POINTCLOUD = "sensor_msgs/msg/PointCloud2"
-IMU = "sensor_msgs/msg/Imu"
-
 SUFFIXES = (".bag", ".mcap", ".db3")
+_MAGIC = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
+_REPAIR = {
+    ".bag": "`rosbag reindex {path}` repairs it",
+    ".mcap": "`mcap recover {path} -o repaired.mcap` saves what is whole",
+    ".db3": "`sqlite3 {path} .recover | sqlite3 repaired.db3` saves what is whole",
+    "": "`ros2 bag reindex {path}` may repair it",
+}
+_KINDS = "a ROS 1 .bag, a ROS 2 folder, an .mcap or a .db3"
+_FOREVER = 2**63 - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +35,12 @@ class Topic:
 
 
 class Source:
-    """A recording opened for reading: its topics, and its messages in the order they were logged."""
+    """A recording opened for reading: its topics, and its messages by log time.
+
+    Attributes:
+        path: as given. topics: by name. start_ns, end_ns: log times of the first and last message.
+        findings: what is unusual about the file and was overcome.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open.
@@ -37,40 +49,105 @@ class Source:
             HemislamError: missing, empty, cut, foreign, corrupt or unindexed file.
         """
         self.path = path
-        self._reader = _open(path)
-        counts: dict[str, tuple[str, int]] = {}
-        for connection in self._reader.connections:
-            _, before = counts.get(connection.topic, ("", 0))
-            counts[connection.topic] = (connection.msgtype, before + connection.msgcount)
+        self.findings: tuple[Finding, ...] = ()
+        files = _recording_files(path)
+        self._reader: AnyReader | McapStream = self._open(files)
+        if isinstance(self._reader, McapStream):
+            counts = self._reader.counts
+            self.start_ns, self.end_ns = self._reader.start_ns, self._reader.end_ns
+        else:
+            counts = {}
+            for connection in self._reader.connections:
+                _, before = counts.get(connection.topic, ("", 0))
+                counts[connection.topic] = (connection.msgtype, before + connection.msgcount)
+            self.start_ns, self.end_ns = int(self._reader.start_time), int(self._reader.end_time)
         self.topics = tuple(Topic(name, kind, count) for name, (kind, count) in sorted(counts.items()))
-        self.start_ns = int(self._reader.start_time)
-        self.end_ns = int(self._reader.end_time)
+        if not any(topic.messages for topic in self.topics):
+            self.close()
+            raise HemislamError(f"{path} is a recording without a single message; record it again.")
 
     def messages(
         self, topics: tuple[str, ...], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, int, Any]]:
-        """(topic, log time ns, deserialised message) of these topics, by log time.
+        """(topic, log time ns, deserialised message) of these topics, logged within [start, stop).
 
         Raises:
             HemislamError: the file is damaged here; everything before was given.
         """
-        connections = [c for c in self._reader.connections if c.topic in topics]
-        if not connections:
-            return
+        first, stop = 0 if start_ns is None else start_ns, _FOREVER if stop_ns is None else stop_ns
+        stream = (
+            self._reader.messages(topics, first, stop)
+            if isinstance(self._reader, McapStream)
+            else self._rosbags_messages(self._reader, topics, first, stop)
+        )
         log_ns = self.start_ns
-        stream = self._reader.messages(connections, start=start_ns, stop=stop_ns)
         while True:
             try:
-                connection, log_ns, raw = next(stream)
-                message = self._reader.deserialize(raw, connection.msgtype)
-            except StopIteration:
-                return
-            except Exception as error:  # rosbags lets errors of zstd, lz4, sqlite, struct and asserts through
+                entry = next(stream, None)
+            except Exception as error:  # rosbags lets those of zstd, lz4, sqlite, struct and asserts through
+                at = (log_ns - self.start_ns) / 1e9
                 raise HemislamError(
-                    f"{self.path} is damaged {(log_ns - self.start_ns) / 1e9:.1f} s after its start "
-                    f"({_brief(error)}); what comes before it was read, the rest can not be."
+                    f"{self.path} is damaged {at:.1f} s after its start ({_brief(error)}); what comes before "
+                    f"can be used (--duration {max(at - 0.5, 0):.1f}), and {_repair(self.path)}."
                 ) from error
-            yield connection.topic, log_ns, message
+            if entry is None:
+                return
+            log_ns = entry[1]
+            yield entry
+
+    @staticmethod
+    def _rosbags_messages(
+        reader: AnyReader, topics: tuple[str, ...], start_ns: int, stop_ns: int
+    ) -> Iterator[tuple[str, int, Any]]:
+        connections = [connection for connection in reader.connections if connection.topic in topics]
+        if not connections:  # which rosbags would take for all of them
+            return
+        for connection, log_ns, raw in reader.messages(connections, start=start_ns, stop=stop_ns):
+            yield connection.topic, log_ns, reader.deserialize(raw, connection.msgtype)
+
+    def _open(self, files: list[Path]) -> AnyReader | McapStream:
+        reader = None
+        try:
+            reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader.open()
+        except Exception as error:  # as above
+            salvaged = self._salvage(files, _brief(error))
+            if salvaged is not None:
+                return salvaged
+            raise HemislamError(self._refusal(error)) from error
+        if self.path.is_dir() and files != [self.path]:
+            text = f"the folder has no metadata.yaml; its {len(files)} {files[0].suffix} file(s) were read without it"
+            self.findings = (Finding("file", "corrected", text),)
+        return reader
+
+    def _salvage(self, files: list[Path], why: str) -> McapStream | None:
+        """A single MCAP read from front to back, if that yields anything."""
+        inner = sorted(self.path.glob("*.mcap")) if files == [self.path] and self.path.is_dir() else files
+        if len(inner) != 1 or inner[0].suffix != ".mcap":
+            return None
+        try:
+            stream = McapStream(inner[0])
+        except Exception:  # whatever a damaged file may cause: the first error is the one to report
+            return None
+        if not stream.counts:
+            return None
+        if stream.complete:
+            text = f"read from front to back, since its index can not be used ({why})"
+        else:
+            text = (
+                f"the file is cut off {(stream.end_ns - stream.start_ns) / 1e9:.1f} s after its start ({why}); "
+                "what comes before is used"
+            )
+        self.findings = (Finding("file", "corrected", text),)
+        return stream
+
+    def _refusal(self, error: Exception) -> str:
+        path, brief = self.path, _brief(error)
+        if isinstance(error, PermissionError):
+            return f"{path} can not be opened (permission denied); change its permissions or copy it."
+        if "not indexed" in brief:
+            return f"{path} has no index, as after a recorder that was stopped hard; {_repair(path)}."
+        return f"{path} is cut off or damaged ({brief}); {_repair(path)}."
 
     def close(self) -> None:
         self._reader.close()
@@ -82,20 +159,49 @@ class Source:
         self.close()
 
 
-def _open(path: Path) -> AnyReader:
-    if not path.exists():
-        raise HemislamError(f"There is no recording {path}; check the path.")
+def _recording_files(path: Path) -> list[Path]:
+    """What to hand to rosbags for this path; refuses what is clearly no recording."""
     try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        reader.open()
-    except Exception as error:
-        raise HemislamError(f"{path} can not be read as a recording ({_brief(error)}).") from error
-    return reader
+        if not path.exists():
+            raise HemislamError(f"There is no recording {path}; check the path.")
+        if path.is_dir():
+            return _folder_files(path)
+        if path.suffix not in SUFFIXES:
+            raise HemislamError(f"{path} is no recording by its name; what can be read is {_KINDS}.")
+        if path.stat().st_size == 0:
+            raise HemislamError(f"{path} is empty (0 bytes); record or copy it again.")
+        with path.open("rb") as file:
+            start = file.read(16)
+    except OSError as error:
+        raise HemislamError(
+            f"{path} can not be opened ({error.strerror}); check the path and its permissions."
+        ) from error
+    magic = _MAGIC[path.suffix]
+    if not start.startswith(magic[: len(start)]):
+        other = next((suffix for suffix, known in _MAGIC.items() if start.startswith(known)), None)
+        hint = f"by its content it is a {other}: rename it" if other else f"what can be read is {_KINDS}"
+        raise HemislamError(
+            f"{path} is not what its name says, the first bytes are not those of a {path.suffix}; {hint}."
+        )
+    return [path]
+
+
+def _folder_files(path: Path) -> list[Path]:
+    if (path / "metadata.yaml").is_file():
+        return [path]
+    for suffix in (".mcap", ".db3"):
+        if files := sorted(path.glob(f"*{suffix}")):
+            return files
+    bags = sorted(path.glob("*.bag"))
+    hint = f"open one of its files, such as {bags[0].name}" if bags else "give the folder that holds metadata.yaml"
+    raise HemislamError(f"The folder {path} is no ROS 2 recording (it has neither metadata.yaml nor .mcap); {hint}.")
+
+
+def _repair(path: Path) -> str:
+    return _REPAIR["" if path.is_dir() else path.suffix].format(path=path)
 
 
 def _brief(error: BaseException) -> str:
     """The library's own words, shortened to fit into our sentence."""
-    if isinstance(error, struct.error):
-        return "a record is cut"
     text = " ".join(str(error).split()).rstrip(".")
     return text[:120] or type(error).__name__
