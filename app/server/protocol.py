@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from app.sensors.doctor import Finding
+from app.sensors.findings import Finding
 from app.slam.params import Params
 from app.slam.types import F32, F64, I64, U8, U16, StepResult
 
