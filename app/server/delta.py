@@ -1,0 +1,169 @@
+"""What changed between two snapshots: collected in the engine's process, folded in the reader's.
+
+`Outbox` gathers changes until somebody takes them, however long that takes: fields that are
+replaced as a whole coalesce to their newest value, rows and chunks queue up. So a slow reader never
+holds up the engine and never misses anything, and nothing is kept here once it was taken.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from app.server.protocol import SERIES, Chunk, Notice, Snapshot
+from app.slam.params import Params
+from app.slam.types import F64
+
+NOTICES_KEPT = 50
+
+
+@dataclass(frozen=True, slots=True)
+class Delta:
+    """Changes since the delta before.
+
+    Attributes:
+        session: of all that follows; a new number empties the scene first.
+        replaced: new values of fields of `Snapshot`.
+        positions: (m, 3) and series: (m, len(SERIES)), rows of the frames since then.
+        chunks, notices: new since then.
+    """
+
+    session: int
+    replaced: dict[str, Any]
+    positions: F64
+    series: F64
+    chunks: tuple[Chunk, ...]
+    notices: tuple[Notice, ...]
+
+
+class Outbox:
+    """Collects changes for the next `Delta`. `urgent` asks for it at once, whatever the rate limit."""
+
+    def __init__(self, params: Params, *, session: int = 0, notices: int = 0) -> None:
+        self._session = session
+        self._notices_given = notices
+        self._replaced: dict[str, Any] = {"params": params}
+        self._positions: list[F64] = []
+        self._rows: list[list[float]] = []
+        self._chunks: list[Chunk] = []
+        self._notices: list[Notice] = []
+        self.urgent = True
+
+    def begin(self) -> None:
+        """Start a new session: what belonged to the old one and was not taken is dropped."""
+        self._session += 1
+        self.urgent = True
+        self._positions, self._rows, self._chunks = [], [], []
+        self._replaced |= {"result": None, "keyframe_poses": None, "T_map_truth": None}
+
+    def put(self, *, urgent: bool = False, **values: Any) -> None:
+        """Set fields of the snapshot. Only the newest value of each is sent."""
+        self._replaced |= values
+        self.urgent |= urgent
+
+    def frame(self, position: F64, readouts: list[float]) -> None:
+        """Add a frame: its position (3,) in the map and its readouts in the order of SERIES."""
+        self._positions.append(position)
+        self._rows.append(readouts)
+
+    def chunk(self, chunk: Chunk) -> None:
+        self._chunks.append(chunk)
+
+    def notice(self, level: Literal["info", "warning", "error"], text: str) -> None:
+        self._notices_given += 1
+        self._notices.append(Notice(self._notices_given, level, text))
+        self.urgent = True
+
+    @property
+    def filled(self) -> bool:
+        """Whether there is anything to take."""
+        return bool(self._replaced or self._rows or self._chunks or self._notices)
+
+    def take(self) -> Delta:
+        """All changes since the last call."""
+        delta = Delta(
+            session=self._session,
+            replaced=self._replaced,
+            positions=np.array(self._positions, dtype=np.float64).reshape(-1, 3),
+            series=np.array(self._rows, dtype=np.float64).reshape(-1, len(SERIES)),
+            chunks=tuple(self._chunks),
+            notices=tuple(self._notices),
+        )
+        self._replaced, self._positions, self._rows, self._chunks, self._notices = {}, [], [], [], []
+        self.urgent = False
+        return delta
+
+
+class Rows:
+    """A table that grows at its end. Views handed out are read-only and never change.
+
+    Capacity doubles, so that n rows cost O(n) copies in all; columns are contiguous.
+    """
+
+    def __init__(self, width: int) -> None:
+        self._table = np.empty((256, width), order="F")
+        self._length = 0
+
+    def extend(self, rows: F64) -> None:
+        needed = self._length + len(rows)
+        if needed > len(self._table):
+            larger = np.empty((max(needed, 2 * len(self._table)), self._table.shape[1]), order="F")
+            larger[: self._length] = self._table[: self._length]
+            self._table = larger
+        self._table[self._length : needed] = rows
+        self._length = needed
+
+    def view(self) -> F64:
+        """(n, width), read-only."""
+        view = self._table[: self._length]
+        view.setflags(write=False)
+        return view
+
+
+class Fold:
+    """Lays deltas over a snapshot, in their order. One thread writes; anybody may read `snapshot`."""
+
+    def __init__(self, snapshot: Snapshot | None = None) -> None:
+        self.snapshot = snapshot or Snapshot()
+        self._positions, self._series = Rows(3), Rows(len(SERIES))
+
+    def apply(self, delta: Delta) -> Snapshot:
+        before, delta = self.snapshot, read_only(delta)
+        chunks = before.chunks
+        if delta.session != before.session:
+            self._positions, self._series, chunks = Rows(3), Rows(len(SERIES)), ()
+        self._positions.extend(delta.positions)
+        self._series.extend(delta.series)
+        series = self._series.view()
+        return self.edit(
+            session=delta.session,
+            chunks=chunks + delta.chunks,
+            trajectory=self._positions.view(),
+            series={name: series[:, column] for column, name in enumerate(SERIES)},
+            notices=delta.notices,
+            **delta.replaced,
+        )
+
+    def edit(self, *, notices: Iterable[Notice] = (), **values: Any) -> Snapshot:
+        """Replace fields and add notices: the next revision."""
+        before = self.snapshot
+        kept = (*before.notices, *notices)[-NOTICES_KEPT:]
+        self.snapshot = replace(before, revision=before.revision + 1, notices=kept, **values)
+        return self.snapshot
+
+
+def read_only(value: Any) -> Any:
+    """The same value, with every array in it made read-only, through dataclasses, tuples and dictionaries."""
+    if isinstance(value, np.ndarray):
+        value.setflags(write=False)
+    elif isinstance(value, tuple):
+        for entry in value:
+            read_only(entry)
+    elif isinstance(value, dict):
+        for entry in value.values():
+            read_only(entry)
+    elif is_dataclass(value):
+        for field in fields(value):
+            read_only(getattr(value, field.name))
+    return value

@@ -1,0 +1,318 @@
+"""What happens in the engine's process: commands in, one unit of work at a time, changes out."""
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol, assert_never
+
+from app.server.delta import Outbox
+from app.server.pacing import Pacer
+from app.server.protocol import (
+    Command,
+    LoadParams,
+    OpenRecording,
+    Pause,
+    Play,
+    Progress,
+    Restart,
+    Save,
+    Seek,
+    SetParams,
+    SetSpeed,
+    Shutdown,
+    StepFrame,
+)
+from app.server.publisher import Publisher
+from app.server.run import Run
+from app.server.saver import Saver
+from app.slam.errors import HemislamError
+from app.slam.params import Params, leaves
+from app.slam.types import DroppedScan
+
+log = logging.getLogger(__name__)
+
+SLOWEST = 0.1
+LONG_SEEK = 20
+"""Frames; a longer way to a frame is a seek with progress, a shorter one a few steps."""
+SAVE_POLL_S = 0.05
+
+_EFFECT = {leaf.path: leaf.effect for leaf in leaves()}
+
+
+class OpenRun(Protocol):
+    """Opens a recording with a new engine; raises HemislamError."""
+
+    def __call__(self, path: Path, truth: Path | None, params: Params, /) -> Run: ...
+
+
+class Session:
+    """The open recording, its engine and the transport.
+
+    Commands only note what is wanted; `work` does it, a short piece a call. One thread calls both.
+
+    Args:
+        outbox: takes everything that changes.
+        params: to begin with.
+        open_run: opens a recording.
+        resolve: parameters that a recording is opened with, before changes by hand; None: the present ones.
+        chunk_voxel: edge of the voxels (m) in which keyframe clouds are thinned for the page.
+        clock: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        outbox: Outbox,
+        params: Params,
+        open_run: OpenRun,
+        *,
+        resolve: Callable[[Path], Params] | None = None,
+        chunk_voxel: float = 0.05,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._outbox = outbox
+        self._page = Publisher(outbox, chunk_voxel)
+        self._pacer = Pacer(clock)
+        self._saver = Saver()
+        self._open_run = open_run
+        self._resolve = resolve
+        self._params = self._base = params
+        self._run: Run | None = None
+        # What is wanted but not done yet:
+        self._opening: Callable[[], None] | None = None
+        self._relabelling = False
+        self._target: int | None = None
+        self._target_from = -1
+
+    def open(self, path: Path, truth: Path | None, *, play: bool = False) -> None:
+        """Open a recording with exactly the parameters given so far."""
+
+        def opening() -> None:
+            self._take(self._open_run(path, truth, self._params), 0)
+            self._page.show(playing=play)
+
+        self._open_soon(path, opening)
+
+    # --- commands --------------------------------------------------------------------------------
+    def handle(self, command: Command) -> None:
+        """Take in a command. What can not be done becomes a notice; nothing is raised."""
+        try:
+            self._handle(command)
+        except HemislamError as error:
+            self._outbox.notice("error", str(error))
+
+    def _handle(self, command: Command) -> None:
+        match command:
+            case Play():
+                if self._need_run().finished:
+                    self._handle(Restart())
+                self._pacer.release()
+                self._page.show(playing=True)
+            case Pause() | Shutdown():
+                self._halt()
+            case StepFrame(frames):
+                self._step(frames)
+            case SetSpeed(factor):
+                if not factor >= SLOWEST:
+                    raise HemislamError(f"The speed can not be {factor}; choose one from {SLOWEST} to inf.")
+                self._pacer.speed = factor
+                self._page.show(speed=factor)
+            case Seek(frame):
+                self._seek(frame)
+            case SetParams(values):
+                self._set_params(self._params.with_values(values))
+            case LoadParams(text):
+                self._set_params(Params().merged_yaml(text))
+            case OpenRecording(path, truth):
+                self._open_soon(path, lambda: self._open_other(path, truth))
+            case Restart():
+                path = self._need_run().opened.path
+                self._open_soon(path, lambda: self._reopen(self._params, 0))
+            case Save(folder, trajectory_only):
+                self._saver.start(folder, self._need_run().saver(folder, trajectory_only=trajectory_only))
+            case _:
+                assert_never(command)
+
+    def _halt(self) -> None:
+        """Stay at the present frame, also if one was being sought."""
+        if self._target is not None:
+            self._target = None
+            self._outbox.put(progress=None)
+        self._page.show(playing=False, frames_per_second=0.0)
+
+    def _step(self, frames: int) -> None:
+        """Steps asked for while the last one is not done yet add up."""
+        at = self._need_run().frame
+        stepping = self._target is not None and self._target - at <= LONG_SEEK
+        start = self._target if stepping and self._target is not None else at
+        self._halt()
+        self._go_to(start + frames)
+
+    def _seek(self, frame: int) -> None:
+        run = self._need_run()
+        frame = max(0, min(frame, run.opened.frames - 1))
+        if frame < run.frame:
+            self._open_soon(run.opened.path, lambda: self._reopen(run.engine.params, frame))
+        else:
+            self._go_to(frame)
+
+    def _go_to(self, frame: int) -> None:
+        """Process frames as fast as possible up to this one, then go on as before."""
+        run = self._need_run()
+        if run.frame < frame:
+            self._target, self._target_from = frame, run.frame
+
+    def _set_params(self, params: Params) -> None:
+        changed = self._params.changed(params)
+        self._params = params
+        if self._run is not None:
+            engine, waiting = self._run.engine, self._pending_restart()
+            engine.params = params.with_values({path: engine.params.value(path) for path in waiting})
+            self._relabelling |= any(_EFFECT[path] == "now" for path in changed)
+        self._page.params(params, self._pending_restart())
+
+    def _pending_restart(self) -> tuple[str, ...]:
+        """Names of parameters that the engine still has another value of, since it can not change them."""
+        if self._run is None:
+            return ()
+        return tuple(path for path in self._run.engine.params.changed(self._params) if _EFFECT[path] == "restart")
+
+    def _need_run(self) -> Run:
+        if self._run is None:
+            raise HemislamError("No recording is open; open one first.")
+        return self._run
+
+    # --- work ------------------------------------------------------------------------------------
+    def work(self) -> float | None:
+        """Do the next piece of due work.
+
+        Returns:
+            Seconds until there may be more: 0 if there is more already; None if nothing will be due
+            before the next command.
+        """
+        while (saved := self._saver.ended()) is not None:
+            self._page.saved(saved)
+        if self._opening is not None:
+            self._do_opening(self._opening)
+            return 0.0
+        if self._relabelling:
+            self._relabel()
+            return 0.0
+        moving = self._page.transport.playing or self._target is not None
+        wait = self._advance(self._run) if self._run is not None and moving else None
+        return SAVE_POLL_S if wait is None and self._saver.busy else wait
+
+    def _advance(self, run: Run) -> float | None:
+        """Process the next frame if it is due."""
+        try:
+            entry = run.peek()
+        except Exception as error:  # what was processed stays; the rest can not be read
+            self._fail("The recording can not be read on from here", error)
+            self._page.show(finished=True)
+            return None
+        if entry is None:
+            self._halt()
+            self._page.show(finished=True)
+            return None
+        if isinstance(entry, DroppedScan):
+            self._page.show(dropped=self._page.transport.dropped + 1, urgent=False)
+            self._page.notice_once(f"A scan was left out: {entry.reason}.", entry.stamp_ns)
+            return 0.0
+        if self._target is None and (wait := self._pacer.wait(entry.scan.stamp_ns)) > 0:
+            return wait
+        try:
+            result = run.step()
+        except Exception as error:
+            self._fail(f"The frame after frame {run.frame} could not be processed and is left out", error)
+            return None
+        self._page.frame(run, result)
+        self._page.show(frame=run.frame, stamp_ns=result.stamp_ns, frames_per_second=self._pacer.tick(), urgent=False)
+        if self._target is not None:
+            self._approach(run.frame, self._target)
+        return 0.0
+
+    def _approach(self, frame: int, target: int) -> None:
+        if frame >= target:
+            self._target = None
+            self._pacer.release()
+            self._outbox.put(progress=None, urgent=True)
+        elif target - self._target_from > LONG_SEEK:
+            fraction = (frame - self._target_from) / (target - self._target_from)
+            self._outbox.put(progress=Progress(f"Going to frame {target}", fraction))
+
+    def _relabel(self) -> None:
+        self._relabelling = False
+        if self._run is None or self._page.result is None:
+            return
+        try:
+            self._page.relabelled(self._run.engine.relabel(self._page.result))
+        except Exception as error:
+            self._fail("The ground of this frame could not be found again", error)
+
+    def _fail(self, what: str, error: Exception) -> None:
+        """Tell the user, pause, and go on living."""
+        if isinstance(error, HemislamError):
+            reason = str(error)
+        else:
+            log.error("%s", what, exc_info=error)
+            reason = f"{type(error).__name__}: {error}"
+        self._halt()
+        self._outbox.notice("error", f"{what}. {reason}")
+
+    # --- opening ---------------------------------------------------------------------------------
+    def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
+        """Leave the opening to `work`, so that the page can say first that it takes a moment."""
+        self._opening = opening
+        self._outbox.put(progress=Progress(f"Opening {path.name}", math.nan), urgent=True)
+
+    def _do_opening(self, opening: Callable[[], None]) -> None:
+        """Open; if that is not possible, everything stays as it is."""
+        self._opening = None
+        try:
+            opening()
+        except HemislamError as error:
+            self._outbox.notice("error", str(error))
+        except Exception as error:
+            self._fail("The recording can not be opened", error)
+        self._outbox.put(progress=None, urgent=True)
+
+    def _open_other(self, path: Path, truth: Path | None) -> None:
+        """Open another recording with its own parameters, and on top those changed by hand.
+
+        What was changed by hand about the device stays with the recording it was meant for.
+        """
+        base = self._resolve(path) if self._resolve else self._params
+        by_hand = {
+            name: value
+            for name, value in self._base.changed(self._params).items()
+            if name.partition(".")[0] not in ("recording", "sensor")
+        }
+        params = base.with_values(by_hand)
+        run = self._open_run(path, truth, params)
+        self._base, self._params = base, params
+        self._halt()
+        self._take(run, 0)
+
+    def _reopen(self, params: Params, target: int) -> None:
+        opened = self._need_run().opened
+        self._take(self._open_run(opened.path, opened.truth, params), target)
+
+    def _take(self, run: Run, target: int) -> None:
+        """Let go of the present run and go to a frame of this one."""
+        if self._run is not None:
+            self._saver.wait()
+            self._run.close()
+        self._run = run
+        self._relabelling = False
+        self._page.opened(run)
+        self._page.params(self._params, self._pending_restart())
+        self._pacer.release()
+        self._target = None
+        self._go_to(target)
+
+    def close(self) -> None:
+        """Finish the saves under way and close the recording."""
+        self._saver.close()
+        if self._run is not None:
+            self._run.close()

@@ -1,0 +1,202 @@
+"""The engine in a process of its own, started and watched from here.
+
+Two pipes join the processes. Commands go down; deltas come up, one at a time: the next is sent when
+the one before was acknowledged, so that neither side ever waits for the other. When the upper
+process dies, however, the pipe for commands ends and the engine's process ends itself.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from app.server import wire
+from app.server.delta import Delta, Fold
+from app.server.protocol import Command, Notice, Shutdown, Snapshot
+from app.server.wire import Pipe
+from app.slam.params import Params
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What an engine's process starts with. Must be picklable.
+
+    Attributes:
+        recording: to open, or None to wait for OpenRecording. truth: its truth, if not beside it.
+        start_s, duration_s: the part of that recording to process.
+        resolve: parameters for recordings opened later; None keeps the present ones.
+        play: begin at once. speed: to play at.
+        chunk_voxel: m, see `Session`.
+        session, notices: how many there were before, for a process that takes over from another.
+    """
+
+    recording: Path | None = None
+    truth: Path | None = None
+    params: Params = field(default_factory=Params)
+    start_s: float = 0.0
+    duration_s: float | None = None
+    resolve: Callable[[Path], Params] | None = None
+    play: bool = False
+    speed: float = 1.0
+    chunk_voxel: float = 0.05
+    session: int = 0
+    notices: int = 0
+
+
+Main = Callable[[Pipe, Pipe, Setup], None]
+
+
+def _run_engine(commands: Pipe, updates: Pipe, setup: Setup) -> None:
+    from app.server.engine_process import main  # the parent has no need of the engine and its compiler
+
+    main(commands, updates, setup)
+
+
+class EngineProcess:
+    """Starts, feeds and watches the engine's process. All methods may be called by any thread.
+
+    Args:
+        main: what runs in the process; another one only in tests.
+    """
+
+    def __init__(self, setup: Setup, *, main: Main = _run_engine) -> None:
+        self._setup = setup
+        self._main = main
+        self._fold = Fold(Snapshot(params=setup.params))
+        self._changed = threading.Condition()
+        self._sending = threading.Lock()
+        self._commands: Pipe | None = None
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._start(setup)
+
+    # --- for its users ---------------------------------------------------------------------------
+    @property
+    def snapshot(self) -> Snapshot:
+        """The newest one."""
+        return self._fold.snapshot
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid if self._process else None
+
+    def wait(self, after_revision: int, timeout: float | None = None) -> Snapshot:
+        """The newest snapshot, once it is newer than `after_revision` or the time (s) is over."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.snapshot.revision > after_revision, timeout)
+            return self.snapshot
+
+    def send(self, command: Command) -> None:
+        """Enqueue a command. To a dead engine it is lost; `Snapshot.engine_alive` tells."""
+        with self._sending, contextlib.suppress(OSError):
+            if self._commands is not None:
+                self._commands.send(command)
+
+    def restart(self) -> None:
+        """After the process died: a new one, with the same recording and the newest parameters, from the start."""
+        self._end(timeout=0)
+        last = self.snapshot
+        opened = last.recording
+        same = opened is None or opened.path == self._setup.recording
+        self._start(
+            replace(
+                self._setup,
+                recording=opened.path if opened else self._setup.recording,
+                truth=opened.truth if opened else self._setup.truth,
+                start_s=self._setup.start_s if same else 0.0,
+                duration_s=self._setup.duration_s if same else None,
+                params=last.params,
+                play=False,
+                speed=last.transport.speed,
+                session=last.session,
+                notices=last.notices[-1].number if last.notices else 0,
+            )
+        )
+        self._edit(engine_alive=True)
+
+    def close(self, timeout: float = 10.0) -> None:
+        """Let the process finish what it is writing and end; end it by force after the time (s)."""
+        self._end(timeout)
+
+    # --- the process -----------------------------------------------------------------------------
+    def _start(self, setup: Setup) -> None:
+        context = multiprocessing.get_context("spawn")
+        commands_in, commands_out = context.Pipe(duplex=False)
+        updates_in, updates_out = context.Pipe(duplex=False)
+        wire.widen(updates_out)
+        process = context.Process(
+            target=self._main, args=(commands_in, updates_out, setup), name="hemislam engine", daemon=True
+        )
+        with _sigint_blocked():
+            process.start()
+        commands_in.close()
+        updates_out.close()
+        self._commands, self._process = commands_out, process
+        threading.Thread(
+            target=self._read, args=(updates_in, commands_out, process), name="engine updates", daemon=True
+        ).start()
+
+    def _read(self, updates: Pipe, commands: Pipe, process: multiprocessing.process.BaseProcess) -> None:
+        """Fold what the process sends, until it ends."""
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                delta: Delta = wire.receive(updates)
+                with self._sending:
+                    commands.send(None)  # acknowledged: the next one may come
+                with self._changed:
+                    self._fold.apply(delta)
+                    self._changed.notify_all()
+        updates.close()
+        process.join()
+        if process is self._process:
+            last = self.snapshot
+            number = last.notices[-1].number + 1 if last.notices else 1
+            code = process.exitcode or 0
+            how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            text = f"The engine's process has ended unexpectedly ({how}); restart it to begin again at the first frame."
+            self._edit(
+                engine_alive=False,
+                progress=None,
+                transport=replace(last.transport, playing=False, frames_per_second=0.0),
+                notices=(Notice(number, "error", text),),
+            )
+
+    def _edit(self, **values: Any) -> None:
+        with self._changed:
+            self._fold.edit(**values)
+            self._changed.notify_all()
+
+    def _end(self, timeout: float) -> None:
+        process, self._process = self._process, None  # from now on its end is expected
+        if process is None:
+            return
+        if timeout:
+            self.send(Shutdown())
+            process.join(timeout)
+        if process.is_alive():
+            process.kill()
+        process.join()
+        with self._sending, contextlib.suppress(OSError):
+            if self._commands is not None:
+                self._commands.close()
+                self._commands = None
+
+
+@contextlib.contextmanager
+def _sigint_blocked() -> Iterator[None]:
+    """A process started meanwhile does not see Ctrl-C, not even while it is still importing.
+
+    The terminal sends it to all processes of the foreground; ours is told to end by its parent.
+    """
+    if os.name != "posix":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,0 +1,155 @@
+"""The engine in a process of its own: over real pipes, killed for real."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import server_fakes as fakes
+
+from app.server.protocol import Pause, Play, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.worker import EngineProcess, Setup
+
+PATIENCE_S = 20.0
+
+
+def until(engine: EngineProcess, wanted: Callable[[Snapshot], bool]) -> Snapshot:
+    """The first snapshot that is as wanted; fails if none comes."""
+    deadline = time.monotonic() + PATIENCE_S
+    snapshot = engine.snapshot
+    while not wanted(snapshot):
+        assert time.monotonic() < deadline, snapshot
+        snapshot = engine.wait(snapshot.revision, timeout=1.0)
+    return snapshot
+
+
+@pytest.fixture
+def engine() -> Iterator[EngineProcess]:
+    process = EngineProcess(Setup(recording=Path("walk-300.mcap")), main=fakes.fake_main)
+    try:
+        until(process, lambda s: s.transport.frame == 0)
+        yield process
+    finally:
+        process.close()
+
+
+def test_everything_arrives_whole_and_read_only(engine: EngineProcess) -> None:
+    engine.send(SetSpeed(float("inf")))
+    engine.send(Play())
+    snapshot = until(engine, lambda s: s.transport.finished)
+    assert snapshot.trajectory is not None and snapshot.keyframe_poses is not None
+    np.testing.assert_array_equal(snapshot.trajectory, [fakes.pose(index)[:3, 3] for index in range(300)])
+    assert [chunk.index for chunk in snapshot.chunks] == list(range(60))
+    assert all(len(column) == 300 for column in snapshot.series.values())
+    assert snapshot.result is not None
+    arrays = [snapshot.trajectory, snapshot.chunks[0].points, snapshot.result.cloud.points, snapshot.result.T_map_odom]
+    arrays += [snapshot.series["distance"], snapshot.keyframe_poses]
+    assert not any(array.flags.writeable for array in arrays)
+
+
+def test_a_snapshot_once_taken_never_changes(engine: EngineProcess) -> None:
+    early = until(engine, lambda s: s.trajectory is not None and len(s.trajectory) == 1)
+    assert early.trajectory is not None
+    kept = early.trajectory.copy()
+    engine.send(Seek(299))
+    until(engine, lambda s: s.transport.frame == 299)
+    np.testing.assert_array_equal(early.trajectory, kept)
+
+
+def test_commands_act_while_it_plays_as_fast_as_it_can(engine: EngineProcess) -> None:
+    engine.send(Seek(250))
+    engine.send(SetParams({"ground.alpha": 20}))
+    engine.send(Pause())
+    snapshot = until(engine, lambda s: s.params.ground.alpha == 20 and s.progress is None)
+    assert snapshot.transport.frame < 250
+
+
+def test_a_killed_engine_is_reported_and_can_be_started_again(engine: EngineProcess) -> None:
+    engine.send(SetParams({"ground.alpha": 20}))
+    engine.send(StepFrame(10))
+    until(engine, lambda s: s.transport.frame == 10)
+    assert engine.pid is not None
+    os.kill(engine.pid, signal.SIGKILL)
+    dead = until(engine, lambda s: not s.engine_alive)
+    assert dead.notices[-1].level == "error" and "signal 9" in dead.notices[-1].text
+    assert dead.trajectory is not None and len(dead.trajectory) == 11, "what was there stays"
+    engine.send(StepFrame())  # to nobody
+    engine.restart()
+    alive = until(engine, lambda s: s.engine_alive and s.session > dead.session and s.transport.frame == 0)
+    assert alive.params.ground.alpha == 20
+    assert [n.number for n in alive.notices] == list(range(1, len(alive.notices) + 1))
+    engine.send(StepFrame())
+    until(engine, lambda s: s.transport.frame == 1)
+
+
+PARENT = """
+import sys, time
+sys.path[:0] = {path!r}
+import server_fakes as fakes
+from pathlib import Path
+from app.server.worker import EngineProcess, Setup
+if __name__ == "__main__":
+    engine = EngineProcess(Setup(recording=Path("walk-300.mcap")), main=fakes.fake_main)
+    while engine.snapshot.transport.frame < 0:
+        time.sleep(0.01)
+    print(engine.pid, flush=True)
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        engine.close()
+        print("closed", engine.snapshot.engine_alive, flush=True)
+"""
+
+
+@pytest.fixture
+def parent(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """A process in a terminal session of its own, and the id of its engine's process."""
+    script = tmp_path / "parent.py"
+    root = Path(__file__).resolve().parents[2]
+    script.write_text(PARENT.format(path=[str(root), str(Path(__file__).parent)]))
+    process = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        assert process.stdout is not None
+        yield process, int(process.stdout.readline())
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def gone(pid: int) -> bool:
+    """Whether a process that is not our child ends before our patience does."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        try:
+            if Path(f"/proc/{pid}/stat").read_text().split()[2] == "Z":
+                return True
+        except FileNotFoundError:
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def test_a_killed_parent_leaves_no_engine_behind(parent: tuple[subprocess.Popen[str], int]) -> None:
+    process, engine_pid = parent
+    process.kill()
+    process.wait()
+    assert gone(engine_pid)
+
+
+def test_ctrl_c_ends_both_without_a_traceback(parent: tuple[subprocess.Popen[str], int]) -> None:
+    process, engine_pid = parent
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to everything in the foreground
+    out, err = process.communicate(timeout=PATIENCE_S)
+    assert out == "closed True\n" and err == "" and process.returncode == 0
+    assert gone(engine_pid)
