@@ -46,10 +46,10 @@ class Spin:
 
 def settle_spin(clouds: list[tuple[F32, U16]], period_s: float) -> Spin:
     """How the sensor turns, from a few clouds ((n, 3) points, (n,) ring) in the order of the message."""
-    senses = [clockwise for clockwise in (True, False) if all(_laps(p, r, clockwise) < 1.1 for p, r in clouds)]
-    if not senses:  # no order to learn from; almost every sensor turns clockwise seen from above
+    points, ring = clouds[0]
+    clockwise, turns = sense_of_rotation(points, ring)
+    if not turns < 1.2:  # no order to learn from; almost every sensor turns clockwise seen from above
         return Spin(period_s, clockwise=True, ordered=False, start=(0.0,))
-    clockwise = senses[0]
     rings = 1 + max(int(ring.max()) for _, ring in clouds)
     begins: list[list[float]] = [[] for _ in range(rings)]
     for points, ring in clouds:
@@ -69,8 +69,20 @@ def turned_azimuth(points: F32, clockwise: bool) -> F64:
     return -azimuth if clockwise else azimuth
 
 
+def sense_of_rotation(points: F32, ring: U16) -> tuple[bool, float]:
+    """Whether points (n, 3) in firing order turn clockwise (seen from +z), and how many turns they make.
+
+    About one turn is a scan of a rotating sensor; many, or inf, is no rotation at all.
+    """
+    turns = {clockwise: _laps(points, ring, clockwise) for clockwise in (True, False)}
+    # Against the rotation, each small step counts as one back: the sum is negative.
+    forward = {clockwise: value for clockwise, value in turns.items() if value > 0.1}
+    clockwise = min(forward, key=forward.__getitem__, default=True)
+    return clockwise, forward.get(clockwise, np.inf)
+
+
 def _laps(points: F32, ring: U16, clockwise: bool) -> float:
-    """Turns that a typical ring makes in the order of the message; about 1 in the right sense."""
+    """Turns that a typical ring makes in this order, walking in this sense."""
     _, begins, walked = _walk(turned_azimuth(points, clockwise), ring)
     ends = np.append(begins[1:], len(walked)) - 1
     full = ends - begins >= 20

@@ -5,18 +5,20 @@ states its evidence and names the option that overrules it.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from app.sensors.azimuth import settle_spin
+from app.sensors.azimuth import sense_of_rotation, settle_spin
 from app.sensors.findings import Finding
 from app.sensors.pointcloud import CloudLayout, CloudMessage, valid_points
 from app.sensors.rings import Sample, settle_rings
-from app.sensors.timing import Clocked, settle_timing
+from app.sensors.timing import Clocked, Timing, may_be_time, settle_timing
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.params import Params, Recording
-from app.slam.types import F64, I64
+from app.slam.types import F32, F64, I64, U16
 
 INTENSITY_NAMES = ("intensity", "intensities", "reflectivity", "reflectance", "i")
 STANDARD_GRAVITY = 9.80665
@@ -58,15 +60,19 @@ def settle_cloud(probes: list[Probe], chosen: Recording, where: str) -> tuple[Cl
         points, index = valid_points(probe.cloud.xyz())
         index = np.arange(len(probe.cloud)) if index is None else index
         samples.append(Sample(probe.cloud, points, index))
-        columns = {name: probe.cloud.column(name)[index] for name in fields if _may_be_time(name, chosen)}
+        columns = {
+            name: probe.cloud.column(name)[index] for name in fields if may_be_time(name) or name == chosen.time_field
+        }
         clocked.append(Clocked(probe.log_ns, probe.cloud.stamp_ns, columns))
     findings = [_fields_finding(probes[0].cloud)]
     timing, time_findings = settle_timing(clocked, chosen, where)
     rings, ring_finding = settle_rings(samples, names)
+    clouds = [(s.points, rings.of(s.cloud, s.points, s.index)) for s in samples]
     spin = None
     if timing.field is None:
-        clouds = [(s.points, rings.of(s.cloud, s.points, s.index)) for s in samples]
         spin = settle_spin(clouds, timing.period_ns / 1e9)
+    else:
+        time_findings.append(_rotation_finding(clouds[-1], clocked[-1].columns[timing.field], timing))
     layout = CloudLayout(
         time_field=timing.field,
         unit_ns=timing.unit_ns,
@@ -110,7 +116,7 @@ def settle_imu(probe: ImuProbe, chosen: Recording) -> tuple[float, list[Finding]
     findings = [finding]
     turning = float(np.percentile(np.linalg.norm(probe.gyro, axis=1), 90))
     if turning > 10.0:
-        text = f"the gyroscope reads {turning:.0f} at the start, which as rad/s no hand does; its driver must publish rad/s"
+        text = f"the gyroscope reads {turning:.0f} at the start, too fast for rad/s; its driver must publish rad/s"
         findings.append(Finding("IMU units", "needs you", text))
     return scale, findings
 
@@ -132,8 +138,8 @@ def gravity_findings(probe: ImuProbe, scale: float, params: Params) -> list[Find
         moving = float(np.linalg.norm(gyro.std(axis=0))) > 0.05 or float(np.linalg.norm(accel.std(axis=0))) > 0.5
         if moving:
             text += f"; the device moves during the first {params.imu.start_duration:g} s, so that is rough"
-        findings.append(Finding("gravity", "needs you" if moving else "fine", text))
-    if params.sensor.translation == (0, 0, 0) and params.sensor.rotation == (0, 0, 0):
+        findings.append(Finding("gravity", "corrected" if moving else "fine", text))
+    if not any(params.sensor.translation + params.sensor.rotation):
         findings.append(
             Finding(
                 "mount",
@@ -150,8 +156,21 @@ def gravity_findings(probe: ImuProbe, scale: float, params: Params) -> list[Find
     return findings
 
 
-def _may_be_time(name: str, chosen: Recording) -> bool:
-    return name == chosen.time_field or name.lower() not in ("x", "y", "z", "rgb", "ring")
+def _rotation_finding(cloud: tuple[F32, U16], time: npt.NDArray[Any], timing: Timing) -> Finding:
+    """Whether the azimuth follows the points' times, as it must on a rotating sensor."""
+    points, ring = cloud
+    order = np.argsort(time, kind="stable")
+    clockwise, turns = sense_of_rotation(points[order], ring[order])
+    if turns < 2.5:
+        period_s = float(time.max() - time.min()) * timing.unit_ns / 1e9 / turns
+        sense = "clockwise" if clockwise else "counter-clockwise"
+        text = f"the points' times follow their azimuth: one turn in {period_s:.4f} s, {sense} seen from +z"
+        return Finding("rotation", "fine", text)
+    text = (
+        "the points' times do not follow their azimuth: either the sensor does not rotate, or the times are made up "
+        "and the azimuth should tell them"
+    )
+    return Finding("rotation", "needs you", text, "--set recording.time_field=none")
 
 
 def _fields_finding(cloud: CloudMessage) -> Finding:

@@ -3,7 +3,7 @@
 import hashlib
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -13,22 +13,37 @@ import numpy as np
 from app.sensors.clocks import clock_finding, clock_offset_s
 from app.sensors.findings import Finding
 from app.sensors.layout import ImuProbe, Probe, gravity_findings, settle_cloud, settle_imu
-from app.sensors.pointcloud import CloudError, CloudMessage, decode, stamp_ns, valid_points
+from app.sensors.pointcloud import CloudError, CloudMessage, decode, stamp_ns
+from app.sensors.probe import choose_topic, probe_clouds, probe_imu
 from app.sensors.sequencer import Sequencer
 from app.sensors.source import SUFFIXES, Source
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement, Scan
 
-POINTCLOUD = "sensor_msgs/msg/PointCloud2"
-IMU = "sensor_msgs/msg/Imu"
-
-PROBED_CLOUDS = 20
-PROBED_IMU_NS = 2_000_000_000
 LOG_MARGIN_NS = 2_000_000_000
 """How much later or earlier than usual a message may have been logged and still be found by time."""
 IMU_BEFORE_NS = 200_000_000
 """IMU samples given from before `start_s`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanEntry:
+    """A point cloud message: when it was logged, its content (None if malformed), and what it decodes to."""
+
+    log_ns: int
+    cloud: CloudMessage | None
+    scan: Scan | DroppedScan
+
+
+@dataclass(frozen=True, slots=True)
+class ImuEntry:
+    """An IMU message: when it was logged, its stamp with all corrections, rad/s and m/s^2 in the IMU frame."""
+
+    log_ns: int
+    stamp_ns: int
+    gyro: tuple[float, float, float]
+    accel: tuple[float, float, float]
 
 
 class Recording:
@@ -45,21 +60,16 @@ class Recording:
         self._params = params
         self.path = source.path
         self.topics = source.topics
-        self.lidar_topic, lidar_finding = self._choose(POINTCLOUD, params.recording.lidar_topic, "lidar")
-        self.imu_topic, imu_finding = self._choose(IMU, params.recording.imu_topic, "imu")
+        chosen = params.recording
+        self.lidar_topic, lidar_finding = choose_topic(source, "lidar", chosen.lidar_topic)
+        self.imu_topic, imu_finding = choose_topic(source, "imu", chosen.imu_topic)
         self.scan_count = sum(topic.messages for topic in source.topics if topic.name == self.lidar_topic)
-        self._lidar_stamped = self._imu_stamped = True
 
-        probes, unusable = self._probe_clouds()
-        self._layout, cloud_findings = settle_cloud(probes, params.recording, self.lidar_topic)
-        imu = self._probe_imu()
-        self._accel_scale, imu_findings = settle_imu(imu, params.recording)
-        stamped = [
-            Finding("stamps", "corrected", f"the headers of {topic} carry no time; the log times are used instead")
-            for topic, has in ((self.lidar_topic, self._lidar_stamped), (self.imu_topic, self._imu_stamped))
-            if not has
-        ]
-        scans = [decode(probe.cloud, self._layout) for probe in probes]
+        probes, self._lidar_stamped, probe_findings = probe_clouds(source, self.lidar_topic)
+        self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic)
+        imu, self._imu_stamped, imu_probe_findings = probe_imu(source, self.imu_topic, chosen.imu_time_offset)
+        self._accel_scale, imu_findings = settle_imu(imu, chosen)
+        probes, scans = self._decode_probes(probes, cloud_findings)
         self.start_ns = scans[0].stamp_ns
         self._log_after_stamp_ns = probes[0].log_ns - self.start_ns
         self.duration_s = max((source.end_ns - probes[0].log_ns) / 1e9, 0.0) + (scans[0].end_ns - self.start_ns) / 1e9
@@ -68,9 +78,9 @@ class Recording:
             *source.findings,
             lidar_finding,
             imu_finding,
-            *unusable,
-            *stamped,
+            *probe_findings,
             *cloud_findings,
+            *imu_probe_findings,
             *imu_findings,
             self._clocks,
             *gravity_findings(imu, self._accel_scale, params),
@@ -91,12 +101,12 @@ class Recording:
         reasons: Counter[str] = Counter()
         damage = None
         try:
-            for entry in self._entries(first_ns if start_s > 0 else None, stop_ns):
-                if isinstance(entry, Scan | DroppedScan):
-                    if entry.stamp_ns >= first_ns and (stop_ns is None or entry.stamp_ns < stop_ns):
-                        sequencer.add_scan(entry)
-                elif start_s <= 0 or entry[0] >= first_ns - IMU_BEFORE_NS:
-                    sequencer.add_imu(*entry)
+            for entry in self.entries(first_ns if start_s > 0 else None, stop_ns):
+                if isinstance(entry, ScanEntry):
+                    if entry.scan.stamp_ns >= first_ns and (stop_ns is None or entry.scan.stamp_ns < stop_ns):
+                        sequencer.add_scan(entry.scan)
+                elif start_s <= 0 or entry.stamp_ns >= first_ns - IMU_BEFORE_NS:
+                    sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
                 yield from _counted(sequencer.ready(), reasons)
         except HemislamError as error:
             damage = error
@@ -106,110 +116,55 @@ class Recording:
         if not sequencer.counts.paired:
             raise HemislamError(self._nothing_usable(reasons, start_s, duration_s))
 
-    def _entries(
-        self, first_ns: int | None, stop_ns: int | None
-    ) -> Iterator[Scan | DroppedScan | tuple[int, list[float], list[float]]]:
-        """Decoded scans and IMU samples (stamp ns, rad/s, m/s^2) by log time, around [first, stop)."""
+    def entries(self, first_ns: int | None = None, stop_ns: int | None = None) -> Iterator[ScanEntry | ImuEntry]:
+        """Decoded scans and IMU samples in the order of the file; generously more than [first, stop).
+
+        Raises:
+            HemislamError: where the file is damaged.
+        """
         offset = self._log_after_stamp_ns
         log_first = None if first_ns is None else first_ns + offset - LOG_MARGIN_NS
         log_stop = None if stop_ns is None else stop_ns + offset + LOG_MARGIN_NS
         for topic, log_ns, message in self._source.messages((self.lidar_topic, self.imu_topic), log_first, log_stop):
-            yield self._scan(message, log_ns) if topic == self.lidar_topic else self._imu_sample(message, log_ns)
+            yield self._scan_entry(message, log_ns) if topic == self.lidar_topic else self._imu_entry(message, log_ns)
 
-    def _scan(self, message: Any, log_ns: int) -> Scan | DroppedScan:
+    def fraction_at(self, log_ns: int) -> float:
+        """Share of the recording, 0-1, that was logged before."""
+        length = self._source.end_ns - self._source.start_ns
+        return min(max((log_ns - self._source.start_ns) / length, 0.0), 1.0) if length > 0 else 1.0
+
+    def _scan_entry(self, message: Any, log_ns: int) -> ScanEntry:
+        cloud = None
         try:
-            return decode(self._cloud(message, log_ns), self._layout)
+            cloud = CloudMessage.from_ros(message)
+            if not self._lidar_stamped:
+                cloud = replace(cloud, stamp_ns=log_ns)
+            return ScanEntry(log_ns, cloud, decode(cloud, self._layout))
         except CloudError as error:
-            return DroppedScan(stamp_ns(message.header.stamp) if self._lidar_stamped else log_ns, str(error))
+            stamp = stamp_ns(message.header.stamp) if self._lidar_stamped else log_ns
+            return ScanEntry(log_ns, cloud, DroppedScan(stamp, str(error)))
 
-    def _cloud(self, message: Any, log_ns: int) -> CloudMessage:
-        cloud = CloudMessage.from_ros(message)
-        return cloud if self._lidar_stamped else replace(cloud, stamp_ns=log_ns)
-
-    def _imu_sample(self, message: Any, log_ns: int) -> tuple[int, list[float], list[float]]:
+    def _imu_entry(self, message: Any, log_ns: int) -> ImuEntry:
         stamp = stamp_ns(message.header.stamp) if self._imu_stamped else log_ns
         w, a, k = message.angular_velocity, message.linear_acceleration, self._accel_scale
         offset = round(self._params.recording.imu_time_offset * 1e9)
-        return stamp + offset, [w.x, w.y, w.z], [k * a.x, k * a.y, k * a.z]
+        return ImuEntry(log_ns, stamp + offset, (w.x, w.y, w.z), (k * a.x, k * a.y, k * a.z))
 
-    def _choose(self, kind: str, wanted: str, name: str) -> tuple[str, Finding]:
-        """The topic to use of this type, and the finding about it. Raises HemislamError if there is none."""
-        what = "point clouds" if kind == POINTCLOUD else "IMU samples"
-        listed = ", ".join(f"{topic.name} ({topic.type})" for topic in self._source.topics)
-        candidates = [topic for topic in self._source.topics if topic.type == kind and topic.messages]
-        others = [topic.name for topic in candidates if topic.name != wanted]
-        option = f"--set recording.{name}_topic="
-        if wanted:
-            chosen = next((topic for topic in candidates if topic.name == wanted), None)
-            if chosen is None:
-                found = next((topic for topic in self._source.topics if topic.name == wanted), None)
-                why = "has no topic" if found is None else ("no messages on" if found.type == kind else f"no {what} on")
-                hint = f"choose {' or '.join(others)} by {option}{others[0]}" if others else f"it has {listed}"
-                raise HemislamError(f"{self.path} {why} {wanted}; {hint}.")
-            return wanted, Finding(f"{name} topic", "fine", f"{wanted}, {chosen.messages} messages, as you set it")
-        if not candidates:
-            empty = [topic.name for topic in self._source.topics if topic.type == kind]
-            why = f"no messages on {empty[0]}" if empty else f"no topic of type {kind}"
-            raise HemislamError(f"{self.path} holds no {what}: {why}; it has {listed}.")
-        chosen = max(candidates, key=lambda topic: topic.messages)  # the first of equals
-        if len(candidates) == 1:
-            return chosen.name, Finding(f"{name} topic", "fine", f"{chosen.name}, {chosen.messages} messages")
-        rest = ", ".join(topic.name for topic in candidates if topic is not chosen)
-        text = f"{chosen.name} has the most messages ({chosen.messages}); there are also {rest}"
-        return chosen.name, Finding(f"{name} topic", "needs you", text, f"{option}{chosen.name}")
-
-    def _probe_clouds(self) -> tuple[list[Probe], list[Finding]]:
-        """The first clouds that have points. Raises HemislamError if there are not two."""
-        probes: list[Probe] = []
-        unusable, reason = 0, ""
-        for _, log_ns, message in self._source.messages((self.lidar_topic,)):
+    def _decode_probes(self, probes: list[Probe], findings: list[Finding]) -> tuple[list[Probe], list[Scan]]:
+        """The probes that make scans, and these. Raises HemislamError if none does (a wrong time unit, say)."""
+        decoded, reason = [], ""
+        for probe in probes:
             try:
-                cloud = CloudMessage.from_ros(message)
-                has_points = len(valid_points(cloud.xyz())[0]) > 0
+                decoded.append((probe, decode(probe.cloud, self._layout)))
             except CloudError as error:
-                has_points, reason = False, str(error)
-            if has_points:
-                probes.append(Probe(log_ns, cloud))
-            else:
-                unusable += 1
-            if len(probes) == PROBED_CLOUDS:
-                break
-        if not probes:
-            why = reason or "each is empty, or all of its points are NaN or zero"
+                reason = str(error)
+        if not decoded:
+            advice = next((f"{f.text.rstrip('.')}: try {f.option}" for f in findings if f.verdict == "needs you"), "")
             raise HemislamError(
-                f"None of the {unusable} point clouds on {self.lidar_topic} in {self.path} has a usable point ({why}); "
-                "check the LiDAR's driver, or choose another topic by --lidar-topic."
+                f"The clouds on {self.lidar_topic} in {self.path} make no scans: {reason}"
+                f"; {advice or 'check the recording.time_* settings'}."
             )
-        if len(probes) == 1:
-            raise HemislamError(
-                f"{self.path} holds a single usable scan on {self.lidar_topic}, and a map needs at least two; record longer."
-            )
-        if len({probe.cloud.stamp_ns for probe in probes}) == 1:
-            self._lidar_stamped = False
-            probes = [Probe(probe.log_ns, replace(probe.cloud, stamp_ns=probe.log_ns)) for probe in probes]
-        text = f"{unusable} of the first {unusable + len(probes)} clouds have no usable point and are left out"
-        return probes, [Finding("empty clouds", "corrected", text)] if unusable else []
-
-    def _probe_imu(self) -> ImuProbe:
-        rows, logs = [], []
-        for _, log_ns, message in self._source.messages((self.imu_topic,)):
-            w, a = message.angular_velocity, message.linear_acceleration
-            rows.append((stamp_ns(message.header.stamp), w.x, w.y, w.z, a.x, a.y, a.z))
-            logs.append(log_ns)
-            if log_ns - logs[0] > PROBED_IMU_NS:
-                break
-        stamps = np.array([row[0] for row in rows], np.int64)
-        if len(rows) > 1 and np.all(stamps == stamps[0]):
-            self._imu_stamped = False
-            stamps = np.array(logs, np.int64)
-        values = np.array([row[1:] for row in rows], np.float64)
-        good = np.isfinite(values).all(axis=1)
-        if not good.any():
-            raise HemislamError(
-                f"The first {len(rows)} IMU samples on {self.imu_topic} in {self.path} are all NaN; check the IMU's driver."
-            )
-        stamps += round(self._params.recording.imu_time_offset * 1e9)
-        return ImuProbe(np.array(logs, np.int64)[good], stamps[good], values[good, :3], values[good, 3:])
+        return [probe for probe, _ in decoded], [scan for _, scan in decoded]
 
     def _compare_clocks(self, probes: list[Probe], scans: list[Scan], imu: ImuProbe) -> Finding:
         scan_logs = np.array([probe.log_ns for probe in probes], np.int64)

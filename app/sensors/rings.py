@@ -14,6 +14,8 @@ from app.sensors.findings import Finding
 from app.slam.types import F32, F64, I64, U16
 
 RING_NAMES = ("ring", "line", "channel", "laser_id", "laser")
+_ENOUGH = 50_000
+"""Points that are enough to tell the lines apart."""
 _COMMON_LINES = (16, 32, 40, 64, 80, 128)
 
 
@@ -110,7 +112,8 @@ def settle_rings(samples: list[Sample], names: dict[str, str]) -> tuple[Rings, F
 def _far(points: F32) -> npt.NDArray[np.intp]:
     """Indices of the farther half: there the beams' different origins hardly show in the elevation."""
     distance = np.linalg.norm(points, axis=1)
-    return np.flatnonzero(distance >= np.median(distance))
+    far = np.flatnonzero(distance >= np.median(distance))
+    return far[:: max(1, len(far) // _ENOUGH)]
 
 
 def _settle_field(field: str, raw: I64, angles: F32, lines: int) -> tuple[Rings, Finding]:
@@ -154,7 +157,6 @@ def _settle_place(samples: list[Sample]) -> tuple[Rings, int] | None:
 
 def _settle_elevation(points: F32) -> tuple[F64, tuple[float, float]]:
     """Elevations that separate the lines, seen from the centre that makes the lines sharpest."""
-    points = points[:: max(1, len(points) // 40_000)]
     edges = np.radians(np.arange(-90.0, 90.05, 0.1))
 
     def sharpness(centre: tuple[float, float]) -> float:

@@ -5,13 +5,15 @@ of arrival, then `ready()` gives what is complete. Pairing is by measurement tim
 """
 
 import bisect
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from app.slam.types import DroppedScan, ImuSamples, Measurement, Scan
+
+Vector = tuple[float, float, float]
 
 MAX_WAITING = 64
 """Scans that may wait for IMU samples; bounds the memory when the IMU falls silent."""
@@ -52,10 +54,10 @@ class Sequencer:
     _intervals_ns: list[int] = field(default_factory=list)
     _behind: bool = False
 
-    def add_imu(self, stamp_ns: int, gyro: npt.ArrayLike, accel: npt.ArrayLike) -> None:
+    def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector) -> None:
         """One IMU sample: rad/s and m/s^2, IMU frame."""
-        values = (*np.asarray(gyro, float).tolist(), *np.asarray(accel, float).tolist())
-        if not np.isfinite(values).all():
+        values = (*gyro, *accel)
+        if not all(map(math.isfinite, values)):
             self._count("imu_invalid", "an IMU sample is NaN or infinite and was left out")
             return
         newest = self._stamps[-1] if self._stamps else None
@@ -115,25 +117,25 @@ class Sequencer:
         return measurement
 
     def _objection(self, scan: Scan) -> str:
-        """Why a scan can not be used; "" if it can."""
+        """Why a scan can not be used; "" if it can. Without numbers, so that equal reasons can be counted."""
         begin_ns, end_ns = scan.stamp_ns, scan.end_ns
         if self._last_stamp_ns is not None and self._last_end_ns is not None:
             if begin_ns == self._last_stamp_ns:
                 return "it repeats the scan before it (same time)"
             if begin_ns < self._last_stamp_ns or end_ns <= self._last_end_ns:
-                return f"scan time steps back by {(self._last_end_ns - begin_ns) / 1e9:.3f} s"
+                return "its time steps back before the scan before it"
         if not self._stamps:
-            return "there is no IMU sample yet"
+            return "there is no IMU sample"
         if begin_ns < self._stamps[0]:
-            return f"the IMU starts {(self._stamps[0] - begin_ns) / 1e9:.3f} s after it"
+            return "the IMU starts after it"
         if end_ns > self._stamps[-1]:
-            return f"the IMU stops {(end_ns - self._stamps[-1]) / 1e9:.3f} s before its end"
+            return "the IMU stops before its end"
         first = bisect.bisect_right(self._stamps, begin_ns) - 1
         last = bisect.bisect_left(self._stamps, end_ns)
         for before, after in zip(self._stamps[first:last], self._stamps[first + 1 : last + 1], strict=True):
             inside = min(after, end_ns) - max(before, begin_ns)
             if after - before > self.max_gap_s * 1e9 and inside > 0.5 * (end_ns - begin_ns):
-                return f"it lies in a gap of {(after - before) / 1e9:.3f} s without IMU"
+                return "it lies in a gap of the IMU"
         return ""
 
     def _note_missing_scans(self, scan: Scan) -> None:

@@ -79,7 +79,12 @@ def _candidates(clouds: list[Clocked], wanted: str) -> list[str]:
         return [wanted]
     lower = {name.lower(): name for name in columns}
     usual = [lower[name] for name in TIME_NAMES if name in lower]
-    return usual + [name for low, name in lower.items() if ("time" in low or "stamp" in low) and name not in usual]
+    return usual + [name for low, name in lower.items() if may_be_time(low) and name not in usual]
+
+
+def may_be_time(name: str) -> bool:
+    """Whether a field may be the points' time, by its name."""
+    return name.lower() in TIME_NAMES or "time" in name.lower() or "stamp" in name.lower()
 
 
 def _try_field(
