@@ -4,6 +4,7 @@ import numpy as np
 
 from app.sensors.simulator.mesh import MeshBuilder
 from app.sensors.simulator.scenes import props
+from app.sensors.simulator.scenes.plan import level, rectangle, stroll, tiled
 from app.sensors.simulator.scenes.scene import Scene
 from app.slam.types import F64
 
@@ -15,23 +16,17 @@ def corridor(rng: np.random.Generator) -> Scene:
     """A 24 x 14 m loop of office corridors: doors, open rooms, pillars, ceiling lamps, a person walking."""
     length, depth = 24.0, 14.0
     mesh = MeshBuilder()
-    floor = 0.38
-
-    def tiles(xy: F64) -> F64:
-        odd = (np.floor(xy[:, 0] / 0.6) + np.floor(xy[:, 1] / 0.6)) % 2
-        return floor + 0.08 * odd
-
     reach = 4.2  # rooms behind the outer walls
     mesh.surface(
         np.arange(-reach, length + reach + 0.01, 0.6),
         np.arange(-reach, depth + reach + 0.01, 0.6),
-        lambda xy: np.zeros(len(xy)),
-        tiles,
+        level,
+        tiled(0.38),
     )
-    mesh.quad([(x, y, HEIGHT) for x, y in _rectangle(-reach, -reach, length + reach, depth + reach)], 0.7)
+    mesh.quad([(x, y, HEIGHT) for x, y in rectangle(-reach, -reach, length + reach, depth + reach)], 0.7)
 
-    outer = _rectangle(0, 0, length, depth)
-    inner = _rectangle(WIDTH, WIDTH, length - WIDTH, depth - WIDTH)
+    outer = rectangle(0, 0, length, depth)
+    inner = rectangle(WIDTH, WIDTH, length - WIDTH, depth - WIDTH)
     for k in range(4):
         _outer_wall(mesh, outer[k], outer[(k + 1) % 4], rng)
         _inner_wall(mesh, inner[k], inner[(k + 1) % 4], rng)
@@ -48,27 +43,11 @@ def corridor(rng: np.random.Generator) -> Scene:
         mesh.box((x + 1.5, depth - middle, HEIGHT - 0.15), (0.3, WIDTH, 0.3), 0.6)
     mesh.box((length / 2, WIDTH - 0.25, HEIGHT - 0.2), (length - 2 * WIDTH, 0.25, 0.08), 0.3)
 
-    path = np.array(_rectangle(middle, middle, length - middle, depth - middle))
+    path = np.array(rectangle(middle, middle, length - middle, depth - middle))
     start = np.array([[middle + 4.0, middle]])
     walk = np.vstack([start, path[1:], path[:1]])
-    someone = props.pedestrian(_rounded(np.array(_rectangle(1.7, 1.7, length - 1.7, depth - 1.7)))[::-1], 1.1)
+    someone = props.pedestrian(stroll(rectangle(1.7, 1.7, length - 1.7, depth - 1.7))[::-1], 1.1)
     return Scene(mesh.build(), (someone,), walk)
-
-
-def _rectangle(x0: float, y0: float, x1: float, y1: float) -> list[tuple[float, float]]:
-    """Corners, counter-clockwise."""
-    return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-
-
-def _rounded(
-    corners: F64,
-) -> F64:
-    """Waypoints a metre apart along a closed polygon, its corners cut."""
-    points: list[F64] = []
-    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        along = (b - a) / np.linalg.norm(b - a)
-        points.extend(a + along * s for s in np.arange(0.7, float(np.linalg.norm(b - a)) - 0.5, 1.0))
-    return np.array(points)
 
 
 def _outer_wall(

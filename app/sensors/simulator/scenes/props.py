@@ -162,3 +162,29 @@ def pedestrian(
         return np.column_stack([xy, z]), np.arctan2(ahead[:, 1], ahead[:, 0])
 
     return Mover(person_mesh(size), pose)
+
+
+def building(mesh: MeshBuilder, at: Vector, size: Vector, yaw: float = 0.0) -> None:
+    """Rows of windows all round, a plinth, a gabled roof; its walls reach 2 m below `at`, so it stands on slopes."""
+    p = _place(at, yaw)
+    length, depth, height = size
+    mesh.box(p(0, 0, height / 2 - 1.0), (length, depth, height + 2.0), 0.4, yaw)
+    mesh.box(p(0, 0, -0.7), (length + 0.2, depth + 0.2, 2.6), 0.3, yaw)
+    for z in np.arange(2.0, height - 1.0, 3.0):
+        for x in np.arange(-length / 2 + 1.6, length / 2 - 1.0, 2.6):
+            for y in (-depth / 2, depth / 2):
+                mesh.box(p(x, y, z), (1.2, 0.06, 1.5), 0.03, yaw)
+                mesh.box(p(x, y * (1 + 0.14 / depth), z - 0.8), (1.4, 0.16, 0.08), 0.5, yaw)
+        for y in np.arange(-depth / 2 + 1.6, depth / 2 - 1.0, 2.6):
+            for x in (-length / 2, length / 2):
+                mesh.box(p(x, y, z), (0.06, 1.2, 1.5), 0.03, yaw)
+    eave, ridge = height, height + 0.3 * min(length, depth)
+    a, b = length / 2 + 0.4, depth / 2 + 0.4
+    along = (length / 2 - 0.2, 0.0) if length > depth else (0.0, depth / 2 - 0.2)
+    corners = [p(-a, -b, eave), p(a, -b, eave), p(a, b, eave), p(-a, b, eave)]
+    peaks = [p(-along[0], -along[1], ridge), p(along[0], along[1], ridge)]
+    if length > depth:
+        faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]
+    else:
+        faces = [[1, 2, 5], [1, 5, 4], [3, 0, 4], [3, 4, 5], [0, 1, 4], [2, 3, 5], [0, 2, 1], [0, 3, 2]]
+    mesh.add(np.array(corners + peaks), np.array(faces), 0.25)
