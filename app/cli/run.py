@@ -1,5 +1,6 @@
 """`hemislam run`: a recording from end to end, without a browser."""
 
+import contextlib
 import itertools
 import signal
 from pathlib import Path
@@ -23,6 +24,7 @@ from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
     from app.server.run import Run
+    from app.slam.trajectory import Trajectory
 
 
 def run(
@@ -61,24 +63,30 @@ def run(
 
     params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
     folder = out or _free_folder(recording)
-    _compile()
     work = open_run(recording, truth, params, start, duration)
     try:
-        prepare_folder(folder, replace=force)
         truth_path = work.opened.truth
-        if truth_path and not truth:
+        true_poses = read_tum(truth_path) if truth_path else None
+        if truth and true_poses:
+            _check_truth(truth, true_poses, work)
+        elif truth_path:
             typer.echo(f"Using the truth that lies beside the recording: {truth_path}")
+        prepare_folder(folder, replace=force)
+        for finding in work.opened.findings:
+            if finding.verdict != "fine":
+                typer.echo(f"{finding.verdict}: {finding.subject}: {finding.text} {finding.option}".rstrip())
+        _compile()
         stop = _process(work)
         if not len(work.log):
-            if not any(folder.iterdir()):
-                folder.rmdir()
-            raise stop if isinstance(stop, KeyboardInterrupt) else HemislamError(_nothing_processed(work, stop))
+            with contextlib.suppress(OSError):
+                folder.rmdir()  # only if it is empty
+            raise stop or HemislamError(_nothing_processed(work))
         info = RunInfo(
             recording=recording,
             params=params,
             start_s=start,
             duration_s=duration,
-            truth=read_tum(truth_path) if truth_path else None,
+            truth=true_poses,
             truth_path=truth_path,
             stopped="" if stop is None else str(stop) or type(stop).__name__,
         )
@@ -97,6 +105,16 @@ def _free_folder(recording: Path) -> Path:
     """The first of runs/NAME-1, runs/NAME-2, ... that does not exist yet."""
     name = recording.resolve().stem
     return next(folder for n in itertools.count(1) if not (folder := Path("runs") / f"{name}-{n}").exists())
+
+
+def _check_truth(path: Path, truth: "Trajectory", work: "Run") -> None:
+    """Better now than after a long run. Raises HemislamError if the truth is of another time."""
+    begin, end = work.opened.start_ns * 1e-9, work.opened.start_ns * 1e-9 + work.opened.duration_s
+    if truth.stamps_ns[-1] * 1e-9 < begin or truth.stamps_ns[0] * 1e-9 > end:
+        raise HemislamError(
+            f"The truth {path} covers {truth.stamps_ns[0] * 1e-9:.1f} s to {truth.stamps_ns[-1] * 1e-9:.1f} s, but the"
+            f" recording {begin:.1f} s to {end:.1f} s; both must be stamped by the same clock, in seconds."
+        )
 
 
 def _compile() -> None:
@@ -133,9 +151,7 @@ def _process(work: "Run") -> BaseException | None:
     return None
 
 
-def _nothing_processed(work: "Run", stop: BaseException | None) -> str:
-    if stop is not None:
-        return str(stop)
+def _nothing_processed(work: "Run") -> str:
     reasons = "; ".join(f"{count} x {reason}" for reason, count in work.log.dropped.most_common(3))
     why = f"all were dropped: {reasons}" if reasons else "there is none in the part asked for"
     return f"No scan of {work.opened.path} could be processed ({why}); `hemislam info` tells more."

@@ -1,0 +1,135 @@
+"""A small recording with exact truth, and a way to call the command line as a user does."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from app.sensors.simulator.lidar import Returns
+from app.sensors.simulator.recording import RecordingWriter
+from app.slam.metrics import Trajectory, write_tum
+
+ROOT = Path(__file__).resolve().parents[2]
+START_NS = 1_700_000_000_000_000_000
+STILL_S, DURATION_S = 1.5, 4.0
+ROOM = np.array([[-4.0, -3.0, -1.2], [5.0, 3.5, 1.6]])
+LOOKING_FORWARD = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])
+"""R_world_lidar: the sensor's axis points along the world's x, the world's up is the sensor's x."""
+
+
+def positions(seconds: np.ndarray) -> np.ndarray:
+    """Where the sensor is: at rest, then on a smooth curve. (n, 3) m."""
+    u = np.clip(seconds - STILL_S, 0, None)[:, None]
+    return np.hstack([0.5 * (1 - np.cos(0.8 * u)), 0.3 * (1 - np.cos(1.1 * u)), 0.1 * (1 - np.cos(1.7 * u))])
+
+
+def accelerations(seconds: np.ndarray) -> np.ndarray:
+    u = np.clip(seconds - STILL_S, 0, None)[:, None]
+    moving = (seconds[:, None] > STILL_S).astype(float)
+    second = [0.5 * 0.8**2 * np.cos(0.8 * u), 0.3 * 1.1**2 * np.cos(1.1 * u), 0.1 * 1.7**2 * np.cos(1.7 * u)]
+    return moving * np.hstack(second)
+
+
+def sweep(start_s: float, seed: int) -> Returns:
+    """One revolution in a box-shaped room, every ray from where the sensor is at its own time."""
+    azimuth, elevation = np.meshgrid(np.arange(0, 360, 2.0), np.linspace(2.3, 89.5, 32), indexing="ij")
+    seconds = start_s + azimuth.ravel() / 360 * 0.1
+    a, e = np.radians(azimuth.ravel()), np.radians(elevation.ravel())
+    rays = np.stack([np.cos(e) * np.cos(a), -np.cos(e) * np.sin(a), np.sin(e)], axis=1)
+    directions, origins = rays @ LOOKING_FORWARD.T, positions(seconds)
+    with np.errstate(divide="ignore"):
+        to_walls = np.maximum((ROOM[0] - origins) / directions, (ROOM[1] - origins) / directions)
+    hit = to_walls.argmin(axis=1)
+    ranges = to_walls.min(axis=1) + np.random.default_rng(seed).normal(scale=0.005, size=len(rays))
+    return Returns(
+        stamps_ns=START_NS + np.rint(seconds * 1e9).astype(np.int64),
+        points=(rays * ranges[:, None]).astype(np.float32),
+        intensity=np.full(len(rays), 50, dtype=np.float32),
+        ring=np.tile(np.arange(32, dtype=np.uint16), 180),
+        ground=((hit == 2) & (directions[:, 2] < 0)).astype(np.uint8),
+    )
+
+
+def write_walk(path: Path, *, duration_s: float = DURATION_S, imu_until_s: float = DURATION_S) -> None:
+    """A recording of the walk, and its truth beside it."""
+    imu_s = np.arange(0, imu_until_s, 0.005)
+    rng = np.random.default_rng(7)
+    accel = (accelerations(imu_s) + np.array([0, 0, 9.81])) @ LOOKING_FORWARD + rng.normal(
+        scale=0.02, size=(len(imu_s), 3)
+    )
+    gyro = rng.normal(scale=0.001, size=(len(imu_s), 3))
+    ends: list[int] = []
+    with RecordingWriter(path) as recording:
+        sample = 0
+        for index in range(round(duration_s * 10) - 1):
+            returns = sweep(0.05 + index / 10, index)
+            ends.append(int(returns.stamps_ns.max()))
+            while sample < len(imu_s) and START_NS + imu_s[sample] * 1e9 <= ends[-1]:
+                recording.add_imu(START_NS + round(imu_s[sample] * 1e9), gyro[sample], accel[sample])
+                sample += 1
+            recording.add_cloud(returns, ends[-1])
+        for k in range(sample, len(imu_s)):
+            recording.add_imu(START_NS + round(imu_s[k] * 1e9), gyro[k], accel[k])
+    stamps = np.array(ends)
+    turned = np.tile(Rotation.from_matrix(LOOKING_FORWARD).as_quat(), (len(ends), 1))
+    truth = Trajectory(stamps, positions((stamps - START_NS) * 1e-9), turned)
+    write_tum(path.with_name(f"{path.stem}_truth.tum"), truth)
+
+
+@pytest.fixture(scope="session")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of 39 scans in a room, with truth beside it."""
+    path = tmp_path_factory.mktemp("recording") / "walk.mcap"
+    write_walk(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def walk_without(tmp_path_factory: pytest.TempPathFactory) -> Callable[[float], Path]:
+    """The same walk, but its IMU falls silent after so many seconds."""
+
+    def make(imu_until_s: float) -> Path:
+        path = tmp_path_factory.mktemp("recording") / "silent.mcap"
+        write_walk(path, imu_until_s=imu_until_s)
+        return path
+
+    return make
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    code: int
+    out: str
+    err: str
+
+    def refused(self) -> str:
+        """The sentence of a refusal: exit code 2, one line on stderr, no traceback."""
+        assert self.code == 2, self.err
+        assert "Traceback" not in self.err
+        assert len(self.err.splitlines()) == 1, self.err
+        assert self.err.startswith("hemislam: ")
+        return self.err.strip()
+
+
+Call = Callable[..., Outcome]
+
+
+@pytest.fixture(scope="session")
+def hemislam() -> Call:
+    """Calls the command line in a process of its own."""
+
+    def call(*arguments: str | Path, folder: Path = ROOT) -> Outcome:
+        command = [sys.executable, "-m", "app", *map(str, arguments)]
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
+        )
+        return Outcome(done.returncode, done.stdout, done.stderr)
+
+    return call

@@ -1,0 +1,74 @@
+"""Help that teaches, at once; parameters that are printed and read back; misspelt ones refused by name."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app import __version__
+from app.slam.params import Params
+
+Call = Callable[..., Any]
+
+
+@pytest.mark.parametrize("command", ["serve", "run", "info", "simulate", "params"])
+def test_every_command_explains_itself_by_example(hemislam: Call, command: str) -> None:
+    outcome = hemislam(command, "--help")
+    assert outcome.code == 0
+    assert f"hemislam {command} " in outcome.out.partition("Examples:")[2]
+
+
+def test_help_loads_nothing_heavy() -> None:
+    heavy = "{'numba', 'open3d', 'viser', 'fastapi', 'numpy', 'scipy', 'pydantic', 'rosbags'}"
+    code = (
+        "import sys; sys.argv = ['hemislam', '--help']\n"
+        "from app.__main__ import main\n"
+        "try: main()\n"
+        f"finally: print(sorted({heavy} & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr.strip() == "[]"
+    assert "serve" in done.stdout
+
+
+def test_the_version_is_printed(hemislam: Call) -> None:
+    assert hemislam("--version").out == f"hemislam {__version__}\n"
+
+
+def test_printed_parameters_are_read_back(hemislam: Call, tmp_path: Path) -> None:
+    printed = hemislam("params", "--set", "ground.alpha=30", "--set", "sensor.translation=[0.1, 0, -0.2]")
+    assert printed.code == 0
+    params = Params().merged_yaml(printed.out)
+    assert (params.ground.alpha, params.sensor.translation) == (30, (0.1, 0, -0.2))
+    (tmp_path / "mine.yaml").write_text(printed.out)
+    assert hemislam("params", "--config", tmp_path / "mine.yaml").out == printed.out
+
+
+def test_a_preset_is_overruled_by_a_file_and_a_file_by_set(hemislam: Call, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("recording: {imu_topic: /other}\nground: {alpha: 50, sigma: 0.05}\n")
+    printed = hemislam("params", "--preset", "h2lid", "--config", tmp_path / "mine.yaml", "--set", "ground.alpha=20")
+    params = Params().merged_yaml(printed.out)
+    assert params.recording.lidar_topic == "/horizontal_laser_3d"
+    assert params.recording.imu_topic == "/other"
+    assert (params.ground.alpha, params.ground.sigma) == (20, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--set", "ground.alpha=300"], "`ground.alpha` can not be 300"),
+        (["--set", "ground.alfa=30"], "did you mean `ground.alpha`"),
+        (["--set", "gound.alpha=30"], "did you mean `ground`"),
+        (["--set", "ground.alpha"], "has no value"),
+        (["--set", "ground.alpha=steep"], "`ground.alpha` can not be 'steep'"),
+        (["--set", "ground.alpha=.nan"], "`ground.alpha` can not be nan"),
+        (["--preset", "h2lib"], "no preset `h2lib`"),
+        (["--config", "nowhere.yaml"], "nowhere.yaml"),
+        (["--config", "README.md"], "README.md"),
+    ],
+)
+def test_a_parameter_that_can_not_be_is_refused_by_name(hemislam: Call, arguments: list[str], says: str) -> None:
+    assert says in hemislam("params", *arguments).refused()

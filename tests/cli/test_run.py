@@ -1,0 +1,203 @@
+"""`hemislam run` from the outside: right results, the same bytes again, and nothing lost when it goes wrong."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from app.__main__ import cli
+from app.server.run import Run
+from app.slam.errors import HemislamError
+from app.slam.metrics import Trajectory, ate, read_tum, write_tum
+
+Call = Callable[..., Any]
+RESULTS = ["map.ply", "report.json", "timings.csv", "trajectory.tum"]
+
+
+@pytest.fixture(scope="module")
+def first(hemislam: Call, walk: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
+    folder = tmp_path_factory.mktemp("results") / "first"
+    return hemislam("run", walk, "--out", folder), folder
+
+
+def test_a_walk_in_a_room_is_followed_to_a_centimetre(first: tuple[Any, Path], walk: Path) -> None:
+    outcome, folder = first
+    assert outcome.code == 0, outcome.err
+    error = ate(read_tum(folder / "trajectory.tum"), read_tum(walk.with_name("walk_truth.tum")))
+    assert error.position.rmse < 0.01
+    assert error.rotation.rmse < 1.0
+    report = json.loads((folder / "report.json").read_text())
+    assert report["accuracy"]["ate_m"]["rmse"] == pytest.approx(error.position.rmse, abs=1e-7)
+    assert report["frames"]["processed"] == 39
+    assert report["ground"]["f1"] > 0.9
+
+
+def test_truth_beside_the_recording_is_used_and_named(first: tuple[Any, Path]) -> None:
+    assert "walk_truth.tum" in first[0].out
+    assert "ATE" in first[0].out
+
+
+def test_without_a_terminal_only_the_summary_is_printed(first: tuple[Any, Path]) -> None:
+    assert first[0].err == ""
+    assert str(first[1]) in first[0].out
+
+
+def test_the_same_run_twice_gives_the_same_bytes(
+    first: tuple[Any, Path], hemislam: Call, walk: Path, tmp_path: Path
+) -> None:
+    assert hemislam("run", walk, "--out", tmp_path / "second").code == 0
+    for name in ("trajectory.tum", "map.ply"):
+        assert (tmp_path / "second" / name).read_bytes() == (first[1] / name).read_bytes()
+
+
+def test_only_the_part_asked_for_is_processed(hemislam: Call, walk: Path, tmp_path: Path) -> None:
+    outcome = hemislam(
+        "run", walk, "--start", "0.5", "--duration", "2", "--set", "imu.start_duration=0.5", folder=tmp_path
+    )
+    assert outcome.code == 0, outcome.err
+    stamps = read_tum(tmp_path / "runs" / "walk-1" / "trajectory.tum").stamps_ns
+    assert stamps[-1] - stamps[0] <= 2e9
+    report = json.loads((tmp_path / "runs" / "walk-1" / "report.json").read_text())
+    assert report["frames"]["processed"] == 20
+    assert report["parameters"]["imu"]["start_duration"] == 0.5
+
+
+# --- refused at once -------------------------------------------------------------------------------
+def missing(walk: Path, path: Path) -> None:
+    pass
+
+
+def empty(walk: Path, path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def foreign(walk: Path, path: Path) -> None:
+    path.write_text("This is not a recording.\n" * 100)
+
+
+def empty_folder(walk: Path, path: Path) -> None:
+    path.mkdir()
+
+
+def cut_in_the_header(walk: Path, path: Path) -> None:
+    path.write_bytes(walk.read_bytes()[:20])
+
+
+@pytest.mark.parametrize(
+    ("command", "spoil"),
+    [
+        ("run", missing),
+        ("run", empty),
+        ("run", foreign),
+        ("run", empty_folder),
+        ("run", cut_in_the_header),
+        ("info", missing),
+        ("info", cut_in_the_header),
+        ("serve", missing),
+        ("serve", empty),
+    ],
+)
+def test_a_file_that_is_no_recording_is_refused_by_name(
+    hemislam: Call, walk: Path, tmp_path: Path, command: str, spoil: Callable[[Path, Path], None]
+) -> None:
+    path = tmp_path / "spoilt.mcap"
+    spoil(walk, path)
+    assert "spoilt.mcap" in hemislam(command, path, folder=tmp_path).refused()
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_recording_whose_imu_is_silent_is_refused(
+    hemislam: Call, walk_without: Callable[[float], Path], tmp_path: Path
+) -> None:
+    assert "IMU" in hemislam("run", walk_without(0.0), folder=tmp_path).refused().replace("Imu", "IMU")
+
+
+def test_scans_after_the_last_imu_sample_are_dropped_and_counted(
+    hemislam: Call, walk_without: Callable[[float], Path], tmp_path: Path
+) -> None:
+    outcome = hemislam("run", walk_without(3.0), "--out", tmp_path / "out")
+    assert outcome.code == 0, outcome.err
+    frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
+    assert (frames["processed"], frames["dropped"]) == (29, 10)
+    assert sum(frames["dropped_reasons"].values()) == 10
+    assert len((tmp_path / "out" / "timings.csv").read_text().splitlines()) == 30
+
+
+def test_of_a_recording_that_was_cut_short_the_rest_is_used_and_said_to_be_one(
+    hemislam: Call, walk: Path, tmp_path: Path
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(walk.read_bytes()[: walk.stat().st_size * 2 // 3])
+    outcome = hemislam("run", cut, "--out", tmp_path / "out")
+    assert outcome.code == 0, outcome.err
+    assert "the file is cut off" in outcome.out
+    assert 15 <= json.loads((tmp_path / "out" / "report.json").read_text())["frames"]["processed"] < 39
+
+
+def test_a_truth_of_another_day_or_none_at_all_is_refused(hemislam: Call, walk: Path, tmp_path: Path) -> None:
+    assert "none.tum" in hemislam("run", walk, "--truth", tmp_path / "none.tum", folder=tmp_path).refused()
+    truth = read_tum(walk.with_name("walk_truth.tum"))
+    write_tum(tmp_path / "late.tum", Trajectory(truth.stamps_ns + 86_400 * 10**9, truth.positions, truth.quaternions))
+    late = hemislam("run", walk, "--truth", tmp_path / "late.tum", folder=tmp_path).refused()
+    assert "late.tum" in late
+    assert "same clock" in late
+    assert not (tmp_path / "runs").exists()
+
+
+def test_results_are_kept_unless_told_otherwise(first: tuple[Any, Path], hemislam: Call, walk: Path) -> None:
+    before = {path.name: path.read_bytes() for path in first[1].iterdir()}
+    assert "--force" in hemislam("run", walk, "--out", first[1]).refused()
+    assert {path.name: path.read_bytes() for path in first[1].iterdir()} == before
+
+
+# --- stopped on the way ----------------------------------------------------------------------------
+def run_with_trouble(
+    monkeypatch: pytest.MonkeyPatch, walk: Path, folder: Path, trouble: BaseException, after: int = 20
+) -> Any:
+    """Run in this process; `trouble` is raised when the frame number `after` is due."""
+    step = Run.step
+
+    def trouble_comes(self: Run) -> Any:
+        if self.frame + 1 == after:
+            raise trouble
+        return step(self)
+
+    monkeypatch.setattr(Run, "step", trouble_comes)
+    return CliRunner().invoke(cli, ["run", str(walk), "--out", str(folder)])
+
+
+def test_an_interrupted_run_keeps_what_it_has(monkeypatch: pytest.MonkeyPatch, walk: Path, tmp_path: Path) -> None:
+    outcome = run_with_trouble(monkeypatch, walk, tmp_path / "out", KeyboardInterrupt())
+    assert outcome.exit_code == 130
+    assert "20 processed" in outcome.output
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == RESULTS
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["stopped_early"] == "KeyboardInterrupt"
+
+
+def test_a_recording_damaged_on_the_way_gives_what_came_before(
+    monkeypatch: pytest.MonkeyPatch, walk: Path, tmp_path: Path
+) -> None:
+    outcome = run_with_trouble(monkeypatch, walk, tmp_path / "out", HemislamError("The file is damaged at 2.1 s."))
+    assert outcome.exit_code == 2
+    assert "hemislam: The file is damaged at 2.1 s. The frames before that" in outcome.stderr
+    assert np.genfromtxt(tmp_path / "out" / "timings.csv", delimiter=",", skip_header=1).shape[0] == 20
+
+
+def test_a_bug_of_ours_costs_no_frames_and_is_not_hidden(
+    monkeypatch: pytest.MonkeyPatch, walk: Path, tmp_path: Path
+) -> None:
+    outcome = run_with_trouble(monkeypatch, walk, tmp_path / "out", ZeroDivisionError("our bug"))
+    assert isinstance(outcome.exception, ZeroDivisionError)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == RESULTS
+
+
+def test_a_run_that_fails_before_its_first_frame_leaves_no_folder(
+    monkeypatch: pytest.MonkeyPatch, walk: Path, tmp_path: Path
+) -> None:
+    outcome = run_with_trouble(monkeypatch, walk, tmp_path / "out", HemislamError("No."), after=0)
+    assert outcome.exit_code == 2
+    assert not (tmp_path / "out").exists()
