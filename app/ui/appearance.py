@@ -1,0 +1,68 @@
+"""The controls of how the scene looks, and the legend that explains its colours."""
+
+from typing import Final
+
+import viser
+
+from app.ui.colours import ColourBy, Limits
+from app.ui.html import box, legend
+from app.ui.view import View
+from app.ui.widgets import show
+
+_LAYERS: Final = (
+    ("ceilings", "ceilings", "Without them one looks into a building from above. Ceilings labelled ground stay."),
+    ("map", "map", "Keyframes' points."),
+    ("scan", "scan", "Points of the newest frame."),
+    ("wedge", "seed wedge", "Where seeds are looked for: within α of straight down, on the M outermost lines."),
+    ("plane", "ground plane", "The plane through the seeds."),
+    ("path", "path, truth", "Where the sensor walked, and the truth when it is loaded."),
+    ("grid", "grid", "1 m cells on the ground below the sensor."),
+)
+
+
+class AppearancePanel:
+    """Widgets whose values are the `View`; nothing here reaches the engine."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        default = View()
+        self._colour_by = gui.add_dropdown(
+            "colour by", tuple(ColourBy), initial_value=default.colour_by, hint="What colours mean. C goes to the next."
+        )
+        self._legend = gui.add_html(legend(default.colour_by, None))
+        self._follow = gui.add_checkbox(
+            "follow", default.follow, hint="Keep the sensor in the middle; orbit and zoom as you like. F toggles."
+        )
+        self._point_size = gui.add_slider(
+            "points (cm)", 0.5, 15.0, 0.5, 100 * default.point_size, hint="Diameter of the points drawn."
+        )
+        with gui.add_folder("Layers", expand_by_default=True):
+            self._layers = {
+                name: gui.add_checkbox(text, getattr(default, name), hint=hint) for name, text, hint in _LAYERS
+            }
+        self._count = gui.add_html("")
+        gui.add_command("Follow the sensor or look freely", hotkey="F").on_trigger(
+            lambda _: show(self._follow, not self._follow.value)
+        )
+        gui.add_command("Next colouring", hotkey="C").on_trigger(lambda _: self._next_colouring())
+
+    @property
+    def view(self) -> View:
+        """As the widgets say now."""
+        return View(
+            colour_by=ColourBy(self._colour_by.value),
+            point_size=self._point_size.value / 100,
+            follow=self._follow.value,
+            **{name: layer.value for name, layer in self._layers.items()},
+        )
+
+    def draw(self, view: View, limits: Limits | None, points: int, budget: int) -> None:
+        """Explain the colours as drawn and say how many points the page holds."""
+        self._legend.content = legend(view.colour_by, limits)
+        self._count.content = box(
+            f'<span class="hs-note">{points:,} map points in the page, at most {budget:,}; '
+            "the whole map stays with the engine.</span>"
+        )
+
+    def _next_colouring(self) -> None:
+        order = list(ColourBy)
+        show(self._colour_by, order[(order.index(ColourBy(self._colour_by.value)) + 1) % len(order)])

@@ -1,0 +1,33 @@
+"""Finding the ceiling above a keyframe, so that the page can look into a building from above."""
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from app.slam.types import F32, F64, NON_GROUND, U8
+
+_CONE: Final = float(np.cos(np.radians(35.0)))
+_HIGHEST_M: Final = 8.0
+_LEAST_SHARE: Final = 0.02
+_FLATNESS_M: Final = 0.12
+"""Most median deviation of the points overhead from their median height: treetops are rougher."""
+_MARGIN_M: Final = 0.25
+
+
+def below_ceiling(points: F32, labels: U8, up: F64) -> npt.NDArray[np.bool_] | None:
+    """Which points stay when the ceiling is taken off; None where nothing flat is overhead.
+
+    Points labelled ground always stay: a ceiling taken for ground is something to be seen.
+
+    Args:
+        points: (n, 3) m, LiDAR frame. labels: (n,). up: (3,) unit, LiDAR frame.
+    """
+    height = points @ up.astype(np.float32)
+    overhead = height[height > _CONE * np.linalg.norm(points, axis=1)]
+    if len(overhead) < max(30.0, _LEAST_SHARE * len(points)):
+        return None
+    ceiling = float(np.median(overhead))
+    if ceiling > _HIGHEST_M or float(np.median(np.abs(overhead - ceiling))) > _FLATNESS_M:
+        return None
+    return np.asarray((height < ceiling - _MARGIN_M) | (labels != NON_GROUND))

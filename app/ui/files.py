@@ -1,0 +1,187 @@
+"""Opening a recording and saving results. The page sees the folders that the command line allowed, no others."""
+
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import viser
+
+from app.server.protocol import Command, OpenRecording, Save, Snapshot
+from app.slam.errors import HemislamError
+from app.slam.trajectory import truth_beside
+from app.ui.html import box, code
+from app.ui.widgets import by_user
+
+_MOST_ENTRIES: Final = 60
+
+
+class Entry(Protocol):
+    """A line of a folder's listing."""
+
+    @property
+    def path(self) -> Path: ...
+    @property
+    def is_recording(self) -> bool: ...
+    @property
+    def size(self) -> int: ...
+
+
+class Folders(Protocol):
+    """The folders a page may look into (`app.server.folders`)."""
+
+    @property
+    def roots(self) -> Sequence[Path]: ...
+    def listing(self, folder: Path) -> Sequence[Entry]:
+        """Sub-folders and recordings of `folder`; raises HemislamError outside the roots."""
+        ...
+
+
+def size_text(size: int) -> str:
+    """Bytes in the unit a person would choose."""
+    value = float(size)
+    for unit in ("B", "kB", "MB"):
+        if value < 1000:
+            return f"{value:.0f} {unit}"
+        value /= 1000
+    return f"{value:.1f} GB"
+
+
+def result_folder_name(recording: Path, now: datetime) -> str:
+    """`hall_bpearl-2026-05-01-134502`: sorts by recording, then by time; never overwrites an older run."""
+    stem = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in recording.stem)
+    return f"{stem}-{now:%Y-%m-%d-%H%M%S}"
+
+
+class FilesPanel:
+    """Buttons that open a file browser, and that save, each in the browser that asked for it.
+
+    Args:
+        results: folder below which results are saved.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        folders: Folders,
+        results: Path,
+        send: Callable[[Command], None],
+        snapshot: Callable[[], Snapshot],
+    ) -> None:
+        self._folders = folders
+        self._results = results
+        self._send = send
+        self._snapshot = snapshot
+        self._open = gui.add_button("Open a recording…", icon=viser.Icon.FOLDER_OPEN, color="gray")
+        self._save = gui.add_button("Save results…", icon=viser.Icon.DEVICE_FLOPPY, color="gray", disabled=True)
+        self._saved = gui.add_html("", visible=False)
+        self._open.on_click(by_user(self._browse))
+        self._save.on_click(by_user(lambda _, client: self._ask_where(client)))
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Offer saving once there is something to save; say where the newest results are."""
+        self._save.disabled = snapshot.result is None
+        done = [saved.folder for saved in snapshot.saved if not saved.error]
+        self._saved.visible = bool(done)
+        if done:
+            self._saved.content = box('<span class="hs-quiet">Saved in ', code(str(done[-1])), "</span>")
+
+    def _browse(self, _: Any, client: viser.ClientHandle) -> None:
+        FileBrowser(client, self._folders, self._send)
+
+    def _ask_where(self, client: viser.ClientHandle) -> None:
+        recording = self._snapshot().recording
+        if recording is None:
+            return
+        gui = client.gui
+        with gui.add_modal("Save results") as modal:
+            gui.add_html(
+                box(
+                    "Writes <b>trajectory.tum</b>, <b>timings.csv</b>, <b>map.ply</b> and <b>report.json</b> "
+                    "of what was processed so far, below ",
+                    code(str(self._results)),
+                )
+            )
+            name = gui.add_text("folder", result_folder_name(recording.path, datetime.now()))
+            everything = gui.add_checkbox("all files", True, hint="Without: trajectory.tum only, which takes no time.")
+            problem = gui.add_html("", visible=False)
+            save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
+            cancel = gui.add_button("Cancel", color="gray")
+
+        def confirmed(_: object) -> None:
+            chosen = Path(name.value.strip())
+            if not name.value.strip() or chosen.name != str(chosen) or chosen.name in (".", ".."):
+                problem.content = box("The folder needs a plain name, without / and not empty.")
+                problem.visible = True
+                return
+            self._send(Save(self._results / chosen, trajectory_only=not everything.value))
+            modal.close()
+
+        save.on_click(confirmed)
+        cancel.on_click(lambda _: modal.close())
+
+
+class FileBrowser:
+    """A dialog in one browser: goes through folders until a recording is chosen."""
+
+    def __init__(self, client: viser.ClientHandle, folders: Folders, send: Callable[[Command], None]) -> None:
+        self._gui = client.gui
+        self._folders = folders
+        self._send = send
+        self._shown: list[viser.GuiButtonHandle | viser.GuiHtmlHandle] = []
+        self._modal = self._gui.add_modal("Open a recording")
+        with self._modal:
+            self._here = self._gui.add_html("")
+            self._list = self._gui.add_folder(None)
+            self._with_truth = self._gui.add_checkbox(
+                "with truth", True, hint="Load the trajectory (.tum) that lies beside the recording, if there is one."
+            )
+            cancel = self._gui.add_button("Cancel", color="gray")
+        cancel.on_click(lambda _: self._modal.close())
+        roots = tuple(folders.roots)
+        self._go(roots[0] if len(roots) == 1 else None)
+
+    def _go(self, folder: Path | None) -> None:
+        """List a folder; None lists the roots."""
+        for handle in self._shown:
+            handle.remove()
+        self._shown.clear()
+        with self._list:
+            if folder is None:
+                self._here.content = box("Folders that this server was started with:")
+                for root in self._folders.roots:
+                    self._button(str(root), viser.Icon.FOLDER, partial(self._go, root))
+                return
+            self._here.content = box(code(str(folder)))
+            try:
+                entries = self._folders.listing(folder)
+            except HemislamError as error:
+                self._shown.append(self._gui.add_html(box(code(str(error)))))
+                entries = ()
+            at_root = folder in self._folders.roots
+            if not at_root or len(self._folders.roots) > 1:
+                self._button("..", viser.Icon.CORNER_LEFT_UP, lambda: self._go(None if at_root else folder.parent))
+            for entry in entries[:_MOST_ENTRIES]:
+                self._entry(entry)
+            if not entries:
+                self._shown.append(self._gui.add_html(box("No recordings (.bag, .mcap, .db3, ROS 2 folders) here.")))
+            if len(entries) > _MOST_ENTRIES:
+                more = f"{len(entries) - _MOST_ENTRIES} more are not shown; name the file on the command line."
+                self._shown.append(self._gui.add_html(box(more)))
+
+    def _entry(self, entry: Entry) -> None:
+        path = entry.path
+        if entry.is_recording:
+            self._button(f"{path.name}   {size_text(entry.size)}", viser.Icon.FILE_DATABASE, lambda: self._choose(path))
+        else:
+            self._button(path.name, viser.Icon.FOLDER, lambda: self._go(path))
+
+    def _button(self, text: str, icon: viser.IconName, act: Callable[[], None]) -> None:
+        button = self._gui.add_button(text, icon=icon, color="gray")
+        button.on_click(lambda _: act())
+        self._shown.append(button)
+
+    def _choose(self, path: Path) -> None:
+        self._send(OpenRecording(path, truth_beside(path) if self._with_truth.value else None))
+        self._modal.close()

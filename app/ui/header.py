@@ -1,0 +1,91 @@
+"""The head of the page: which recording, what is going on, and what one can do."""
+
+from html import escape
+from typing import Final
+
+import numpy as np
+import viser
+
+from app.server.protocol import Snapshot
+from app.slam.types import FrameStatus
+from app.ui.doctor import verdicts
+from app.ui.html import BAD, GOOD, QUIET, WARN, box, chip, heading, key
+
+HELP: Final = (
+    heading("What to do here")
+    + box(
+        "<b>Replay</b> a recording and watch the map grow. <b>Tune</b> M, α, σ and the voxel size while it plays "
+        "or is paused: the frame you see is labelled anew at once, the engine uses the values from the next frame on. "
+        "<b>Read</b> on the left how well ground and motion are found."
+    )
+    + heading("Keys")
+    + box(
+        f"{key('space')} play or pause<br>{key('→')} one frame<br>{key('F')} follow the sensor or look freely<br>"
+        f"{key('C')} next colouring<br>{key('Ctrl')} {key('K')} all commands"
+    )
+    + heading("Mouse")
+    + box("left drag: orbit · right drag: move · wheel: zoom<br>W A S D Q E: fly")
+    + heading("Colours")
+    + box(
+        "The amber wedge is where seeds are looked for: within α of straight down, on the M outermost scan lines. "
+        "The teal disc is the plane they gave; points nearer to it than σ · range are ground."
+    )
+)
+
+_WELCOME: Final = (
+    "Press <b>Play</b> or " + key("space") + " to map it; " + key("→") + " goes one frame. Then move the sliders below."
+)
+
+
+def status(snapshot: Snapshot) -> tuple[str, str]:
+    """What is going on in a word or two, and its colour."""
+    transport, result = snapshot.transport, snapshot.result
+    if not snapshot.engine_alive:
+        return "engine stopped", BAD
+    if snapshot.progress is not None:
+        return "busy", WARN
+    if snapshot.recording is None:
+        return "no recording", QUIET
+    if result is not None and result.status is FrameStatus.LOST:
+        return "lost", BAD
+    if transport.finished:
+        return "finished", QUIET
+    if result is not None and result.status is FrameStatus.INITIALISING:
+        return "initialising", WARN
+    return ("playing", GOOD) if transport.playing else ("paused", QUIET)
+
+
+def title(snapshot: Snapshot) -> str:
+    """The recording's name, the status, the doctor's verdicts and, before the first frame, what to do."""
+    text, colour = status(snapshot)
+    recording = snapshot.recording
+    name = escape(recording.path.name) if recording else "hemislam"
+    parts = [f'<div class="hs-row"><span class="hs-title">{name}</span>{chip(text, colour)}</div>']
+    if not snapshot.engine_alive:
+        parts.append("The engine's process has ended; it is started again.")
+    elif recording is None and snapshot.progress is None:
+        parts.append("Maps what a handheld hemispherical LiDAR saw. Open a recording under <b>Files</b> below.")
+    elif recording is not None:
+        parts.append(f"<div>{verdicts(recording.findings)}</div>")
+        if snapshot.transport.frame < 0 and snapshot.progress is None:
+            parts.append(f'<div style="margin-top:6px">{_WELCOME}</div>')
+    return box(*parts)
+
+
+class HeaderPanel:
+    """Title, status and, while something takes long, what that is and how far it got."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._title = gui.add_html("")
+        self._work = gui.add_html("", visible=False)
+        self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
+
+    def draw(self, snapshot: Snapshot) -> None:
+        self._title.content = title(snapshot)
+        progress = snapshot.progress
+        self._work.visible = self._bar.visible = progress is not None
+        if progress is not None:
+            known = bool(np.isfinite(progress.fraction))
+            percent = 100 * min(max(progress.fraction, 0.0), 1.0) if known else 100.0
+            self._work.content = box(escape(progress.title) + (f" · {percent:.0f} %" if known else " …"))
+            self._bar.value = percent  # type: ignore[misc]  # mypy overlooks viser's setter

@@ -1,0 +1,230 @@
+"""The parameter panel, generated from the one declaration in `app.slam.params`.
+
+Browsers and the engine may both change a value. What a user set is sent as a command; what the
+snapshot says flows back, except into a control that was touched a moment ago: otherwise the
+snapshot's older value would pull the slider from under the hand that moves it.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import viser
+
+from app.server.protocol import Command, LoadParams, Restart, SetParams, Snapshot
+from app.slam.params import Effect, Leaf, Params, leaves
+from app.ui.html import box
+from app.ui.widgets import by_user, show
+
+PRIMARY: Final = ("ground.scan_lines", "ground.alpha", "ground.sigma", "ground.voxel_size")
+"""The paper's sliders, above all others."""
+
+MARK: Final[dict[Effect, str]] = {"now": "", "frame": " ▸", "restart": " ↻"}
+_TYPING_S: Final = 0.5
+"""A typed value is sent when the keys have rested for so long: "0.05" begins with "0"."""
+_HOLD_S: Final = 1.0
+"""A control that was touched shows what the user set for so long, whatever older snapshots say."""
+
+TITLES: Final = {
+    "recording": "Recording",
+    "sensor": "Sensor",
+    "ground": "Ground, more",
+    "scan": "Scan voxel",
+    "imu": "IMU",
+    "filter": "Filter",
+    "map": "Local map",
+    "keyframe": "Keyframes",
+}
+
+Control = (
+    viser.GuiSliderHandle[Any]
+    | viser.GuiNumberHandle[Any]
+    | viser.GuiCheckboxHandle
+    | viser.GuiDropdownHandle[str]
+    | viser.GuiTextHandle
+    | viser.GuiVector3Handle
+)
+
+
+def label(leaf: Leaf) -> str:
+    """Symbol or name, unit, and the mark of when a change takes effect."""
+    name = leaf.name.replace("_", " ")
+    if leaf.path in PRIMARY:
+        name = leaf.symbol if leaf.symbol == "voxel" else f"{leaf.symbol} {name if leaf.symbol == 'M' else ''}".strip()
+    unit = {"deg": "°"}.get(leaf.unit, leaf.unit)
+    return f"{name} ({unit}){MARK[leaf.effect]}" if unit else f"{name}{MARK[leaf.effect]}"
+
+
+def add_control(gui: viser.GuiApi, leaf: Leaf, value: Any) -> Control:
+    """The widget that fits a parameter's type and range."""
+    text, hint = label(leaf), leaf.help
+    if leaf.choices:
+        return gui.add_dropdown(text, leaf.choices, initial_value=value, hint=hint)
+    if isinstance(leaf.default, bool):
+        return gui.add_checkbox(text, value, hint=hint)
+    if isinstance(leaf.default, str):
+        return gui.add_text(text, value, hint=hint)
+    if isinstance(leaf.default, tuple):
+        return gui.add_vector3(text, value, step=leaf.step, hint=hint)
+    kind = type(leaf.default)
+    low, high, step = (None if limit is None else kind(limit) for limit in (leaf.minimum, leaf.maximum, leaf.step))
+    if leaf.path in PRIMARY and low is not None and high is not None and step is not None:
+        return gui.add_slider(text, low, high, step, value, hint=hint)
+    return gui.add_number(text, value, min=low, max=high, step=step, hint=hint)
+
+
+@dataclass(slots=True)
+class _Edit:
+    """A value that a user set, when that was, and whether the engine was told."""
+
+    value: Any
+    at: float
+    sent: bool
+
+
+class ParameterPanel:
+    """Controls for every parameter; `tick` sends what was typed and takes in what the snapshot says.
+
+    Args:
+        send: enqueues a command for the engine.
+        now: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        params: Params,
+        send: Callable[[Command], None],
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._gui = gui
+        self._send = send
+        self._now = now
+        self._edits: dict[str, _Edit] = {}
+        self._controls: dict[str, Control] = {}
+        self._resets: dict[str, viser.GuiButtonGroupHandle] = {}
+        self._sections: dict[str, dict[str, Leaf]] = {}
+        for leaf in leaves():
+            group = "primary" if leaf.path in PRIMARY else leaf.section
+            self._sections.setdefault(group, {})[leaf.name] = leaf
+        self._pending = gui.add_html("", visible=False)
+        self._restart = gui.add_button("Restart now", icon=viser.Icon.REFRESH, color="orange", visible=False)
+        self._restart.on_click(lambda _: self._send(Restart()))
+        for path in PRIMARY:
+            self._add(self._sections["primary"][path.partition(".")[2]], params)
+        self._add_reset("primary")
+        for section in Params.model_fields:
+            with gui.add_folder(TITLES.get(section, section.title()), expand_by_default=False):
+                for leaf in self._sections[section].values():
+                    self._add(leaf, params)
+                self._add_reset(section)
+        gui.add_html(box('<span class="hs-quiet">▸ acts from the next frame · ↻ acts on restart</span>'))
+
+    def tick(self, snapshot: Snapshot) -> None:
+        """Called by the drawing thread, often: sends typed values that have rested, shows the snapshot's."""
+        now = self._now()
+        for path, edit in list(self._edits.items()):
+            if not edit.sent and now - edit.at >= _TYPING_S:
+                edit.sent = True
+                self._send(SetParams({path: edit.value}))
+            elif edit.sent and now - edit.at >= _HOLD_S and snapshot.progress is None:
+                self._edits.pop(path, None)
+        for path, control in self._controls.items():
+            value = snapshot.params.value(path)
+            if path not in self._edits:
+                show(control, value)
+        self._show_resets(snapshot.params)
+        self._show_pending(snapshot.pending_restart)
+
+    def fit_lines(self, lines: int) -> None:
+        """End the slider of M at the number of scan lines that the open recording has."""
+        slider = self._controls["ground.scan_lines"]
+        if isinstance(slider, viser.GuiSliderHandle) and lines >= slider.value:
+            slider.max = lines
+
+    def _add(self, leaf: Leaf, params: Params) -> None:
+        control = add_control(self._gui, leaf, params.value(leaf.path))
+        typed = not isinstance(control, viser.GuiSliderHandle | viser.GuiCheckboxHandle | viser.GuiDropdownHandle)
+        self._controls[leaf.path] = control
+
+        def changed(value: Any, _: viser.ClientHandle) -> None:
+            self._edits[leaf.path] = _Edit(value, self._now(), sent=not typed)
+            if not typed:
+                self._send(SetParams({leaf.path: value}))
+
+        control.on_update(by_user(changed))
+
+    def _add_reset(self, group: str) -> None:
+        """A button for every parameter of the group that is not at its default, and one for all."""
+        buttons = self._gui.add_button_group("default", ("all",), visible=False, hint="Back to the default value.")
+        self._resets[group] = buttons
+
+        def reset(chosen: str, _: viser.ClientHandle) -> None:
+            of_group = self._sections[group]
+            leafs = of_group.values() if chosen == "all" else [of_group[n] for n in of_group if _short(n) == chosen]
+            values = {leaf.path: leaf.default for leaf in leafs}
+            for path in values:
+                self._edits.pop(path, None)
+            self._send(SetParams(values))
+
+        buttons.on_click(by_user(reset))
+
+    def _show_resets(self, params: Params) -> None:
+        for group, buttons in self._resets.items():
+            changed = [
+                _short(leaf.name) for leaf in self._sections[group].values() if params.value(leaf.path) != leaf.default
+            ]
+            options = (*changed, "all") if len(changed) != 1 else (changed[0],)
+            buttons.visible = bool(changed)
+            if changed and buttons.options != options:
+                buttons.options = options
+
+    def _show_pending(self, pending: tuple[str, ...]) -> None:
+        self._pending.visible = self._restart.visible = bool(pending)
+        if pending:
+            names = ", ".join(f"<code>{path}</code>" for path in pending)
+            self._pending.content = box(f"Waiting for a restart: {names}")
+
+
+def _short(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def add_yaml_buttons(gui: viser.GuiApi, params: Callable[[], Params], send: Callable[[Command], None]) -> None:
+    """Buttons that show the parameters as YAML to copy or download, and that take YAML in."""
+    copy = gui.add_button("Copy as YAML", icon=viser.Icon.COPY, color="gray")
+    load = gui.add_button("Load YAML", icon=viser.Icon.CLIPBOARD_TEXT, color="gray")
+    copy.on_click(by_user(lambda _, client: _show_yaml(client, params())))
+    load.on_click(by_user(lambda _, client: _load_yaml(client, send)))
+
+
+def _show_yaml(client: viser.ClientHandle, params: Params) -> None:
+    text = params.to_yaml()
+    with client.gui.add_modal("Parameters as YAML") as modal:
+        client.gui.add_html(box("Select all and copy, or download; <code>hemislam --config FILE</code> reads it."))
+        client.gui.add_text("yaml", text, multiline=True)
+        download = client.gui.add_button("Download", icon=viser.Icon.DOWNLOAD)
+        close = client.gui.add_button("Close", color="gray")
+    download.on_click(lambda _: client.send_file_download("hemislam.params.yaml", text.encode(), save_immediately=True))
+    close.on_click(lambda _: modal.close())
+
+
+def _load_yaml(client: viser.ClientHandle, send: Callable[[Command], None]) -> None:
+    with client.gui.add_modal("Load parameters") as modal:
+        client.gui.add_html(box("Paste YAML or choose a file. Names that are left out go back to their defaults."))
+        text = client.gui.add_text("yaml", "", multiline=True)
+        upload = client.gui.add_upload_button("Choose a file", icon=viser.Icon.UPLOAD, mime_type=".yaml,.yml,text/yaml")
+        apply = client.gui.add_button("Apply", icon=viser.Icon.CHECK)
+        cancel = client.gui.add_button("Cancel", color="gray")
+
+    def uploaded(_: Any) -> None:
+        show(text, upload.value.content.decode("utf-8", errors="replace"))
+
+    def applied(_: Any) -> None:
+        send(LoadParams(text.value))
+        modal.close()
+
+    upload.on_upload(uploaded)
+    apply.on_click(applied)
+    cancel.on_click(lambda _: modal.close())

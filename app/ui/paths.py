@@ -1,0 +1,80 @@
+"""Lines over the map: where the sensor walked, and where the truth says it did."""
+
+from typing import Final
+
+import numpy as np
+import viser
+
+from app.slam.types import F32, F64
+from app.ui.geometry import wxyz
+
+PATH_COLOUR: Final = (255, 92, 141)
+TRUTH_COLOUR: Final = (240, 244, 250)
+BLOCK: Final = 256
+"""Segments per node: as the walk goes on, only the newest node is sent again."""
+_MOST_TRUTH_POINTS: Final = 4000
+
+
+def segments(positions: F64) -> F32:
+    """(n, 3) positions -> (n-1, 2, 3) segments between neighbours."""
+    return np.stack((positions[:-1], positions[1:]), axis=1).astype(np.float32)
+
+
+class Trajectory:
+    """The estimated path, in blocks of at most `BLOCK` segments below the node `root`."""
+
+    def __init__(self, scene: viser.SceneApi, root: str) -> None:
+        self._scene = scene
+        self._root = root
+        self._blocks: list[viser.LineSegmentsHandle] = []
+        self._drawn: F64 = np.empty((0, 3))
+
+    def clear(self) -> None:
+        """Take the path away; its names are used again."""
+        for block in self._blocks:
+            block.remove()
+        self._blocks.clear()
+        self._drawn = np.empty((0, 3))
+
+    def draw(self, positions: F64, visible: bool) -> None:
+        """Draw (n, 3) positions, sending the blocks that differ from what is drawn."""
+        for index, first in enumerate(range(0, len(positions) - 1, BLOCK)):
+            part = positions[first : first + BLOCK + 1]
+            if index == len(self._blocks):
+                self._blocks.append(
+                    self._scene.add_line_segments(
+                        f"{self._root}/{index}", segments(part), PATH_COLOUR, thickness=3.0, thickness_units="screen"
+                    )
+                )
+            elif not np.array_equal(part, self._drawn[first : first + BLOCK + 1]):
+                self._blocks[index].points = segments(part)
+            self._blocks[index].visible = visible
+        self._drawn = positions
+
+
+class Truth:
+    """The true path: sent once in the truth's own frame and laid over the map by the node's pose."""
+
+    def __init__(self, scene: viser.SceneApi, root: str) -> None:
+        self._scene = scene
+        self._root = root
+        self._line: viser.LineSegmentsHandle | None = None
+
+    def load(self, positions: F64 | None) -> None:
+        """Replace the line; None or fewer than two (m, 3) positions take it away."""
+        if self._line is not None:
+            self._line.remove()
+            self._line = None
+        if positions is not None and len(positions) >= 2:
+            some = positions[:: max(1, len(positions) // _MOST_TRUTH_POINTS)]
+            self._line = self._scene.add_line_segments(
+                self._root, segments(some), TRUTH_COLOUR, thickness=1.5, thickness_units="screen", visible=False
+            )
+
+    def draw(self, T_map_truth: F64 | None, visible: bool) -> None:
+        """Show the line where `T_map_truth` (4, 4) lays it; hidden while that is unknown."""
+        if self._line is None:
+            return
+        self._line.visible = visible and T_map_truth is not None
+        if T_map_truth is not None:
+            self._line.wxyz, self._line.position = wxyz(T_map_truth[:3, :3]), T_map_truth[:3, 3]

@@ -1,0 +1,119 @@
+"""Play, pause, step, speed and the time slider; the same by keyboard."""
+
+import math
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Any, Final
+
+import viser
+
+from app.server.protocol import Command, Pause, Play, Restart, Seek, SetSpeed, Snapshot, StepFrame
+from app.ui.html import box, number
+from app.ui.widgets import by_user, show
+
+SPEEDS: Final = {
+    "0.1×": 0.1,
+    "0.25×": 0.25,
+    "0.5×": 0.5,
+    "1×": 1.0,
+    "2×": 2.0,
+    "5×": 5.0,
+    "10×": 10.0,
+    "as fast as it can": math.inf,
+}
+_STEP, _RESTART = "step ▸", "from start ↺"
+_DRAG_REST_S: Final = 0.2
+"""The slider seeks when the hand has rested for so long; seeking back starts from the beginning."""
+_SEEK_HOLD_S: Final = 1.0
+
+
+class TransportPanel:
+    """The controls; `tick` seeks to where the slider was dragged and shows where the engine is.
+
+    Args:
+        send: enqueues a command. snapshot: the newest one. now: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        send: Callable[[Command], None],
+        snapshot: Callable[[], Snapshot],
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._send = send
+        self._snapshot = snapshot
+        self._now = now
+        self._dragged: tuple[int, float] | None = None
+        self._sought: tuple[int, float] | None = None
+        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY_FILLED, hint="space")
+        self._frames = gui.add_button_group("frame", (_STEP, _RESTART), hint="→ steps one frame.")
+        self._slider = gui.add_slider("time (frame)", 0, 1, 1, 0, hint="Drag to go to a frame.")
+        self._where = gui.add_html("")
+        self._speed = gui.add_dropdown(
+            "speed", tuple(SPEEDS), initial_value="1×", hint="Times real time; the engine never skips a frame."
+        )
+        self._play.on_click(lambda _: self.toggle())
+        self._frames.on_click(by_user(lambda chosen, _: send(StepFrame() if chosen == _STEP else Restart())))
+        self._speed.on_update(by_user(lambda chosen, _: send(SetSpeed(SPEEDS[chosen]))))
+        self._slider.on_update(by_user(self._drag))
+        gui.add_command("Play or pause", hotkey="space").on_trigger(lambda _: self.toggle())
+        gui.add_command("Step one frame", hotkey="arrowright").on_trigger(lambda _: send(StepFrame()))
+
+    def toggle(self) -> None:
+        """Play, or pause what plays."""
+        self._send(Pause() if self._snapshot().transport.playing else Play())
+
+    def tick(self, snapshot: Snapshot) -> None:
+        """Called by the drawing thread, often."""
+        transport, now = snapshot.transport, self._now()
+        dragged = self._dragged
+        if dragged is not None and now - dragged[1] >= _DRAG_REST_S:
+            self._dragged, self._sought = None, (dragged[0], now)
+            self._send(Seek(dragged[0]))
+        if self._sought is not None:
+            target, since = self._sought
+            if transport.frame == target or (now - since > _SEEK_HOLD_S and snapshot.progress is None):
+                self._sought = None
+        last = max(snapshot.recording.frames - 1, 1) if snapshot.recording else 1
+        if self._slider.max != last:
+            self._slider.max = last
+        if self._dragged is None and self._sought is None:
+            show(self._slider, min(max(transport.frame, 0), last))
+        self._slider.disabled = self._play.disabled = snapshot.recording is None
+        playing = transport.playing
+        if (self._play.label == "Pause") != playing:
+            self._play.label = "Pause" if playing else "Play"
+            self._play.icon = viser.Icon.PLAYER_PAUSE_FILLED if playing else viser.Icon.PLAYER_PLAY_FILLED
+        show(self._speed, speed_name(transport.speed))
+        self._where.content = where(snapshot)
+
+    def _drag(self, frame: int, _: Any) -> None:
+        self._dragged = (frame, self._now())
+
+
+def speed_name(factor: float) -> str:
+    """The offered speed that is nearest to `factor`."""
+    if math.isinf(factor):
+        return "as fast as it can"
+    finite = {name: value for name, value in SPEEDS.items() if math.isfinite(value)}
+    return min(finite, key=lambda name: abs(math.log(finite[name] / max(factor, 1e-3))))
+
+
+def where(snapshot: Snapshot) -> str:
+    """Frame, seconds into the recording, and the stamp in UTC."""
+    recording, transport = snapshot.recording, snapshot.transport
+    if recording is None:
+        return box('<span class="hs-quiet">No recording is open.</span>')
+    if transport.frame < 0:
+        return box(f'<span class="hs-quiet">{recording.frames:,} frames, {recording.duration_s:.1f} s</span>')
+    seconds = (transport.stamp_ns - recording.start_ns) * 1e-9
+    clock = datetime.fromtimestamp(transport.stamp_ns // 1_000_000_000, UTC)
+    millis = transport.stamp_ns // 1_000_000 % 1000
+    return box(
+        f'<div class="hs-row"><span>frame <b>{transport.frame:,}</b> of {recording.frames:,}</span>'
+        f"<span><b>{number(seconds)}</b> of {number(recording.duration_s, 1)} s</span></div>",
+        f'<div class="hs-row hs-note"><span>{clock:%Y-%m-%d %H:%M:%S}.{millis:03d} UTC</span>'
+        f"<span>{number(transport.frames_per_second, 1)} frames/s</span></div>",
+    )

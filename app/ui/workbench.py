@@ -1,0 +1,157 @@
+"""The page of a session: puts the panels together and draws snapshots into them.
+
+Callbacks of the page only enqueue commands for the engine. One thread draws: it waits for snapshots
+and sends what differs between the last one drawn and the newest. Everything is drawn on the server's
+scene and panels, which viser keeps for every browser, those that connect or reload later included.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, Protocol
+
+import viser
+
+from app.server.protocol import Command, Snapshot
+from app.ui.appearance import AppearancePanel
+from app.ui.doctor import DoctorPanel
+from app.ui.files import FilesPanel, Folders
+from app.ui.header import HELP, HeaderPanel
+from app.ui.html import ACCENT, STYLE, heading
+from app.ui.notices import NoticePanel
+from app.ui.parameters import ParameterPanel, add_yaml_buttons
+from app.ui.readouts import ReadoutPanel
+from app.ui.scene import Scene
+from app.ui.transport import TransportPanel
+from app.ui.view import View
+
+log = logging.getLogger(__name__)
+
+_SCENE_PERIOD_S: Final = 1 / 15
+_PANEL_PERIOD_S: Final = 1 / 4
+_TICK_S: Final = 0.04
+"""How long the drawing thread waits for a snapshot before it looks at the page's own controls."""
+
+
+class EngineClient(Protocol):
+    """The engine's process as the page knows it (`app.server.worker.EngineProcess`)."""
+
+    @property
+    def snapshot(self) -> Snapshot: ...
+    def send(self, command: Command) -> None: ...
+    def wait(self, after_revision: int, timeout: float) -> Snapshot:
+        """The newest snapshot, as soon as its revision is greater or the time (s) is up."""
+        ...
+
+
+class Workbench:
+    """Builds the page on `server`; `start` begins to draw, `close` ends it.
+
+    Args:
+        server: whose page this is. engine: where snapshots come from and commands go.
+        folders: where recordings may be opened from. point_budget: most map points in the page.
+        results: folder below which results are saved.
+        now: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        engine: EngineClient,
+        folders: Folders,
+        point_budget: int = 3_000_000,
+        *,
+        results: Path = Path("results"),
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._server = server
+        self._engine = engine
+        self._budget = point_budget
+        self._now = now
+        gui = server.gui
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=ACCENT)
+        gui.set_panel_label("hemislam")
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(340)
+        first = engine.snapshot
+        self._scene = Scene(server, point_budget)
+
+        gui.add_html(STYLE)
+        self._header = HeaderPanel(gui)
+        self._transport = TransportPanel(gui, engine.send, lambda: engine.snapshot)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Tune", viser.Icon.ADJUSTMENTS_HORIZONTAL):
+            self._parameters = ParameterPanel(gui, first.params, engine.send)
+            add_yaml_buttons(gui, lambda: engine.snapshot.params, engine.send)
+        with tabs.add_tab("View", viser.Icon.EYE):
+            self._appearance = AppearancePanel(gui)
+        with tabs.add_tab("Files", viser.Icon.FOLDER):
+            self._files = FilesPanel(gui, folders, results, engine.send, lambda: engine.snapshot)
+        with tabs.add_tab("Help", viser.Icon.HELP):
+            gui.add_html(HELP)
+
+        left = gui.add_panel()
+        with left.add_tab("Readouts", viser.Icon.CHART_LINE):
+            self._readouts = ReadoutPanel(gui)
+        with left.add_tab("Recording", viser.Icon.STETHOSCOPE):
+            gui.add_html(heading("The recording doctor"))
+            self._doctor = DoctorPanel(gui)
+            gui.add_html(heading("Log"))
+            self._notices = NoticePanel(server)
+        left.dock_left()
+        left.set_width(300)
+
+        self._drawn: Snapshot | None = None
+        self._drawn_view: View | None = None
+        self._scene_drawn_at = self._panels_drawn_at = -1e9
+        self._panels_due = True
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="workbench", daemon=True)
+
+    def start(self) -> None:
+        """Begin to draw."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop drawing; the page stays as it is until its server stops."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+
+    def _run(self) -> None:
+        revision = -1
+        while not self._stop.is_set():
+            snapshot = self._engine.wait(revision, _TICK_S)
+            revision = snapshot.revision
+            try:
+                self.draw(snapshot)
+            except Exception:  # the page must outlive one snapshot that can not be drawn
+                log.exception("Snapshot %d could not be drawn", snapshot.revision)
+                time.sleep(_PANEL_PERIOD_S)
+
+    def draw(self, current: Snapshot) -> None:
+        """Bring the page up to `current`: at once what a user waits for, the rest no faster than one can see."""
+        now, view, drawn = self._now(), self._appearance.view, self._drawn
+        self._transport.tick(current)
+        self._parameters.tick(current)
+        self._notices.draw(current)
+        self._header.draw(current)
+        news = drawn is None or drawn.revision != current.revision
+        relabelled = drawn is not None and drawn.params != current.params
+        due = now - self._scene_drawn_at >= _SCENE_PERIOD_S
+        if (news and (due or relabelled)) or view != self._drawn_view:
+            if current.result is not None and (drawn is None or drawn.result is None):
+                self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
+            self._scene.draw(drawn, current, view, self._drawn_view)
+            self._drawn, self._drawn_view = current, view
+            self._scene_drawn_at = now
+            self._panels_due = True
+        if self._panels_due and now - self._panels_drawn_at >= _PANEL_PERIOD_S:
+            self._panels_due = False
+            self._panels_drawn_at = now
+            self._readouts.draw(current)
+            self._doctor.draw(current)
+            self._files.draw(current)
+            self._appearance.draw(view, self._scene.limits(view.colour_by), self._scene.points, self._budget)
