@@ -1,0 +1,90 @@
+"""The part of the disk that the page may see."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from app.sensors.source import SUFFIXES
+from app.slam.errors import HemislamError
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A line of the file browser: a recording that can be opened, or a folder to look into."""
+
+    path: Path
+    is_recording: bool
+    size: int = 0
+    """Bytes, of a recording."""
+
+
+class Folders:
+    """Folders given on the command line. Nothing outside of them is listed or opened, whatever links say.
+
+    Raises:
+        HemislamError: one of them is not a folder.
+    """
+
+    def __init__(self, roots: Iterable[Path]) -> None:
+        self.roots = tuple(dict.fromkeys(root.resolve() for root in roots))
+        for root in self.roots:
+            if not root.is_dir():
+                raise HemislamError(f"{root} is not a folder; give a folder that holds recordings.")
+
+    def inside(self, path: Path | str) -> Path:
+        """The real path behind `path`, relative to the first folder if it is not absolute.
+
+        Raises:
+            HemislamError: it does not exist, or lies outside. Both in the same words, so that the
+                answer tells nothing about what is outside.
+        """
+        try:
+            real = (self.roots[0] / path if self.roots else Path(path)).resolve(strict=True)
+        except (OSError, RuntimeError, ValueError):
+            real = None
+        if real is None or not self._holds(real):
+            raise HemislamError(
+                f"There is no {path} in the folders that hemislam was started for; start it with the folder given."
+            )
+        return real
+
+    def listing(self, folder: Path | str) -> list[Entry]:
+        """What is in a folder inside: first its folders, then its recordings, each by name.
+
+        Raises:
+            HemislamError: as `inside`, or it can not be read.
+        """
+        place = self.inside(folder)
+        try:
+            seen = [path for path in place.iterdir() if not path.name.startswith(".") and self._holds(path.resolve())]
+            found = [entry for path in seen if (entry := _entry(path))]
+        except OSError as error:
+            raise HemislamError(f"The folder {place} can not be read: {error.strerror}.") from None
+        return sorted(found, key=lambda entry: (entry.is_recording, entry.path.name.casefold()))
+
+    def recordings(self) -> list[Path]:
+        """All recordings in all folders and theirs, by path."""
+        found: list[Path] = []
+        waiting = list(self.roots)
+        seen = set(waiting)
+        while waiting:
+            for entry in self.listing(waiting.pop()):
+                if entry.is_recording:
+                    found.append(entry.path)
+                elif (real := entry.path.resolve()) not in seen:
+                    seen.add(real)
+                    waiting.append(real)
+        return sorted(set(found))
+
+    def _holds(self, real: Path) -> bool:
+        return any(real.is_relative_to(root) for root in self.roots)
+
+
+def _entry(path: Path) -> Entry | None:
+    if path.is_dir():
+        is_recording = (path / "metadata.yaml").is_file()
+        size = sum(file.stat().st_size for file in path.iterdir() if file.is_file()) if is_recording else 0
+        return Entry(path, is_recording, size)
+    if path.suffix in SUFFIXES and path.is_file():
+        return Entry(path, True, path.stat().st_size)
+    return None

@@ -1,0 +1,146 @@
+"""The session's state as the REST interface sends it."""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, Field
+from scipy.spatial.transform import Rotation
+
+from app.server.protocol import OpenedRecording, Snapshot
+from app.slam.types import StepResult
+
+Speed = Annotated[float, Field(ge=0.1)] | Literal["max"]
+"""Times real time; JSON knows no infinity."""
+
+
+class FindingView(BaseModel):
+    subject: str
+    verdict: str
+    text: str
+    option: str
+
+
+class RecordingView(BaseModel):
+    path: str
+    duration_s: float
+    frames: int
+    findings: list[FindingView]
+
+
+class TransportView(BaseModel):
+    playing: bool
+    speed: Speed
+    frame: int
+    stamp_ns: int
+    finished: bool
+    frames_per_second: float
+    dropped: int
+
+
+class FrameView(BaseModel):
+    """The newest frame, without its points."""
+
+    index: int
+    stamp_ns: int
+    status: str
+    position: list[float] = Field(description="Of the IMU in the map, m.")
+    quaternion: list[float] = Field(description="x, y, z, w: from the IMU's axes to the map's.")
+    velocity: list[float] = Field(description="m/s, odometry frame.")
+    ground_found: bool
+    ground_reason: str
+    planarity: float | None
+    seeds: int
+    ground_share: float | None
+    inliers: int
+    residual_rms: float | None
+    degenerate: bool
+    timings_ms: dict[str, float]
+    distance: float | None = Field(description="Walked, m.")
+    error: float | None = Field(description="To the truth, aligned to the walk so far, m.")
+
+
+class NoticeView(BaseModel):
+    number: int
+    level: str
+    text: str
+
+
+class ProgressView(BaseModel):
+    title: str
+    fraction: float | None
+
+
+class StateView(BaseModel):
+    session: int
+    revision: int
+    engine_alive: bool
+    recording: RecordingView | None
+    transport: TransportView
+    frame: FrameView | None
+    keyframes: int
+    progress: ProgressView | None
+    pending_restart: list[str]
+    notices: list[NoticeView]
+
+
+def state_view(snapshot: Snapshot) -> StateView:
+    recording, transport, progress = snapshot.recording, snapshot.transport, snapshot.progress
+    return StateView(
+        session=snapshot.session,
+        revision=snapshot.revision,
+        engine_alive=snapshot.engine_alive,
+        recording=_recording(recording) if recording else None,
+        transport=TransportView(
+            playing=transport.playing,
+            speed="max" if math.isinf(transport.speed) else transport.speed,
+            frame=transport.frame,
+            stamp_ns=transport.stamp_ns,
+            finished=transport.finished,
+            frames_per_second=transport.frames_per_second,
+            dropped=transport.dropped,
+        ),
+        frame=_frame(snapshot.result, snapshot) if snapshot.result else None,
+        keyframes=len(snapshot.chunks),
+        progress=ProgressView(title=progress.title, fraction=_finite(progress.fraction)) if progress else None,
+        pending_restart=list(snapshot.pending_restart),
+        notices=[NoticeView(number=n.number, level=n.level, text=n.text) for n in snapshot.notices],
+    )
+
+
+def _recording(recording: OpenedRecording) -> RecordingView:
+    return RecordingView(
+        path=str(recording.path),
+        duration_s=recording.duration_s,
+        frames=recording.frames,
+        findings=[
+            FindingView(subject=f.subject, verdict=f.verdict, text=f.text, option=f.option) for f in recording.findings
+        ],
+    )
+
+
+def _frame(result: StepResult, snapshot: Snapshot) -> FrameView:
+    T, ground, registration = result.T_map_imu, result.ground, result.registration
+    newest = {name: column[-1] for name, column in snapshot.series.items() if len(column)}
+    return FrameView(
+        index=result.index,
+        stamp_ns=result.stamp_ns,
+        status=result.status.value,
+        position=T[:3, 3].tolist(),
+        quaternion=Rotation.from_matrix(T[:3, :3]).as_quat().tolist(),
+        velocity=result.state.v_odom_imu.tolist(),
+        ground_found=ground.found,
+        ground_reason=ground.reason,
+        planarity=_finite(ground.planarity),
+        seeds=ground.seeds,
+        ground_share=_finite(ground.share),
+        inliers=registration.inliers,
+        residual_rms=_finite(registration.residual_rms),
+        degenerate=registration.degenerate,
+        timings_ms=result.timings_ms,
+        distance=_finite(newest.get("distance", math.nan)),
+        error=_finite(newest.get("error_m", math.nan)),
+    )
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

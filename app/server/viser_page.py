@@ -1,0 +1,124 @@
+"""viser behind our own port: its server on a loopback port that only we can use, its page, and the bridge."""
+
+import asyncio
+import contextlib
+import io
+import secrets
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import viser
+import viser._messages
+import websockets.asyncio.server
+from starlette.websockets import WebSocket, WebSocketDisconnect
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.typing import Subprotocol
+
+KEY_HEADER = "X-Hemislam-Key"
+
+
+@dataclass(frozen=True, slots=True)
+class Viser:
+    """A running viser server and what is needed to reach it."""
+
+    server: viser.ViserServer
+    key: str
+
+    @property
+    def url(self) -> str:
+        return f"ws://127.0.0.1:{self.server.get_port()}/"
+
+    def stop(self) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):  # it has its own words for that
+            self.server.stop()
+
+
+def start_viser() -> Viser:
+    """Start viser on a free loopback port that answers to nobody but our bridge.
+
+    By itself viser accepts any Origin, so any web page that the user has open could drive it, and
+    any of them could ask for the public share tunnel.
+    """
+    key = secrets.token_urlsafe(24)
+    with _keyed(key), contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server._websock_server.unregister_handler(viser._messages.ShareUrlRequest)
+    server._websock_server.unregister_handler(viser._messages.ShareUrlDisconnect)
+    return Viser(server, key)
+
+
+@contextlib.contextmanager
+def _keyed(key: str) -> Iterator[None]:
+    """WebSocket servers started meanwhile refuse requests without the key, which no browser can send."""
+    serve = websockets.asyncio.server.serve
+
+    def keyed_serve(*args: Any, **kwargs: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            if not secrets.compare_digest("".join(request.headers.get_all(KEY_HEADER)), key):
+                return connection.respond(403, "Only hemislam itself talks to this port.\n")
+            return None
+
+        return serve(*args, **kwargs | {"process_request": check})
+
+    websockets.asyncio.server.serve = keyed_serve  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def page_html() -> str:
+    """viser's client: one file that holds everything."""
+    page = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    return page.read_text(encoding="utf-8").replace("<title>Viser</title>", "<title>hemislam</title>", 1)
+
+
+async def bridge(browser: WebSocket, target: Viser) -> None:
+    """Pass messages between a browser and viser until either leaves.
+
+    Each direction takes a message only when the one before was delivered, so a slow browser slows
+    viser's sending, and viser then sends it fewer, newer updates.
+    """
+    try:
+        upstream = await connect(
+            target.url,
+            subprotocols=[Subprotocol(name) for name in browser.scope["subprotocols"]] or None,
+            additional_headers={KEY_HEADER: target.key},
+            proxy=None,
+            compression=None,
+            max_size=None,
+            max_queue=2,
+            ping_interval=None,
+        )
+    except (OSError, InvalidHandshake, TimeoutError):
+        await browser.close(1013, "The page's server is not there.")
+        return
+    async with upstream:
+        await browser.accept(subprotocol=upstream.subprotocol)
+        ways = [asyncio.create_task(_up(browser, upstream)), asyncio.create_task(_down(browser, upstream))]
+        try:
+            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for way in ways:
+                way.cancel()
+            await asyncio.gather(*ways, return_exceptions=True)
+
+
+async def _up(browser: WebSocket, upstream: ClientConnection) -> None:
+    with contextlib.suppress(WebSocketDisconnect, ConnectionClosed):
+        while True:
+            await upstream.send(await browser.receive_bytes())
+
+
+async def _down(browser: WebSocket, upstream: ClientConnection) -> None:
+    with contextlib.suppress(WebSocketDisconnect):
+        try:
+            while True:
+                message = await upstream.recv(decode=False)
+                await browser.send_bytes(message)
+        except ConnectionClosed as closed:
+            code, reason = (closed.rcvd.code, closed.rcvd.reason) if closed.rcvd else (1001, "")
+            await browser.close(code if code not in (1005, 1006) else 1000, reason)

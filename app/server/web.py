@@ -1,0 +1,193 @@
+"""The one public port: viser's page, the bridge to it, and the REST interface."""
+
+import contextlib
+import errno
+import math
+import os
+import signal
+import socket
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Protocol
+
+import uvicorn
+import viser
+from fastapi import FastAPI, Request
+from fastapi.responses import HTMLResponse, JSONResponse
+from starlette.websockets import WebSocket
+from tqdm import tqdm
+
+from app import __version__
+from app.server.access import Access, Guard
+from app.server.api import make_router
+from app.server.folders import Folders
+from app.server.viser_page import Viser, bridge, page_html, start_viser
+from app.server.worker import EngineProcess, Setup
+from app.slam.errors import HemislamError
+
+
+class Page(Protocol):
+    """What draws the session into viser; `app.ui.workbench.Workbench`."""
+
+    def start(self) -> None: ...
+    def close(self) -> None: ...
+
+
+BuildPage = Callable[[viser.ViserServer, EngineProcess, Folders], Page]
+
+
+def make_app(engine: EngineProcess, folders: Folders, target: Viser, access: Access) -> FastAPI:
+    """Everything that is reachable from outside."""
+    app = FastAPI(
+        title="hemislam",
+        version=__version__,
+        openapi_url="/api/openapi.json",
+        docs_url=None,  # their pages load scripts from elsewhere
+        redoc_url=None,
+    )
+    app.add_middleware(Guard, access=access)
+    page = page_html()
+
+    @app.get("/", response_class=HTMLResponse, include_in_schema=False)
+    def index() -> str:
+        return page
+
+    @app.websocket("/")
+    async def messages(browser: WebSocket) -> None:
+        await bridge(browser, target)
+
+    @app.get("/healthz")
+    def health() -> dict[str, str]:
+        """Whether the server is there, and its engine with it."""
+        return {"status": "ok" if engine.snapshot.engine_alive else "engine down"}
+
+    @app.exception_handler(HemislamError)
+    def refused(request: Request, error: HemislamError) -> JSONResponse:
+        return JSONResponse({"detail": str(error)}, status_code=422)
+
+    app.include_router(make_router(engine, folders))
+    return app
+
+
+def run_server(
+    setup: Setup,
+    *,
+    folders: Folders,
+    build_page: BuildPage,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    open_browser: bool = True,
+    start_engine: Callable[[Setup], EngineProcess] = EngineProcess,
+) -> None:
+    """Serve the workbench until Ctrl-C or SIGTERM; then end the engine's process and everything else.
+
+    Args:
+        setup: what the engine starts with. folders: what the page may open.
+        build_page: makes the page.
+        host, port: to bind to; beyond loopback a token is made and is part of the printed link. Port 0: a free one.
+        open_browser: if there is a display to open one on.
+        start_engine: another one only in tests.
+
+    Raises:
+        HemislamError: the address can not be bound to.
+    """
+    listener = listen(host, port)
+    port = listener.getsockname()[1]
+    access = Access.on(host, port)
+    with contextlib.ExitStack() as cleanup:
+        cleanup.callback(listener.close)
+        engine = start_engine(setup)
+        cleanup.callback(engine.close)
+        target = start_viser()
+        cleanup.callback(target.stop)
+        page = build_page(target.server, engine, folders)
+        page.start()
+        cleanup.callback(page.close)
+        server = _Server(
+            uvicorn.Config(
+                make_app(engine, folders, target, access),
+                log_level="warning",
+                lifespan="off",
+                ws="websockets-sansio",
+                ws_per_message_deflate=False,
+                timeout_graceful_shutdown=1,
+                server_header=False,
+            )
+        )
+        address = link(host, access)
+        print(f"hemislam is at {address} (Ctrl-C ends it)", flush=True)
+        threading.Thread(target=show_compilation, args=(engine,), name="progress", daemon=True).start()
+        if open_browser and _has_display():
+            webbrowser.open(address)  # the listener holds the request until the server is up
+        server.run(sockets=[listener])
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket.
+
+    Raises:
+        HemislamError: the port is busy, or the address is not this machine's.
+    """
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except OSError:
+        raise HemislamError(f"{host} is no address of this machine; choose another one by --host.") from None
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    if os.name == "posix":  # elsewhere it would let two servers share the port
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind(address)
+        listener.listen(128)
+    except OSError as error:
+        listener.close()
+        if error.errno == errno.EADDRINUSE:
+            raise HemislamError(f"Port {port} is in use by another program; choose another one by --port.") from None
+        raise HemislamError(
+            f"The address {host}:{port} can not be used ({error.strerror}); choose another one by --host and --port."
+        ) from None
+    return listener
+
+
+def link(host: str, access: Access) -> str:
+    """The address to open, with the token if there is one."""
+    if host in ("0.0.0.0", "::", ""):
+        host = socket.gethostname()
+    name = f"[{host}]" if ":" in host else host
+    return f"http://{name}:{access.port}/" + (f"?token={access.token}" if access.token else "")
+
+
+def show_compilation(engine: EngineProcess) -> None:
+    """A progress bar in the terminal while the engine compiles; it takes a minute on a first start."""
+    with tqdm(total=1.0, disable=None, leave=False, bar_format="{desc}: {percentage:3.0f}% |{bar}|") as bar:
+        snapshot = engine.snapshot
+        while snapshot.engine_alive and (snapshot.revision == 0 or snapshot.progress is not None):
+            if snapshot.progress is not None and math.isfinite(snapshot.progress.fraction):
+                bar.set_description_str(snapshot.progress.title)
+                bar.update(snapshot.progress.fraction - bar.n)
+            snapshot = engine.wait(snapshot.revision, timeout=0.5)
+
+
+def _has_display() -> bool:
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+class _Server(uvicorn.Server):
+    """Ends on SIGINT and SIGTERM, and leaves it there: uvicorn would raise the signal again at the end."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        def end(number: int, frame: FrameType | None) -> None:
+            self.force_exit = self.should_exit
+            self.should_exit = True
+
+        before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
