@@ -1,0 +1,90 @@
+"""`hemislam serve`: the workbench in the browser."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic, Preset, Start, Truth, resolve
+
+
+def serve(
+    recording: Annotated[
+        Path | None,
+        typer.Argument(metavar="RECORDING", help="What to open first; another one can be chosen in the page."),
+    ] = None,
+    host: Annotated[str, typer.Option("--host", metavar="ADDRESS", help="0.0.0.0: all, by a link with a token.")] = (
+        "127.0.0.1"
+    ),
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, metavar="PORT", help="0: a free one.")] = 8080,
+    folder: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--folder",
+            metavar="DIR",
+            help="The page may open recordings below DIR. Repeatable; else the recording's folder or the present one.",
+        ),
+    ] = None,
+    point_budget: Annotated[
+        int, typer.Option("--point-budget", min=10_000, metavar="N", help="Most map points that the page draws.")
+    ] = 3_000_000,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the address.")] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Wait for Play instead of starting at once.")] = False,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Assignments = None,
+    lidar_topic: LidarTopic = None,
+    imu_topic: ImuTopic = None,
+    start: Start = 0.0,
+    duration: Duration = None,
+    truth: Truth = None,
+) -> None:
+    """Open the workbench in the browser.
+
+    Replays a recording and shows the map as it grows; every parameter can be changed meanwhile.
+    In the page, space plays and pauses, the right arrow steps one frame. Ctrl-C here ends it.
+
+    \b
+    Examples:
+      hemislam serve walk.mcap
+      hemislam serve indoor1.bag --preset h2lid --paused
+      hemislam serve --folder ~/recordings --port 8081
+      hemislam serve walk.mcap --host 0.0.0.0            from other computers, by the printed link
+    """
+    from app.sensors.recording import open_recording
+    from app.server.folders import Folders
+    from app.server.web import run_server
+    from app.server.worker import Setup
+    from app.slam.trajectory import read_tum
+    from app.ui.workbench import Workbench
+
+    resolve_for = partial(
+        resolve,
+        preset=preset,
+        config=config,
+        assignments=assignments,
+        lidar_topic=lidar_topic,
+        imu_topic=imu_topic,
+    )
+    params = resolve_for(recording)
+    if recording is not None:
+        open_recording(recording, params).close()  # so that a mistake is told here and not in the page
+    if truth is not None:
+        read_tum(truth)
+    run_server(
+        Setup(
+            recording=recording,
+            truth=truth,
+            params=params,
+            start_s=start,
+            duration_s=duration,
+            resolve=resolve_for,
+            play=not paused,
+        ),
+        folders=Folders(folder or [recording.resolve().parent if recording else Path.cwd()]),
+        build_page=partial(Workbench, point_budget=point_budget, results=Path("runs")),
+        host=host,
+        port=port,
+        open_browser=not no_browser,
+    )
