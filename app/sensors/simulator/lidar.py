@@ -80,11 +80,13 @@ class Returns:
 class Lidar:
     """Attributes:
     range_noise: m, spread of a distance before it is rounded to `range_step` (m, 0 = not rounded).
+    coordinate_step: m, rounding of x, y, z (0 = none). lossless: whether every beam that hits returns.
     """
 
     pattern: Pattern = field(default_factory=firing_pattern)
     range_noise: float = 0.005
     range_step: float = BPEARL.range_step
+    coordinate_step: float = 0.0
     lossless: bool = False
 
     def turn(
@@ -109,6 +111,8 @@ class Lidar:
 
         kept = np.flatnonzero(seen)
         points = pattern.levers[kept] + distance[kept, None] * pattern.directions[kept]
+        if self.coordinate_step > 0:
+            points = np.rint(points / self.coordinate_step) * self.coordinate_step
         return Returns(
             epoch_ns + start_ns + pattern.offsets_ns[kept],
             points.astype(np.float32),

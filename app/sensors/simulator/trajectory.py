@@ -73,7 +73,7 @@ class Walker:
         wander: m, spread of the slow sideways deviation from the path.
     """
 
-    speed: float = 1.0
+    speed: float = 1.2
     height: float = 1.25
     still: float = 2.5
     bob: float = 0.02
@@ -100,14 +100,16 @@ def walk(
     """
     t = np.arange(-1.0, duration_s + 1.0, 1.0 / _SAMPLE_HZ)
     awake = _smoothstep((t - walker.still) / 1.5)
-    speed = walker.speed * awake * (1.0 + 0.1 * _wander(t, rng, (0.05, 0.15)))
+    # Smoothing in time reaches back before the first step, hence the second of delay.
+    walking = _smoothstep((t - walker.still - 1.0) / 1.5)
+    speed = walker.speed * walking * (1.0 + 0.1 * _wander(t, rng, (0.05, 0.15)))
     travelled = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2) / _SAMPLE_HZ])
 
     line, arc = _unrolled(path, closed, travelled[-1] + 5.0)
     if not closed:
         travelled = _brake(travelled, arc[-1])
     xy = np.column_stack([np.interp(travelled, arc, line[:, k]) for k in (0, 1)])
-    xy = np.column_stack([_smoothed(xy[:, k], 0.5 * _SAMPLE_HZ) for k in (0, 1)])
+    xy = np.column_stack([_smoothed(xy[:, k], 0.4 * _SAMPLE_HZ) for k in (0, 1)])
 
     # The walker looks half a metre ahead, and turns over about as much.
     step = 0.05
@@ -157,7 +159,7 @@ def _smoothstep(x: F64) -> F64:
 
 def _smoothed(values: F64, sigma: float) -> F64:
     """Convolved with a Gaussian whose spread is `sigma` samples; the ends go on as they are."""
-    reach = round(5 * sigma)
+    reach = round(4 * sigma)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     return np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), mode="valid")
 

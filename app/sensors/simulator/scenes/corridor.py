@@ -4,7 +4,7 @@ import numpy as np
 
 from app.sensors.simulator.mesh import MeshBuilder
 from app.sensors.simulator.scenes import props
-from app.sensors.simulator.scenes.plan import level, rectangle, stroll, tiled
+from app.sensors.simulator.scenes.plan import level, rectangle, tiled
 from app.sensors.simulator.scenes.scene import Scene
 from app.slam.types import F64
 
@@ -46,7 +46,7 @@ def corridor(rng: np.random.Generator) -> Scene:
     path = np.array(rectangle(middle, middle, length - middle, depth - middle))
     start = np.array([[middle + 4.0, middle]])
     walk = np.vstack([start, path[1:], path[:1]])
-    someone = props.pedestrian(stroll(rectangle(1.7, 1.7, length - 1.7, depth - 1.7))[::-1], 1.1)
+    someone = props.pedestrian(rectangle(1.7, 1.7, length - 1.7, depth - 1.7)[::-1], 1.1)
     return Scene(mesh.build(), (someone,), walk)
 
 

@@ -24,9 +24,9 @@ def museum(rng: np.random.Generator) -> Scene:
         [(0.0, -8.6), (4.2, -7.2), (5.4, -3.0), (5.4, 10.4), (-5.4, 10.4), (-5.4, -3.0), (-4.2, -7.2)], np.float64
     )
     people = (
-        props.pedestrian(np.array([(-8.0, 0.5), (8.0, 1.5), (9.5, 3.0), (-8.0, 2.0)]), 1.1, 3.0, _terrain),
-        props.pedestrian(np.array([(-3.0, 12.9), (3.0, 12.9), (3.6, 13.5), (-3.0, 13.6)]), 0.7, 1.0, None, 1.65),
-        props.pedestrian(np.array([(-16.0, -15.6), (16.0, -15.4), (16.0, -16.6), (-16.0, -16.8)]), 1.3, 20.0, _terrain),
+        props.pedestrian([(-8.0, 0.5), (8.0, 1.5), (9.5, 3.0), (-8.0, 2.0)], 1.1, 3.0, _terrain),
+        props.pedestrian([(-3.0, 12.9), (3.0, 12.9), (3.6, 13.5), (-3.0, 13.6)], 0.7, 1.0, None, 1.65),
+        props.pedestrian([(-16.0, -15.6), (16.0, -15.4), (16.0, -16.6), (-16.0, -16.8)], 1.3, 20.0, _terrain),
     )
     return Scene(mesh.build(), people, path, height=_terrain)
 
@@ -116,8 +116,9 @@ def _hall(mesh: MeshBuilder, rng: np.random.Generator) -> None:
             shift = rng.uniform(-0.08, 0.08, 2)
             radii = rng.uniform(0.14, 0.3, 3) * (2.2 - z)
             mesh.ellipsoid((x + shift[0], y + shift[1], z), radii + 0.08, 0.75, rng.uniform(0, np.pi))
-    for x in (-0.9, 1.2):  # show cases
-        mesh.box((x, 10.4 - 1.9 * np.sign(x) * 0.1, 0.4), (1.3, 0.7, 0.8), 0.3)
+    for x, y in ((1.3, 8.4), (-1.3, 12.3), (7.4, 9.6)):  # show cases
+        mesh.box((x, y, 0.4), (1.1, 0.7, 0.8), 0.3)
+        mesh.ellipsoid((x, y, 0.95), (0.2, 0.14, 0.15), 0.7)
     mesh.box((-7.9, 10.4, 0.55), (0.7, 2.4, 1.1), 0.5)  # the desk
     props.shelf(mesh, (8.6, 11.5, 0.0), np.pi, rng, (2.0, 2.2))
     for x, y in ((-8.4, 6.8), (8.4, 6.8), (-3.4, 6.7), (3.4, 6.7)):

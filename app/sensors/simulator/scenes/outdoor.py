@@ -72,6 +72,6 @@ def outdoor(rng: np.random.Generator) -> Scene:
     people = (
         props.pedestrian(path * 1.04 + [0.0, 0.4], 1.1, 40.0, height),
         props.pedestrian(path[::-1] * 0.94, 1.3, 25.0, height, 1.65),
-        props.pedestrian(np.array([(-8.0, 17.5), (8.0, 18.0), (9.0, 19.5), (-8.0, 19.0)]), 1.2, 0.0, height, 1.8),
+        props.pedestrian([(-8.0, 17.5), (8.0, 18.0), (9.0, 19.5), (-8.0, 19.0)], 1.2, 0.0, height, 1.8),
     )
     return Scene(mesh.build(), people, path, height=height)

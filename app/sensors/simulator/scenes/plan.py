@@ -6,13 +6,16 @@ import numpy as np
 
 from app.slam.types import F64
 
+Corners = Sequence[tuple[float, float]] | F64
+"""A closed polygon in plan, m."""
+
 
 def rectangle(x0: float, y0: float, x1: float, y1: float) -> list[tuple[float, float]]:
     """Corners, counter-clockwise."""
     return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
 
 
-def stroll(corners: Sequence[tuple[float, float]]) -> F64:
+def stroll(corners: Corners) -> F64:
     """(n, 2) waypoints a metre apart round a closed polygon, its corners cut."""
     points: list[F64] = []
     outline = np.array(corners, np.float64)

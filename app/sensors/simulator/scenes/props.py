@@ -7,6 +7,7 @@ from scipy.interpolate import make_interp_spline
 
 from app.sensors.simulator.mesh import Mesh, MeshBuilder, Vector
 from app.sensors.simulator.raycast import Mover
+from app.sensors.simulator.scenes.plan import Corners, stroll
 from app.slam.types import F64
 
 
@@ -146,10 +147,11 @@ def person_mesh(height: float = 1.75) -> Mesh:
 
 
 def pedestrian(
-    path: F64, speed: float, start: float = 0.0, height: Callable[[F64], F64] | None = None, size: float = 1.75
+    corners: Corners, speed: float, start: float = 0.0, height: Callable[[F64], F64] | None = None, size: float = 1.75
 ) -> Mover:
-    """A person who walks round a closed path of (n, 2) waypoints for ever, `start` metres along it at time 0."""
-    loop = np.vstack([path, path[:1]]).astype(np.float64)
+    """A person who walks round a closed polygon for ever, `start` metres along it at time 0."""
+    path = stroll(corners)
+    loop = np.vstack([path, path[:1]])
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(loop, axis=0), axis=1))])
     curve = make_interp_spline(arc, loop, k=3, bc_type="periodic")
     tangent = curve.derivative()

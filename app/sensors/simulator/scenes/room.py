@@ -4,7 +4,7 @@ import numpy as np
 
 from app.sensors.simulator.mesh import MeshBuilder
 from app.sensors.simulator.scenes import props
-from app.sensors.simulator.scenes.plan import level, rectangle, stroll, tiled
+from app.sensors.simulator.scenes.plan import level, rectangle, tiled
 from app.sensors.simulator.scenes.scene import Scene
 
 HEIGHT = 2.8
@@ -55,5 +55,5 @@ def room(rng: np.random.Generator) -> Scene:
     mesh.box((11.85, 4.4, 1.5), (0.05, 2.4, 1.2), 0.85)
 
     path = np.array([(3.5, 2.1), (7.4, 2.1), (8.2, 4.4), (7.4, 6.9), (3.2, 6.9), (2.0, 4.4)])
-    pacing = props.pedestrian(stroll(rectangle(9.8, 2.0, 11.0, 7.0)), 0.8)
+    pacing = props.pedestrian(rectangle(9.8, 2.0, 11.0, 7.0), 0.8)
     return Scene(mesh.build(), (pacing,), path)
