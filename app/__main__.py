@@ -121,6 +121,9 @@ def simulate(
     every_block: Annotated[
         int, typer.Option("--every-block", metavar="K", help="Fire every K-th azimuth only, for a small file.")
     ] = 1,
+    coordinate_step: Annotated[
+        float, typer.Option("--coordinate-step", metavar="METRES", help="Round x, y, z, for a smaller file; 0: do not.")
+    ] = 0.0,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it is there.")] = False,
 ) -> None:
     """Make a recording of a walk through a modelled scene.
@@ -148,7 +151,14 @@ def simulate(
             bar.update(done - bar.n)
 
         made = simulate(
-            scene, out, duration_s=duration, seed=seed, rate_hz=rate, every_block=every_block, progress=show
+            scene,
+            out,
+            duration_s=duration,
+            seed=seed,
+            rate_hz=rate,
+            every_block=every_block,
+            coordinate_step=coordinate_step,
+            progress=show,
         )
     typer.echo(
         f"{made.recording}: {made.scans} scans, {made.points:,} points, {made.duration_s:g} s,"
