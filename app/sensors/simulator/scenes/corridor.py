@@ -46,7 +46,7 @@ def corridor(rng: np.random.Generator) -> Scene:
     path = np.array(rectangle(middle, middle, length - middle, depth - middle))
     start = np.array([[middle + 4.0, middle]])
     walk = np.vstack([start, path[1:], path[:1]])
-    someone = props.pedestrian(rectangle(1.7, 1.7, length - 1.7, depth - 1.7)[::-1], 1.1)
+    someone = props.pedestrian(rectangle(1.85, 1.85, length - 1.85, depth - 1.85)[::-1], 1.1)
     return Scene(mesh.build(), (someone,), walk)
 
 
