@@ -1,13 +1,14 @@
 """Opening a recording and saving results. The page sees the folders that the command line allowed, no others."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import viser
 
+from app.server.folders import Entry, Folders
 from app.server.protocol import Command, OpenRecording, Save, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.trajectory import truth_beside
@@ -15,27 +16,6 @@ from app.ui.html import box, code
 from app.ui.widgets import by_user
 
 _MOST_ENTRIES: Final = 60
-
-
-class Entry(Protocol):
-    """A line of a folder's listing."""
-
-    @property
-    def path(self) -> Path: ...
-    @property
-    def is_recording(self) -> bool: ...
-    @property
-    def size(self) -> int: ...
-
-
-class Folders(Protocol):
-    """The folders a page may look into (`app.server.folders`)."""
-
-    @property
-    def roots(self) -> Sequence[Path]: ...
-    def listing(self, folder: Path) -> Sequence[Entry]:
-        """Sub-folders and recordings of `folder`; raises HemislamError outside the roots."""
-        ...
 
 
 def size_text(size: int) -> str:
@@ -158,7 +138,7 @@ class FileBrowser:
                 entries = self._folders.listing(folder)
             except HemislamError as error:
                 self._shown.append(self._gui.add_html(box(code(str(error)))))
-                entries = ()
+                entries = []
             at_root = folder in self._folders.roots
             if not at_root or len(self._folders.roots) > 1:
                 self._button("..", viser.Icon.CORNER_LEFT_UP, lambda: self._go(None if at_root else folder.parent))

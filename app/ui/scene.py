@@ -31,6 +31,7 @@ class Scene:
         scene = server.scene
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
+        scene.configure_default_lights(cast_shadow=False)  # nothing here throws one, and they cost every frame
         self._server = server
         self._root = scene.add_frame(ROOT, show_axes=False)
         self._grid = scene.add_grid(

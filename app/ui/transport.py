@@ -62,8 +62,11 @@ class TransportPanel:
         gui.add_command("Step one frame", hotkey="arrowright").on_trigger(lambda _: send(StepFrame()))
 
     def toggle(self) -> None:
-        """Play, or pause what plays."""
-        self._send(Pause() if self._snapshot().transport.playing else Play())
+        """Play, or pause what plays; at the end, play from the beginning."""
+        transport = self._snapshot().transport
+        if transport.finished and not transport.playing:
+            self._send(Restart())
+        self._send(Pause() if transport.playing else Play())
 
     def tick(self, snapshot: Snapshot) -> None:
         """Called by the drawing thread, often."""

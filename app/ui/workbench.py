@@ -14,12 +14,14 @@ from typing import Final, Protocol
 
 import viser
 
+from app.server.folders import Folders
 from app.server.protocol import Command, Snapshot
 from app.ui.appearance import AppearancePanel
 from app.ui.doctor import DoctorPanel
-from app.ui.files import FilesPanel, Folders
+from app.ui.files import FilesPanel
 from app.ui.header import HELP, HeaderPanel
 from app.ui.html import ACCENT, STYLE, heading
+from app.ui.keys import KEYS
 from app.ui.notices import NoticePanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.readouts import ReadoutPanel
@@ -78,7 +80,7 @@ class Workbench:
         first = engine.snapshot
         self._scene = Scene(server, point_budget)
 
-        gui.add_html(STYLE)
+        gui.add_html(STYLE + KEYS)
         self._header = HeaderPanel(gui)
         self._transport = TransportPanel(gui, engine.send, lambda: engine.snapshot)
         tabs = gui.add_tab_group()

@@ -343,12 +343,3 @@ class FakeEngine:
             points_filter=used,
             timings_ms=stages,
         )
-
-
-class NoFolders:
-    """A browser's view of no folder at all."""
-
-    roots: tuple[Path, ...] = ()
-
-    def listing(self, folder: Path) -> list[object]:
-        raise HemislamError(f"{folder} is not among the folders of this session.")
