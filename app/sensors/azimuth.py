@@ -10,6 +10,9 @@ from app.slam.types import F32, F64, I64, U16
 _SLACK = np.radians(10.0)
 """Azimuth may run back by this much (noise, horizontal calibration) without counting as a full turn."""
 
+_FIXED = np.radians(0.7)
+"""Clouds that begin within this of each other are cut at a fixed azimuth."""
+
 
 @dataclass(frozen=True, slots=True)
 class Spin:
@@ -19,19 +22,23 @@ class Spin:
         period_s: of one revolution. clockwise: seen from +z (RoboSense) or not.
         ordered: whether the points of one ring come in firing order in the message.
         start: (rings,) rad, azimuth at which each ring's revolution begins (they differ by the
-            channels' horizontal calibration), counted in the sense of rotation.
+            channels' horizontal calibration), counted in the sense of rotation; None: each cloud
+            begins somewhere else, at its first point.
     """
 
     period_s: float
     clockwise: bool
     ordered: bool
-    start: tuple[float, ...]
+    start: tuple[float, ...] | None
 
     def times_ns(self, points: F32, ring: U16) -> I64:
         """(n,) int64 ns after the revolution's begin, of (n, 3) points on rings (n,)."""
         azimuth = turned_azimuth(points, self.clockwise)
-        starts = np.asarray(self.start)
-        from_start = _forward(azimuth - starts[np.minimum(ring, len(starts) - 1)])
+        if self.start is None:
+            from_start = _centred(azimuth - azimuth[0])
+        else:
+            starts = np.asarray(self.start)
+            from_start = _forward(azimuth - starts[np.minimum(ring, len(starts) - 1)])
         if self.ordered:
             order, begins, walked = _walk(azimuth, ring)
             lengths = np.diff(begins, append=len(order))
@@ -57,10 +64,13 @@ def settle_spin(clouds: list[tuple[F32, U16]], period_s: float) -> Spin:
         lines, first = np.unique(ring, return_index=True)
         for line, at in zip(lines, first, strict=True):
             begins[line].append(float(azimuth[at]))
-    # A ring whose first firings had no return begins late in that cloud: the earliest counts.
+    firsts = np.array([turned_azimuth(points[:1], clockwise)[0] for points, _ in clouds])
+    if np.median(np.abs(_centred(firsts - _circular_median(firsts)))) > _FIXED:
+        return Spin(period_s, clockwise, ordered=True, start=None)
     common = _circular_median(np.array([value for values in begins for value in values]))
-    start = [min((_centred(v - common) for v in values), default=0.0) + common for values in begins]
-    return Spin(period_s, clockwise, ordered=True, start=tuple(start))
+    # A ring whose first firings had no return begins late in that cloud: the earliest counts.
+    start = [min(_centred(np.array(values) - common), default=0.0) + common for values in begins]
+    return Spin(period_s, clockwise, ordered=True, start=tuple(map(float, start)))
 
 
 def turned_azimuth(points: F32, clockwise: bool) -> F64:
@@ -85,7 +95,7 @@ def _laps(points: F32, ring: U16, clockwise: bool) -> float:
     """Turns that a typical ring makes in this order, walking in this sense."""
     _, begins, walked = _walk(turned_azimuth(points, clockwise), ring)
     ends = np.append(begins[1:], len(walked)) - 1
-    full = ends - begins >= 20
+    full = ends - begins >= 8
     if not full.any():
         return np.inf
     return float(np.median((walked[ends] - walked[begins])[full])) / (2 * np.pi)
@@ -112,10 +122,12 @@ def _forward(angle: F64) -> F64:
     return wrapped
 
 
-def _centred(angle: float) -> float:
-    return float(np.mod(angle + np.pi, 2 * np.pi) - np.pi)
+def _centred(angle: F64) -> F64:
+    """Wrapped to [-180 deg, 180 deg)."""
+    wrapped: F64 = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+    return wrapped
 
 
 def _circular_median(angles: F64) -> float:
     mean = float(np.angle(np.exp(1j * angles).sum()))
-    return mean + float(np.median(np.mod(angles - mean + np.pi, 2 * np.pi) - np.pi))
+    return mean + float(np.median(_centred(angles - mean)))

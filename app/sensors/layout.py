@@ -4,7 +4,7 @@
 states its evidence and names the option that overrules it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -71,6 +71,8 @@ def settle_cloud(probes: list[Probe], chosen: Recording, where: str) -> tuple[Cl
     spin = None
     if timing.field is None:
         spin = settle_spin(clouds, timing.period_ns / 1e9)
+        if spin.start is None:  # then only the cloud's own first or last point can be at the header stamp
+            timing = replace(timing, anchor="last" if timing.shift_ns else "first", shift_ns=0)
     else:
         time_findings.append(_rotation_finding(clouds[-1], clocked[-1].columns[timing.field], timing))
     layout = CloudLayout(

@@ -101,7 +101,7 @@ def settle_rings(samples: list[Sample], names: dict[str, str]) -> tuple[Rings, F
         return rings, Finding(
             "ring order", "corrected", f"{why}; the order of the points shows {lines} scan lines, ranked by elevation"
         )
-    bounds, centre = _settle_elevation(points[far])
+    bounds, centre = _settle_elevation(points)
     lines = len(bounds) + 1
     text = f"{why}; {lines} scan lines were told apart by their elevation"
     if lines < 4:
@@ -158,9 +158,10 @@ def _settle_place(samples: list[Sample]) -> tuple[Rings, int] | None:
 def _settle_elevation(points: F32) -> tuple[F64, tuple[float, float]]:
     """Elevations that separate the lines, seen from the centre that makes the lines sharpest."""
     edges = np.radians(np.arange(-90.0, 90.05, 0.1))
+    some = points[:: max(1, len(points) // _ENOUGH)]
 
     def sharpness(centre: tuple[float, float]) -> float:
-        counts = np.histogram(elevation(points, centre), edges)[0].astype(np.float64)
+        counts = np.histogram(elevation(some, centre), edges)[0].astype(np.float64)
         return float(counts @ counts)
 
     heights = np.arange(-0.12, 0.1201, 0.01)

@@ -55,7 +55,6 @@ def settle_timing(clouds: list[Clocked], chosen: Recording, where: str) -> tuple
     for name in _candidates(clouds, chosen.time_field):
         timing, problem, findings = _try_field(name, clouds, chosen, period_ns)
         if not problem or chosen.time_field == name:
-            assert timing is not None
             return timing, findings
         rejected.append(problem)
     return _without_field(clouds, chosen, period_ns, period_known, rejected)
@@ -89,17 +88,20 @@ def may_be_time(name: str) -> bool:
 
 def _try_field(
     name: str, clouds: list[Clocked], chosen: Recording, period_ns: int
-) -> tuple[Timing | None, str, list[Finding]]:
-    """Timing by this field; a problem, if it can not be the time of the points; the findings."""
+) -> tuple[Timing, str, list[Finding]]:
+    """Timing by this field; a problem, if it can not be the time of the points; the findings.
+
+    A unit that was chosen is kept even where it does not fit; then it is a finding, not a problem.
+    """
     columns = [cloud.columns[name] for cloud in clouds]
     spans = [float(column.max()) - float(column.min()) for column in columns]
     span = float(np.median(spans))
     kind = str(columns[0].dtype)
     problem = ""
-    if span <= 0.0:
-        problem = f"`{name}` is the same for all points of a scan"
-    elif columns[0].dtype == np.float32 and np.spacing(np.float32(abs(columns[0]).max())) > 0.02 * span:
+    if columns[0].dtype == np.float32 and columns[0].any() and _spacing(columns[0]) > 0.02 * span:
         problem = f"`{name}` is float32, too coarse for values like {float(columns[0].max()):.0f}"
+    elif span <= 0.0:
+        problem = f"`{name}` is the same for all points of a scan"
     if chosen.time_unit == "auto":
         unit = min(UNITS_NS, key=lambda u: abs(np.log(max(span, 1e-12) * UNITS_NS[u] / period_ns)))
     else:
@@ -108,14 +110,16 @@ def _try_field(
     ratio = span * unit_ns / period_ns
     seconds = span * unit_ns / 1e9
     fits = 0.05 < ratio < 1.5
-    if not problem and not fits:
-        problem = f"`{name}` in {unit} makes a scan last {seconds:.3g} s, yet they come every {period_ns / 1e9:.3f} s"
+    misfit = f"`{name}` in {unit} makes a scan last {seconds:.3g} s, yet they come every {period_ns / 1e9:.3f} s"
+    if not problem and not fits and chosen.time_unit == "auto":
+        problem = misfit
     facts = (
         f"`{name}` ({kind}) in {unit}: a scan then lasts {seconds:.4f} s and they come every {period_ns / 1e9:.4f} s"
     )
     if problem:
-        option = "" if chosen.time_unit == "auto" else "--set recording.time_unit=auto"
-        finding = Finding("point time", "needs you", f"{problem}.", option or "--set recording.time_field=none")
+        finding = Finding("point time", "needs you", problem, "--set recording.time_field=none")
+    elif not fits:
+        finding = Finding("point time", "needs you", misfit, "--set recording.time_unit=auto")
     elif chosen.time_unit != "auto":
         finding = Finding("point time", "fine", f"{facts}, as you set it")
     else:
@@ -266,6 +270,11 @@ def _without_field(
         Finding("header stamp", verdict, f"of the {header} point: {evidence}", f"--set recording.header_stamp={other}")
     )
     return Timing(None, 1, "header", -period_ns if header == "last" else 0, period_ns), findings
+
+
+def _spacing(column: npt.NDArray[Any]) -> float:
+    """Distance between neighbouring numbers of this type at the largest value."""
+    return float(np.spacing(np.abs(column).max()))
 
 
 def _to_ns(value: Any, unit_ns: int) -> int:
