@@ -1,0 +1,26 @@
+"""Run the benchmarks by name, or all: `python -m benchmarks frame`."""
+
+import os
+import sys
+
+from benchmarks import frame, replay
+from benchmarks.record import show
+
+BENCHMARKS = {"frame": frame.run, "replay": replay.run}
+
+
+def main() -> None:
+    names = sys.argv[1:] or list(BENCHMARKS)
+    if unknown := [name for name in names if name not in BENCHMARKS]:
+        sys.exit(f"There is no benchmark {unknown[0]}; choose from {', '.join(BENCHMARKS)}.")
+    busy = os.getloadavg()[0]
+    if busy > 0.5:
+        print(
+            f"Other programs keep this machine busy (load {busy:.1f} on {os.cpu_count()} cores); times will be too long."
+        )
+    for name in names:
+        show(BENCHMARKS[name]())
+
+
+if __name__ == "__main__":
+    main()
