@@ -15,9 +15,7 @@ def main() -> None:
         sys.exit(f"There is no benchmark {unknown[0]}; choose from {', '.join(BENCHMARKS)}.")
     busy = os.getloadavg()[0]
     if busy > 0.5:
-        print(
-            f"Other programs keep this machine busy (load {busy:.1f} on {os.cpu_count()} cores); times will be too long."
-        )
+        print(f"Other programs keep this machine busy (load {busy:.1f} on {os.cpu_count()} cores); times mislead.")
     for name in names:
         show(BENCHMARKS[name]())
 
