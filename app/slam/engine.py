@@ -76,7 +76,9 @@ class Engine:
         # paper 2.3, eq. 5-7
         posterior, registration = predicted, _NOT_REGISTERED
         if self._map.voxels:
-            posterior, registration = iekf.update(predicted, sampled.points, self._map, p.filter)
+            posterior, registration = iekf.update(
+                predicted, _spread(sampled.points, p.filter.max_points), self._map, p.filter
+            )
         status = _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 
@@ -187,6 +189,11 @@ def _down_in_lidar(belief: Belief) -> np.ndarray:
     state = belief.state
     down = (state.R_odom_imu @ state.R_imu_lidar).T @ state.g_odom
     return np.asarray(down / np.linalg.norm(down))
+
+
+def _spread(points: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` of the points, evenly over their order."""
+    return points if len(points) <= most else points[np.arange(most) * len(points) // most]
 
 
 def _in_range(scan: Scan, nearest: float, farthest: float) -> Scan:

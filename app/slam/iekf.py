@@ -7,8 +7,8 @@ state's size and not by the number of points; each iteration is one Gauss-Newton
 
 import numpy as np
 
-from app.slam import lie
 from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
+from app.slam.kernels import manifold
 from app.slam.kernels import registration as kernels
 from app.slam.local_map import LocalMap, Planes
 from app.slam.params import Filter
@@ -32,16 +32,16 @@ _MEASURED = np.r_[0:6, 17:23]
 
 def boxplus(x: NavState, d: F64) -> NavState:
     """x [+] d for an error d (23,)."""
-    B = lie.tangent_basis(x.g_odom)
+    B = manifold.tangent_basis(x.g_odom)
     return NavState(
         stamp_ns=x.stamp_ns,
-        R_odom_imu=x.R_odom_imu @ lie.exp(d[ROT]),
+        R_odom_imu=x.R_odom_imu @ manifold.exp(d[ROT]),
         p_odom_imu=x.p_odom_imu + d[POS],
         v_odom_imu=x.v_odom_imu + d[VEL],
         b_gyro=x.b_gyro + d[BG],
         b_accel=x.b_accel + d[BA],
-        g_odom=lie.exp(B @ d[GRAV]) @ x.g_odom,
-        R_imu_lidar=x.R_imu_lidar @ lie.exp(d[EXT_ROT]),
+        g_odom=manifold.exp(B @ d[GRAV]) @ x.g_odom,
+        R_imu_lidar=x.R_imu_lidar @ manifold.exp(d[EXT_ROT]),
         p_imu_lidar=x.p_imu_lidar + d[EXT_POS],
     )
 
@@ -49,13 +49,13 @@ def boxplus(x: NavState, d: F64) -> NavState:
 def boxminus(a: NavState, b: NavState) -> F64:
     """a [-] b: the error d (23,) with b [+] d = a."""
     d = np.empty(DIM)
-    d[ROT] = lie.log(b.R_odom_imu.T @ a.R_odom_imu)
+    d[ROT] = manifold.log(b.R_odom_imu.T @ a.R_odom_imu)
     d[POS] = a.p_odom_imu - b.p_odom_imu
     d[VEL] = a.v_odom_imu - b.v_odom_imu
     d[BG] = a.b_gyro - b.b_gyro
     d[BA] = a.b_accel - b.b_accel
-    d[GRAV] = lie.tangent_basis(b.g_odom).T @ lie.log(lie.between(b.g_odom, a.g_odom))
-    d[EXT_ROT] = lie.log(b.R_imu_lidar.T @ a.R_imu_lidar)
+    d[GRAV] = manifold.tangent_basis(b.g_odom).T @ manifold.turn(b.g_odom, a.g_odom)
+    d[EXT_ROT] = manifold.log(b.R_imu_lidar.T @ a.R_imu_lidar)
     d[EXT_POS] = a.p_imu_lidar - b.p_imu_lidar
     return d
 
@@ -63,9 +63,9 @@ def boxminus(a: NavState, b: NavState) -> F64:
 def _boxminus_jacobian(d: F64, x: NavState, prior: NavState) -> F64:
     """d(x [+] e [-] prior)/de at e = 0, where d = x [-] prior."""
     J = np.eye(DIM)
-    J[ROT, ROT] = lie.right_jacobian_inverse(d[ROT])
-    J[EXT_ROT, EXT_ROT] = lie.right_jacobian_inverse(d[EXT_ROT])
-    J[GRAV, GRAV] = lie.tangent_basis(prior.g_odom).T @ lie.tangent_basis(x.g_odom)
+    J[ROT, ROT] = manifold.right_jacobian_inverse(d[ROT])
+    J[EXT_ROT, EXT_ROT] = manifold.right_jacobian_inverse(d[EXT_ROT])
+    J[GRAV, GRAV] = manifold.tangent_basis(prior.g_odom).T @ manifold.tangent_basis(x.g_odom)
     return J
 
 
@@ -151,5 +151,5 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> t
 
 
 def _moved(x: NavState, R: F64, p: F64) -> bool:
-    angle = np.linalg.norm(lie.log(R.T @ x.R_odom_imu))
+    angle = np.linalg.norm(manifold.log(R.T @ x.R_odom_imu))
     return bool(angle > RESEARCH_ROTATION or np.linalg.norm(x.p_odom_imu - p) > RESEARCH_TRANSLATION)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam import lie
-from app.slam.kernels import motion
+from app.slam.kernels import manifold, motion
 from app.slam.params import Imu
 from app.slam.types import F32, F64, ImuSamples, NavState, Scan
 
@@ -56,12 +56,12 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: Imu) -> tupl
     noise = np.array([params.gyro_noise, params.accel_noise, params.gyro_bias_walk, params.accel_bias_walk, *GAP_NOISE])
     knots = int(np.sum(np.ceil(np.maximum(np.diff(times), 0) / MAX_KNOT_STEP))) + 2 * len(times)
     knot_t, knot_T = np.empty(knots), np.empty((knots, 3, 4))
-    basis = lie.tangent_basis(state.g_odom)
+    basis = manifold.tangent_basis(state.g_odom)
     n = motion.propagate(
         times, gyro, accel, MAX_KNOT_STEP, params.max_gap, R, p, v,
         state.b_gyro, state.b_accel, state.g_odom, basis, P, noise, knot_t, knot_T,
     )  # fmt: skip
-    R = lie.exp(lie.log(R))  # back onto SO(3) after many products
+    R = 1.5 * R - 0.5 * R @ R.T @ R  # back onto SO(3) after many products: one Newton step of the polar form
     P = 0.5 * (P + P.T)
     moved = replace(state, stamp_ns=end_ns, R_odom_imu=R, p_odom_imu=p, v_odom_imu=v)
     return Belief(moved, P), Path(knot_t[:n] - times[-1], knot_T[:n])

@@ -97,8 +97,10 @@ def evict(center, radius, voxel, table, cells, counts, store, used):
     return kept
 
 
-NEAREST = 20
-"""Most neighbours that one patch may take."""
+MOST = 40
+"""A patch that is not certain with this many neighbours is not used."""
+BINS = 64
+"""Steps of squared distance in which neighbours are ranked; sorting them exactly costs three times as much."""
 
 
 @njit(cache=True, inline="always")
@@ -107,101 +109,116 @@ def _outside(u, cell):
     return max(0.0, max(cell - u, u - (cell + 1)))
 
 
-@njit(cache=True)
-def _nearest(x, y, z, voxel, reach2, table, cells, counts, store, near):
-    """Offsets of the up to NEAREST map points within reach, ascending in distance.
+@njit(cache=True, error_model="numpy")
+def _nearest(x, y, z, voxel, reach2, table, cells, counts, store, near, bins, begin, order):
+    """Map points within reach of (x, y, z), ranked by distance up to the width of a bin.
 
-    near (NEAREST, 4) f64 out: squared distance and offset from (x, y, z). Looks through the 27
-    voxels around, the own one first, and passes over voxels that can not hold a nearer point.
+    Out: near (m, 3) offsets as found; order (n,) their ranking. Scratch: bins (m,), begin (BINS + 2,).
+    Returns n. The inner loop has no branch: what is out of reach falls into a last bin of its own.
     """
     ux, uy, uz = x / voxel, y / voxel, z / voxel
     a0, b0, c0 = math.floor(ux), math.floor(uy), math.floor(uz)
-    worst, n = reach2, 0
-    for v in range(27):
-        w = 13 if v == 0 else (v - 1 if v <= 13 else v)  # voxel 13 is the own one
-        a, b, c = a0 + w // 9 - 1, b0 + (w // 3) % 3 - 1, c0 + w % 3 - 1
-        ox, oy, oz = _outside(ux, a) * voxel, _outside(uy, b) * voxel, _outside(uz, c) * voxel
-        if ox * ox + oy * oy + oz * oz >= worst:
-            continue
-        k = _find(table, cells, a, b, c)
-        if k < 0:
-            continue
-        for i in range(counts[k]):
-            ex, ey, ez = store[k, i, 0] - x, store[k, i, 1] - y, store[k, i, 2] - z
-            e2 = ex * ex + ey * ey + ez * ez
-            if e2 >= worst:
-                continue
-            at = n if n < NEAREST else NEAREST - 1
-            while at > 0 and near[at - 1, 0] > e2:
-                near[at, 0], near[at, 1] = near[at - 1, 0], near[at - 1, 1]
-                near[at, 2], near[at, 3] = near[at - 1, 2], near[at - 1, 3]
-                at -= 1
-            near[at, 0], near[at, 1], near[at, 2], near[at, 3] = e2, ex, ey, ez
-            if n < NEAREST:
-                n += 1
-            if n == NEAREST:
-                worst = near[NEAREST - 1, 0]
+    scale = BINS / reach2
+    begin[:] = 0
+    m = 0
+    for a in range(a0 - 1, a0 + 2):
+        ox = _outside(ux, a) * voxel
+        for b in range(b0 - 1, b0 + 2):
+            oy = _outside(uy, b) * voxel
+            for c in range(c0 - 1, c0 + 2):
+                oz = _outside(uz, c) * voxel
+                if ox * ox + oy * oy + oz * oz >= reach2:
+                    continue
+                k = _find(table, cells, a, b, c)
+                if k < 0:
+                    continue
+                for i in range(counts[k]):
+                    ex, ey, ez = store[k, i, 0] - x, store[k, i, 1] - y, store[k, i, 2] - z
+                    at = min(int((ex * ex + ey * ey + ez * ez) * scale), BINS)
+                    near[m, 0], near[m, 1], near[m, 2] = ex, ey, ez
+                    bins[m] = at
+                    begin[at + 1] += 1
+                    m += 1
+    for i in range(BINS):
+        begin[i + 1] += begin[i]
+    n = begin[BINS]
+    for i in range(m):
+        at = bins[i]
+        order[begin[at]] = i
+        begin[at] += 1
     return n
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, error_model="numpy")
+def _fit(near, order, n, first, flat, tilt, noise, normal, center):
+    """A plane through the nearest of n ranked offsets (`planes` says how many).
+
+    Returns l3 of the patch, m²; -1 where there is none.
+    """
+    sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
+    done, take = 0, first
+    while take <= n:
+        for i in range(done, take):
+            k = order[i]
+            ex, ey, ez = near[k, 0], near[k, 1], near[k, 2]
+            sx += ex
+            sy += ey
+            sz += ez
+            xx += ex * ex
+            xy += ex * ey
+            xz += ex * ez
+            yy += ey * ey
+            yz += ey * ez
+            zz += ez * ez
+        done = take
+        s = 1.0 / take
+        mx, my, mz = sx * s, sy * s, sz * s
+        _, l2, l3 = plane_of(
+            xx * s - mx * mx, xy * s - mx * my, xz * s - mx * mz,
+            yy * s - my * my, yz * s - my * mz, zz * s - mz * mz, normal,
+        )  # fmt: skip
+        if max(l3, noise * noise) < tilt * tilt * take * l2:
+            for i in range(take):
+                k = order[i]
+                ex, ey, ez = near[k, 0] - mx, near[k, 1] - my, near[k, 2] - mz
+                if abs(ex * normal[0] + ey * normal[1] + ez * normal[2]) > flat:
+                    return -1.0
+            center[0], center[1], center[2] = mx, my, mz
+            return l3
+        if take == n:
+            break
+        take = min(2 * take, n)
+    return -1.0
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
 def planes(queries, voxel, reach, first, flat, tilt, noise, table, cells, counts, store, normals, centers, variances):
     """A plane through the nearest map points of each query.
 
     The `first` nearest within `reach` m are tried. A plane through k points of scatter s has a normal
     that is uncertain by s / sqrt(k l2): where that is over `tilt` rad (neighbours from one scan line
-    say nothing about the surface across it) the patch widens, up to NEAREST points. Accepted when
-    it becomes certain enough and every neighbour lies within `flat` m of it.
+    say nothing about the surface across it) the patch is widened to twice as many, up to MOST.
+    Accepted when it becomes certain enough and every neighbour lies within `flat` m of it.
 
     queries (n, 3) f64, map frame; noise: least scatter of the points, m. Out: normals (n, 3), centers
-    (n, 3), variances (n,): l3 of the patch in m², or -1 where there is no plane.
+    (n, 3), variances (n,): l3 of the patch in m², negative where there is no plane.
     """
     total = len(queries)
     for chunk in prange(CHUNKS):
-        near = np.empty((NEAREST, 4))
+        room = 27 * store.shape[1]
+        near = np.empty((room, 3))
+        bins = np.empty(room, np.int32)
+        order = np.empty(room, np.int32)
+        begin = np.empty(BINS + 2, np.int32)
         normal = np.empty(3)
+        center = np.empty(3)
         for j in range(chunk * total // CHUNKS, (chunk + 1) * total // CHUNKS):
             x, y, z = queries[j, 0], queries[j, 1], queries[j, 2]
-            variances[j] = -1.0
-            n = _nearest(x, y, z, voxel, reach * reach, table, cells, counts, store, near)
-            sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
-            done, take = 0, first
-            while take <= n:
-                for i in range(done, take):
-                    ex, ey, ez = near[i, 1], near[i, 2], near[i, 3]
-                    sx += ex
-                    sy += ey
-                    sz += ez
-                    xx += ex * ex
-                    xy += ex * ey
-                    xz += ex * ez
-                    yy += ey * ey
-                    yz += ey * ez
-                    zz += ez * ez
-                done = take
-                s = 1.0 / take
-                mx, my, mz = sx * s, sy * s, sz * s
-                _, l2, l3 = plane_of(
-                    xx * s - mx * mx, xy * s - mx * my, xz * s - mx * mz,
-                    yy * s - my * my, yz * s - my * mz, zz * s - mz * mz, normal,
-                )  # fmt: skip
-                if max(l3, noise * noise) < tilt * tilt * take * l2:
-                    good = True
-                    for i in range(take):
-                        off = (
-                            (near[i, 1] - mx) * normal[0]
-                            + (near[i, 2] - my) * normal[1]
-                            + (near[i, 3] - mz) * normal[2]
-                        )
-                        if abs(off) > flat:
-                            good = False
-                            break
-                    if good:
-                        variances[j] = l3
-                        for i in range(3):
-                            normals[j, i] = normal[i]
-                        centers[j, 0], centers[j, 1], centers[j, 2] = x + mx, y + my, z + mz
-                    break
-                if take == n:
-                    break
-                take = min(2 * take, n)
+            n = min(
+                _nearest(x, y, z, voxel, reach * reach, table, cells, counts, store, near, bins, begin, order), MOST
+            )
+            l3 = _fit(near, order, n, first, flat, tilt, noise, normal, center)
+            variances[j] = l3
+            if l3 >= 0.0:
+                normals[j, 0], normals[j, 1], normals[j, 2] = normal[0], normal[1], normal[2]
+                centers[j, 0], centers[j, 1], centers[j, 2] = x + center[0], y + center[1], z + center[2]
