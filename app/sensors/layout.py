@@ -26,10 +26,14 @@ STANDARD_GRAVITY = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """One cloud of the first few: when it was logged, and what it holds."""
+    """One cloud of the first few: when it was logged, and what it holds.
+
+    `stamped` is False if its header carries no time, and `cloud.stamp_ns` is the log time.
+    """
 
     log_ns: int
     cloud: CloudMessage
+    stamped: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +67,7 @@ def settle_cloud(probes: list[Probe], chosen: Recording, where: str) -> tuple[Cl
         columns = {
             name: probe.cloud.column(name)[index] for name in fields if may_be_time(name) or name == chosen.time_field
         }
-        clocked.append(Clocked(probe.log_ns, probe.cloud.stamp_ns, columns))
+        clocked.append(Clocked(probe.log_ns, probe.cloud.stamp_ns, columns, probe.stamped))
     findings = [_fields_finding(probes[0].cloud)]
     timing, time_findings = settle_timing(clocked, chosen, where)
     rings, ring_finding = settle_rings(samples, names)

@@ -87,7 +87,7 @@ def probe_clouds(source: Source, topic: str) -> tuple[list[Probe], bool, list[Fi
         findings.append(Finding("empty clouds", "corrected", text))
     stamped = len({probe.cloud.stamp_ns for probe in probes}) > 1
     if not stamped:
-        probes = [Probe(probe.log_ns, replace(probe.cloud, stamp_ns=probe.log_ns)) for probe in probes]
+        probes = [Probe(probe.log_ns, replace(probe.cloud, stamp_ns=probe.log_ns), stamped=False) for probe in probes]
         findings.append(_unstamped(topic))
     return probes, stamped, findings
 

@@ -26,11 +26,13 @@ class Clocked:
 
     Attributes:
         log_ns, stamp_ns: of the message. columns: field -> (n,) values of the valid points.
+        stamped: False if the header carries no time, and `stamp_ns` is the log time.
     """
 
     log_ns: int
     stamp_ns: int
     columns: dict[str, npt.NDArray[Any]]
+    stamped: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,6 +235,8 @@ def header_by_delay(
 
 def log_delay_ns(clouds: list[Clocked]) -> float | None:
     """Median of log time minus header stamp; None if it is no evidence (equal, or other clocks)."""
+    if not clouds[0].stamped:
+        return 0.0
     delays = np.array([cloud.log_ns - cloud.stamp_ns for cloud in clouds], np.float64)
     delay = float(np.median(delays))
     if np.all(np.abs(delays) < 2_000) or not -1e6 < delay < 5e9:

@@ -94,6 +94,12 @@ class Layout:
     big_endian: bool = False
 
 
+RELATIVE = [
+    ("x", "f4", "x"), ("y", "f4", "y"), ("z", "f4", "z"), ("ring", "u2", "ring"), ("time", "f4", "time"),
+]  # fmt: skip
+"""Fields of a driver that counts seconds from the scan's first point."""
+
+
 def message(turned: Turn, layout: Layout | None = None, ros: int = 2, lost: Iterable[int] = ()) -> Any:
     """A PointCloud2 of it, written value by value. `lost`: slots without a return, stored as NaN."""
     layout = layout or Layout()

@@ -1,0 +1,174 @@
+"""The same walk reads the same from every container, from any start, and from the recordings of others."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.sensors.presets import resolve_params
+from app.sensors.recording import find_recordings, input_hash, open_recording
+from app.slam.params import Params
+from app.slam.types import DroppedScan, Measurement
+from tests.sensors import rig
+
+CONTAINERS = [
+    "bag", "bag-bz2", "bag-lz4", "sqlite3", "sqlite3-message", "sqlite3-file", "mcap", "mcap-zstd", "bare-mcap",
+    "bare-db3",
+]  # fmt: skip
+
+
+def read(path: Path, params: Params | None = None, **part: float) -> list[Measurement | DroppedScan]:
+    with open_recording(path, params or Params()) as recording:
+        return list(recording.measurements(**part))
+
+
+def scans(entries: list[Measurement | DroppedScan]) -> list[int]:
+    """Numbers of the revolutions that can be used."""
+    return [round((e.scan.stamp_ns - rig.START_NS) / rig.PERIOD_NS) for e in entries if isinstance(e, Measurement)]
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_every_container_gives_the_same_measurements(tmp_path: Path, container: str) -> None:
+    ros = 1 if container.startswith("bag") else 2
+    path = rig.write(tmp_path / "walk", rig.walk(turns=4, ros=ros, columns=12), container)
+    with open_recording(path, Params()) as recording:
+        entries = list(recording.measurements())
+        assert recording.scan_count == 4
+        assert abs(recording.start_ns - rig.START_NS) < 1_000
+        assert recording.duration_s == pytest.approx(0.45, abs=0.02)
+    assert scans(entries) == [0, 1, 2, 3]
+    for number, entry in enumerate(entries):
+        assert isinstance(entry, Measurement)
+        truth = rig.turn(number, columns=12)
+        np.testing.assert_array_equal(entry.scan.points, truth.points)
+        np.testing.assert_array_equal(entry.scan.ring, truth.ring)
+        np.testing.assert_array_equal(entry.imu.accel, np.tile([0, 0, 9.81], (len(entry.imu), 1)))
+        assert entry.imu.stamps_ns[0] <= entry.scan.stamp_ns <= entry.scan.end_ns <= entry.imu.stamps_ns[-1]
+
+
+def test_a_folder_without_metadata_reads_its_files(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=3, columns=12), "mcap")
+    (path / "metadata.yaml").unlink()
+    with open_recording(path, Params()) as recording:
+        assert scans(list(recording.measurements())) == [0, 1, 2]
+        assert any("no metadata.yaml" in finding.text for finding in recording.findings)
+
+
+def test_start_and_duration_choose_scans_by_their_own_time(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=9, columns=12))
+    assert scans(read(path, start_s=0.29, duration_s=0.4)) == [3, 4, 5, 6]
+    assert scans(read(path, start_s=0.35)) == [4, 5, 6, 7, 8]
+    assert scans(read(path, duration_s=0.2)) == [0, 1]
+    later = read(path, start_s=0.29)[0]
+    assert isinstance(later, Measurement)
+    assert later.imu.stamps_ns[0] <= later.scan.stamp_ns
+
+
+def test_reading_twice_gives_the_same_bytes(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=3, columns=12))
+
+    def everything() -> list[bytes]:
+        return [e.scan.points.tobytes() + e.imu.stamps_ns.tobytes() for e in read(path) if isinstance(e, Measurement)]
+
+    assert everything() == everything() != []
+
+
+def test_scans_logged_late_and_in_disorder_are_paired_by_their_stamps(tmp_path: Path) -> None:
+    entries = [
+        (topic, log + (70_000_000 if topic == "/points" and number % 2 else 0), sent)
+        for number, (topic, log, sent) in enumerate(rig.walk(turns=6, columns=12))
+    ]
+    path = rig.write(tmp_path / "walk", sorted(entries, key=lambda entry: entry[1]))
+    assert scans(read(path)) == [0, 1, 2, 3, 4, 5]
+
+
+def test_an_accelerometer_in_g_is_given_in_metres_per_second_squared(tmp_path: Path) -> None:
+    entries = [
+        (topic, log, rig.imu(log - 500_000, accel=(0.0, -1.0, 0.0)) if topic == "/imu" else sent)
+        for topic, log, sent in rig.walk(turns=3, columns=12)
+    ]
+    first = read(rig.write(tmp_path / "walk", entries))[0]
+    assert isinstance(first, Measurement)
+    np.testing.assert_allclose(first.imu.accel[0], [0, -9.80665, 0])
+
+
+def test_an_imu_clock_that_lags_is_found_and_the_proposed_option_settles_it(tmp_path: Path) -> None:
+    entries = [
+        (topic, log, rig.imu(log - 500_000 - 37_000_000_000) if topic == "/imu" else sent)
+        for topic, log, sent in rig.walk(turns=5, columns=12)
+    ]
+    path = rig.write(tmp_path / "walk", entries)
+    with open_recording(path, Params()) as recording:
+        clocks = next(finding for finding in recording.findings if finding.subject == "clocks")
+    assert clocks.verdict == "needs you" and "behind the LiDAR's" in clocks.text
+    name, _, offset = clocks.option.removeprefix("--set ").partition("=")
+    assert name == "recording.imu_time_offset" and abs(float(offset) - 37.0) < 0.01  # the delays of logging remain
+    settled = resolve_params(path, None, None, [clocks.option.removeprefix("--set ")])
+    assert scans(read(path, settled)) == [0, 1, 2, 3, 4]
+
+
+def test_headers_without_time_fall_back_on_the_log_times(tmp_path: Path) -> None:
+    entries = []
+    for topic, log, sent in rig.walk(turns=4, layout=rig.Layout(absolute=False, fields=rig.RELATIVE), columns=12):
+        sent.header = rig.header(0, 2)
+        entries.append((topic, log, sent))
+    path = rig.write(tmp_path / "walk", entries)
+    with open_recording(path, Params()) as recording:
+        assert sum("log times are used" in finding.text for finding in recording.findings) == 2
+        entries_read = list(recording.measurements())
+    times = [entry.scan.stamp_ns for entry in entries_read if isinstance(entry, Measurement)]
+    begins = [rig.turn(number).begin_ns for number in range(4)]
+    # Logged 3 ms after a scan's end; the last firing (of 96) itself is a hundredth of a turn before it.
+    np.testing.assert_allclose(np.array(times) - begins, 4_000_000, atol=1_100_000)
+
+
+def test_of_several_topics_the_busiest_is_used_and_the_others_are_named(tmp_path: Path) -> None:
+    few = [
+        ("/other_points", log, sent) for _, log, sent in rig.walk(turns=2, columns=4) if sent.__msgtype__.endswith("2")
+    ]
+    entries = sorted([*rig.walk(turns=4, columns=12), *few], key=lambda entry: entry[1])
+    path = rig.write(tmp_path / "walk", entries)
+    with open_recording(path, Params()) as recording:
+        assert recording.lidar_topic == "/points"
+        finding = next(finding for finding in recording.findings if finding.subject == "lidar topic")
+    assert finding.verdict == "needs you" and "/other_points" in finding.text
+    chosen = Params().with_values({"recording.lidar_topic": "/other_points"})
+    with open_recording(path, chosen) as recording:
+        assert recording.scan_count == 2
+
+
+def test_the_hash_of_a_file_is_its_sha256_and_that_of_a_folder_covers_all_its_files(tmp_path: Path) -> None:
+    folder = rig.write(tmp_path / "walk", rig.walk(turns=2, columns=4))
+    file = next(folder.glob("*.mcap"))
+    assert input_hash(file) == hashlib.sha256(file.read_bytes()).hexdigest()
+    before = input_hash(folder)
+    (folder / "metadata.yaml").write_text("changed")
+    assert input_hash(folder) != before
+
+
+def test_recordings_are_found_below_a_folder(tmp_path: Path) -> None:
+    entries = rig.walk(turns=2, columns=4)
+    rig.write(tmp_path / "inside", entries, "mcap")
+    (tmp_path / "deep").mkdir()
+    rig.write(tmp_path / "deep" / "one", rig.walk(turns=2, columns=4, ros=1), "bag")
+    (tmp_path / "notes.txt").write_text("no recording")
+    (tmp_path / ".hidden.mcap").write_text("")
+    assert find_recordings(tmp_path) == [tmp_path / "deep" / "one.bag", tmp_path / "inside"]
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "down"),
+    [("hall_bpearl", 598, "+x"), ("outdoor_bpearl", 498, "+x"), ("garage_hdl32e", 45, "−z")],
+)
+def test_the_recordings_of_others_read_whole(shared_data: Path, name: str, count: int, down: str) -> None:
+    with open_recording(shared_data / f"{name}.mcap", Params()) as recording:
+        findings = {finding.subject: finding for finding in recording.findings}
+        entries = list(recording.measurements(duration_s=4.0))
+        assert recording.scan_count == count
+    assert len(entries) == 40
+    assert all(isinstance(entry, Measurement) and not entry.notices for entry in entries)
+    assert f"LiDAR's {down} axis" in findings["gravity"].text
+    assert "of the last point" in findings["header stamp"].text
+    assert "one turn in 0.100" in findings["rotation"].text
+    assert findings["mount"].verdict == "needs you"

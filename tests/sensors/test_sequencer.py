@@ -1,0 +1,206 @@
+"""A scan is given with the IMU samples that cover it, or dropped with the reason; nothing good is lost."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.sensors.sequencer import MAX_WAITING, Sequencer
+from app.slam.types import DroppedScan, Measurement, Scan
+
+MS = 1_000_000
+PERIOD, IMU_STEP = 100 * MS, 10 * MS
+
+
+def scan(begin_ms: int, length_ms: int = 100) -> Scan:
+    offsets = np.array([0, length_ms // 2, length_ms], np.int32) * MS
+    return Scan(begin_ms * MS, np.ones((3, 3), np.float32), offsets, np.ones(3, np.float32), np.zeros(3, np.uint16))
+
+
+def samples(begin_ms: int, end_ms: int, step_ms: int = 10) -> list[int]:
+    return list(range(begin_ms, end_ms + 1, step_ms))
+
+
+def feed(
+    imu_ms: Sequence[int], scans: Sequence[Scan | DroppedScan]
+) -> tuple[list[Measurement | DroppedScan], Sequencer]:
+    """Everything in the order of time, and what came out. A sample's gyro carries its own time."""
+    arrivals: list[tuple[int, int, int | Scan | DroppedScan]] = [(at, n, at) for n, at in enumerate(imu_ms)]
+    arrivals += [(s.stamp_ns // MS + 100, n, s) for n, s in enumerate(scans)]
+    sequencer = Sequencer(max_gap_s=0.1)
+    out: list[Measurement | DroppedScan] = []
+    for _, _, arrived in sorted(arrivals, key=lambda entry: entry[:2]):
+        push(sequencer, arrived)
+        out += sequencer.ready()
+    return [*out, *sequencer.finish()], sequencer
+
+
+def push(sequencer: Sequencer, arrived: int | Scan | DroppedScan) -> None:
+    if isinstance(arrived, int):
+        sequencer.add_imu(arrived * MS, (float(arrived), 0.0, 0.0), (0.0, 0.0, 9.81))
+    else:
+        sequencer.add_scan(arrived)
+
+
+def stamps(entry: Measurement | DroppedScan) -> list[int]:
+    assert isinstance(entry, Measurement)
+    np.testing.assert_array_equal(entry.imu.gyro[:, 0] * MS, entry.imu.stamps_ns)
+    return (entry.imu.stamps_ns // MS).tolist()
+
+
+def dropped(entries: Sequence[Measurement | DroppedScan]) -> list[tuple[int, str]]:
+    return [(entry.stamp_ns // MS, entry.reason) for entry in entries if isinstance(entry, DroppedScan)]
+
+
+def test_samples_run_from_the_previous_scans_end_to_this_scans_end() -> None:
+    out, _ = feed(samples(-35, 335), [scan(0), scan(100), scan(200)])
+    assert stamps(out[0]) == samples(-35, 105)  # the first: all there are, and one at or past the end
+    assert stamps(out[1]) == samples(95, 205)
+    assert stamps(out[2]) == samples(195, 305)
+
+
+def test_a_sample_exactly_at_a_scans_end_closes_it_and_opens_the_next() -> None:
+    out, _ = feed(samples(0, 200), [scan(0), scan(100)])
+    assert stamps(out[0]) == samples(0, 100)
+    assert stamps(out[1]) == samples(100, 200)
+
+
+@given(
+    delays=st.lists(st.integers(0, 250), min_size=12, max_size=12),
+    imu_delay=st.integers(0, 400),
+    phase=st.integers(0, 9),
+)
+def test_whatever_the_delays_of_arrival_the_pairs_are_the_same(delays: list[int], imu_delay: int, phase: int) -> None:
+    scans = [scan(100 * n) for n in range(12)]
+    imu = samples(-20 + phase, 1250 + phase)
+    expected, _ = feed(imu, scans)
+    arrivals: list[tuple[int, int, int | Scan]] = [(at + imu_delay, n, at) for n, at in enumerate(imu)]
+    arrivals += [(100 * n + 100 + delay, n, s) for n, (delay, s) in enumerate(zip(delays, scans, strict=True))]
+    sequencer, out = Sequencer(max_gap_s=0.1), []
+    for _, _, arrived in sorted(arrivals, key=lambda entry: entry[:2]):
+        push(sequencer, arrived)
+        out += sequencer.ready()
+        late = [entry for entry in out if isinstance(entry, DroppedScan)]
+    out += sequencer.finish()
+    # A scan that arrives after a later one was already paired can only be dropped; none is lost unseen.
+    assert sorted(s.stamp_ns for s in scans) == sorted(
+        e.stamp_ns if isinstance(e, DroppedScan) else e.scan.stamp_ns for e in out
+    )
+    if not late:
+        assert [stamps(entry) for entry in out] == [stamps(entry) for entry in expected]
+
+
+@given(st.lists(st.integers(0, 3000), min_size=2, max_size=80), st.lists(st.integers(0, 3000), max_size=15))
+def test_every_measurement_is_covered_and_in_order_whatever_comes_in(imu: list[int], begins: list[int]) -> None:
+    out, _ = feed(imu, [scan(begin) for begin in begins])
+    assert len(out) == len(begins)
+    previous_end = None
+    for entry in out:
+        if isinstance(entry, DroppedScan):
+            assert entry.reason
+            continue
+        times = entry.imu.stamps_ns
+        assert (np.diff(times) > 0).all()
+        assert times[0] <= entry.scan.stamp_ns and times[-1] >= entry.scan.end_ns
+        assert times[-2] < entry.scan.end_ns
+        if previous_end is not None:
+            assert entry.scan.end_ns > previous_end
+            assert times[0] <= previous_end < times[1]
+        previous_end = entry.scan.end_ns
+
+
+def test_scans_before_a_late_imu_are_dropped_and_the_rest_is_kept() -> None:
+    out, _ = feed(samples(250, 620), [scan(100 * n) for n in range(6)])
+    assert dropped(out) == [
+        (0, "the IMU starts after it"),
+        (100, "the IMU starts after it"),
+        (200, "the IMU starts after it"),
+    ]
+    assert stamps(out[3]) == samples(250, 400)
+
+
+def test_scans_after_the_imu_stopped_are_dropped_with_the_reason() -> None:
+    out, _ = feed(samples(0, 350), [scan(100 * n) for n in range(6)])
+    assert [at for at, _ in dropped(out)] == [300, 400, 500]
+    assert {why for _, why in dropped(out)} == {"the IMU stops before its end"}
+
+
+def test_a_silent_imu_does_not_fill_the_memory() -> None:
+    sequencer = Sequencer(max_gap_s=0.1)
+    for at in samples(0, 110):
+        push(sequencer, at)
+    out: list[Measurement | DroppedScan] = []
+    for number in range(3 * MAX_WAITING):
+        sequencer.add_scan(scan(100 * number))
+        out += sequencer.ready()
+    assert len(out) >= 2 * MAX_WAITING - 1
+    assert isinstance(out[0], Measurement) and all(isinstance(entry, DroppedScan) for entry in out[1:])
+
+
+def test_an_outage_of_the_imu_drops_the_scans_inside_and_is_told_with_the_next() -> None:
+    out, sequencer = feed([*samples(0, 210), *samples(480, 800)], [scan(100 * n) for n in range(7)])
+    assert dropped(out) == [(200, "it lies in a gap of the IMU"), (300, "it lies in a gap of the IMU"),
+                            (400, "it lies in a gap of the IMU")]  # fmt: skip
+    after = next(entry for entry in out if isinstance(entry, Measurement) and entry.scan.stamp_ns == 500 * MS)
+    assert any("no IMU sample for 0.270 s" in notice for notice in after.notices)
+    assert stamps(after)[0] == 200  # continuous with the last scan that was used
+    assert sequencer.counts.imu_gaps == 1
+
+
+def test_a_scan_that_lies_only_partly_in_a_gap_is_used_and_told() -> None:
+    out, _ = feed([*samples(0, 160), *samples(270, 400)], [scan(0), scan(100), scan(200), scan(300)])
+    assert dropped(out) == [(200, "it lies in a gap of the IMU")]
+    assert stamps(out[1]) == [*samples(100, 160), 270]
+    assert isinstance(out[1], Measurement) and out[1].notices == ("no IMU sample for 0.110 s",)
+    assert stamps(out[3]) == [160, *samples(270, 400)]
+
+
+def test_repeated_and_reversed_samples_are_left_out_once_and_told() -> None:
+    sequencer = Sequencer(max_gap_s=0.1)
+    order = [*samples(0, 50), 50, 20, 30, 40, *samples(60, 210)]
+    for at in order:
+        push(sequencer, at)
+    sequencer.add_scan(scan(0))
+    sequencer.add_scan(scan(100))
+    first, second = sequencer.ready()
+    assert stamps(first) == samples(0, 100) and stamps(second) == samples(100, 200)
+    assert isinstance(first, Measurement)
+    assert len(first.notices) == 1 and "stepped back by 0.0300 s" in first.notices[0]
+    assert (sequencer.counts.imu_duplicates, sequencer.counts.imu_back_steps) == (1, 1)
+
+
+def test_nan_samples_are_left_out_and_told() -> None:
+    sequencer = Sequencer(max_gap_s=0.1)
+    for at in samples(0, 110):
+        push(sequencer, at)
+        sequencer.add_imu(at * MS + MS, (float("nan"), 0, 0), (0, 0, 9.81))
+    sequencer.add_scan(scan(0))
+    (only,) = sequencer.ready()
+    assert stamps(only) == samples(0, 100)
+    assert sequencer.counts.imu_invalid == 12
+
+
+def test_repeated_and_reversed_scans_are_dropped_and_the_next_is_used() -> None:
+    sequencer = Sequencer(max_gap_s=0.1)
+    for at in samples(0, 500):
+        push(sequencer, at)
+    out: list[Measurement | DroppedScan] = []
+    for begin in (0, 100, 100, 50, 200):
+        sequencer.add_scan(scan(begin))
+        out += sequencer.ready()
+    assert [why.split(" ")[0:3] for _, why in dropped(out)] == [["it", "repeats", "the"], ["its", "time", "steps"]]
+    assert [e.scan.stamp_ns // MS for e in out if isinstance(e, Measurement)] == [0, 100, 200]
+
+
+def test_missing_scans_are_told_with_the_next() -> None:
+    begins = [*range(0, 1000, 100), 1300]
+    out, _ = feed(samples(0, 1500), [scan(begin) for begin in begins])
+    assert isinstance(out[-1], Measurement)
+    assert out[-1].notices == ("no usable scan for 0.400 s before this one (3 missing)",)
+
+
+def test_a_scan_that_could_not_be_read_keeps_its_place() -> None:
+    out, _ = feed(samples(0, 320), [scan(0), DroppedScan(100 * MS, "all its points are NaN"), scan(200)])
+    assert dropped(out) == [(100, "all its points are NaN")]
+    assert isinstance(out[1], DroppedScan) and stamps(out[2])[0] == 100
