@@ -199,6 +199,13 @@ class Filter(Section):
     gate: float = _param(
         0.11, "Residuals over this times √range are not used (FAST-LIO2's gate).", unit="m/√m", ge=0.01, le=1, step=0.01
     )
+    max_points: int = _param(
+        1500,
+        "Most points of a scan, spread evenly over it, that are looked up in the map.",
+        ge=100,
+        le=20_000,
+        step=100,
+    )
     max_iterations: int = _param(5, "Most iterations of one update.", ge=1, le=20, step=1)
     plane_threshold: float = _param(
         0.1, "All neighbours must lie within this of their plane.", unit="m", ge=0.01, le=1, step=0.01
