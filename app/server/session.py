@@ -81,6 +81,7 @@ class Session:
         self._run: Run | None = None
         # What is wanted but not done yet:
         self._opening: Callable[[], None] | None = None
+        self._after_opening: list[Command] = []
         self._relabelling = False
         self._target: int | None = None
         self._target_from = -1
@@ -97,6 +98,9 @@ class Session:
     # --- commands --------------------------------------------------------------------------------
     def handle(self, command: Command) -> None:
         """Take in a command. What can not be done becomes a notice; nothing is raised."""
+        if self._opening is not None and isinstance(command, Play | Pause | StepFrame | Seek | Save):
+            self._after_opening.append(command)  # it is meant for what will be open then
+            return
         try:
             self._handle(command)
         except HemislamError as error:
@@ -263,7 +267,7 @@ class Session:
     # --- opening ---------------------------------------------------------------------------------
     def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
         """Leave the opening to `work`, so that the page can say first that it takes a moment."""
-        self._opening = opening
+        self._opening, self._after_opening = opening, []
         self._outbox.put(progress=Progress(f"Opening {path.name}", math.nan), urgent=True)
 
     def _do_opening(self, opening: Callable[[], None]) -> None:
@@ -276,6 +280,9 @@ class Session:
         except Exception as error:
             self._fail("The recording can not be opened", error)
         self._outbox.put(progress=None, urgent=True)
+        waiting, self._after_opening = self._after_opening, []
+        for command in waiting:
+            self.handle(command)
 
     def _open_other(self, path: Path, truth: Path | None) -> None:
         """Open another recording with its own parameters, and on top those changed by hand.

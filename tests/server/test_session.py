@@ -191,6 +191,23 @@ def test_everything_the_page_draws_arrives() -> None:
     assert snapshot.result is not None and snapshot.result.keyframe is None
 
 
+def test_commands_given_while_a_recording_opens_act_once_it_is_open() -> None:
+    desk = Desk(recording=None)
+    desk.session.open(Path("walk-60.mcap"), None)
+    snapshot = desk.do(Seek(30), Play())
+    assert snapshot.notices[-1].level != "error"
+    assert snapshot.transport.frame == 31 and snapshot.transport.playing
+
+
+def test_dragging_the_time_slider_back_and_forth_ends_where_it_was_let_go() -> None:
+    desk = Desk()
+    desk.do(Seek(50))
+    for frame in (40, 20, 10, 35):
+        desk.session.handle(Seek(frame))
+    assert desk.settle().transport.frame == 35
+    assert len(desk.runs) == 2, "opened again only once"
+
+
 # --- parameters ----------------------------------------------------------------------------------
 def ground_share_below(snapshot: Snapshot, height: float) -> float:
     assert snapshot.result is not None
