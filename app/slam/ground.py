@@ -4,10 +4,10 @@ import numpy as np
 
 from app.slam.kernels import ground as kernels
 from app.slam.params import Ground
-from app.slam.types import F32, F64, NON_GROUND, SEED, U8, U16, GroundResult
+from app.slam.types import F32, F64, NON_GROUND, U8, U16, GroundResult
 
 MIN_SEEDS = 20
-"""Fewer points than this do not make a plane worth believing."""
+"""Fewer seeds than this do not make a plane worth believing."""
 
 
 def segment(points: F32, ring: U16, down: F64, params: Ground) -> GroundResult:
@@ -52,6 +52,12 @@ def segment(points: F32, ring: U16, down: F64, params: Ground) -> GroundResult:
         reason = f"λ3/λ2 of the seeds is {planarity:.2f}, not below {params.planarity:g}: they form no plane"
         return _none(labels, down, reason, normal, centroid, planarity, seeds)
 
+    slope = float(np.degrees(np.arccos(np.clip(-normal @ down, -1.0, 1.0))))
+    if slope > params.max_slope:
+        labels[:] = NON_GROUND
+        reason = f"the seeds' plane is {slope:.0f}° steep, over {params.max_slope:g}°"
+        return _none(labels, down, reason, normal, centroid, planarity, seeds)
+
     kernels.label(points, centroid, normal, params.sigma, labels)
     return GroundResult(
         labels=labels,
@@ -86,6 +92,3 @@ def _none(
         seeds=seeds,
         share=0.0,
     )
-
-
-__all__ = ["MIN_SEEDS", "SEED", "segment"]

@@ -101,7 +101,7 @@ class Ground(Section):
         symbol="M",
     )
     alpha: float = _param(
-        40.0,
+        25.0,
         "Largest angle between a seed point and the direction straight down.",
         unit="deg",
         ge=1,
@@ -111,7 +111,7 @@ class Ground(Section):
         symbol="α",
     )
     sigma: float = _param(
-        0.03,
+        0.025,
         "Distance to the plane below which a point is ground, per metre of range.",
         unit="m/m",
         ge=0.001,
@@ -122,6 +122,15 @@ class Ground(Section):
     )
     planarity: float = _param(
         0.3, "The seeds form a plane if λ3/λ2 is below this.", ge=0.01, le=1, step=0.01, effect="now", symbol="λ3/λ2"
+    )
+    max_slope: float = _param(
+        40.0,
+        "A plane steeper than this is a wall or a stair's side, not ground.",
+        unit="deg",
+        ge=1,
+        le=90,
+        step=1,
+        effect="now",
     )
     voxel_size: float = _param(
         0.5,

@@ -41,7 +41,7 @@ def proceed(still: ImuSamples | None, scan: Scan, samples: ImuSamples, params: P
         samples: IMU samples up to this scan's end.
     """
     together = samples if still is None else _joined(still, samples)
-    if not is_moving(samples):
+    if not is_moving(together):
         rest = (together.stamps_ns[-1] - together.stamps_ns[0]) * 1e-9
         waiting = bool(rest < params.imu.start_duration)
         belief = standing(together, scan.end_ns, params)
