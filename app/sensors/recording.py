@@ -207,10 +207,17 @@ def open_recording(path: Path, params: Params) -> Recording:
 
 
 def find_recordings(folder: Path) -> list[Path]:
-    """Recordings below a folder: .bag, .mcap, .db3 files, and ROS 2 folders as one entry each, sorted."""
+    """Recordings below a folder: .bag, .mcap, .db3 files, and ROS 2 folders as one entry each, sorted.
+
+    Hidden entries, links to folders (they may lead in circles) and what can not be read are passed over.
+    """
     found: list[Path] = []
-    for entry in sorted(folder.iterdir()):
-        if entry.name.startswith("."):
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError:
+        return found
+    for entry in entries:
+        if entry.name.startswith(".") or (entry.is_symlink() and entry.is_dir()):
             continue
         if entry.is_dir():
             found += [entry] if (entry / "metadata.yaml").is_file() else find_recordings(entry)

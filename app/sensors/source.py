@@ -86,9 +86,11 @@ class Source:
                 entry = next(stream, None)
             except Exception as error:  # rosbags lets those of zstd, lz4, sqlite, struct and asserts through
                 at = (log_ns - self.start_ns) / 1e9
+                advice = _repair(self.path)
+                if at > 1:
+                    advice = f"what comes before can be used (--duration {at - 0.5:.1f}), and {advice}"
                 raise HemislamError(
-                    f"{self.path} is damaged {at:.1f} s after its start ({_brief(error)}); what comes before "
-                    f"can be used (--duration {max(at - 0.5, 0):.1f}), and {_repair(self.path)}."
+                    f"{self.path} is damaged {at:.1f} s after its start ({_brief(error)}); {advice}."
                 ) from error
             if entry is None:
                 return
@@ -145,6 +147,8 @@ class Source:
         path, brief = self.path, _brief(error)
         if isinstance(error, PermissionError):
             return f"{path} can not be opened (permission denied); change its permissions or copy it."
+        if path.is_dir() and "metadata" in brief.lower():
+            return f"The metadata.yaml of {path} can not be read ({brief}); {_REPAIR[''].format(path=path)}."
         if "not indexed" in brief:
             return f"{path} has no index, as after a recorder that was stopped hard; {_repair(path)}."
         return f"{path} is cut off or damaged ({brief}); {_repair(path)}."
@@ -180,9 +184,7 @@ def _recording_files(path: Path) -> list[Path]:
     if not start.startswith(magic[: len(start)]):
         other = next((suffix for suffix, known in _MAGIC.items() if start.startswith(known)), None)
         hint = f"by its content it is a {other}: rename it" if other else f"what can be read is {_KINDS}"
-        raise HemislamError(
-            f"{path} is not what its name says, the first bytes are not those of a {path.suffix}; {hint}."
-        )
+        raise HemislamError(f"{path} does not begin like a {path.suffix} file; {hint}.")
     return [path]
 
 
@@ -198,6 +200,9 @@ def _folder_files(path: Path) -> list[Path]:
 
 
 def _repair(path: Path) -> str:
+    if path.is_dir():
+        inside = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
+        path = inside[0] if len(inside) == 1 else path
     return _REPAIR["" if path.is_dir() else path.suffix].format(path=path)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -202,11 +203,14 @@ def write(path: Path, entries: list[Entry], container: str = "mcap") -> Path:
     """Write a recording; returns what a user would open.
 
     `container`: bag, bag-bz2, bag-lz4, sqlite3, sqlite3-message, sqlite3-file, mcap, mcap-zstd (all
-    but the bags are folders), bare-mcap, bare-db3.
+    but the bags are folders), bare-mcap, bare-db3, small-chunks (a bare .mcap of many zstd chunks).
     """
+    if container == "small-chunks":
+        return _write_small_chunks(path.with_suffix(".mcap"), entries)
     if container.startswith("bag"):
         path = path.with_suffix(".bag")
         writer: Any = Writer1(path)
+        writer.chunk_threshold = 30_000
         if "-" in container:
             writer.set_compression(Writer1.CompressionFormat[container[4:].upper()])
         _fill(writer, entries, 1)
@@ -220,6 +224,23 @@ def write(path: Path, entries: list[Entry], container: str = "mcap") -> Path:
     _fill(writer, entries, 2)
     if container.startswith("bare-"):
         return next(path.glob("*.mcap" if kind == "mcap" else "*.db3"))
+    return path
+
+
+def _write_small_chunks(path: Path, entries: list[Entry]) -> Path:
+    with path.open("wb") as stream:
+        writer = McapWriter(stream, chunk_size=30_000)
+        writer.start(profile="ros2")
+        channels: dict[str, int] = {}
+        for topic, log_ns, sent in entries:
+            kind = sent.__msgtype__
+            if topic not in channels:
+                text = TYPESTORES[2].generate_msgdef(kind, ros_version=2)[0]
+                schema = writer.register_schema(kind, "ros2msg", text.encode())
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            data = bytes(TYPESTORES[2].serialize_cdr(sent, kind))
+            writer.add_message(channels[topic], log_ns, data, publish_time=log_ns)
+        writer.finish()
     return path
 
 

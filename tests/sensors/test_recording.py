@@ -14,7 +14,7 @@ from tests.sensors import rig
 
 CONTAINERS = [
     "bag", "bag-bz2", "bag-lz4", "sqlite3", "sqlite3-message", "sqlite3-file", "mcap", "mcap-zstd", "bare-mcap",
-    "bare-db3",
+    "bare-db3", "small-chunks",
 ]  # fmt: skip
 
 
@@ -154,6 +154,7 @@ def test_recordings_are_found_below_a_folder(tmp_path: Path) -> None:
     rig.write(tmp_path / "deep" / "one", rig.walk(turns=2, columns=4, ros=1), "bag")
     (tmp_path / "notes.txt").write_text("no recording")
     (tmp_path / ".hidden.mcap").write_text("")
+    (tmp_path / "circle").symlink_to(tmp_path)
     assert find_recordings(tmp_path) == [tmp_path / "deep" / "one.bag", tmp_path / "inside"]
 
 

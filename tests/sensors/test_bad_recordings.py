@@ -1,0 +1,216 @@
+"""What can not be used is refused in one sentence that says what, where and what to do."""
+
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.sensors.recording import open_recording
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import DroppedScan, Measurement
+from tests.sensors import rig
+
+
+def refusal(path: Path, params: Params | None = None) -> str:
+    """The sentence, whether opening or reading raises it."""
+    with pytest.raises(HemislamError) as caught, open_recording(path, params or Params()) as recording:
+        list(recording.measurements())
+    sentence = str(caught.value)
+    assert "\n" not in sentence and sentence.endswith(".")
+    assert "Traceback" not in sentence and "Error(" not in sentence
+    return sentence
+
+
+# --- files -------------------------------------------------------------------------------------------
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    assert str(tmp_path / "gone.mcap") in refusal(tmp_path / "gone.mcap")
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
+def test_an_empty_file_is_called_empty(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"walk{suffix}"
+    path.touch()
+    assert "is empty" in refusal(path)
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
+def test_a_foreign_file_is_not_believed_by_its_name(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"walk{suffix}"
+    path.write_bytes(b"\x7fELF" + bytes(5000))
+    assert f"does not begin like a {suffix} file" in refusal(path)
+
+
+def test_a_file_with_a_wrong_suffix_is_recognised(tmp_path: Path) -> None:
+    bag = rig.write(tmp_path / "walk", rig.walk(turns=2, columns=4, ros=1), "bag")
+    assert "it is a .bag: rename it" in refusal(bag.rename(tmp_path / "walk.mcap"))
+
+
+def test_other_suffixes_and_folders_are_told_what_can_be_read(tmp_path: Path) -> None:
+    (tmp_path / "walk.pcap").write_bytes(b"1")
+    assert "ROS 1 .bag" in refusal(tmp_path / "walk.pcap")
+    assert "metadata.yaml" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("container", "repair"), [("bag", "rosbag reindex"), ("bare-db3", "sqlite3"), ("sqlite3", "sqlite3")]
+)
+@pytest.mark.parametrize("kept", [0.02, 0.5, 0.9])
+def test_a_cut_file_names_the_command_that_repairs_it(tmp_path: Path, container: str, repair: str, kept: float) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=20, columns=12, ros=1 if container == "bag" else 2), container)
+    file = path if path.is_file() else next(path.glob("*.db3"))
+    file.write_bytes(file.read_bytes()[: int(kept * file.stat().st_size)])
+    assert repair in refusal(path)
+
+
+def test_a_cut_mcap_is_read_up_to_the_cut_and_says_so(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=40, columns=30), "small-chunks")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with open_recording(path, Params()) as recording:
+        entries = list(recording.measurements())
+        assert any("cut off" in finding.text for finding in recording.findings)
+    used = [entry for entry in entries if isinstance(entry, Measurement)]
+    assert 10 <= len(used) <= 21
+    np.testing.assert_array_equal(used[5].scan.points, rig.turn(5, columns=30).points)
+
+
+def test_an_mcap_without_the_ros2_profile_is_read_all_the_same(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=4, columns=12), "small-chunks")
+    path.write_bytes(path.read_bytes().replace(b"\x04\x00\x00\x00ros2", b"\x04\x00\x00\x00xxxx", 1))
+    with open_recording(path, Params()) as recording:
+        assert sum(isinstance(entry, Measurement) for entry in recording.measurements()) == 4
+
+
+def test_a_folder_with_broken_metadata_names_the_command_that_makes_it_anew(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=2, columns=4), "sqlite3")
+    (path / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}")
+    assert "ros2 bag reindex" in refusal(path)
+
+
+def test_an_mcap_cut_in_its_head_is_refused(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=3, columns=12), "bare-mcap")
+    path.write_bytes(path.read_bytes()[:300])
+    assert "mcap recover" in refusal(path)
+
+
+def test_an_unindexed_bag_names_the_command_that_repairs_it(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=3, columns=12, ros=1), "bag")
+    content = bytearray(path.read_bytes())
+    at = content.index(b"index_pos=") + len(b"index_pos=")
+    content[at : at + 8] = bytes(8)
+    path.write_bytes(content)
+    assert "has no index" in refusal(path) and "rosbag reindex" in refusal(path)
+
+
+@pytest.mark.parametrize("container", ["bag-bz2", "small-chunks", "sqlite3-message"])
+def test_damage_in_the_middle_gives_all_before_it_and_then_says_when(tmp_path: Path, container: str) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=60, columns=40, ros=1 if "bag" in container else 2), container)
+    if container == "sqlite3-message":
+        with sqlite3.connect(next(path.glob("*.db3"))) as database:
+            database.execute("UPDATE messages SET data = x'0102' WHERE id = (SELECT max(id) * 2 / 3 FROM messages)")
+        database.close()
+    else:
+        content = bytearray(path.read_bytes())
+        at = len(content) * 2 // 3
+        content[at : at + 2000] = bytes(2000)
+        path.write_bytes(content)
+    used = 0
+    with open_recording(path, Params()) as recording, pytest.raises(HemislamError) as caught:
+        for entry in recording.measurements():
+            used += isinstance(entry, Measurement)
+    assert "is damaged" in str(caught.value) and "s after its start" in str(caught.value)
+    assert 20 <= used < 60
+
+
+# --- contents ----------------------------------------------------------------------------------------
+def test_a_recording_without_messages_says_so(tmp_path: Path) -> None:
+    assert "without a single message" in refusal(rig.write(tmp_path / "walk", [], "mcap"))
+
+
+def test_without_lidar_or_imu_the_topics_that_there_are_are_listed(tmp_path: Path) -> None:
+    entries = rig.walk(turns=3, columns=4)
+    blind = rig.write(tmp_path / "blind", [entry for entry in entries if entry[0] == "/imu"])
+    deaf = rig.write(tmp_path / "deaf", [entry for entry in entries if entry[0] == "/points"])
+    assert "no point clouds" in refusal(blind) and "/imu (sensor_msgs/msg/Imu)" in refusal(blind)
+    assert "no IMU samples" in refusal(deaf) and "/points" in refusal(deaf)
+
+
+def test_a_topic_that_is_not_there_lists_those_that_are(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=3, columns=4))
+    assert "--lidar-topic /points" in refusal(path, Params().with_values({"recording.lidar_topic": "/nope"}))
+    wrong_type = refusal(path, Params().with_values({"recording.imu_topic": "/points"}))
+    assert "no IMU samples on /points" in wrong_type and "--imu-topic /imu" in wrong_type
+
+
+@pytest.mark.parametrize(("lost", "keep"), [(True, True), (False, False)])
+def test_clouds_of_nan_or_of_nothing_are_refused(tmp_path: Path, lost: bool, keep: bool) -> None:
+    entries = []
+    for topic, log, sent in rig.walk(turns=4, columns=4):
+        if topic == "/points":
+            number = (log - rig.START_NS) // rig.PERIOD_NS - 1
+            made = rig.turn(number, columns=4)
+            made = made if keep else made.only(np.zeros(len(made), bool))
+            sent = rig.message(made, lost=range(len(made)) if lost else ())
+        entries.append((topic, log, sent))
+    sentence = refusal(rig.write(tmp_path / "walk", entries))
+    assert "None of the 4 point clouds" in sentence and "--lidar-topic" in sentence
+
+
+def test_a_few_empty_clouds_are_dropped_with_the_reason_and_the_rest_is_used(tmp_path: Path) -> None:
+    entries = rig.walk(turns=6, columns=12)
+    at = [n for n, (topic, _, _) in enumerate(entries) if topic == "/points"]
+    for number in (0, 3):
+        topic, log, _ = entries[at[number]]
+        made = rig.turn(number, columns=12)
+        entries[at[number]] = (topic, log, rig.message(made, lost=range(len(made))))
+    with open_recording(rig.write(tmp_path / "walk", entries), Params()) as recording:
+        read = list(recording.measurements())
+    reasons = [entry.reason for entry in read if isinstance(entry, DroppedScan)]
+    assert reasons == ["all its points are NaN"] * 2
+    assert sum(isinstance(entry, Measurement) for entry in read) == 4
+
+
+def test_a_single_scan_is_too_little(tmp_path: Path) -> None:
+    assert "a single usable scan" in refusal(rig.write(tmp_path / "walk", rig.walk(turns=1, columns=4)))
+
+
+def test_an_imu_that_starts_after_the_end_or_stops_before_the_start_leaves_nothing(tmp_path: Path) -> None:
+    late = rig.walk(turns=4, columns=4, imu_start_ns=600_000_000, imu_stop_ns=900_000_000)
+    assert "None of the 4 scans" in refusal(rig.write(tmp_path / "late", late))
+    assert "the IMU starts after it" in refusal(tmp_path / "late")
+    early = rig.walk(turns=4, columns=4, imu_start_ns=-300_000_000, imu_stop_ns=-100_000_000)
+    assert "the IMU stops before its end" in refusal(rig.write(tmp_path / "early", early))
+
+
+def test_an_imu_that_starts_late_and_stops_early_leaves_the_middle(tmp_path: Path) -> None:
+    entries = rig.walk(turns=9, columns=4, imu_start_ns=150_000_000, imu_stop_ns=720_000_000)
+    with open_recording(rig.write(tmp_path / "walk", entries), Params()) as recording:
+        read = list(recording.measurements())
+    assert [isinstance(entry, Measurement) for entry in read] == [False] * 2 + [True] * 5 + [False] * 2
+
+
+def test_an_imu_of_nan_is_refused(tmp_path: Path) -> None:
+    entries = [
+        (topic, log, rig.imu(log, accel=(float("nan"),) * 3) if topic == "/imu" else sent)
+        for topic, log, sent in rig.walk(turns=3, columns=4)
+    ]
+    assert "are all NaN" in refusal(rig.write(tmp_path / "walk", entries))
+
+
+def test_a_part_beyond_the_end_is_told_how_long_the_recording_is(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=4, columns=4))
+    with (
+        open_recording(path, Params()) as recording,
+        pytest.raises(HemislamError, match=r"no scan after 50 s.*lasts 0\.4"),
+    ):
+        list(recording.measurements(start_s=50))
+
+
+def test_a_time_unit_that_makes_no_scans_names_the_option_that_does(tmp_path: Path) -> None:
+    layout = rig.Layout(
+        unit_ns=1_000, absolute=False, fields=[*rig.RELATIVE[:-1], ("time", "u4", "time")], header="first"
+    )
+    path = rig.write(tmp_path / "walk", rig.walk(turns=3, layout=layout, columns=12))
+    sentence = refusal(path, Params().with_values({"recording.time_unit": "s"}))
+    assert "--set recording.time_unit=auto" in sentence

@@ -1,0 +1,87 @@
+"""The doctor names what is wrong with a recording, and nothing else."""
+
+from pathlib import Path
+
+import numpy as np
+
+from app.sensors.doctor import examine
+from app.sensors.findings import Finding
+from app.slam.params import Params
+from tests.sensors import rig
+
+MOUNTED = Params.parse({"sensor": {"translation": [0.1, 0.0, 0.0]}})
+
+
+def by_subject(path: Path, params: Params = MOUNTED) -> dict[str, Finding]:
+    return {finding.subject: finding for finding in examine(path, params)}
+
+
+def test_a_good_recording_is_fine_in_every_respect(tmp_path: Path) -> None:
+    fractions: list[float] = []
+    path = rig.write(tmp_path / "walk", rig.walk(turns=20, columns=12))
+    findings = examine(path, MOUNTED, fractions.append)
+    assert [finding for finding in findings if finding.verdict != "fine"] == []
+    assert {f.subject for f in findings} >= {
+        "topics", "fields", "point time", "header stamp", "rotation", "ring order", "IMU units", "gravity", "mount",
+        "scan rate", "IMU rate", "clocks", "IMU gaps", "IMU time", "scan time", "pairing", "returns",
+    }  # fmt: skip
+    assert fractions == sorted(fractions) and fractions[-1] == 1.0
+
+
+def test_rates_are_those_of_the_sensors(tmp_path: Path) -> None:
+    found = by_subject(rig.write(tmp_path / "walk", rig.walk(turns=8, columns=4, imu_period_ns=20_000_000)))
+    assert "10.00 Hz, 8 messages" in found["scan rate"].text
+    assert "50.00 Hz" in found["IMU rate"].text
+    assert found["IMU rate"].verdict == "needs you"
+
+
+def test_outages_steps_back_and_missing_scans_are_counted(tmp_path: Path) -> None:
+    entries = rig.walk(turns=20, columns=4)
+    stamp = {
+        id(sent): sent.header.stamp.sec * 10**9 + sent.header.stamp.nanosec - rig.START_NS for _, _, sent in entries
+    }
+    kept = [
+        (topic, log, sent)
+        for topic, log, sent in entries
+        if not (topic == "/imu" and 500_000_000 < stamp[id(sent)] < 900_000_000)
+        and not (topic == "/points" and stamp[id(sent)] in (1_400_000_000, 1_500_000_000))
+    ]
+    at = next(n for n, (topic, _, sent) in enumerate(kept) if topic == "/imu" and stamp[id(sent)] == 1_200_000_000)
+    kept.insert(at + 1, ("/imu", kept[at][1] + 1, rig.imu(rig.START_NS + 1_170_000_000)))
+    found = by_subject(rig.write(tmp_path / "walk", kept))
+    assert found["IMU gaps"].verdict == "needs you" and "the longest 0.400 s" in found["IMU gaps"].text
+    assert found["IMU time"].verdict == "corrected" and "1 steps back" in found["IMU time"].text
+    assert "2 missing" in found["scan time"].text and "0.300 s" in found["scan time"].text
+    assert "gap of the IMU" in found["pairing"].text
+
+
+def test_the_share_of_nan_is_told(tmp_path: Path) -> None:
+    entries = []
+    for topic, log, sent in rig.walk(turns=4, columns=10):
+        if topic == "/points":
+            made = rig.turn((log - rig.START_NS) // rig.PERIOD_NS - 1, columns=10)
+            sent = rig.message(made, lost=range(0, 80, 4))
+        entries.append((topic, log, sent))
+    found = by_subject(rig.write(tmp_path / "walk", entries))
+    assert "25.0% are NaN, 75.0% are returns" in found["returns"].text
+
+
+def test_damage_is_a_finding_and_the_rest_is_still_examined(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=60, columns=40), "small-chunks")
+    content = bytearray(path.read_bytes())
+    at = len(content) * 2 // 3
+    content[at : at + 2000] = bytes(2000)
+    path.write_bytes(content)
+    found = by_subject(path)
+    assert found["file"].verdict == "needs you" and "is damaged" in found["file"].text
+    assert "10.00 Hz" in found["scan rate"].text
+
+
+def test_the_gravity_finding_follows_the_imu(tmp_path: Path) -> None:
+    entries = [
+        (topic, log, rig.imu(log - 500_000, accel=(-9.7, 0.0, 1.0)) if topic == "/imu" else sent)
+        for topic, log, sent in rig.walk(turns=4, columns=4)
+    ]
+    found = by_subject(rig.write(tmp_path / "walk", entries))
+    assert "LiDAR's +x axis" in found["gravity"].text
+    assert f"down is {np.degrees(np.arctan2(1.0, 9.7)):.0f} deg" in found["gravity"].text
