@@ -148,7 +148,7 @@ class Source:
         if isinstance(error, PermissionError):
             return f"{path} can not be opened (permission denied); change its permissions or copy it."
         if path.is_dir() and "metadata" in brief.lower():
-            return f"The metadata.yaml of {path} can not be read ({brief}); {_REPAIR[''].format(path=path)}."
+            return f"The metadata.yaml of {path} can not be understood; {_REPAIR[''].format(path=path)}."
         if "not indexed" in brief:
             return f"{path} has no index, as after a recorder that was stopped hard; {_repair(path)}."
         return f"{path} is cut off or damaged ({brief}); {_repair(path)}."
