@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from app.sensors.simulator.mesh import Mesh
 from app.slam.errors import HemislamError
@@ -52,8 +53,9 @@ class Raycaster:
         hits = self._still.cast(origins, directions)
         for mover, target, centre, radius in self._movers:
             where, _ = mover.pose(times[[0, -1]])
-            reach = radius + float(np.linalg.norm(where[1] - where[0]))
-            near = np.flatnonzero(_passes(origins, directions, where[0] + [0.0, 0.0, centre], reach))
+            moved = np.linalg.norm(where[1] - where[0]) + np.ptp(origins, axis=0).sum()
+            towards = where[0] + [0.0, 0.0, centre] - origins[0]
+            near = np.flatnonzero(_passes(directions, towards, radius + float(moved)))
             if not near.size:
                 continue
             position, yaw = mover.pose(times[near])
@@ -107,12 +109,10 @@ def _sphere(mesh: Mesh) -> tuple[float, float]:
     return centre, float(np.linalg.norm(mesh.vertices - np.array([0.0, 0.0, centre]), axis=1).max()) + 0.01
 
 
-def _passes(origins: F64, directions: F64, centre: F64, radius: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which rays come within `radius` of `centre`."""
-    to_centre = centre - origins
-    along = np.maximum(np.einsum("ni,ni->n", to_centre, directions), 0.0)
-    off = to_centre - along[:, None] * directions
-    return np.asarray(np.einsum("ni,ni->n", off, off) < radius * radius)
+def _passes(directions: F64, centre: F64, radius: float) -> npt.NDArray[np.bool_]:
+    """Which rays from the origin along unit `directions` come within `radius` of `centre`."""
+    along = np.maximum(directions @ centre, 0.0)
+    return np.asarray(centre @ centre - along**2 < radius**2)
 
 
 def _unturned(vectors: F64, yaw: F64) -> F64:
