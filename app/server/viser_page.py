@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import io
 import secrets
+import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,9 @@ from websockets.typing import Subprotocol
 
 KEY_HEADER = "X-Hemislam-Key"
 
+BUFFER_BYTES = 1 << 20
+"""Of each socket on the way to the browser. The system would let tens of megabytes of old frames queue there."""
+
 
 @dataclass(frozen=True, slots=True)
 class Viser:
@@ -28,8 +32,12 @@ class Viser:
     key: str
 
     @property
+    def address(self) -> tuple[str, int]:
+        return "127.0.0.1", self.server.get_port()
+
+    @property
     def url(self) -> str:
-        return f"ws://127.0.0.1:{self.server.get_port()}/"
+        return "ws://{}:{}/".format(*self.address)
 
     def stop(self) -> None:
         with contextlib.redirect_stdout(io.StringIO()):  # it has its own words for that
@@ -82,18 +90,24 @@ async def bridge(browser: WebSocket, target: Viser) -> None:
     Each direction takes a message only when the one before was delivered, so a slow browser slows
     viser's sending, and viser then sends it fewer, newer updates.
     """
+    pipe = socket.socket()
+    pipe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+    pipe.setblocking(False)
     try:
+        await asyncio.get_running_loop().sock_connect(pipe, target.address)
         upstream = await connect(
             target.url,
+            sock=pipe,
             subprotocols=[Subprotocol(name) for name in browser.scope["subprotocols"]] or None,
             additional_headers={KEY_HEADER: target.key},
             proxy=None,
             compression=None,
             max_size=None,
-            max_queue=2,
+            max_queue=1,
             ping_interval=None,
         )
     except (OSError, InvalidHandshake, TimeoutError):
+        pipe.close()
         await browser.close(1013, "The page's server is not there.")
         return
     async with upstream:

@@ -24,7 +24,7 @@ from app import __version__
 from app.server.access import Access, Guard
 from app.server.api import make_router
 from app.server.folders import Folders
-from app.server.viser_page import Viser, bridge, page_html, start_viser
+from app.server.viser_page import BUFFER_BYTES, Viser, bridge, page_html, start_viser
 from app.server.worker import EngineProcess, Setup
 from app.slam.errors import HemislamError
 
@@ -106,17 +106,7 @@ def run_server(
         page = build_page(target.server, engine, folders)
         page.start()
         cleanup.callback(page.close)
-        server = _Server(
-            uvicorn.Config(
-                make_app(engine, folders, target, access),
-                log_level="warning",
-                lifespan="off",
-                ws="websockets-sansio",
-                ws_per_message_deflate=False,
-                timeout_graceful_shutdown=1,
-                server_header=False,
-            )
-        )
+        server = make_server(make_app(engine, folders, target, access))
         address = link(host, access)
         print(f"hemislam is at {address} (Ctrl-C ends it)", flush=True)
         threading.Thread(target=show_compilation, args=(engine,), name="progress", daemon=True).start()
@@ -138,6 +128,7 @@ def listen(host: str, port: int) -> socket.socket:
     listener = socket.socket(family, socket.SOCK_STREAM)
     if os.name == "posix":  # elsewhere it would let two servers share the port
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
     try:
         listener.bind(address)
         listener.listen(128)
@@ -176,11 +167,29 @@ def _has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
+def make_server(app: FastAPI) -> uvicorn.Server:
+    """What runs the app. Nothing is compressed: it would cost more than it saves on this machine."""
+    config = uvicorn.Config(
+        app,
+        log_level="warning",
+        lifespan="off",
+        ws="websockets-sansio",
+        ws_per_message_deflate=False,
+        timeout_graceful_shutdown=1,
+        server_header=False,
+    )
+    return _Server(config)
+
+
 class _Server(uvicorn.Server):
     """Ends on SIGINT and SIGTERM, and leaves it there: uvicorn would raise the signal again at the end."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
+        if threading.current_thread() is not threading.main_thread():  # only there signals can be heard
+            yield
+            return
+
         def end(number: int, frame: FrameType | None) -> None:
             self.force_exit = self.should_exit
             self.should_exit = True

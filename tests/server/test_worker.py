@@ -97,8 +97,8 @@ if __name__ == "__main__":
     engine = EngineProcess(Setup(recording=Path("walk-300.mcap")), main=fakes.fake_main)
     while engine.snapshot.transport.frame < 0:
         time.sleep(0.01)
-    print(engine.pid, flush=True)
     try:
+        print(engine.pid, flush=True)
         time.sleep(60)
     except KeyboardInterrupt:
         engine.close()

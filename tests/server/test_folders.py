@@ -1,0 +1,74 @@
+"""The page sees the folders it was given and nothing else."""
+
+from pathlib import Path
+
+import pytest
+
+from app.server.folders import Folders
+from app.slam.errors import HemislamError
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Path:
+    """open/ may be seen; private/ may not; links lead from one to the other."""
+    for name in ("open/walks/deep", "open/ros2", "private"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in ("open/a.mcap", "open/walks/b.bag", "open/walks/deep/c.db3", "private/secret.mcap"):
+        (tmp_path / name).write_bytes(b"1234")
+    (tmp_path / "open/ros2/metadata.yaml").write_text("x")
+    (tmp_path / "open/ros2/data_0.db3").write_bytes(b"123")
+    (tmp_path / "open/notes.txt").write_text("x")
+    (tmp_path / "open/.hidden.mcap").write_text("x")
+    (tmp_path / "open/out.mcap").symlink_to(tmp_path / "private/secret.mcap")
+    (tmp_path / "open/outside").symlink_to(tmp_path / "private")
+    (tmp_path / "open/loop").symlink_to(tmp_path / "open")
+    return tmp_path
+
+
+OUTSIDE = (
+    "../private/secret.mcap",
+    "walks/../../private/secret.mcap",
+    "out.mcap",
+    "outside/secret.mcap",
+    "/etc/passwd",
+    "..",
+    "/",
+    "missing.mcap",
+    "a.mcap/../../private",
+    "nul\0byte",
+    "~",
+)
+
+
+@pytest.mark.parametrize("path", OUTSIDE)
+def test_nothing_outside_is_reached_and_the_answer_tells_nothing(disk: Path, path: str) -> None:
+    with pytest.raises(HemislamError, match=r"There is no .* in the folders that hemislam was started for"):
+        Folders([disk / "open"]).inside(path)
+
+
+def test_a_folder_whose_name_begins_alike_is_not_inside(disk: Path) -> None:
+    (disk / "open-not").mkdir()
+    with pytest.raises(HemislamError):
+        Folders([disk / "open"]).inside(disk / "open-not")
+
+
+def test_a_listing_shows_folders_and_recordings_but_no_way_out(disk: Path) -> None:
+    listing = Folders([disk / "open"]).listing("")
+    assert [(entry.path.name, entry.is_recording, entry.size) for entry in listing] == [
+        ("loop", False, 0), ("walks", False, 0), ("a.mcap", True, 4), ("ros2", True, 4),
+    ]  # fmt: skip
+
+
+def test_all_recordings_are_found_once_in_spite_of_loops(disk: Path) -> None:
+    names = [path.relative_to(disk / "open").as_posix() for path in Folders([disk / "open"]).recordings()]
+    assert names == ["a.mcap", "ros2", "walks/b.bag", "walks/deep/c.db3"]
+
+
+def test_a_root_given_through_a_link_works(disk: Path) -> None:
+    (disk / "link").symlink_to(disk / "open")
+    assert Folders([disk / "link"]).inside(disk / "link" / "a.mcap") == (disk / "open/a.mcap").resolve()
+
+
+def test_a_root_that_is_no_folder_is_refused(disk: Path) -> None:
+    with pytest.raises(HemislamError, match=r"a\.mcap is not a folder"):
+        Folders([disk / "open/a.mcap"])

@@ -1,0 +1,412 @@
+"""The public port over real sockets: the page, the bridge, the REST interface, and who is refused."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import msgspec
+import numpy as np
+import pytest
+import server_fakes as fakes
+import viser
+import zstandard
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin, Subprotocol
+
+from app.server.access import Access
+from app.server.folders import Folders
+from app.server.viser_page import Viser, start_viser
+from app.server.web import link, listen, make_app, make_server
+from app.server.worker import EngineProcess, Setup
+from app.slam.errors import HemislamError
+
+PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
+PATIENCE_S = 20.0
+
+
+@dataclass
+class Site:
+    port: int
+    engine: EngineProcess
+    viser: Viser
+    folder: Path
+    access: Access
+
+    def url(self, path: str = "/") -> str:
+        return f"http://127.0.0.1:{self.port}{path}"
+
+    def socket(self, **kwargs: object) -> ClientConnection:
+        url = f"ws://127.0.0.1:{self.port}/"
+        return connect(url, subprotocols=[PROTOCOL], max_size=None, proxy=None, **kwargs)  # type: ignore[arg-type]
+
+
+@contextmanager
+def serving(engine: EngineProcess, target: Viser, folder: Path, token: str | None) -> Iterator[Site]:
+    listener = listen("127.0.0.1", 0)
+    access = Access(listener.getsockname()[1], token)
+    server = make_server(make_app(engine, Folders([folder]), target, access))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        yield Site(access.port, engine, target, folder, access)
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()
+
+
+@pytest.fixture(scope="module")
+def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EngineProcess]:
+    recording = tmp_path_factory.mktemp("recordings") / "walk-60.mcap"
+    recording.write_bytes(b"x")
+    (recording.parent / "walk-30.mcap").write_bytes(b"x")
+    process = EngineProcess(Setup(recording=recording), main=fakes.fake_main)
+    yield process
+    process.close()
+
+
+@pytest.fixture(scope="module")
+def target() -> Iterator[Viser]:
+    running = start_viser()
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="module")
+def site(engine: EngineProcess, target: Viser) -> Iterator[Site]:
+    recording = engine_recording(engine)
+    with serving(engine, target, recording.parent, None) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def locked_site(engine: EngineProcess, target: Viser) -> Iterator[Site]:
+    with serving(engine, target, engine_recording(engine).parent, "the-token") as running:
+        yield running
+
+
+def engine_recording(engine: EngineProcess) -> Path:
+    deadline = time.monotonic() + PATIENCE_S
+    while (recording := engine.snapshot.recording) is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return recording.path
+
+
+def eventually(site: Site, **wanted: object) -> dict[str, object]:
+    """The transport, once it is as wanted."""
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        transport: dict[str, object] = httpx.get(site.url("/api/state")).json()["transport"]
+        if wanted.items() <= transport.items():
+            return transport
+        assert time.monotonic() < deadline, transport
+        time.sleep(0.02)
+
+
+# --- page and bridge -----------------------------------------------------------------------------
+def test_the_page_is_visers_and_bound_to_this_server(site: Site) -> None:
+    answer = httpx.get(site.url())
+    assert answer.status_code == 200 and "<title>hemislam</title>" in answer.text
+    policy = answer.headers["content-security-policy"]
+    assert "connect-src 'self'" in policy and "default-src 'self'" in policy
+    assert not re.search(r"https?:", policy)
+
+
+def messages(raw: str | bytes) -> list[dict[str, Any]]:
+    """What viser packs into one WebSocket message."""
+    assert isinstance(raw, bytes)
+    size = int.from_bytes(raw[8:16], "little")
+    unpacked = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size])
+    entries: list[dict[str, Any]] = msgspec.msgpack.decode(unpacked)["messages"]
+    return entries
+
+
+def test_what_viser_shows_comes_through_and_what_the_user_does_goes_back(site: Site) -> None:
+    slider = site.viser.server.gui.add_slider("a slider for the test", min=0, max=10, step=1, initial_value=3)
+    with site.socket() as browser:
+        shown: list[dict[str, Any]] = []
+        while not shown:
+            received = messages(browser.recv(timeout=PATIENCE_S))
+            shown = [m for m in received if m.get("props", {}).get("label") == "a slider for the test"]
+        assert shown[0]["value"] == 3
+        update = {"type": "GuiUpdateMessage", "uuid": shown[0]["uuid"], "updates": {"value": 7}}
+        browser.send(msgspec.msgpack.encode(update))
+        deadline = time.monotonic() + PATIENCE_S
+        while slider.value != 7:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    slider.remove()
+
+
+def test_a_page_of_another_version_is_told_so(site: Site) -> None:
+    with connect(f"ws://127.0.0.1:{site.port}/", subprotocols=[Subprotocol("viser-v0.0.1")], proxy=None) as browser:
+        with pytest.raises(ConnectionClosed):
+            browser.recv(timeout=PATIENCE_S)
+        assert browser.close_code == 1002 and "Version mismatch" in (browser.close_reason or "")
+
+
+def test_a_browser_that_does_not_read_is_spared_all_but_the_newest(site: Site) -> None:
+    """240 MB are offered to a reader that takes none. They must not queue up: viser keeps the newest only."""
+    points = np.zeros((200_000, 3), dtype=np.float32)
+    newest = np.full(100, 100.0, dtype=np.float32).tobytes()
+    cloud = site.viser.server.scene.add_point_cloud("/test", points, (0, 0, 0), precision="float32")
+    with socket.socket() as browser:
+        browser.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 18)
+        browser.settimeout(PATIENCE_S)
+        browser.connect(("127.0.0.1", site.port))
+        browser.sendall(
+            f"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"Sec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Version: 13\r\n"
+            f"Sec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n".encode()
+        )
+        for value in range(1, 101):
+            cloud.points = points + value
+            time.sleep(0.01)
+        received, end = 0, b""
+        while newest not in end:
+            part = browser.recv(1 << 20)
+            assert part
+            received += len(part)
+            end = end[-len(newest) :] + part
+    cloud.remove()
+    assert received < 60_000_000
+
+
+@pytest.mark.parametrize("key", [None, "wrong"])
+def test_visers_own_port_is_closed_to_everybody_else(site: Site, key: str | None) -> None:
+    headers = {"X-Hemislam-Key": key} if key else {}
+    with pytest.raises(InvalidStatus) as refused:
+        connect(site.viser.url, subprotocols=[PROTOCOL], additional_headers=headers, proxy=None)
+    assert refused.value.response.status_code == 403
+    assert httpx.get(site.viser.url.replace("ws", "http"), headers=headers).status_code == 403
+
+
+def test_nobody_can_ask_for_visers_public_tunnel(site: Site) -> None:
+    handlers = site.viser.server._websock_server._incoming_handlers
+    assert not [kind for kind in handlers if "Share" in kind.__name__]
+
+
+# --- who is refused ------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://127.0.0.1:1", "https://127.0.0.1.evil.example"]
+)
+def test_a_foreign_origin_is_refused_everywhere(site: Site, origin: str) -> None:
+    for path in ("/", "/api/state", "/healthz"):
+        assert httpx.get(site.url(path), headers={"Origin": origin}).status_code == 403
+    answer = httpx.post(site.url("/api/transport"), json={"action": "play"}, headers={"Origin": origin})
+    assert answer.status_code == 403
+    with pytest.raises(InvalidStatus):
+        site.socket(origin=Origin(origin))
+
+
+def test_our_own_page_is_let_in(site: Site) -> None:
+    own = site.url("")
+    assert httpx.get(site.url("/api/state"), headers={"Origin": own}).status_code == 200
+    with site.socket(origin=Origin(own)) as browser:
+        assert browser.subprotocol == PROTOCOL
+
+
+def test_a_foreign_name_for_this_machine_is_refused(site: Site) -> None:
+    """DNS rebinding: the attacker's name resolves to 127.0.0.1, so Origin and Host agree."""
+    host = f"evil.example:{site.port}"
+    assert httpx.get(site.url(), headers={"Host": host, "Origin": f"http://{host}"}).status_code == 403
+    assert httpx.get(site.url(), headers={"Host": f"localhost:{site.port}"}).status_code == 200
+
+
+@pytest.mark.parametrize("token", [None, "", "wrong", "the-toke", "the-token2", "ünïcode"])
+def test_without_the_token_nothing_is_answered(locked_site: Site, token: str | None) -> None:
+    params = {"token": token} if token is not None else {}
+    headers = {"Cookie": f"{locked_site.access.cookie}={token}".encode()} if token else {}
+    for path in ("/", "/api/state", "/api/openapi.json", "/api/export/map.ply"):
+        assert httpx.get(locked_site.url(path), params=params).status_code == 401
+        assert httpx.get(locked_site.url(path), headers=headers).status_code == 401
+    with pytest.raises(InvalidStatus):
+        locked_site.socket()
+    assert httpx.get(locked_site.url("/healthz")).json() == {"status": "ok"}
+
+
+def test_the_link_lets_in_once_and_the_cookie_from_then_on(locked_site: Site) -> None:
+    with httpx.Client() as browser:
+        answer = browser.get(locked_site.url("/?token=the-token&darkMode=1"))
+        assert answer.status_code == 303 and answer.headers["location"] == "/?darkMode=1"
+        assert "HttpOnly" in answer.headers["set-cookie"]
+        assert browser.get(locked_site.url("/")).status_code == 200
+        cookie = "; ".join(f"{name}={value}" for name, value in browser.cookies.items())
+    with locked_site.socket(additional_headers={"Cookie": cookie}) as page:
+        assert page.subprotocol == PROTOCOL
+
+
+def test_the_redirect_never_leaves_for_another_host(locked_site: Site) -> None:
+    answer = httpx.get(locked_site.url("//evil.example/?token=the-token"))
+    assert answer.headers.get("location", "/").startswith("/") and not answer.headers["location"].startswith("//")
+
+
+def test_scripts_give_the_token_as_a_bearer(locked_site: Site) -> None:
+    answer = httpx.get(locked_site.url("/api/state"), headers={"Authorization": "Bearer the-token"})
+    assert answer.status_code == 200
+
+
+def test_the_token_alone_does_not_open_the_door_to_another_site(locked_site: Site) -> None:
+    headers = {"Authorization": "Bearer the-token", "Origin": "http://evil.example"}
+    assert httpx.get(locked_site.url("/api/state"), headers=headers).status_code == 403
+
+
+@pytest.mark.parametrize(
+    ("host", "needed"),
+    [
+        ("127.0.0.1", False),
+        ("localhost", False),
+        ("::1", False),
+        ("0.0.0.0", True),
+        ("192.168.1.5", True),
+        ("::", True),
+        ("", True),
+    ],
+)
+def test_a_token_is_made_wherever_others_could_reach_us(host: str, needed: bool) -> None:
+    access = Access.on(host, 8080)
+    assert (access.token is not None) == needed
+    assert ("token=" in link(host, access)) == needed
+
+
+# --- REST ----------------------------------------------------------------------------------------
+def test_transport_by_rest(site: Site) -> None:
+    def post(**body: object) -> int:
+        return httpx.post(site.url("/api/transport"), json=body).status_code
+
+    assert post(action="seek", frame=7) == 202
+    eventually(site, frame=7, playing=False)
+    assert post(action="step") == 202
+    eventually(site, frame=8)
+    assert post(action="speed", factor="max") == 202
+    assert post(action="play") == 202
+    eventually(site, finished=True, frame=59, speed="max")
+    assert post(action="restart") == 202
+    assert post(action="pause") == 202
+    eventually(site, finished=False, playing=False)
+    for bad in (
+        {"action": "fly"},
+        {"action": "seek"},
+        {"action": "speed", "factor": 0},
+        {"action": "step", "frames": -1},
+    ):
+        assert post(**bad) == 422
+
+
+def test_parameters_by_rest(site: Site) -> None:
+    answer = httpx.patch(site.url("/api/params"), json={"ground": {"alpha": 31}})
+    assert answer.json()["ground"]["alpha"] == 31
+    deadline = time.monotonic() + PATIENCE_S
+    while httpx.get(site.url("/api/params")).json()["ground"]["alpha"] != 31:
+        assert time.monotonic() < deadline
+    refused = httpx.patch(site.url("/api/params"), json={"ground": {"alpha": 900}})
+    assert refused.status_code == 422 and "`ground.alpha` can not be 900" in refused.json()["detail"]
+    schema = httpx.get(site.url("/api/openapi.json")).json()["components"]["schemas"]["Ground"]["properties"]["alpha"]
+    assert schema["minimum"] == 1 and schema["maximum"] == 90 and schema["unit"] == "deg"
+
+
+def test_exports_by_rest(site: Site) -> None:
+    httpx.post(site.url("/api/transport"), json={"action": "seek", "frame": 20})
+    eventually(site, frame=20)
+    trajectory = httpx.get(site.url("/api/export/trajectory.tum"), timeout=PATIENCE_S).text.splitlines()
+    assert len(trajectory) == 21 and all(len(line.split()) == 8 for line in trajectory)
+    cloud = httpx.get(site.url("/api/export/map.ply"), timeout=PATIENCE_S).content
+    assert f"element vertex {5 * fakes.POINTS:012d}".encode() in cloud
+    assert httpx.get(site.url("/api/export/passwd")).status_code == 422
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "../../../../etc/passwd", "missing.mcap"])
+def test_recordings_outside_the_folders_are_not_opened(site: Site, path: str) -> None:
+    answer = httpx.post(site.url("/api/recordings"), json={"path": path})
+    assert answer.status_code == 422 and "There is no" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    "path", ["/../pyproject.toml", "/%2e%2e/pyproject.toml", "/..%2fpyproject.toml", "/index.html"]
+)
+def test_no_file_but_the_page_is_served(site: Site, path: str) -> None:
+    with socket.create_connection(("127.0.0.1", site.port)) as raw:
+        raw.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n".encode())
+        assert raw.recv(100).split()[1] == b"404"
+
+
+def test_recordings_inside_are_listed_and_opened(site: Site) -> None:
+    names = httpx.get(site.url("/api/recordings")).json()
+    assert [Path(name).name for name in names] == ["walk-30.mcap", "walk-60.mcap"]
+    for name in names:
+        assert httpx.post(site.url("/api/recordings"), json={"path": name}).status_code == 202
+        deadline = time.monotonic() + PATIENCE_S
+        while httpx.get(site.url("/api/state")).json()["recording"]["path"] != name:
+            assert time.monotonic() < deadline
+
+
+# --- the whole server ----------------------------------------------------------------------------
+def test_a_busy_port_is_named_with_the_way_out() -> None:
+    with listen("127.0.0.1", 0) as busy:
+        port = busy.getsockname()[1]
+        with pytest.raises(HemislamError, match=f"Port {port} is in use .* --port"):
+            listen("127.0.0.1", port)
+
+
+def test_an_address_that_is_not_ours_is_named() -> None:
+    with pytest.raises(HemislamError, match="--host"):
+        listen("192.0.2.1", 0)
+
+
+SERVER = """
+import sys
+sys.path[:0] = {path!r}
+import server_fakes as fakes
+from functools import partial
+from pathlib import Path
+from app.server.folders import Folders
+from app.server.web import run_server
+from app.server.worker import EngineProcess, Setup
+
+class Page:
+    def __init__(self, viser, engine, folders): self.engine = engine
+    def start(self): print("engine", self.engine.pid, flush=True)
+    def close(self): print("page closed", flush=True)
+
+if __name__ == "__main__":
+    run_server(
+        Setup(recording=Path("walk-300.mcap")), folders=Folders([]), build_page=Page, port=0, open_browser=False,
+        start_engine=partial(EngineProcess, main=fakes.fake_main),
+    )
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_server_stops_cleanly_with_everything_it_started(tmp_path: Path, number: signal.Signals) -> None:
+    script = tmp_path / "server.py"
+    script.write_text(SERVER.format(path=[str(Path(__file__).resolve().parents[2]), str(Path(__file__).parent)]))
+    process = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        assert process.stdout is not None
+        engine_pid = int(process.stdout.readline().removeprefix("engine "))
+        address = process.stdout.readline().split()[3]
+        health = f"{address}healthz"
+        assert httpx.get(health, timeout=PATIENCE_S).json() == {"status": "ok"}
+        with connect(address.replace("http", "ws"), subprotocols=[PROTOCOL], proxy=None):
+            os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
+            out, err = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+    assert process.returncode == 0 and err == "" and out == "page closed\n"
+    with pytest.raises(ProcessLookupError):
+        os.kill(engine_pid, 0)
