@@ -1,5 +1,7 @@
 """Whether the LiDAR's and the IMU's stamps come from the same clock, judged by when they were logged."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from app.sensors.findings import Finding
@@ -17,6 +19,20 @@ def clock_offset_s(scan_log_ns: I64, scan_end_ns: I64, imu_log_ns: I64, imu_stam
     scan_delay = np.median((scan_log_ns - scan_end_ns).astype(np.float64))
     imu_delay = np.median((imu_log_ns - imu_stamps_ns).astype(np.float64))
     return float(imu_delay - scan_delay) / 1e9
+
+
+def offset_spread_s(scan_log_ns: I64, scan_end_ns: I64, imu_log_ns: I64, imu_stamps_ns: I64, parts: int = 10) -> float:
+    """Seconds by which that offset changes over a recording: a clock that was set, or that drifts."""
+    if min(len(scan_log_ns), len(imu_log_ns)) < 10 * parts:
+        return 0.0
+    edges = np.linspace(scan_log_ns[0], scan_log_ns[-1], parts + 1)
+    offsets = []
+    for begin, end in pairwise(edges):
+        scans = (scan_log_ns >= begin) & (scan_log_ns <= end)
+        imu = (imu_log_ns >= begin) & (imu_log_ns <= end)
+        if scans.any() and imu.any():
+            offsets.append(clock_offset_s(scan_log_ns[scans], scan_end_ns[scans], imu_log_ns[imu], imu_stamps_ns[imu]))
+    return max(offsets) - min(offsets) if offsets else 0.0
 
 
 def clock_finding(offset_s: float, applied_s: float, logged_apart: bool) -> Finding:

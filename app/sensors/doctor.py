@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.sensors.clocks import clock_finding, clock_offset_s
+from app.sensors.clocks import TOLERANCE_S, clock_finding, clock_offset_s, offset_spread_s
 from app.sensors.findings import Finding as Finding
 from app.sensors.findings import Verdict
 from app.sensors.recording import ImuEntry, Recording, ScanEntry, open_recording
@@ -101,8 +101,15 @@ class _Census:
         if not len(scans) or not len(imu):
             return Finding("clocks", "needs you", "there are no scans and IMU samples to compare")
         copied = np.all(np.abs(scans[:, 0] - scans[:, 2]) < 2_000) and np.all(np.abs(imu[:, 0] - imu[:, 1]) < 2_000)
-        offset = clock_offset_s(scans[:, 0], scans[:, 2], imu[:, 0], imu[:, 1])
-        return clock_finding(offset, params.recording.imu_time_offset, not copied)
+        times = scans[:, 0], scans[:, 2], imu[:, 0], imu[:, 1]
+        spread = offset_spread_s(*times)
+        if spread > TOLERANCE_S:
+            text = (
+                f"the offset between the LiDAR's and the IMU's stamps changes by {spread:.3f} s on the way: a clock "
+                "was set or drifts; use a part before that (--start, --duration), and one clock for both next time"
+            )
+            return Finding("clocks", "needs you", text)
+        return clock_finding(clock_offset_s(*times), params.recording.imu_time_offset, not copied)
 
 
 def _topics(recording: Recording) -> Finding:

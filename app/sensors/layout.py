@@ -69,7 +69,7 @@ def settle_cloud(probes: list[Probe], chosen: Recording, where: str) -> tuple[Cl
         }
         clocked.append(Clocked(probe.log_ns, probe.cloud.stamp_ns, columns, probe.stamped))
     findings = [_fields_finding(probes[0].cloud)]
-    timing, time_findings = settle_timing(clocked, chosen, where)
+    timing, time_findings = settle_timing(clocked, chosen)
     rings, ring_finding = settle_rings(samples, names)
     clouds = [(s.points, rings.of(s.cloud, s.points, s.index)) for s in samples]
     spin = None

@@ -13,6 +13,9 @@ import numpy as np
 
 from app.slam.types import DroppedScan, ImuSamples, Measurement, Scan
 
+OUTAGE_NS = 1_000_000_000
+"""A sample that comes more than this after the one before must be confirmed by the next."""
+
 Vector = tuple[float, float, float]
 
 MAX_WAITING = 64
@@ -53,6 +56,8 @@ class Sequencer:
     _last_end_ns: int | None = None
     _intervals_ns: list[int] = field(default_factory=list)
     _behind: bool = False
+    _suspect: tuple[int, tuple[float, ...]] | None = None
+    """A sample stamped far ahead of the one before: a wrong stamp, unless the next one goes on from there."""
 
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector) -> None:
         """One IMU sample: rad/s and m/s^2, IMU frame."""
@@ -61,6 +66,15 @@ class Sequencer:
             self._count("imu_invalid", "an IMU sample is NaN or infinite and was left out")
             return
         newest = self._stamps[-1] if self._stamps else None
+        if newest is not None and stamp_ns > newest + OUTAGE_NS and not self._confirms(stamp_ns):
+            self._suspect = (stamp_ns, values)
+            return
+        if self._suspect is not None:
+            suspect, self._suspect = self._suspect, None
+            if newest is not None and stamp_ns > newest + OUTAGE_NS:
+                self._append(*suspect)
+            else:
+                self._count("imu_back_steps", "an IMU sample was stamped far ahead of its time and was left out")
         if newest is not None and stamp_ns <= newest:
             if stamp_ns == newest:
                 self.counts.imu_duplicates += 1
@@ -70,10 +84,17 @@ class Sequencer:
                 self._behind = True
             return
         self._behind = False
-        if newest is not None and stamp_ns - newest > self.max_gap_s * 1e9:
-            gap = (stamp_ns - newest) / 1e9
-            self.counts.longest_imu_gap_s = max(self.counts.longest_imu_gap_s, gap)
-            self._count("imu_gaps", f"no IMU sample for {gap:.3f} s")
+        self._append(stamp_ns, values)
+
+    def _confirms(self, stamp_ns: int) -> bool:
+        """Whether this sample goes on where the one far ahead was: then time did go on while the IMU was silent."""
+        return self._suspect is not None and 0 < stamp_ns - self._suspect[0] <= OUTAGE_NS
+
+    def _append(self, stamp_ns: int, values: tuple[float, ...]) -> None:
+        gap_s = (stamp_ns - self._stamps[-1]) / 1e9 if self._stamps else 0.0
+        if gap_s > self.max_gap_s:
+            self.counts.imu_gaps += 1
+            self.counts.longest_imu_gap_s = max(self.counts.longest_imu_gap_s, gap_s)
         self.counts.imu_samples += 1
         self._stamps.append(stamp_ns)
         self._values.append(values)
@@ -108,7 +129,10 @@ class Sequencer:
         first = max(bisect.bisect_right(self._stamps, begin_ns) - 1, 0)
         last = bisect.bisect_left(self._stamps, end_ns)
         self._note_missing_scans(scan)
-        measurement = Measurement(scan, self._samples(first, last + 1), tuple(self._notices))
+        imu = self._samples(first, last + 1)
+        gaps = np.diff(imu.stamps_ns) / 1e9
+        self._notices += [f"no IMU sample for {gap:.3f} s" for gap in gaps[gaps > self.max_gap_s]]
+        measurement = Measurement(scan, imu, tuple(self._notices))
         self._notices.clear()
         self._last_stamp_ns, self._last_end_ns = scan.stamp_ns, end_ns
         keep = max(bisect.bisect_right(self._stamps, end_ns) - 1, 0)

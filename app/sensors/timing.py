@@ -50,8 +50,8 @@ class Timing:
     period_ns: int
 
 
-def settle_timing(clouds: list[Clocked], chosen: Recording, where: str) -> tuple[Timing, list[Finding]]:
-    """Decide from a few clouds. `where`: the topic, for texts. Raises nothing: bad choices are findings."""
+def settle_timing(clouds: list[Clocked], chosen: Recording) -> tuple[Timing, list[Finding]]:
+    """Decide from a few clouds. Bad choices of the user are findings, not errors."""
     period_ns, period_known = scan_period_ns(clouds, chosen.rotation_rate)
     rejected: list[str] = []
     for name in _candidates(clouds, chosen.time_field):

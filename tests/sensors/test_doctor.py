@@ -77,6 +77,17 @@ def test_damage_is_a_finding_and_the_rest_is_still_examined(tmp_path: Path) -> N
     assert "10.00 Hz" in found["scan rate"].text
 
 
+def test_a_clock_that_was_set_on_the_way_is_named(tmp_path: Path) -> None:
+    entries = [
+        (topic, log, rig.imu(log - 500_000 - (400_000_000 if log > rig.START_NS + 6 * 10**9 else 0)))
+        if topic == "/imu"
+        else (topic, log, sent)
+        for topic, log, sent in rig.walk(turns=110, columns=2)
+    ]
+    found = by_subject(rig.write(tmp_path / "walk", entries))
+    assert found["clocks"].verdict == "needs you" and "changes by 0.400 s" in found["clocks"].text
+
+
 def test_the_gravity_finding_follows_the_imu(tmp_path: Path) -> None:
     entries = [
         (topic, log, rig.imu(log - 500_000, accel=(-9.7, 0.0, 1.0)) if topic == "/imu" else sent)

@@ -170,6 +170,24 @@ def test_repeated_and_reversed_samples_are_left_out_once_and_told() -> None:
     assert (sequencer.counts.imu_duplicates, sequencer.counts.imu_back_steps) == (1, 1)
 
 
+def test_one_sample_stamped_far_ahead_does_not_silence_the_rest() -> None:
+    sequencer = Sequencer(max_gap_s=0.1)
+    for at in [*samples(0, 50), 9_000_000, *samples(60, 210)]:
+        push(sequencer, at)
+    sequencer.add_scan(scan(0))
+    sequencer.add_scan(scan(100))
+    first, second = sequencer.ready()
+    assert stamps(first) == samples(0, 100) and stamps(second) == samples(100, 200)
+    assert isinstance(first, Measurement) and "far ahead" in first.notices[0]
+
+
+def test_the_imu_goes_on_after_an_outage_of_many_seconds() -> None:
+    out, sequencer = feed([*samples(0, 110), *samples(5000, 5310)], [scan(0), scan(5000), scan(5100), scan(5200)])
+    assert stamps(out[1]) == [100, 110, *samples(5000, 5100)]
+    assert len(out) == 4 and dropped(out) == []
+    assert sequencer.counts.longest_imu_gap_s == 4.89
+
+
 def test_nan_samples_are_left_out_and_told() -> None:
     sequencer = Sequencer(max_gap_s=0.1)
     for at in samples(0, 110):
