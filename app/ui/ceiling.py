@@ -9,7 +9,7 @@ from app.slam.types import F32, F64, NON_GROUND, U8
 
 _CONE: Final = float(np.cos(np.radians(35.0)))
 _HIGHEST_M: Final = 8.0
-_LEAST_SHARE: Final = 0.02
+_LEAST_SHARE: Final = 0.004
 _FLATNESS_M: Final = 0.12
 """Most median deviation of the points overhead from their median height: treetops are rougher."""
 _MARGIN_M: Final = 0.25

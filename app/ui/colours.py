@@ -15,8 +15,8 @@ from app.slam.types import GROUND, NON_GROUND, SEED, U8
 Rgb = tuple[int, int, int]
 
 LABEL_COLOURS: Final[dict[int, Rgb]] = {
-    NON_GROUND: (158, 172, 192),
-    GROUND: (46, 190, 165),
+    NON_GROUND: (164, 177, 198),
+    GROUND: (34, 170, 148),
     SEED: (255, 176, 32),
 }
 """Blue-grey, teal and amber: told apart by every kind of colour vision, and by lightness too."""
