@@ -53,7 +53,7 @@ def hemislam(
 
     \b
     Try:
-      hemislam serve sample_data/corridor.mcap    watch the map grow in the browser
+      hemislam serve sample_data/museum.mcap      watch the map grow in the browser
       hemislam info walk.bag                      what is in a recording, and what is wrong with it
       hemislam run walk.bag --preset h2lid        trajectory, map and report, without a browser
 
@@ -113,7 +113,7 @@ def info(
 
 @cli.command()
 def simulate(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="corridor, room, outdoor, ...")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="corridor, room, outdoor or museum.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE.mcap", help="The recording to write.")],
     duration: Annotated[float, typer.Option("--duration", metavar="SECONDS", help="Of the walk.")] = 60.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed, another walk.")] = 0,
@@ -124,6 +124,9 @@ def simulate(
     coordinate_step: Annotated[
         float, typer.Option("--coordinate-step", metavar="METRES", help="Round x, y, z, for a smaller file; 0: do not.")
     ] = 0.0,
+    range_step: Annotated[
+        float, typer.Option("--range-step", metavar="METRES", help="Of distances; 0.0025 for a newer unit, 0: none.")
+    ] = 0.005,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it is there.")] = False,
 ) -> None:
     """Make a recording of a walk through a modelled scene.
@@ -157,6 +160,7 @@ def simulate(
             seed=seed,
             rate_hz=rate,
             every_block=every_block,
+            range_step=range_step,
             coordinate_step=coordinate_step,
             progress=show,
         )
