@@ -7,6 +7,7 @@ import numpy as np
 
 from app.slam import ground, iekf, imu, keyframes, start
 from app.slam.imu import Belief
+from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
 from app.slam.local_map import LocalMap, MapState
 from app.slam.params import Params
@@ -197,9 +198,8 @@ def _spread(points: np.ndarray, most: int) -> np.ndarray:
 
 
 def _in_range(scan: Scan, nearest: float, farthest: float) -> Scan:
-    r2 = np.einsum("ij,ij->i", scan.points, scan.points)
-    keep = (r2 >= nearest * nearest) & (r2 <= farthest * farthest)
-    if keep.all():
+    keep = np.empty(len(scan), dtype=np.bool_)
+    if clouds.in_range(scan.points, nearest, farthest, keep) == len(scan):
         return scan
     return Scan(
         scan.stamp_ns,

@@ -7,7 +7,7 @@ state's size and not by the number of points; each iteration is one Gauss-Newton
 
 import numpy as np
 
-from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
+from app.slam.imu import DIM, POS, ROT, Belief
 from app.slam.kernels import manifold
 from app.slam.kernels import registration as kernels
 from app.slam.local_map import LocalMap, Planes
@@ -26,47 +26,34 @@ DEGENERATE_SIGMA = 0.05
 """m (rotation: rad times the points' typical range): a direction that one scan alone leaves
 more uncertain than this is called degenerate."""
 
-_MEASURED = np.r_[0:6, 17:23]
-"""Error dimensions that a point-to-plane distance depends on."""
+NAVIGATION = 17
+"""Error dimensions without the extrinsics, which come last and stay as they are unless estimated."""
 
 
 def boxplus(x: NavState, d: F64) -> NavState:
     """x [+] d for an error d (23,)."""
-    B = manifold.tangent_basis(x.g_odom)
-    return NavState(
-        stamp_ns=x.stamp_ns,
-        R_odom_imu=x.R_odom_imu @ manifold.exp(d[ROT]),
-        p_odom_imu=x.p_odom_imu + d[POS],
-        v_odom_imu=x.v_odom_imu + d[VEL],
-        b_gyro=x.b_gyro + d[BG],
-        b_accel=x.b_accel + d[BA],
-        g_odom=manifold.exp(B @ d[GRAV]) @ x.g_odom,
-        R_imu_lidar=x.R_imu_lidar @ manifold.exp(d[EXT_ROT]),
-        p_imu_lidar=x.p_imu_lidar + d[EXT_POS],
-    )
+    out = np.empty(manifold.SIZE)
+    manifold.boxplus(_packed(x), d, out)
+    return _unpacked(out, x.stamp_ns)
 
 
 def boxminus(a: NavState, b: NavState) -> F64:
     """a [-] b: the error d (23,) with b [+] d = a."""
     d = np.empty(DIM)
-    d[ROT] = manifold.log(b.R_odom_imu.T @ a.R_odom_imu)
-    d[POS] = a.p_odom_imu - b.p_odom_imu
-    d[VEL] = a.v_odom_imu - b.v_odom_imu
-    d[BG] = a.b_gyro - b.b_gyro
-    d[BA] = a.b_accel - b.b_accel
-    d[GRAV] = manifold.tangent_basis(b.g_odom).T @ manifold.turn(b.g_odom, a.g_odom)
-    d[EXT_ROT] = manifold.log(b.R_imu_lidar.T @ a.R_imu_lidar)
-    d[EXT_POS] = a.p_imu_lidar - b.p_imu_lidar
+    manifold.boxminus(_packed(a), _packed(b), d)
     return d
 
 
-def _boxminus_jacobian(d: F64, x: NavState, prior: NavState) -> F64:
-    """d(x [+] e [-] prior)/de at e = 0, where d = x [-] prior."""
-    J = np.eye(DIM)
-    J[ROT, ROT] = manifold.right_jacobian_inverse(d[ROT])
-    J[EXT_ROT, EXT_ROT] = manifold.right_jacobian_inverse(d[EXT_ROT])
-    J[GRAV, GRAV] = manifold.tangent_basis(prior.g_odom).T @ manifold.tangent_basis(x.g_odom)
-    return J
+def _packed(x: NavState) -> F64:
+    rotation, extrinsic = x.R_odom_imu.ravel(), x.R_imu_lidar.ravel()
+    return np.concatenate(
+        [rotation, x.p_odom_imu, x.v_odom_imu, x.b_gyro, x.b_accel, x.g_odom, extrinsic, x.p_imu_lidar]
+    )
+
+
+def _unpacked(x: F64, stamp_ns: int) -> NavState:
+    R, p, v, bg, ba, g, R_il, p_il = np.split(x, [9, 12, 15, 18, 21, 24, 33])
+    return NavState(stamp_ns, R.reshape(3, 3), p, v, bg, ba, g, R_il.reshape(3, 3), p_il)
 
 
 def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> tuple[Belief, Registration]:
@@ -81,55 +68,34 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> t
         the update went.
     """
     n = len(points)
-    free = np.arange(DIM) if params.estimate_extrinsics else np.arange(17)
-    information = np.linalg.inv(prior.covariance[np.ix_(free, free)])
-    world, residuals = np.empty((n, 3)), np.full(n, np.nan)
+    free = DIM if params.estimate_extrinsics else NAVIGATION
+    information = np.linalg.inv(prior.covariance[:free, :free])
+    world, residuals = np.empty((n, 3)), np.empty(n)
     H, b, stats = np.empty((12, 12)), np.empty(12), np.zeros(2)
-    x = prior.state
+    begin = x = _packed(prior.state)
+    covariance, step = np.empty((free, free)), np.empty(DIM)
     planes: Planes | None = None
-    searched_R, searched_p = x.R_odom_imu, x.p_odom_imu
+    since_search = np.zeros(DIM)
     converged, iteration = False, 0
-    posterior = prior.covariance
 
     for iteration in range(1, params.max_iterations + 1):
-        if planes is None or _moved(x, searched_R, searched_p):
-            kernels.to_world(points, x.R_odom_imu, x.p_odom_imu, x.R_imu_lidar, x.p_imu_lidar, world)
-            planes = local_map.planes(
-                world,
-                params.neighbour_distance,
-                params.plane_threshold,
-                params.neighbours,
-                np.radians(params.plane_tilt),
-                params.point_noise,
-            )
-            searched_R, searched_p = x.R_odom_imu, x.p_odom_imu
+        R, p, R_il, p_il = x[0:9].reshape(3, 3), x[9:12], x[24:33].reshape(3, 3), x[33:36]
+        if planes is None or _over(since_search, RESEARCH_ROTATION, RESEARCH_TRANSLATION):
+            kernels.to_world(points, R, p, R_il, p_il, world)
+            planes = local_map.planes(world, params)
+            since_search[:] = 0.0
         kernels.normal_equations(
-            points, x.R_odom_imu, x.p_odom_imu, x.R_imu_lidar, x.p_imu_lidar,
-            planes.normals, planes.centers, planes.variances,
+            points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,
             params.point_noise, params.gate, params.estimate_extrinsics, H, b, stats, residuals,
         )  # fmt: skip
         if stats[0] < MIN_INLIERS:
             reason = f"only {int(stats[0])} of {n} points found a plane in the map; an update takes {MIN_INLIERS}"
             nothing = Registration(False, iteration, n, int(stats[0]), float("nan"), np.zeros(6), True, reason)
             return prior, nothing
-
-        # Gauss-Newton on |x [-] prior|²_P + sum |z + H d|²_R
-        d = boxminus(x, prior.state)
-        J = _boxminus_jacobian(d, x, prior.state)[np.ix_(free, free)]
-        A = J.T @ information @ J
-        rhs = J.T @ (information @ d[free])
-        full_H, full_b = np.zeros((DIM, DIM)), np.zeros(DIM)
-        full_H[np.ix_(_MEASURED, _MEASURED)] = H
-        full_b[_MEASURED] = b
-        A += full_H[np.ix_(free, free)]
-        rhs += full_b[free]
-        posterior_free = np.linalg.inv(A)
-        step = np.zeros(DIM)
-        step[free] = -posterior_free @ rhs
-        x = boxplus(x, step)
-        posterior = prior.covariance.copy()
-        posterior[np.ix_(free, free)] = 0.5 * (posterior_free + posterior_free.T)
-        if np.linalg.norm(step[ROT]) < CONVERGED_ROTATION and np.linalg.norm(step[POS]) < CONVERGED_TRANSLATION:
+        here, x = x, np.empty(manifold.SIZE)
+        manifold.gauss_newton(here, begin, information, H, b, covariance, step, x)
+        since_search += step
+        if not _over(step, CONVERGED_ROTATION, CONVERGED_TRANSLATION):
             converged = True
             break
 
@@ -147,9 +113,11 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> t
         degenerate=degenerate,
         reason="one direction is not held by this scan" if degenerate else "",
     )
-    return Belief(x, posterior), registration
+    posterior = prior.covariance.copy()
+    posterior[:free, :free] = covariance
+    return Belief(_unpacked(x, prior.state.stamp_ns), posterior), registration
 
 
-def _moved(x: NavState, R: F64, p: F64) -> bool:
-    angle = np.linalg.norm(manifold.log(R.T @ x.R_odom_imu))
-    return bool(angle > RESEARCH_ROTATION or np.linalg.norm(x.p_odom_imu - p) > RESEARCH_TRANSLATION)
+def _over(step: F64, rotation: float, translation: float) -> bool:
+    """Whether an error's pose part is over either bound (rad, m)."""
+    return bool(step[ROT] @ step[ROT] > rotation**2 or step[POS] @ step[POS] > translation**2)

@@ -50,6 +50,9 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: Imu) -> tupl
     Returns the predicted belief and the path in between.
     """
     state = belief.state
+    if end_ns <= state.stamp_ns:  # nothing to integrate: the device has not moved meanwhile
+        here = state.T_odom_imu[None, :3]
+        return belief, Path(np.array([-1.0, 0.0]), np.concatenate([here, here]))
     times, gyro, accel = _clipped(imu, state.stamp_ns, end_ns)
     R, p, v = state.R_odom_imu.copy(), state.p_odom_imu.copy(), state.v_odom_imu.copy()
     P = belief.covariance.copy()
@@ -79,9 +82,9 @@ def deskew(scan: Scan, path: Path, state: NavState) -> F32:
     poses[:, :3] = path.poses
     poses[:, 3, 3] = 1.0
     relative = lie.inverse(T_imu_lidar) @ lie.inverse(poses[-1]) @ poses @ T_imu_lidar
-    times = (scan.offsets_ns.astype(np.float64) + (scan.stamp_ns - state.stamp_ns)) * 1e-9
+    shift = (scan.stamp_ns - state.stamp_ns) * 1e-9
     out = np.empty_like(scan.points)
-    motion.deskew(scan.points, times, path.times, np.ascontiguousarray(relative[:, :3]), out)
+    motion.deskew(scan.points, scan.offsets_ns, shift, path.times, np.ascontiguousarray(relative[:, :3]), out)
     return out
 
 

@@ -1,10 +1,12 @@
 """The local map that scans are registered to: hashed voxels, bounded memory, planes on request."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from app.slam.kernels import map as kernels
+from app.slam.params import Filter
 from app.slam.params import LocalMap as MapParams
 from app.slam.types import F32, F64, I32, U8
 
@@ -26,7 +28,7 @@ class Planes:
 
     Attributes:
         normals: (n, 3) unit. centers: (n, 3) m, odom.
-        variances: (n,) m², spread of each patch across its plane; -1 where there is no plane.
+        variances: (n,) m², spread of each patch across its plane; negative where there is no plane.
     """
 
     normals: F64
@@ -78,12 +80,13 @@ class LocalMap:
         )
         self._center = np.array(center)
 
-    def planes(self, queries: F64, reach: float, flat: float, neighbours: int, tilt: float, noise: float) -> Planes:
+    def planes(self, queries: F64, params: Filter) -> Planes:
         """A plane for each of (n, 3) odom points; see `kernels.map.planes`."""
         n = len(queries)
         out = Planes(np.empty((n, 3)), np.empty((n, 3)), np.empty(n))
+        reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(params.plane_tilt)
         kernels.planes(
-            queries, self._voxel, min(reach, self._voxel), neighbours, flat, tilt, noise,
+            queries, self._voxel, reach, params.neighbours, params.plane_threshold, tilt, params.point_noise,
             self._table, self._cells, self._counts, self._store, out.normals, out.centers, out.variances,
         )  # fmt: skip
         return out

@@ -209,7 +209,7 @@ class Filter(Section):
         0.11, "Residuals over this times √range are not used (FAST-LIO2's gate).", unit="m/√m", ge=0.01, le=1, step=0.01
     )
     max_points: int = _param(
-        1500,
+        1000,
         "Most points of a scan, spread evenly over it, that are looked up in the map.",
         ge=100,
         le=20_000,

@@ -1,6 +1,7 @@
-"""Single-element SO(3) and S² operations, and the Gauss-Newton step of the filter's update.
+"""The filter's manifold: single-element SO(3) and S² operations, and its Gauss-Newton step.
 
-The same formulas as `app.slam.lie`, which is the batched, readable form that tests hold these to.
+The same formulas as `app.slam.lie`, the batched form. A state is packed into one vector of SIZE
+numbers: R (9, by rows), p, v, b_gyro, b_accel, g (3 each), R_imu_lidar (9), p_imu_lidar (3).
 """
 
 import math
@@ -93,3 +94,57 @@ def turn(a, b):
     if s == 0.0:
         return axis
     return (math.atan2(s, a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) / s) * axis
+
+
+SIZE = 36
+
+
+@njit(cache=True)
+def boxplus(x, d, out):
+    """out = x [+] d, for packed states (SIZE,) and an error d (23,)."""
+    out[0:9] = (x[0:9].reshape(3, 3) @ exp(d[0:3])).ravel()
+    out[9:21] = x[9:21] + d[3:15]
+    g = x[21:24]
+    out[21:24] = exp(tangent_basis(g) @ d[15:17]) @ g
+    out[24:33] = (x[24:33].reshape(3, 3) @ exp(d[17:20])).ravel()
+    out[33:36] = x[33:36] + d[20:23]
+
+
+@njit(cache=True)
+def boxminus(a, b, d):
+    """d (23,) with b [+] d = a, for packed states (SIZE,)."""
+    d[0:3] = log(b[0:9].reshape(3, 3).T @ a[0:9].reshape(3, 3))
+    d[3:15] = a[9:21] - b[9:21]
+    d[15:17] = tangent_basis(b[21:24]).T @ turn(b[21:24], a[21:24])
+    d[17:20] = log(b[24:33].reshape(3, 3).T @ a[24:33].reshape(3, 3))
+    d[20:23] = a[33:36] - b[33:36]
+
+
+@njit(cache=True)
+def gauss_newton(x, prior, information, H, b, covariance, step, out):
+    """One step of eq. 7: minimise |x [-] prior|²_P + sum |z + H d|²_R, linearised at x.
+
+    x, prior, out: packed states. information (n, n): inverse prior covariance of the first n error
+    dimensions (17 without the extrinsics, 23 with them). H (12, 12), b (12,): normal equations of
+    the points over rotation, position and the extrinsics. Out: covariance (n, n), step (23,).
+    """
+    n = len(information)
+    d = np.empty(23)
+    boxminus(x, prior, d)
+    J = np.eye(n)
+    J[0:3, 0:3] = right_jacobian_inverse(d[0:3])
+    J[15:17, 15:17] = tangent_basis(prior[21:24]).T @ tangent_basis(x[21:24])
+    if n > 17:
+        J[17:20, 17:20] = right_jacobian_inverse(d[17:20])
+    A = J.T @ information @ J
+    r = J.T @ (information @ d[:n])
+    for i in range(12 if n > 17 else 6):
+        row = i if i < 6 else i + 11
+        r[row] += b[i]
+        for j in range(12 if n > 17 else 6):
+            A[row, j if j < 6 else j + 11] += H[i, j]
+    inverse = np.linalg.inv(A)
+    covariance[:] = 0.5 * (inverse + inverse.T)
+    step[:] = 0.0
+    step[:n] = -(covariance @ r)
+    boxplus(x, step, out)

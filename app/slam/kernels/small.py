@@ -2,8 +2,10 @@
 
 import math
 
-import numpy as np
 from numba import njit
+
+CHUNKS = 32
+"""Fixed number of pieces that parallel reductions work in, whatever the number of threads."""
 
 
 @njit(cache=True, inline="always")
@@ -67,9 +69,3 @@ def plane_of(xx, xy, xz, yy, yz, zz, normal):
         s = 1.0 / math.sqrt(best)
         normal[0], normal[1], normal[2] = bx * s, by * s, bz * s
     return l1, l2, max(l3, 0.0)
-
-
-CHUNKS = 32
-"""Fixed number of pieces that parallel reductions work in, whatever the number of threads."""
-
-Array = np.ndarray
