@@ -124,10 +124,11 @@ def test_nanoseconds_as_unsigned_64_bit_integers_lose_no_digit() -> None:
         (lambda m: setattr(m, "data", m.data[:-1]), "but holds"),
         (lambda m: setattr(m, "point_step", 20), "point_step"),
         (lambda m: setattr(m, "width", 10**6), "but holds"),
+        (lambda m: setattr(m, "row_step", 100), "row_step"),
     ],
 )
 def test_a_cloud_whose_sizes_contradict_each_other_is_refused(spoil: object, said: str) -> None:
-    message = rig.message(rig.turn(0, columns=5))
+    message = rig.message(rig.turn(0, columns=5), rig.Layout(rows=2))
     spoil(message)  # type: ignore[operator]
     with pytest.raises(CloudError, match=said):
         CloudMessage.from_ros(message)
