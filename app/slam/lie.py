@@ -101,12 +101,11 @@ def matrix(q: F64) -> F64:
 def between(a: F64, b: F64) -> F64:
     """The smallest rotation that turns the direction of `a` (3,) into that of `b` (3,)."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-    c = float(a @ b)
-    if c < -1 + 1e-12:  # opposite: half a turn about any axis across
+    axis = np.cross(a, b)
+    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
+    if sine < 1e-12:  # no axis of its own: none is needed, or half a turn about any axis across
         axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
-        return exp(np.pi * axis / np.linalg.norm(axis))
-    K = hat(np.cross(a, b))
-    return np.asarray(np.eye(3) + K + K @ K / (1.0 + c))
+    return exp(np.arctan2(sine, cosine) * axis / np.linalg.norm(axis))
 
 
 def from_rpy_degrees(rpy: tuple[float, float, float]) -> F64:
