@@ -10,6 +10,9 @@ from app.slam.types import F32, F64, I64, U16
 _SLACK = np.radians(10.0)
 """Azimuth may run back by this much (noise, horizontal calibration) without counting as a full turn."""
 
+_SMALL_STEP = np.radians(60.0)
+"""Steps below this are from one firing to the next, not across what gave no return."""
+
 _FIXED = np.radians(0.7)
 """Clouds that begin within this of each other are cut at a fixed azimuth."""
 
@@ -84,11 +87,14 @@ def sense_of_rotation(points: F32, ring: U16) -> tuple[bool, float]:
 
     About one turn is a scan of a rotating sensor; many, or inf, is no rotation at all.
     """
-    turns = {clockwise: _laps(points, ring, clockwise) for clockwise in (True, False)}
-    # Against the rotation, each small step counts as one back: the sum is negative.
-    forward = {clockwise: value for clockwise, value in turns.items() if value > 0.1}
-    clockwise = min(forward, key=forward.__getitem__, default=True)
-    return clockwise, forward.get(clockwise, np.inf)
+    # Outdoors a ring may see only part of a turn, so the way around says little; the small steps do.
+    order = np.argsort(ring, kind="stable")
+    step = _centred(np.diff(turned_azimuth(points, True)[order]))
+    same = (np.diff(ring[order].astype(np.int32)) == 0) & (np.abs(step) < _SMALL_STEP) & (step != 0)
+    if not same.any():
+        return True, np.inf
+    clockwise = bool(np.median(step[same]) > 0)
+    return clockwise, _laps(points, ring, clockwise)
 
 
 def _laps(points: F32, ring: U16, clockwise: bool) -> float:
