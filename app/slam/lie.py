@@ -105,6 +105,7 @@ def between(a: F64, b: F64) -> F64:
     sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
     if sine < 1e-12:  # no axis of its own: none is needed, or half a turn about any axis across
         axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+    axis -= (axis @ a) * a  # what rounding left along `a` would show at half a turn
     return exp(np.arctan2(sine, cosine) * axis / np.linalg.norm(axis))
 
 
