@@ -37,7 +37,7 @@ def log(R):
             i = k
     axis = np.empty(3)
     for k in range(3):
-        axis[k] = R[i, k] + (1.0 if k == i else 0.0)
+        axis[k] = 0.5 * (R[i, k] + R[k, i]) + (1.0 if k == i else 0.0)
     n = math.sqrt(axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2])
     sign = 1.0 if axis[0] * v[0] + axis[1] * v[1] + axis[2] * v[2] >= 0.0 else -1.0
     return (sign * angle / n) * axis
