@@ -129,9 +129,13 @@ def recent(series: dict[str, F64], *names: str) -> tuple[F64, ...]:
 
 
 def stacked_stages(series: dict[str, F64]) -> tuple[F64, ...]:
-    """Stamps, then running sums of the stages' milliseconds from the highest down, for filled areas."""
+    """Stamps, then running sums of the stages' milliseconds from the highest down, for filled areas.
+
+    Peaks are cut at four times the median: the first frame's would leave nothing of all others.
+    """
     stamps, *stages = recent(series, *(f"{stage}_ms" for stage in STAGES))
     sums = np.cumsum(np.nan_to_num(np.array(stages)), axis=0)
+    sums = np.minimum(sums, 4 * np.median(sums[-1]))
     return (stamps, *sums[::-1])
 
 

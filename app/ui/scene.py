@@ -50,8 +50,8 @@ class Scene:
         self._sensor = Sensor(scene, f"{ROOT}/sensor")
         self._trajectory = Trajectory(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
-        server.initial_camera.position = (-4.5, -5.5, 4.0)
-        server.initial_camera.look_at = (0.0, 0.0, -0.4)
+        server.initial_camera.position = (-4.5, -4.0, 6.5)  # high enough to look into a corridor without its ceiling
+        server.initial_camera.look_at = (0.3, 0.2, -0.6)
         server.initial_camera.fov = float(np.radians(60.0))
 
     @property

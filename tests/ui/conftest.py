@@ -1,0 +1,72 @@
+"""A viser server whose messages to the browsers are written down."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import viser
+
+from tests.ui.fake_engine import FakeEngine
+
+
+class Wire:
+    """What was sent to the browsers since `clear`."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.server = server
+        self.messages: list[Any] = []
+        send = server._websock_server.queue_message
+
+        def record(message: Any) -> None:
+            self.messages.append(message)
+            send(message)
+
+        server._websock_server.queue_message = record  # type: ignore[method-assign]
+
+    def clear(self) -> None:
+        self.messages.clear()
+
+    def updates(self, node: str) -> dict[str, Any]:
+        """Properties of a scene node that were sent, other than its pose."""
+        found: dict[str, Any] = {}
+        for message in self.messages:
+            if type(message).__name__ == "SceneNodeUpdateMessage" and message.name == node:
+                found |= message.updates
+        return found
+
+    def nodes(self, kind: str) -> list[str]:
+        """Names in messages of a type, in the order sent."""
+        return [message.name for message in self.messages if type(message).__name__ == kind]
+
+    @property
+    def kept(self) -> int:
+        """Messages that a browser which connects now is sent."""
+        return len(self.server._websock_server._broadcast_buffer.message_from_id)
+
+
+@pytest.fixture(scope="session")
+def _viser() -> Iterator[viser.ViserServer]:
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def server(_viser: viser.ViserServer) -> Iterator[viser.ViserServer]:
+    _viser.scene.reset()
+    _viser.gui.reset()
+    yield _viser
+
+
+@pytest.fixture
+def wire(server: viser.ViserServer) -> Iterator[Wire]:
+    recorder = Wire(server)
+    yield recorder
+    del server._websock_server.queue_message  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def engine() -> Iterator[FakeEngine]:
+    engine = FakeEngine(columns=40)
+    yield engine
+    engine.close()

@@ -1,0 +1,234 @@
+"""What the scene sends: differences, and nothing twice."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import viser
+
+from app.server.protocol import SetParams, Snapshot, StepFrame
+from app.ui.colours import LABEL_COLOURS, ColourBy
+from app.ui.scene import Scene
+from app.ui.view import View
+from tests.ui.conftest import Wire
+from tests.ui.fake_engine import FakeEngine
+
+SCAN = "/map/sensor/lidar/scan"
+
+
+class Drawn:
+    """A scene that remembers what it shows, as the workbench does."""
+
+    def __init__(self, server: viser.ViserServer, engine: FakeEngine, budget: int = 1_000_000) -> None:
+        self.scene = Scene(server, budget)
+        self.engine = engine
+        self.snapshot: Snapshot | None = None
+        self.view: View | None = None
+
+    def draw(self, view: View | None = None, **changes: object) -> None:
+        view = view or self.view or View()
+        snapshot = replace(self.engine.snapshot, **changes)  # type: ignore[arg-type]
+        self.scene.draw(self.snapshot, snapshot, view, self.view)
+        self.snapshot, self.view = snapshot, view
+
+
+def chunk_nodes(server: viser.ViserServer) -> dict[str, viser.PointCloudHandle]:
+    nodes = server.scene._handle_from_node_name
+    return {n: h for n, h in nodes.items() if isinstance(h, viser.PointCloudHandle) and n.startswith("/map/keyframes/")}
+
+
+@pytest.fixture
+def drawn(server: viser.ViserServer, wire: Wire, engine: FakeEngine) -> Drawn:
+    drawn = Drawn(server, engine)
+    engine.send(StepFrame(14))
+    drawn.draw()
+    wire.clear()
+    return drawn
+
+
+def test_nothing_is_sent_when_nothing_changed(drawn: Drawn, wire: Wire) -> None:
+    drawn.draw()
+    assert [m for m in wire.messages if type(m).__name__ != "SetPositionMessage"] == []
+
+
+def test_a_relabelled_frame_sends_its_colours_and_no_points(drawn: Drawn, wire: Wire) -> None:
+    drawn.engine.send(SetParams({"ground.sigma": 0.2}))
+    drawn.draw()
+    sent = wire.updates(SCAN)
+    assert set(sent) == {"colors"}
+    assert len(sent["colors"]) == len(drawn.engine.snapshot.result.cloud)  # type: ignore[union-attr]
+
+
+def test_the_page_shows_the_labels_that_the_engine_gave(drawn: Drawn, server: viser.ViserServer) -> None:
+    drawn.engine.send(SetParams({"ground.sigma": 0.005, "ground.alpha": 20}))
+    drawn.draw()
+    scan = server.scene.get_handle_by_name(SCAN)
+    result = drawn.engine.snapshot.result
+    assert isinstance(scan, viser.PointCloudHandle) and result is not None
+    expected = np.array([LABEL_COLOURS[int(label)] for label in result.cloud.labels])
+    assert np.array_equal(scan.colors, expected)
+
+
+def test_keyframes_that_a_loop_moves_send_poses_and_no_points(drawn: Drawn, wire: Wire) -> None:
+    moved = drawn.engine.snapshot.keyframe_poses.copy()  # type: ignore[union-attr]
+    moved[:, 0, 3] += 0.5
+    drawn.draw(keyframe_poses=moved)
+    assert wire.nodes("PointCloudMessage") == []
+    assert all("points" not in m.updates for m in wire.messages if type(m).__name__ == "SceneNodeUpdateMessage"
+               and m.name.startswith("/map/keyframes"))  # fmt: skip
+    placed = {m.name: m.position for m in wire.messages if type(m).__name__ == "SetPositionMessage"}
+    for index, T in enumerate(moved):
+        assert placed[f"/map/keyframes/{index}"] == pytest.approx(T[:3, 3])
+
+
+def test_a_new_frame_sends_no_keyframe_again(drawn: Drawn, wire: Wire) -> None:
+    drawn.engine.send(StepFrame(2))
+    drawn.draw()
+    assert not [name for name in wire.nodes("SceneNodeUpdateMessage") if name.startswith("/map/keyframes")]
+
+
+def test_points_are_drawn_where_the_map_has_them(drawn: Drawn, server: viser.ViserServer) -> None:
+    from viser.transforms import SE3, SO3
+
+    drawn.draw(View(ceilings=True))
+    snapshot = drawn.engine.snapshot
+    for chunk, T in zip(snapshot.chunks, snapshot.keyframe_poses, strict=True):  # type: ignore[arg-type]
+        node = chunk_nodes(server)[f"/map/keyframes/{chunk.index}"]
+        placed = SE3.from_rotation_and_translation(SO3(node.wxyz), node.position) @ node.points.astype(float)
+        assert np.abs(placed - (chunk.points @ T[:3, :3].T + T[:3, 3])).max() < 0.03  # float16 at 40 m
+
+
+def test_without_ceilings_the_map_has_no_points_above_the_walls(drawn: Drawn, server: viser.ViserServer) -> None:
+    node = chunk_nodes(server)["/map/keyframes/0"]
+    up = drawn.engine.snapshot.keyframe_poses[0, 2, :3]  # type: ignore[index, union-attr]
+    assert (node.points.astype(float) @ up).max() < 1.3
+    drawn.draw(View(ceilings=True))
+    node = chunk_nodes(server)["/map/keyframes/0"]
+    assert (node.points.astype(float) @ up).max() > 1.4
+
+
+def test_the_map_stays_within_its_budget(server: viser.ViserServer, wire: Wire, engine: FakeEngine) -> None:
+    drawn = Drawn(server, engine, budget=6_000)
+    for _ in range(20):
+        engine.send(StepFrame(6))
+        drawn.draw(View(ceilings=True))
+        assert drawn.scene.points <= 6_000
+        assert sum(len(node.points) for node in chunk_nodes(server).values()) == drawn.scene.points
+    assert len(chunk_nodes(server)) == len(engine.snapshot.chunks)
+    newest, oldest = (chunk_nodes(server)[f"/map/keyframes/{i}"] for i in (len(engine.snapshot.chunks) - 1, 0))
+    assert len(newest.points) > 2 * len(oldest.points)
+
+
+def test_two_pages_thin_the_same_way(server: viser.ViserServer, wire: Wire, engine: FakeEngine) -> None:
+    shown = []
+    for _ in range(2):
+        server.scene.reset()
+        drawn = Drawn(server, engine, budget=4_000)
+        engine.send(StepFrame(30)) if not shown else None
+        drawn.draw()
+        shown.append({name: len(node.points) for name, node in chunk_nodes(server).items()})
+    assert shown[0] == shown[1] and shown[0]
+
+
+def test_colouring_sends_colours_only_and_the_legend_knows_its_limits(drawn: Drawn, wire: Wire) -> None:
+    for by in (ColourBy.HEIGHT, ColourBy.INTENSITY, ColourBy.RING, ColourBy.TIME):
+        wire.clear()
+        drawn.draw(View(colour_by=by))
+        assert set(wire.updates("/map/keyframes/0")) == {"colors"}
+        assert wire.nodes("PointCloudMessage") == []
+        limits = drawn.scene.limits(by)
+        assert limits is not None and limits.low < limits.high
+
+
+def test_higher_points_are_lighter_when_coloured_by_height(drawn: Drawn, server: viser.ViserServer) -> None:
+    drawn.draw(View(colour_by=ColourBy.HEIGHT))
+    node = chunk_nodes(server)["/map/keyframes/0"]
+    height = node.points.astype(float) @ drawn.engine.snapshot.keyframe_poses[0, 2, :3]  # type: ignore[index, union-attr]
+    order = np.argsort(height)
+    third = len(order) // 3
+    assert node.colors[order[-third:]].mean() > node.colors[order[:third]].mean() + 20
+
+
+def test_sessions_that_come_and_go_leave_nothing_behind(drawn: Drawn, wire: Wire, server: viser.ViserServer) -> None:
+    from app.server.protocol import Restart
+
+    kept = []
+    for _ in range(4):
+        drawn.engine.send(Restart())
+        drawn.draw()
+        assert chunk_nodes(server) == {}
+        drawn.engine.send(StepFrame(14))
+        drawn.draw()
+        assert len(chunk_nodes(server)) == 3
+        server._run_garbage_collector(force=True)
+        kept.append(wire.kept)
+    assert kept[0] == kept[-1]
+
+
+def test_following_keeps_the_sensor_near_the_origin_and_leaves_the_camera_alone(drawn: Drawn, wire: Wire) -> None:
+    for _ in range(60):
+        drawn.engine.send(StepFrame(1))
+        drawn.draw()
+    root = next(
+        m.position for m in reversed(wire.messages) if getattr(m, "name", "") == "/map" and hasattr(m, "position")
+    )
+    sensor = drawn.engine.snapshot.result.T_map_imu[:3, 3]  # type: ignore[union-attr]
+    assert np.linalg.norm(sensor) > 5
+    assert np.linalg.norm(sensor + root) < 0.5
+    assert not [m for m in wire.messages if type(m).__name__.startswith("SetCamera")]
+
+
+def test_looking_freely_the_map_stands_still(drawn: Drawn, wire: Wire) -> None:
+    drawn.draw(View(follow=False))
+    wire.clear()
+    drawn.engine.send(StepFrame(5))
+    drawn.draw()
+    assert not [m for m in wire.messages if getattr(m, "name", "") == "/map"]
+
+
+def test_the_grid_lies_on_the_ground_below_the_sensor(drawn: Drawn, server: viser.ViserServer) -> None:
+    grid = server.scene.get_handle_by_name("/map/grid")
+    assert grid is not None
+    assert grid.position[2] == pytest.approx(-1.3, abs=0.05)  # the map starts at the sensor, 1.3 m up
+
+
+def test_the_path_is_sent_in_blocks(server: viser.ViserServer, wire: Wire, engine: FakeEngine) -> None:
+    drawn = Drawn(server, engine)
+    walk = np.cumsum(np.full((600, 3), 0.01), axis=0)
+    engine.send(StepFrame(1))
+    drawn.draw(trajectory=walk[:590])
+    wire.clear()
+    drawn.draw(trajectory=walk[:595])
+    assert wire.nodes("SceneNodeUpdateMessage") == ["/map/trajectory/2"]
+    bent = walk[:595].copy()
+    bent[:100, 0] += 1.0
+    wire.clear()
+    drawn.draw(trajectory=bent)
+    assert wire.nodes("SceneNodeUpdateMessage") == ["/map/trajectory/0"]
+
+
+def test_truth_is_hidden_until_it_can_be_laid_over_the_map(drawn: Drawn, server: viser.ViserServer) -> None:
+    truth = server.scene.get_handle_by_name("/map/truth")
+    assert truth is not None and truth.visible
+    drawn.draw(T_map_truth=None)
+    assert not truth.visible
+
+
+def test_a_frame_without_points_is_drawn_as_nothing(drawn: Drawn, server: viser.ViserServer) -> None:
+    result = drawn.engine.snapshot.result
+    assert result is not None
+    none = replace(
+        result.cloud,
+        **{name: getattr(result.cloud, name)[:0] for name in ("points", "labels", "intensity", "ring", "offsets_ns")},
+    )
+    drawn.draw(result=replace(result, index=99, cloud=none))
+    scan = server.scene.get_handle_by_name(SCAN)
+    assert scan is not None and not scan.visible
+
+
+def test_without_a_plane_neither_disc_nor_ground_is_shown(drawn: Drawn, server: viser.ViserServer) -> None:
+    result = drawn.engine.snapshot.result
+    assert result is not None
+    drawn.draw(result=replace(result, index=99, ground=replace(result.ground, found=False)))
+    plane = server.scene.get_handle_by_name("/map/sensor/lidar/plane")
+    assert plane is not None and not plane.visible
