@@ -57,7 +57,6 @@ class RunLog:
         self._stamps = array("q")
         self._poses = array("d")
         self._timings = array("d")
-        self._posed = array("b")
         self.statuses: Counter[FrameStatus] = Counter()
         self.dropped: Counter[str] = Counter()
         self.notices: Counter[str] = Counter()
@@ -76,7 +75,6 @@ class RunLog:
         self._poses.extend(T_map_imu[:3, 3])
         self._poses.extend(Rotation.from_matrix(T_map_imu[:3, :3]).as_quat())
         self._timings.extend(result.timings_ms.get(stage, 0.0) for stage in TIMINGS)
-        self._posed.append(result.status is not FrameStatus.INITIALISING)
         self.statuses[result.status] += 1
         self._count(result.notices)
         self.points += len(result.cloud)
@@ -107,10 +105,9 @@ class RunLog:
 
     @property
     def trajectory(self) -> Trajectory:
-        """T_map_imu at every scan's end, but for the frames before the filter had started."""
+        """T_map_imu at every scan's end; while the filter waits at rest to start, the origin."""
         rows = np.array(self._poses).reshape(-1, 7)
-        every = Trajectory(self.stamps_ns, rows[:, :3], rows[:, 3:])
-        return every.chosen(np.array(self._posed, dtype=bool))
+        return Trajectory(self.stamps_ns, rows[:, :3], rows[:, 3:])
 
 
 def prepare_folder(folder: Path, *, replace: bool = False) -> None:

@@ -115,13 +115,13 @@ def test_a_run_writes_its_four_files(tmp_path: Path, recording: Path) -> None:
     assert json.loads((folder / "report.json").read_text()) == report
 
 
-def test_the_trajectory_begins_where_the_filter_had_started(tmp_path: Path, recording: Path) -> None:
+def test_the_trajectory_has_a_pose_at_every_scans_end(tmp_path: Path, recording: Path) -> None:
     save_results(tmp_path / "out", logged(), [], RunInfo(recording, Params()))
     lines = (tmp_path / "out" / "trajectory.tum").read_text().splitlines()
     assert lines[0] == (
-        "1700000000.250000000 1.000000000 0.100000000 0.000000000 0.000000000 0.000000000 0.707106781 0.707106781"
+        "1700000000.150000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 0.707106781 0.707106781"
     )
-    assert len(read_tum(tmp_path / "out" / "trajectory.tum")) == 5
+    assert len(read_tum(tmp_path / "out" / "trajectory.tum")) == 6
 
 
 def test_timings_hold_every_processed_frame(tmp_path: Path, recording: Path) -> None:
@@ -156,7 +156,7 @@ def test_the_report_measures_against_truth(tmp_path: Path, recording: Path) -> N
     shifted = Trajectory(ours.stamps_ns, ours.positions + np.array([5.0, 0, 0]), ours.quaternions)
     report = save_results(tmp_path / "out", log, [], RunInfo(recording, Params(), truth=shifted))
     assert report["accuracy"]["ate_m"]["rmse"] < 1e-9
-    assert report["accuracy"]["poses"] == 7
+    assert report["accuracy"]["poses"] == 8
     assert report["accuracy"]["rpe"]["50 m"] is None
 
 
@@ -196,7 +196,7 @@ def test_results_are_not_overwritten_unless_asked(tmp_path: Path, recording: Pat
         save_results(tmp_path / "out", logged(9), [], info)
     assert (tmp_path / "out" / "trajectory.tum").read_bytes() == before
     save_results(tmp_path / "out", logged(9), [], info, replace=True)
-    assert len(read_tum(tmp_path / "out" / "trajectory.tum")) == 8
+    assert len(read_tum(tmp_path / "out" / "trajectory.tum")) == 9
 
 
 def test_older_results_survive_a_write_that_fails(tmp_path: Path, recording: Path) -> None:
