@@ -94,9 +94,6 @@ def make_router(engine: EngineProcess, folders: Folders) -> APIRouter:
     @router.post("/transport", status_code=202)
     def transport(action: Action) -> None:
         """Play, pause, step, seek, set the speed ("max": as fast as it can), start again."""
-        if isinstance(action, Simple) and action.action == "restart" and not engine.snapshot.engine_alive:
-            engine.restart()
-            return
         _send(engine, _command(action))
 
     @router.get("/recordings")
@@ -126,8 +123,8 @@ def make_router(engine: EngineProcess, folders: Folders) -> APIRouter:
 
 
 def _send(engine: EngineProcess, command: Command) -> None:
-    if not engine.snapshot.engine_alive:
-        raise HTTPException(503, "The engine's process has ended; POST /api/transport restart starts it again.")
+    if not engine.snapshot.engine_alive and not isinstance(command, Restart | OpenRecording):
+        raise HTTPException(503, "The engine's process has ended; the action `restart` starts it again.")
     engine.send(command)
 
 

@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 
-LONGEST_LAG_S = 0.25
+LONGEST_LAG_S = 0.5
 """A replay that is later than this does not hurry to catch up; it goes on from where it is."""
 
 

@@ -107,8 +107,10 @@ def run_server(
         page.start()
         cleanup.callback(page.close)
         server = make_server(make_app(engine, folders, target, access))
-        address = link(host, access)
+        address, *others = links(host, access)
         print(f"hemislam is at {address} (Ctrl-C ends it)", flush=True)
+        for other in others:
+            print(f"from other computers: {other}", flush=True)
         threading.Thread(target=show_compilation, args=(engine,), name="progress", daemon=True).start()
         if open_browser and _has_display():
             webbrowser.open(address)  # the listener holds the request until the server is up
@@ -142,12 +144,23 @@ def listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-def link(host: str, access: Access) -> str:
-    """The address to open, with the token if there is one."""
+def links(host: str, access: Access) -> list[str]:
+    """The addresses to open, with the token if there is one: first for this computer, then for others."""
+    names = [host]
     if host in ("0.0.0.0", "::", ""):
-        host = socket.gethostname()
-    name = f"[{host}]" if ":" in host else host
-    return f"http://{name}:{access.port}/" + (f"?token={access.token}" if access.token else "")
+        names = ["localhost", _own_address()]
+    token = f"?token={access.token}" if access.token else ""
+    return [f"http://{f'[{name}]' if ':' in name else name}:{access.port}/{token}" for name in names]
+
+
+def _own_address() -> str:
+    """This computer's address on the network that leads outside; its name if there is none."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing: it only chooses the way
+            return str(probe.getsockname()[0])
+        except OSError:
+            return socket.gethostname()
 
 
 def show_compilation(engine: EngineProcess) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 from app.server import wire
 from app.server.delta import Delta, Fold
-from app.server.protocol import Command, Notice, Shutdown, Snapshot
+from app.server.protocol import Command, Notice, OpenRecording, Restart, Shutdown, Snapshot
 from app.server.wire import Pipe
 from app.slam.params import Params
 
@@ -92,24 +92,30 @@ class EngineProcess:
             return self.snapshot
 
     def send(self, command: Command) -> None:
-        """Enqueue a command. To a dead engine it is lost; `Snapshot.engine_alive` tells."""
+        """Enqueue a command. A dead engine is started again by Restart and OpenRecording; others are lost on it."""
+        if not self.snapshot.engine_alive and isinstance(command, Restart | OpenRecording):
+            self.restart(command)
+            return
         with self._sending, contextlib.suppress(OSError):
             if self._commands is not None:
                 self._commands.send(command)
 
-    def restart(self) -> None:
-        """After the process died: a new one, with the same recording and the newest parameters, from the start."""
+    def restart(self, command: Restart | OpenRecording | None = None) -> None:
+        """A new process in place of this one, with the newest parameters, at the first frame.
+
+        It opens what was open, or what the command names.
+        """
         self._end(timeout=0)
-        last = self.snapshot
-        opened = last.recording
-        same = opened is None or opened.path == self._setup.recording
+        last, setup = self.snapshot, self._setup
+        if isinstance(command, OpenRecording):
+            setup = replace(setup, recording=command.path, truth=command.truth)
+        elif last.recording is not None:
+            setup = replace(setup, recording=last.recording.path, truth=last.recording.truth)
+        if setup.recording != self._setup.recording:
+            setup = replace(setup, start_s=0.0, duration_s=None)
         self._start(
             replace(
-                self._setup,
-                recording=opened.path if opened else self._setup.recording,
-                truth=opened.truth if opened else self._setup.truth,
-                start_s=self._setup.start_s if same else 0.0,
-                duration_s=self._setup.duration_s if same else None,
+                setup,
                 params=last.params,
                 play=False,
                 speed=last.transport.speed,
@@ -149,6 +155,8 @@ class EngineProcess:
                 with self._sending:
                     commands.send(None)  # acknowledged: the next one may come
                 with self._changed:
+                    if process is not self._process:  # another one has taken over
+                        break
                     self._fold.apply(delta)
                     self._changed.notify_all()
         updates.close()

@@ -28,7 +28,7 @@ from websockets.typing import Origin, Subprotocol
 from app.server.access import Access
 from app.server.folders import Folders
 from app.server.viser_page import Viser, start_viser
-from app.server.web import link, listen, make_app, make_server
+from app.server.web import links, listen, make_app, make_server
 from app.server.worker import EngineProcess, Setup
 from app.slam.errors import HemislamError
 
@@ -279,7 +279,7 @@ def test_the_token_alone_does_not_open_the_door_to_another_site(locked_site: Sit
 def test_a_token_is_made_wherever_others_could_reach_us(host: str, needed: bool) -> None:
     access = Access.on(host, 8080)
     assert (access.token is not None) == needed
-    assert ("token=" in link(host, access)) == needed
+    assert all((f":8080/?token={access.token}" in address) == needed for address in links(host, access))
 
 
 # --- REST ----------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import server_fakes as fakes
 
-from app.server.protocol import Pause, Play, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.protocol import OpenRecording, Pause, Play, Restart, Seek, SetParams, SetSpeed, Snapshot, StepFrame
 from app.server.worker import EngineProcess, Setup
 
 PATIENCE_S = 20.0
@@ -28,14 +28,21 @@ def until(engine: EngineProcess, wanted: Callable[[Snapshot], bool]) -> Snapshot
     return snapshot
 
 
+@pytest.fixture(scope="module")
+def process() -> Iterator[EngineProcess]:
+    started = EngineProcess(Setup(), main=fakes.fake_main)
+    yield started
+    started.close()
+
+
 @pytest.fixture
-def engine() -> Iterator[EngineProcess]:
-    process = EngineProcess(Setup(recording=Path("walk-300.mcap")), main=fakes.fake_main)
-    try:
-        until(process, lambda s: s.transport.frame == 0)
-        yield process
-    finally:
-        process.close()
+def engine(process: EngineProcess) -> EngineProcess:
+    """At the first frame of a recording of 300, alive whatever the test before did to it."""
+    before = process.snapshot.session
+    process.send(OpenRecording(Path("walk-300.mcap")))
+    until(process, lambda s: s.session > before and s.transport.frame == 0 and s.engine_alive)
+    process.send(SetSpeed(1.0))
+    return process
 
 
 def test_everything_arrives_whole_and_read_only(engine: EngineProcess) -> None:
@@ -79,12 +86,20 @@ def test_a_killed_engine_is_reported_and_can_be_started_again(engine: EngineProc
     assert dead.notices[-1].level == "error" and "signal 9" in dead.notices[-1].text
     assert dead.trajectory is not None and len(dead.trajectory) == 11, "what was there stays"
     engine.send(StepFrame())  # to nobody
-    engine.restart()
+    engine.send(Restart())
     alive = until(engine, lambda s: s.engine_alive and s.session > dead.session and s.transport.frame == 0)
     assert alive.params.ground.alpha == 20
     assert [n.number for n in alive.notices] == list(range(1, len(alive.notices) + 1))
     engine.send(StepFrame())
     until(engine, lambda s: s.transport.frame == 1)
+
+
+def test_opening_another_recording_revives_a_dead_engine(engine: EngineProcess) -> None:
+    assert engine.pid is not None
+    os.kill(engine.pid, signal.SIGKILL)
+    until(engine, lambda s: not s.engine_alive)
+    engine.send(OpenRecording(Path("walk-30.mcap")))
+    until(engine, lambda s: s.recording is not None and s.recording.path == Path("walk-30.mcap") and s.engine_alive)
 
 
 PARENT = """
