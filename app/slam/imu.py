@@ -53,7 +53,7 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: Imu) -> tupl
     if end_ns <= state.stamp_ns:  # nothing to integrate: the device has not moved meanwhile
         here = state.T_odom_imu[None, :3]
         return belief, Path(np.array([-1.0, 0.0]), np.concatenate([here, here]))
-    times, gyro, accel = _clipped(imu, state.stamp_ns, end_ns)
+    times, gyro, accel, spacing = _clipped(imu, state.stamp_ns, end_ns)
     R, p, v = state.R_odom_imu.copy(), state.p_odom_imu.copy(), state.v_odom_imu.copy()
     P = belief.covariance.copy()
     noise = np.array([params.gyro_noise, params.accel_noise, params.gyro_bias_walk, params.accel_bias_walk, *GAP_NOISE])
@@ -61,7 +61,7 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: Imu) -> tupl
     knot_t, knot_T = np.empty(knots), np.empty((knots, 3, 4))
     basis = manifold.tangent_basis(state.g_odom)
     n = motion.propagate(
-        times, gyro, accel, MAX_KNOT_STEP, params.max_gap, R, p, v,
+        times, gyro, accel, spacing > params.max_gap, MAX_KNOT_STEP, R, p, v,
         state.b_gyro, state.b_accel, state.g_odom, basis, P, noise, knot_t, knot_T,
     )  # fmt: skip
     R = 1.5 * R - 0.5 * R @ R.T @ R  # back onto SO(3) after many products: one Newton step of the polar form
@@ -88,12 +88,18 @@ def deskew(scan: Scan, path: Path, state: NavState) -> F32:
     return out
 
 
-def _clipped(imu: ImuSamples, begin_ns: int, end_ns: int) -> tuple[F64, F64, F64]:
-    """Samples from begin to end (s after begin), with values interpolated at both ends."""
+def _clipped(imu: ImuSamples, begin_ns: int, end_ns: int) -> tuple[F64, F64, F64, F64]:
+    """Samples from begin to end (s after begin), with values interpolated at both ends.
+
+    The last value (k - 1,) is, for each interval, how far apart the samples around it are, s: a gap
+    stays one, however many scans end inside it.
+    """
     inside = (imu.stamps_ns > begin_ns) & (imu.stamps_ns < end_ns)
     stamps = np.concatenate([[begin_ns], imu.stamps_ns[inside], [end_ns]])
     at = (stamps - begin_ns) * 1e-9
     have = (imu.stamps_ns - begin_ns) * 1e-9
     gyro = np.stack([np.interp(at, have, imu.gyro[:, i]) for i in range(3)], axis=1)
     accel = np.stack([np.interp(at, have, imu.accel[:, i]) for i in range(3)], axis=1)
-    return at, gyro, accel
+    known = np.concatenate([[min(have[0], at[0])], have, [max(have[-1], at[-1])]])
+    after = np.searchsorted(known, 0.5 * (at[1:] + at[:-1]))
+    return at, gyro, accel, known[after] - known[after - 1]

@@ -9,13 +9,13 @@ from app.slam.kernels.small import CHUNKS, cross, rotation
 
 
 @njit(cache=True)
-def propagate(times, gyro, accel, max_step, gap, R, p, v, bg, ba, g, B, P, noise, knot_t, knot_T):
+def propagate(times, gyro, accel, bridged, max_step, R, p, v, bg, ba, g, B, P, noise, knot_t, knot_T):
     """Integrate the kinematics from times[0] to times[-1]; R, p, v and P are updated in place.
 
     times (k,) s ascending; gyro, accel (k, 3) at those times, linear in between. Error state order
-    as in `app.slam.iekf`. noise (4,): densities of gyro, accel, gyro bias, accel bias. Intervals
-    over `gap` seconds are bridged with the noise in noise[4:6] instead. Knots (time, 3x4 pose) are
-    written every `max_step` seconds at most. Returns the number of knots.
+    as in `app.slam.imu`. noise (6,): densities of gyro, accel, gyro bias, accel bias, and those of
+    gyro and accel in intervals that are `bridged` (k - 1,) bool, for want of samples. Knots (time,
+    3x4 pose) are written every `max_step` seconds at most. Returns the number of knots.
     """
     d = P.shape[0]
     F = np.zeros((d, d))
@@ -64,7 +64,7 @@ def propagate(times, gyro, accel, max_step, gap, R, p, v, bg, ba, g, B, P, noise
         T1[:] = F @ P
         P[:] = T1 @ F.T
         ng, na = noise[0], noise[1]
-        if dt > gap:
+        if bridged[s]:
             ng, na = noise[4], noise[5]
         for i in range(3):
             P[i, i] += ng * ng * dt
