@@ -5,7 +5,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from app.sensors.simulator.scenes.building import building
 from app.sensors.simulator.scenes.corridor import corridor
+from app.sensors.simulator.scenes.identical import identical
 from app.sensors.simulator.scenes.museum import museum
 from app.sensors.simulator.scenes.outdoor import outdoor
 from app.sensors.simulator.scenes.room import room
@@ -13,7 +15,7 @@ from app.sensors.simulator.scenes.scene import Scene
 from app.slam.errors import HemislamError
 
 _BUILDERS: dict[str, Callable[[np.random.Generator], Scene]] = {
-    builder.__name__: builder for builder in (corridor, room, outdoor, museum)
+    builder.__name__: builder for builder in (corridor, room, outdoor, museum, building, identical)
 }
 
 SCENES: dict[str, str] = {name: (builder.__doc__ or "").splitlines()[0] for name, builder in _BUILDERS.items()}

@@ -28,8 +28,8 @@ def corridor(rng: np.random.Generator) -> Scene:
     outer = rectangle(0, 0, length, depth)
     inner = rectangle(WIDTH, WIDTH, length - WIDTH, depth - WIDTH)
     for k in range(4):
-        _outer_wall(mesh, outer[k], outer[(k + 1) % 4], rng)
-        _inner_wall(mesh, inner[k], inner[(k + 1) % 4], rng)
+        outer_wall(mesh, outer[k], outer[(k + 1) % 4], rng)
+        inner_wall(mesh, inner[k], inner[(k + 1) % 4], rng)
 
     middle = WIDTH / 2
     for x in np.arange(3.0, length, 4.5):
@@ -50,7 +50,7 @@ def corridor(rng: np.random.Generator) -> Scene:
     return Scene(mesh.build(), (someone,), walk)
 
 
-def _outer_wall(
+def outer_wall(
     mesh: MeshBuilder, start: tuple[float, float], end: tuple[float, float], rng: np.random.Generator
 ) -> None:
     """Doors every few metres, some open to a furnished room; pillars and odds and ends between them."""
@@ -87,7 +87,7 @@ def _outer_wall(
     mesh.wall(start, end, HEIGHT, 0.65, openings)
 
 
-def _inner_wall(
+def inner_wall(
     mesh: MeshBuilder, start: tuple[float, float], end: tuple[float, float], rng: np.random.Generator
 ) -> None:
     """Shallow niches with closed doors or panes, radiators under them."""
