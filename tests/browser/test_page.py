@@ -1,0 +1,239 @@
+"""The page in a real Chromium, drawn in software. One browser for all tests: starting it takes longest."""
+
+import io
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import viser
+from PIL import Image
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from app.server.folders import Folders
+from app.server.protocol import OpenRecording, Seek, SetParams, StepFrame
+from app.ui.workbench import Workbench
+from tests.ui.fake_engine import FakeEngine
+
+_ARGS = (
+    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
+)  # fmt: skip
+_SLOW_MS = 60_000
+"""Software rendering on a busy machine; what is expected comes as soon as it comes."""
+expect.set_options(timeout=_SLOW_MS)
+
+
+@dataclass
+class Bench:
+    """A served workbench and a page that shows it."""
+
+    server: viser.ViserServer
+    engine: FakeEngine
+    page: Page
+    url: str
+
+    def eventually(self, holds: Callable[[], bool], seconds: float = 60.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not holds():
+            assert time.monotonic() < deadline, "it did not come about in time"
+            self.page.wait_for_timeout(50)
+
+    def pixels(self) -> np.ndarray:
+        """(h, w, 3) of the scene between the panels."""
+        shot = self.page.screenshot(clip={"x": 310, "y": 150, "width": 340, "height": 460})
+        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
+
+    def seed_pixels(self) -> int:
+        """How much of the scene is amber, as seeds and their wedge are."""
+        r, g, b = np.moveaxis(self.pixels(), 2, 0)
+        return int(((r > 180) & (g > 110) & (g < 210) & (b < 90)).sum())
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("needs chromium")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=list(_ARGS))
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def bench(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    folder = tmp_path_factory.mktemp("recordings")
+    (folder / "garage.mcap").write_bytes(b"x" * 2_000)
+    (folder / "older").mkdir()
+    engine = FakeEngine(columns=30)
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    workbench = Workbench(server, engine, Folders([folder]))
+    workbench.start()
+    page = chromium.new_page(viewport={"width": 1000, "height": 620})
+    page.set_default_timeout(_SLOW_MS)
+    url = f"http://127.0.0.1:{server.get_port()}/"
+    page.goto(url)
+    expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+    yield Bench(server, engine, page, url)
+    workbench.close()
+    engine.close()
+    server.stop()
+
+
+@pytest.fixture(autouse=True)
+def _fresh(bench: Bench) -> None:
+    """Each test starts paused and with nothing sent."""
+    bench.engine.sent.clear()
+
+
+ALPHA = 2
+"""Number of the slider of α: after those of time and M."""
+
+
+def test_the_first_screen_says_what_it_is_and_what_to_do(bench: Bench) -> None:
+    expect(bench.page.get_by_text("hall_bpearl.mcap")).to_be_visible()
+    expect(bench.page.get_by_text("goes one frame")).to_be_visible()
+    expect(bench.page.get_by_text("needs you 1")).to_be_visible()
+
+
+def test_the_arrow_key_steps_a_frame_and_leaves_the_camera_alone(bench: Bench) -> None:
+    bench.eventually(lambda: bool(bench.server.get_clients()))
+    (client,) = bench.server.get_clients().values()
+    before = client.camera.position
+    for _ in range(3):
+        bench.page.keyboard.press("ArrowRight", delay=120)
+    bench.eventually(lambda: bench.engine.snapshot.transport.frame == 2)
+    assert bench.engine.sent == [StepFrame()] * 3
+    expect(bench.page.get_by_text("frame 2 of 400")).to_be_visible()
+    bench.page.wait_for_timeout(300)
+    assert np.allclose(client.camera.position, before, atol=1e-3)
+
+
+def test_space_plays_and_pauses(bench: Bench) -> None:
+    bench.page.keyboard.press("Space")
+    bench.eventually(lambda: bench.engine.snapshot.transport.playing)
+    bench.page.keyboard.press("Space")
+    bench.eventually(lambda: not bench.engine.snapshot.transport.playing)
+
+
+def test_space_after_a_click_on_a_button_does_not_click_it_again(bench: Bench) -> None:
+    bench.page.get_by_role("button", name="step ▸").click()
+    bench.eventually(lambda: bench.engine.sent == [StepFrame()])
+    bench.page.keyboard.press("Space")
+    bench.eventually(lambda: bench.engine.snapshot.transport.playing)
+    bench.page.keyboard.press("Space")
+    bench.eventually(lambda: not bench.engine.snapshot.transport.playing)
+    assert bench.engine.sent.count(StepFrame()) == 1
+
+
+def test_a_focused_slider_takes_the_arrow_for_itself_and_the_scene_is_relabelled(bench: Bench) -> None:
+    bench.engine.send(SetParams({"ground.alpha": 60.0, "ground.scan_lines": 16}))
+    bench.engine.sent.clear()
+    slider = bench.page.locator("[role=slider]").nth(ALPHA)
+    expect(slider).to_have_attribute("aria-valuenow", "60")
+    bench.eventually(lambda: bench.seed_pixels() > 300)
+    slider.focus()
+    bench.page.keyboard.press("ArrowLeft")
+    bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha == 59.0)
+    bench.page.keyboard.press("Home")
+    bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha == 1.0)
+    assert not [command for command in bench.engine.sent if isinstance(command, StepFrame)]
+    bench.eventually(lambda: bench.seed_pixels() < 100)
+    bench.engine.send(SetParams({"ground.alpha": 40.0, "ground.scan_lines": 8}))
+    expect(slider).to_have_attribute("aria-valuenow", "40")
+
+
+def test_dragging_the_time_slider_seeks(bench: Bench) -> None:
+    slider = bench.page.locator("[role=slider]").first
+    slider.focus()
+    frame = bench.engine.snapshot.transport.frame
+    for _ in range(4):
+        bench.page.keyboard.press("ArrowRight")
+    bench.eventually(lambda: bench.engine.snapshot.transport.frame == frame + 4)
+    assert all(isinstance(command, Seek) for command in bench.engine.sent)
+    bench.page.evaluate("document.activeElement.blur()")
+
+
+def test_the_recording_s_findings_are_in_their_panel(bench: Bench) -> None:
+    bench.page.get_by_role("tab", name="Recording").click()
+    expect(bench.page.get_by_text("--set imu.max_gap=0.4")).to_be_visible()
+    bench.page.get_by_role("tab", name="Readouts").click()
+
+
+def test_parameters_can_be_had_as_yaml_and_given(bench: Bench) -> None:
+    bench.page.get_by_role("button", name="Copy as YAML").click()
+    expect(bench.page.get_by_role("dialog").locator("textarea")).to_have_value(bench.engine.snapshot.params.to_yaml())
+    bench.page.get_by_role("button", name="Close").click()
+    expect(bench.page.get_by_role("dialog")).to_have_count(0)
+    bench.page.get_by_role("button", name="Load YAML").click()
+    bench.page.get_by_role("dialog").locator("textarea").fill("ground:\n  alpha: 33\n")
+    bench.page.get_by_role("button", name="Apply").click()
+    bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha == 33.0)
+
+
+def test_yaml_that_can_not_be_used_is_told_and_nothing_changes(bench: Bench) -> None:
+    before = bench.engine.snapshot.params
+    bench.page.get_by_role("button", name="Load YAML").click()
+    bench.page.get_by_role("dialog").locator("textarea").fill("ground:\n  alhpa: 33\n")
+    bench.page.get_by_role("button", name="Apply").click()
+    expect(bench.page.get_by_text("alhpa").first).to_be_visible()
+    assert bench.engine.snapshot.params == before
+
+
+def test_a_recording_is_chosen_from_the_allowed_folder(bench: Bench) -> None:
+    bench.page.get_by_role("tab", name="Files").click()
+    bench.page.get_by_role("button", name="Open a recording").click()
+    dialog = bench.page.get_by_role("dialog")
+    expect(dialog.get_by_role("button", name="older")).to_be_visible()
+    dialog.get_by_role("button", name="garage.mcap").click()
+    bench.eventually(lambda: any(isinstance(command, OpenRecording) for command in bench.engine.sent))
+    expect(bench.page.get_by_text("garage.mcap").first).to_be_visible()
+    bench.page.get_by_role("tab", name="Tune").click()
+
+
+def test_a_reload_finds_everything_again(bench: Bench) -> None:
+    bench.engine.send(StepFrame(9))
+    bench.engine.send(SetParams({"ground.alpha": 37.0}))
+    bench.page.reload()
+    expect(bench.page.get_by_text("frame 8 of 400")).to_be_visible()
+    expect(bench.page.locator("[role=slider]").nth(ALPHA)).to_have_attribute("aria-valuenow", "37")
+    bench.eventually(lambda: bench.pixels().std() > 8)
+
+
+def test_two_browsers_see_one_session(bench: Bench, chromium: Browser) -> None:
+    other = chromium.new_page(viewport={"width": 1000, "height": 620})
+    try:
+        other.goto(bench.url)
+        theirs = other.locator("[role=slider]").nth(ALPHA)
+        expect(theirs).to_have_attribute("aria-valuenow", "37")
+        mine = bench.page.locator("[role=slider]").nth(ALPHA)
+        theirs.focus()
+        other.keyboard.press("ArrowRight")
+        expect(mine).to_have_attribute("aria-valuenow", "38")
+        bench.page.keyboard.press("ArrowRight")
+        expect(other.get_by_text("frame 9 of 400")).to_be_visible()
+    finally:
+        other.close()
+
+
+def test_the_page_has_no_errors_and_reaches_out_to_nobody(bench: Bench, chromium: Browser) -> None:
+    page = chromium.new_page(viewport={"width": 1000, "height": 620})
+    try:
+        errors: list[str] = []
+        hosts: set[str] = set()
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("request", lambda request: hosts.add(request.url.split("/")[2]) if "://" in request.url else None)
+        page.goto(bench.url)
+        expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+        bench.engine.send(StepFrame(3))
+        expect(page.get_by_text("frame 12 of 400")).to_be_visible()
+        page.wait_for_timeout(500)
+        assert errors == []
+        assert hosts <= {Path(bench.url).name, bench.url.split("/")[2]}
+    finally:
+        page.close()
