@@ -13,6 +13,8 @@ MOVING_GYRO = 0.05
 MOVING_ACCEL = 0.4
 """Standard deviations (rad/s, m/s²) above which a device is not standing still: ten to thirty times
 the noise of a consumer IMU at 200-500 Hz, and well below any step."""
+LARGEST_BIAS = 0.2
+"""rad/s; an even turn faster than this is a turn and not a gyroscope's bias."""
 LEAST_STILL = 0.3
 """s; a shorter rest says too little about the gyroscope's bias."""
 
@@ -56,8 +58,9 @@ def proceed(still: ImuSamples | None, scan: Scan, samples: ImuSamples, params: P
 
 
 def is_moving(imu: ImuSamples) -> bool:
-    """Whether the samples spread more than a device standing still would show."""
-    return bool(np.any(imu.gyro.std(axis=0) > MOVING_GYRO) or np.any(imu.accel.std(axis=0) > MOVING_ACCEL))
+    """Whether the samples spread more than a device standing still would show, or tell of an even turn."""
+    turning = np.linalg.norm(imu.gyro.mean(axis=0)) > LARGEST_BIAS
+    return bool(turning or np.any(imu.gyro.std(axis=0) > MOVING_GYRO) or np.any(imu.accel.std(axis=0) > MOVING_ACCEL))
 
 
 def standing(imu: ImuSamples, stamp_ns: int, params: Params) -> Belief:
