@@ -1,7 +1,6 @@
 """One pass through a recording: the open file, the engine at work on it, and what came of it so far."""
 
 import copy
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from app.sensors.recording import Recording, open_recording
 from app.server.protocol import OpenedRecording
 from app.server.readouts import Readouts
 from app.slam.engine import Engine
+from app.slam.keyframes import KeyframeStore
 from app.slam.params import Params
 from app.slam.results import RunInfo, RunLog, prepare_folder, save_results
 from app.slam.trajectory import read_tum, truth_beside, write_tum
@@ -52,7 +52,6 @@ class Run:
         self.frame = -1
         self.readouts = Readouts(recording.start_ns, truth)
         self.log = RunLog()
-        self._engine_lock = threading.Lock()  # a save reads keyframes in another thread
         self._recording = recording
         self._truth = truth
         self._part = (start_s, duration_s)
@@ -81,8 +80,7 @@ class Run:
         """Process the measurement last peeked at. It is used up even if the engine fails on it."""
         measurement, self._waiting = self._waiting, None
         assert measurement is not None
-        with self._engine_lock:
-            result = self.engine.step(measurement.scan, measurement.imu)
+        result = self.engine.step(measurement.scan, measurement.imu)
         if measurement.notices:
             result = replace(result, notices=(*measurement.notices, *result.notices))
         self.frame += 1
@@ -106,7 +104,7 @@ class Run:
             truth=self._truth,
             truth_path=self.opened.truth,
         )
-        keyframes = _Present(self.engine, self._engine_lock)
+        keyframes = _Present(self.engine.keyframes)
 
         def save() -> None:
             save_results(folder, log, keyframes, info, replace=True)
@@ -119,18 +117,16 @@ class Run:
 
 
 class _Present:
-    """The keyframes that an engine has now; later ones are not seen. Reading one waits for the frame under way."""
+    """The keyframes that there are now; later ones are not seen."""
 
-    def __init__(self, engine: Engine, lock: threading.Lock) -> None:
-        self._keyframes, self._lock = engine.keyframes, lock
-        self._count = len(engine.keyframes)
+    def __init__(self, keyframes: KeyframeStore) -> None:
+        self._keyframes, self._count = keyframes, len(keyframes)
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, index: int, /) -> Keyframe:
-        with self._lock:
-            return self._keyframes[index]
+        return self._keyframes[index]
 
 
 def _save_trajectory(folder: Path, log: RunLog) -> None:

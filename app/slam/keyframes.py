@@ -1,11 +1,12 @@
-"""Keyframes: which frames are kept, and their clouds on disk, so that memory does not grow.
+"""Keyframes: which frames are kept, and all of them on disk, so that memory does not grow.
 
-Clouds are immutable and only ever appended, so a checkpoint needs no more than their number.
+They are immutable and only ever appended, so a checkpoint needs no more than their number.
 """
 
+import os
 import tempfile
+from array import array
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,9 +14,20 @@ from app.slam import lie
 from app.slam.params import Keyframes
 from app.slam.types import F64, Cloud, Keyframe
 
-_RECORD = np.dtype(
+_HEAD = np.dtype(
+    [
+        ("frame", "<i8"),
+        ("stamp_ns", "<i8"),
+        ("T_odom_imu", "<f8", (4, 4)),
+        ("T_imu_lidar", "<f8", (4, 4)),
+        ("covariance", "<f8", (6, 6)),
+        ("points", "<i8"),
+    ]
+)
+_POINT = np.dtype(
     [("points", "<f4", 3), ("labels", "u1"), ("intensity", "<f4"), ("ring", "<u2"), ("offsets_ns", "<i4")]
 )
+"""One point of a `Cloud`; the names are its attributes."""
 
 
 def is_due(last: Keyframe | None, T_odom_imu: F64, params: Keyframes) -> bool:
@@ -29,62 +41,56 @@ def is_due(last: Keyframe | None, T_odom_imu: F64, params: Keyframes) -> bool:
 
 
 class KeyframeStore:
-    """All keyframes of a walk. Poses are in memory, clouds in an unnamed temporary file.
+    """All keyframes of a walk, in an unnamed temporary file.
 
-    `store[i]` reads keyframe i with its cloud; iterating streams all of them in order.
+    `store[i]` reads keyframe i, from any thread; iterating streams all of them in order.
     """
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile(prefix="hemislam-keyframes-")  # noqa: SIM115 - closed by close()
-        self._heads: list[Keyframe] = []
-        self._extents: list[tuple[int, int]] = []
-        self._end = 0
+        self._file = tempfile.TemporaryFile(prefix="hemislam-keyframes-", buffering=0)  # noqa: SIM115 - closed by close()
+        self._ends = array("q")  # file offset after each keyframe
 
     def __len__(self) -> int:
-        return len(self._heads)
+        return len(self._ends)
 
     def __getitem__(self, index: int) -> Keyframe:
-        head = self._heads[index]
-        offset, count = self._extents[index]
-        self._file.seek(offset)
-        data = np.frombuffer(self._file.read(count * _RECORD.itemsize), dtype=_RECORD)
-        return replace(head, cloud=Cloud(**{name: np.ascontiguousarray(data[name]) for name in _RECORD.names or ()}))
+        if not 0 <= index < len(self):
+            raise IndexError(f"keyframe {index} of {len(self)}")
+        begin = self._ends[index - 1] if index else 0
+        raw = os.pread(self._file.fileno(), self._ends[index] - begin, begin)
+        head = np.frombuffer(raw, dtype=_HEAD, count=1)[0]
+        data = np.frombuffer(raw, dtype=_POINT, offset=_HEAD.itemsize)
+        return Keyframe(
+            index=index,
+            frame=int(head["frame"]),
+            stamp_ns=int(head["stamp_ns"]),
+            T_odom_imu=head["T_odom_imu"].copy(),
+            T_imu_lidar=head["T_imu_lidar"].copy(),
+            covariance=head["covariance"].copy(),
+            cloud=Cloud(**{name: np.ascontiguousarray(data[name]) for name in _POINT.names or ()}),
+        )
 
     def __iter__(self) -> Iterator[Keyframe]:
         return (self[i] for i in range(len(self)))
 
-    def poses(self) -> F64:
-        """(k, 4, 4) T_odom_imu of all keyframes."""
-        return np.array([head.T_odom_imu for head in self._heads]).reshape(-1, 4, 4)
-
     def append(self, keyframe: Keyframe) -> None:
         cloud = keyframe.cloud
-        data = np.empty(len(cloud), dtype=_RECORD)
-        for name in _RECORD.names or ():
+        head = np.zeros((), dtype=_HEAD)
+        for name in ("frame", "stamp_ns", "T_odom_imu", "T_imu_lidar", "covariance"):
+            head[name] = getattr(keyframe, name)
+        head["points"] = len(cloud)
+        data = np.empty(len(cloud), dtype=_POINT)
+        for name in _POINT.names or ():
             data[name] = getattr(cloud, name)
-        self._file.seek(self._end)
-        self._file.write(data.tobytes())
-        self._extents.append((self._end, len(cloud)))
-        self._end += data.nbytes
-        self._heads.append(replace(keyframe, cloud=_NO_CLOUD))
+        begin = self._ends[-1] if self._ends else 0
+        self._file.seek(begin)
+        self._file.write(head.tobytes() + data.tobytes())
+        self._ends.append(begin + head.nbytes + data.nbytes)
 
     def truncate(self, count: int) -> None:
         """Forget all but the first `count` keyframes."""
-        del self._heads[count:], self._extents[count:]
-        self._end = self._end_of(count - 1) if count else 0
-
-    def _end_of(self, index: int) -> int:
-        offset, count = self._extents[index]
-        return offset + count * _RECORD.itemsize
+        del self._ends[count:]
 
     def close(self) -> None:
+        """Give the disk space back."""
         self._file.close()
-
-
-_NO_CLOUD = Cloud(
-    np.empty((0, 3), np.float32),
-    np.empty(0, np.uint8),
-    np.empty(0, np.float32),
-    np.empty(0, np.uint16),
-    np.empty(0, np.int32),
-)
