@@ -124,7 +124,7 @@ def test_a_knock_right_at_the_start_is_not_taken_for_a_rest() -> None:
 def test_turning_evenly_is_not_a_rest() -> None:
     """A turntable, or a person turning on the spot: the rates do not scatter, but they are no bias."""
     even = samples(RESTING, 0, 0.1)
-    turning = start.ImuSamples(even.stamps_ns, even.gyro + [0.0, 0.0, 0.6], even.accel)
+    turning = start.ImuSamples(even.stamps_ns, np.add(even.gyro, [0.0, 0.0, 0.6]), even.accel)
     assert start.is_moving(turning)
     assert not start.is_moving(even)
 
