@@ -66,6 +66,7 @@ class LocalMap:
         while refused and radius > 1.0:
             radius *= 0.8
             self._evict(position, radius)
+            points = points[np.linalg.norm(points - position, axis=1) < radius]
             self._used, refused = self._insert(points, params)
 
     def _insert(self, points: F32, params: MapParams) -> tuple[int, int]:
