@@ -1,0 +1,311 @@
+"""The local map against brute force, and what bounds its memory."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from app.slam.kernels.map import BINS, MOST
+from app.slam.local_map import LocalMap, MapState, Planes
+from app.slam.params import Filter
+from app.slam.params import LocalMap as MapParams
+
+SMALL = MapParams(max_voxels=5000)
+LOOSE = Filter(plane_tilt=20.0)
+HERE = np.zeros(3)
+
+
+def stored(local_map: LocalMap) -> np.ndarray:
+    """All points of the map, (n, 3) float64."""
+    state = local_map.checkpoint()
+    return np.concatenate([np.empty((0, 3)), *(state.store[k, :n] for k, n in enumerate(state.counts))]).astype(float)
+
+
+def filled(points: np.ndarray, params: MapParams = SMALL) -> LocalMap:
+    local_map = LocalMap(params)
+    local_map.insert(points.astype(np.float32), HERE, params)
+    return local_map
+
+
+def surface(seed: int, n: int = 4000, noise: float = 0.003, at: float = 0.0) -> np.ndarray:
+    """A floor, two walls and a slope in a patch of 6 m around x = `at`."""
+    rng = np.random.default_rng(seed)
+    a, b = rng.uniform(-3, 3, (2, n))
+    zero, kind = np.zeros(n), rng.integers(0, 4, n)[:, None]
+    parts = [[a, b, zero - 1.3], [a, zero + 2.1, b], [zero - 2.4, a, b], [a, b, 0.5 * a + 0.2 * b]]
+    return (
+        np.choose(kind, [np.stack(p, axis=1) for p in parts])
+        + rng.normal(scale=noise, size=(n, 3))
+        + np.array([at, 0, 0])
+    )
+
+
+def equal(a: Planes, b: Planes) -> bool:
+    """To the bit, wherever there is a plane."""
+    found = a.variances >= 0
+    return bool(
+        np.array_equal(found, b.variances >= 0)
+        and all(np.array_equal(getattr(a, f.name)[found], getattr(b, f.name)[found]) for f in fields(Planes))
+    )
+
+
+# --- insertion -----------------------------------------------------------------------------------
+def by_dictionary(points: np.ndarray, p: MapParams) -> dict[tuple[int, ...], list[np.ndarray]]:
+    voxels: dict[tuple[int, ...], list[np.ndarray]] = {}
+    for point in points:
+        inside = voxels.setdefault(tuple(np.floor(point.astype(float) / p.voxel_size).astype(int)), [])
+        apart = all(np.sum((q - point) ** 2) >= p.spacing**2 for q in inside)
+        if len(inside) < p.points_per_voxel and apart:
+            inside.append(point)
+    return voxels
+
+
+@given(
+    seed=st.integers(0, 2**32),
+    voxel=st.sampled_from([0.5, 1.0, 2.0]),
+    spacing=st.sampled_from([0.0, 0.1, 0.3]),
+    room=st.sampled_from([1, 5, 40]),
+)
+def test_what_is_stored_is_what_a_dictionary_stores(seed: int, voxel: float, spacing: float, room: int) -> None:
+    params = MapParams(voxel_size=voxel, spacing=spacing, points_per_voxel=room, max_voxels=5000)
+    points = np.random.default_rng(seed).normal(scale=1.5, size=(300, 3)).astype(np.float32)
+    state = filled(points, params).checkpoint()
+    expected = by_dictionary(points, params)
+    assert {tuple(cell) for cell in state.cells.tolist()} == set(expected)
+    for cell, count, store in zip(state.cells.tolist(), state.counts, state.store, strict=True):
+        np.testing.assert_array_equal(store[:count], np.array(expected[tuple(cell)]))
+
+
+def test_standing_still_piles_up_nothing() -> None:
+    points = surface(1)
+    local_map = filled(points)
+    before = len(stored(local_map))
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        local_map.insert((points + rng.normal(scale=0.003, size=points.shape)).astype(np.float32), HERE, SMALL)
+    assert len(stored(local_map)) < 1.3 * before
+
+
+# --- planes --------------------------------------------------------------------------------------
+def expected_plane(
+    query: np.ndarray, near: np.ndarray, p: Filter, reach: float
+) -> tuple[np.ndarray, np.ndarray, float] | str | None:
+    """Normal, centre and thickness by numpy, from neighbours sorted exactly; None: no plane.
+
+    "ambiguous" where the map's ranking in bins of squared distance may take others than the nearest,
+    or where a decision hangs on the last digits.
+    """
+    squares = np.sum((near - query) ** 2, axis=1)
+    order = np.argsort(squares)
+    near, bins = near[order], (squares[order] * (BINS / reach**2)).astype(int)
+    n = min(len(near), MOST)
+    k = p.neighbours
+    while k <= n:
+        if k < len(near) and bins[k] == bins[k - 1]:
+            return "ambiguous"
+        patch = near[:k]
+        values, vectors = np.linalg.eigh(np.cov(patch.T, bias=True))
+        certain = max(values[0], p.point_noise**2) / (np.radians(p.plane_tilt) ** 2 * k * values[1])
+        if abs(certain - 1) < 1e-3:
+            return "ambiguous"
+        if certain < 1:
+            off = np.abs((patch - patch.mean(axis=0)) @ vectors[:, 0]).max()
+            if abs(off - p.plane_threshold) < 1e-4:
+                return "ambiguous"
+            return None if off > p.plane_threshold else (vectors[:, 0], patch.mean(axis=0), values[0])
+        if k == n:
+            break
+        k = min(2 * k, n)
+    return None
+
+
+@pytest.mark.parametrize("tilt", [1.5, 5.0, 20.0])
+@pytest.mark.parametrize("reach", [0.6, 1.0])
+def test_planes_are_those_through_the_nearest_neighbours(tilt: float, reach: float) -> None:
+    params = Filter(plane_tilt=tilt, neighbour_distance=reach)
+    local_map = filled(surface(3))
+    points = stored(local_map)
+    tree = cKDTree(points)
+    queries = surface(5, 1500, noise=0.05)
+    planes = local_map.planes(queries, params)
+    compared = {"plane": 0, "none": 0}
+    for j, query in enumerate(queries):
+        near = points[sorted(tree.query_ball_point(query, reach))]
+        expected = expected_plane(query, near, params, reach)
+        if isinstance(expected, str):
+            continue
+        if expected is None:
+            compared["none"] += 1
+            assert planes.variances[j] < 0
+            continue
+        compared["plane"] += 1
+        normal, center, thickness = expected
+        assert planes.variances[j] == pytest.approx(thickness, abs=1e-7)
+        assert abs(planes.normals[j] @ normal) == pytest.approx(1, abs=1e-5)
+        np.testing.assert_allclose(planes.centers[j], center, atol=1e-5)
+    assert compared["plane"] > 5, compared
+    assert compared["plane"] + compared["none"] > 300, compared
+
+
+def test_a_plane_is_found_across_the_borders_of_voxels() -> None:
+    """The floor exactly between two layers of voxels, so that noise throws its points into both."""
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-3, 3, (3000, 2)), rng.normal(scale=0.002, size=3000)])
+    queries = np.column_stack([rng.uniform(-2, 2, (200, 2)), np.zeros(200)])
+    planes = filled(floor).planes(queries, Filter())
+    assert np.all(planes.variances >= 0)
+    assert np.abs(planes.normals[:, 2]).min() > np.cos(np.radians(2.0))
+    assert np.abs(planes.centers[:, 2]).max() < 0.005
+
+
+def line(offset: float, n: int = 200) -> np.ndarray:
+    return np.column_stack([np.linspace(-3, 3, n), np.full(n, offset), np.zeros(n)])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005, 0.02])
+def test_points_along_one_scan_line_make_no_plane(noise: float) -> None:
+    """The trap of this sensor: five collinear neighbours fit any plane that holds their line."""
+    rng = np.random.default_rng(1)
+    params = MapParams(spacing=0.02, max_voxels=1000)
+    local_map = filled(line(0.0) + rng.normal(scale=noise, size=(200, 3)), params)
+    planes = local_map.planes(line(0.01, 50), Filter())
+    assert np.all(planes.variances < 0)
+
+
+def test_a_second_scan_line_makes_them_a_plane() -> None:
+    rng = np.random.default_rng(1)
+    points = np.concatenate([line(0.0), line(0.4)]) + rng.normal(scale=0.003, size=(400, 3))
+    local_map = filled(points, MapParams(spacing=0.05, max_voxels=1000))
+    planes = local_map.planes(line(0.2, 30)[5:-5], Filter())
+    assert np.all(planes.variances >= 0)
+    assert np.abs(planes.normals[:, 2]).min() > np.cos(np.radians(3.0))
+
+
+def test_a_corner_is_no_plane() -> None:
+    """Neighbours on both sides of an edge lie off any common plane by more than the threshold."""
+    rng = np.random.default_rng(2)
+    a, b = rng.uniform(0, 1, (2, 1500))
+    edge = np.concatenate([np.column_stack([a, b, 0 * a]), np.column_stack([0 * a, b, a])])
+    queries = np.column_stack([np.zeros(20), np.linspace(0.3, 0.7, 20), np.zeros(20)]) + 0.3
+    planes = filled(edge).planes(queries, Filter(plane_tilt=20, neighbours=20))
+    flat = planes.variances >= 0
+    assert np.all(np.abs(planes.normals[flat]).max(axis=1) > 0.9)  # never the diagonal
+
+
+def test_nothing_near_is_no_plane() -> None:
+    planes = filled(surface(0)).planes(np.array([[50.0, 0, 0], [0, 0, 90.0]]), LOOSE)
+    assert np.all(planes.variances < 0)
+    assert len(LocalMap(SMALL).planes(np.empty((0, 3)), LOOSE).variances) == 0
+    assert np.all(LocalMap(SMALL).planes(np.zeros((3, 3)), LOOSE).variances < 0)
+
+
+def test_neighbours_are_not_looked_for_beyond_a_voxels_edge() -> None:
+    """Whatever the reach asked for, it is cut to where 27 voxels surely hold everything."""
+    local_map = filled(surface(3))
+    queries = surface(6, 200)
+    far, near = (local_map.planes(queries, Filter(neighbour_distance=d)) for d in (5.0, SMALL.voxel_size))
+    assert equal(far, near)
+    assert np.any(near.variances >= 0)
+
+
+# --- bounds --------------------------------------------------------------------------------------
+def size_of(local_map: LocalMap) -> int:
+    """Bytes of everything the map holds on to."""
+    return sum(v.nbytes for v in vars(local_map).values() if isinstance(v, np.ndarray))
+
+
+def test_far_voxels_are_dropped_and_near_ones_stay_as_they_are() -> None:
+    params = MapParams(radius=10.0, max_voxels=5000)
+    rng = np.random.default_rng(0)
+    local_map = LocalMap(params)
+    ahead = surface(1, at=20.0)
+    local_map.insert(surface(1).astype(np.float32), HERE, params)
+    local_map.insert(ahead.astype(np.float32), HERE, params)
+    queries = ahead[rng.integers(0, len(ahead), 200)]
+    before = local_map.planes(queries, LOOSE)
+    local_map.insert(np.empty((0, 3), np.float32), np.array([21.0, 0, 0]), params)
+    after = local_map.planes(queries, LOOSE)
+    assert equal(after, before)
+    assert np.any(after.variances >= 0)
+    reach = np.linalg.norm(stored(local_map) - [21.0, 0, 0], axis=1)
+    assert reach.max() < 10.0 + np.sqrt(3) / 2 * params.voxel_size
+    assert np.all(local_map.planes(surface(2, 100), LOOSE).variances < 0)
+
+
+def test_a_walk_of_a_kilometre_needs_no_more_memory_than_its_first_metres() -> None:
+    params = MapParams(radius=20.0, max_voxels=3000)
+    local_map, sizes, voxels = LocalMap(params), [], []
+    rng = np.random.default_rng(0)
+    for x in np.arange(0.0, 1000.0, 1.0):
+        tunnel = np.column_stack([rng.uniform(x - 15, x + 15, 300), rng.choice([-2, 2], 300), rng.uniform(-2, 2, 300)])
+        local_map.insert(tunnel.astype(np.float32), np.array([x, 0, 0]), params)
+        sizes.append(size_of(local_map))
+        voxels.append(local_map.voxels)
+    assert len(set(sizes)) == 1
+    assert max(voxels[100:]) <= 1.1 * max(voxels[40:100])
+    assert max(voxels) < 3000
+
+
+def test_a_full_map_keeps_what_is_near() -> None:
+    """A wide plain with more voxels than there is room for."""
+    params = MapParams(voxel_size=0.5, radius=200.0, max_voxels=2000)
+    local_map, rng = LocalMap(params), np.random.default_rng(0)
+    for x in np.arange(0.0, 60.0, 2.0):
+        plain = np.column_stack([x + rng.uniform(-40, 40, 16000), rng.uniform(-40, 40, 16000), np.full(16000, -1.3)])
+        local_map.insert(plain.astype(np.float32), np.array([x, 0, 0]), params)
+        assert local_map.voxels <= params.max_voxels
+        at = np.column_stack([x + rng.uniform(-5, 5, 100), rng.uniform(-5, 5, 100), np.full(100, -1.3)])
+        distance, _ = cKDTree(stored(local_map)).query(at)
+        assert np.quantile(distance, 0.9) < 0.7, x
+
+
+def test_lookups_end_even_if_the_map_is_full_to_the_last_voxel() -> None:
+    params = MapParams(voxel_size=0.1, max_voxels=1000, radius=500.0)
+    cells = np.stack(np.meshgrid(*[np.arange(10)] * 3), axis=-1).reshape(-1, 3) * 0.1 + 0.05
+    local_map = filled(cells, params)
+    assert local_map.voxels == 1000
+    planes = local_map.planes(cells + 1.0, LOOSE)
+    assert len(planes.variances) == 1000
+
+
+# --- checkpoints ---------------------------------------------------------------------------------
+def same(a: MapState, b: MapState) -> bool:
+    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(MapState))
+
+
+def walked(local_map: LocalMap, begin: int, end: int, params: MapParams) -> LocalMap:
+    for k in range(begin, end):
+        local_map.insert(surface(k, 500, at=2.0 * k).astype(np.float32), np.array([2.0 * k, 0, 0]), params)
+    return local_map
+
+
+@pytest.mark.parametrize("fresh", [False, True], ids=["the same map", "another map"])
+def test_a_restored_map_goes_on_to_the_same_bytes(fresh: bool) -> None:
+    params = MapParams(radius=12.0, max_voxels=2000)
+    local_map = walked(LocalMap(params), 0, 10, params)
+    checkpoint = local_map.checkpoint()
+    copy = MapState(**{f.name: getattr(checkpoint, f.name).copy() for f in fields(MapState)})
+    expected = walked(local_map, 10, 25, params).checkpoint()
+    assert same(checkpoint, copy), "a checkpoint must not change with the map it was taken from"
+
+    other = LocalMap(params) if fresh else local_map
+    other.restore(checkpoint)
+    queries = surface(9, 300, at=18.0)
+    restored = other.planes(queries, LOOSE)
+    assert same(walked(other, 10, 25, params).checkpoint(), expected)
+    assert same(checkpoint, copy)
+    local_map.restore(checkpoint)
+    assert equal(local_map.planes(queries, LOOSE), restored)
+
+
+def test_a_checkpoint_of_an_empty_map_empties_the_map() -> None:
+    empty = LocalMap(SMALL).checkpoint()
+    local_map = filled(surface(0))
+    local_map.restore(empty)
+    assert local_map.voxels == 0
+    assert np.all(local_map.planes(surface(0, 50), LOOSE).variances < 0)
+    local_map.insert(surface(0).astype(np.float32), HERE, SMALL)
+    assert same(local_map.checkpoint(), filled(surface(0)).checkpoint())
