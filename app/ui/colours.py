@@ -15,9 +15,9 @@ from app.slam.types import GROUND, NON_GROUND, SEED, U8
 Rgb = tuple[int, int, int]
 
 LABEL_COLOURS: Final[dict[int, Rgb]] = {
-    NON_GROUND: (164, 177, 198),
-    GROUND: (34, 170, 148),
-    SEED: (255, 176, 32),
+    NON_GROUND: (136, 148, 168),
+    GROUND: (52, 199, 170),
+    SEED: (255, 205, 80),
 }
 """Blue-grey, teal and amber: told apart by every kind of colour vision, and by lightness too."""
 
@@ -33,11 +33,11 @@ class ColourBy(StrEnum):
 
 
 _ANCHORS: Final[dict[str, str]] = {
-    # Nine evenly spaced colours of matplotlib's maps (CC0, van der Walt and Smith), which are uniform in
-    # CAM02-UCS. Their dark ends are left out: they would vanish on the page's dark ground.
-    "viridis": "472c7a 3b518b 2c718e 21908d 27ad81 5cc863 aadc32 fde725",
-    "plasma": "4c02a1 7e03a8 a92395 cc4778 e56b5d f89540 fdc527 f0f921",
-    "magma": "4f127b 812581 b5367a e55964 fb8761 fec287 fcfdbf",
+    # Evenly spaced colours of matplotlib's maps (CC0, van der Walt and Smith), which are uniform in CAM02-UCS.
+    # Their dark ends are left out: they would vanish on the page's dark ground.
+    "viridis": "3b518b 2c718e 21908d 27ad81 5cc863 aadc32 fde725",
+    "plasma": "7e03a8 a92395 cc4778 e56b5d f89540 fdc527 f0f921",
+    "magma": "812581 b5367a e55964 fb8761 fec287 fcfdbf",
 }
 
 MAP_OF: Final[dict[ColourBy, str]] = {

@@ -40,7 +40,7 @@ class Scene:
             cell_size=1.0,
             cell_color=(70, 80, 98),
             section_size=5.0,
-            section_color=(118, 134, 160),
+            section_color=(96, 110, 134),
             section_thickness=1.2,
             fade_distance=60.0,
             shadow_opacity=0.0,
@@ -50,7 +50,7 @@ class Scene:
         self._sensor = Sensor(scene, f"{ROOT}/sensor")
         self._trajectory = Trajectory(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
-        server.initial_camera.position = (-4.5, -4.0, 6.5)  # high enough to look into a corridor without its ceiling
+        server.initial_camera.position = (-4.0, -4.0, 9.0)  # high enough to look into a corridor without its ceiling
         server.initial_camera.look_at = (0.3, 0.2, -0.6)
         server.initial_camera.fov = float(np.radians(60.0))
 

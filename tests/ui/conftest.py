@@ -70,3 +70,26 @@ def engine() -> Iterator[FakeEngine]:
     engine = FakeEngine(columns=40)
     yield engine
     engine.close()
+
+
+SOMEONE = object()
+"""Stands for a browser."""
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def user_sets(handle: Any, value: Any) -> None:
+    """As if somebody set a control in a browser."""
+    handle._impl.value = value
+    for callback in handle._impl.update_cb:
+        callback(viser.GuiEvent(client=SOMEONE, client_id=0, target=handle))  # type: ignore[arg-type]
+
+
+def user_clicks(handle: Any) -> None:
+    user_sets(handle, True)

@@ -1,0 +1,132 @@
+"""The parameter panel: what a person sets becomes a command, what the engine says is shown, and neither echoes."""
+
+from typing import Any
+
+import pytest
+import viser
+
+from app.server.protocol import (
+    Command,
+    Progress,
+    Restart,
+    SetParams,
+    Snapshot,
+)
+from app.slam.params import Params, leaves
+from app.ui.parameters import PRIMARY, ParameterPanel
+from tests.ui.conftest import Clock, user_clicks, user_sets
+
+
+class Parameters:
+    """A parameter panel with its clock and what it sent."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.sent: list[Command] = []
+        self.clock = Clock()
+        self.panel = ParameterPanel(server.gui, Params(), self.sent.append, self.clock)
+        self.params = Params()
+
+    def control(self, path: str) -> Any:
+        return self.panel._controls[path]
+
+    def tick(self, seconds: float = 0.0, **changes: Any) -> None:
+        self.clock.now += seconds
+        self.panel.tick(Snapshot(params=self.params, **changes))
+
+
+@pytest.fixture
+def parameters(server: viser.ViserServer) -> Parameters:
+    return Parameters(server)
+
+
+def test_every_parameter_has_a_control_that_shows_its_default(parameters: Parameters) -> None:
+    assert set(parameters.panel._controls) == {leaf.path for leaf in leaves()}
+    for leaf in leaves():
+        assert parameters.control(leaf.path).value == leaf.default
+        assert parameters.control(leaf.path).hint == leaf.help
+
+
+def test_the_papers_four_come_first_and_are_sliders(parameters: Parameters) -> None:
+    orders = {path: control.order for path, control in parameters.panel._controls.items()}
+    assert set(sorted(orders, key=lambda path: orders[path])[:4]) == set(PRIMARY)
+    assert all(isinstance(parameters.control(path), viser.GuiSliderHandle) for path in PRIMARY)
+
+
+@pytest.mark.parametrize(("path", "mark"), [("ground.alpha", ""), ("filter.point_noise", "▸"), ("imu.gravity", "↻")])
+def test_labels_say_when_a_change_takes_effect(parameters: Parameters, path: str, mark: str) -> None:
+    text = parameters.control(path).label
+    assert [m for m in "▸↻" if m in text] == list(mark)
+
+
+def test_moving_a_slider_sends_the_value_at_once(parameters: Parameters) -> None:
+    user_sets(parameters.control("ground.alpha"), 25.0)
+    assert parameters.sent == [SetParams({"ground.alpha": 25.0})]
+
+
+def test_a_typed_value_is_sent_once_the_keys_rest(parameters: Parameters) -> None:
+    noise = parameters.control("filter.point_noise")
+    for typed in (0.0, 0.2, 0.25):
+        user_sets(noise, typed)
+        parameters.tick(0.1)
+    assert parameters.sent == []
+    parameters.tick(0.6)
+    assert parameters.sent == [SetParams({"filter.point_noise": 0.25})]
+
+
+def test_what_the_engine_says_is_shown_and_not_sent_back(parameters: Parameters) -> None:
+    parameters.params = Params().with_values(
+        {"ground.alpha": 12.0, "imu.max_gap": 0.3, "sensor.translation": (1, 2, 3)}
+    )
+    parameters.tick()
+    assert parameters.control("ground.alpha").value == 12.0
+    assert parameters.control("imu.max_gap").value == 0.3
+    assert parameters.control("sensor.translation").value == (1, 2, 3)
+    assert parameters.sent == []
+
+
+def test_an_older_snapshot_does_not_pull_the_slider_from_under_the_hand(parameters: Parameters) -> None:
+    alpha = parameters.control("ground.alpha")
+    user_sets(alpha, 20.0)
+    parameters.tick(0.05)
+    assert alpha.value == 20.0
+
+
+def test_a_value_that_the_engine_refused_goes_back(parameters: Parameters) -> None:
+    alpha = parameters.control("ground.alpha")
+    user_sets(alpha, 20.0)
+    parameters.tick(0.5, progress=Progress("Going to frame 5", 0.1))
+    parameters.tick(5.0, progress=Progress("Going to frame 5", 0.9))
+    assert alpha.value == 20.0  # it may be busy still
+    parameters.tick(0.1)
+    parameters.tick(0.1)
+    assert alpha.value == Params().ground.alpha
+
+
+def test_changed_parameters_can_be_reset_one_by_one_or_all(parameters: Parameters) -> None:
+    resets = parameters.panel._resets["primary"]
+    parameters.tick()
+    assert not resets.visible
+    parameters.params = Params().with_values({"ground.alpha": 12.0, "ground.sigma": 0.1})
+    parameters.tick()
+    assert resets.visible and resets.options == ("alpha", "sigma", "all")
+    user_sets(resets, "sigma")
+    assert parameters.sent == [SetParams({"ground.sigma": Params().ground.sigma})]
+    parameters.sent.clear()
+    user_sets(resets, "all")
+    (command,) = parameters.sent
+    assert isinstance(command, SetParams)
+    assert command.values == {path: Params().value(path) for path in PRIMARY}
+
+
+def test_what_waits_for_a_restart_is_named_and_can_be_had_now(parameters: Parameters) -> None:
+    parameters.tick()
+    assert not parameters.panel._restart.visible
+    parameters.tick(pending_restart=("imu.gravity",))
+    assert parameters.panel._restart.visible and "imu.gravity" in parameters.panel._pending.content
+    user_clicks(parameters.panel._restart)
+    assert parameters.sent == [Restart()]
+
+
+def test_the_slider_of_m_ends_at_the_lines_there_are(parameters: Parameters) -> None:
+    parameters.panel.fit_lines(32)
+    assert parameters.control("ground.scan_lines").max == 32

@@ -1,0 +1,88 @@
+"""Play, pause, step, speed and the time slider."""
+
+from dataclasses import replace
+
+import pytest
+import viser
+
+from app.server.protocol import (
+    Pause,
+    Play,
+    Restart,
+    Seek,
+    SetSpeed,
+    StepFrame,
+)
+from app.ui.transport import SPEEDS, TransportPanel, speed_name, where
+from tests.ui.conftest import Clock, user_clicks, user_sets
+from tests.ui.fake_engine import FakeEngine
+
+
+class Transporting:
+    def __init__(self, server: viser.ViserServer, engine: FakeEngine) -> None:
+        self.engine, self.clock = engine, Clock()
+        self.panel = TransportPanel(server.gui, engine.send, lambda: engine.snapshot, self.clock)
+
+    def tick(self, seconds: float = 0.0) -> None:
+        self.clock.now += seconds
+        self.panel.tick(self.engine.snapshot)
+
+
+@pytest.fixture
+def transport(server: viser.ViserServer, engine: FakeEngine) -> Transporting:
+    return Transporting(server, engine)
+
+
+def test_the_play_button_plays_then_pauses(transport: Transporting) -> None:
+    user_clicks(transport.panel._play)
+    transport.tick()
+    assert transport.panel._play.label == "Pause"
+    user_clicks(transport.panel._play)
+    transport.tick()
+    assert transport.engine.sent == [Play(), Pause()]
+    assert transport.panel._play.label == "Play"
+
+
+def test_playing_at_the_end_begins_anew(transport: Transporting) -> None:
+    snapshot = transport.engine.snapshot
+    transport.engine.publish(transport=replace(snapshot.transport, finished=True))
+    user_clicks(transport.panel._play)
+    assert transport.engine.sent == [Restart(), Play()]
+
+
+def test_the_slider_follows_the_frame_without_seeking(transport: Transporting) -> None:
+    transport.engine.send(StepFrame(7))
+    transport.tick()
+    assert transport.panel._slider.value == 6
+    assert transport.panel._slider.max == transport.engine.frames - 1
+    transport.tick(5.0)
+    assert transport.engine.sent == [StepFrame(7)]
+
+
+def test_dragging_seeks_once_to_where_the_hand_came_to_rest(transport: Transporting) -> None:
+    transport.engine.send(StepFrame(3))
+    transport.tick()
+    for frame in (5, 9, 12):
+        user_sets(transport.panel._slider, frame)
+        transport.tick(0.05)
+        assert transport.panel._slider.value == frame
+    transport.tick(0.3)
+    assert transport.engine.sent[1:] == [Seek(12)]
+    transport.tick()
+    assert transport.panel._slider.value == 12
+
+
+@pytest.mark.parametrize("name", SPEEDS)
+def test_speeds_are_sent_and_shown(transport: Transporting, name: str) -> None:
+    user_sets(transport.panel._speed, name)
+    assert transport.engine.sent == [SetSpeed(SPEEDS[name])]
+    assert speed_name(SPEEDS[name]) == name
+    transport.tick()
+    assert transport.panel._speed.value == name
+
+
+def test_the_stamp_is_exact_to_the_millisecond(engine: FakeEngine) -> None:
+    engine.send(StepFrame(12))
+    text = where(engine.snapshot)
+    assert "frame <b>11</b> of 400" in text and "<b>1.10</b> of 40.0 s" in text
+    assert "2023-11-14 22:13:21.100 UTC" in text

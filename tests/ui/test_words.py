@@ -1,0 +1,76 @@
+"""What the panels say, and how they plot."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.server.protocol import (
+    Notice,
+    Snapshot,
+    StepFrame,
+)
+from app.ui.doctor import findings_html, verdicts
+from app.ui.files import result_folder_name, size_text
+from app.ui.header import title
+from app.ui.html import legend, tile
+from app.ui.notices import log_html
+from app.ui.readouts import HISTORY, recent, stacked_stages
+from tests.ui.fake_engine import FINDINGS, FakeEngine
+
+
+def test_what_needs_the_user_comes_first_with_its_option() -> None:
+    text = findings_html(FINDINGS)
+    assert text.index("needs you") < text.index("corrected") < text.index("fine")
+    assert "<code>--set imu.max_gap=0.4</code>" in text
+    assert "needs you 1" in verdicts(FINDINGS) and "fine 2" in verdicts(FINDINGS)
+
+
+@pytest.mark.parametrize(
+    "render",
+    [
+        lambda text: findings_html((replace(FINDINGS[0], subject=text, text=text, option=text),)),
+        lambda text: log_html((Notice(1, "error", text),)),
+        lambda text: tile(text, text, text, note=text),
+        lambda text: title(Snapshot(recording=replace(FakeEngine(frames=2).snapshot.recording, path=Path(text)))),  # type: ignore[type-var]
+    ],
+)
+def test_names_from_a_recording_are_never_markup(render: Callable[[str], str]) -> None:
+    assert "<script" not in render("<script>alert(1)<")
+
+
+def test_the_legend_names_limits_and_unit() -> None:
+    from app.ui.colours import ColourBy, Limits
+
+    text = legend(ColourBy.HEIGHT, Limits(-2.0, 3.0))
+    assert ">-2<" in text and ">3<" in text and "height · m" in text
+    assert all(name in legend(ColourBy.LABEL, None) for name in ("ground", "not ground", "seed"))
+
+
+def test_result_folders_sort_and_need_no_quoting() -> None:
+    now = datetime(2026, 5, 1, 13, 45, 2)
+    assert result_folder_name(Path("/x/hall bpearl (1).mcap"), now) == "hall_bpearl__1_-2026-05-01-134502"
+
+
+@pytest.mark.parametrize(
+    ("size", "text"), [(12, "12 B"), (2_000, "2 kB"), (25_400_000, "25 MB"), (3_800_000_000, "3.8 GB")]
+)
+def test_sizes_read_as_people_say_them(size: int, text: str) -> None:
+    assert size_text(size) == text
+
+
+def test_plots_show_the_newest_frames_only(engine: FakeEngine) -> None:
+    engine.send(StepFrame(HISTORY + 20))
+    stamps, planarity = recent(engine.snapshot.series, "planarity")
+    assert len(stamps) == len(planarity) == HISTORY
+    assert stamps[-1] == pytest.approx(0.1 * (HISTORY + 19))
+
+
+def test_stages_are_stacked_to_the_total(engine: FakeEngine) -> None:
+    engine.send(StepFrame(10))
+    _, highest, *lower = stacked_stages(engine.snapshot.series)
+    assert np.allclose(highest, engine.snapshot.series["total_ms"])
+    assert all((a >= b).all() for a, b in zip([highest, *lower], lower, strict=False))

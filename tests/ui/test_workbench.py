@@ -1,0 +1,112 @@
+"""The whole page, drawn at the pace of eyes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import viser
+
+from app.server.folders import Folders
+from app.server.protocol import (
+    Progress,
+    SetParams,
+    StepFrame,
+)
+from app.ui.workbench import Workbench
+from tests.ui.conftest import Clock, Wire
+from tests.ui.fake_engine import FakeEngine
+
+
+class Page:
+    def __init__(self, server: viser.ViserServer, engine: FakeEngine, folder: Path) -> None:
+        self.clock = Clock()
+        self.engine = engine
+        self.workbench = Workbench(server, engine, Folders([folder]), now=self.clock)
+
+    def draw(self, seconds: float = 0.0) -> None:
+        self.clock.now += seconds
+        self.workbench.draw(self.engine.snapshot)
+
+
+@pytest.fixture
+def page(server: viser.ViserServer, wire: Wire, engine: FakeEngine, tmp_path: Path) -> Page:
+    page = Page(server, engine, tmp_path)
+    page.draw()
+    return page
+
+
+SCAN = "/map/sensor/lidar/scan"
+
+
+def test_frames_are_sent_at_the_rate_that_eyes_follow(page: Page, wire: Wire) -> None:
+    wire.clear()
+    for _ in range(100):
+        page.engine.send(StepFrame(1))
+        page.draw(0.01)
+    scans = [m for m in wire.messages if getattr(m, "name", "") == SCAN and "points" in getattr(m, "updates", {})]
+    assert 10 <= len(scans) <= 16
+
+
+def test_a_moved_slider_is_drawn_at_once_however_recent_the_last_frame(page: Page, wire: Wire) -> None:
+    page.engine.send(StepFrame(1))
+    page.draw(1.0)
+    wire.clear()
+    page.engine.send(SetParams({"ground.sigma": 0.2}))
+    page.draw(0.001)
+    assert "colors" in wire.updates(SCAN)
+
+
+def test_numbers_come_at_most_four_times_a_second_and_end_at_the_newest(page: Page, wire: Wire) -> None:
+    wire.clear()
+    for _ in range(100):
+        page.engine.send(StepFrame(1))
+        page.draw(0.01)
+    uuid = page.workbench._readouts._tiles._impl.uuid
+    sent = [m for m in wire.messages if getattr(m, "uuid", "") == uuid]
+    assert 1 <= len(sent) <= 5
+    page.draw(0.5)
+    assert f"{page.engine.snapshot.result.ground.seeds:,}" in page.workbench._readouts._tiles.content  # type: ignore[union-attr]
+
+
+def test_a_page_at_rest_sends_nothing(page: Page, wire: Wire) -> None:
+    page.engine.send(StepFrame(5))
+    for _ in range(5):
+        page.draw(0.5)
+    wire.clear()
+    page.draw(0.5)
+    assert wire.messages == []
+
+
+def test_the_page_says_that_the_engine_is_gone(page: Page) -> None:
+    page.engine.publish(engine_alive=False)
+    page.draw(0.1)
+    assert "engine stopped" in page.workbench._header._title.content
+
+
+def test_long_work_shows_what_it_is_and_how_far(page: Page) -> None:
+    page.engine.publish(progress=Progress("Compiling deskew", 0.25))
+    page.draw(0.1)
+    header = page.workbench._header
+    assert header._bar.visible and header._bar.value == 25.0 and "Compiling deskew · 25 %" in header._work.content
+    page.engine.publish(progress=Progress("Opening x.mcap", float("nan")))
+    page.draw(0.1)
+    assert "Opening x.mcap …" in header._work.content
+    page.engine.publish(progress=None)
+    page.draw(0.1)
+    assert not header._bar.visible
+
+
+def test_the_thread_outlives_a_snapshot_that_can_not_be_drawn(page: Page, caplog: pytest.LogCaptureFixture) -> None:
+    import time
+
+    page.clock.now += 1000
+    page.workbench.start()
+    page.engine.publish(trajectory=np.zeros((3, 7)))
+    time.sleep(0.2)
+    page.engine.publish(trajectory=None, progress=Progress("Still here", 0.5))
+    deadline = time.monotonic() + 10
+    while "Still here" not in page.workbench._header._work.content and time.monotonic() < deadline:
+        time.sleep(0.02)
+    page.workbench.close()
+    assert "Still here" in page.workbench._header._work.content
+    assert "could not be drawn" in caplog.text
