@@ -115,6 +115,9 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> t
     )
     posterior = prior.covariance.copy()
     posterior[:free, :free] = covariance
+    # what is not estimated keeps its variance, and its correlation shrinks with the rest (Schmidt 1966)
+    posterior[:free, free:] = covariance @ information @ prior.covariance[:free, free:]
+    posterior[free:, :free] = posterior[:free, free:].T
     return Belief(_unpacked(x, prior.state.stamp_ns), posterior), registration
 
 
