@@ -1,0 +1,331 @@
+"""The filter's update: where it ends up, and its algebra against textbook formulas and SciPy's optimiser."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from app.slam import iekf
+from app.slam.iekf import boxminus, boxplus
+from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
+from app.slam.local_map import LocalMap
+from app.slam.params import Filter
+from app.slam.params import LocalMap as MapParams
+from app.slam.types import NavState
+
+from .scenes import START_NS, Rig, Scene, Walk, box, furnished_room, mounted, pose_error, sweep
+
+SIDEWAYS = mounted((90, 10, -30), (0.1, -0.2, 0.15))
+RIG = Rig(columns=60, T_imu_lidar=SIDEWAYS, range_noise=0.003)
+STANDING = Walk(still=1e9)
+
+
+def truth(rig: Rig = RIG) -> NavState:
+    pose = STANDING.pose(0.0)
+    return NavState(
+        stamp_ns=START_NS,
+        R_odom_imu=pose[:3, :3].copy(),
+        p_odom_imu=pose[:3, 3].copy(),
+        v_odom_imu=np.zeros(3),
+        b_gyro=np.zeros(3),
+        b_accel=np.zeros(3),
+        g_odom=np.array([0.0, 0.0, -9.81]),
+        R_imu_lidar=rig.T_imu_lidar[:3, :3].copy(),
+        p_imu_lidar=rig.T_imu_lidar[:3, 3].copy(),
+    )
+
+
+def surveyed(scene: Scene) -> LocalMap:
+    """The map of a scene, seen from several places at high density."""
+    params = MapParams(max_voxels=20_000)
+    local_map, rng = LocalMap(params), np.random.default_rng(1)
+    for origin in ([0.0, 0, 0], [1.5, -1.0, 0.2], [1.5, 0.9, -0.4], [-1.5, 0.5, 0.0]):
+        directions = rng.normal(size=(12_000, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        ranges, _ = scene.cast(np.tile(origin, (len(directions), 1)), directions)
+        near = ranges < 30
+        points = np.array(origin) + directions[near] * (ranges + rng.normal(scale=0.002, size=len(ranges)))[near, None]
+        local_map.insert(points.astype(np.float32), np.zeros(3), params)
+    return local_map
+
+
+@pytest.fixture(scope="module")
+def room() -> LocalMap:
+    return surveyed(furnished_room())
+
+
+def points_of(scene: Scene, rig: Rig = RIG) -> np.ndarray:
+    return sweep(scene, STANDING, rig, 0.0, seed=7).points[::2]
+
+
+def uncertain(rotation: float = 0.1, position: float = 0.3) -> np.ndarray:
+    sigma = np.full(DIM, 1e-3)
+    sigma[ROT], sigma[POS] = rotation, position
+    return np.diag(sigma**2)
+
+
+# --- where it ends up ----------------------------------------------------------------------------
+@pytest.mark.parametrize("axis", range(3), ids=["about x", "about y", "about z"])
+@pytest.mark.parametrize("degrees", [5.0, -5.0])
+@pytest.mark.parametrize("direction", range(3), ids=["along x", "along y", "along z"])
+def test_five_degrees_and_twenty_centimetres_are_recovered(
+    room: LocalMap, axis: int, degrees: float, direction: int
+) -> None:
+    d = np.zeros(DIM)
+    d[ROT][axis], d[POS][direction] = np.radians(degrees), 0.2 * np.sign(degrees)
+    prior = Belief(boxplus(truth(), d), uncertain())
+    posterior, registration = iekf.update(prior, points_of(furnished_room()), room, Filter(max_iterations=10))
+    metres, angle = pose_error(posterior.state.T_odom_imu, truth().T_odom_imu)
+    assert metres < 0.01
+    assert angle < 0.2
+    assert registration.inliers > 300
+    assert registration.residual_rms < 0.01
+    assert not registration.degenerate
+
+
+def test_a_good_prior_stays_good_and_converges_at_once(room: LocalMap) -> None:
+    posterior, registration = iekf.update(
+        Belief(truth(), uncertain(1e-3, 1e-2)), points_of(furnished_room()), room, Filter()
+    )
+    metres, angle = pose_error(posterior.state.T_odom_imu, truth().T_odom_imu)
+    assert metres < 0.003
+    assert angle < 0.05
+    assert registration.converged
+    assert registration.iterations <= 3
+
+
+def test_the_posterior_is_more_certain_than_the_prior(room: LocalMap) -> None:
+    prior = Belief(truth(), uncertain())
+    posterior, _ = iekf.update(prior, points_of(furnished_room()), room, Filter())
+    np.testing.assert_array_equal(posterior.covariance, posterior.covariance.T)
+    assert np.linalg.eigvalsh(posterior.covariance)[0] > 0
+    assert np.linalg.eigvalsh(prior.covariance - posterior.covariance)[0] > -1e-12
+    assert np.sqrt(np.diag(posterior.covariance)[:6]).max() < 0.01
+
+
+def test_what_is_correlated_with_the_pose_is_corrected_with_it(room: LocalMap) -> None:
+    """A wrong velocity carried the position astray; seeing the position tells the velocity."""
+    error = np.array([0.05, -0.04, 0.03])
+    P = uncertain(1e-3, 1e-3)
+    P[VEL, VEL] = np.eye(3) * 0.25
+    P[POS, POS] += np.eye(3) * 0.25 * 0.1**2
+    P[POS, VEL] = P[VEL, POS] = np.eye(3) * 0.25 * 0.1
+    wrong = replace(truth(), v_odom_imu=error / 0.1, p_odom_imu=truth().p_odom_imu + error)
+    posterior, _ = iekf.update(Belief(wrong, P), points_of(furnished_room()), room, Filter())
+    np.testing.assert_allclose(posterior.state.v_odom_imu, 0, atol=0.05)
+
+
+# --- too little to go by -------------------------------------------------------------------------
+@pytest.mark.parametrize("count", [0, 1, iekf.MIN_INLIERS - 1])
+def test_too_few_points_leave_the_prior_as_it_is_and_say_so(room: LocalMap, count: int) -> None:
+    prior = Belief(boxplus(truth(), np.full(DIM, 1e-3)), uncertain())
+    posterior, registration = iekf.update(prior, points_of(furnished_room())[:count], room, Filter())
+    for field in fields(NavState):
+        np.testing.assert_array_equal(getattr(posterior.state, field.name), getattr(prior.state, field.name))
+    np.testing.assert_array_equal(posterior.covariance, prior.covariance)
+    assert not registration.converged
+    assert registration.inliers <= count
+    assert str(registration.inliers) in registration.reason
+
+
+def test_points_of_another_place_leave_the_prior_as_it_is(room: LocalMap) -> None:
+    far = replace(truth(), p_odom_imu=np.array([200.0, 0, 0]))
+    posterior, registration = iekf.update(Belief(far, uncertain()), points_of(furnished_room()), room, Filter())
+    np.testing.assert_array_equal(posterior.state.p_odom_imu, [200.0, 0, 0])
+    assert registration.inliers == 0
+    assert registration.reason
+
+
+LONG = box(-60.0, -1.2, -1.3, 60.0, 1.2, 1.2)
+NEAR = Rig(columns=60, T_imu_lidar=np.eye(4), range_noise=0.003)
+
+
+def test_a_plain_corridor_holds_everything_but_the_way_along_it() -> None:
+    corridor = Scene(LONG)
+    points = points_of(corridor, NEAR)
+    points = points[np.linalg.norm(points, axis=1) < 20]
+    d = np.zeros(DIM)
+    d[POS] = [0.05, 0.05, -0.05]
+    d[ROT] = np.radians([0.5, -0.5, 0.5])
+    prior = Belief(boxplus(truth(NEAR), d), uncertain(0.02, 0.1))
+    posterior, registration = iekf.update(prior, points, surveyed(corridor), Filter())
+    assert registration.degenerate
+    assert "direction" in registration.reason
+    assert registration.eigenvalues[0] < 1e-2 * registration.eigenvalues[1]
+    error = boxminus(posterior.state, truth(NEAR))
+    assert np.abs(error[POS][1:]).max() < 0.01  # across, the walls hold it
+    assert error[POS][0] == pytest.approx(0.05, abs=0.02)  # along, nothing is known, and nothing is invented
+    assert np.sqrt(posterior.covariance[3, 3]) > 0.05
+    assert np.sqrt(posterior.covariance[4, 4]) < 0.01
+
+
+def test_a_corridors_end_in_sight_ends_the_degeneracy() -> None:
+    ending = Scene(box(-60.0, -1.2, -1.3, 8.0, 1.2, 1.2))
+    points = points_of(ending, NEAR)
+    _, registration = iekf.update(Belief(truth(NEAR), uncertain(0.02, 0.1)), points, surveyed(ending), Filter())
+    assert not registration.degenerate
+    assert registration.reason == ""
+
+
+def test_eigenvalues_ascend_and_are_of_the_information(room: LocalMap) -> None:
+    points = points_of(furnished_room())
+    few, many = (
+        iekf.update(Belief(truth(), uncertain()), p, room, Filter())[1].eigenvalues for p in (points[::3], points)
+    )
+    assert np.all(np.diff(many) >= 0)
+    assert np.all(many > few)  # three times the points, about three times the information
+    np.testing.assert_allclose(many / few, 3, rtol=0.5)
+
+
+# --- algebra -------------------------------------------------------------------------------------
+def random_state(seed: int) -> NavState:
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=3)
+    return NavState(
+        START_NS,
+        Rotation.random(random_state=rng).as_matrix(),
+        rng.normal(scale=100, size=3),
+        *rng.normal(size=(3, 3)),
+        9.81 * g / np.linalg.norm(g),
+        Rotation.random(random_state=rng).as_matrix(),
+        rng.normal(size=3),
+    )
+
+
+def errors(scale: float) -> st.SearchStrategy[np.ndarray]:
+    return st.integers(0, 2**32).map(lambda s: np.random.default_rng(s).uniform(-scale, scale, DIM))
+
+
+@given(st.integers(0, 2**32), st.one_of(errors(1.0), errors(1e-3), errors(1e-9), st.just(np.zeros(DIM))))
+def test_boxminus_undoes_boxplus(seed: int, d: np.ndarray) -> None:
+    x = random_state(seed)
+    moved = boxplus(x, d)
+    np.testing.assert_allclose(boxminus(moved, x), d, rtol=1e-6, atol=1e-13)
+    assert np.linalg.norm(moved.g_odom) == pytest.approx(9.81, abs=1e-9)
+    assert moved.stamp_ns == x.stamp_ns
+
+
+@given(st.integers(0, 2**31), st.integers(0, 2**31))
+def test_boxplus_of_boxminus_reaches_any_state(a: int, b: int) -> None:
+    x, y = random_state(a), random_state(b + 2**31 + 1)
+    reached = boxplus(x, boxminus(y, x))
+    for field in fields(NavState):
+        np.testing.assert_allclose(getattr(reached, field.name), getattr(y, field.name), atol=1e-6)
+
+
+def test_each_error_moves_what_its_name_says() -> None:
+    x, d = random_state(3), np.zeros(DIM)
+    expected = [
+        (ROT, "R_odom_imu"), (POS, "p_odom_imu"), (VEL, "v_odom_imu"), (BG, "b_gyro"),
+        (BA, "b_accel"), (GRAV, "g_odom"), (EXT_ROT, "R_imu_lidar"), (EXT_POS, "p_imu_lidar"),
+    ]  # fmt: skip
+    for part, name in expected:
+        d[:] = 0
+        d[part] = 0.1
+        moved = boxplus(x, d)
+        changed = {f.name for f in fields(NavState) if not np.allclose(getattr(moved, f.name), getattr(x, f.name))}
+        assert changed == {name}
+
+
+class Problem:
+    """A scan against the room's planes, linearised by finite differences of the distances themselves."""
+
+    def __init__(self, room: LocalMap, prior: Belief, points: np.ndarray, params: Filter) -> None:
+        self.prior, self.points, self.params = prior, points.astype(np.float64), params
+        planes = room.planes(self._world(prior.state), params)
+        self.normals, self.centers = planes.normals, planes.centers
+        ranges = np.linalg.norm(self.points, axis=1)
+        all_distances = self._all_distances(prior.state)
+        self.used = (planes.variances >= 0) & (np.abs(all_distances) <= params.gate * np.sqrt(ranges))
+        self.sigma = np.sqrt(params.point_noise**2 + planes.variances[self.used])
+
+    def _world(self, x: NavState) -> np.ndarray:
+        imu = self.points @ x.R_imu_lidar.T + x.p_imu_lidar
+        return np.asarray(imu @ x.R_odom_imu.T + x.p_odom_imu)
+
+    def _all_distances(self, x: NavState) -> np.ndarray:
+        return np.asarray(np.einsum("ij,ij->i", self.normals, self._world(x) - self.centers))
+
+    def distances(self, x: NavState) -> np.ndarray:
+        return self._all_distances(x)[self.used]
+
+    def jacobian(self, x: NavState) -> np.ndarray:
+        h = 1e-6
+        return np.stack(
+            [(self.distances(boxplus(x, e)) - self.distances(boxplus(x, -e))) / (2 * h) for e in np.eye(DIM) * h],
+            axis=1,
+        )
+
+
+def correlated_prior(scale: float) -> Belief:
+    """Off by a few `scale` in every direction, with a full covariance."""
+    rng = np.random.default_rng(8)
+    root = rng.normal(size=(DIM, DIM))
+    P = scale**2 * (root @ root.T / DIM + 0.3 * np.eye(DIM))
+    return Belief(boxplus(truth(), rng.multivariate_normal(np.zeros(DIM), P)), P)
+
+
+@pytest.mark.parametrize("extrinsics", [False, True], ids=["extrinsics fixed", "extrinsics estimated"])
+def test_one_iteration_is_the_textbook_kalman_update(room: LocalMap, extrinsics: bool) -> None:
+    """K = P H^T (H P H^T + R)^-1 with a Jacobian by finite differences: the gain in its other form."""
+    params = Filter(max_iterations=1, estimate_extrinsics=extrinsics)
+    prior, points = correlated_prior(5e-3), points_of(furnished_room())
+    problem = Problem(room, prior, points, params)
+    free = slice(0, DIM if extrinsics else 17)
+    H, P = problem.jacobian(prior.state)[:, free], prior.covariance[free, free]
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(problem.sigma**2))
+    step = np.zeros(DIM)
+    step[free] = -K @ problem.distances(prior.state)
+
+    posterior, registration = iekf.update(prior, points, room, params)
+    assert registration.inliers == problem.used.sum() > 300
+    np.testing.assert_allclose(boxminus(posterior.state, prior.state), step, atol=1e-7)
+    np.testing.assert_allclose(posterior.covariance[free, free], (np.eye(len(P)) - K @ H) @ P, atol=1e-10)
+
+
+@pytest.mark.parametrize("extrinsics", [False, True], ids=["extrinsics fixed", "extrinsics estimated"])
+def test_the_iteration_ends_at_the_minimum_of_equation_7(room: LocalMap, extrinsics: bool) -> None:
+    """SciPy's Levenberg-Marquardt on the same sum of squares, from the same prior."""
+    params = Filter(max_iterations=20, estimate_extrinsics=extrinsics, gate=1.0)
+    prior, points = correlated_prior(2e-4), points_of(furnished_room())
+    problem = Problem(room, prior, points, params)
+    free = DIM if extrinsics else 17
+    whiten = np.linalg.inv(np.linalg.cholesky(prior.covariance[:free, :free]))
+
+    def residuals(d: np.ndarray) -> np.ndarray:
+        x = boxplus(prior.state, np.concatenate([d, np.zeros(DIM - free)]))
+        return np.concatenate([whiten @ d, problem.distances(x) / problem.sigma])
+
+    best = least_squares(residuals, np.zeros(free), method="lm", xtol=1e-12, ftol=1e-12).x
+    posterior, registration = iekf.update(prior, points, room, params)
+    assert registration.converged
+    np.testing.assert_allclose(boxminus(posterior.state, prior.state)[:free], best, atol=2e-6)
+
+
+def test_the_residual_told_is_that_of_the_inliers(room: LocalMap) -> None:
+    params, prior = Filter(max_iterations=1), Belief(truth(), uncertain(1e-3, 1e-2))
+    points = points_of(furnished_room())
+    problem = Problem(room, prior, points, params)
+    _, registration = iekf.update(prior, points, room, params)
+    assert registration.residual_rms == pytest.approx(np.sqrt(np.mean(problem.distances(prior.state) ** 2)), rel=1e-6)
+    assert registration.used == len(points)
+
+
+def test_extrinsics_stay_unless_they_are_estimated(room: LocalMap) -> None:
+    prior, points = correlated_prior(5e-3), points_of(furnished_room())
+    kept, _ = iekf.update(prior, points, room, Filter())
+    np.testing.assert_array_equal(kept.state.R_imu_lidar, prior.state.R_imu_lidar)
+    np.testing.assert_array_equal(kept.state.p_imu_lidar, prior.state.p_imu_lidar)
+    np.testing.assert_array_equal(kept.covariance[17:, 17:], prior.covariance[17:, 17:])
+
+
+def test_switching_the_extrinsics_on_and_off_keeps_the_covariance_one(room: LocalMap) -> None:
+    """A covariance with a negative eigenvalue claims to know more than everything."""
+    belief, points = correlated_prior(5e-3), points_of(furnished_room())
+    for extrinsics in (True, False, False, True, False, True):
+        belief, _ = iekf.update(belief, points, room, Filter(estimate_extrinsics=extrinsics))
+        assert np.linalg.eigvalsh(belief.covariance)[0] > 0
