@@ -91,7 +91,7 @@ def info(
     """
     from tqdm import tqdm
 
-    from app.sensors.doctor import examine
+    from app.sensors.doctor import DAMAGE, examine
 
     params = options.resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
     with tqdm(
@@ -109,6 +109,8 @@ def info(
             typer.echo(f"{'':<9}  {'':<{width}}  -> {finding.option}")
     waiting = sum(finding.verdict == "needs you" for finding in findings)
     typer.echo(f"{waiting} of {len(findings)} findings need you." if waiting else "Nothing here needs you.")
+    if broken := next((f for f in findings if f.subject == DAMAGE and f.verdict == "needs you"), None):
+        raise HemislamError(broken.text)
 
 
 @cli.command()

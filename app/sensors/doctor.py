@@ -20,6 +20,9 @@ from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import I64, DroppedScan, Scan
 
+DAMAGE = "file"
+"""Subject of what is wrong with the file itself."""
+
 
 def examine(
     path: Path, params: Params, progress: Callable[[float], None] = lambda fraction: None
@@ -41,10 +44,11 @@ def examine(
                 if number % 100 == 0:
                     progress(recording.fraction_at(entry.log_ns))
         except HemislamError as error:
-            damage = Finding("file", "needs you", str(error))
+            damage = Finding(DAMAGE, "needs you", str(error))
         census.finish()
         progress(1.0)
-        probed = [finding for finding in recording.findings if finding.subject != "clocks"]
+        known = ("clocks", DAMAGE) if damage else ("clocks",)
+        probed = [finding for finding in recording.findings if finding.subject not in known]
         found = [
             _topics(recording),
             *probed,

@@ -34,13 +34,19 @@ class McapStream:
         self.start_ns, self.end_ns = times or (0, 0)
 
     def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
-        """(topic, log time ns, deserialised message), in the order of the file."""
+        """(topic, log time ns, deserialised message), in the order of the file.
+
+        Raises:
+            EndOfFile: where the file is cut off, if messages up to `stop_ns` might have followed.
+        """
         for topic, kind, log_ns, encoding, data in self._records():
             if topic in topics and start_ns <= log_ns < stop_ns:
                 if encoding == "ros1":
                     yield topic, log_ns, self._ros1.deserialize_ros1(data, kind)
                 else:
                     yield topic, log_ns, self._ros2.deserialize_cdr(data, kind)
+        if not self.complete and stop_ns > self.end_ns:
+            raise EndOfFile("the file ends here, in the middle of a record")
 
     def close(self) -> None:
         """Nothing stays open between two readings."""

@@ -1,7 +1,8 @@
 """A look at a recording's first messages: which topics to use, the first clouds and IMU samples."""
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -57,7 +58,7 @@ def probe_clouds(source: Source, topic: str) -> tuple[list[Probe], bool, list[Fi
     """
     probes: list[Probe] = []
     unusable, reason = 0, ""
-    for _, log_ns, message in source.messages((topic,)):
+    for _, log_ns, message in _readable(source.messages((topic,))):
         try:
             cloud = CloudMessage.from_ros(message)
             if not {"x", "y", "z"} <= cloud.fields.keys():
@@ -99,7 +100,7 @@ def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProb
         HemislamError: all of them are NaN.
     """
     logs, stamps, values = [], [], []
-    for _, log_ns, message in source.messages((topic,)):
+    for _, log_ns, message in _readable(source.messages((topic,))):
         w, a = message.angular_velocity, message.linear_acceleration
         logs.append(log_ns)
         stamps.append(stamp_ns(message.header.stamp))
@@ -120,3 +121,15 @@ def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProb
 
 def _unstamped(topic: str) -> Finding:
     return Finding("stamps", "corrected", f"the headers of {topic} carry no time; the log times are used instead")
+
+
+def _readable(entries: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
+    """What comes before a damage, if anything does; whoever reads the recording is told of it then."""
+    some = False
+    try:
+        for entry in entries:
+            some = True
+            yield entry
+    except HemislamError:
+        if not some:
+            raise

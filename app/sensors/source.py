@@ -136,11 +136,9 @@ class Source:
         if stream.complete:
             text = f"read from front to back, since its index can not be used ({why})"
         else:
-            text = (
-                f"the file is cut off {(stream.end_ns - stream.start_ns) / 1e9:.1f} s after its start ({why}); "
-                "what comes before is used"
-            )
-        self.findings = (Finding("file", "corrected", text),)
+            length = (stream.end_ns - stream.start_ns) / 1e9
+            text = f"the file is cut off {length:.1f} s after its start ({why}); what comes before is used"
+        self.findings = (Finding("file", "corrected" if stream.complete else "needs you", text),)
         return stream
 
     def _refusal(self, error: Exception) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from app.slam import ground, iekf, imu, start
+from app.slam.engine import Engine
 from app.slam.local_map import LocalMap
 from app.slam.params import LocalMap as MapParams
 from app.slam.params import Params
@@ -37,6 +38,19 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     grid.downsample(points, 0.3, chosen=surface.labels)
     progress("local map", 0.55)
     local_map.insert(floor, np.array([100.0, 0.0, 0.0]), params.map)
-    progress("registration", 0.7)
+    progress("registration", 0.65)
     iekf.update(predicted, points, local_map, params.filter)
+    progress("a whole frame", 0.9)
+    _run_frames(scan, samples, params)
     progress("done", 1.0)
+
+
+def _run_frames(scan: Scan, samples: ImuSamples, params: Params) -> None:
+    """Scans as recordings give them: read-only as they come, and writable once some points are out of range."""
+    for array in (scan.points, scan.offsets_ns, scan.ring):
+        array.setflags(write=False)
+    engine = Engine(params)
+    for farthest in (params.sensor.max_range, 4.0):
+        engine.params = params.with_values({"sensor.max_range": farthest})
+        engine.relabel(engine.step(scan, samples))
+    engine.close()

@@ -133,8 +133,9 @@ def test_of_a_recording_that_was_cut_short_the_rest_is_used_and_said_to_be_one(
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(walk.read_bytes()[: walk.stat().st_size * 2 // 3])
     outcome = hemislam("run", cut, "--out", tmp_path / "out")
-    assert outcome.code == 0, outcome.err
-    assert "the file is cut off" in outcome.out
+    assert outcome.code == 2
+    assert "the file ends here" in outcome.err
+    assert "Traceback" not in outcome.err
     assert 15 <= json.loads((tmp_path / "out" / "report.json").read_text())["frames"]["processed"] < 39
 
 
