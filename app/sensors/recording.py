@@ -1,6 +1,5 @@
 """A recording on disk as a stream of measurements: open, look, read. Constant memory throughout."""
 
-import hashlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -224,17 +223,6 @@ def find_recordings(folder: Path) -> list[Path]:
         elif entry.suffix in SUFFIXES:
             found.append(entry)
     return found
-
-
-def input_hash(path: Path) -> str:
-    """SHA-256, as hex, of the recording's file, or of the files of its folder in order of name; streamed."""
-    digest = hashlib.sha256()
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for file in files:
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()
 
 
 def _counted(

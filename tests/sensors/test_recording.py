@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from app.sensors.presets import resolve_params
-from app.sensors.recording import find_recordings, input_hash, open_recording
+from app.sensors.recording import find_recordings, open_recording
 from app.slam.params import Params
+from app.slam.provenance import hash_input
 from app.slam.types import DroppedScan, Measurement
 from tests.sensors import rig
 
@@ -140,10 +141,10 @@ def test_of_several_topics_the_busiest_is_used_and_the_others_are_named(tmp_path
 def test_the_hash_of_a_file_is_its_sha256_and_that_of_a_folder_covers_all_its_files(tmp_path: Path) -> None:
     folder = rig.write(tmp_path / "walk", rig.walk(turns=2, columns=4))
     file = next(folder.glob("*.mcap"))
-    assert input_hash(file) == hashlib.sha256(file.read_bytes()).hexdigest()
-    before = input_hash(folder)
+    assert hash_input(file) == hashlib.sha256(file.read_bytes()).hexdigest()
+    before = hash_input(folder)
     (folder / "metadata.yaml").write_text("changed")
-    assert input_hash(folder) != before
+    assert hash_input(folder) != before
 
 
 def test_recordings_are_found_below_a_folder(tmp_path: Path) -> None:
