@@ -10,7 +10,19 @@ import yaml
 from pydantic import ValidationError
 
 from app.slam.errors import HemislamError
-from app.slam.sections import Effect, Filter, Ground, Imu, Keyframes, LocalMap, Recording, ScanVoxel, Section, Sensor
+from app.slam.sections import (
+    Effect,
+    Filter,
+    Ground,
+    Imu,
+    Keyframes,
+    LocalMap,
+    Loops,
+    Recording,
+    ScanVoxel,
+    Section,
+    Sensor,
+)
 
 __all__ = [
     "Effect",
@@ -20,6 +32,7 @@ __all__ = [
     "Keyframes",
     "Leaf",
     "LocalMap",
+    "Loops",
     "Params",
     "Recording",
     "ScanVoxel",
@@ -39,6 +52,7 @@ class Params(Section):
     filter: Filter = Filter()
     map: LocalMap = LocalMap()
     keyframe: Keyframes = Keyframes()
+    loops: Loops = Loops()
 
     @classmethod
     def parse(cls, tree: Mapping[str, Any]) -> "Params":

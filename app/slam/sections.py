@@ -264,3 +264,56 @@ class Keyframes(Section):
 
     distance: float = _param(0.5, "A new keyframe after walking this far.", unit="m", ge=0.05, le=20, step=0.05)
     angle: float = _param(15.0, "A new keyframe after turning this far.", unit="deg", ge=1, le=180, step=1)
+
+
+class Loops(Section):
+    """Recognising places seen before, and the graph that they straighten (paper 2.4, eq. 8)."""
+
+    enabled: bool = _param(True, "Look for loops and correct the map by them.")
+    min_time: float = _param(15.0, "Places left less long ago than this are no loops.", unit="s", ge=1, le=600, step=1)
+    candidates: int = _param(
+        10, "Nearest places by ring key whose Scan Contexts are compared.", ge=1, le=100, step=1, symbol="M"
+    )
+    verified: int = _param(2, "Best of these that are registered, for each keyframe.", ge=1, le=10, step=1)
+    context_distance: float = _param(
+        0.3, "Candidates whose Scan Contexts differ more than this are refused unregistered.", ge=0.01, le=1, step=0.01
+    )
+    submap_keyframes: int = _param(
+        8, "Keyframes before and after one that make its submap with it.", ge=0, le=50, step=1, effect="restart"
+    )
+    submap_voxel: float = _param(
+        0.25, "Edge of the voxels that thin submaps.", unit="m", ge=0.05, le=2, step=0.05, effect="restart"
+    )
+    min_overlap: float = _param(
+        0.3, "Least share of points near both keyframes that must have a partner.", ge=0, le=1, step=0.01
+    )
+    max_residual: float = _param(
+        0.05, "Most residual, point to plane, of a registration (rms).", unit="m", ge=0.005, le=1, step=0.005
+    )
+    max_slide: float = _param(
+        0.05,
+        "A registration pushed along its weakest direction must come back this close, or it slides.",
+        unit="m",
+        ge=0.005,
+        le=1,
+        step=0.005,
+    )
+    max_mahalanobis: float = _param(
+        3.5, "Most standard deviations from where odometry expects a loop.", unit="σ", ge=0.5, le=20, step=0.1
+    )
+    support: int = _param(2, "Candidates nearby that must agree before one is accepted.", ge=0, le=10, step=1)
+    drift_translation: float = _param(
+        1.0, "Drift of odometry's position (standard deviation) per distance.", unit="%", ge=0.01, le=20, step=0.1
+    )
+    drift_rotation: float = _param(
+        0.02, "Drift of odometry's heading (standard deviation) per distance.", unit="deg/m", ge=0.001, le=2, step=0.005
+    )
+    window: int = _param(
+        0,
+        "Newest keyframes whose poses are solved for, as in the paper; 0: all, so that late loops straighten the"
+        " whole map.",
+        ge=0,
+        le=100_000,
+        step=10,
+        effect="restart",
+    )
