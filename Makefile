@@ -31,7 +31,7 @@ check: $(VENV)/.installed-dev ## Check format, lint, types and the direction of 
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: install ## Time the engine stage by stage; adds to benchmarks/results.csv.
+bench: $(VENV)/.installed-dev ## Time the engine stage by stage and the page; adds to benchmarks/results.csv.
 	$(BIN)/python -m benchmarks
 
 lock: $(VENV)/.installed-dev ## Resolve the dependencies again and write the hashed requirements*.txt.

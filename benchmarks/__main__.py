@@ -3,10 +3,10 @@
 import os
 import sys
 
-from benchmarks import frame, replay
+from benchmarks import frame, page, replay
 from benchmarks.record import show
 
-BENCHMARKS = {"frame": frame.run, "replay": replay.run}
+BENCHMARKS = {"frame": frame.run, "replay": replay.run, "page": page.run}
 
 
 def main() -> None:

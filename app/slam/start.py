@@ -26,7 +26,7 @@ class Started:
     Attributes:
         belief: where to propagate from; while waiting, the belief at the scan's end.
         still: samples of the rest so far. waiting: whether more of it is wanted.
-        notice: what to tell the user, once; "" while waiting.
+        notice: what to tell the user, once; "" while waiting, and after a full rest.
     """
 
     belief: Belief
@@ -47,7 +47,7 @@ def proceed(still: ImuSamples | None, scan: Scan, samples: ImuSamples, params: P
         rest = (together.stamps_ns[-1] - together.stamps_ns[0]) * 1e-9
         waiting = bool(rest < params.imu.start_duration)
         belief = standing(together, scan.end_ns, params)
-        return Started(belief, together, waiting, "" if waiting else f"Started after {rest:.1f} s at rest.")
+        return Started(belief, together, waiting, "")
     if still is not None and (still.stamps_ns[-1] - still.stamps_ns[0]) * 1e-9 >= LEAST_STILL:
         rest = (still.stamps_ns[-1] - still.stamps_ns[0]) * 1e-9
         belief = standing(still, int(still.stamps_ns[-1]), params)
