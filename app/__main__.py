@@ -8,6 +8,7 @@ from typer.core import TyperGroup
 
 from app import __version__
 from app.cli import options
+from app.cli.evaluate import evaluate
 from app.cli.run import run
 from app.cli.serve import serve
 from app.slam.errors import HemislamError
@@ -63,6 +64,7 @@ def hemislam(
 
 cli.command()(serve)
 cli.command()(run)
+cli.command()(evaluate)
 
 
 @cli.command()

@@ -1,0 +1,188 @@
+"""`hemislam evaluate`: the paper's tables, on any recordings."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic, Preset, Start, resolve
+from app.slam.errors import HemislamError
+
+if TYPE_CHECKING:
+    from app.evaluation.truth import Truth
+    from app.slam.trajectory import Trajectory
+
+_TRUTH_HELP = (
+    "True poses: a TUM or KITTI file, the GNSS/INS table of H2LID, or topic:/NAME in the recording. Repeatable, in the"
+    " order of the recordings; `none` for none; else RECORDING_truth.tum beside it."
+)
+
+
+def evaluate(
+    recordings: Annotated[
+        list[Path] | None, typer.Argument(metavar="RECORDING...", help="One or more recordings.")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Where to write; runs found there are reused.")
+    ] = Path("runs/evaluation"),
+    truths: Annotated[list[str] | None, typer.Option("--truth", metavar="TRUTH", help=_TRUTH_HELP)] = None,
+    lever: Annotated[
+        str | None,
+        typer.Option("--lever", metavar="X,Y,Z", help="Metres from the IMU to the truth's point, in its body's axes."),
+    ] = None,
+    variants: Annotated[
+        list[str] | None,
+        typer.Option("--variant", metavar="NAME:PARAM=VALUE,...", help="One more column. Repeatable."),
+    ] = None,
+    ablation: Annotated[
+        bool, typer.Option("--ablation/--no-ablation", help="The paper's four variants, or only your own.")
+    ] = True,
+    compare: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--compare",
+            metavar="NAME=FILE.tum",
+            help="Another system's trajectory as one more column; NAME@RECORDING=FILE among several recordings.",
+        ),
+    ] = None,
+    suite: Annotated[
+        str | None, typer.Option("--suite", metavar="paper", help="The simulated twins of the paper's six sequences.")
+    ] = None,
+    short: Annotated[bool, typer.Option("--short", help="The first 60 s of each sequence of the suite.")] = False,
+    seeds: Annotated[list[int] | None, typer.Option("--seed", min=0, help="Of the suite. Repeatable.")] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", min=1, metavar="N", help="Runs side by side; else one a core.")
+    ] = None,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Assignments = None,
+    lidar_topic: LidarTopic = None,
+    imu_topic: ImuTopic = None,
+    start: Start = 0.0,
+    duration: Duration = None,
+) -> None:
+    """Measure accuracy, time and fineness: the paper's ablation, and yours.
+
+    Each recording is run with FAST-LIO (no ground downsampling, no loops), FAST-LIO-GD, FAST-LIO-L
+    and Ours, and with each --variant. A run that is finished is not run again: what was
+    interrupted goes on where it was when started again.
+
+    \b
+    Writes into DIR:
+      report.html      tables, trajectories, errors, times and pieces of the maps, in one file
+      report.md, *.csv the same tables
+      results.json     everything, with parameters, input hashes and the machine
+      runs/            trajectory and times of every run
+
+    \b
+    Examples:
+      hemislam evaluate walk.mcap --truth walk.tum --out results
+      hemislam evaluate outdoor3.bag --preset h2lid --truth outdoor3_gnss.txt --out results
+      hemislam evaluate walk.mcap --variant fine:scan.voxel_size=0.2 --compare FAST-LIO2=theirs.tum
+      hemislam evaluate --suite paper --short --out results
+    """
+    from app.cli.run import _compile
+    from app.evaluation.evaluate import Plan, Subject
+    from app.evaluation.evaluate import evaluate as run_evaluation
+    from app.evaluation.truth import read_truth
+    from app.evaluation.variants import choose_variants, parse_variant
+
+    chosen = choose_variants([parse_variant(text) for text in variants or []], ablation=ablation)
+    paths = list(recordings or [])
+    _make_folder(out)
+    if suite is not None:
+        paths += _suite(suite, out / "recordings", short, seeds or [0])
+    if not paths:
+        raise HemislamError("There is nothing to evaluate; name a RECORDING or use --suite paper.")
+    names = _names(paths)
+    others = _compared(compare or [], names)
+    arm = _lever(lever)
+    subjects = []
+    for path, name, text in zip(paths, names, _truth_texts(paths, truths or []), strict=True):
+        truth: Truth | None = read_truth(text, path, arm) if text else None
+        params = resolve(path, preset, config, assignments, lidar_topic, imu_topic)
+        subjects.append(Subject(name, path, params, truth, tuple(others[name])))
+    for variant in chosen:
+        variant.applied(subjects[0].params)  # refuses what is misspelt before anything runs
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    runnable = sum(not variant.missing for variant in chosen) * len(subjects)
+    parallel = max(1, min(jobs or cores, runnable))
+    _compile()
+    findings, failures = run_evaluation(
+        Plan(
+            subjects=tuple(subjects),
+            variants=tuple(chosen),
+            folder=out,
+            parallel=parallel,
+            threads=max(1, cores // parallel),
+            start_s=start,
+            duration_s=duration,
+        )
+    )
+    for finding in findings:
+        typer.echo(finding)
+    typer.echo(f"report     {out / 'report.html'}")
+    if failures:
+        (recording, name), why = next(iter(failures.items()))
+        raise HemislamError(f"{len(failures)} of {runnable} runs failed; {recording}, {name}: {why}")
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HemislamError(f"The folder {folder} can not be made: {error.strerror}; choose another one.") from None
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """The recordings' own names, numbered where two share one."""
+    names: list[str] = []
+    for path in paths:
+        stem = path.resolve().stem
+        count = sum(name == stem or name.startswith(f"{stem}~") for name in names)
+        names.append(stem if not count else f"{stem}~{count + 1}")
+    return names
+
+
+def _truth_texts(paths: list[Path], given: list[str]) -> list[str | None]:
+    from app.slam.trajectory import truth_beside
+
+    if len(given) > len(paths):
+        raise HemislamError(f"There are {len(given)} --truth for {len(paths)} recordings; give one for each, in order.")
+    texts: list[str | None] = [None if text == "none" else text for text in given]
+    beside = [truth_beside(path) for path in paths[len(given) :]]
+    return texts + [str(path) if path else None for path in beside]
+
+
+def _lever(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise HemislamError(f"`--lever {text}` is not three numbers; write it as --lever 0.1,0,-0.2.") from None
+    return x, y, z
+
+
+def _compared(texts: list[str], names: list[str]) -> dict[str, list[tuple[str, "Trajectory"]]]:
+    """By recording: names and trajectories."""
+    from app.slam.trajectory import read_tum
+
+    found: dict[str, list[tuple[str, Trajectory]]] = {name: [] for name in names}
+    for text in texts:
+        who, equals, file = text.partition("=")
+        system, at, recording = who.partition("@")
+        if not (system and equals and file):
+            raise HemislamError(f"`--compare {text}` can not be understood; write it as --compare NAME=FILE.tum.")
+        if not at and len(names) > 1:
+            raise HemislamError(f"`--compare {text}`: of which recording? Write {system}@{names[0]}={file}.")
+        recording = recording if at else names[0]
+        if recording not in found:
+            raise HemislamError(f"`--compare {text}`: there is no recording {recording}; there are {', '.join(names)}.")
+        found[recording].append((system, read_tum(Path(file))))
+    return found
+
+
+def _suite(name: str, folder: Path, short: bool, seeds: list[int]) -> list[Path]:
+    raise HemislamError(f"There is no suite {name} yet.")

@@ -1,0 +1,31 @@
+"""Pieces of the map seen from above, the same for every variant, to be looked at side by side."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from app.slam.types import F64, U16, Keyframe
+
+HALF_M = 6.0
+PIXEL_M = 0.025
+SLICE_M = (-0.6, 0.7)
+"""Heights above the sensor: walls and trunks show as lines, floor and ceiling stay out."""
+REACH_M = 15.0
+PLACES = {"start": 0.0, "half way": 0.5}
+"""By share of the recording's time. A walk that comes back shows both passes at its start."""
+
+
+def crop(keyframes: Iterable[Keyframe], poses: F64, centre: F64) -> U16:
+    """Points per pixel in a square of 2 HALF_M around `centre` (3,), row 0 in the north (+y)."""
+    pixels = round(2 * HALF_M / PIXEL_M)
+    image = np.zeros((pixels, pixels), np.int64)
+    for keyframe, T_map_imu in zip(keyframes, poses, strict=True):
+        if np.linalg.norm(T_map_imu[:2, 3] - centre[:2]) > HALF_M + REACH_M:
+            continue
+        T = T_map_imu @ keyframe.T_imu_lidar
+        points = keyframe.cloud.points.astype(np.float64) @ T[:3, :3].T + (T[:3, 3] - centre)
+        level = (points[:, 2] > SLICE_M[0]) & (points[:, 2] < SLICE_M[1])
+        column, row = np.floor((points[level, :2] + HALF_M) / PIXEL_M).astype(np.int64).T
+        inside = (column >= 0) & (column < pixels) & (row >= 0) & (row < pixels)
+        np.add.at(image, (pixels - 1 - row[inside], column[inside]), 1)
+    return np.minimum(image, 65535).astype(np.uint16)

@@ -1,0 +1,203 @@
+"""One recording run with one variant, in a process of its own, and the files that it leaves.
+
+A run's folder holds trajectory.tum, timings.csv, crops.npz and, written last, run.json with the key
+of all that the results depend on: a folder with the right key is finished and never run again.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app import __version__
+from app.evaluation import crops, fineness
+from app.sensors.recording import open_recording
+from app.slam.engine import Engine
+from app.slam.metrics import GroundScore, write_tum
+from app.slam.params import Params
+from app.slam.provenance import describe_machine, peak_memory_mb
+from app.slam.results import TIMINGS, RunLog
+from app.slam.trajectory import Trajectory, stamp_text
+from app.slam.types import F64, DroppedScan, FrameStatus, StepResult
+
+FORMAT = 1
+GROUND_RANGES_M = (0.0, 5.0, 10.0, 20.0, 40.0, 100.0)
+RUN_FILES = ("trajectory.tum", "timings.csv", "crops.npz", "run.json")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Attributes:
+    recording: its path, sha256: of its bytes. name: of the recording in tables. variant: its name.
+    params: as run. folder: for the results. threads: for the kernels.
+    """
+
+    recording: Path
+    sha256: str
+    name: str
+    variant: str
+    params: Params
+    folder: Path
+    threads: int = 1
+    start_s: float = 0.0
+    duration_s: float | None = None
+
+    @property
+    def key(self) -> str:
+        """Hash of all that a result depends on, the machine and its load aside."""
+        parts = {
+            "format": FORMAT,
+            "version": __version__,
+            "code": code_digest(),
+            "input": self.sha256,
+            "parameters": self.params.model_dump(mode="json"),
+            "part": [self.start_s, self.duration_s],
+        }
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def finished(job: Job) -> dict[str, Any] | None:
+    """What run.json holds, if the job was run to its end with just these inputs."""
+    try:
+        report: dict[str, Any] = json.loads((job.folder / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    whole = all((job.folder / name).is_file() for name in RUN_FILES)
+    return report if whole and report.get("key") == job.key else None
+
+
+def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
+    """Run to the end and write the files; `progress` is called with (frames done, frames in all).
+
+    Raises:
+        HemislamError: the recording can not be used. OSError: the disk is full or fails.
+    """
+    import numba
+
+    from app.slam.warmup import compile_kernels
+
+    numba.set_num_threads(min(job.threads, numba.get_num_threads()))
+    compile_kernels()
+    log, ground, cpu_ms = RunLog(), [GroundScore() for _ in GROUND_RANGES_M[1:]], []
+    with open_recording(job.recording, job.params) as recording:
+        rest = max(0.0, recording.duration_s - job.start_s)
+        part = (rest if job.duration_s is None else min(rest, job.duration_s)) / max(recording.duration_s, 1e-9)
+        total = round(recording.scan_count * part)
+        engine = Engine(job.params)
+        try:
+            for entry in recording.measurements(job.start_s, job.duration_s):
+                if isinstance(entry, DroppedScan):
+                    log.drop(entry)
+                    continue
+                begin = time.process_time()
+                result = engine.step(entry.scan, entry.imu)
+                cpu_ms.append((time.process_time() - begin) * 1e3)
+                log.add(result)
+                _score_ground(ground, result)
+                progress(len(log), total)
+            memory = peak_memory_mb()
+            _write(job, log, engine, _facts(job, log, ground, memory), cpu_ms)
+        finally:
+            engine.close()
+
+
+def _facts(job: Job, log: RunLog, ground: list[GroundScore], memory_mb: float) -> dict[str, Any]:
+    """What run.json holds but for what needs the map."""
+    return {
+        "key": job.key,
+        "hemislam": __version__,
+        "code": code_digest(),
+        "recording": str(job.recording),
+        "sha256": job.sha256,
+        "variant": job.variant,
+        "parameters": job.params.model_dump(mode="json"),
+        "start_s": job.start_s,
+        "duration_s": job.duration_s,
+        "frames": len(log),
+        "lost": log.statuses[FrameStatus.LOST],
+        "dropped": dict(log.dropped.most_common()),
+        "distance_m": log.trajectory.distance,
+        "ground_share": log.ground_points / log.points if log.points else None,
+        "ground": None if log.ground_score is None else [asdict(score) for score in ground],
+        "peak_memory_mb": memory_mb,
+        "threads": job.threads,
+        "load": os.getloadavg()[0],
+        "machine": describe_machine(),
+    }
+
+
+def _write(job: Job, log: RunLog, engine: Engine, facts: dict[str, Any], cpu_ms: list[float]) -> None:
+    """All files beside their places, then moved there, run.json last: a kill in between leaves no result."""
+    trajectory = log.trajectory
+    poses = np.array([log.T_map_odom @ keyframe.T_odom_imu for keyframe in engine.keyframes]).reshape(-1, 4, 4)
+    measured = fineness.measure(fineness.collect(engine.keyframes, poses))
+    facts["fineness"] = {name: value if np.isfinite(value) else None for name, value in asdict(measured).items()}
+
+    part = job.folder.with_name(f"{job.folder.name}.part-{os.getpid()}")
+    part.mkdir(parents=True, exist_ok=True)
+    try:
+        write_tum(part / "trajectory.tum", trajectory)
+        (part / "timings.csv").write_text(_timings(log, cpu_ms), encoding="utf-8")
+        centres = {place: _position_at(trajectory, share) for place, share in crops.PLACES.items()}
+        np.savez_compressed(
+            part / "crops.npz",
+            allow_pickle=False,
+            **{place: crops.crop(engine.keyframes, poses, centre) for place, centre in centres.items()},
+        )
+        (part / "run.json").write_text(json.dumps(facts, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        job.folder.mkdir(exist_ok=True)
+        (job.folder / "run.json").unlink(missing_ok=True)
+        for name in RUN_FILES:
+            (part / name).replace(job.folder / name)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def clear_remains(folder: Path) -> None:
+    """Remove what runs that were killed left in the making."""
+    for part in folder.glob("*/*.part-*"):
+        shutil.rmtree(part, ignore_errors=True)
+
+
+@cache
+def code_digest() -> str:
+    """Hash of the code that results depend on: a version that changes between releases is another one."""
+    root = Path(__file__).parents[1]
+    files = [*(root / "slam").rglob("*.py"), *(root / "sensors").glob("*.py")]
+    files += [root / "evaluation" / name for name in ("job.py", "fineness.py", "crops.py")]
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _score_ground(scores: list[GroundScore], result: StepResult) -> None:
+    if result.truth_ground is None:
+        return
+    distance = np.linalg.norm(result.cloud.points, axis=1)
+    ranges = np.digitize(distance, GROUND_RANGES_M[1:-1])
+    for index in range(len(scores)):
+        chosen = ranges == index
+        scores[index] += GroundScore.of(result.cloud.labels[chosen], result.truth_ground[chosen])
+
+
+def _position_at(trajectory: Trajectory, share: float) -> F64:
+    stamps = trajectory.stamps_ns
+    wanted = stamps[0] + int(share * (stamps[-1] - stamps[0]))
+    return np.asarray(trajectory.positions[int(np.argmin(np.abs(stamps - wanted)))])
+
+
+def _timings(log: RunLog, cpu_ms: list[float]) -> str:
+    lines = ["frame,stamp_s," + ",".join(f"{stage}_ms" for stage in TIMINGS) + ",cpu_ms"]
+    for frame, (stamp, row, cpu) in enumerate(zip(log.stamps_ns, log.timings_ms, cpu_ms, strict=True)):
+        values = ",".join(f"{value:.4f}" for value in (*row, cpu))
+        lines.append(f"{frame},{stamp_text(int(stamp))},{values}")
+    return "\n".join(lines) + "\n"

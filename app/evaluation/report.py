@@ -1,0 +1,119 @@
+"""Writes what was measured: report.html, report.md, results.json and the CSV tables."""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from app import __version__
+from app.evaluation.findings import findings
+from app.evaluation.html import html
+from app.evaluation.job import GROUND_RANGES_M, code_digest
+from app.evaluation.markdown import markdown
+from app.evaluation.measured import Evaluated, as_json
+from app.evaluation.tables import make_tables
+from app.slam.errors import HemislamError
+from app.slam.provenance import describe_machine
+
+REPORT_FILES = ("report.html", "report.md", "results.json", "accuracy.csv", "runtime.csv", "fineness.csv", "ground.csv")
+
+
+def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
+    """Write all files, each whole or not at all, and return the findings.
+
+    Raises:
+        HemislamError: the folder can not be written to.
+    """
+    machine = describe_machine()
+    said, tables = findings(recordings), make_tables(recordings)
+    made_by = (
+        f"hemislam {__version__} on {machine['processor']}, {machine['cores']} cores, {machine['system']};"
+        f" {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+    )
+    results = _results(recordings, machine, said)
+    texts = {
+        "report.html": html(recordings, tables, said, made_by),
+        "report.md": markdown(recordings, tables, said, made_by),
+        "results.json": json.dumps(results, indent=2, ensure_ascii=False) + "\n",
+        **{f"{name}.csv": _csv(rows) for name, rows in _flat(results).items()},
+    }
+    try:
+        for name, text in texts.items():
+            part = folder / f".{name}.part"
+            part.write_text(text, encoding="utf-8")
+            part.replace(folder / name)
+    except OSError as error:
+        raise HemislamError(f"The report can not be written to {folder}: {error.strerror}.") from error
+    return said
+
+
+def _results(recordings: Sequence[Evaluated], machine: dict[str, Any], said: list[str]) -> dict[str, Any]:
+    results = {
+        "hemislam": __version__,
+        "code": code_digest(),
+        "machine": machine,
+        "findings": said,
+        "recordings": [
+            {
+                "name": recording.name,
+                "path": str(recording.recording),
+                "sha256": recording.sha256,
+                "truth": recording.truth or None,
+                "notes": list(recording.notes),
+                "variants": [as_json(column) for column in recording.columns],
+            }
+            for recording in recordings
+        ],
+    }
+    finite: dict[str, Any] = _finite(results)
+    return finite
+
+
+def _flat(results: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """One row for each variant on each recording (and, for ground, each range)."""
+    tables: dict[str, list[dict[str, Any]]] = {"accuracy": [], "runtime": [], "fineness": [], "ground": []}
+    for recording in results["recordings"]:
+        for variant in recording["variants"]:
+            who = {"recording": recording["name"], "variant": variant["variant"]}
+            for name, entry in (
+                ("accuracy", variant["accuracy"]),
+                ("runtime", variant["runtime_ms"]),
+                ("fineness", variant["fineness"]),
+            ):
+                if entry is not None:
+                    tables[name].append(who | dict(_leaves(entry)))
+            for index, scores in enumerate(variant["ground"] or []):
+                low, high = GROUND_RANGES_M[index : index + 2]
+                tables["ground"].append(who | {"from_m": low, "to_m": high} | scores)
+    return tables
+
+
+def _csv(rows: list[dict[str, Any]]) -> str:
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _leaves(entry: Any, path: str = "") -> Iterable[tuple[str, Any]]:
+    """Numbers of a tree with their dotted names."""
+    if isinstance(entry, dict):
+        for name, value in entry.items():
+            yield from _leaves(value, f"{path}.{name}" if path else str(name))
+    else:
+        yield path, entry
+
+
+def _finite(value: Any) -> Any:
+    """The same tree with NaN and infinity as None, which JSON can hold."""
+    if isinstance(value, dict):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

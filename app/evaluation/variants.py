@@ -1,0 +1,93 @@
+"""Variants: parameter sets that are run on the same recording, the paper's ablation among them."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+
+LOOPS = "loops.enabled"
+HAS_LOOPS = False
+"""Whether the engine closes loops. Until it does, variants with loops are left out, not shown as if they had some."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """Attributes:
+    name: column of the tables. values: parameters by dotted name, laid over those of the recording.
+    meaning: in words.
+    """
+
+    name: str
+    values: Mapping[str, Any]
+    meaning: str = ""
+
+    @property
+    def missing(self) -> str:
+        """Why this can not be run in this version, in words; "" if it can."""
+        without = self.values.get(LOOPS) and not HAS_LOOPS
+        return "loop closure is not part of this version, so there are no figures" if without else ""
+
+    def applied(self, params: Params) -> Params:
+        """`params` with this variant's values.
+
+        Raises:
+            HemislamError: a parameter is unknown or out of range.
+        """
+        try:
+            return params.with_values(self.values)
+        except HemislamError as error:
+            raise HemislamError(f"Variant {self.name}: {error}") from None
+
+
+PAPER: tuple[Variant, ...] = (
+    Variant("FAST-LIO", {"ground.enabled": False, LOOPS: False}, "no ground downsampling, no loops"),
+    Variant("FAST-LIO-GD", {"ground.enabled": True, LOOPS: False}, "ground downsampling, no loops"),
+    Variant("FAST-LIO-L", {"ground.enabled": False, LOOPS: True}, "loops, no ground downsampling"),
+    Variant("Ours", {"ground.enabled": True, LOOPS: True}, "ground downsampling and loops"),
+)
+"""The ablation of the paper's Table 2: all four are this engine, with its parts switched off in turn."""
+
+
+def parse_variant(text: str) -> Variant:
+    """`NAME:section.name=value,section.name=value`; values are YAML, commas in brackets belong to them.
+
+    Raises:
+        HemislamError: it is not written like that.
+    """
+    name, colon, rest = text.partition(":")
+    name = name.strip()
+    values: dict[str, Any] = {}
+    for part in re.split(r",(?![^\[]*\])", rest):
+        path, equals, value = part.partition("=")
+        if not (name and colon and equals):
+            raise HemislamError(
+                f"`--variant {text}` can not be understood;"
+                " write it as `--variant NAME:ground.sigma=0.03,ground.alpha=30`."
+            )
+        try:
+            values[path.strip()] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise HemislamError(f"`--variant {text}`: the value of {path.strip()} can not be read.") from None
+    if not re.fullmatch(r"[\w.+-]+", name) or name.startswith("."):
+        raise HemislamError(f"A variant can not be named `{name}`; use letters, digits, `-`, `_`, `.` and `+`.")
+    return Variant(name, values, ", ".join(f"{path} = {value}" for path, value in values.items()))
+
+
+def choose_variants(own: list[Variant], *, ablation: bool) -> list[Variant]:
+    """The paper's, if wanted, and the user's.
+
+    Raises:
+        HemislamError: two have the same name, or there is none.
+    """
+    chosen = [*(PAPER if ablation else ()), *own]
+    names = [variant.name for variant in chosen]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise HemislamError(f"There are two variants named {twice}; give each --variant another name.")
+    if not chosen:
+        raise HemislamError("There is no variant to run; leave out --no-ablation or add a --variant.")
+    return chosen
