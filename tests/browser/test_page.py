@@ -1,6 +1,7 @@
 """The page in a real Chromium, drawn in software. One browser for all tests: starting it takes longest."""
 
 import io
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -56,6 +57,8 @@ class Bench:
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
     path = shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None and "CI" in os.environ:
+        pytest.fail("CI must have chromium")
     if path is None:
         pytest.skip("needs chromium")
     with sync_playwright() as playwright:
