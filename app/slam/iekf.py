@@ -22,6 +22,9 @@ CONVERGED_TRANSLATION = 1e-4
 """rad, m: an increment below these ends the iteration."""
 MIN_INLIERS = 30
 """Fewer planes than this do not make an update; the prediction stands."""
+ENOUGH_PLANES, RELAXED = 100, 4.0
+"""Where fewer planes than this are found, ones of so many times the allowed tilt are taken too: in
+clutter at arm's length no patch is wide enough for a better normal, and poor planes beat none."""
 DEGENERATE_SIGMA = 0.05
 """m (rotation: rad times the points' typical range): a direction that one scan alone leaves
 more uncertain than this is called degenerate."""
@@ -83,6 +86,8 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> t
         if planes is None or _over(since_search, RESEARCH_ROTATION, RESEARCH_TRANSLATION):
             kernels.to_world(points, R, p, R_il, p_il, world)
             planes = local_map.planes(world, params)
+            if np.count_nonzero(planes.variances >= 0.0) < ENOUGH_PLANES:
+                planes = local_map.planes(world, params, RELAXED)
             since_search[:] = 0.0
         kernels.normal_equations(
             points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,

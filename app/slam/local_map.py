@@ -81,11 +81,11 @@ class LocalMap:
         )
         self._center = np.array(center)
 
-    def planes(self, queries: F64, params: Filter) -> Planes:
-        """A plane for each of (n, 3) odom points; see `kernels.map.planes`."""
+    def planes(self, queries: F64, params: Filter, relaxed: float = 1.0) -> Planes:
+        """A plane for each of (n, 3) odom points; see `kernels.map.planes`. `relaxed` widens the tilt allowed."""
         n = len(queries)
         out = Planes(np.empty((n, 3)), np.empty((n, 3)), np.empty(n))
-        reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(params.plane_tilt)
+        reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(relaxed * params.plane_tilt)
         kernels.planes(
             queries, self._voxel, reach, params.neighbours, params.plane_threshold, tilt, params.point_noise,
             self._table, self._cells, self._counts, self._store, out.normals, out.centers, out.variances,
