@@ -1,0 +1,83 @@
+"""Each recording beside the project goes through the real reader and the engine once a session."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.sensors.presets import PRESETS
+from app.sensors.recording import open_recording
+from app.slam.engine import Engine
+from app.slam.metrics import GroundScore, Trajectory, interpolate, read_tum
+from app.slam.params import Params
+from app.slam.types import NON_GROUND, FrameStatus, Measurement
+
+H2LID_MOUNT = Params().merged(PRESETS["h2lid-mount"])
+
+
+@dataclass
+class Pass:
+    """What came of one recording.
+
+    Attributes:
+        estimate: poses of all frames. score: of the ground labels. statuses: how many frames each.
+        found: frames with a ground plane. overhead: points over the sensor that were labelled ground but are none,
+            and nearest_overhead, the nearest of them, m.
+        converged: registrations that converged.
+    """
+
+    estimate: Trajectory
+    truth: Trajectory
+    score: GroundScore = field(default_factory=GroundScore)
+    statuses: Counter[FrameStatus] = field(default_factory=Counter)
+    found: int = 0
+    overhead: int = 0
+    nearest_overhead: float = float("inf")
+    converged: int = 0
+
+
+def process(path: Path, truth_path: Path, params: Params) -> Pass:
+    truth, engine = read_tum(truth_path), Engine(params)
+    stamps, poses = [], []
+    outcome = Pass(truth, truth)
+    with open_recording(path, params) as recording:
+        for entry in recording.measurements():
+            if not isinstance(entry, Measurement):
+                continue
+            r = engine.step(entry.scan, entry.imu)
+            stamps.append(r.stamp_ns)
+            poses.append(r.T_map_imu)
+            outcome.statuses[r.status] += 1
+            outcome.converged += r.registration.converged
+            outcome.found += r.ground.found
+            if r.truth_ground is None:
+                continue
+            outcome.score += GroundScore.of(r.cloud.labels, r.truth_ground)
+            here, usable = interpolate(truth, np.array([r.stamp_ns]))
+            if usable.any():
+                R_truth_lidar = here.rotations[0].as_matrix() @ r.state.R_imu_lidar
+                heights = r.cloud.points.astype(np.float64) @ R_truth_lidar[2]
+                over = (r.cloud.labels != NON_GROUND) & (heights > 0) & (r.truth_ground == 0)
+                outcome.overhead += int(np.sum(over))
+                ranges = np.linalg.norm(r.cloud.points[over], axis=1)
+                outcome.nearest_overhead = min([outcome.nearest_overhead, *ranges.tolist()])
+    engine.close()
+    outcome.estimate = Trajectory.from_poses(stamps, np.array(poses))
+    return outcome
+
+
+@pytest.fixture(scope="session")
+def passed(shared_data: Path) -> Callable[[str], Pass]:
+    """The outcome of "hall", "outdoor" or "garage"."""
+
+    @cache
+    def outcome(name: str) -> Pass:
+        if name == "garage":
+            return process(shared_data / "garage_hdl32e.mcap", shared_data / "garage_hdl32e_reference.tum", Params())
+        return process(shared_data / f"{name}_bpearl.mcap", shared_data / f"{name}_bpearl_truth.tum", H2LID_MOUNT)
+
+    return outcome
