@@ -22,7 +22,7 @@ CONVERGED_TRANSLATION = 1e-4
 """rad, m: an increment below these ends the iteration."""
 MIN_INLIERS = 30
 """Fewer planes than this do not make an update; the prediction stands."""
-ENOUGH_PLANES, RELAXED = 100, 4.0
+ENOUGH_PLANES, RELAXED = 50, 4.0
 """Where fewer planes than this are found, ones of so many times the allowed tilt are taken too: in
 clutter at arm's length no patch is wide enough for a better normal, and poor planes beat none."""
 DEGENERATE_SIGMA = 0.05
