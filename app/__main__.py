@@ -117,14 +117,20 @@ def info(
 
 @cli.command()
 def simulate(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="corridor, room, outdoor or museum.")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.mcap", help="The recording to write.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE.mcap", help="The recording to write; of a suite a folder.")
+    ],
+    scene: Annotated[str | None, typer.Argument(metavar="SCENE", help="corridor, room, outdoor, museum, ...")] = None,
+    suite: Annotated[
+        str | None, typer.Option("--suite", metavar="paper", help="Twins of the paper's six sequences, not one SCENE.")
+    ] = None,
+    short: Annotated[bool, typer.Option("--short", help="The first 60 s of each of the suite.")] = False,
     duration: Annotated[float, typer.Option("--duration", metavar="SECONDS", help="Of the walk.")] = 60.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed, another walk.")] = 0,
     rate: Annotated[int, typer.Option("--rate", metavar="HZ", help="Revolutions a second, 10 or 20.")] = 10,
     every_block: Annotated[
-        int, typer.Option("--every-block", metavar="K", help="Fire every K-th azimuth only, for a small file.")
-    ] = 1,
+        int | None, typer.Option("--every-block", metavar="K", help="Fire every K-th azimuth only, for a small file.")
+    ] = None,
     coordinate_step: Annotated[
         float, typer.Option("--coordinate-step", metavar="METRES", help="Round x, y, z, for a smaller file; 0: do not.")
     ] = 0.0,
@@ -144,11 +150,18 @@ def simulate(
       hemislam simulate corridor --out corridor.mcap
       hemislam simulate outdoor --out outdoor.mcap --duration 120 --seed 7
       hemislam simulate room --out small.mcap --duration 20 --every-block 6
+      hemislam simulate --suite paper --out suite/
     """
     from tqdm import tqdm
 
-    from app.sensors.simulator import simulate
+    from app.cli.suite import make_suite
+    from app.sensors.simulator import SCENES, simulate
 
+    if suite is not None:
+        make_suite(suite, out, [seed], short=short, every_block=every_block)
+        return
+    if scene is None:
+        raise HemislamError(f"Name a SCENE, one of {', '.join(SCENES)}, or use --suite paper.")
     if out.exists() and not force:
         raise HemislamError(f"{out} is there already; choose another --out or add --force to replace it.")
     with tqdm(desc="Simulating", unit=" scans", leave=False, disable=None) as bar:
@@ -163,7 +176,7 @@ def simulate(
             duration_s=duration,
             seed=seed,
             rate_hz=rate,
-            every_block=every_block,
+            every_block=every_block or 1,
             range_step=range_step,
             coordinate_step=coordinate_step,
             progress=show,

@@ -83,6 +83,7 @@ def evaluate(
       hemislam evaluate --suite paper --short --out results
     """
     from app.cli.run import _compile
+    from app.cli.suite import make_suite
     from app.evaluation.evaluate import Plan, Subject
     from app.evaluation.evaluate import evaluate as run_evaluation
     from app.evaluation.truth import read_truth
@@ -92,7 +93,7 @@ def evaluate(
     paths = list(recordings or [])
     _make_folder(out)
     if suite is not None:
-        paths += _suite(suite, out / "recordings", short, seeds or [0])
+        paths += make_suite(suite, out / "recordings", seeds or [0], short=short)
     if not paths:
         raise HemislamError("There is nothing to evaluate; name a RECORDING or use --suite paper.")
     names = _names(paths)
@@ -182,7 +183,3 @@ def _compared(texts: list[str], names: list[str]) -> dict[str, list[tuple[str, "
             raise HemislamError(f"`--compare {text}`: there is no recording {recording}; there are {', '.join(names)}.")
         found[recording].append((system, read_tum(Path(file))))
     return found
-
-
-def _suite(name: str, folder: Path, short: bool, seeds: list[int]) -> list[Path]:
-    raise HemislamError(f"There is no suite {name} yet.")

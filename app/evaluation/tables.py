@@ -106,8 +106,8 @@ def runtime(recordings: Sequence[Evaluated]) -> Table | None:
         tuple(rows),
         f"As the paper's Table 3. All stages of a frame, reading the file not counted, on {_list(threads)} thread(s) a"
         " variant; variants that ran side by side share the machine's memory and caches, so --jobs 1 gives the quietest"
-        f" times. The machine's load was up to {load:.1f}: where that is more than its cores, other work made frames wait,"
-        " and CPU time tells more.",
+        f" times. The machine's load was up to {load:.1f}: where that is more than its cores, other work made frames"
+        " wait, and CPU time tells more.",
     )
 
 
@@ -172,7 +172,7 @@ def beside_paper(recordings: Sequence[Evaluated]) -> Table | None:
     rows = []
     systems = ("FAST-LIO", "FAST-LIO-GD", "FAST-LIO-L", "Ours")
     for recording in recordings:
-        sequence = paper.SEQUENCES.get(recording.name.partition("-seed")[0])
+        sequence = paper.SEQUENCES.get(recording.name.partition("-")[0])
         if sequence is None:
             continue
         columns = {column.name: column for column in recording.columns}

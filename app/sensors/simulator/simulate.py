@@ -14,7 +14,7 @@ from app.sensors.simulator.imu import ImuNoise
 from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
 from app.sensors.simulator.raycast import Raycaster
 from app.sensors.simulator.recording import TRANSPORT_NS, RecordingWriter
-from app.sensors.simulator.scenes import build_scene
+from app.sensors.simulator.scenes import Scene, build_scene
 from app.sensors.simulator.trajectory import Trajectory, Walker, seconds, walk
 from app.slam.errors import HemislamError
 from app.slam.types import I64
@@ -100,14 +100,7 @@ def simulate(
     )
     walker = walker or Walker()
     place = build_scene(scene, seed)
-    trajectory = walk(
-        place.path,
-        duration_s,
-        _random(seed, _WALK),
-        walker=walker,
-        closed=place.closed,
-        height=place.height,
-    )
+    trajectory = walk_through(place, duration_s, seed, walker)
     caster = Raycaster(place.mesh, place.movers)
     lidar = Lidar(firing_pattern(BPEARL, rate_hz, every_block), range_noise, range_step, coordinate_step)
     imu_stamps = START_NS + np.arange(round(duration_s * imu_model.RATE_HZ) + 1, dtype=np.int64) * _IMU_PERIOD_NS
@@ -156,6 +149,12 @@ def simulate(
         distance_m=float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
         bytes=out.stat().st_size,
     )
+
+
+def walk_through(place: Scene, duration_s: float, seed: int, walker: Walker) -> Trajectory:
+    """The walk that `simulate` simulates."""
+    rng = _random(seed, _WALK)
+    return walk(place.path, duration_s, rng, walker=walker, closed=place.closed, height=place.height)
 
 
 _SIDECAR = "# Mounting of the simulated scanner (as H2LID); read by itself with the recording beside it.\n"

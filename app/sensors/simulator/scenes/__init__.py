@@ -10,12 +10,17 @@ from app.sensors.simulator.scenes.corridor import corridor
 from app.sensors.simulator.scenes.identical import identical
 from app.sensors.simulator.scenes.museum import museum
 from app.sensors.simulator.scenes.outdoor import outdoor
+from app.sensors.simulator.scenes.paper import indoor_1, indoor_2, outdoor_1, outdoor_2, outdoor_3, outdoor_4
 from app.sensors.simulator.scenes.room import room
 from app.sensors.simulator.scenes.scene import Scene
 from app.slam.errors import HemislamError
 
 _BUILDERS: dict[str, Callable[[np.random.Generator], Scene]] = {
-    builder.__name__: builder for builder in (corridor, room, outdoor, museum, building, identical)
+    builder.__name__: builder
+    for builder in (
+        *(corridor, room, outdoor, museum, building, identical),
+        *(indoor_1, indoor_2, outdoor_1, outdoor_2, outdoor_3, outdoor_4),
+    )
 }
 
 SCENES: dict[str, str] = {name: (builder.__doc__ or "").splitlines()[0] for name, builder in _BUILDERS.items()}

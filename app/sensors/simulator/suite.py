@@ -1,0 +1,137 @@
+"""The paper's suite: simulated twins of the six sequences of its Table 1, from one seed.
+
+Same number of frames, duration and length; the places are `scenes.paper`. The short form is the
+first minute of each, with fewer firings.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app.sensors.simulator.scenes import build_scene
+from app.sensors.simulator.simulate import simulate, walk_through
+from app.sensors.simulator.trajectory import Walker
+from app.slam.errors import HemislamError
+
+RATE_HZ = 10
+SHORT_S = 60.0
+SHORT_EVERY_BLOCK = 3
+"""The short form fires every third azimuth, 19,000 a scan, so that it is made within minutes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Twin:
+    """One sequence of the paper's Table 1; `scene` is its name here."""
+
+    scene: str
+    frames: int
+    length_m: float
+
+    @property
+    def duration_s(self) -> float:
+        """So that just as many scans fit (the first begins after 0.05 s)."""
+        return self.frames / RATE_HZ + 0.05
+
+
+PAPER: tuple[Twin, ...] = (
+    Twin("indoor_1", 2266, 218.39),
+    Twin("indoor_2", 1252, 54.63),
+    Twin("outdoor_1", 3306, 335.59),
+    Twin("outdoor_2", 3414, 422.25),
+    Twin("outdoor_3", 9530, 869.16),
+    Twin("outdoor_4", 5667, 573.64),
+)
+SUITES = {"paper": PAPER}
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """Attributes:
+    recording: the file. new: whether it was simulated now. distance_m: walked.
+    """
+
+    recording: Path
+    new: bool
+    distance_m: float
+
+
+def make_twin(
+    twin: Twin,
+    folder: Path,
+    *,
+    seed: int = 0,
+    short: bool = False,
+    every_block: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Made:
+    """Simulate one sequence into `folder`, unless the same is there already.
+
+    The walker's speed is chosen so that the length of the whole walk is the paper's.
+
+    Args:
+        every_block: fire every k-th azimuth only; None: all, or every SHORT_EVERY_BLOCK-th if short.
+
+    Raises:
+        HemislamError: as `simulate`.
+    """
+    name = twin.scene + (f"-seed{seed}" if seed else "") + ("-short" if short else "")
+    out, note = folder / f"{name}.mcap", folder / f"{name}.suite.json"
+    every_block = every_block or (SHORT_EVERY_BLOCK if short else 1)
+    duration_s = min(SHORT_S, twin.duration_s) if short else twin.duration_s
+    wanted = {"twin": asdict(twin), "seed": seed, "duration_s": duration_s, "every_block": every_block} | {
+        "simulator": _digest()
+    }
+    if out.is_file() and (there := _noted(note)) is not None and there["made"] == wanted:
+        return Made(out, False, there["distance_m"])
+    made = simulate(
+        twin.scene,
+        out,
+        duration_s=duration_s,
+        seed=seed,
+        rate_hz=RATE_HZ,
+        every_block=every_block,
+        walker=Walker(speed=fitting_speed(twin, seed)),
+        progress=progress,
+    )
+    note.write_text(json.dumps({"made": wanted, "distance_m": made.distance_m}, indent=2) + "\n", encoding="utf-8")
+    return Made(out, True, made.distance_m)
+
+
+def fitting_speed(twin: Twin, seed: int) -> float:
+    """m/s, with which the whole walk is as long as the paper's, to a centimetre or so."""
+    place = build_scene(twin.scene, seed)
+    times = np.arange(0.0, twin.duration_s, 1 / RATE_HZ)
+    speed = twin.length_m / (twin.duration_s - 4.0)
+    for _ in range(6):
+        path = walk_through(place, twin.duration_s, seed, Walker(speed=speed)).poses(times)[0]
+        length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+        speed *= twin.length_m / length
+    return speed
+
+
+def find_suite(name: str) -> tuple[Twin, ...]:
+    """Raises HemislamError if there is none of that name."""
+    if name not in SUITES:
+        raise HemislamError(f"There is no suite `{name}`; there is {', '.join(SUITES)}.")
+    return SUITES[name]
+
+
+def _noted(path: Path) -> dict[str, Any] | None:
+    try:
+        noted: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return noted if {"made", "distance_m"} <= noted.keys() else None
+
+
+def _digest() -> str:
+    """Hash of the simulator's code: another one makes other recordings."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
