@@ -15,7 +15,7 @@ from app.sensors.layout import ImuProbe, Probe, gravity_findings, settle_cloud, 
 from app.sensors.pointcloud import CloudError, CloudMessage, decode, stamp_ns
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu
 from app.sensors.sequencer import Sequencer
-from app.sensors.source import SUFFIXES, Source
+from app.sensors.source import SUFFIXES, Mark, Source
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement, Scan
@@ -85,38 +85,28 @@ class Recording:
             *gravity_findings(imu, self._accel_scale, params),
         )
 
+    @property
+    def max_imu_gap_s(self) -> float:
+        """The longest interval between IMU samples that is no gap."""
+        return self._params.imu.max_gap
+
     def measurements(
-        self, start_s: float = 0.0, duration_s: float | None = None
-    ) -> Iterator[Measurement | DroppedScan]:
+        self, start_s: float = 0.0, duration_s: float | None = None, *, after: "Place | None" = None
+    ) -> "Measurements":
         """Scans that begin within [start_s, start_s + duration_s) after `start_ns`, with their IMU samples.
 
-        Raises:
-            HemislamError: at the end, if no scan could be used; or where the file is damaged, after
-                all that comes before the damage.
+        Args:
+            after: a place where an earlier reading of the same part was; this one goes on exactly as that did.
         """
-        first_ns = self.start_ns + round(start_s * 1e9)
-        stop_ns = None if duration_s is None else first_ns + round(duration_s * 1e9)
-        sequencer = Sequencer(self._params.imu.max_gap)
-        reasons: Counter[str] = Counter()
-        damage = None
-        try:
-            for entry in self.entries(first_ns if start_s > 0 else None, stop_ns):
-                if isinstance(entry, ScanEntry):
-                    if entry.scan.stamp_ns >= first_ns and (stop_ns is None or entry.scan.stamp_ns < stop_ns):
-                        sequencer.add_scan(entry.scan)
-                elif start_s <= 0 or entry.stamp_ns >= first_ns - IMU_BEFORE_NS:
-                    sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
-                yield from _counted(sequencer.ready(), reasons)
-        except HemislamError as error:
-            damage = error
-        yield from _counted(sequencer.finish(), reasons)
-        if damage is not None:
-            raise damage
-        if not sequencer.counts.paired:
-            raise HemislamError(self._nothing_usable(reasons, start_s, duration_s))
+        return Measurements(self, start_s, duration_s, after)
 
-    def entries(self, first_ns: int | None = None, stop_ns: int | None = None) -> Iterator[ScanEntry | ImuEntry]:
+    def entries(
+        self, first_ns: int | None = None, stop_ns: int | None = None, after: Mark | None = None
+    ) -> Iterator[ScanEntry | ImuEntry]:
         """Decoded scans and IMU samples in the order of the file; generously more than [first, stop).
+
+        Args:
+            after: only what comes after this message.
 
         Raises:
             HemislamError: where the file is damaged.
@@ -124,7 +114,8 @@ class Recording:
         offset = self._log_after_stamp_ns
         log_first = None if first_ns is None else first_ns + offset - LOG_MARGIN_NS
         log_stop = None if stop_ns is None else stop_ns + offset + LOG_MARGIN_NS
-        for topic, log_ns, message in self._source.messages((self.lidar_topic, self.imu_topic), log_first, log_stop):
+        topics = (self.lidar_topic, self.imu_topic)
+        for topic, log_ns, message in self._source.messages(topics, log_first, log_stop, after):
             yield self._scan_entry(message, log_ns) if topic == self.lidar_topic else self._imu_entry(message, log_ns)
 
     def fraction_at(self, log_ns: int) -> float:
@@ -173,7 +164,7 @@ class Recording:
         copied = np.all(np.abs(scan_logs - headers) < 2_000) and np.all(np.abs(imu.log_ns - imu.stamps_ns) < 2_000)
         return clock_finding(offset, self._params.recording.imu_time_offset, not copied)
 
-    def _nothing_usable(self, reasons: Counter[str], start_s: float, duration_s: float | None) -> str:
+    def nothing_usable(self, reasons: Counter[str], start_s: float, duration_s: float | None) -> str:
         if not reasons:
             until = "" if duration_s is None else f" and before {start_s + duration_s:g} s"
             return f"{self.path} has no scan after {start_s:g} s{until}; it lasts {self.duration_s:.1f} s."
@@ -189,6 +180,69 @@ class Recording:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a reading is, between two measurements: the last message read, and what pairing remembers."""
+
+    message: Mark | None
+    sequencer: Sequencer
+    reasons: Counter[str]
+    ended: bool
+
+
+class Measurements(Iterator[Measurement | DroppedScan]):
+    """A reading of a recording, made by `Recording.measurements`.
+
+    Iterating raises HemislamError at the end, if no scan could be used; or where the file is
+    damaged, after all that comes before the damage.
+    """
+
+    def __init__(self, recording: Recording, start_s: float, duration_s: float | None, after: Place | None) -> None:
+        self._recording = recording
+        self._part = (start_s, duration_s)
+        self._message = after.message if after else None
+        self._sequencer = after.sequencer.copy() if after else Sequencer(recording.max_imu_gap_s)
+        self._reasons = after.reasons.copy() if after else Counter[str]()
+        self._ended = after is not None and after.ended
+        self._entries = self._read()
+
+    def __next__(self) -> Measurement | DroppedScan:
+        entry = next(self._entries)
+        if isinstance(entry, DroppedScan):
+            self._reasons[entry.reason] += 1
+        return entry
+
+    def place(self) -> Place:
+        """Where it is now; cheap."""
+        return Place(self._message, self._sequencer.copy(), self._reasons.copy(), self._ended)
+
+    def _read(self) -> Iterator[Measurement | DroppedScan]:
+        start_s, duration_s = self._part
+        recording, sequencer = self._recording, self._sequencer
+        first_ns = recording.start_ns + round(start_s * 1e9)
+        stop_ns = None if duration_s is None else first_ns + round(duration_s * 1e9)
+        damage = None
+        if not self._ended:
+            yield from sequencer.ready()
+            try:
+                for entry in recording.entries(first_ns if start_s > 0 else None, stop_ns, self._message):
+                    self._message = Mark.after(self._message, entry.log_ns)
+                    if isinstance(entry, ScanEntry):
+                        if entry.scan.stamp_ns >= first_ns and (stop_ns is None or entry.scan.stamp_ns < stop_ns):
+                            sequencer.add_scan(entry.scan)
+                    elif start_s <= 0 or entry.stamp_ns >= first_ns - IMU_BEFORE_NS:
+                        sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
+                    yield from sequencer.ready()
+            except HemislamError as error:
+                damage = error
+        self._ended = damage is None
+        yield from sequencer.finish()
+        if damage is not None:
+            raise damage
+        if not sequencer.counts.paired:
+            raise HemislamError(recording.nothing_usable(self._reasons, start_s, duration_s))
 
 
 def open_recording(path: Path, params: Params) -> Recording:
@@ -223,12 +277,3 @@ def find_recordings(folder: Path) -> list[Path]:
         elif entry.suffix in SUFFIXES:
             found.append(entry)
     return found
-
-
-def _counted(
-    entries: Iterator[Measurement | DroppedScan], reasons: Counter[str]
-) -> Iterator[Measurement | DroppedScan]:
-    for entry in entries:
-        if isinstance(entry, DroppedScan):
-            reasons[entry.reason] += 1
-        yield entry

@@ -7,7 +7,7 @@ of arrival, then `ready()` gives what is complete. Pairing is by measurement tim
 import bisect
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -58,6 +58,18 @@ class Sequencer:
     _behind: bool = False
     _suspect: tuple[int, tuple[float, ...]] | None = None
     """A sample stamped far ahead of the one before: a wrong stamp, unless the next one goes on from there."""
+
+    def copy(self) -> "Sequencer":
+        """Another one that goes on from here by itself. Scans are shared: they never change."""
+        return replace(
+            self,
+            counts=replace(self.counts),
+            _stamps=self._stamps.copy(),
+            _values=self._values.copy(),
+            _waiting=self._waiting.copy(),
+            _notices=self._notices.copy(),
+            _intervals_ns=self._intervals_ns.copy(),
+        )
 
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector) -> None:
         """One IMU sample: rad/s and m/s^2, IMU frame."""

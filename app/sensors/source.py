@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -32,6 +33,22 @@ class Topic:
     name: str
     type: str
     messages: int
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A message that was read: how many there were until then, its log time, and how many of them had just that."""
+
+    read: int
+    log_ns: int
+    at_log_ns: int
+
+    @classmethod
+    def after(cls, mark: "Mark | None", log_ns: int) -> "Mark":
+        """The mark of the message, logged at `log_ns`, that comes next after `mark`."""
+        if mark is None:
+            return cls(1, log_ns, 1)
+        return cls(mark.read + 1, log_ns, mark.at_log_ns + 1 if mark.log_ns == log_ns else 1)
 
 
 class Source:
@@ -67,19 +84,29 @@ class Source:
             raise HemislamError(f"{path} is a recording without a single message; record it again.")
 
     def messages(
-        self, topics: tuple[str, ...], start_ns: int | None = None, stop_ns: int | None = None
+        self,
+        topics: tuple[str, ...],
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+        after: Mark | None = None,
     ) -> Iterator[tuple[str, int, Any]]:
         """(topic, log time ns, deserialised message) of these topics, logged within [start, stop).
+
+        Args:
+            after: where an earlier call with the same arguments was; this one goes on from there.
 
         Raises:
             HemislamError: the file is damaged here; everything before was given.
         """
         first, stop = 0 if start_ns is None else start_ns, _FOREVER if stop_ns is None else stop_ns
-        stream = (
-            self._reader.messages(topics, first, stop)
-            if isinstance(self._reader, McapStream)
-            else self._rosbags_messages(self._reader, topics, first, stop)
-        )
+        stream: Iterator[tuple[str, int, Any]]
+        if isinstance(self._reader, McapStream):  # in the order of the file, whatever the log times
+            stream = self._reader.messages(topics, first, stop)
+            known = after.read if after else 0
+        else:
+            stream = self._rosbags_messages(self._reader, topics, after.log_ns if after else first, stop)
+            known = after.at_log_ns if after else 0
+        stream = islice(stream, known, None)
         log_ns = self.start_ns
         while True:
             try:
