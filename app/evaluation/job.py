@@ -10,7 +10,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ RUN_FILES = ("trajectory.tum", "timings.csv", "crops.npz", "run.json")
 class Job:
     """Attributes:
     recording: its path, sha256: of its bytes. name: of the recording in tables. variant: its name.
-    params: as run. folder: for the results. threads: for the kernels.
+    params: as run. folder: for the results. threads: for the kernels. code: `code_digest()`.
     """
 
     recording: Path
@@ -49,6 +49,7 @@ class Job:
     threads: int = 1
     start_s: float = 0.0
     duration_s: float | None = None
+    code: str = field(default_factory=lambda: code_digest())
 
     @property
     def key(self) -> str:
@@ -56,7 +57,7 @@ class Job:
         parts = {
             "format": FORMAT,
             "version": __version__,
-            "code": code_digest(),
+            "code": self.code,
             "input": self.sha256,
             "parameters": self.params.model_dump(mode="json"),
             "part": [self.start_s, self.duration_s],
@@ -114,7 +115,7 @@ def _facts(job: Job, log: RunLog, ground: list[GroundScore], memory_mb: float) -
     return {
         "key": job.key,
         "hemislam": __version__,
-        "code": code_digest(),
+        "code": job.code,
         "recording": str(job.recording),
         "sha256": job.sha256,
         "variant": job.variant,

@@ -16,8 +16,8 @@ from app.slam.metrics import interpolate, umeyama
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64, I64
 
-JUMP_M, JUMP_M_S = 1.0, 15.0
-"""A step over both, at five times the speed of the rest, is no motion of a body but of its frame."""
+JUMP_M, JUMP_M_S, JUMP_TIMES = 1.0, 15.0, 5.0
+"""A step over both, and so many times faster than those around it, is no motion of a body but of its frame."""
 ODD_AXES_DEG = 10.0
 
 
@@ -144,8 +144,9 @@ def _check(truth: Truth) -> None:
         row = int(np.argmax(steps_s <= 0)) + 1
         raise HemislamError(f"Time does not increase at pose {row + 1} of {truth.source}; sort it by time.")
     steps_m = np.linalg.norm(np.diff(truth.positions, axis=0), axis=1)
-    usual = float(np.percentile(steps_m / steps_s, 95))
-    jumps = np.flatnonzero((steps_m > JUMP_M) & (steps_m / steps_s > max(JUMP_M_S, 5 * usual)))
+    speeds = steps_m / steps_s
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(speeds, 3), 7)[:, [0, 1, 2, 4, 5, 6]].max(axis=1)
+    jumps = np.flatnonzero((steps_m > JUMP_M) & (speeds > JUMP_M_S) & (speeds > JUMP_TIMES * around))
     if len(jumps):
         at, since = int(jumps[0]), (truth.stamps_ns - truth.stamps_ns[0]) * 1e-9
         raise HemislamError(
@@ -182,7 +183,7 @@ def _borrow_rotation(there: Trajectory, estimate: Trajectory) -> Trajectory:
 
 
 def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) -> tuple[Trajectory, str]:
-    """The truth turned into the IMU's axes by the mean rotation between both, if they differ at all."""
+    """The truth turned into the IMU's axes by the mean rotation between both, if they are `certainly` others."""
     theirs, usable = interpolate(there, estimate.stamps_ns)
     if len(theirs) < 3:
         return there, ""  # the metrics will say so
@@ -192,8 +193,14 @@ def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) ->
     R_body_imu = between.mean()
     angle = float(np.degrees(R_body_imu.magnitude()))
     spread = float(np.degrees(np.median((R_body_imu.inv() * between).magnitude())))
-    if not certainly and (angle < ODD_AXES_DEG or spread > angle / 3):
-        return there, ""
+    if not certainly:
+        odd = angle > ODD_AXES_DEG and spread < angle / 3
+        return there, (
+            f"Its orientations differ from ours by a constant {angle:.0f}°; its axes may not be the IMU's, and then"
+            " rotation errors and RPE mean little."
+            if odd
+            else ""
+        )
     return (
         replace(there, quaternions=(there.rotations * R_body_imu).as_quat()),
         f"Its axes are not the IMU's: the constant rotation between them ({angle:.1f}°) was estimated as the mean"

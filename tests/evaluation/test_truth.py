@@ -1,0 +1,195 @@
+"""Truth of every format gives the same poses; truth that can not be used is refused in one sentence."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from app.evaluation.alignment import find_offset
+from app.evaluation.truth import check_overlap, match, read_truth
+from app.evaluation.truth_files import H2LID_LEVER
+from app.slam.errors import HemislamError
+from app.slam.metrics import Trajectory, ate, rpe, write_tum
+from tests.evaluation import walks
+
+
+def seen_elsewhere(walk: Trajectory, seed: int = 5) -> Trajectory:
+    """The same walk in the odometry's own world."""
+    turn = Rotation.from_rotvec([0, 0, seed * 0.7])
+    moved = turn.apply(walk.positions) + np.array([3, -7, 1])
+    return Trajectory(walk.stamps_ns, moved, (turn * walk.rotations).as_quat())
+
+
+ESTIMATE = seen_elsewhere(walks.wandering(walks.frames()))
+
+
+@pytest.fixture(scope="module")
+def gnss(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """At 200 Hz, 20 s longer than the recording on both sides, in seconds of the GPS week."""
+    walk = walks.wandering(np.arange(-20.0, 100.0, 0.005))
+    head = "GPSTime Easting Northing H-Ell Heading Pitch Roll Latitude Longitude VEast VNorth VUp Q"
+    lines = [head, *walks.gnss_lines(walk, 9879.920, H2LID_LEVER)]
+    return walks.write(tmp_path_factory.mktemp("truth") / "gnss.txt", lines)
+
+
+def test_the_gnss_table_is_brought_into_clock_point_and_axes_of_the_imu(gnss: Path) -> None:
+    matched = match(read_truth(str(gnss)), ESTIMATE)
+    true_offset = walks.START_NS * 1e-9 - 20.0 - 9879.920
+    assert matched.offset_s == pytest.approx(true_offset, abs=0.002)
+    error = ate(ESTIMATE, matched.trajectory)
+    assert error.position.max < 0.01  # the table is written in millimetres, time is found to milliseconds
+    assert error.rotation.max < 0.2
+    relative = rpe(ESTIMATE, matched.trajectory, metres=10)
+    assert relative is not None and relative.position.max < 0.01
+    said = " ".join(matched.notes)
+    assert "clock" in said and "lever arm" in said and "axes" in said
+
+
+def test_without_its_lever_arm_the_antenna_is_told_from_the_imu(gnss: Path) -> None:
+    matched = match(read_truth(str(gnss), lever=(0.0, 0.0, 0.0)), ESTIMATE)
+    assert 0.1 < ate(ESTIMATE, matched.trajectory).position.max < 0.6  # 0.45 m of arm, turned about
+
+
+@pytest.mark.parametrize("offset_s", [-33.333, 0.0, 4.567])
+def test_the_offset_of_two_clocks_is_found_from_the_motion(offset_s: float) -> None:
+    truth = walks.wandering(np.arange(-15.0, 90.0, 0.01))
+    shifted = Trajectory(truth.stamps_ns - round(offset_s * 1e9), truth.positions, truth.quaternions)
+    for by_rotation in (True, False):
+        found = find_offset(ESTIMATE, shifted, by_rotation=by_rotation)
+        assert found.offset_s == pytest.approx(offset_s, abs=0.005)
+        assert found.correlation > 0.99
+
+
+def test_the_truth_of_another_walk_has_no_offset() -> None:
+    rng = np.random.default_rng(0)
+    stamps = walks.START_NS + np.arange(8000) * 10_000_000
+    turning = Rotation.from_rotvec(np.cumsum(rng.normal(scale=0.02, size=(8000, 3)), axis=0) * [0, 0, 1])
+    other = Trajectory(stamps, rng.normal(size=(8000, 3)).cumsum(axis=0) * 0.01, turning.as_quat())
+    with pytest.raises(HemislamError, match="fits that of the recording nowhere"):
+        find_offset(ESTIMATE, other, by_rotation=True)
+
+
+def kitti_lines(walk: Trajectory) -> list[str]:
+    rows = np.concatenate([walk.rotations.as_matrix(), walk.positions[:, :, None]], axis=2).reshape(-1, 12)
+    return [" ".join(f"{value:.9e}" for value in row) for row in rows]
+
+
+def test_kitti_poses_belong_to_frames_or_to_the_times_beside_them(tmp_path: Path) -> None:
+    walk = walks.wandering(walks.frames())
+    path = walks.write(tmp_path / "00.txt", kitti_lines(walk))
+    assert ate(ESTIMATE, match(read_truth(str(path)), ESTIMATE).trajectory).position.max < 1e-6
+    with pytest.raises(HemislamError, match=r"holds 799 poses without times, but the recording 700 frames"):
+        match(read_truth(str(path)), ESTIMATE.chosen(np.arange(len(ESTIMATE)) < 700))
+
+    walks.write(tmp_path / "times.txt", [f"{t:.6f}" for t in (walk.stamps_ns - walk.stamps_ns[0]) * 1e-9])
+    matched = match(read_truth(str(path)), ESTIMATE.chosen(np.arange(len(ESTIMATE)) < 700))
+    assert matched.offset_s == pytest.approx(walks.START_NS * 1e-9 + 0.1, abs=0.002)
+
+
+def write_topic(path: Path, kind: str, messages: list[tuple[int, dict[str, object]]]) -> Path:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/truth", kind, typestore=store)
+        for stamp, values in messages:
+            time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+            header = types["std_msgs/msg/Header"](stamp=time, frame_id="map")
+            writer.write(connection, stamp, store.serialize_cdr(types[kind](header=header, **values), kind))
+    return path
+
+
+def test_poses_of_a_topic_are_truth(tmp_path: Path) -> None:
+    types = get_typestore(Stores.ROS2_HUMBLE).types
+    walk = walks.wandering(np.arange(0.0, 80.0, 0.05))
+    body = (walk.rotations * walks.R_BODY_IMU.inv()).as_quat()
+    messages = [
+        (
+            int(stamp),
+            {
+                "pose": types["geometry_msgs/msg/Pose"](
+                    position=types["geometry_msgs/msg/Point"](*map(float, p)),
+                    orientation=types["geometry_msgs/msg/Quaternion"](*map(float, q)),
+                )
+            },
+        )
+        for stamp, p, q in zip(walk.stamps_ns, walk.positions, body, strict=True)
+    ]
+    recording = write_topic(tmp_path / "rec", "geometry_msgs/msg/PoseStamped", messages)
+    matched = match(read_truth("topic:/truth", recording), ESTIMATE)
+    error = ate(ESTIMATE, matched.trajectory)
+    assert error.position.max < 0.01 and error.rotation.max < 0.2
+    with pytest.raises(HemislamError, match=r"no topic /odom to take as truth; it has /truth\."):
+        read_truth("topic:/odom", recording)
+
+
+def test_satellite_fixes_are_metres_east_north_up(tmp_path: Path) -> None:
+    types = get_typestore(Stores.ROS2_HUMBLE).types
+    walk = walks.wandering(np.arange(0.0, 80.0, 0.5))
+    # An independent way onto the ellipsoid: radii of curvature at the start, good to millimetres over 100 m.
+    latitude, longitude = np.radians(30.5388466765), np.radians(114.3526809197)
+    a, e2 = 6_378_137.0, 0.00669437999014
+    meridian = a * (1 - e2) / (1 - e2 * np.sin(latitude) ** 2) ** 1.5
+    vertical = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
+    messages = []
+    for stamp, (x, y, z) in zip(walk.stamps_ns, walk.positions, strict=True):
+        fix = {
+            "status": types["sensor_msgs/msg/NavSatStatus"](status=0, service=1),
+            "latitude": float(np.degrees(latitude + y / meridian)),
+            "longitude": float(np.degrees(longitude + x / (vertical * np.cos(latitude)))),
+            "altitude": float(20.0 + z),
+            "position_covariance": np.zeros(9),
+            "position_covariance_type": 0,
+        }
+        messages.append((int(stamp), fix))
+    recording = write_topic(tmp_path / "rec", "sensor_msgs/msg/NavSatFix", messages)
+    truth = read_truth("topic:/truth", recording)
+    np.testing.assert_allclose(truth.positions, walk.positions - walk.positions[0], atol=0.01)
+    matched = match(truth, ESTIMATE)
+    assert not matched.has_rotation
+    assert ate(ESTIMATE, matched.trajectory).position.max < 0.06  # chords of half a second
+
+
+def test_a_truth_in_the_imus_axes_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "truth.tum"
+    write_tum(path, walks.wandering(walks.frames()))
+    matched = match(read_truth(str(path)), ESTIMATE)
+    assert matched.notes == () and matched.offset_s == 0.0
+    assert ate(ESTIMATE, matched.trajectory).position.max < 1e-6
+
+
+GOOD = "1700000000.{} {} 0 0 0 0 0 1"
+
+
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        ([], "holds no poses"),
+        (["1 2 3"], "line 1 has 3 columns; TUM has 8 columns"),
+        (["1 0 0 0 0 1 0 0 0 0 1", "x"], "line 1 has 11 columns"),
+        (["1 0 0 0 0 1 0 0 0 0 1 0"], "holds 1 poses; at least 3"),
+        (["1 0 0 0 0 1 0 0 0 0 1 0", "1 0 0"], "line 2 has 3 columns, the first has 12"),
+        (["1 0 0 0 0 1 0 0 0 0 nan 0"] * 3, "line 1 holds NaN"),
+        (["2 0 0 0 0 1 0 0 0 0 1 0"] * 3, "pose 1: the left 3x3 of its 3x4 matrix is no rotation"),
+        (["-5 " + "0 " * 12] * 3, "not in seconds of the GPS week"),
+        (
+            [GOOD.format(k, k * 0.1 + (40.0 if k > 4 else 0.0)) for k in range(10)],
+            "jumps by 40.1 m within 0.1 s, 0.4 s",
+        ),
+        ([f"{t} 0 0 0 0 0 0 0 0 0 0 0 0" for t in (5, 4, 6)], "Time does not increase at pose 2"),
+    ],
+)
+def test_a_bad_truth_is_refused_in_one_sentence(tmp_path: Path, lines: list[str], says: str) -> None:
+    path = walks.write(tmp_path / "truth.txt", lines)
+    with pytest.raises(HemislamError, match=says.replace("(", r"\(")) as refused:
+        read_truth(str(path))
+    assert "\n" not in str(refused.value)
+
+
+def test_a_truth_of_another_day_is_refused_before_anything_runs(tmp_path: Path) -> None:
+    path = tmp_path / "truth.tum"
+    write_tum(path, walks.wandering(walks.frames()))
+    with pytest.raises(HemislamError, match=r"but the recording 1700086400\.0 s to 1700086460\.0 s"):
+        check_overlap(read_truth(str(path)), walks.START_NS + 86_400_000_000_000, 60.0)
