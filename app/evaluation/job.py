@@ -33,6 +33,18 @@ GROUND_RANGES_M = (0.0, 5.0, 10.0, 20.0, 40.0, 100.0)
 RUN_FILES = ("trajectory.tum", "timings.csv", "crops.npz", "run.json")
 
 
+@cache
+def code_digest() -> str:
+    """Hash of the code that results depend on: a version that changes between releases is another one."""
+    root = Path(__file__).parents[1]
+    files = [*(root / "slam").rglob("*.py"), *(root / "sensors").glob("*.py")]
+    files += [root / "evaluation" / name for name in ("job.py", "fineness.py", "crops.py")]
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
 @dataclass(frozen=True, slots=True)
 class Job:
     """Attributes:
@@ -49,7 +61,7 @@ class Job:
     threads: int = 1
     start_s: float = 0.0
     duration_s: float | None = None
-    code: str = field(default_factory=lambda: code_digest())
+    code: str = field(default_factory=code_digest)
 
     @property
     def key(self) -> str:
@@ -166,18 +178,6 @@ def clear_remains(folder: Path) -> None:
     """Remove what runs that were killed left in the making."""
     for part in folder.glob("*/*.part-*"):
         shutil.rmtree(part, ignore_errors=True)
-
-
-@cache
-def code_digest() -> str:
-    """Hash of the code that results depend on: a version that changes between releases is another one."""
-    root = Path(__file__).parents[1]
-    files = [*(root / "slam").rglob("*.py"), *(root / "sensors").glob("*.py")]
-    files += [root / "evaluation" / name for name in ("job.py", "fineness.py", "crops.py")]
-    digest = hashlib.sha256()
-    for path in sorted(files):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
 
 
 def _score_ground(scores: list[GroundScore], result: StepResult) -> None:

@@ -1,0 +1,200 @@
+"""`hemislam evaluate` from the outside: the tables, resuming after a kill, and what it refuses."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from app.__main__ import cli
+from app.evaluation.report import REPORT_FILES
+from app.evaluation.variants import HAS_LOOPS, PAPER, choose_variants, parse_variant
+from app.slam.engine import Engine
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.trajectory import read_tum, write_tum
+from tests.cli.conftest import ROOT, write_walk
+
+VARIANT = "coarse:scan.voxel_size=0.8,ground.alpha=30"
+
+
+def command(*arguments: str | Path) -> list[str]:
+    return [sys.executable, "-m", "app", "evaluate", *map(str, arguments)]
+
+
+def call(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli, ["evaluate", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "walk.mcap"
+    write_walk(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def evaluated(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The whole ablation, a variant, and a trajectory from elsewhere: the truth itself."""
+    folder = tmp_path_factory.mktemp("evaluation")
+    theirs = folder / "theirs.tum"
+    write_tum(theirs, read_tum(recording.with_name("walk_truth.tum")))
+    done = call(recording, "--out", folder, "--variant", VARIANT, "--compare", f"Perfect={theirs}")
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+def results(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "results.json").read_text())
+    return found
+
+
+def columns(folder: Path) -> dict[str, dict[str, Any]]:
+    return {entry["variant"]: entry for entry in results(folder)["recordings"][0]["variants"]}
+
+
+def test_every_variant_is_measured(evaluated: Path) -> None:
+    assert all((evaluated / name).is_file() for name in REPORT_FILES)
+    there = columns(evaluated)
+    assert list(there) == ["FAST-LIO", "FAST-LIO-GD", "FAST-LIO-L", "Ours", "coarse", "Perfect"]
+    for name in ("FAST-LIO", "FAST-LIO-GD", "coarse"):
+        entry = there[name]
+        assert entry["frames"] == 39
+        assert 0 < entry["accuracy"]["ate_m"]["rmse"] < 0.02
+        assert entry["accuracy"]["ate_ratio"] == pytest.approx(
+            entry["accuracy"]["ate_m"]["rmse"] / entry["accuracy"]["distance_m"]
+        )
+        assert entry["runtime_ms"]["total"]["median"] <= entry["runtime_ms"]["total"]["max"]
+        assert entry["fineness"]["thickness"] < 0.02
+    assert there["coarse"]["parameters"]["ground"]["alpha"] == 30
+    assert there["FAST-LIO"]["ground"] is None  # it segments none
+    assert sum(scores["true_positive"] for scores in there["FAST-LIO-GD"]["ground"]) > 1000
+    assert there["Perfect"]["accuracy"]["ate_m"]["max"] < 1e-6
+
+
+def test_loops_that_are_not_there_are_not_shown_as_figures(evaluated: Path) -> None:
+    there = columns(evaluated)
+    if HAS_LOOPS:
+        assert there["Ours"]["accuracy"] is not None
+        return
+    for name in ("FAST-LIO-L", "Ours"):
+        assert there[name]["accuracy"] is None and there[name]["runtime_ms"] is None
+        assert "not part of this version" in there[name]["missing"]
+    assert any("loop closure is not part of this version" in said for said in results(evaluated)["findings"])
+
+
+def test_variants_have_loops_as_soon_as_the_engine_has() -> None:
+    source = Path(sys.modules[Engine.__module__].__file__ or "").read_text()
+    assert bool(re.search(r"\.loops\b", source)) == HAS_LOOPS, "set HAS_LOOPS in app/evaluation/variants.py"
+
+
+def test_the_page_needs_nothing_else(evaluated: Path) -> None:
+    page = (evaluated / "report.html").read_text()
+    assert not re.findall(r"""(?:src|href)=["'](?!#|data:)[^"']*""", page)
+    assert "http" not in page.replace("http-equiv", "")
+    for text in ("Trajectory accuracy", "Run time per frame", "Fineness of the map", "From above", "Perfect"):
+        assert text in page
+
+
+def test_a_finished_run_is_not_run_again(recording: Path, evaluated: Path) -> None:
+    runs = sorted((evaluated / "runs").rglob("run.json"))
+    before = {path: path.stat().st_mtime_ns for path in runs}
+    done = call(recording, "--out", evaluated, "--variant", VARIANT, "--compare", f"Perfect={evaluated / 'theirs.tum'}")
+    assert done.exit_code == 0
+    assert before == {path: path.stat().st_mtime_ns for path in runs}
+
+
+def deterministic(folder: Path) -> Any:
+    """results.json but for times, memory, and where things lie."""
+
+    def kept(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: kept(entry) for name, entry in value.items() if name not in ("runtime_ms", "findings")}
+        return [kept(entry) for entry in value] if isinstance(value, list) else value
+
+    return kept(results(folder)["recordings"])
+
+
+def test_killed_at_any_moment_and_started_again_it_gives_the_same_tables(
+    recording: Path, evaluated: Path, tmp_path: Path
+) -> None:
+    arguments = (recording, "--out", tmp_path, "--no-ablation", "--variant", VARIANT, "--variant", "fine:map.radius=90")
+    whole = evaluated.parent / "whole"
+    assert call(*arguments[:2], whole, *arguments[3:]).exit_code == 0
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    runs = tmp_path / "runs" / "walk"
+
+    def kill_when(moment: Callable[[], bool]) -> None:
+        process = subprocess.Popen(
+            command(*arguments), cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        while not moment() and process.poll() is None:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+
+    kill_when(lambda: any(runs.glob("*.part-*")))  # in the middle of writing results
+    kill_when(lambda: any(runs.glob("*/run.json")))  # some are finished, some are not
+    survived = {path: path.stat().st_mtime_ns for path in runs.glob("*/run.json")}
+    done = call(*arguments)
+    assert done.exit_code == 0, done.output
+    assert deterministic(tmp_path) == deterministic(whole)
+    assert survived.items() <= {path: path.stat().st_mtime_ns for path in runs.glob("*/run.json")}.items()
+    assert not list(runs.glob("*.part-*"))
+
+
+def test_a_variant_is_a_name_and_parameters() -> None:
+    variant = parse_variant("mine:ground.sigma=0.03,sensor.translation=[0, 0.1, 0],map.radius=50")
+    assert variant.values == {"ground.sigma": 0.03, "sensor.translation": [0, 0.1, 0], "map.radius": 50}
+    assert variant.applied(Params()).sensor.translation == (0, 0.1, 0)
+    assert PAPER[0].applied(Params()).ground.enabled is False
+    assert PAPER[1].applied(Params()).ground.enabled is True
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("ground.sigma=0.03", "write it as"),
+        ("x:ground.sigma", "write it as"),
+        ("a/b:ground.sigma=0.03", "can not be named `a/b`"),
+    ],
+)
+def test_a_variant_that_is_none_is_refused(text: str, says: str) -> None:
+    with pytest.raises(HemislamError, match=says):
+        parse_variant(text)
+
+
+def test_two_variants_of_one_name_and_misspelt_parameters_are_refused() -> None:
+    with pytest.raises(HemislamError, match="two variants named Ours"):
+        choose_variants([parse_variant("Ours:ground.sigma=0.03")], ablation=True)
+    with pytest.raises(HemislamError, match=r"Variant x: There is no parameter `ground\.sigm`"):
+        parse_variant("x:ground.sigm=0.03").applied(Params())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], "nothing to evaluate"),
+        (["--suite", "papre"], "no suite `papre`"),
+        (["RECORDING", "--lever", "1,2"], "not three numbers"),
+        (["RECORDING", "--compare", "theirs.tum"], "NAME=FILE"),
+        (["RECORDING", "--truth", "topic:/odom"], "no topic /odom"),
+        (["RECORDING", "--truth", "a", "--truth", "b"], "2 --truth for 1 recordings"),
+    ],
+)
+def test_what_can_not_be_done_is_said_in_one_sentence(
+    recording: Path, tmp_path: Path, arguments: list[str], says: str
+) -> None:
+    done = call(*(str(recording) if text == "RECORDING" else text for text in arguments), "--out", tmp_path)
+    assert done.exit_code == 2
+    assert says in done.stderr and "Traceback" not in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
