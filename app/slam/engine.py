@@ -89,6 +89,8 @@ class Engine:
         watch.lap("insert")
 
         cloud = Cloud(points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns)
+        for array in (points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns):
+            array.setflags(write=False)
         keyframe = None if waiting else self._keyframe(posterior, cloud)
         watch.lap("keyframe")
 
@@ -120,6 +122,7 @@ class Engine:
         cloud, p = result.cloud, self.params.ground
         surface = ground.segment(cloud.points, cloud.ring, result.ground.down, p)
         reduced = self._grid.downsample(cloud.points, p.voxel_size, chosen=surface.labels)
+        surface.labels.setflags(write=False)
         return replace(
             result, cloud=replace(cloud, labels=surface.labels), ground=surface, points_reduced=len(reduced.points)
         )
