@@ -31,6 +31,15 @@ def serve(
     ] = 3_000_000,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the address.")] = False,
     paused: Annotated[bool, typer.Option("--paused", help="Wait for Play instead of starting at once.")] = False,
+    checkpoint_memory: Annotated[
+        int,
+        typer.Option(
+            "--checkpoint-memory",
+            min=16,
+            metavar="MB",
+            help="For going back to any frame; what is beyond it goes to temporary files, up to four times as much.",
+        ),
+    ] = 1024,
     preset: Preset = None,
     config: Config = None,
     assignments: Assignments = None,
@@ -43,7 +52,8 @@ def serve(
     """Open the workbench in the browser.
 
     Replays a recording and shows the map as it grows; every parameter can be changed meanwhile.
-    In the page, space plays and pauses, the right arrow steps one frame. Ctrl-C here ends it.
+    In the page, space plays and pauses, the arrow keys step one frame
+    back or on. Ctrl-C here ends it.
 
     \b
     Examples:
@@ -81,6 +91,7 @@ def serve(
             duration_s=duration,
             resolve=resolve_for,
             play=not paused,
+            checkpoint_bytes=checkpoint_memory << 20,
         ),
         folders=Folders(folder or [recording.resolve().parent if recording else Path.cwd()]),
         build_page=partial(Workbench, point_budget=point_budget, results=Path("runs")),

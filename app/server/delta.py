@@ -24,12 +24,15 @@ class Delta:
 
     Attributes:
         session: of all that follows; a new number empties the scene first.
+        kept: how many frames and how many chunks are left of what there was, before those that
+            follow; None: all.
         replaced: new values of fields of `Snapshot`.
         positions: (m, 3) and series: (m, len(SERIES)), rows of the frames since then.
         chunks, notices: new since then.
     """
 
     session: int
+    kept: tuple[int, int] | None
     replaced: dict[str, Any]
     positions: F64
     series: F64
@@ -38,7 +41,12 @@ class Delta:
 
 
 class Outbox:
-    """Collects changes for the next `Delta`. `urgent` asks for it at once, whatever the rate limit."""
+    """Collects changes for the next `Delta`.
+
+    Attributes:
+        urgent: asks for the next one at once, whatever the rate limit.
+        frames, chunks: how many the reader has of this session once it has taken everything.
+    """
 
     def __init__(self, params: Params, *, session: int = 0, notices: int = 0) -> None:
         self._session = session
@@ -47,6 +55,9 @@ class Outbox:
         self._positions: list[F64] = []
         self._rows: list[list[float]] = []
         self._chunks: list[Chunk] = []
+        self._kept: tuple[int, int] | None = None
+        self.frames = 0
+        self.chunks = 0
         self._notices: list[Notice] = []
         self.urgent = True
 
@@ -55,6 +66,7 @@ class Outbox:
         self._session += 1
         self.urgent = True
         self._positions, self._rows, self._chunks = [], [], []
+        self._kept, self.frames, self.chunks = None, 0, 0
         self._replaced |= {"result": None, "keyframe_poses": None, "T_map_truth": None}
 
     def put(self, *, urgent: bool = False, **values: Any) -> None:
@@ -66,9 +78,21 @@ class Outbox:
         """Add a frame: its position (3,) in the map and its readouts in the order of SERIES."""
         self._positions.append(position)
         self._rows.append(readouts)
+        self.frames += 1
 
     def chunk(self, chunk: Chunk) -> None:
         self._chunks.append(chunk)
+        self.chunks += 1
+
+    def rewind(self, frames: int, chunks: int) -> None:
+        """Take frames and chunks back, the newest first, so that so many are left."""
+        frames, chunks = min(frames, self.frames), min(chunks, self.chunks)
+        taken_frames, taken_chunks = self.frames - len(self._rows), self.chunks - len(self._chunks)
+        if frames < taken_frames or chunks < taken_chunks:
+            self._kept = min(frames, taken_frames), min(chunks, taken_chunks)
+        del self._positions[max(frames - taken_frames, 0) :], self._rows[max(frames - taken_frames, 0) :]
+        del self._chunks[max(chunks - taken_chunks, 0) :]
+        self.frames, self.chunks = frames, chunks
 
     def notice(self, level: Literal["info", "warning", "error"], text: str) -> None:
         self._notices_given += 1
@@ -78,12 +102,13 @@ class Outbox:
     @property
     def filled(self) -> bool:
         """Whether there is anything to take."""
-        return bool(self._replaced or self._rows or self._chunks or self._notices)
+        return bool(self._replaced or self._rows or self._chunks or self._notices or self._kept)
 
     def take(self) -> Delta:
         """All changes since the last call."""
         delta = Delta(
             session=self._session,
+            kept=self._kept,
             replaced=self._replaced,
             positions=np.array(self._positions, dtype=np.float64).reshape(-1, 3),
             series=np.array(self._rows, dtype=np.float64).reshape(-1, len(SERIES)),
@@ -91,6 +116,7 @@ class Outbox:
             notices=tuple(self._notices),
         )
         self._replaced, self._positions, self._rows, self._chunks, self._notices = {}, [], [], [], []
+        self._kept = None
         self.urgent = False
         return delta
 
@@ -114,6 +140,19 @@ class Rows:
         self._table[self._length : needed] = rows
         self._length = needed
 
+    def __len__(self) -> int:
+        return self._length
+
+    def go_to(self, length: int) -> None:
+        """Go back to so many rows, or forth again to as many as there were. Views handed out may then change."""
+        self._length = min(length, len(self._table))
+
+    def rewound(self, length: int) -> "Rows":
+        """Another table, of the first `length` rows: views handed out of this one stay as they are."""
+        rows = Rows(self._table.shape[1])
+        rows.extend(self._table[: min(length, self._length)])
+        return rows
+
     def view(self) -> F64:
         """(n, width), read-only."""
         view = self._table[: self._length]
@@ -133,6 +172,10 @@ class Fold:
         chunks = before.chunks
         if delta.session != before.session:
             self._positions, self._series, chunks = Rows(3), Rows(len(SERIES)), ()
+        if delta.kept is not None:
+            frames, count = delta.kept
+            self._positions, self._series = self._positions.rewound(frames), self._series.rewound(frames)
+            chunks = chunks[:count]
         self._positions.extend(delta.positions)
         self._series.extend(delta.series)
         series = self._series.view()

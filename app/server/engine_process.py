@@ -100,9 +100,8 @@ def main(commands: Pipe, updates: Pipe, setup: Setup) -> None:
     """Compile, open the recording, and work until told to end or the parent has gone."""
 
     def opener(path: Path, truth: Path | None, params: Params, /) -> Run:
-        if path != setup.recording:
-            return open_run(path, truth, params)
-        return open_run(path, truth, params, setup.start_s, setup.duration_s)
+        part = (setup.start_s, setup.duration_s) if path == setup.recording else (0.0, None)
+        return open_run(path, truth, params, *part, checkpoint_bytes=setup.checkpoint_bytes)
 
     run_loop(commands, updates, setup, opener, compile_kernels)
 

@@ -26,7 +26,7 @@ class Pause:
 
 @dataclass(frozen=True, slots=True)
 class StepFrame:
-    """Pause and process this many frames."""
+    """Pause and go this many frames on; back, if negative."""
 
     frames: int = 1
 
@@ -40,7 +40,10 @@ class SetSpeed:
 
 @dataclass(frozen=True, slots=True)
 class Seek:
-    """Go to a frame: run on to a later one; an earlier one starts again from the beginning."""
+    """Go to a frame, back or on. One that was processed before is shown as it was, but for ground labels.
+
+    Going on from there, the frames that follow are processed anew, with the present parameters.
+    """
 
     frame: int
 
@@ -190,7 +193,7 @@ class Snapshot:
         pending_restart: names of parameters that were changed and act on restart only.
         result: newest frame, already relabelled with the present ground parameters. Its `keyframe`
             is left out, since that is sent as a chunk.
-        chunks: append-only within a session.
+        chunks: within a session only appended, and taken away at the end when going back.
         keyframe_poses: (k, 4, 4) T_map_imu of each keyframe.
         trajectory: (n, 3) positions of the IMU in the map, every processed frame.
         series: (n,) arrays by SERIES name.

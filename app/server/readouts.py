@@ -1,5 +1,7 @@
 """The numbers the page plots for every frame, and the error to the truth while walking."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from app.server.delta import Rows
@@ -11,6 +13,16 @@ from app.slam.types import F64, StepResult
 
 LEAST_EXTENT_M = 0.5
 """Truth is aligned once the walk spans this much; before, any noise would fit."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadoutsState:
+    """What `Readouts.restore` needs beside the positions, which the readouts keep."""
+
+    walked: float
+    last: F64 | None
+    compared: int
+    T_map_truth: F64 | None
 
 
 class Readouts:
@@ -27,6 +39,15 @@ class Readouts:
         self._last: F64 | None = None
         self._theirs, self._ours = Rows(3), Rows(3)
         self.T_map_truth: F64 | None = None
+
+    def checkpoint(self) -> ReadoutsState:
+        return ReadoutsState(self._walked, self._last, len(self._ours), self.T_map_truth)
+
+    def restore(self, state: ReadoutsState) -> None:
+        """Go back to a checkpoint, or forth again to one whose frames were not replaced since."""
+        self._walked, self._last, self.T_map_truth = state.walked, state.last, state.T_map_truth
+        self._theirs.go_to(state.compared)
+        self._ours.go_to(state.compared)
 
     def row(self, result: StepResult) -> list[float]:
         """The readouts of one frame, in the order of SERIES. Call it once for every frame."""

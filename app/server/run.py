@@ -2,28 +2,43 @@
 
 import copy
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from app.sensors.recording import Recording, open_recording
+from app.sensors.recording import Place, Recording, open_recording
+from app.server.checkpoints import DEFAULT_BYTES, Checkpoints
 from app.server.protocol import OpenedRecording
-from app.server.readouts import Readouts
-from app.slam.engine import Engine
+from app.server.readouts import Readouts, ReadoutsState
+from app.slam.engine import Checkpoint, Engine
 from app.slam.keyframes import KeyframeStore
 from app.slam.params import Params
-from app.slam.results import RunInfo, RunLog, prepare_folder, save_results
+from app.slam.results import LogState, RunInfo, RunLog, prepare_folder, save_results
 from app.slam.trajectory import read_tum, truth_beside, write_tum
 from app.slam.types import DroppedScan, Keyframe, Measurement, StepResult
+
+
+@dataclass(frozen=True, slots=True)
+class RunState:
+    """A run after a frame, but for the rows that its parts keep."""
+
+    frame: int
+    engine: Checkpoint
+    place: Place
+    log: LogState
+    readouts: ReadoutsState
 
 
 class Run:
     """A recording being processed.
 
-    Reading a measurement and processing it are two steps, so that a frame can be waited for.
+    Reading a measurement and processing it are two steps, so that a frame can be waited for. A run
+    that went back knows how it went on before, up to frame `known`, until it goes on differently.
 
     Attributes:
         opened: what the page is told of the recording. finished: whether all of it was processed.
-        frame: index of the newest frame, -1 before the first. readouts, log: filled frame by frame.
+        frame: index of the newest frame, -1 before the first. known: of the last one that there is a way back to.
+        params: for frames not yet processed; set them with `choose`.
+        checkpoints: to go back to; filled by `remember`. readouts, log: filled frame by frame.
     """
 
     def __init__(
@@ -34,6 +49,7 @@ class Run:
         truth_path: Path | None = None,
         start_s: float = 0.0,
         duration_s: float | None = None,
+        checkpoint_bytes: int = DEFAULT_BYTES,
     ) -> None:
         truth = read_tum(truth_path) if truth_path else None
         rest = max(0.0, recording.duration_s - start_s)
@@ -49,7 +65,10 @@ class Run:
             truth=truth_path,
         )
         self.engine = engine
-        self.frame = -1
+        self.frame = self.known = -1
+        self.params = engine.params
+        self.checkpoints = Checkpoints(checkpoint_bytes)
+        self._params_from: list[tuple[int, Params]] = []  # journal: from which frame on which were in force
         self.readouts = Readouts(recording.start_ns, truth)
         self.log = RunLog()
         self._recording = recording
@@ -76,16 +95,74 @@ class Run:
             self._waiting = entry
         return self._waiting
 
-    def step(self) -> StepResult:
-        """Process the measurement last peeked at. It is used up even if the engine fails on it."""
+    def step(self, *, again: bool = False) -> StepResult:
+        """Process the measurement last peeked at. It is used up even if the engine fails on it.
+
+        Args:
+            again: with the parameters of then, for a frame that is known; else with the present ones.
+        """
         measurement, self._waiting = self._waiting, None
         assert measurement is not None
-        result = self.engine.step(measurement.scan, measurement.imu)
+        frame = self.frame + 1
+        if not again and self.params_of(frame) != self.params:
+            self.forget_after(self.frame)
+            self._params_from.append((frame, self.params))
+        self.engine.params = (self.params_of(frame) if again else None) or self.params
+        try:
+            result = self.engine.step(measurement.scan, measurement.imu)
+        finally:
+            self.engine.params = self.params
         if measurement.notices:
             result = replace(result, notices=(*measurement.notices, *result.notices))
-        self.frame += 1
+        self.frame = frame
+        self.known = max(self.known, frame)
         self.log.add(result)
         return result
+
+    # --- going back ------------------------------------------------------------------------------
+    def choose(self, params: Params) -> None:
+        """Take these parameters for all frames not yet processed."""
+        self.params = self.engine.params = params
+
+    def params_of(self, frame: int) -> Params | None:
+        """Those in force at a frame that is known; of a later one, those of the last."""
+        return next((params for first, params in reversed(self._params_from) if first <= frame), None)
+
+    def forget_after(self, frame: int) -> None:
+        """What comes after a frame will be another walk."""
+        self.known = min(self.known, frame)
+        self.checkpoints.forget_after(frame)
+        self._params_from = [entry for entry in self._params_from if entry[0] <= frame]
+
+    def remember(self, *, near: bool = False) -> None:
+        """Take a checkpoint, if one is wanted here. Call it between two steps, with nothing peeked at."""
+        if self._waiting is None and self.checkpoints.wanted(self.frame, near=near):
+            state = RunState(
+                frame=self.frame,
+                engine=self.engine.checkpoint(),
+                place=self._incoming.place(),
+                log=self.log.checkpoint(),
+                readouts=self.readouts.checkpoint(),
+            )
+            self.checkpoints.add(self.frame, state)
+
+    def go_before(self, frame: int) -> None:
+        """To the last checkpoint before a frame that is known.
+
+        Raises:
+            OSError: it can not be read; nothing has changed.
+        """
+        nearest = self.checkpoints.before(frame)
+        assert nearest is not None, "remember() was not called at the start"
+        state = self.checkpoints.get(nearest)
+        assert isinstance(state, RunState)
+        self.engine.restore(state.engine)
+        self.engine.params = self.params
+        self.log.restore(state.log)
+        self.readouts.restore(state.readouts)
+        self.frame = state.frame
+        self._incoming = self._recording.measurements(*self._part, after=state.place)
+        self._waiting, self.finished = None, False
 
     def saver(self, folder: Path, *, trajectory_only: bool) -> Callable[[], None]:
         """A function that writes the results of the frames so far; may be called in another thread.
@@ -114,6 +191,7 @@ class Run:
     def close(self) -> None:
         self._recording.close()
         self.engine.close()
+        self.checkpoints.close()
 
 
 class _Present:
@@ -135,9 +213,17 @@ def _save_trajectory(folder: Path, log: RunLog) -> None:
 
 
 def open_run(
-    path: Path, truth: Path | None, params: Params, start_s: float = 0.0, duration_s: float | None = None
+    path: Path,
+    truth: Path | None,
+    params: Params,
+    start_s: float = 0.0,
+    duration_s: float | None = None,
+    checkpoint_bytes: int = DEFAULT_BYTES,
 ) -> Run:
     """Open a recording and give it a new engine. Truth beside the recording is used if none is named.
+
+    Args:
+        checkpoint_bytes: memory for checkpoints, see `app.server.checkpoints`.
 
     Raises:
         HemislamError: the recording or the truth can not be used.
@@ -145,7 +231,14 @@ def open_run(
     recording = open_recording(path, params)
     try:
         truth_path = truth or truth_beside(path)
-        return Run(recording, Engine(params), truth_path=truth_path, start_s=start_s, duration_s=duration_s)
+        return Run(
+            recording,
+            Engine(params),
+            truth_path=truth_path,
+            start_s=start_s,
+            duration_s=duration_s,
+            checkpoint_bytes=checkpoint_bytes,
+        )
     except BaseException:
         recording.close()
         raise

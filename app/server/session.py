@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, assert_never
 
+from app.server.checkpoints import NEAR
 from app.server.delta import Outbox
 from app.server.pacing import Pacer
 from app.server.protocol import (
@@ -29,13 +30,13 @@ from app.server.run import Run
 from app.server.saver import Saver
 from app.slam.errors import HemislamError
 from app.slam.params import Params, leaves
-from app.slam.types import DroppedScan
+from app.slam.types import DroppedScan, StepResult
 
 log = logging.getLogger(__name__)
 
 SLOWEST = 0.1
 LONG_SEEK = 20
-"""Frames; a longer way to a frame is a seek with progress, a shorter one a few steps."""
+"""Frames to process on the way to a frame, from which on progress is shown."""
 SAVE_POLL_S = 0.05
 
 _EFFECT = {leaf.path: leaf.effect for leaf in leaves()}
@@ -83,14 +84,19 @@ class Session:
         self._opening: Callable[[], None] | None = None
         self._after_opening: list[Command] = []
         self._relabelling = False
+        self._going_back = False  # to the checkpoint before the target, later than here perhaps
         self._target: int | None = None
         self._target_from = -1
+        self._stepping = False
+        self._again_to = -1  # up to this frame what is known is repeated, unseen until its end
+        self._unseen: StepResult | None = None
+        self._page_behind = False
 
     def open(self, path: Path, truth: Path | None, *, play: bool = False) -> None:
         """Open a recording with exactly the parameters given so far."""
 
         def opening() -> None:
-            self._take(self._open_run(path, truth, self._params), 0)
+            self._take(self._open_run(path, truth, self._params))
             self._page.show(playing=play)
 
         self._open_soon(path, opening)
@@ -132,7 +138,7 @@ class Session:
                 self._open_soon(path, lambda: self._open_other(path, truth))
             case Restart():
                 path = self._need_run().opened.path
-                self._open_soon(path, lambda: self._reopen(self._params, 0))
+                self._open_soon(path, self._reopen)
             case Save(folder, trajectory_only):
                 self._saver.start(folder, self._need_run().saver(folder, trajectory_only=trajectory_only))
             case _:
@@ -141,38 +147,53 @@ class Session:
     def _halt(self) -> None:
         """Stay at the present frame, also if one was being sought."""
         if self._target is not None:
-            self._target = None
+            self._target, self._going_back = None, False
             self._outbox.put(progress=None)
+        self._catch_up()
         self._page.show(playing=False, frames_per_second=0.0)
 
     def _step(self, frames: int) -> None:
         """Steps asked for while the last one is not done yet add up."""
-        at = self._need_run().frame
-        stepping = self._target is not None and self._target - at <= LONG_SEEK
-        start = self._target if stepping and self._target is not None else at
-        self._halt()
-        self._go_to(start + frames)
+        run = self._need_run()
+        if self._stepping and self._target is not None:
+            self._page.show(playing=False, frames_per_second=0.0)
+            start, again_to = self._target, self._again_to
+        else:
+            self._halt()
+            start = again_to = run.frame
+        frame = max(start + frames, 0)
+        self._go_to(frame, min(again_to, frame))
+        self._stepping = True
 
     def _seek(self, frame: int) -> None:
         run = self._need_run()
         frame = max(0, min(frame, run.opened.frames - 1))
-        if frame < run.frame:
-            self._open_soon(run.opened.path, lambda: self._reopen(run.engine.params, frame))
-        else:
-            self._go_to(frame)
+        self._go_to(frame, min(frame, run.known))
 
-    def _go_to(self, frame: int) -> None:
-        """Process frames as fast as possible up to this one, then go on as before."""
+    def _go_to(self, frame: int, again_to: int) -> None:
+        """Go to a frame as fast as possible, then go on as before.
+
+        Args:
+            again_to: frames up to this one are taken as they were; later ones are processed anew.
+        """
         run = self._need_run()
-        if run.frame < frame:
-            self._target, self._target_from = frame, run.frame
+        self._target, self._again_to, self._stepping = frame, again_to, False
+        nearest = run.checkpoints.before(again_to)
+        self._going_back = again_to < run.frame or (nearest is not None and run.frame < nearest)
+        self._target_from = run.frame
+        if not self._going_back and run.frame >= frame:
+            self._catch_up()
+            self._approach(run.frame, frame)
 
     def _set_params(self, params: Params) -> None:
         changed = self._params.changed(params)
         self._params = params
         if self._run is not None:
-            engine, waiting = self._run.engine, self._pending_restart()
-            engine.params = params.with_values({path: engine.params.value(path) for path in waiting})
+            run, waiting = self._run, self._pending_restart()
+            usable = params.with_values({path: run.params.value(path) for path in waiting})
+            if usable != run.params:
+                run.forget_after(run.frame if self._target is None else max(run.frame, self._again_to))
+                run.choose(usable)
             self._relabelling |= any(_EFFECT[path] == "now" for path in changed)
         self._page.params(params, self._pending_restart())
 
@@ -180,7 +201,7 @@ class Session:
         """Names of parameters that the engine still has another value of, since it can not change them."""
         if self._run is None:
             return ()
-        return tuple(path for path in self._run.engine.params.changed(self._params) if _EFFECT[path] == "restart")
+        return tuple(path for path in self._run.params.changed(self._params) if _EFFECT[path] == "restart")
 
     def _need_run(self) -> Run:
         if self._run is None:
@@ -203,9 +224,27 @@ class Session:
         if self._relabelling:
             self._relabel()
             return 0.0
+        if self._going_back and self._run is not None:
+            self._go_back(self._run)
+            return 0.0
         moving = self._page.transport.playing or self._target is not None
         wait = self._advance(self._run) if self._run is not None and moving else None
         return SAVE_POLL_S if wait is None and self._saver.busy else wait
+
+    def _go_back(self, run: Run) -> None:
+        """To the checkpoint, and on by a frame: there is something to show then, should that be the end of it."""
+        self._going_back = False
+        self._saver.wait()  # it may read keyframes that are about to be replaced
+        try:
+            run.go_before(self._again_to)
+        except Exception as error:
+            self._fail("The frames before can not be gone back to", error)
+            return
+        self._target_from = run.frame
+        self._page_behind, self._unseen = True, None
+        self._pacer.release()
+        while self._target is not None and self._page_behind and self._unseen is None:
+            self._advance(run)
 
     def _advance(self, run: Run) -> float | None:
         """Process the next frame if it is due."""
@@ -215,26 +254,49 @@ class Session:
             self._fail("The recording can not be read on from here", error)
             self._page.show(finished=True)
             return None
+        again = self._target is not None and run.frame < self._again_to
         if entry is None:
             self._halt()
             self._page.show(finished=True)
             return None
         if isinstance(entry, DroppedScan):
-            self._page.show(dropped=self._page.transport.dropped + 1, urgent=False)
+            if again:
+                return 0.0
+            self._page.show(dropped=run.log.dropped.total(), urgent=False)
             self._page.notice_once(f"A scan was left out: {entry.reason}.", entry.stamp_ns)
             return 0.0
         if self._target is None and (wait := self._pacer.wait(entry.scan.stamp_ns)) > 0:
             return wait
         try:
-            result = run.step()
+            result = run.step(again=again)
         except Exception as error:
+            if again:  # as it did then
+                return 0.0
             self._fail(f"The frame after frame {run.frame} could not be processed and is left out", error)
             return None
-        self._page.frame(run, result)
-        self._page.show(frame=run.frame, stamp_ns=result.stamp_ns, frames_per_second=self._pacer.tick(), urgent=False)
+        if again:
+            run.readouts.row(result)
+            self._page_behind, self._unseen = True, result
+            run.remember(near=self._again_to - run.frame <= NEAR)
+            if run.frame >= self._again_to:
+                self._catch_up()
+        else:
+            self._page.frame(run, result)
+            self._page.show(frames_per_second=self._pacer.tick(), urgent=False)
+            run.remember()
         if self._target is not None:
             self._approach(run.frame, self._target)
         return 0.0
+
+    def _catch_up(self) -> None:
+        """Show the frame that was gone to, if the page does not."""
+        if self._page_behind and self._run is not None:
+            run, result = self._run, self._unseen
+            self._page_behind, self._unseen = False, None
+            self._page.arrived(run, result)
+            then = run.params_of(run.frame)
+            changed = then.changed(run.params) if then is not None else {}
+            self._relabelling = any(_EFFECT[path] == "now" for path in changed)
 
     def _approach(self, frame: int, target: int) -> None:
         if frame >= target:
@@ -299,27 +361,29 @@ class Session:
         run = self._open_run(path, truth, params)
         self._base, self._params = base, params
         self._halt()
-        self._take(run, 0)
+        self._take(run)
 
-    def _reopen(self, params: Params, target: int) -> None:
+    def _reopen(self) -> None:
         opened = self._need_run().opened
-        self._take(self._open_run(opened.path, opened.truth, params), target)
+        self._take(self._open_run(opened.path, opened.truth, self._params))
 
-    def _take(self, run: Run, target: int) -> None:
-        """Let go of the present run and go to a frame of this one."""
+    def _take(self, run: Run) -> None:
+        """Let go of the present run and show the first frame of this one."""
         if self._run is not None:
             self._saver.wait()
             self._run.close()
         self._run = run
-        self._relabelling = False
+        self._relabelling = self._going_back = self._page_behind = False
+        self._unseen = None
+        run.remember()
         self._page.opened(run)
         self._page.params(self._params, self._pending_restart())
         self._pacer.release()
-        self._target = None
-        self._go_to(target)
+        self._go_to(0, -1)
 
     def close(self) -> None:
         """Finish the saves under way and close the recording."""
         self._saver.close()
+        self._page.close()
         if self._run is not None:
             self._run.close()

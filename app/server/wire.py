@@ -22,9 +22,12 @@ def widen(connection: Pipe) -> None:
         fcntl.fcntl(connection.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
 
-def send(connection: Pipe, value: object) -> None:
-    """Write a value. Blocks until the other side has taken all but a pipe's buffer of it."""
-    arrays: list[memoryview] = []
+Parts: TypeAlias = list[bytes | memoryview]  # a value: its pickle, then the large arrays beside it
+
+
+def pack(value: object) -> Parts:
+    """A value as bytes. Its large arrays are not copied: they must not change as long as the parts are in use."""
+    arrays: Parts = []
 
     def inline(buffer: pickle.PickleBuffer) -> bool:
         raw = buffer.raw()
@@ -33,7 +36,17 @@ def send(connection: Pipe, value: object) -> None:
             return False
         return True
 
-    body = pickle.dumps(value, protocol=5, buffer_callback=inline)
+    return [pickle.dumps(value, protocol=5, buffer_callback=inline), *arrays]
+
+
+def unpack(parts: Parts) -> Any:
+    """The value. Its large arrays are views of the parts."""
+    return pickle.loads(parts[0], buffers=parts[1:])
+
+
+def send(connection: Pipe, value: object) -> None:
+    """Write a value. Blocks until the other side has taken all but a pipe's buffer of it."""
+    body, *arrays = pack(value)
     connection.send_bytes(struct.pack("<I", len(arrays)) + body)
     for array in arrays:
         connection.send_bytes(array)

@@ -32,7 +32,7 @@ class Setup:
         start_s, duration_s: the part of that recording to process.
         resolve: parameters for recordings opened later; None keeps the present ones.
         play: begin at once. speed: to play at.
-        chunk_voxel: m, see `Session`.
+        chunk_voxel: m, see `Session`. checkpoint_bytes: see `app.server.checkpoints`.
         session, notices: how many there were before, for a process that takes over from another.
     """
 
@@ -45,6 +45,7 @@ class Setup:
     play: bool = False
     speed: float = 1.0
     chunk_voxel: float = 0.05
+    checkpoint_bytes: int = 1 << 30
     session: int = 0
     notices: int = 0
 

@@ -1,6 +1,7 @@
 """Keyframes: which frames are kept, and all of them on disk, so that memory does not grow.
 
-They are immutable and only ever appended, so a checkpoint needs no more than their number.
+They are immutable and only ever appended, so a checkpoint needs no more than their number. After
+going back the later ones stay until others are put in their place, so that one can go forth again.
 """
 
 import os
@@ -47,11 +48,12 @@ class KeyframeStore:
     """
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile(prefix="hemislam-keyframes-", buffering=0)  # noqa: SIM115 - closed by close()
-        self._ends = array("q")  # file offset after each keyframe
+        self._file = tempfile.TemporaryFile(prefix="hemislam-keyframes-")  # noqa: SIM115 - closed by close()
+        self._ends = array("q")  # file offset after each keyframe, also of those gone back over
+        self._count = 0
 
     def __len__(self) -> int:
-        return len(self._ends)
+        return self._count
 
     def __getitem__(self, index: int) -> Keyframe:
         if not 0 <= index < len(self):
@@ -82,14 +84,28 @@ class KeyframeStore:
         data = np.empty(len(cloud), dtype=_POINT)
         for name in _POINT.names or ():
             data[name] = getattr(cloud, name)
-        begin = self._ends[-1] if self._ends else 0
+        begin = self._ends[self._count - 1] if self._count else 0
+        end = begin + head.nbytes + data.nbytes
         self._file.seek(begin)
         self._file.write(head.tobytes() + data.tobytes())
-        self._ends.append(begin + head.nbytes + data.nbytes)
+        self._file.flush()
+        if self._count == len(self._ends) or self._ends[self._count] != end:  # else what follows is still whole
+            del self._ends[self._count :]
+            self._ends.append(end)
+        self._count += 1
 
     def truncate(self, count: int) -> None:
-        """Forget all but the first `count` keyframes."""
-        del self._ends[count:]
+        """Go back to the first `count` keyframes, or forth again to as many as there were.
+
+        What is appended after going back must be what was there, or going forth again beyond it
+        gives keyframes of two different walks.
+
+        Raises:
+            IndexError: there never were so many, or others have been put in their place since.
+        """
+        if not 0 <= count <= len(self._ends):
+            raise IndexError(f"{count} of {len(self._ends)} keyframes")
+        self._count = count
 
     def close(self) -> None:
         """Give the disk space back."""

@@ -4,6 +4,7 @@
 it, at the end or at any moment in between.
 """
 
+import copy
 import json
 import math
 import os
@@ -29,6 +30,8 @@ RESULT_FILES = ("trajectory.tum", "timings.csv", "map.ply", "report.json")
 TIMINGS = (*STAGES, "total")
 RPE_METRES = (1.0, 10.0, 50.0)
 MOST_NOTICES = 200
+_SUMS = ("statuses", "dropped", "notices", "points", "ground_points", "ground_score", "T_map_odom")
+"""Attributes of `RunLog` that are no rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +53,22 @@ class RunInfo:
     stopped: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class LogState:
+    """What `RunLog.restore` needs beside the rows, which the log keeps."""
+
+    frames: int
+    sums: dict[str, Any]
+
+
 class RunLog:
-    """One row a frame (about 150 bytes), and sums over all of them."""
+    """One row a frame (about 150 bytes), and sums over all of them.
+
+    After going back to a checkpoint the later rows stay until others are put in their place.
+    """
 
     def __init__(self) -> None:
+        self._frames = 0
         self._stamps = array("q")
         self._poses = array("d")
         self._timings = array("d")
@@ -66,15 +81,17 @@ class RunLog:
         self.T_map_odom: F64 = np.eye(4)
 
     def __len__(self) -> int:
-        return len(self._stamps)
+        return self._frames
 
     def add(self, result: StepResult) -> None:
         """Take in a processed frame."""
-        T_map_imu = result.T_map_imu
-        self._stamps.append(result.stamp_ns)
-        self._poses.extend(T_map_imu[:3, 3])
-        self._poses.extend(Rotation.from_matrix(T_map_imu[:3, :3]).as_quat())
-        self._timings.extend(result.timings_ms.get(stage, 0.0) for stage in TIMINGS)
+        T_map_imu, frame = result.T_map_imu, self._frames
+        pose = (*T_map_imu[:3, 3], *Rotation.from_matrix(T_map_imu[:3, :3]).as_quat())
+        timings = [result.timings_ms.get(stage, 0.0) for stage in TIMINGS]
+        self._stamps[frame : frame + 1] = array("q", [result.stamp_ns])
+        self._poses[7 * frame : 7 * (frame + 1)] = array("d", pose)
+        self._timings[len(TIMINGS) * frame : len(TIMINGS) * (frame + 1)] = array("d", timings)
+        self._frames += 1
         self.statuses[result.status] += 1
         self._count(result.notices)
         self.points += len(result.cloud)
@@ -88,6 +105,15 @@ class RunLog:
         """Take in a scan that was not processed."""
         self.dropped[scan.reason] += 1
 
+    def checkpoint(self) -> LogState:
+        return LogState(self._frames, {name: copy.copy(getattr(self, name)) for name in _SUMS})
+
+    def restore(self, state: LogState) -> None:
+        """Go back to a checkpoint of this log, or forth again to one whose rows were not replaced since."""
+        self._frames = state.frames
+        for name, value in state.sums.items():
+            setattr(self, name, copy.copy(value))
+
     def _count(self, notices: tuple[str, ...]) -> None:
         for notice in notices:
             if notice in self.notices or len(self.notices) < MOST_NOTICES:
@@ -96,17 +122,17 @@ class RunLog:
     @property
     def stamps_ns(self) -> I64:
         """(n,) scan ends of all processed frames."""
-        return np.array(self._stamps, dtype=np.int64)
+        return np.array(self._stamps[: self._frames], dtype=np.int64)
 
     @property
     def timings_ms(self) -> F64:
         """(n, len(TIMINGS)) milliseconds."""
-        return np.array(self._timings).reshape(-1, len(TIMINGS))
+        return np.array(self._timings).reshape(-1, len(TIMINGS))[: self._frames]
 
     @property
     def trajectory(self) -> Trajectory:
         """T_map_imu at every scan's end; while the filter waits at rest to start, the origin."""
-        rows = np.array(self._poses).reshape(-1, 7)
+        rows = np.array(self._poses).reshape(-1, 7)[: self._frames]
         return Trajectory(self.stamps_ns, rows[:, :3], rows[:, 3:])
 
 

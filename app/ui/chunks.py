@@ -33,6 +33,8 @@ class _Drawn:
     level: int
     handle: viser.PointCloudHandle | None
     """None while no point of it is shown."""
+    limits: dict[ColourBy, Limits]
+    """Ends of the colour maps with this keyframe and those before it."""
 
     @property
     def count(self) -> int:
@@ -94,18 +96,34 @@ class MapChunks:
         self._start_ns = start_ns
         self._limits = {ColourBy.TIME: Limits(0.0, max(duration_s, 1.0))}
 
+    def _take_back(self, chunks: tuple[Chunk, ...]) -> None:
+        """Take away the keyframes from the first on that is not among `chunks` any more."""
+        same = (drawn.chunk is chunk for drawn, chunk in zip(self._drawn, chunks, strict=False))
+        kept = next((index for index, is_same in enumerate(same) if not is_same), min(len(chunks), len(self._drawn)))
+        if kept == len(self._drawn):
+            return
+        for drawn in self._drawn[kept:]:
+            if drawn.handle is not None:
+                drawn.handle.remove()
+        del self._drawn[kept:]
+        self._poses = self._poses[:kept]
+        before = self._drawn[-1].limits if self._drawn else {}
+        self._limits = {ColourBy.TIME: self._limits[ColourBy.TIME], **before}
+
     def draw(self, chunks: tuple[Chunk, ...], poses: F64, sensor: F64, view: View) -> None:
-        """Add chunks that are new, move those whose pose changed, colour anew where needed.
+        """Add chunks that are new, take away those that are gone, move and colour anew where needed.
 
         Args:
             poses: (k, 4, 4) T_map_imu by keyframe index. sensor: (3,) m in the map.
         """
         before, seen = self._limits.get(view.colour_by), self._view
         self._view = view
-        new = chunks[len(self._drawn) :]
-        placed = [poses[chunk.index] @ chunk.T_imu_lidar for chunk in new]
-        for chunk, T in zip(new, placed, strict=True):
+        self._take_back(chunks)
+        new = []
+        for chunk in chunks[len(self._drawn) :]:
+            T = poses[chunk.index] @ chunk.T_imu_lidar
             self._widen(chunk, T)
+            new.append(_Drawn(chunk, T, np.empty(0, np.int64), 0, None, self._limits.copy()))
         recolour = view.colour_by is not seen.colour_by or self._limits.get(view.colour_by) != before
         restyle = (view.point_size, view.map) != (seen.point_size, seen.map)
         now = poses[[drawn.chunk.index for drawn in self._drawn]]
@@ -122,8 +140,7 @@ class MapChunks:
                     drawn.handle.point_size, drawn.handle.visible = view.point_size, view.map
                 if recolour or (has_moved and view.colour_by is ColourBy.HEIGHT):
                     drawn.handle.colors = self._colours(drawn)
-        for chunk, T in zip(new, placed, strict=True):
-            drawn = _Drawn(chunk, T, np.empty(0, np.int64), 0, None)
+        for drawn in new:
             self._drawn.append(drawn)
             self._send(drawn, self._show(drawn))
         self._poses = poses[[drawn.chunk.index for drawn in self._drawn]]

@@ -38,6 +38,8 @@ class Trajectory:
 
     def draw(self, positions: F64, visible: bool) -> None:
         """Draw (n, 3) positions, sending the blocks that differ from what is drawn."""
+        while len(self._blocks) > -(-max(len(positions) - 1, 0) // BLOCK):
+            self._blocks.pop().remove()
         for index, first in enumerate(range(0, len(positions) - 1, BLOCK)):
             part = positions[first : first + BLOCK + 1]
             if index == len(self._blocks):

@@ -22,9 +22,10 @@ SPEEDS: Final = {
     "10×": 10.0,
     "as fast as it can": math.inf,
 }
-_STEP, _RESTART = "step ▸", "from start ↺"
+_BACK, _STEP, _RESTART = "◂ back", "step ▸", "from start ↺"
+_FRAME_COMMANDS: Final[dict[str, Command]] = {_BACK: StepFrame(-1), _STEP: StepFrame(), _RESTART: Restart()}
 _DRAG_REST_S: Final = 0.2
-"""The slider seeks when the hand has rested for so long; seeking back starts from the beginning."""
+"""The slider seeks when the hand has rested for so long: some frames on the way may have to be processed."""
 _SEEK_HOLD_S: Final = 1.0
 
 
@@ -48,18 +49,19 @@ class TransportPanel:
         self._dragged: tuple[int, float] | None = None
         self._sought: tuple[int, float] | None = None
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY_FILLED, hint="space")
-        self._frames = gui.add_button_group("frame", (_STEP, _RESTART), hint="→ steps one frame.")
-        self._slider = gui.add_slider("time (frame)", 0, 1, 1, 0, hint="Drag to go to a frame.")
+        self._frames = gui.add_button_group("frame", (_BACK, _STEP, _RESTART), hint="← and → step one frame.")
+        self._slider = gui.add_slider("time (frame)", 0, 1, 1, 0, hint="Drag to go to a frame, back or on.")
         self._where = gui.add_html("")
         self._speed = gui.add_dropdown(
             "speed", tuple(SPEEDS), initial_value="1×", hint="Times real time; the engine never skips a frame."
         )
         self._play.on_click(lambda _: self.toggle())
-        self._frames.on_click(by_user(lambda chosen, _: send(StepFrame() if chosen == _STEP else Restart())))
+        self._frames.on_click(by_user(lambda chosen, _: send(_FRAME_COMMANDS[chosen])))
         self._speed.on_update(by_user(lambda chosen, _: send(SetSpeed(SPEEDS[chosen]))))
         self._slider.on_update(by_user(self._drag))
         gui.add_command("Play or pause", hotkey="space").on_trigger(lambda _: self.toggle())
         gui.add_command("Step one frame", hotkey="arrowright").on_trigger(lambda _: send(StepFrame()))
+        gui.add_command("Step one frame back", hotkey="arrowleft").on_trigger(lambda _: send(StepFrame(-1)))
 
     def toggle(self) -> None:
         """Play, or pause what plays; at the end, play from the beginning."""

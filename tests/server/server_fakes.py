@@ -54,9 +54,12 @@ class FakeRecording:
         self._broken_at, self._dropped_at = broken_at, dropped_at
 
     def measurements(
-        self, start_s: float = 0.0, duration_s: float | None = None
-    ) -> Iterator[Measurement | DroppedScan]:
-        for index in range(self.scan_count):
+        self, start_s: float = 0.0, duration_s: float | None = None, *, after: int = 0
+    ) -> "FakeMeasurements":
+        return FakeMeasurements(self._read(after), after)
+
+    def _read(self, first: int) -> Iterator[Measurement | DroppedScan]:
+        for index in range(first, self.scan_count):
             stamp = START_NS + index * FRAME_NS
             if index == self._broken_at:
                 raise HemislamError(f"{self.path} is damaged at frame {index}; repair it.")
@@ -70,6 +73,18 @@ class FakeRecording:
 
     def close(self) -> None:
         self.closed = True
+
+
+class FakeMeasurements(Iterator[Measurement | DroppedScan]):
+    def __init__(self, entries: Iterator[Measurement | DroppedScan], read: int) -> None:
+        self._entries, self._count = entries, read
+
+    def __next__(self) -> Measurement | DroppedScan:
+        self._count += 1
+        return next(self._entries)
+
+    def place(self) -> int:
+        return self._count
 
 
 class FakeStore(list[Keyframe]):
@@ -93,27 +108,34 @@ def labels(points: np.ndarray, params: Params) -> np.ndarray:
 
 
 class FakeEngine:
-    """Every 5th frame is a keyframe. With `fails_at`, that step raises."""
+    """Every 5th frame is a keyframe. With `fails_at`, that step raises.
+
+    Like a filter it has a memory: the speed it reports tells which parameters were in force at every
+    frame so far, and in which order.
+    """
 
     def __init__(self, params: Params, fails_at: int | None = None) -> None:
         self.params = params
         self.keyframes = FakeStore()
         self.steps_with: list[Params] = []
         self._fails_at = fails_at
+        self._index, self._memory = 0, 0.1
 
     def close(self) -> None:
         self.keyframes.close()
 
     def step(self, scan: Scan, imu: ImuSamples) -> StepResult:
-        index = len(self.steps_with)
+        index = self._index
         if index == self._fails_at:
             self._fails_at = None
             raise FloatingPointError("the covariance is not positive")
         self.steps_with.append(self.params)
+        self._index += 1
+        self._memory = 0.5 * self._memory + 0.05 * self.params.ground.sigma / Params().ground.sigma
         T = pose(index)
         state = NavState(
-            scan.end_ns, T[:3, :3], T[:3, 3], np.array([0.1, 0, 0]), *(np.zeros(3) for _ in range(3)), np.eye(3),
-            np.zeros(3),
+            scan.end_ns, T[:3, :3], T[:3, 3], np.array([self._memory, 0, 0]), *(np.zeros(3) for _ in range(3)),
+            np.eye(3), np.zeros(3),
         )  # fmt: skip
         cloud = Cloud(scan.points, labels(scan.points, self.params), scan.intensity, scan.ring, scan.offsets_ns)
         keyframe = None
@@ -141,6 +163,12 @@ class FakeEngine:
 
         cloud = replace(result.cloud, labels=labels(result.cloud.points, self.params))
         return replace(result, cloud=cloud, ground=self._ground(cloud))
+
+    def checkpoint(self) -> tuple[object, ...]:
+        return self._index, self._memory, self._fails_at, self.params, list(self.keyframes)
+
+    def restore(self, state: tuple[object, ...]) -> None:
+        self._index, self._memory, self._fails_at, self.params, self.keyframes[:] = state  # type: ignore[misc, assignment]
 
     def _ground(self, cloud: Cloud) -> GroundResult:
         share = float(np.mean(cloud.labels == GROUND))
