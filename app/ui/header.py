@@ -21,7 +21,8 @@ HELP: Final = (
     + heading("Keys")
     + box(
         f"{key('space')} play or pause<br>{key('←')} {key('→')} one frame back or on<br>"
-        f"{key('F')} follow the sensor or look freely<br>{key('C')} next colouring<br>{key('Ctrl')} {key('K')} all commands"
+        f"{key('F')} follow the sensor or look freely<br>{key('C')} next colouring<br>"
+        f"{key('Ctrl')} {key('K')} all commands"
     )
     + heading("Mouse")
     + box("left drag: orbit · right drag: move · wheel: zoom<br>W A S D Q E: fly")
