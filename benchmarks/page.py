@@ -26,7 +26,7 @@ CHROMIUM = (
 )  # fmt: skip
 ALPHA = 2  # number of the slider of α, after those of time and M
 TRIALS = 15
-WATCHED_MS = 1500
+WATCHED_MS = 2500
 
 # At every drawn image, how many pixels of the scene are as bright as points of the ground are.
 PROBE = """
