@@ -12,10 +12,10 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 INSTALL := $(PIP) install --require-hashes --only-binary :all:
 
 .DEFAULT_GOAL := help
-.PHONY: help run install test check bench lock clean
+.PHONY: help run install test check bench bench-peers lock clean
 
 help: ## List these targets.
-	@sed -n 's/^\([a-z]*\):.*## /make \1\t/p' Makefile | expand -t 16
+	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 20
 
 run: install ## Open the workbench on RECORDING; by default the one in sample_data/.
 	$(BIN)/hemislam serve $(RECORDING)
@@ -33,6 +33,12 @@ check: $(VENV)/.installed-dev ## Check format, lint, types and the direction of 
 
 bench: $(VENV)/.installed-dev ## Time the engine stage by stage and the page; adds to benchmarks/results.csv.
 	$(BIN)/python -m benchmarks
+
+bench-peers: $(VENV)/.installed-dev ## Time and error of other odometries from PyPI on the same recordings.
+	$(PIP) install --quiet --upgrade --only-binary :all: --target build/peers $(PEERS)
+	$(BIN)/python -m benchmarks.peers
+# In a folder of their own: some want other versions of what hemislam uses.
+PEERS := 'kiss-icp>=1.3' 'rko_lio>=0.4' 'pypatchworkpp>=1.4'
 
 lock: $(VENV)/.installed-dev ## Resolve the dependencies again and write the hashed requirements*.txt.
 	$(PIP) install --quiet uv
