@@ -3,10 +3,10 @@
 import os
 import sys
 
-from benchmarks import frame, page, replay
+from benchmarks import frame, page, replay, seek, walk
 from benchmarks.record import show
 
-BENCHMARKS = {"frame": frame.run, "replay": replay.run, "page": page.run}
+BENCHMARKS = {"frame": frame.run, "replay": replay.run, "seek": seek.run, "page": page.run, "walk": walk.run}
 
 
 def main() -> None:

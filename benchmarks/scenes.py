@@ -13,14 +13,23 @@ DURATION_S = 15.0
 
 def recording(scene: str) -> Path:
     """A 15 s walk through the scene, 57,632 firings a scan."""
-    path = FOLDER / f"{scene}.mcap"
+    return _simulated(f"{scene}.mcap", scene, DURATION_S, seed=1)
+
+
+def long_recording() -> Path:
+    """Ten minutes outdoors, with one azimuth of 24, so that the file stays small."""
+    return _simulated("long.mcap", "outdoor", 600.0, seed=5, every_block=24)
+
+
+def _simulated(name: str, scene: str, duration_s: float, *, seed: int, every_block: int = 1) -> Path:
+    path = FOLDER / name
     if not path.exists():
         FOLDER.mkdir(parents=True, exist_ok=True)
-        with tqdm(desc=f"Simulating {scene}", unit=" scans", leave=False, disable=None) as bar:
+        with tqdm(desc=f"Simulating {name}", unit=" scans", leave=False, disable=None) as bar:
 
             def progress(done: int, total: int) -> None:
                 bar.total = total
                 bar.update(done - bar.n)
 
-            simulate(scene, path, duration_s=DURATION_S, seed=1, progress=progress)
+            simulate(scene, path, duration_s=duration_s, seed=seed, every_block=every_block, progress=progress)
     return path

@@ -189,6 +189,9 @@ class FakeEngine:
                     self._player.start()
             case Pause():
                 self._transport(playing=False)
+            case StepFrame(frames) if frames < 0:
+                self._transport(playing=False)
+                self._go_back(max(snapshot.transport.frame + frames, 0))
             case StepFrame(frames):
                 self._transport(playing=False)
                 for _ in range(frames):
@@ -196,8 +199,7 @@ class FakeEngine:
             case SetSpeed(factor):
                 self._transport(speed=factor)
             case Seek(frame):
-                if frame < snapshot.transport.frame:
-                    self._open(Path("/data/hall_bpearl.mcap"))
+                self._go_back(frame)
                 while self._snapshot.transport.frame < frame:
                     self._step()
             case SetParams(values):
@@ -245,6 +247,24 @@ class FakeEngine:
             trajectory=None,
             series={},
             T_map_truth=None,
+        )
+
+    def _go_back(self, frame: int) -> None:
+        """What came later is taken away, what was before stays the same objects."""
+        snapshot = self._snapshot
+        if not 0 <= frame < snapshot.transport.frame:
+            return
+        assert snapshot.trajectory is not None and snapshot.keyframe_poses is not None
+        result, chunks = self.result(frame, snapshot.params), frame // 6 + 1
+        del self._rows[frame + 1 :]
+        self.publish(
+            transport=replace(snapshot.transport, frame=frame, stamp_ns=result.stamp_ns, finished=False),
+            result=result,
+            chunks=snapshot.chunks[:chunks],
+            keyframe_poses=snapshot.keyframe_poses[:chunks],
+            trajectory=snapshot.trajectory[: frame + 1],
+            series={name: column[: frame + 1] for name, column in snapshot.series.items()},
+            T_map_truth=snapshot.T_map_truth if frame > 10 else None,
         )
 
     def _play(self) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import viser
 
-from app.server.protocol import SetParams, Snapshot, StepFrame
+from app.server.protocol import Seek, SetParams, Snapshot, StepFrame
 from app.ui.colours import LABEL_COLOURS, ColourBy
 from app.ui.scene import Scene
 from app.ui.view import View
@@ -163,6 +163,49 @@ def test_sessions_that_come_and_go_leave_nothing_behind(drawn: Drawn, wire: Wire
         server._run_garbage_collector(force=True)
         kept.append(wire.kept)
     assert kept[0] == kept[-1]
+
+
+def shown(drawn: Drawn, server: viser.ViserServer) -> dict[str, object]:
+    path = {
+        name: handle.points.tobytes()
+        for name, handle in server.scene._handle_from_node_name.items()
+        if name.startswith("/map/trajectory/") and isinstance(handle, viser.LineSegmentsHandle)
+    }
+    map_points = {name: (node.points.tobytes(), node.colors.tobytes()) for name, node in chunk_nodes(server).items()}
+    return {"path": path, "map": map_points, "limits": {by: drawn.scene.limits(by) for by in ColourBy}}
+
+
+@pytest.mark.parametrize("by", [ColourBy.LABEL, ColourBy.HEIGHT])
+def test_going_back_shows_what_was_shown_then(server: viser.ViserServer, engine: FakeEngine, by: ColourBy) -> None:
+    drawn, then = Drawn(server, engine), {}
+    for frame in (12, 20, 300):
+        engine.send(Seek(frame))
+        drawn.draw(View(colour_by=by))
+        then[frame] = shown(drawn, server)
+    for frame in (20, 12):
+        engine.send(Seek(frame))
+        drawn.draw()
+        assert shown(drawn, server) == then[frame]
+
+
+def test_going_back_and_forth_leaves_nothing_behind(drawn: Drawn, wire: Wire, server: viser.ViserServer) -> None:
+    kept = []
+    for _ in range(4):
+        drawn.engine.send(Seek(40))
+        drawn.draw()
+        drawn.engine.send(Seek(3))
+        drawn.draw()
+        assert len(chunk_nodes(server)) == 1
+        server._run_garbage_collector(force=True)
+        kept.append(wire.kept)
+    assert kept[0] == kept[-1]
+
+
+def test_a_keyframe_that_another_walk_put_in_place_of_one_is_drawn(drawn: Drawn, server: viser.ViserServer) -> None:
+    first, *rest = drawn.engine.snapshot.chunks
+    other = replace(rest[0], points=rest[0].points + np.float32(1.0))
+    drawn.draw(View(ceilings=True), chunks=(first, other, *rest[1:]))
+    assert np.array_equal(chunk_nodes(server)["/map/keyframes/1"].points, other.points.astype(np.float16))
 
 
 def test_following_keeps_the_sensor_near_the_origin_and_leaves_the_camera_alone(drawn: Drawn, wire: Wire) -> None:

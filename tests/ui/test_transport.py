@@ -59,6 +59,22 @@ def test_the_slider_follows_the_frame_without_seeking(transport: Transporting) -
     assert transport.engine.sent == [StepFrame(7)]
 
 
+@pytest.mark.parametrize(("button", "command"), [("◂ back", StepFrame(-1)), ("step ▸", StepFrame())])
+def test_buttons_step_back_and_on(transport: Transporting, button: str, command: StepFrame) -> None:
+    user_sets(transport.panel._frames, button)
+    assert transport.engine.sent == [command]
+
+
+def test_dragging_back_seeks_to_the_earlier_frame(transport: Transporting) -> None:
+    transport.engine.send(StepFrame(30))
+    transport.tick()
+    user_sets(transport.panel._slider, 4)
+    transport.tick(0.3)
+    assert transport.engine.sent[1:] == [Seek(4)]
+    transport.tick()
+    assert transport.panel._slider.value == 4 == transport.engine.snapshot.transport.frame
+
+
 def test_dragging_seeks_once_to_where_the_hand_came_to_rest(transport: Transporting) -> None:
     transport.engine.send(StepFrame(3))
     transport.tick()

@@ -1,0 +1,91 @@
+"""Going to any frame of a ten-minute recording, and what being able to costs while it plays."""
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+from tqdm import tqdm
+
+from app.sensors.presets import resolve_params
+from app.server.protocol import Play, Seek, Snapshot, StepFrame
+from app.server.run import open_run
+from app.server.worker import EngineProcess, Setup
+from app.slam.types import Measurement
+from benchmarks.record import Line
+from benchmarks.scenes import long_recording
+
+SEEKS, STEPS = 60, 40
+SMALL_BUDGET = 128 << 20
+PATIENCE_S = 1200.0
+MIB = 1 << 20
+
+
+def run() -> list[Line]:
+    return [*_seeking(), *_cost()]
+
+
+def _seeking() -> list[Line]:
+    """From the command to the snapshot that shows the frame, through the engine's process."""
+    path = long_recording()
+    on = f"{path.stem}: outdoor, ten minutes"
+    engine = EngineProcess(Setup(recording=path, params=resolve_params(path, None, None, []), speed=math.inf))
+    rng = np.random.default_rng(0)
+    try:
+        _until(engine, lambda now: now.recording is not None and now.progress is None)
+        engine.send(Play())
+        _until(engine, lambda now: now.transport.finished)
+        last = engine.snapshot.transport.frame
+        seeks = [_timed(engine, Seek(frame), frame) for frame in rng.integers(0, last, SEEKS).tolist()]
+        steps = []
+        for frame in rng.integers(STEPS, last, 3).tolist():
+            _timed(engine, Seek(frame), frame)
+            steps += [_timed(engine, StepFrame(-1), frame - back) for back in range(1, STEPS + 1)]
+        return [
+            Line.of("seek to a random frame", on, "ms", seeks),
+            Line.of("step back one frame", on, "ms", steps),
+        ]
+    finally:
+        engine.close()
+
+
+def _timed(engine: EngineProcess, command: Seek | StepFrame, frame: int) -> float:
+    begin = time.perf_counter()
+    engine.send(command)
+    _until(engine, lambda now: now.transport.frame == frame and now.progress is None)
+    return (time.perf_counter() - begin) * 1e3
+
+
+def _until(engine: EngineProcess, holds: Callable[[Snapshot], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not holds(snapshot := engine.snapshot):
+        if not snapshot.engine_alive or time.monotonic() > deadline:
+            raise RuntimeError(f"it did not come about: {snapshot.transport} {snapshot.notices[-1:]}")
+        engine.wait(snapshot.revision, 1.0)
+
+
+def _cost() -> list[Line]:
+    """The share of the time that goes into checkpoints, and what they hold, with little room."""
+    path = long_recording()
+    work = open_run(path, None, resolve_params(path, None, None, []), checkpoint_bytes=SMALL_BUDGET)
+    steps, remembering, memory, disk = 0.0, 0.0, [], []
+    work.remember()
+    with tqdm(desc="Checkpoints", unit=" frames", leave=False, disable=None) as bar:
+        while (entry := work.peek()) is not None:
+            if isinstance(entry, Measurement):
+                begin = time.perf_counter()
+                work.step()
+                stepped = time.perf_counter()
+                work.remember()
+                remembering += time.perf_counter() - stepped
+                steps += stepped - begin
+                memory.append(work.checkpoints.memory / MIB)
+                disk.append(work.checkpoints.disk / MIB)
+                bar.update()
+    work.close()
+    on = f"checkpoints within {SMALL_BUDGET // MIB} MiB of memory"
+    return [
+        Line.of("share of the frame time", on, "%", [100 * remembering / steps]),
+        Line.of("in memory", on, "MiB", memory),
+        Line.of("on disk", on, "MiB", disk),
+    ]

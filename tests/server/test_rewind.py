@@ -1,0 +1,293 @@
+"""Going back and on again is as if one had never been elsewhere: to the last bit, in the engine and in the page."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import server_fakes as fakes
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_delta import content
+
+from app.sensors.presets import resolve_params
+from app.server.delta import Fold, Outbox
+from app.server.protocol import SERIES, Command, Pause, Play, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.run import Run, open_run
+from app.server.session import Session
+from app.slam.params import Params
+from app.slam.types import DroppedScan
+
+SAMPLE = next((Path(__file__).resolve().parents[2] / "sample_data").glob("*.mcap"))
+FRAMES = 60
+FREE = tuple(name for name in SERIES if name.endswith("_ms"))
+"""Readouts that no two runs share."""
+
+
+class Desk:
+    """A session that works whenever it is told something, and the page's view of it."""
+
+    def __init__(self, params: Params, opener: Callable[..., Run], path: Path) -> None:
+        self.outbox, self.fold = Outbox(params), Fold()
+        self.runs: list[Run] = []
+
+        def opening(path: Path, truth: Path | None, params: Params) -> Run:
+            self.runs.append(opener(path, truth, params))
+            return self.runs[-1]
+
+        self.session = Session(self.outbox, params, opening, clock=lambda: 0.0)
+        self.session.open(path, None)
+        self.settle()
+
+    @property
+    def run(self) -> Run:
+        return self.runs[-1]
+
+    def do(self, *commands: Command) -> Snapshot:
+        for command in commands:
+            self.session.handle(command)
+            self.settle()
+        return self.see()
+
+    def settle(self) -> None:
+        while self.session.work() == 0:
+            pass
+
+    def see(self) -> Snapshot:
+        if self.outbox.filled:
+            self.fold.apply(self.outbox.take())
+        return self.fold.snapshot
+
+
+def page(snapshot: Snapshot) -> dict[str, object]:
+    """What the page shows, without what depends on how one came here: what was told, and how long it took."""
+    seen = content(replace(snapshot, notices=(), transport=replace(snapshot.transport, finished=False)))
+    return seen | {"series": {name: column for name, column in seen["series"].items() if name not in FREE}}
+
+
+# --- with an engine that knows the answer --------------------------------------------------------
+SIGMAS = (0.02, 0.1, 0.2)
+SCRIPTS = st.lists(
+    st.one_of(
+        st.builds(Seek, st.integers(0, FRAMES + 5)),
+        st.builds(StepFrame, st.integers(-12, 12).filter(bool)),
+        st.sampled_from(SIGMAS).map(lambda sigma: SetParams({"ground.sigma": sigma})),
+    ),
+    min_size=1,
+    max_size=12,
+)
+
+
+class Expected:
+    """Where one is, and with which parameter each frame that is known was processed: nothing else matters."""
+
+    def __init__(self) -> None:
+        self.at, self.present = 0, Params().ground.sigma
+        self.used = [self.present]
+
+    def do(self, command: Command) -> None:
+        match command:
+            case SetParams(values):
+                if values["ground.sigma"] != self.present:
+                    del self.used[self.at + 1 :]
+                self.present = values["ground.sigma"]
+            case StepFrame(frames) if frames < 0:
+                self.at = max(self.at + frames, 0)
+            case StepFrame(frames):
+                self._on(self.at + frames)
+            case Seek(frame):
+                self.at = min(frame, len(self.used) - 1)
+                self._on(frame)
+
+    def _on(self, frame: int) -> None:
+        while self.at < min(frame, FRAMES - 1):
+            self.at += 1
+            if self.at < len(self.used) and self.used[self.at] != self.present:
+                del self.used[self.at :]
+            if self.at == len(self.used):
+                self.used.append(self.present)
+
+
+def straight_to(expected: Expected) -> Snapshot:
+    """The page of a run that went there without a detour."""
+    desk = Desk(Params(), fakes.open_fake, Path(f"walk-{FRAMES}.mcap"))
+    for sigma in expected.used[1 : expected.at + 1]:
+        desk.do(SetParams({"ground.sigma": sigma}), StepFrame())
+    return desk.do(SetParams({"ground.sigma": expected.present}))
+
+
+@settings(deadline=None, max_examples=40)
+@given(script=SCRIPTS)
+def test_the_page_is_that_of_a_run_that_went_straight_there(script: list[Command]) -> None:
+    desk, expected = Desk(Params(), fakes.open_fake, Path(f"walk-{FRAMES}.mcap")), Expected()
+    for command in script:
+        desk.do(command)
+        expected.do(command)
+    assert page(desk.see()) == page(straight_to(expected))
+    desk.session.close()
+
+
+def test_going_back_sends_nothing_that_the_page_has() -> None:
+    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    desk.do(Seek(50))
+    desk.session.handle(Seek(33))
+    desk.settle()
+    delta = desk.outbox.take()
+    assert delta.kept == (34, 7)
+    assert len(delta.positions) == 0 and delta.chunks == ()
+
+
+def test_frames_on_the_way_back_are_not_shown() -> None:
+    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    desk.do(Seek(50))
+    desk.session.handle(Seek(38))
+    seen = set()
+    for _ in range(30):
+        desk.session.work()
+        seen.add(desk.see().transport.frame)
+    assert seen == {50, 38}
+
+
+def test_a_pause_on_the_way_back_shows_the_frame_that_was_reached() -> None:
+    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    there = desk.do(Seek(50))
+    desk.session.handle(Seek(38))
+    for _ in range(3):
+        desk.session.work()
+    snapshot = desk.do(Pause())
+    at = snapshot.transport.frame
+    assert 20 < at < 38
+    assert snapshot.trajectory is not None and there.trajectory is not None and snapshot.result is not None
+    assert np.array_equal(snapshot.trajectory, there.trajectory[: at + 1]) and snapshot.result.index == at
+    assert desk.do(StepFrame()).transport.frame == at + 1
+
+
+def test_steps_back_that_come_faster_than_they_are_done_add_up() -> None:
+    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    desk.do(Seek(50))
+    for _ in range(7):
+        desk.session.handle(StepFrame(-1))
+    desk.session.work()
+    desk.session.handle(StepFrame())
+    desk.settle()
+    assert desk.see().transport.frame == 44
+
+
+def test_playing_on_after_going_back_overwrites_the_future() -> None:
+    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    before = desk.do(Seek(50))
+    desk.do(Seek(20), SetParams({"ground.sigma": 0.2}), SetSpeed(math.inf), Play())
+    after = desk.do(Seek(50))
+    assert np.array_equal(after.series["speed"][:21], before.series["speed"][:21])
+    assert np.all(after.series["speed"][21:51] > before.series["speed"][21:51])
+    used = [params.ground.sigma for params in desk.run.engine.steps_with]  # type: ignore[attr-defined]
+    assert used[-1] == 0.2
+
+
+def test_a_longer_way_shows_progress() -> None:
+    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    desk.do(Seek(50))
+    desk.run.checkpoints.forget_after(-1)
+    desk.session.handle(Seek(40))
+    fractions = []
+    while desk.session.work() == 0:
+        progress = desk.see().progress
+        fractions += [progress.fraction] if progress else []
+    assert len(fractions) > 30 and fractions == sorted(fractions) and fractions[-1] > 0.9
+    assert desk.see().progress is None and desk.see().transport.frame == 40
+
+
+def test_scans_dropped_and_frames_failed_before_are_so_again_and_not_told_again() -> None:
+    for name in ("dropped-60-20.mcap", "failing-60-20.mcap"):
+        desk = Desk(Params(), fakes.open_fake, Path(name))
+        desk.do(SetSpeed(math.inf), Play())
+        there = desk.do(Play() if name.startswith("failing") else Pause(), Seek(45))
+        notices = len(there.notices)
+        back = desk.do(Seek(15))
+        assert back.transport.dropped == 0 and len(back.notices) == notices
+        again = desk.do(Seek(45))
+        assert page(again) == page(there) and len(again.notices) == notices
+
+
+# --- with the real engine ------------------------------------------------------------------------
+LENGTH_S = 6.0
+CHANGES = {12: {"ground.sigma": 0.02}, 25: {"filter.max_iterations": 2}, 40: {"scan.voxel_size": 0.6}}
+
+
+def open_sample(path: Path, truth: Path | None, params: Params, /, *, megabytes: int = 1024) -> Run:
+    return open_run(path, truth, params, 0.0, LENGTH_S, checkpoint_bytes=megabytes << 20)
+
+
+@pytest.fixture(scope="module")
+def sample_params() -> Params:
+    return resolve_params(SAMPLE, None, None, [])
+
+
+@pytest.fixture(scope="module")
+def never_stopped(sample_params: Params) -> Snapshot:
+    desk = Desk(sample_params, open_sample, SAMPLE)
+    walk_on(desk, FRAMES)
+    desk.session.close()
+    return desk.see()
+
+
+def walk_on(desk: Desk, end: int) -> None:
+    """Frame by frame to the end, changing parameters on the way."""
+    while (at := desk.see().transport.frame) < end - 1:
+        desk.session.handle(SetParams(CHANGES.get(at, {})))
+        desk.do(StepFrame())
+        if desk.see().transport.finished:
+            break
+
+
+@pytest.mark.parametrize("megabytes", [1024, 4])
+def test_restored_and_continued_equals_never_stopped(
+    sample_params: Params, never_stopped: Snapshot, megabytes: int
+) -> None:
+    def opener(path: Path, truth: Path | None, params: Params, /) -> Run:
+        return open_sample(path, truth, params, megabytes=megabytes)
+
+    desk = Desk(sample_params, opener, SAMPLE)
+    walk_on(desk, FRAMES)
+    rng = np.random.default_rng(megabytes)
+    last = never_stopped.transport.frame
+    for frame in rng.integers(0, last, 8).tolist():
+        snapshot = desk.do(Seek(frame))
+        assert snapshot.trajectory is not None and never_stopped.trajectory is not None
+        assert snapshot.trajectory.tobytes() == never_stopped.trajectory[: frame + 1].tobytes()
+        assert desk.run.checkpoints.memory <= megabytes << 20
+    assert (desk.run.checkpoints.disk > 0) is (megabytes == 4)
+    # From an early frame on, all of it anew, with the parameters chosen anew:
+    first = {name: sample_params.value(name) for change in CHANGES.values() for name in change}
+    desk.do(Seek(5), SetParams(first))
+    walk_on(desk, FRAMES)
+    assert desk.run.engine.params == never_stopped.params
+    assert page(desk.see()) == page(never_stopped)
+    desk.session.close()
+
+
+def test_after_going_back_there_is_nothing_of_what_came_later(sample_params: Params) -> None:
+    desk = Desk(sample_params, open_sample, SAMPLE)
+    fresh = desk.do(Seek(17))
+    assert page(desk.do(Seek(45), Seek(17))) == page(fresh)
+    desk.session.close()
+
+
+def test_reading_is_taken_up_between_any_two_measurements_as_if_it_had_gone_on(sample_params: Params) -> None:
+    run = open_sample(SAMPLE, None, sample_params)
+    entries, places = run._recording.measurements(1.0, 3.0), []
+    read = []
+    for entry in entries:
+        read.append(entry)
+        places.append(entries.place())
+    for at in range(0, len(places), 3):
+        rest = list(run._recording.measurements(1.0, 3.0, after=places[at]))
+        assert len(rest) == len(read) - at - 1
+        for one, other in zip(rest, read[at + 1 :], strict=True):
+            assert not isinstance(one, DroppedScan) and not isinstance(other, DroppedScan)
+            assert one.scan.points.tobytes() == other.scan.points.tobytes()
+            assert one.imu.stamps_ns.tobytes() == other.imu.stamps_ns.tobytes()
+            assert one.imu.accel.tobytes() == other.imu.accel.tobytes() and one.notices == other.notices
+    run.close()
