@@ -35,7 +35,7 @@ bench: $(VENV)/.installed-dev ## Time the engine stage by stage and the page; ad
 	$(BIN)/python -m benchmarks
 
 bench-peers: $(VENV)/.installed-dev ## Time and error of other odometries from PyPI on the same recordings.
-	$(PIP) install --quiet --upgrade --only-binary :all: --target build/peers $(PEERS)
+	$(PIP) install --quiet --upgrade --no-warn-conflicts --only-binary :all: --target build/peers $(PEERS)
 	$(BIN)/python -m benchmarks.peers
 # In a folder of their own: some want other versions of what hemislam uses.
 PEERS := 'kiss-icp>=1.3' 'rko_lio>=0.4' 'pypatchworkpp>=1.4'
