@@ -16,6 +16,8 @@ from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import F64, U16
 
 RPE_OVER = ("1 frame", *(f"{metres:g} m" for metres in RPE_METRES))
+START_S = 5.0
+"""The start: standing and walking off. A slip there moves all later poses against the few of the start."""
 BUDGETS_MS = (50.0, 100.0)
 """A frame at 20 Hz and at 10 Hz."""
 
@@ -28,6 +30,7 @@ class Accuracy:
         ate_m, ate_deg, rpe[over]["m" | "deg"]: {"rmse", "mean", "max"}. distance_m: true length.
         times_s, errors_m: (n,) the position error of each pose after the alignment.
         aligned: (n, 3) the estimate in the truth's world. poses: compared.
+        later_m: RMSE of the positions after START_S, aligned without those before; None if there are too few.
     """
 
     ate_m: dict[str, float]
@@ -38,6 +41,7 @@ class Accuracy:
     times_s: F64
     errors_m: F64
     aligned: F64
+    later_m: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +182,16 @@ def _accuracy(estimate: Trajectory, matched: Matched) -> Accuracy:
         times_s=(ours.stamps_ns - estimate.stamps_ns[0]) * 1e-9,
         errors_m=np.linalg.norm(aligned - theirs.positions, axis=1),
         aligned=aligned,
+        later_m=_later(estimate, truth),
     )
+
+
+def _later(estimate: Trajectory, truth: Trajectory) -> float | None:
+    later = estimate.stamps_ns - estimate.stamps_ns[0] > START_S * 1e9
+    try:
+        return ate(estimate.chosen(later), truth).position.rmse
+    except HemislamError:
+        return None
 
 
 def as_json(column: Column) -> dict[str, Any]:
@@ -195,6 +208,7 @@ def as_json(column: Column) -> dict[str, Any]:
         else {
             "ate_m": accuracy.ate_m,
             "ate_deg": accuracy.ate_deg,
+            "ate_after_start_m": accuracy.later_m,
             "ate_ratio": accuracy.ate_m["rmse"] / accuracy.distance_m,
             "rpe": accuracy.rpe,
             "rpe_ratio": {

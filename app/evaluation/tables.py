@@ -10,7 +10,7 @@ import numpy as np
 
 from app.evaluation import paper
 from app.evaluation.job import GROUND_RANGES_M
-from app.evaluation.measured import RPE_OVER, Accuracy, Column, Evaluated
+from app.evaluation.measured import RPE_OVER, START_S, Accuracy, Column, Evaluated
 from app.slam.metrics import GroundScore
 from app.slam.results import TIMINGS
 
@@ -48,6 +48,7 @@ def accuracy(recordings: Sequence[Evaluated]) -> Table | None:
         ("ATE, RMSE (m)", lambda a: a.ate_m["rmse"], ".4f"),
         ("ATE, mean (m)", lambda a: a.ate_m["mean"], ".4f"),
         ("ATE, max (m)", lambda a: a.ate_m["max"], ".4f"),
+        (f"ATE, RMSE after {START_S:g} s (m)", lambda a: a.later_m, ".4f"),
         ("ATE, rotation RMSE (°)", lambda a: a.ate_deg["rmse"] if a.ate_deg else None, ".3f"),
         ("ATE ratio error", lambda a: a.ate_m["rmse"] / a.distance_m, ".2e"),
     ]
@@ -72,7 +73,8 @@ def accuracy(recordings: Sequence[Evaluated]) -> Table | None:
         tuple(rows),
         "As the paper's Table 2. ATE after one SE(3) alignment of positions (Umeyama, no scale), RPE of the motion"
         " between poses so far apart, both against the truth interpolated at our stamps; ratios are to the true path's"
-        " length. RMSE where not said otherwise. The smallest of a row is bold.",
+        f' length. RMSE where not said otherwise; "after {START_S:g} s" is aligned anew without the start, where a slip of'
+        " a centimetre moves all that follows. The smallest of a row is bold.",
     )
 
 

@@ -71,7 +71,18 @@ def check_against_evo(estimate: Trajectory, truth: Trajectory) -> None:
     assert accuracy.distance_m == pytest.approx(as_evo(truth).path_length, abs=EXACT)
 
 
-@settings(max_examples=8, deadline=None)
+def test_a_slip_at_the_start_is_told_from_the_errors_after_it() -> None:
+    truth = walks.wandering(walks.frames(), 1)
+    slipped = truth.positions + np.where(np.arange(len(truth)) < 30, 0.05, 0.0)[:, None] * [1.0, 0.0, 0.0]
+    estimate = Trajectory(truth.stamps_ns, slipped, truth.quaternions)
+    given_truth = Truth("The truth", "TUM", truth.stamps_ns, truth.positions, truth.quaternions)
+    (column,), _, _ = measure([Column("ours", trajectory=estimate)], given_truth)
+    assert column.accuracy is not None and column.accuracy.later_m is not None
+    assert column.accuracy.ate_m["rmse"] > 0.005
+    assert column.accuracy.later_m < 1e-9
+
+
+@settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_errors_equal_those_of_evo_on_random_walks(seed: int) -> None:
     truth = walks.wandering(walks.frames(), seed)
