@@ -73,8 +73,8 @@ def accuracy(recordings: Sequence[Evaluated]) -> Table | None:
         tuple(rows),
         "As the paper's Table 2. ATE after one SE(3) alignment of positions (Umeyama, no scale), RPE of the motion"
         " between poses so far apart, both against the truth interpolated at our stamps; ratios are to the true path's"
-        f' length. RMSE where not said otherwise; "after {START_S:g} s" is aligned anew without the start, where a slip of'
-        " a centimetre moves all that follows. The smallest of a row is bold.",
+        f' length. RMSE where not said otherwise; "after {START_S:g} s" is aligned anew without the start, where a slip'
+        " of a centimetre moves all that follows. The smallest of a row is bold.",
     )
 
 
