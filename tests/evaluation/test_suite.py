@@ -1,0 +1,72 @@
+"""The twins of the paper's sequences: as long as these, the same every time, and one without a loop."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from app.evaluation.paper import SEQUENCES
+from app.sensors.simulator.scenes import build_scene
+from app.sensors.simulator.simulate import walk_through
+from app.sensors.simulator.suite import PAPER, Twin, find_suite, fitting_speed, make_twin
+from app.sensors.simulator.trajectory import Walker
+from app.slam.errors import HemislamError
+from app.slam.trajectory import read_tum
+
+TWINS = {twin.scene: twin for twin in PAPER}
+
+
+def walked(twin: Twin, seed: int = 0) -> np.ndarray:
+    """True positions at 10 Hz of the whole walk."""
+    trajectory = walk_through(
+        build_scene(twin.scene, seed), twin.duration_s, seed, Walker(speed=fitting_speed(twin, seed))
+    )
+    return trajectory.poses(np.arange(0.05, twin.duration_s, 0.1))[0]
+
+
+def test_the_suite_is_table_1() -> None:
+    assert list(TWINS) == list(SEQUENCES)
+    for name, sequence in SEQUENCES.items():
+        twin = TWINS[name]
+        assert (twin.frames, twin.length_m) == (sequence.frames, sequence.length_m)
+        assert twin.duration_s == pytest.approx(sequence.duration_s, abs=0.1)
+    with pytest.raises(HemislamError, match="no suite `papre`; there is paper"):
+        find_suite("papre")
+
+
+@pytest.mark.parametrize(("name", "seed"), [("indoor_1", 0), ("indoor_2", 3), ("outdoor_1", 1)])
+def test_a_twin_is_as_long_as_its_sequence(name: str, seed: int) -> None:
+    path = walked(TWINS[name], seed)
+    length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+    assert length == pytest.approx(TWINS[name].length_m, rel=0.002)
+
+
+def came_back_within(path: np.ndarray, metres: float) -> bool:
+    """Whether a place is seen again after a minute; `path` is at 2 Hz."""
+    tree = KDTree(path[:, :2])
+    return any(abs(i - j) > 120 for i, j in tree.query_pairs(metres))
+
+
+def test_the_fourth_walk_outdoors_has_no_loop_and_the_first_has() -> None:
+    assert not came_back_within(walked(TWINS["outdoor_4"])[::5], 15.0)
+    assert came_back_within(walked(TWINS["outdoor_1"])[::5], 2.0)
+
+
+def test_a_twin_is_made_once_and_the_same_every_time(tmp_path: Path) -> None:
+    twin = Twin("indoor_2", 80, 3.0)
+    first, again = tmp_path / "first", tmp_path / "again"
+    first.mkdir()
+    again.mkdir()
+    made = make_twin(twin, first, every_block=30)
+    assert made.new
+    truth = read_tum(made.recording.with_name("indoor_2_truth.tum"))
+    assert len(truth) == 80
+    before = made.recording.stat().st_mtime_ns
+    assert not make_twin(twin, first, every_block=30).new
+    assert made.recording.stat().st_mtime_ns == before
+    assert make_twin(twin, again, every_block=30).recording.read_bytes() == made.recording.read_bytes()
+    other = make_twin(twin, again, seed=1, every_block=30)
+    assert other.recording.name == "indoor_2-seed1.mcap"
+    assert other.recording.read_bytes() != made.recording.read_bytes()
+    assert make_twin(twin, first, every_block=15).new  # other firings, another recording
