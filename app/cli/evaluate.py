@@ -82,7 +82,7 @@ def evaluate(
       hemislam evaluate walk.mcap --variant fine:scan.voxel_size=0.2 --compare FAST-LIO2=theirs.tum
       hemislam evaluate --suite paper --short --out results
     """
-    from app.cli.run import _compile
+    from app.cli.run import compile_behind_bar
     from app.cli.suite import make_suite
     from app.evaluation.evaluate import Plan, Subject
     from app.evaluation.evaluate import evaluate as run_evaluation
@@ -109,7 +109,7 @@ def evaluate(
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     runnable = sum(not variant.missing for variant in chosen) * len(subjects)
     parallel = max(1, min(jobs or cores, runnable))
-    _compile()
+    compile_behind_bar()
     findings, failures = run_evaluation(
         Plan(
             subjects=tuple(subjects),

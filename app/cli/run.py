@@ -75,7 +75,7 @@ def run(
         for finding in work.opened.findings:
             if finding.verdict != "fine":
                 typer.echo(f"{finding.verdict}: {finding.subject}: {finding.text} {finding.option}".rstrip())
-        _compile()
+        compile_behind_bar()
         stop = _process(work)
         if not len(work.log):
             with contextlib.suppress(OSError):
@@ -117,7 +117,7 @@ def _check_truth(path: Path, truth: "Trajectory", work: "Run") -> None:
         )
 
 
-def _compile() -> None:
+def compile_behind_bar() -> None:
     """Compile the kernels behind a progress bar; a moment only, once they are in the cache."""
     from tqdm import tqdm
 

@@ -117,6 +117,7 @@ def legend(entries: Sequence[tuple[str, str]]) -> str:
 def density_image(counts: U16, brightest: float) -> str:
     """Points per pixel as an image tag, dark to bright on a logarithmic scale up to `brightest`."""
     level = np.log1p(counts.astype(np.float64)) / np.log1p(max(brightest, 1.0))
+    level = np.where(counts > 0, 0.25 + 0.75 * level, 0.0)  # a single point is seen too
     pixels = np.rint(255 * level.clip(0, 1)).astype(np.uint8)
     ramp = np.linspace(0, 1, 256)[:, None]
     stops = np.array([[13, 17, 33], [46, 69, 140], [72, 166, 180], [190, 227, 150], [255, 255, 240]])
