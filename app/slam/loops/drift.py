@@ -1,0 +1,115 @@
+"""How far odometry may have drifted between two keyframes, and whether measured loops agree with it.
+
+The filter's covariance is of no use for this: it holds the map for known, so it stays at millimetres
+however long the walk. Drift grows with the way instead. Model: position drifts by a share of the
+way, heading by an angle per metre, both constant along the way (the worst case: nothing averages
+out), the two independent. Gravity holds roll and pitch. The way between two keyframes is the
+shortest one through the graph: accepted loops are short cuts, and what they tied together can not
+have drifted apart.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from app.slam import lie
+from app.slam.loops.types import LoopEdge, Pair
+from app.slam.types import F64
+
+POSITION_M, ROTATION = 0.05, np.radians(0.5)
+"""Standard deviations with no way at all: of registration and of submaps (m; rad about each axis)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Attributes:
+    translation: per distance walked. rotation: rad/m, of the heading. Standard deviations.
+    """
+
+    translation: float
+    rotation: float
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """What the graph expects of every keyframe as seen from one, the root.
+
+    Attributes:
+        root: index. poses: (k, 4, 4) T_map_imu. way: (k,) m, shortest through the graph.
+        lever: (k, 3) m^2, integral of the lever arm along the way: what a constant rate of heading
+            drift, rad/m, is multiplied by (crossed with z) to give the error of position.
+    """
+
+    root: int
+    poses: F64
+    way: F64
+    lever: F64
+    drift: Drift
+
+    def covariance(self, other: int) -> F64:
+        """(6, 6) of the root's pose as seen from `other`, rotation then translation, map axes."""
+        way = float(self.way[other])
+        heading = self.drift.rotation * way
+        sideways = self.drift.rotation * np.array([-self.lever[other, 1], self.lever[other, 0], 0.0])
+        out = np.zeros((6, 6))
+        out[:3, :3] = np.diag([0.0, 0.0, heading**2]) + ROTATION**2 * np.eye(3)
+        out[3:, 3:] = ((self.drift.translation * way) ** 2 + POSITION_M**2) * np.eye(3) + np.outer(sideways, sideways)
+        return out
+
+    def position_sigmas(self) -> F64:
+        """(k,) m, standard deviation of the root's position as seen from each, in its worst direction."""
+        sideways = self.drift.rotation * np.hypot(self.lever[:, 0], self.lever[:, 1])
+        return np.asarray(np.sqrt((self.drift.translation * self.way) ** 2 + sideways**2 + POSITION_M**2))
+
+    def mahalanobis(self, other: int, T_other_root: F64) -> float:
+        """Standard deviations between a measured (4, 4) pose of the root, seen from `other`, and the expected one."""
+        R = self.poses[other, :3, :3]
+        expected = lie.inverse(self.poses[other]) @ self.poses[self.root]
+        turned = R @ lie.log(T_other_root[:3, :3] @ expected[:3, :3].T)
+        moved = R @ (T_other_root[:3, 3] - expected[:3, 3])
+        error = np.concatenate([turned, moved])
+        return float(np.sqrt(error @ np.linalg.solve(self.covariance(other), error)))
+
+
+def expect(root: int, poses: F64, loops: Iterable[Pair], drift: Drift) -> Expectation:
+    """What the graph of poses (k, 4, 4) T_map_imu with these loops expects, seen from keyframe `root`."""
+    count = len(poses)
+    p = poses[:, :3, 3]
+    steps = np.linalg.norm(np.diff(p, axis=0), axis=1)
+    pairs = np.array(sorted(loops), dtype=np.int64).reshape(-1, 2)
+    first = np.concatenate([np.arange(count - 1), pairs[:, 0]])
+    second = np.concatenate([np.arange(1, count), pairs[:, 1]])
+    length = np.concatenate([steps, np.zeros(len(pairs))])
+    length = length + 1e-6  # scipy drops edges of length 0
+    graph = coo_array((length, (first, second)), shape=(count, count))  # type: ignore[no-untyped-call]  # no types
+    way, before = dijkstra(graph, directed=False, indices=root, return_predecessors=True)
+
+    # moments of each way, gathered towards the root by doubling: log2(k) vector operations
+    before = np.where(before < 0, root, before)
+    tied = before.copy()
+    stretch = way - way[before]
+    moment = stretch[:, None] * (p + p[before]) / 2
+    moment[root] = 0.0
+    while (tied != root).any():
+        moment = moment + moment[tied]
+        tied = tied[tied]
+    lever = way[:, None] * p[root] - moment
+    return Expectation(root, poses, np.asarray(way), lever, drift)
+
+
+def agree(a: LoopEdge, b: LoopEdge, poses: F64, way: float, drift: Drift) -> bool:
+    """Whether two loops tell the same story: round from older to older by both is no way at all.
+
+    Args:
+        poses: (k, 4, 4) by odometry, which is exact enough between ends that are near each other.
+        way: m, walked between the older ends and between the newer ends together.
+    """
+    older = lie.inverse(poses[a.older]) @ poses[b.older]
+    newer = lie.inverse(poses[a.newer]) @ poses[b.newer]
+    around = lie.inverse(older @ b.T_older_newer) @ a.T_older_newer @ newer
+    far = 2 * POSITION_M + 3 * drift.translation * way
+    turned = 2 * ROTATION + 3 * drift.rotation * way
+    return bool(np.linalg.norm(around[:3, 3]) < far and np.linalg.norm(lie.log(around[:3, :3])) < turned)

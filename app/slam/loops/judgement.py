@@ -1,0 +1,107 @@
+"""What speaks for and against one candidate, and the verdict on it alone. No two candidates meet here."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from app.slam import lie
+from app.slam.loops.detection import Detector, Sighting
+from app.slam.loops.drift import Expectation
+from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
+from app.slam.loops.verification import Fit
+from app.slam.params import Loops
+from app.slam.types import F64
+
+FLOOR_M, FLOOR_RAD = 0.015, np.radians(0.15)
+"""Standard deviations that no number of points brings a registration below."""
+POINT_M, INDEPENDENT = 0.05, 0.05
+"""Standard deviation of a point's distance to a plane with all that is not noise, and the share of
+points whose errors are independent of their neighbours'."""
+
+
+def judge(sighting: Sighting, detector: Detector, expectation: Expectation, params: Loops) -> LoopEdge:
+    """Register a sighting and hold it against the limits: a candidate if it meets them all, else rejected."""
+    older, newer = sighting.older, sighting.newer
+    guess = detector.guess(older, newer, expectation.poses)
+    sigma = float(expectation.position_sigmas()[older])
+    evidence = Evidence(sighting.distance, sighting.yaw, gate_m=sigma)
+    now = len(detector) - 1
+
+    def edge(T_older_newer: F64, covariance: F64, evidence: Evidence, reason: str) -> LoopEdge:
+        verdict = Verdict.REJECTED if reason else Verdict.CANDIDATE
+        return LoopEdge(older, newer, now, T_older_newer, covariance, verdict, reason, evidence)
+
+    if sighting.distance > params.context_distance:
+        reason = (
+            f"the places look different: context distance {sighting.distance:.2f} (most {params.context_distance:g})"
+        )
+        return edge(_imu(detector, older, newer, guess), np.eye(6), evidence, reason)
+
+    fit = detector.register(older, newer, guess)
+    T = _imu(detector, older, newer, fit.T_target_source)
+    evidence = replace(
+        evidence,
+        overlap=fit.overlap,
+        residual_rms=fit.residual_rms,
+        condition=fit.condition,
+        mahalanobis=expectation.mahalanobis(older, T),
+    )
+    reason = _objection(evidence, fit, params)
+    if not reason:
+        evidence = replace(evidence, slide=detector.slide(older, newer, fit))
+        reason = _objection(evidence, fit, params)
+    return edge(T, covariance(detector, newer, fit), evidence, reason)
+
+
+def by_hand(older: int, newer: int, detector: Detector, T_older_newer: F64, *, register: bool) -> LoopEdge:
+    """A loop that the user proposes, registered from the given (4, 4) or taken as it is."""
+    guess = detector.T_level_imu(older) @ T_older_newer @ lie.inverse(detector.T_level_imu(newer))
+    fit = detector.register(older, newer, guess) if register else detector.assess(older, newer, guess)
+    evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
+    reason = f"added by hand: overlap {fit.overlap:.2f}, residual {fit.residual_rms * 1e3:.0f} mm"
+    T = _imu(detector, older, newer, fit.T_target_source) if register else T_older_newer
+    return LoopEdge(
+        *(older, newer, newer, T, covariance(detector, newer, fit), Verdict.ACCEPTED, reason, evidence),
+        origin=Origin.USER,
+        overruled=True,
+    )
+
+
+def covariance(detector: Detector, newer: int, fit: Fit) -> F64:
+    """(6, 6) of a registration, rotation then translation, in the newer's IMU frame."""
+    information = fit.information * (INDEPENDENT / POINT_M**2)
+    level = np.linalg.pinv(information) + np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
+    R = (fit.T_target_source @ detector.T_level_imu(newer))[:3, :3]
+    turn = np.kron(np.eye(2), R.T)
+    out = turn @ level @ turn.T
+    return np.asarray((out + out.T) / 2)
+
+
+def summary(e: Evidence) -> str:
+    """The numbers of a registered candidate in words."""
+    return (
+        f"overlap {e.overlap:.2f}, residual {e.residual_rms * 1e3:.0f} mm, slide {e.slide * 1e3:.0f} mm, "
+        f"{e.mahalanobis:.1f} σ from odometry"
+    )
+
+
+def _objection(e: Evidence, fit: Fit, p: Loops) -> str:
+    """The first limit that is not met, in words and numbers; "" if all are."""
+    if len(fit.residuals) < 100:
+        return f"only {len(fit.residuals)} points correspond (least 100)"
+    if e.overlap < p.min_overlap:
+        return f"the submaps overlap by {e.overlap:.2f} (least {p.min_overlap:g})"
+    if e.residual_rms > p.max_residual:
+        return f"the residual is {e.residual_rms:.3f} m (most {p.max_residual:g} m)"
+    if e.mahalanobis > p.max_mahalanobis:
+        return (
+            f"odometry rules it out: {e.mahalanobis:.1f} σ (most {p.max_mahalanobis:g} σ, one being {e.gate_m:.2f} m)"
+        )
+    if e.slide > p.max_slide:
+        return f"it slides: pushed along its weakest direction it ends {e.slide:.2f} m off (most {p.max_slide:g} m)"
+    return ""
+
+
+def _imu(detector: Detector, older: int, newer: int, T_level: F64) -> F64:
+    """T_older_newer of the IMU frames from that of the level frames."""
+    return np.asarray(lie.inverse(detector.T_level_imu(older)) @ T_level @ detector.T_level_imu(newer))

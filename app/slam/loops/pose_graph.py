@@ -1,0 +1,286 @@
+"""The factor graph of keyframe poses (paper 2.4, eq. 8). The only place where gtsam is used.
+
+Everything that is done to the graph is kept in a list of our own. Taking a factor out, and getting
+over an exception (after which gtsam's solver stays broken), is doing the rest of the list again:
+the poses are a function of the list alone, to the last bit.
+
+A pose is T_map_imu of a keyframe; its error is a right perturbation, rotation then translation.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from app.slam.types import F64
+
+HUBER = 1.345
+"""Whitened error from which a loop pulls with constant force (95 % efficient for a Gaussian)."""
+SILENT = 1.0
+"""Whitened error up to which a loop does not pull: it says no more than that odometry is right, and
+odometry over a room is better than registration."""
+RELINEARISE = 0.05
+"""Change of a pose (rad, m) from which its factors are linearised again."""
+MOST_UPDATES = 5
+"""After a loop the update is repeated while the newest pose moves more than that, at most so often."""
+_HELD = 1e-6
+"""Standard deviation (rad, m) with which the first pose is held."""
+
+
+@dataclass(frozen=True, slots=True)
+class Factor:
+    """A measured T_first_second (4, 4) with its covariance (6, 6), first < second.
+
+    Attributes:
+        robust: whether a large error pulls less than its square, as a loop's should.
+    """
+
+    first: int
+    second: int
+    T_first_second: F64
+    covariance: F64
+    robust: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One change of the graph: the next pose (or none) and loops between poses that are there."""
+
+    odometry: Factor | None
+    loops: tuple[Factor, ...] = ()
+
+
+class PoseGraph:
+    """Poses tied by factors, solved incrementally (iSAM2; Kaess et al. 2012).
+
+    Args:
+        first: (4, 4), the first pose, which is held. window: how many of the newest poses are
+            solved for; older ones are marginalised and stay as they are. 0: all.
+    """
+
+    def __init__(self, first: F64, window: int = 0) -> None:
+        self._first, self._window = np.array(first, dtype=np.float64), window
+        self._reset()
+
+    def __len__(self) -> int:
+        return self._solver.count
+
+    @property
+    def poses(self) -> F64:
+        """(n, 4, 4)."""
+        return self._solver.poses()
+
+    @property
+    def newest(self) -> F64:
+        """(4, 4) the last pose."""
+        return self._solver.newest
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        return tuple(self._steps)
+
+    def extend(self, odometry: Factor, loops: Iterable[Factor] = ()) -> tuple[Factor, ...]:
+        """Add the next pose by its odometry factor, and loops that end at poses there are.
+
+        Returns:
+            The factors that the solver failed with. The loops among them are not in the graph; in
+            place of the odometry there is one that says little.
+        """
+        return self._do(Step(odometry, tuple(loops)))
+
+    def close(self, loops: Sequence[Factor]) -> tuple[Factor, ...]:
+        """Add loops. Returns those that the solver failed with; they are not in the graph."""
+        return self._do(Step(None, tuple(loops))) if loops else ()
+
+    def replay(self, steps: Iterable[Step]) -> tuple[Factor, ...]:
+        """Be what these steps make of the first pose. Returns the factors that the solver failed with."""
+        self._reset()
+        return tuple(failed for step in steps for failed in self._do(step))
+
+    def _reset(self) -> None:
+        self._steps: list[Step] = []
+        self._solver: _All | _Window = _Window(self._first, self._window) if self._window else _All(self._first)
+
+    def _do(self, step: Step) -> tuple[Factor, ...]:
+        try:
+            self._try(step)
+            self._steps.append(step)
+            return ()
+        except (RuntimeError, ValueError, IndexError, ArithmeticError):  # gtsam's exceptions, and our own below
+            self.replay(self._steps)
+        if step.odometry is not None and step.loops:
+            return self._do(Step(step.odometry)) + self.close(step.loops)
+        if step.odometry is not None:
+            sound = np.isfinite(step.odometry.T_first_second).all()
+            T = step.odometry.T_first_second if sound else np.eye(4)
+            self._do(Step(replace(step.odometry, T_first_second=T, covariance=np.eye(6))))
+            return (step.odometry,)
+        if len(step.loops) == 1:
+            return step.loops
+        return tuple(failed for loop in step.loops for failed in self.close([loop]))
+
+    def _try(self, step: Step) -> None:
+        self._solver.update(step)
+        if not np.isfinite(self._solver.newest).all():
+            raise ArithmeticError("a pose is not finite")
+
+
+def optimise(first: F64, factors: Sequence[Factor], start: Sequence[F64] | F64) -> F64:
+    """(n, 4, 4) the optimum of all factors at once, by Levenberg-Marquardt from (n, 4, 4) `start`.
+
+    Raises:
+        ArithmeticError: the solver failed.
+    """
+    graph, values = _start(first)
+    for factor in factors:
+        graph.add(_between(factor))
+    for key in range(1, len(start)):
+        values.insert(key, gtsam.Pose3(start[key]))
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-12)
+    params.setAbsoluteErrorTol(1e-12)
+    try:
+        return _matrices(gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize())
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise ArithmeticError(str(error)) from error
+
+
+def whitened(factor: Factor, poses: Sequence[F64] | F64) -> tuple[F64, float]:
+    """A factor's error (6,), rotation (rad) then translation (m), and its length in standard deviations."""
+    between = gtsam.Pose3(poses[factor.first]).between(gtsam.Pose3(poses[factor.second]))
+    error = np.asarray(gtsam.Pose3(factor.T_first_second).localCoordinates(between))
+    return error, float(np.sqrt(error @ np.linalg.solve(factor.covariance, error)))
+
+
+def write_g2o(path: Path, poses: F64, factors: Sequence[Factor]) -> None:
+    """A g2o text file of poses and factors. Raises OSError if it can not be written."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for factor in factors:
+        graph.add(_between(replace(factor, robust=False)))  # g2o has no word for a robust loss
+    for key, pose in enumerate(poses):
+        values.insert(key, gtsam.Pose3(pose))
+    path.write_text("", encoding="utf-8")  # gtsam says nothing where it can not write
+    gtsam.writeG2o(graph, values, str(path))
+
+
+class _All:
+    """Every pose is solved for.
+
+    Attributes:
+        count: of poses. newest: (4, 4), the last of them.
+    """
+
+    def __init__(self, first: F64) -> None:
+        self.count, self.newest = 1, first
+        self._isam = gtsam.ISAM2(_params())
+        self._isam.update(*_start(first))
+
+    def update(self, step: Step) -> None:
+        graph, values, self.newest = _additions(step, self.newest)
+        self.count += step.odometry is not None
+        for loop in step.loops:
+            graph.add(_between(loop))
+        self._isam.update(graph, values)
+        if step.loops:  # odometry alone moves nothing before it
+            self.newest = _settled(self._isam, self._isam.update, self.count - 1, self.newest)
+
+    def poses(self) -> F64:
+        return _matrices(self._isam.calculateEstimate())
+
+
+class _Window:
+    """Only the newest poses are solved for; the rest is marginalised (the paper's fixed number of nodes)."""
+
+    def __init__(self, first: F64, size: int) -> None:
+        self.count, self.newest = 1, first
+        self._size = size
+        self._left: list[F64] = []  # the poses that are no longer solved for
+        self._smoother = gtsam.IncrementalFixedLagSmoother(float(size - 1), _params())
+        self._smoother.update(*_start(first), {0: 0.0})
+
+    def update(self, step: Step) -> None:
+        graph, values, self.newest = _additions(step, self.newest)
+        stamps: dict[Any, Any] = {}
+        if step.odometry is not None:
+            stamps[self.count] = float(self.count)
+            if self.count - len(self._left) == self._size:
+                self._left.append(_estimate(self._smoother, len(self._left)))
+            self.count += 1
+        for loop in step.loops:
+            if loop.first >= len(self._left):
+                graph.add(_between(loop))
+            elif loop.second >= len(self._left):  # the older pose stays where it was left
+                where = gtsam.Pose3(self._left[loop.first] @ loop.T_first_second)
+                graph.add(gtsam.PriorFactorPose3(loop.second, where, _noise(loop)))
+        self._smoother.update(graph, values, stamps)
+        if step.loops:
+            self.newest = _settled(self._smoother, self._smoother.update, self.count - 1, self.newest)
+
+    def poses(self) -> F64:
+        return np.array(self._left + [_estimate(self._smoother, key) for key in range(len(self._left), self.count)])
+
+
+def _settled(solver: Any, update: Callable[[], object], newest: int, before: F64) -> F64:
+    """The newest pose, after updates as long as they move it so far that it has to be linearised again."""
+    for _ in range(MOST_UPDATES):
+        after = _estimate(solver, newest)
+        if not np.abs(after - before).max() > RELINEARISE:
+            return after
+        before = after
+        update()
+    return _estimate(solver, newest)
+
+
+def _estimate(solver: Any, key: int) -> F64:
+    return np.asarray(solver.calculateEstimatePose3(key).matrix())
+
+
+def _start(first: F64) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(first), gtsam.noiseModel.Isotropic.Sigma(6, _HELD)))
+    values.insert(0, gtsam.Pose3(first))
+    return graph, values
+
+
+def _additions(step: Step, newest: F64) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, F64]:
+    """The odometry factor of a step, where its pose begins, and the newest pose as it is then, before loops."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    if step.odometry is not None:
+        newest = newest @ step.odometry.T_first_second
+        values.insert(step.odometry.second, gtsam.Pose3(newest))
+        graph.add(_between(step.odometry))
+    return graph, values, newest
+
+
+def _params() -> gtsam.ISAM2Params:
+    params = gtsam.ISAM2Params()
+    params.setRelinearizeThreshold(RELINEARISE)
+    params.relinearizeSkip = 1
+    exact = gtsam.ISAM2GaussNewtonParams()
+    exact.setWildfireThreshold(0.0)  # otherwise looking at the estimate would change the next one
+    params.setOptimizationParams(exact)
+    return params
+
+
+def _noise(factor: Factor) -> gtsam.noiseModel.Base:
+    noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
+    if not factor.robust:
+        return noise
+    silent = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.L2WithDeadZone.Create(SILENT), noise)
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER), silent)
+
+
+def _between(factor: Factor) -> gtsam.BetweenFactorPose3:
+    return gtsam.BetweenFactorPose3(factor.first, factor.second, gtsam.Pose3(factor.T_first_second), _noise(factor))
+
+
+def _matrices(values: Any) -> F64:
+    """(n, 4, 4) poses in the order of their keys."""
+    flat = np.asarray(gtsam.utilities.extractPose3(values))
+    out = np.tile(np.eye(4), (len(flat), 1, 1))
+    out[:, :3, :3] = flat[:, :9].reshape(-1, 3, 3)
+    out[:, :3, 3] = flat[:, 9:]
+    return out

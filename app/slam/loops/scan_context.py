@@ -1,0 +1,76 @@
+"""Scan Context (Kim and Kim, IROS 2018): a place as rings times sectors around it.
+
+Differences from the paper, for a scanner that sees a hemisphere and walks indoors too:
+- A cell holds how many height bins are occupied, not the greatest height: under a ceiling the
+  greatest height is the same everywhere, while walls and furniture still stand out.
+- Cells that were never seen are masked: they count for neither side of the distance.
+- Columns count from odom's x axis, not from the walker's heading: walking back the other way gives
+  the same columns, and the best shift is the heading that odometry has lost. All shifts are
+  compared at once, by circular correlation.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from app.slam.types import F32, F64
+
+RINGS, SECTORS = 20, 60
+RADIUS = 20.0
+"""m that the rings reach."""
+HEIGHTS = (-2.0, 6.0, 0.4)
+"""Height bins relative to the IMU: from, to, step, m."""
+_BINS = round((HEIGHTS[1] - HEIGHTS[0]) / HEIGHTS[2])
+SECTOR = 2 * np.pi / SECTORS
+YAWS: F64 = (np.arange(SECTORS, dtype=np.float64) * SECTOR + np.pi) % (2 * np.pi) - np.pi
+"""(SECTORS,) rad: R_a_b about z that a shift of b's columns stands for."""
+LEAST_COMMON = 0.4
+"""At a shift, at least this share of the smaller context's seen cells must be seen in both."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanContext:
+    """Attributes:
+    cells: (RINGS, SECTORS) float32, share of occupied height bins, square root; 0 where unseen.
+    seen: (RINGS, SECTORS) bool. ring_key: (RINGS,) float32, mean of each ring's seen cells, the
+        same however the place is turned.
+    """
+
+    cells: F32
+    seen: npt.NDArray[np.bool_]
+    ring_key: F32
+
+
+def describe(points: F32) -> ScanContext:
+    """The context of a submap's points (n, 3), level frame."""
+    radius = np.hypot(points[:, 0], points[:, 1])
+    height = np.floor((points[:, 2] - HEIGHTS[0]) / HEIGHTS[2]).astype(np.int64)
+    inside = (radius < RADIUS) & (height >= 0) & (height < _BINS)
+    x, y = points[inside, 0], points[inside, 1]
+    ring = np.minimum((radius[inside] * (RINGS / RADIUS)).astype(np.int64), RINGS - 1)
+    sector = np.floor(np.arctan2(y, x) * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS
+    occupied = np.zeros((RINGS, SECTORS, _BINS), dtype=np.bool_)
+    occupied[ring, sector, height[inside]] = True
+    filled = occupied.sum(axis=2)
+    # a sector was looked through as far as its farthest return; behind that nothing is known
+    seen = np.cumsum(filled[::-1], axis=0)[::-1] > 0
+    cells = np.sqrt(filled / _BINS).astype(np.float32)
+    key = cells.sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    return ScanContext(cells, seen, key.astype(np.float32))
+
+
+def shift_distances(a: ScanContext, b: ScanContext) -> F64:
+    """(SECTORS,) distance of b, its columns shifted by s, to a: 1 - cosine over the cells seen in both."""
+    fa, fb = np.fft.rfft(a.cells, axis=1), np.fft.rfft(b.cells, axis=1)
+    fa2, fb2 = np.fft.rfft(a.cells**2, axis=1), np.fft.rfft(b.cells**2, axis=1)
+    ma, mb = np.fft.rfft(a.seen, axis=1), np.fft.rfft(b.seen, axis=1)
+
+    def correlate(left: npt.NDArray[np.complex128], right: npt.NDArray[np.complex128]) -> F64:
+        return np.asarray(np.fft.irfft((left * right.conj()).sum(axis=0), SECTORS))
+
+    norms = np.sqrt(np.maximum(correlate(fa2, mb), 0.0) * np.maximum(correlate(ma, fb2), 0.0))
+    common = correlate(ma, mb) / max(min(int(a.seen.sum()), int(b.seen.sum())), 1)
+    usable = (common >= LEAST_COMMON) & (norms > 1e-9)
+    cosine = correlate(fa, fb) / np.where(usable, norms, 1.0)
+    return np.where(usable, np.clip(1.0 - cosine, 0.0, 1.0), 1.0)

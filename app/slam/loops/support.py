@@ -1,0 +1,60 @@
+"""Candidates side by side: which agree, which contradict each other, and which are accepted for it.
+
+One registration can be fooled by a place that looks the same; several, at different keyframes,
+that tell the same story are fooled more rarely. Where two stories are told, neither is believed.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from app.slam.loops.drift import Drift, agree
+from app.slam.loops.judgement import summary
+from app.slam.loops.types import LoopEdge, Verdict
+from app.slam.params import Loops
+from app.slam.types import F64
+
+NEIGHBOURHOOD_M = 15.0
+"""Loops with farther to walk between their ends, on either side, say nothing of each other."""
+
+
+def settle(
+    seen: list[LoopEdge], edges: Iterable[LoopEdge], poses: F64, drift: Drift, params: Loops, now: int
+) -> list[LoopEdge]:
+    """Verdicts on the candidates seen just now, and on those before that they bear on.
+
+    Args:
+        seen: judged each by itself. edges: all before. poses: (k, 4, 4) T_odom_imu. now: newest keyframe.
+
+    Returns:
+        All of `seen`, and those of `edges` whose verdict changed.
+    """
+    kept = {edge.pair for edge in edges}
+    fresh = [edge for edge in seen if edge.pair not in kept]
+    if not any(edge.verdict is Verdict.CANDIDATE for edge in fresh):
+        return fresh
+    walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+
+    def ways(a: LoopEdge, b: LoopEdge) -> tuple[float, float]:
+        return abs(float(walked[a.older] - walked[b.older])), abs(float(walked[a.newer] - walked[b.newer]))
+
+    alive = [edge for edge in [*edges, *fresh] if edge.verdict is not Verdict.REJECTED]
+    near = [edge for edge in alive if any(max(ways(edge, other)) < NEIGHBOURHOOD_M for other in fresh)]
+    out = {edge.pair: edge for edge in fresh}
+    for edge in near:
+        if edge.verdict is not Verdict.CANDIDATE or edge.overruled:
+            continue
+        others = [o for o in near if o.pair != edge.pair and max(ways(edge, o)) < NEIGHBOURHOOD_M]
+        verdicts = [agree(edge, other, poses, sum(ways(edge, other)), drift) for other in others]
+        support = len({other.newer for other, yes in zip(others, verdicts, strict=True) if yes} - {edge.newer})
+        against = verdicts.count(False)
+        evidence = replace(edge.evidence, support=support)
+        if support >= params.support and support > 2 * against:
+            reason = f"{summary(evidence)}; {support} others agree"
+            out[edge.pair] = replace(edge, verdict=Verdict.ACCEPTED, reason=reason, evidence=evidence, decided_at=now)
+        elif edge.pair in out:
+            waits = f"{summary(evidence)}; {support} of {params.support} others agree"
+            contradicted = f", {against} contradict it" if against else ""
+            out[edge.pair] = replace(edge, reason=waits + contradicted, evidence=evidence)
+    return list(out.values())

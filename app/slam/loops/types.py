@@ -1,0 +1,186 @@
+"""Values of the loop back end: candidates with their verdicts, and the user's commands over them.
+
+A loop is named by the two keyframes it ties together, `(older, newer)`: the name stays the same
+whatever else is found, so that a list of overrulings can be replayed.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from app.slam.types import F32, F64
+
+Pair = tuple[int, int]
+"""(older, newer) keyframe."""
+
+
+class Verdict(StrEnum):
+    ACCEPTED = "accepted"
+    REJECTED = "rejected"
+    CANDIDATE = "candidate"
+    """Fits, but waits for others that agree with it. It is no factor of the graph."""
+
+
+class Origin(StrEnum):
+    DETECTED = "detected"
+    USER = "user"
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What speaks for and against one candidate. nan: not looked at.
+
+    Attributes:
+        context_distance: of the two Scan Contexts at the best column shift, 0 (same) to 1.
+        context_yaw: rad, heading of the newer in the older's level frame by that shift.
+        overlap: share of points near both keyframes that have a partner in the other submap, 0-1.
+        residual_rms: m, point to plane, of those.
+        condition: smallest eigenvalue of the registration's translation information over its
+            largest, 0-1; near 0 the two submaps slide along each other.
+        slide: m, how far registrations from disturbed starts ended from one another.
+        rival: overlap of the best other alignment that odometry also allows; 0: there is none.
+        mahalanobis: distance to what odometry predicts, in standard deviations.
+        gate_m: m, standard deviation of that prediction's position.
+        support: other candidates nearby that agree.
+    """
+
+    context_distance: float = float("nan")
+    context_yaw: float = float("nan")
+    overlap: float = float("nan")
+    residual_rms: float = float("nan")
+    condition: float = float("nan")
+    slide: float = float("nan")
+    rival: float = float("nan")
+    mahalanobis: float = float("nan")
+    gate_m: float = float("nan")
+    support: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LoopEdge:
+    """One candidate loop, whatever became of it.
+
+    Attributes:
+        older, newer: the keyframes. decided_at: newest keyframe when it got its verdict; from then on
+            an accepted loop takes effect.
+        T_older_newer: (4, 4), IMU frames. covariance: (6, 6), rotation then translation, in the
+            newer's IMU frame (right perturbation).
+        verdict, reason: and why, in words and numbers.
+        origin: who proposed it. overruled: whether the verdict is the user's.
+        weight: the covariance is divided by it in the graph.
+        evidence: the numbers.
+    """
+
+    older: int
+    newer: int
+    decided_at: int
+    T_older_newer: F64
+    covariance: F64
+    verdict: Verdict
+    reason: str
+    evidence: Evidence
+    origin: Origin = Origin.DETECTED
+    overruled: bool = False
+    weight: float = 1.0
+
+    @property
+    def pair(self) -> Pair:
+        return self.older, self.newer
+
+
+# --- the user's commands -------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class Accept:
+    """Make a candidate a factor of the graph, whatever was found against it."""
+
+    older: int
+    newer: int
+
+
+@dataclass(frozen=True, slots=True)
+class Reject:
+    """Take a loop out of the graph."""
+
+    older: int
+    newer: int
+
+
+@dataclass(frozen=True, slots=True)
+class SetWeight:
+    """Divide a loop's covariance by `weight` (> 0); 1 is what registration said."""
+
+    older: int
+    newer: int
+    weight: float
+
+
+@dataclass(frozen=True, slots=True)
+class Add:
+    """Tie two keyframes together by hand.
+
+    Attributes:
+        guess: (4, 4) T_older_newer of the IMU frames from which their submaps are registered;
+            None: where the graph has them now. As rows of numbers, so that commands compare.
+        register: False takes the guess as it is.
+    """
+
+    older: int
+    newer: int
+    guess: tuple[tuple[float, ...], ...] | None = None
+    register: bool = True
+
+
+Command = Accept | Reject | SetWeight | Add
+
+
+# --- what the inspector and the files show -------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class FactorResidual:
+    """How far one factor of the graph is from being met.
+
+    Attributes:
+        pair: keyframes. loop: or odometry. rotation: deg. translation: m.
+        sigmas: length of the whitened error, in standard deviations.
+    """
+
+    pair: Pair
+    loop: bool
+    rotation: float
+    translation: float
+    sigmas: float
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """What the graph would become: (k, 4, 4) T_map_imu of all keyframes, and every factor's residual."""
+
+    poses: F64
+    residuals: tuple[FactorResidual, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LoopDetail:
+    """All that the inspector shows of one candidate. Points are level frames: z up, origin at the IMU.
+
+    Attributes:
+        older, newer: (n, 3) submap points, each in its own level frame.
+        T_guess: (4, 4) older's level frame from newer's, by the graph. T_registered: by the edge.
+        older_context, newer_context: (rings, sectors), nan where never seen.
+        shift_distances: (sectors,) distance over column shifts.
+        residuals: (k,) m, point-to-plane, of the newer's points that have a partner.
+    """
+
+    older: F32
+    newer: F32
+    T_guess: F64
+    T_registered: F64
+    older_context: F32
+    newer_context: F32
+    shift_distances: F64
+    residuals: F64
+
+
+def rows(T: F64) -> tuple[tuple[float, ...], ...]:
+    """A matrix as a command holds it."""
+    return tuple(tuple(float(value) for value in row) for row in np.asarray(T))

@@ -1,0 +1,178 @@
+"""Verification: register one submap to another and measure what speaks for the result.
+
+Point to plane, between points whose surroundings are flat in both submaps and face the same way:
+the two sides of a wall or of a door's recess, which a walker sees one each on the way there and on
+the way back, lie nearer to each other than many a wrong guess. small_gicp finds the neighbours, on
+one thread, so that the result is the same every time.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import small_gicp
+
+from app.slam import lie
+from app.slam.kernels import patches
+from app.slam.loops.submap import Submap
+from app.slam.types import F64, I64
+
+Flags = npt.NDArray[np.bool_]
+
+NEIGHBOURS = 10
+"""Points of a patch, to estimate its normal."""
+FLAT_M = 0.04
+"""A patch is flat if its points spread less than this along the normal (standard deviation)."""
+FACING = 0.7
+"""Least cosine between the normals of corresponding points."""
+PASSES = ((1.2, 0.3, 8), (0.5, 0.08, 12))
+"""Reach of correspondences, m; residual from which they count less, m; most iterations."""
+ENOUGH = 2e-4
+"""Change (rad, m) that ends a pass."""
+MOST_POINTS = 2500
+"""Points of the source that take part; all are judged."""
+PARTNER_M = 0.3
+"""A point with another within this distance in the other submap has a partner."""
+COMMON_M = 10.0
+"""Overlap is judged on points this near to both keyframes: there both submaps are dense."""
+DISTURBANCE_M = 0.4
+"""How far the test for sliding pushes the result along its weakest direction."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A submap ready to be registered.
+
+    Attributes:
+        points: (n, 3). normals: (n, 3) unit, towards where the point was seen from.
+        flat: (n,) bool. tree: over the points. chosen: indices of flat points that take part as source.
+    """
+
+    submap: Submap
+    points: F64
+    normals: F64
+    flat: Flags
+    tree: small_gicp.KdTree
+    chosen: I64
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How well a source submap lies on a target.
+
+    Attributes:
+        T_target_source: (4, 4), level frames. overlap: 0-1. residuals: (k,) m, point to plane.
+        information: (6, 6) of the pose per residual variance, rotation then translation, errors
+            about the source's origin in the target's axes.
+    """
+
+    T_target_source: F64
+    overlap: float
+    residuals: F64
+    information: F64
+
+    @property
+    def residual_rms(self) -> float:
+        return float(np.sqrt(np.mean(self.residuals**2))) if len(self.residuals) else float("nan")
+
+    @property
+    def condition(self) -> float:
+        """Smallest over largest eigenvalue of the translation's information, rotation left free; 0-1."""
+        values = np.linalg.eigvalsh(self._translation())
+        return float(max(values[0], 0.0) / values[-1]) if values[-1] > 0 else 0.0
+
+    @property
+    def weakest(self) -> F64:
+        """(3,) unit direction of translation, target's axes, that the points say least about."""
+        return np.asarray(np.linalg.eigh(self._translation())[1][:, 0])
+
+    def _translation(self) -> F64:
+        H = self.information
+        return np.asarray(H[3:, 3:] - H[3:, :3] @ np.linalg.pinv(H[:3, :3]) @ H[:3, 3:])
+
+
+def prepare(submap: Submap) -> Prepared:
+    points = submap.points.astype(np.float64)
+    tree = small_gicp.KdTree(points, num_threads=1)
+    index, _ = tree.batch_knn_search(points, NEIGHBOURS, num_threads=1)
+    normals, flat = np.empty_like(points), np.empty(len(points), np.bool_)
+    patches.planes(points, np.asarray(index, np.int64), submap.eyes, FLAT_M, normals, flat)
+    candidates = np.flatnonzero(flat)
+    step = max(1, -(-len(candidates) // MOST_POINTS))
+    return Prepared(submap, points, normals, flat, tree, candidates[::step])
+
+
+def register(target: Prepared, source: Prepared, T_guess: F64, *, coarse: bool = True) -> F64:
+    """(4, 4) T_target_source of the level frames, by Gauss-Newton with Cauchy weights from a guess."""
+    T = T_guess.copy()
+    for reach, scale, iterations in PASSES if coarse else PASSES[1:]:
+        for _ in range(iterations):
+            moved, partner, residual = _correspond(target, source, source.chosen, T, reach)
+            if len(moved) < 6:
+                return T
+            weight = 1.0 / (1.0 + (residual / scale) ** 2)
+            J = _jacobian(moved, target.normals[partner], T)
+            H = (J * weight[:, None]).T @ J
+            step = -np.linalg.lstsq(H + 1e-6 * np.trace(H) * np.eye(6), J.T @ (weight * residual), rcond=None)[0]
+            T[:3, :3] = lie.exp(step[:3]) @ T[:3, :3]
+            T[:3, 3] += step[3:]
+            if np.abs(step).max() < ENOUGH:
+                break
+    return T
+
+
+def assess(target: Prepared, source: Prepared, T: F64) -> Fit:
+    """Overlap, residuals and information of a source laid on a target at T (4, 4)."""
+    back = lie.inverse(T)
+    overlap = min(_overlap(target, source, T), _overlap(source, target, back))
+    near = np.flatnonzero(_near(source.points @ T[:3, :3].T + T[:3, 3], T[:3, 3]) & source.flat)
+    moved, partner, residuals = _correspond(target, source, near, T, PARTNER_M)
+    J = _jacobian(moved, target.normals[partner], T)
+    return Fit(T, overlap, residuals, J.T @ J)
+
+
+def slide(target: Prepared, source: Prepared, fit: Fit) -> float:
+    """m that registrations pushed off along the weakest direction, both ways, end from the result.
+
+    Between features that hold, both come back; along a plain corridor they stay where they were put.
+    """
+    ends = []
+    for sign in (-1.0, 1.0):
+        pushed = fit.T_target_source.copy()
+        pushed[:3, 3] += sign * DISTURBANCE_M * fit.weakest
+        ends.append(register(target, source, pushed, coarse=False)[:3, 3])
+    return float(max(np.linalg.norm(end - fit.T_target_source[:3, 3]) for end in ends))
+
+
+def _correspond(target: Prepared, source: Prepared, chosen: I64, T: F64, reach: float) -> tuple[F64, I64, F64]:
+    """Of the chosen source points those with a counterpart: moved (k, 3), its index (k,), residual (k,) m."""
+    moved = source.points[chosen] @ T[:3, :3].T + T[:3, 3]
+    partner, squared = _nearest(target, moved)
+    normals = source.normals[chosen] @ T[:3, :3].T
+    facing = np.einsum("ni,ni->n", normals, target.normals[partner]) > FACING
+    good = np.flatnonzero((squared < reach**2) & target.flat[partner] & facing)
+    moved, partner = moved[good], partner[good]
+    return moved, partner, np.einsum("ni,ni->n", moved - target.points[partner], target.normals[partner])
+
+
+def _jacobian(moved: F64, normals: F64, T: F64) -> F64:
+    """(k, 6) of the residuals by a rotation about the source's origin and a translation, target's axes."""
+    return np.hstack([np.cross(moved - T[:3, 3], normals), normals])
+
+
+def _overlap(target: Prepared, source: Prepared, T: F64) -> float:
+    moved = source.points @ T[:3, :3].T + T[:3, 3]
+    near = moved[_near(moved, T[:3, 3])]
+    return float((_nearest(target, near)[1] < PARTNER_M**2).mean()) if len(near) else 0.0
+
+
+def _near(points: F64, origin: F64) -> Flags:
+    """Which points (n, 3), target frame, lie near both the target's origin and `origin`."""
+    to_target = np.einsum("ni,ni->n", points, points)
+    to_source = np.einsum("ni,ni->n", points - origin, points - origin)
+    return np.asarray(np.maximum(to_target, to_source) < COMMON_M**2)
+
+
+def _nearest(target: Prepared, points: F64) -> tuple[I64, F64]:
+    index, squared = target.tree.batch_nearest_neighbor_search(points, num_threads=1)
+    return np.asarray(index, np.int64), np.asarray(squared, np.float64)
