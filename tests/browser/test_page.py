@@ -116,6 +116,22 @@ def test_the_arrow_key_steps_a_frame_and_leaves_the_camera_alone(bench: Bench) -
     assert np.allclose(client.camera.position, before, atol=1e-3)
 
 
+def test_the_left_arrow_goes_a_frame_back_and_leaves_the_camera_alone(bench: Bench) -> None:
+    (client,) = bench.server.get_clients().values()
+    before, frame = client.camera.position, bench.engine.snapshot.transport.frame
+    bench.page.keyboard.press("ArrowRight", delay=120)
+    bench.page.keyboard.press("ArrowRight", delay=120)
+    bench.page.keyboard.press("ArrowLeft", delay=120)
+    bench.eventually(lambda: bench.engine.sent == [StepFrame(), StepFrame(), StepFrame(-1)])
+    bench.eventually(lambda: bench.engine.snapshot.transport.frame == frame + 1)
+    expect(bench.page.get_by_text(f"frame {frame + 1} of 400")).to_be_visible()
+    bench.page.get_by_role("button", name="◂ back").click()
+    expect(bench.page.get_by_text(f"frame {frame} of 400")).to_be_visible()
+    bench.page.wait_for_timeout(300)
+    assert np.allclose(client.camera.position, before, atol=1e-3)
+    bench.page.evaluate("document.activeElement.blur()")
+
+
 def test_space_plays_and_pauses(bench: Bench) -> None:
     bench.page.keyboard.press("Space")
     bench.eventually(lambda: bench.engine.snapshot.transport.playing)
@@ -158,6 +174,9 @@ def test_dragging_the_time_slider_seeks(bench: Bench) -> None:
     for _ in range(4):
         bench.page.keyboard.press("ArrowRight")
     bench.eventually(lambda: bench.engine.snapshot.transport.frame == frame + 4)
+    for _ in range(3):
+        bench.page.keyboard.press("ArrowLeft")
+    bench.eventually(lambda: bench.engine.snapshot.transport.frame == frame + 1)
     assert all(isinstance(command, Seek) for command in bench.engine.sent)
     bench.page.evaluate("document.activeElement.blur()")
 

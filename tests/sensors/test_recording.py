@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from app.sensors.presets import resolve_params
-from app.sensors.recording import find_recordings, open_recording
+from app.sensors.recording import Measurements, Place, find_recordings, open_recording
+from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.provenance import hash_input
 from app.slam.types import DroppedScan, Measurement
@@ -46,6 +47,47 @@ def test_every_container_gives_the_same_measurements(tmp_path: Path, container: 
         np.testing.assert_array_equal(entry.scan.ring, truth.ring)
         np.testing.assert_array_equal(entry.imu.accel, np.tile([0, 0, 9.81], (len(entry.imu), 1)))
         assert entry.imu.stamps_ns[0] <= entry.scan.stamp_ns <= entry.scan.end_ns <= entry.imu.stamps_ns[-1]
+
+
+def told(entry: Measurement | DroppedScan) -> tuple[object, ...]:
+    """All of an entry, comparable to the bit."""
+    if isinstance(entry, DroppedScan):
+        return entry.stamp_ns, entry.reason
+    scan, imu = entry.scan, entry.imu
+    arrays = (scan.points, scan.offsets_ns, scan.intensity, scan.ring, imu.stamps_ns, imu.gyro, imu.accel)
+    return scan.stamp_ns, entry.notices, *(array.tobytes() for array in arrays)
+
+
+@pytest.mark.parametrize("container", [*CONTAINERS, "cut"])
+@pytest.mark.parametrize("start_s", [0.0, 0.35])
+def test_reading_is_taken_up_anywhere_as_if_it_had_gone_on(tmp_path: Path, container: str, start_s: float) -> None:
+    ros = 1 if container.startswith("bag") else 2
+    entries = rig.walk(turns=14, ros=ros, columns=12, delay_ns=500_000)  # each logged with a sample of the IMU
+    logged = [log_ns for _, log_ns, _ in entries]
+    assert len(set(logged)) < len(logged)
+    gap = range(rig.START_NS + 700_000_000, rig.START_NS + 930_000_000)
+    entries = [entry for entry in entries if not (entry[0] == "/imu" and entry[1] in gap)]
+    path = rig.write(tmp_path / "walk", entries, "small-chunks" if container == "cut" else container)
+    if container == "cut":
+        path.write_bytes(path.read_bytes()[: 4 * path.stat().st_size // 5])
+    with open_recording(path, Params()) as recording:
+
+        def rest(reading: Measurements) -> tuple[list[tuple[object, ...]], list[Place], str]:
+            found, places = [], []
+            try:
+                for entry in reading:
+                    found.append(told(entry))
+                    places.append(reading.place())
+            except HemislamError as error:
+                return found, places, str(error)
+            return found, places, ""
+
+        whole, places, end = rest(recording.measurements(start_s))
+        assert any(len(entry) == 2 for entry in whole) or container == "cut", "a scan in the gap is dropped"
+        assert ("the file ends here" in end) is (container == "cut")
+        for number, place in enumerate(places, start=1):
+            for _ in range(2):  # a place serves more than once
+                assert rest(recording.measurements(start_s, after=place))[::2] == (whole[number:], end)
 
 
 def test_a_folder_without_metadata_reads_its_files(tmp_path: Path) -> None:

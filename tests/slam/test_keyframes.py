@@ -125,3 +125,19 @@ def test_a_keyframe_is_due_after_walking_or_turning_far_enough(metres: float, de
 
 def test_the_first_frame_is_a_keyframe() -> None:
     assert is_due(None, np.eye(4), Keyframes())
+
+
+def test_after_going_back_the_later_ones_can_be_gone_forth_to_until_others_take_their_place() -> None:
+    store = KeyframeStore()
+    for i in range(6):
+        store.append(keyframe(i))
+    store.truncate(2)
+    store.append(keyframe(2))
+    store.truncate(6)
+    for i in range(6):
+        assert_same(store[i], keyframe(i))
+    store.truncate(2)
+    store.append(keyframe(2, points=99))
+    with pytest.raises(IndexError):
+        store.truncate(6)
+    store.close()

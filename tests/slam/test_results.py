@@ -99,6 +99,27 @@ def logged(frames: int = 6) -> RunLog:
     return log
 
 
+def test_a_log_that_went_back_and_forth_and_back_is_as_it_was_then() -> None:
+    log, states, then = RunLog(), [], []
+    for index in range(6):
+        log.add(frame(index, truth=[1, 0, 1, 0]))
+        log.drop(DroppedScan(START_NS, "no IMU"))
+        states.append(log.checkpoint())
+        then.append(facts(log))
+    for index in (1, 4, 0, 5, 2):
+        log.restore(states[index])
+        assert facts(log) == then[index]
+    log.add(frame(9))
+    assert log.stamps_ns.tolist() == [*(frame(index).stamp_ns for index in range(3)), frame(9).stamp_ns]
+
+
+def facts(log: RunLog) -> tuple[object, ...]:
+    trajectory = log.trajectory
+    arrays = (log.stamps_ns, log.timings_ms, trajectory.positions, trajectory.quaternions)
+    sums = (len(log), log.dropped.copy(), log.statuses.copy(), log.points, log.ground_points, log.ground_score)
+    return *sums, *(array.tobytes() for array in arrays)
+
+
 def read_ply(path: Path) -> np.ndarray:
     head, _, body = path.read_bytes().partition(b"end_header\n")
     lines = head.decode().splitlines()
