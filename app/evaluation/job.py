@@ -150,7 +150,7 @@ def _facts(job: Job, log: RunLog, ground: list[GroundScore], memory_mb: float) -
 def _write(job: Job, log: RunLog, engine: Engine, facts: dict[str, Any], cpu_ms: list[float]) -> None:
     """All files beside their places, then moved there, run.json last: a kill in between leaves no result."""
     trajectory = log.trajectory
-    poses = np.array([log.T_map_odom @ keyframe.T_odom_imu for keyframe in engine.keyframes]).reshape(-1, 4, 4)
+    poses = _map_poses(log, engine)
     measured = fineness.measure(fineness.collect(engine.keyframes, poses))
     facts["fineness"] = {name: value if np.isfinite(value) else None for name, value in asdict(measured).items()}
 
@@ -172,6 +172,11 @@ def _write(job: Job, log: RunLog, engine: Engine, facts: dict[str, Any], cpu_ms:
             (part / name).replace(job.folder / name)
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _map_poses(log: RunLog, engine: Engine) -> F64:
+    """T_map_imu (k, 4, 4) of all keyframes as the map shows them at the end."""
+    return np.array([log.T_map_odom @ keyframe.T_odom_imu for keyframe in engine.keyframes]).reshape(-1, 4, 4)
 
 
 def clear_remains(folder: Path) -> None:
