@@ -9,9 +9,10 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -113,11 +114,12 @@ def _replay(url: str) -> Line:
     return Line.of("replay with a page open", "museum", "x real time", [rate * seconds_a_frame])
 
 
-def _state(url: str) -> dict:  # type: ignore[type-arg]  # JSON
-    return httpx.get(f"{url}api/state").raise_for_status().json()  # type: ignore[no-any-return]
+def _state(url: str) -> Any:
+    """As JSON."""
+    return httpx.get(f"{url}api/state").raise_for_status().json()
 
 
-def _transport(url: str, action: dict[str, object]) -> None:
+def _transport(url: str, action: Mapping[str, object]) -> None:
     httpx.post(f"{url}api/transport", json=action).raise_for_status()
 
 
@@ -127,7 +129,7 @@ def _served() -> Iterator[str]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = [sys.executable, "-m", "app", "serve", SAMPLE, "--paused", "--no-browser", "--port", str(port)]
+    command = [sys.executable, "-m", "app", "serve", str(SAMPLE), "--paused", "--no-browser", "--port", str(port)]
     server = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     url = f"http://127.0.0.1:{port}/"
     try:
