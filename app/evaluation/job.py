@@ -62,10 +62,10 @@ class Job:
     start_s: float = 0.0
     duration_s: float | None = None
     code: str = field(default_factory=code_digest)
+    key: str = field(init=False)
+    """Hash of all that a result depends on, the machine and its load aside."""
 
-    @property
-    def key(self) -> str:
-        """Hash of all that a result depends on, the machine and its load aside."""
+    def __post_init__(self) -> None:
         parts = {
             "format": FORMAT,
             "version": __version__,
@@ -74,7 +74,8 @@ class Job:
             "parameters": self.params.model_dump(mode="json"),
             "part": [self.start_s, self.duration_s],
         }
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+        key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+        object.__setattr__(self, "key", key)  # once, where the job is made, so that its process agrees
 
 
 def finished(job: Job) -> dict[str, Any] | None:
