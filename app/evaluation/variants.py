@@ -38,8 +38,9 @@ class Variant:
         Raises:
             HemislamError: a parameter is unknown or out of range.
         """
+        values = {name: value for name, value in self.values.items() if HAS_LOOPS or name != LOOPS}
         try:
-            return params.with_values(self.values)
+            return params.with_values(values)
         except HemislamError as error:
             raise HemislamError(f"Variant {self.name}: {error}") from None
 

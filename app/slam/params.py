@@ -52,7 +52,6 @@ class Params(Section):
     filter: Filter = Filter()
     map: LocalMap = LocalMap()
     keyframe: Keyframes = Keyframes()
-    loops: Loops = Loops()
 
     @classmethod
     def parse(cls, tree: Mapping[str, Any]) -> "Params":

@@ -34,7 +34,7 @@ from app.slam.loops.types import (
     SetWeight,
     Verdict,
 )
-from app.slam.params import Params
+from app.slam.params import Loops
 from app.slam.types import F64, Keyframe
 
 
@@ -63,15 +63,15 @@ class LoopBackend:
     """Finds loops among the keyframes of one walk and straightens their poses (paper 2.4).
 
     Args:
-        params: its `loops` section counts, as it is now.
+        params: of loops.
         keyframes: where the clouds are; a keyframe must be in it when it is given to `add`.
 
     Attributes:
         notices: what went wrong on the way, in sentences.
     """
 
-    def __init__(self, params: Params, keyframes: KeyframeStore) -> None:
-        self.params = params.loops
+    def __init__(self, params: Loops, keyframes: KeyframeStore) -> None:
+        self.params = params
         self.notices: list[str] = []
         self._drift = Drift(self.params.drift_translation / 100, np.radians(self.params.drift_rotation))
         self._detector = Detector(self.params, keyframes)
@@ -110,7 +110,7 @@ class LoopBackend:
 
     def _look(self, newer: int) -> tuple[LoopEdge, ...]:
         self._detector.describe(newer)
-        accepted = [edge.pair for edge in self.edges if edge.verdict is Verdict.ACCEPTED]
+        accepted = [edge for edge in self.edges if edge.verdict is Verdict.ACCEPTED]
         expectation = expect(newer, self._graph.poses, accepted, self._drift)
         seen = [judge(s, self._detector, expectation, self.params) for s in self._detector.look(newer, expectation)]
         changed = settle(seen, self.edges, self._detector.poses, self._drift, self.params, len(self) - 1)

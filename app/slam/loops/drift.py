@@ -8,7 +8,7 @@ shortest one through the graph: accepted loops are short cuts, and what they tie
 have drifted apart.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from app.slam import lie
-from app.slam.loops.types import LoopEdge, Pair
+from app.slam.loops.types import LoopEdge
 from app.slam.types import F64
 
 POSITION_M, ROTATION = 0.05, np.radians(0.5)
@@ -74,15 +74,20 @@ class Expectation:
         return float(np.sqrt(error @ np.linalg.solve(self.covariance(other), error)))
 
 
-def expect(root: int, poses: F64, loops: Iterable[Pair], drift: Drift) -> Expectation:
+def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift) -> Expectation:
     """What the graph of poses (k, 4, 4) T_map_imu with these loops expects, seen from keyframe `root`."""
     count = len(poses)
     p = poses[:, :3, 3]
     steps = np.linalg.norm(np.diff(p, axis=0), axis=1)
-    pairs = np.array(sorted(loops), dtype=np.int64).reshape(-1, 2)
+    pairs = np.array([loop.pair for loop in loops], dtype=np.int64).reshape(-1, 2)
+    measured = np.array([loop.T_older_newer[:3, 3] for loop in loops]).reshape(-1, 3)
+    older = poses[pairs[:, 0]]
+    missed = np.linalg.norm(
+        p[pairs[:, 1]] - p[pairs[:, 0]] - np.einsum("nij,nj->ni", older[:, :3, :3], measured), axis=1
+    )
     first = np.concatenate([np.arange(count - 1), pairs[:, 0]])
     second = np.concatenate([np.arange(1, count), pairs[:, 1]])
-    length = np.concatenate([steps, np.zeros(len(pairs))])
+    length = np.concatenate([steps, np.maximum(missed - POSITION_M, 0.0) / drift.translation])
     length = length + 1e-6  # scipy drops edges of length 0
     graph = coo_array((length, (first, second)), shape=(count, count))  # type: ignore[no-untyped-call]  # no types
     way, before = dijkstra(graph, directed=False, indices=root, return_predecessors=True)

@@ -12,7 +12,7 @@ from app.slam.loops.verification import Fit
 from app.slam.params import Loops
 from app.slam.types import F64
 
-FLOOR_M, FLOOR_RAD = 0.015, np.radians(0.15)
+FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.25)
 """Standard deviations that no number of points brings a registration below."""
 POINT_M, INDEPENDENT = 0.05, 0.05
 """Standard deviation of a point's distance to a plane with all that is not noise, and the share of

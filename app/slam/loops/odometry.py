@@ -10,6 +10,8 @@ from app.slam.types import F64
 
 STILL_M, STILL_RAD = 0.001, np.radians(0.02)
 """Standard deviations of a step, however short."""
+EVEN_M = 10.0
+"""Distance over which drift goes on in one direction; a way L drifts by drift * sqrt(L * EVEN_M)."""
 
 
 def odometry_factor(second: int, before: Head, after: Head, drift: Drift) -> Factor:
@@ -17,13 +19,15 @@ def odometry_factor(second: int, before: Head, after: Head, drift: Drift) -> Fac
 
     The filter gives the covariance of each pose in its map, not of the step between them, and holds
     the map for known. So: the covariances of both poses add up (as if they were independent, which
-    is more than there is), and drift per metre is added, each metre's independent of the next's.
+    is more than there is), and drift is added as a random walk: even over some metres, independent
+    between them.
     """
     T = lie.inverse(before.T_odom_imu) @ after.T_odom_imu
     walked = float(np.linalg.norm(T[:3, 3]))
     turn = np.kron(np.eye(2), T[:3, :3].T)
     first = turn @ _own_axes(before) @ turn.T
-    noise = np.array([STILL_RAD**2 + drift.rotation**2 * walked] * 3 + [STILL_M**2 + drift.translation**2 * walked] * 3)
+    even = walked * EVEN_M
+    noise = np.array([STILL_RAD**2 + drift.rotation**2 * even] * 3 + [STILL_M**2 + drift.translation**2 * even] * 3)
     covariance = first + _own_axes(after) + np.diag(noise)
     return Factor(second - 1, second, T, (covariance + covariance.T) / 2)
 
