@@ -38,6 +38,10 @@ from app.slam.params import Loops
 from app.slam.types import F64, Keyframe
 
 
+SURE_M = 0.3
+"""Where odometry is surer than this of its position, one place that fits is enough."""
+
+
 @dataclass(frozen=True, slots=True)
 class Done:
     """A command, and for Add the loop that it came to when it was given."""
@@ -112,7 +116,11 @@ class LoopBackend:
         self._detector.describe(newer)
         accepted = [edge for edge in self.edges if edge.verdict is Verdict.ACCEPTED]
         expectation = expect(newer, self._graph.poses, accepted, self._drift)
-        seen = [judge(s, self._detector, expectation, self.params) for s in self._detector.look(newer, expectation)]
+        seen = []
+        for sighting in self._detector.look(newer, expectation):
+            seen.append(judge(sighting, self._detector, expectation, self.params))
+            if seen[-1].verdict is Verdict.CANDIDATE and seen[-1].evidence.gate_m < SURE_M:
+                break
         changed = settle(seen, self.edges, self._detector.poses, self._drift, self.params, len(self) - 1)
         self._found.update((edge.pair, replace(edge, overruled=False, weight=1.0)) for edge in changed)
         fresh = {edge.pair for edge in changed}

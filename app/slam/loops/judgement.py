@@ -7,11 +7,14 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops.detection import Detector, Sighting
 from app.slam.loops.drift import Expectation
+from app.slam.loops.rivals import rival
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.loops.verification import Fit
 from app.slam.params import Loops
 from app.slam.types import F64
 
+FARTHEST_RIVAL_M = 10.0
+"""Beyond this the submaps no longer overlap enough to fit as well."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.25)
 """Standard deviations that no number of points brings a registration below."""
 POINT_M, INDEPENDENT = 0.05, 0.05
@@ -49,6 +52,9 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
     reason = _objection(evidence, fit, params)
     if not reason:
         evidence = replace(evidence, slide=detector.slide(older, newer, fit))
+        reason = _objection(evidence, fit, params)
+    if not reason:
+        evidence = replace(evidence, rival_m=_rival(older, newer, detector, expectation, fit, params))
         reason = _objection(evidence, fit, params)
     return edge(T, covariance(detector, newer, fit), evidence, reason)
 
@@ -99,7 +105,17 @@ def _objection(e: Evidence, fit: Fit, p: Loops) -> str:
         )
     if e.slide > p.max_slide:
         return f"it slides: pushed along its weakest direction it ends {e.slide:.2f} m off (most {p.max_slide:g} m)"
+    if e.ambiguous:
+        return f"it is ambiguous: {e.rival_m:.1f} m away it fits as well, and odometry (σ {e.gate_m:.2f} m) allows both"
     return ""
+
+
+def _rival(older: int, newer: int, detector: Detector, expectation: Expectation, fit: Fit, params: Loops) -> float:
+    def allowed(T_level: F64) -> bool:
+        return expectation.mahalanobis(older, _imu(detector, older, newer, T_level)) <= params.max_mahalanobis
+
+    reach = 2 * params.max_mahalanobis * float(expectation.position_sigmas()[older])
+    return rival(detector.submap(older), detector.submap(newer), fit, min(reach, FARTHEST_RIVAL_M), allowed)
 
 
 def _imu(detector: Detector, older: int, newer: int, T_level: F64) -> F64:

@@ -39,14 +39,15 @@ def settle(
     def ways(a: LoopEdge, b: LoopEdge) -> tuple[float, float]:
         return abs(float(walked[a.older] - walked[b.older])), abs(float(walked[a.newer] - walked[b.newer]))
 
-    alive = [edge for edge in [*edges, *fresh] if edge.verdict is not Verdict.REJECTED]
+    alive = [edge for edge in [*edges, *fresh] if edge.verdict is not Verdict.REJECTED or edge.evidence.ambiguous]
     near = [edge for edge in alive if any(max(ways(edge, other)) < NEIGHBOURHOOD_M for other in fresh)]
     out = {edge.pair: edge for edge in fresh}
     for edge in near:
         if edge.verdict is not Verdict.CANDIDATE or edge.overruled:
             continue
         others = [o for o in near if o.pair != edge.pair and max(ways(edge, o)) < NEIGHBOURHOOD_M]
-        verdicts = [agree(edge, other, poses, sum(ways(edge, other)), drift) for other in others]
+        # what is ambiguous agrees with nothing: where a place has twins, all that was seen there may be one's
+        verdicts = [not o.evidence.ambiguous and agree(edge, o, poses, sum(ways(edge, o)), drift) for o in others]
         support = len({other.newer for other, yes in zip(others, verdicts, strict=True) if yes} - {edge.newer})
         against = verdicts.count(False)
         evidence = replace(edge.evidence, support=support)

@@ -39,7 +39,8 @@ class Evidence:
         condition: smallest eigenvalue of the registration's translation information over its
             largest, 0-1; near 0 the two submaps slide along each other.
         slide: m, how far registrations from disturbed starts ended from one another.
-        rival: overlap of the best other alignment that odometry also allows; 0: there is none.
+        rival_m: m to the nearest other alignment that fits as well and that odometry allows too; inf:
+            there is none.
         mahalanobis: distance to what odometry predicts, in standard deviations.
         gate_m: m, standard deviation of that prediction's position.
         support: other candidates nearby that agree.
@@ -51,10 +52,14 @@ class Evidence:
     residual_rms: float = float("nan")
     condition: float = float("nan")
     slide: float = float("nan")
-    rival: float = float("nan")
+    rival_m: float = float("nan")
     mahalanobis: float = float("nan")
     gate_m: float = float("nan")
     support: int = 0
+
+    @property
+    def ambiguous(self) -> bool:
+        return self.rival_m < float("inf")
 
 
 @dataclass(frozen=True, slots=True)
