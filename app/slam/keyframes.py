@@ -97,12 +97,16 @@ class KeyframeStore:
     def truncate(self, count: int) -> None:
         """Go back to the first `count` keyframes, or forth again to as many as there were.
 
+        A store that never held any stays empty.
+
         What is appended after going back must be what was there, or going forth again beyond it
         gives keyframes of two different walks.
 
         Raises:
             IndexError: there never were so many, or others have been put in their place since.
         """
+        if not self._ends:
+            return  # a new engine goes on from another one's checkpoint: the map before is with that one
         if not 0 <= count <= len(self._ends):
             raise IndexError(f"{count} of {len(self._ends)} keyframes")
         self._count = count
