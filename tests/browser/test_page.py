@@ -171,6 +171,7 @@ def test_a_focused_slider_takes_the_arrow_for_itself_and_the_scene_is_relabelled
     slider.focus()
     bench.page.keyboard.press("ArrowLeft")
     bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha == 59.0)
+    expect(slider).to_have_attribute("aria-valuenow", "59")
     bench.page.keyboard.press("Home")
     bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha == 1.0)
     assert not [command for command in bench.engine.sent if isinstance(command, StepFrame)]
@@ -183,12 +184,10 @@ def test_dragging_the_time_slider_seeks(bench: Bench) -> None:
     slider = bench.page.locator("[role=slider]").first
     slider.focus()
     frame = bench.engine.snapshot.transport.frame
-    for _ in range(4):
-        bench.page.keyboard.press("ArrowRight")
-    bench.eventually(lambda: bench.engine.snapshot.transport.frame == frame + 4)
-    for _ in range(3):
-        bench.page.keyboard.press("ArrowLeft")
-    bench.eventually(lambda: bench.engine.snapshot.transport.frame == frame + 1)
+    for key, there in (("ArrowRight", frame + 1), ("ArrowRight", frame + 2), ("ArrowLeft", frame + 1)):
+        bench.page.keyboard.press(key)
+        bench.eventually(lambda there=there: bench.engine.snapshot.transport.frame == there)
+        expect(slider).to_have_attribute("aria-valuenow", str(there))
     assert all(isinstance(command, Seek) for command in bench.engine.sent)
     bench.page.evaluate("document.activeElement.blur()")
 
