@@ -37,7 +37,6 @@ from app.slam.loops.types import (
 from app.slam.params import Loops
 from app.slam.types import F64, Keyframe
 
-
 SURE_M = 0.3
 """Where odometry is surer than this of its position, one place that fits is enough."""
 

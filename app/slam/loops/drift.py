@@ -80,14 +80,13 @@ def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift) -> Ex
     p = poses[:, :3, 3]
     steps = np.linalg.norm(np.diff(p, axis=0), axis=1)
     pairs = np.array([loop.pair for loop in loops], dtype=np.int64).reshape(-1, 2)
-    measured = np.array([loop.T_older_newer[:3, 3] for loop in loops]).reshape(-1, 3)
-    older = poses[pairs[:, 0]]
-    missed = np.linalg.norm(
-        p[pairs[:, 1]] - p[pairs[:, 0]] - np.einsum("nij,nj->ni", older[:, :3, :3], measured), axis=1
-    )
+    measured = np.array([loop.T_older_newer for loop in loops]).reshape(-1, 4, 4)
+    left = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]  # what the graph leaves of each loop
+    missed = np.maximum(np.linalg.norm(left[:, :3, 3], axis=1) - POSITION_M, 0.0) / drift.translation
+    turned = np.maximum(np.linalg.norm(lie.log(left[:, :3, :3]), axis=1) - ROTATION, 0.0) / drift.rotation
     first = np.concatenate([np.arange(count - 1), pairs[:, 0]])
     second = np.concatenate([np.arange(1, count), pairs[:, 1]])
-    length = np.concatenate([steps, np.maximum(missed - POSITION_M, 0.0) / drift.translation])
+    length = np.concatenate([steps, np.maximum(missed, turned)])
     length = length + 1e-6  # scipy drops edges of length 0
     graph = coo_array((length, (first, second)), shape=(count, count))  # type: ignore[no-untyped-call]  # no types
     way, before = dijkstra(graph, directed=False, indices=root, return_predecessors=True)

@@ -15,9 +15,9 @@ from app.slam.types import F64
 
 FARTHEST_RIVAL_M = 10.0
 """Beyond this the submaps no longer overlap enough to fit as well."""
-FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.25)
+FLOOR_M, FLOOR_RAD = 0.04, np.radians(0.5)
 """Standard deviations that no number of points brings a registration below."""
-POINT_M, INDEPENDENT = 0.05, 0.05
+POINT_M, INDEPENDENT = 0.1, 0.05
 """Standard deviation of a point's distance to a plane with all that is not noise, and the share of
 points whose errors are independent of their neighbours'."""
 

@@ -10,7 +10,7 @@ from app.slam.types import F64
 
 STILL_M, STILL_RAD = 0.001, np.radians(0.02)
 """Standard deviations of a step, however short."""
-EVEN_M = 10.0
+EVEN_M = 1.0
 """Distance over which drift goes on in one direction; a way L drifts by drift * sqrt(L * EVEN_M)."""
 
 

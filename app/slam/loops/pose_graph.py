@@ -19,9 +19,6 @@ from app.slam.types import F64
 
 HUBER = 1.345
 """Whitened error from which a loop pulls with constant force (95 % efficient for a Gaussian)."""
-SILENT = 1.0
-"""Whitened error up to which a loop does not pull: it says no more than that odometry is right, and
-odometry over a room is better than registration."""
 RELINEARISE = 0.05
 """Change of a pose (rad, m) from which its factors are linearised again."""
 MOST_UPDATES = 5
@@ -269,8 +266,7 @@ def _noise(factor: Factor) -> gtsam.noiseModel.Base:
     noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
     if not factor.robust:
         return noise
-    silent = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.L2WithDeadZone.Create(SILENT), noise)
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER), silent)
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER), noise)
 
 
 def _between(factor: Factor) -> gtsam.BetweenFactorPose3:

@@ -45,7 +45,7 @@ def rival(target: Prepared, source: Prepared, fit: Fit, reach_m: float, allowed:
     offsets = ((np.arange(CELLS) + CELLS // 2) % CELLS - CELLS // 2) * CELL_M
     dx, dy = np.meshgrid(offsets, offsets, indexing="ij")
     away = np.hypot(dx, dy)
-    peaks = meeting >= ndimage.maximum_filter(meeting, size=PEAK_CELLS, mode="wrap")
+    peaks = meeting >= ndimage.maximum_filter(meeting, size=PEAK_CELLS, mode="wrap")  # type: ignore[attr-defined]  # no types
     meeting = np.where(peaks & (away >= APART_M) & (away <= reach_m), meeting, -1.0)
     nearest = float("inf")
     for _ in range(TRIED):
