@@ -102,10 +102,14 @@ def _delay_ms(drawn: np.ndarray, pressed: float) -> float:
 
 def _replay(url: str) -> Line:
     """From the start, as fast as it can, with the page open and drawing everything."""
-    for action in ({"action": "restart"}, {"action": "speed", "factor": "max"}, {"action": "play"}):
-        _transport(url, action)
-    while (state := _state(url))["transport"]["frame"] < 50:
+    _transport(url, {"action": "pause"})
+    _transport(url, {"action": "restart"})
+    while _state(url)["transport"]["frame"] > 0:
         time.sleep(0.05)
+    _transport(url, {"action": "speed", "factor": "max"})
+    _transport(url, {"action": "play"})
+    while (state := _state(url))["transport"]["frame"] < 50:
+        time.sleep(0.01)
     begin, first, last = time.perf_counter(), state["transport"]["frame"], state["recording"]["frames"] - 20
     while (now := _state(url)["transport"]["frame"]) < last:
         time.sleep(0.1)

@@ -50,6 +50,9 @@ class Scene:
         self._sensor = Sensor(scene, f"{ROOT}/sensor")
         self._trajectory = Trajectory(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
+        # The page compiles the shader of points anew, for a tenth of a second, whenever colours change and
+        # no other cloud that is drawn uses it. This one always does: two points that are too small to see.
+        scene.add_point_cloud("/shader", np.zeros((2, 3), np.float32), np.zeros((2, 3), np.uint8), point_size=1e-6)
         server.initial_camera.position = (-4.0, -4.0, 9.0)  # high enough to look into a corridor without its ceiling
         server.initial_camera.look_at = (0.3, 0.2, -0.6)
         server.initial_camera.fov = float(np.radians(60.0))

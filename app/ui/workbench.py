@@ -141,15 +141,18 @@ class Workbench:
         self._notices.draw(current)
         self._header.draw(current)
         news = drawn is None or drawn.revision != current.revision
-        relabelled = drawn is not None and drawn.params != current.params
+        awaited = drawn is not None and _changed_by_user(drawn, current)
         due = now - self._scene_drawn_at >= _SCENE_PERIOD_S
-        if (news and (due or relabelled)) or view != self._drawn_view:
+        if (news and (due or awaited)) or view != self._drawn_view:
             if current.result is not None and (drawn is None or drawn.result is None):
                 self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
             self._scene.draw(drawn, current, view, self._drawn_view)
             self._drawn, self._drawn_view = current, view
             self._scene_drawn_at = now
             self._panels_due = True
+            if awaited:  # the page is to be quick with this before anything else
+                self._server.flush()
+                self._panels_drawn_at = now
         if self._panels_due and now - self._panels_drawn_at >= _PANEL_PERIOD_S:
             self._panels_due = False
             self._panels_drawn_at = now
@@ -157,3 +160,10 @@ class Workbench:
             self._doctor.draw(current)
             self._files.draw(current)
             self._appearance.draw(view, self._scene.limits(view.colour_by), self._scene.points, self._budget)
+
+
+def _changed_by_user(drawn: Snapshot, current: Snapshot) -> bool:
+    """Whether parameters are others, or the frame that is drawn was labelled anew by them."""
+    before, after = drawn.result, current.result
+    relabelled = before is not after and before is not None and after is not None and before.index == after.index
+    return relabelled or drawn.params != current.params
