@@ -12,6 +12,7 @@ def thinned(keyframe: Keyframe, voxel_size: float) -> Chunk:
     chosen = one_per_voxel(cloud.points, voxel_size, seed=keyframe.index)
     return Chunk(
         index=keyframe.index,
+        frame=keyframe.frame,
         stamp_ns=keyframe.stamp_ns,
         points=cloud.points[chosen],
         labels=cloud.labels[chosen],

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from app.sensors.findings import Finding
+from app.slam.loops import types as loops
 from app.slam.params import Params
 from app.slam.types import F32, F64, I64, U8, U16, StepResult
 
@@ -88,12 +89,55 @@ class Save:
 
 
 @dataclass(frozen=True, slots=True)
+class OverruleLoop:
+    """The user's word on a loop: accept, reject, add or weigh it."""
+
+    command: loops.Command
+
+
+@dataclass(frozen=True, slots=True)
+class UndoLoop:
+    """Take the last `OverruleLoop` back."""
+
+
+@dataclass(frozen=True, slots=True)
+class RedoLoop:
+    """Do again what was undone last."""
+
+
+@dataclass(frozen=True, slots=True)
+class TryLoop:
+    """Show in `LoopsView.tried` what the graph would become by a command, without doing it; None: no more."""
+
+    command: loops.Command | None
+
+
+@dataclass(frozen=True, slots=True)
+class InspectLoop:
+    """Show in `LoopsView.inspected` all there is on a candidate; None: no more."""
+
+    pair: loops.Pair | None
+
+
+@dataclass(frozen=True, slots=True)
 class Shutdown:
     """End the engine's process cleanly."""
 
 
+LoopCommand = OverruleLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop
 Command = (
-    Play | Pause | StepFrame | SetSpeed | Seek | SetParams | LoadParams | OpenRecording | Restart | Save | Shutdown
+    Play
+    | Pause
+    | StepFrame
+    | SetSpeed
+    | Seek
+    | SetParams
+    | LoadParams
+    | OpenRecording
+    | Restart
+    | Save
+    | LoopCommand
+    | Shutdown
 )
 
 
@@ -106,12 +150,13 @@ class Chunk:
     Points are in random order: the first k are a fair sample, for a page that must show fewer.
 
     Attributes:
-        index: of the keyframe. stamp_ns: its time.
+        index: of the keyframe. frame: that it was. stamp_ns: its time.
         points: (n, 3) float32 m. labels: (n,) uint8. intensity: (n,) float32. ring: (n,) uint16.
         T_imu_lidar: (4, 4).
     """
 
     index: int
+    frame: int
     stamp_ns: int
     points: F32
     labels: U8
@@ -172,6 +217,24 @@ class Notice:
     text: str
 
 
+@dataclass(frozen=True, slots=True)
+class LoopsView:
+    """Loops as they count at the newest frame.
+
+    Attributes:
+        edges: all candidates, by keyframes. residuals: of every factor of the graph, odometry first.
+        undo, redo: commands that can be taken back (the last one next) or done again (likewise).
+        inspected: what `InspectLoop` asked for. tried: what `TryLoop` asked for.
+    """
+
+    edges: tuple[loops.LoopEdge, ...] = ()
+    residuals: tuple[loops.FactorResidual, ...] = ()
+    undo: tuple[loops.Command, ...] = ()
+    redo: tuple[loops.Command, ...] = ()
+    inspected: tuple[loops.Pair, loops.LoopDetail] | None = None
+    tried: tuple[loops.Command, loops.Preview] | None = None
+
+
 SERIES = (
     "stamp_s", "planarity", "seeds", "ground_share", "points_in", "points_reduced", "points_filter",
     "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "total_ms",
@@ -196,6 +259,7 @@ class Snapshot:
         chunks: within a session only appended, and taken away at the end when going back.
         keyframe_poses: (k, 4, 4) T_map_imu of each keyframe.
         trajectory: (n, 3) positions of the IMU in the map, every processed frame.
+        loops: candidates, their verdicts and what was asked about them.
         series: (n,) arrays by SERIES name.
         T_map_truth: (4, 4) that lays the truth's positions over the map, None until the walk
             determines it.
@@ -214,6 +278,7 @@ class Snapshot:
     chunks: tuple[Chunk, ...] = ()
     keyframe_poses: F64 | None = None
     trajectory: F64 | None = None
+    loops: LoopsView = LoopsView()
     series: dict[str, F64] = field(default_factory=dict)
     T_map_truth: F64 | None = None
     progress: Progress | None = None

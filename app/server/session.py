@@ -12,11 +12,14 @@ from app.server.delta import Outbox
 from app.server.pacing import Pacer
 from app.server.protocol import (
     Command,
+    InspectLoop,
     LoadParams,
     OpenRecording,
+    OverruleLoop,
     Pause,
     Play,
     Progress,
+    RedoLoop,
     Restart,
     Save,
     Seek,
@@ -24,6 +27,8 @@ from app.server.protocol import (
     SetSpeed,
     Shutdown,
     StepFrame,
+    TryLoop,
+    UndoLoop,
 )
 from app.server.publisher import Publisher
 from app.server.run import Run
@@ -141,6 +146,8 @@ class Session:
                 self._open_soon(path, self._reopen)
             case Save(folder, trajectory_only):
                 self._saver.start(folder, self._need_run().saver(folder, trajectory_only=trajectory_only))
+            case OverruleLoop() | UndoLoop() | RedoLoop() | TryLoop() | InspectLoop():
+                raise HemislamError("Loops are not looked for yet.")
             case _:
                 assert_never(command)
 

@@ -288,7 +288,16 @@ class FakeEngine:
             cloud = result.cloud
             chunks = (
                 *chunks,
-                Chunk(len(chunks), result.stamp_ns, cloud.points, cloud.labels, cloud.intensity, cloud.ring, np.eye(4)),
+                Chunk(
+                    len(chunks),
+                    result.index,
+                    result.stamp_ns,
+                    cloud.points,
+                    cloud.labels,
+                    cloud.intensity,
+                    cloud.ring,
+                    np.eye(4),
+                ),
             )
             new = T_map_lidar[None]
             poses = new if poses is None else np.concatenate((poses, new))
