@@ -5,7 +5,8 @@ import time
 
 from app.sensors.presets import resolve_params
 from app.server.protocol import Play
-from app.server.worker import EngineProcess, Setup
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
 from benchmarks.record import Line
 from benchmarks.scenes import SCENES, recording
 

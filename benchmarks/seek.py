@@ -10,7 +10,8 @@ from tqdm import tqdm
 from app.sensors.presets import resolve_params
 from app.server.protocol import Play, Seek, Snapshot, StepFrame
 from app.server.run import open_run
-from app.server.worker import EngineProcess, Setup
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
 from app.slam.types import Measurement
 from benchmarks.record import Line
 from benchmarks.scenes import long_recording

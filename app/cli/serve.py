@@ -64,8 +64,8 @@ def serve(
     """
     from app.sensors.recording import open_recording
     from app.server.folders import Folders
+    from app.server.setup import Setup
     from app.server.web import run_server
-    from app.server.worker import Setup
     from app.slam.trajectory import read_tum
     from app.ui.workbench import Workbench
 

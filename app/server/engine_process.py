@@ -15,8 +15,8 @@ from app.server.delta import Delta, Outbox
 from app.server.protocol import Command, Progress, SetSpeed, Shutdown
 from app.server.run import Run, open_run
 from app.server.session import OpenRun, Session
+from app.server.setup import Setup
 from app.server.wire import Pipe
-from app.server.worker import Setup
 from app.slam.params import Params
 from app.slam.warmup import compile_kernels
 

@@ -4,6 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, assert_never
 
@@ -45,6 +46,24 @@ LONG_SEEK = 20
 SAVE_POLL_S = 0.05
 
 _EFFECT = {leaf.path: leaf.effect for leaf in leaves()}
+
+
+@dataclass(frozen=True, slots=True)
+class Journey:
+    """The way to a frame that was asked for.
+
+    Attributes:
+        target: the frame. origin: where it began, for progress.
+        again_to: frames up to this one are taken as they were, unseen until its end; later ones anew.
+        stepping: asked for step by step; further steps add up.
+        back: first to the checkpoint before `again_to`, which may be later than here.
+    """
+
+    target: int
+    again_to: int
+    stepping: bool
+    back: bool
+    origin: int
 
 
 class OpenRun(Protocol):
@@ -89,11 +108,7 @@ class Session:
         self._opening: Callable[[], None] | None = None
         self._after_opening: list[Command] = []
         self._relabelling = False
-        self._going_back = False  # to the checkpoint before the target, later than here perhaps
-        self._target: int | None = None
-        self._target_from = -1
-        self._stepping = False
-        self._again_to = -1  # up to this frame what is known is repeated, unseen until its end
+        self._journey: Journey | None = None
         self._unseen: StepResult | None = None
         self._page_behind = False
 
@@ -153,44 +168,38 @@ class Session:
 
     def _halt(self) -> None:
         """Stay at the present frame, also if one was being sought."""
-        if self._target is not None:
-            self._target, self._going_back = None, False
+        if self._journey is not None:
+            self._journey = None
             self._outbox.put(progress=None)
         self._catch_up()
         self._page.show(playing=False, frames_per_second=0.0)
 
     def _step(self, frames: int) -> None:
         """Steps asked for while the last one is not done yet add up."""
-        run = self._need_run()
-        if self._stepping and self._target is not None:
+        run, journey = self._need_run(), self._journey
+        if journey is not None and journey.stepping:
             self._page.show(playing=False, frames_per_second=0.0)
-            start, again_to = self._target, self._again_to
+            start, again_to = journey.target, journey.again_to
         else:
             self._halt()
             start = again_to = run.frame
         frame = max(start + frames, 0)
-        self._go_to(frame, min(again_to, frame))
-        self._stepping = True
+        self._go_to(frame, min(again_to, frame), stepping=True)
 
     def _seek(self, frame: int) -> None:
         run = self._need_run()
         frame = max(0, min(frame, run.opened.frames - 1))
         self._go_to(frame, min(frame, run.known))
 
-    def _go_to(self, frame: int, again_to: int) -> None:
-        """Go to a frame as fast as possible, then go on as before.
-
-        Args:
-            again_to: frames up to this one are taken as they were; later ones are processed anew.
-        """
+    def _go_to(self, frame: int, again_to: int, *, stepping: bool = False) -> None:
+        """Go to a frame as fast as possible, then go on as before; see `Journey`."""
         run = self._need_run()
-        self._target, self._again_to, self._stepping = frame, again_to, False
         nearest = run.checkpoints.before(again_to)
-        self._going_back = again_to < run.frame or (nearest is not None and run.frame < nearest)
-        self._target_from = run.frame
-        if not self._going_back and run.frame >= frame:
+        back = again_to < run.frame or (nearest is not None and run.frame < nearest)
+        self._journey = Journey(frame, again_to, stepping, back, run.frame)
+        if not back and run.frame >= frame:
             self._catch_up()
-            self._approach(run.frame, frame)
+            self._approach(run.frame)
 
     def _set_params(self, params: Params) -> None:
         changed = self._params.changed(params)
@@ -199,7 +208,7 @@ class Session:
             run, waiting = self._run, self._pending_restart()
             usable = params.with_values({path: run.params.value(path) for path in waiting})
             if usable != run.params:
-                run.forget_after(run.frame if self._target is None else max(run.frame, self._again_to))
+                run.forget_after(run.frame if self._journey is None else max(run.frame, self._journey.again_to))
                 run.choose(usable)
             self._relabelling |= any(_EFFECT[path] == "now" for path in changed)
         self._page.params(params, self._pending_restart())
@@ -231,37 +240,37 @@ class Session:
         if self._relabelling:
             self._relabel()
             return 0.0
-        if self._going_back and self._run is not None:
-            self._go_back(self._run)
+        if self._journey is not None and self._journey.back and self._run is not None:
+            self._go_back(self._run, self._journey)
             return 0.0
-        moving = self._page.transport.playing or self._target is not None
+        moving = self._page.transport.playing or self._journey is not None
         wait = self._advance(self._run) if self._run is not None and moving else None
         return SAVE_POLL_S if wait is None and self._saver.busy else wait
 
-    def _go_back(self, run: Run) -> None:
+    def _go_back(self, run: Run, journey: Journey) -> None:
         """To the checkpoint, and on by a frame: there is something to show then, should that be the end of it."""
-        self._going_back = False
         self._saver.wait()  # it may read keyframes that are about to be replaced
         try:
-            run.go_before(self._again_to)
+            run.go_before(journey.again_to)
         except Exception as error:
             self._fail("The frames before can not be gone back to", error)
             return
-        self._target_from = run.frame
+        self._journey = replace(journey, back=False, origin=run.frame)
         self._page_behind, self._unseen = True, None
         self._pacer.release()
-        while self._target is not None and self._page_behind and self._unseen is None:
+        while self._journey is not None and self._page_behind and self._unseen is None:
             self._advance(run)
 
     def _advance(self, run: Run) -> float | None:
         """Process the next frame if it is due."""
+        journey = self._journey
         try:
             entry = run.peek()
         except Exception as error:  # what was processed stays; the rest can not be read
             self._fail("The recording can not be read on from here", error)
             self._page.show(finished=True)
             return None
-        again = self._target is not None and run.frame < self._again_to
+        again = journey is not None and run.frame < journey.again_to
         if entry is None:
             self._halt()
             self._page.show(finished=True)
@@ -272,7 +281,7 @@ class Session:
             self._page.show(dropped=run.log.dropped.total(), urgent=False)
             self._page.notice_once(f"A scan was left out: {entry.reason}.", entry.stamp_ns)
             return 0.0
-        if self._target is None and (wait := self._pacer.wait(entry.scan.stamp_ns)) > 0:
+        if journey is None and (wait := self._pacer.wait(entry.scan.stamp_ns)) > 0:
             return wait
         try:
             result = run.step(again=again)
@@ -281,18 +290,17 @@ class Session:
                 return 0.0
             self._fail(f"The frame after frame {run.frame} could not be processed and is left out", error)
             return None
-        if again:
+        if again and journey is not None:
             run.readouts.row(result)
             self._page_behind, self._unseen = True, result
-            run.remember(near=self._again_to - run.frame <= NEAR)
-            if run.frame >= self._again_to:
+            run.remember(near=journey.again_to - run.frame <= NEAR)
+            if run.frame >= journey.again_to:
                 self._catch_up()
         else:
             self._page.frame(run, result)
             self._page.show(frames_per_second=self._pacer.tick(), urgent=False)
             run.remember()
-        if self._target is not None:
-            self._approach(run.frame, self._target)
+        self._approach(run.frame)
         return 0.0
 
     def _catch_up(self) -> None:
@@ -305,14 +313,18 @@ class Session:
             changed = then.changed(run.params) if then is not None else {}
             self._relabelling = any(_EFFECT[path] == "now" for path in changed)
 
-    def _approach(self, frame: int, target: int) -> None:
-        if frame >= target:
-            self._target = None
+    def _approach(self, frame: int) -> None:
+        """At a frame of the journey, if there is one: end it there or say how far it is."""
+        journey = self._journey
+        if journey is None:
+            return
+        if frame >= journey.target:
+            self._journey = None
             self._pacer.release()
             self._outbox.put(progress=None, urgent=True)
-        elif target - self._target_from > LONG_SEEK:
-            fraction = (frame - self._target_from) / (target - self._target_from)
-            self._outbox.put(progress=Progress(f"Going to frame {target}", fraction))
+        elif journey.target - journey.origin > LONG_SEEK:
+            fraction = (frame - journey.origin) / (journey.target - journey.origin)
+            self._outbox.put(progress=Progress(f"Going to frame {journey.target}", fraction))
 
     def _relabel(self) -> None:
         self._relabelling = False
@@ -380,7 +392,7 @@ class Session:
             self._saver.wait()
             self._run.close()
         self._run = run
-        self._relabelling = self._going_back = self._page_behind = False
+        self._relabelling = self._page_behind = False
         self._unseen = None
         run.remember()
         self._page.opened(run)

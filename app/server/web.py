@@ -24,8 +24,9 @@ from app import __version__
 from app.server.access import Access, Guard
 from app.server.api import make_router
 from app.server.folders import Folders
+from app.server.setup import Setup
 from app.server.viser_page import BUFFER_BYTES, Viser, bridge, page_html, start_viser
-from app.server.worker import EngineProcess, Setup
+from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
 
 

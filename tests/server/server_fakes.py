@@ -12,8 +12,8 @@ import numpy as np
 from app.sensors.findings import Finding
 from app.server.engine_process import run_loop
 from app.server.run import Run
+from app.server.setup import Setup
 from app.server.wire import Pipe
-from app.server.worker import Setup
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import (

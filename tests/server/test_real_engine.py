@@ -8,7 +8,8 @@ import pytest
 from app.sensors.presets import resolve_params
 from app.server.protocol import Seek, SetParams
 from app.server.run import open_run
-from app.server.worker import EngineProcess, Setup
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
 from app.slam.types import GROUND, Measurement
 
 SAMPLE_DATA = Path(__file__).resolve().parents[2] / "sample_data"

@@ -27,9 +27,10 @@ from websockets.typing import Origin, Subprotocol
 
 from app.server.access import Access
 from app.server.folders import Folders
+from app.server.setup import Setup
 from app.server.viser_page import Viser, start_viser
 from app.server.web import links, listen, make_app, make_server
-from app.server.worker import EngineProcess, Setup
+from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
 
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
@@ -374,7 +375,8 @@ from functools import partial
 from pathlib import Path
 from app.server.folders import Folders
 from app.server.web import run_server
-from app.server.worker import EngineProcess, Setup
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
 
 class Page:
     def __init__(self, viser, engine, folders): self.engine = engine

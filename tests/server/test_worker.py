@@ -13,7 +13,8 @@ import pytest
 import server_fakes as fakes
 
 from app.server.protocol import OpenRecording, Pause, Play, Restart, Seek, SetParams, SetSpeed, Snapshot, StepFrame
-from app.server.worker import EngineProcess, Setup
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
 
 PATIENCE_S = 20.0
 
@@ -107,7 +108,8 @@ import sys, time
 sys.path[:0] = {path!r}
 import server_fakes as fakes
 from pathlib import Path
-from app.server.worker import EngineProcess, Setup
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
 if __name__ == "__main__":
     engine = EngineProcess(Setup(recording=Path("walk-300.mcap")), main=fakes.fake_main)
     while engine.snapshot.transport.frame < 0:
