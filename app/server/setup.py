@@ -1,0 +1,34 @@
+"""What an engine's process is started with."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from app.slam.params import Params
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What an engine's process starts with. Must be picklable.
+
+    Attributes:
+        recording: to open, or None to wait for OpenRecording. truth: its truth, if not beside it.
+        start_s, duration_s: the part of that recording to process.
+        resolve: parameters for recordings opened later; None keeps the present ones.
+        play: begin at once. speed: to play at.
+        chunk_voxel: m, see `Session`. checkpoint_bytes: see `app.server.checkpoints`.
+        session, notices: how many there were before, for a process that takes over from another.
+    """
+
+    recording: Path | None = None
+    truth: Path | None = None
+    params: Params = field(default_factory=Params)
+    start_s: float = 0.0
+    duration_s: float | None = None
+    resolve: Callable[[Path], Params] | None = None
+    play: bool = False
+    speed: float = 1.0
+    chunk_voxel: float = 0.05
+    checkpoint_bytes: int = 1 << 30
+    session: int = 0
+    notices: int = 0
