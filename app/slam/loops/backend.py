@@ -174,6 +174,7 @@ class LoopBackend:
         return LoopDetail(
             older=detector.submap(older).submap.points,
             newer=detector.submap(newer).submap.points,
+            T_imu_level=lie.inverse(detector.T_level_imu(older)),
             T_guess=detector.guess(older, newer, self.poses),
             T_registered=T,
             older_context=np.where(a.seen, a.cells, np.float32(np.nan)),

@@ -170,6 +170,7 @@ class LoopDetail:
 
     Attributes:
         older, newer: (n, 3) submap points, each in its own level frame.
+        T_imu_level: (4, 4) the older keyframe's IMU frame from its level frame: a rotation.
         T_guess: (4, 4) older's level frame from newer's, by the graph. T_registered: by the edge.
         older_context, newer_context: (rings, sectors), nan where never seen.
         shift_distances: (sectors,) distance over column shifts.
@@ -178,6 +179,7 @@ class LoopDetail:
 
     older: F32
     newer: F32
+    T_imu_level: F64
     T_guess: F64
     T_registered: F64
     older_context: F32
