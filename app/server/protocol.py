@@ -238,11 +238,13 @@ class LoopsView:
 SERIES = (
     "stamp_s", "planarity", "seeds", "ground_share", "points_in", "points_reduced", "points_filter",
     "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "total_ms",
-    "iterations", "inliers", "residual_rms", "degeneracy", "speed", "gyro_bias", "accel_bias", "distance", "error_m",
+    "iterations", "used", "inliers", "residual_rms", "degeneracy", "imu_gap_s", "dropped",
+    "speed", "gyro_bias", "accel_bias", "distance", "error_m",
 )  # fmt: skip
 """Per-frame readouts, one float64 array each, nan where there is none. `stamp_s` counts from the
-start of the recording; `degeneracy` is the smallest eigenvalue of the pose information; `speed` m/s;
-the biases are norms; `distance` m walked; `error_m` to the truth, aligned to the walk so far."""
+start of the recording; `used` points were looked up in the map; `degeneracy` is the smallest
+eigenvalue of the pose information; `imu_gap_s` and `dropped` as in `StepResult`; `speed` m/s; the
+biases are norms; `distance` m walked; `error_m` to the truth, aligned to the walk so far."""
 
 
 @dataclass(frozen=True, slots=True)

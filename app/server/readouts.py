@@ -37,7 +37,7 @@ class Readouts:
         self._truth = truth
         self._walked = 0.0
         self._last: F64 | None = None
-        self._theirs, self._ours = Rows(3), Rows(3)
+        self._theirs, self._ours = Rows(3), Rows(3)  # row by frame; theirs is nan where there is no truth
         self.T_map_truth: F64 | None = None
 
     def checkpoint(self) -> ReadoutsState:
@@ -65,9 +65,12 @@ class Readouts:
             "points_reduced": result.points_reduced,
             "points_filter": result.points_filter,
             "iterations": registration.iterations,
+            "used": registration.used,
             "inliers": registration.inliers,
             "residual_rms": registration.residual_rms,
             "degeneracy": registration.eigenvalues[0] if len(registration.eigenvalues) else np.nan,
+            "imu_gap_s": result.imu_gap_s,
+            "dropped": result.dropped,
             "speed": np.linalg.norm(state.v_odom_imu),
             "gyro_bias": np.linalg.norm(state.b_gyro),
             "accel_bias": np.linalg.norm(state.b_accel),
@@ -76,14 +79,23 @@ class Readouts:
         } | {f"{stage}_ms": ms for stage, ms in result.timings_ms.items()}
         return [float(values.get(name, np.nan)) for name in SERIES]
 
+    def moved(self, positions: F64) -> None:
+        """The walk so far was laid anew: (n, 3) positions of all frames in the map."""
+        if self._truth is not None:
+            self._ours.go_to(0)
+            self._ours.extend(positions[: len(self._theirs)])
+
     def _error(self, stamp_ns: int, position: F64) -> float:
         """Distance to the truth (m), aligned to all positions so far; nan where there is none."""
+        if self._truth is None:
+            return float("nan")
         there = self._truth_at(stamp_ns)
+        self._theirs.extend(np.full((1, 3), np.nan) if there is None else there[None])
+        self._ours.extend(position[None])
         if there is None:
             return float("nan")
-        self._theirs.extend(there[None])
-        self._ours.extend(position[None])
-        theirs, ours = self._theirs.view(), self._ours.view()
+        known = np.isfinite(self._theirs.view()[:, 0])
+        theirs, ours = self._theirs.view()[known], self._ours.view()[known]
         if np.linalg.norm(np.ptp(theirs, axis=0)) < LEAST_EXTENT_M:
             return float("nan")
         try:

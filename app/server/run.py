@@ -76,6 +76,7 @@ class Run:
         self._part = (start_s, duration_s)
         self._incoming = recording.measurements(start_s, duration_s)
         self._waiting: Measurement | None = None
+        self._dropped = 0  # scans since the newest frame
         self.finished = False
 
     def peek(self) -> Measurement | DroppedScan | None:
@@ -91,6 +92,7 @@ class Run:
             if not isinstance(entry, Measurement):
                 if entry is not None:
                     self.log.drop(entry)
+                    self._dropped += 1
                 return entry
             self._waiting = entry
         return self._waiting
@@ -112,9 +114,8 @@ class Run:
             result = self.engine.step(measurement.scan, measurement.imu)
         finally:
             self.engine.params = self.params
-        if measurement.notices:
-            result = replace(result, notices=(*measurement.notices, *result.notices))
-        self.frame = frame
+        result = replace(result, notices=(*measurement.notices, *result.notices), dropped=self._dropped)
+        self.frame, self._dropped = frame, 0
         self.known = max(self.known, frame)
         self.log.add(result)
         return result
@@ -162,7 +163,7 @@ class Run:
         self.readouts.restore(state.readouts)
         self.frame = state.frame
         self._incoming = self._recording.measurements(*self._part, after=state.place)
-        self._waiting, self.finished = None, False
+        self._waiting, self._dropped, self.finished = None, 0, False
 
     def saver(self, folder: Path, *, trajectory_only: bool) -> Callable[[], None]:
         """A function that writes the results of the frames so far; may be called in another thread.

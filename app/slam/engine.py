@@ -112,6 +112,7 @@ class Engine:
             keyframe=keyframe,
             notices=tuple(notices),
             truth_ground=scan.truth_ground,
+            imu_gap_s=float(np.diff(samples.stamps_ns).max(initial=0)) * 1e-9,
         )
         self._status = status
         self._frame += 1

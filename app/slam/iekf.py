@@ -12,7 +12,7 @@ from app.slam.kernels import manifold
 from app.slam.kernels import registration as kernels
 from app.slam.local_map import LocalMap, Planes
 from app.slam.params import Filter
-from app.slam.types import F32, F64, NavState, Registration
+from app.slam.types import F32, F64, Matches, NavState, Registration
 
 RESEARCH_ROTATION = 1e-3
 RESEARCH_TRANSLATION = 1e-2
@@ -95,7 +95,8 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> t
         )  # fmt: skip
         if stats[0] < MIN_INLIERS:
             reason = f"only {int(stats[0])} of {n} points found a plane in the map; an update takes {MIN_INLIERS}"
-            nothing = Registration(False, iteration, n, int(stats[0]), float("nan"), np.zeros(6), True, reason)
+            matches = _matches(points, residuals, planes)
+            nothing = Registration(False, iteration, n, int(stats[0]), float("nan"), np.zeros(6), True, reason, matches)
             return prior, nothing
         here, x = x, np.empty(manifold.SIZE)
         manifold.gauss_newton(here, begin, information, H, b, covariance, step, x)
@@ -104,6 +105,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> t
             converged = True
             break
 
+    assert planes is not None
     reach = float(np.sqrt(np.mean(np.sum(points.astype(np.float64) ** 2, axis=1))))
     scale = np.r_[np.full(3, 1.0 / reach), np.ones(3)]
     eigenvalues = np.linalg.eigvalsh(H[:6, :6] * np.outer(scale, scale))
@@ -117,6 +119,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> t
         eigenvalues=eigenvalues,
         degenerate=degenerate,
         reason="one direction is not held by this scan" if degenerate else "",
+        matches=_matches(points, residuals, planes),
     )
     posterior = prior.covariance.copy()
     posterior[:free, :free] = covariance
@@ -124,6 +127,17 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> t
     posterior[:free, free:] = covariance @ information @ prior.covariance[:free, free:]
     posterior[free:, :free] = posterior[:free, free:].T
     return Belief(_unpacked(x, prior.state.stamp_ns), posterior), registration
+
+
+def _matches(points: F32, residuals: F64, planes: Planes) -> Matches:
+    found = planes.variances[:, None] >= 0.0  # elsewhere normals and centers were never written
+    normals, centers = np.where(found, planes.normals, 0.0), np.where(found, planes.centers, 0.0)
+    matches = Matches(
+        points.copy(), residuals.astype(np.float32), normals.astype(np.float32), centers.astype(np.float32)
+    )
+    for array in (matches.points, matches.residuals, matches.normals, matches.centers):
+        array.setflags(write=False)
+    return matches
 
 
 def _over(step: F64, rotation: float, translation: float) -> bool:

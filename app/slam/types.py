@@ -176,6 +176,22 @@ class GroundResult:
 
 
 @dataclass(frozen=True, slots=True)
+class Matches:
+    """The points that an update was offered, and the planes of the map that it found for them.
+
+    Attributes:
+        points: (n, 3) float32 m, LiDAR frame at the scan's end.
+        residuals: (n,) float32, signed distance to the plane in m; nan where no plane was accepted.
+        normals: (n, 3) unit and centers: (n, 3) m, float32, odom; zeros where no plane was found.
+    """
+
+    points: F32
+    residuals: F32
+    normals: F32
+    centers: F32
+
+
+@dataclass(frozen=True, slots=True)
 class Registration:
     """How the filter's update went (paper eq. 5-7). A result that explains itself.
 
@@ -186,6 +202,7 @@ class Registration:
         eigenvalues: (6,) ascending, of the 6x6 pose information (rotation, translation blocks
             scaled by their expected units), the smaller, the less that direction is observed.
         degenerate: whether a direction was not observed by this scan alone. reason: in words.
+        matches: point by point; None where nothing was looked up.
     """
 
     converged: bool
@@ -196,6 +213,7 @@ class Registration:
     eigenvalues: F64
     degenerate: bool
     reason: str = ""
+    matches: Matches | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,6 +260,8 @@ class StepResult:
         points_filter: handed to the filter after the scan voxel.
         timings_ms: of STAGES and "total". keyframe: if this frame became one.
         notices: what a user should know about this frame, in sentences.
+        imu_gap_s: longest time between the IMU samples that cover it.
+        dropped: scans left out between the frame before and this one.
     """
 
     index: int
@@ -259,6 +279,8 @@ class StepResult:
     keyframe: Keyframe | None = None
     notices: tuple[str, ...] = field(default=())
     truth_ground: U8 | None = None
+    imu_gap_s: float = 0.0
+    dropped: int = 0
 
     @property
     def T_map_imu(self) -> F64:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from app.server.chunks import one_per_voxel
 from app.server.delta import Fold, Outbox, Rows
 from app.server.protocol import (
+    SERIES,
     Command,
     OpenRecording,
     Pause,
@@ -90,7 +91,7 @@ def test_a_reader_that_misses_updates_ends_with_the_same_snapshot(
 
 def test_nothing_is_kept_for_a_reader_that_has_it() -> None:
     outbox = Outbox(Params())
-    outbox.frame(np.zeros(3), [0.0] * 24)
+    outbox.frame(np.zeros(3), [0.0] * len(SERIES))
     outbox.notice("info", "one")
     outbox.take()
     assert not outbox.filled and not outbox.urgent
