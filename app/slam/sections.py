@@ -308,6 +308,15 @@ class Loops(Section):
     drift_rotation: float = _param(
         0.02, "Drift of odometry's heading (standard deviation) per distance.", unit="deg/m", ge=0.001, le=2, step=0.005
     )
+    latency: int = _param(
+        20,
+        "Frames after a keyframe at which what was found with it takes effect; fixed, so that results never depend on"
+        " the machine's speed.",
+        ge=1,
+        le=1000,
+        step=1,
+        effect="restart",
+    )
     window: int = _param(
         0,
         "Newest keyframes whose poses are solved for, as in the paper; 0: all, so that late loops straighten the"

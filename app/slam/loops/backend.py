@@ -1,39 +1,30 @@
 """The loop back end: keyframes in, loops and corrected poses out. Synchronous and deterministic.
 
-Two layers. What was FOUND comes from the keyframes, and stays: candidates, their evidence, their
-verdicts. Over it lies the list of the user's COMMANDS, of which any number can be undone and done
-again. The graph is a function of both, solved in the order in which keyframes and loops came, so
-that undoing is the same as never having done.
+Two layers. What was FOUND is history: it came with one keyframe after the other, is only ever
+appended, and going back is looking at fewer of them. Over it lie the user's COMMANDS, which belong
+to the present. The graph is a function of both, solved in the order in which keyframes and loops
+came, so that undoing is the same as never having done. A command forgets nothing that was found;
+but keyframes that come after it are looked at with the loops as they count then.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from app.slam import lie
 from app.slam.errors import HemislamError
-from app.slam.keyframes import KeyframeStore
-from app.slam.loops import scan_context
-from app.slam.loops.detection import Detector, Memory
+from app.slam.loops import inspection
+from app.slam.loops.detection import Detector, Head
 from app.slam.loops.drift import Drift, expect
 from app.slam.loops.judgement import by_hand, judge
 from app.slam.loops.odometry import odometry_factor
-from app.slam.loops.pose_graph import Factor, PoseGraph, Step, optimise, whitened, write_g2o
+from app.slam.loops.overruling import Entry, Overrulings, check, in_words
+from app.slam.loops.pose_graph import Factor, Step, g2o_text, optimise
+from app.slam.loops.scan_context import ScanContext
+from app.slam.loops.solution import Solution, loop_factor
 from app.slam.loops.support import settle
-from app.slam.loops.types import (
-    Accept,
-    Add,
-    Command,
-    FactorResidual,
-    LoopDetail,
-    LoopEdge,
-    Pair,
-    Preview,
-    Reject,
-    SetWeight,
-    Verdict,
-)
+from app.slam.loops.types import Add, Command, FactorResidual, LoopDetail, LoopEdge, Pair, Preview, Verdict
 from app.slam.params import Loops
 from app.slam.types import F64, Keyframe
 
@@ -42,251 +33,329 @@ SURE_M = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
-    """A command, and for Add the loop that it came to when it was given."""
+class Found:
+    """What looking found: contexts of the next keyframes that had none; candidates, new or changed."""
 
-    command: Command
-    added: LoopEdge | None = None
+    contexts: tuple[ScanContext, ...] = ()
+    updates: tuple[LoopEdge, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Checkpoint:
-    """All that the back end's future depends on."""
+class Record:
+    """One keyframe of the history: itself without its cloud, and what was found when it came."""
 
-    memory: Memory
-    found: dict[Pair, LoopEdge]
-    done: tuple[Done, ...]
-    undone: tuple[Done, ...]
-    steps: tuple[Step, ...]
-    broken: frozenset[Pair]
-    notices: tuple[str, ...]
+    head: Head
+    odometry: Factor | None
+    params: Loops
+    found: Found
 
 
 class LoopBackend:
     """Finds loops among the keyframes of one walk and straightens their poses (paper 2.4).
 
-    Args:
-        params: of loops.
-        keyframes: where the clouds are; a keyframe must be in it when it is given to `add`.
-
-    Attributes:
-        notices: what went wrong on the way, in sentences.
+    It keeps a thinned cloud of every keyframe on disk; `close` gives that space back.
     """
 
-    def __init__(self, params: Loops, keyframes: KeyframeStore) -> None:
-        self.params = params
-        self.notices: list[str] = []
-        self._drift = Drift(self.params.drift_translation / 100, np.radians(self.params.drift_rotation))
-        self._detector = Detector(self.params, keyframes)
-        self._graph = PoseGraph(np.eye(4), self.params.window)
-        self._odometry: list[Factor] = []
+    def __init__(self) -> None:
+        self._history: list[Record] = []
+        self._ends: dict[int, Found] = {}  # what `finish` found, by the number of keyframes
+        self._overrulings = Overrulings()
+        self._start = Loops()  # for what acts on restart
+        self._detector = Detector(self._start)
+        self._solution = Solution()
         self._found: dict[Pair, LoopEdge] = {}
-        self._done: list[Done] = []
-        self._undone: list[Done] = []
-        self._broken: frozenset[Pair] = frozenset()
+        self._finished = False
+        self._notices: list[str] = []
 
     def __len__(self) -> int:
         return len(self._detector)
 
+    @property
+    def known(self) -> int:
+        """Keyframes of the history, also those gone back over."""
+        return len(self._history)
+
+    @property
+    def finished(self) -> bool:
+        return self._finished
+
+    def close(self) -> None:
+        self._detector.close()
+
     # --- the walk --------------------------------------------------------------------------------
-    def add(self, keyframe: Keyframe) -> tuple[LoopEdge, ...]:
+    def add(self, keyframe: Keyframe, params: Loops) -> None:
         """Take the next keyframe; look for loops of the newest one whose surroundings are complete.
 
-        Returns:
-            Candidates that are new or whose verdict has changed.
+        A keyframe of the history, as it was, only goes forth to it. Raises HemislamError if it is not the next.
         """
-        self._detector.add(keyframe)
-        if len(self) == 1:
-            self._graph = PoseGraph(keyframe.T_odom_imu, self.params.window)
+        if keyframe.index != len(self):
+            raise HemislamError(f"Keyframe {keyframe.index} can not follow on {len(self)} keyframes; one is missing.")
+        self.go_to(len(self))
+        head = Head(keyframe.stamp_ns, keyframe.T_odom_imu, keyframe.covariance)
+        if len(self) < self.known:
+            record = self._history[len(self)]
+            if record.params == params and _same(record.head, head):
+                self.go_to(len(self) + 1)
+                return
+        self.forget()
+        if not self.known:
+            self._begin(params)
+        elif params == self._history[-1].params:
+            params = self._history[-1].params  # so that they are kept once
+        self._detector.take(keyframe)
+        odometry = odometry_factor(len(self), self._detector.heads[-1], head, _drift(params)) if len(self) else None
+        self._step(head, odometry)
+        found = Found()
+        if params.enabled:
+            complete = len(self) - 1 - self._start.submap_keyframes
+            found = self._look(max(complete, self._detector.described), complete + 1, params)
+        self._history.append(Record(head, odometry, params, found))
+        self._learn(found)
+        self._resolve()
+
+    def finish(self) -> None:
+        """The walk ends here: look for loops of the last keyframes too. The next step of the walk takes it back."""
+        if self._finished or not len(self):
+            return
+        count, params = len(self), self._history[len(self) - 1].params
+        if count not in self._ends:
+            self._ends[count] = self._look(self._detector.described, count, params) if params.enabled else Found()
+        self._finished = True
+        self._stand(count)
+        self._resolve()
+        for command in self._idle():
+            self._notices.append(f"{in_words(command)} has no effect: there is no such loop; loops.csv lists all.")
+
+    def go_to(self, count: int) -> None:
+        """Be where it was after `count` keyframes of the history. Raises HemislamError if there are not so many."""
+        if not 0 <= count <= self.known:
+            raise HemislamError(f"The loop search knows {self.known} keyframes and can not go to {count}.")
+        if self._finished or not len(self) <= count <= len(self) + 1:
+            self._finished = False
+            self._stand(count)
+        elif count == len(self) + 1:  # as `_stand` would, but quicker
+            record = self._history[len(self)]
+            self._step(record.head, record.odometry)
+            self._detector.learn(record.found.contexts)
+            self._learn(record.found)
+        self._resolve()
+
+    def forget(self) -> None:
+        """Forget the history beyond where it stands."""
+        count = len(self)
+        if count == self.known:
+            return
+        half = self._start.submap_keyframes
+        del self._history[count:]
+        self._ends = {end: found for end, found in self._ends.items() if end <= count}
+        self._detector.forget()
+        self._overrulings.wait_again(lambda pair: pair[1] + half >= count)
+        self._stand(count)
+
+    def _begin(self, params: Loops) -> None:
+        self._detector.close()
+        self._start, self._detector = params, Detector(params)
+
+    def _stand(self, count: int) -> None:
+        """Take from the history what was found with the first `count` keyframes, and solve."""
+        records = self._history[:count]
+        end = self._ends[count] if self._finished else Found()
+        parts = [*(record.found for record in records), end]
+        self._detector.stand((record.head for record in records), (c for part in parts for c in part.contexts))
+        self._found = {edge.pair: edge for part in parts for edge in part.updates}
+        self._solve()
+
+    def _step(self, head: Head, odometry: Factor | None) -> None:
+        """One more keyframe in the graph."""
+        self._detector.go_on(head)
+        if odometry is None:
+            self._solution.begin(head.T_odom_imu, self._start.window)
         else:
-            heads = self._detector.heads
-            self._odometry.append(odometry_factor(len(self) - 1, heads[-2], heads[-1], self._drift))
-            self._report(self._graph.extend(self._odometry[-1]))
-        complete = len(self) - 1 - self.params.submap_keyframes
-        return self._look(complete) if self.params.enabled and complete >= self._detector.described else ()
+            self._solution.extend(odometry)
 
-    def finish(self) -> tuple[LoopEdge, ...]:
-        """At the end of the walk: look for loops of the last keyframes too. Returns as `add`."""
-        if not self.params.enabled:
-            return ()
-        return tuple(edge for index in range(self._detector.described, len(self)) for edge in self._look(index))
+    def _learn(self, found: Found) -> None:
+        """What was found with the newest keyframe takes effect."""
+        self._found.update((edge.pair, edge) for edge in found.updates)
+        newest = len(self) - 1
+        self._solution.close([loop_factor(edge) for edge in self._accepted(self.edges) if edge.decided_at == newest])
 
-    def _look(self, newer: int) -> tuple[LoopEdge, ...]:
-        self._detector.describe(newer)
-        accepted = [edge for edge in self.edges if edge.verdict is Verdict.ACCEPTED]
-        expectation = expect(newer, self._graph.poses, accepted, self._drift)
-        seen = []
-        for sighting in self._detector.look(newer, expectation):
-            seen.append(judge(sighting, self._detector, expectation, self.params))
-            if seen[-1].verdict is Verdict.CANDIDATE and seen[-1].evidence.gate_m < SURE_M:
-                break
-        changed = settle(seen, self.edges, self._detector.poses, self._drift, self.params, len(self) - 1)
-        self._found.update((edge.pair, replace(edge, overruled=False, weight=1.0)) for edge in changed)
-        fresh = {edge.pair for edge in changed}
-        loops = [edge for edge in self.edges if edge.pair in fresh and edge.verdict is Verdict.ACCEPTED]
-        self._report(self._graph.close([_factor(edge) for edge in loops]))
-        return tuple(edge for edge in self.edges if edge.pair in fresh)
+    def _look(self, first: int, end: int, params: Loops) -> Found:
+        """Look for loops of the keyframes from `first` to before `end`; the graph stays as it is."""
+        described, updates = self._detector.described, dict[Pair, LoopEdge]()
+        while self._detector.described < end:
+            self._detector.learn([self._detector.describe(self._detector.described)])
+        for newer in range(first, end):
+            edges = self._edges({**self._found, **updates})
+            expectation = expect(newer, self.poses, self._accepted(edges.values()), _drift(params))
+            seen = []
+            for sighting in self._detector.look(newer, expectation, params):
+                seen.append(judge(sighting, self._detector, expectation, params))
+                if seen[-1].verdict is Verdict.CANDIDATE and seen[-1].evidence.gate_m < SURE_M:
+                    break
+            known = {*self._found, *updates}
+            fresh = {edge.pair: edge for edge in seen if edge.pair not in known}
+            laid = self._edges({**self._found, **updates, **fresh})
+            settled = settle(fresh, laid, self._detector.poses, _drift(params), params, len(self) - 1)
+            updates.update((edge.pair, edge) for edge in settled)
+        return Found(tuple(self._detector.context(i) for i in range(described, end)), tuple(updates.values()))
 
     # --- what there is ---------------------------------------------------------------------------
     @property
     def poses(self) -> F64:
         """(k, 4, 4) T_map_imu of all keyframes."""
-        return self._graph.poses if len(self) else np.empty((0, 4, 4))
+        return self._solution.poses
 
     @property
     def T_map_odom(self) -> F64:
         """(4, 4) the correction at the newest keyframe."""
-        if not len(self):
-            return np.eye(4)
-        return np.asarray(self._graph.newest @ lie.inverse(self._detector.heads[-1].T_odom_imu))
+        return np.asarray(self.corrections_of(self.poses)[-1]) if len(self) else np.eye(4)
+
+    def corrections_of(self, poses: F64) -> F64:
+        """(k, 4, 4) T_map_odom at each keyframe, by these T_map_imu."""
+        return poses @ lie.inverse(self._detector.poses)
 
     @property
     def edges(self) -> tuple[LoopEdge, ...]:
         """All candidates ever, as they count now, by keyframes."""
-        return self._edges(self._done)
+        return tuple(self._edges(self._found).values())
 
-    def _edges(self, done: list[Done]) -> tuple[LoopEdge, ...]:
-        edges = dict(self._found)
-        for entry in done:
-            pair = entry.command.older, entry.command.newer
-            if isinstance(entry.command, Add) and entry.added is not None:
-                edges[pair] = entry.added
-            elif pair in edges:
-                edges[pair] = _overruled(edges[pair], entry.command)
-        for pair in self._broken & edges.keys():
-            edges[pair] = replace(edges[pair], verdict=Verdict.REJECTED, reason="the solver failed with it")
-        return tuple(edges[pair] for pair in sorted(edges))
+    def take_notices(self) -> tuple[str, ...]:
+        """What went wrong since this was last asked, in sentences."""
+        notices, self._notices = self._notices, []
+        return (*self._solution.take_notices(), *notices)
 
     def factor_residuals(self) -> tuple[FactorResidual, ...]:
         """Of every factor of the graph, odometry first."""
-        return _residuals(self._factors(self.edges), self.poses)
+        return inspection.residuals(self._factors(self.edges), self.poses)
 
     def optimised(self) -> F64:
         """(k, 4, 4) T_map_imu by Levenberg-Marquardt over all factors at once, from the present poses."""
         return self._batch(self.edges)
 
     def detail(self, older: int, newer: int) -> LoopDetail:
-        """What the inspector shows of a candidate. Raises HemislamError if there is none of these keyframes."""
-        edge = self._edge(older, newer)
-        detector = self._detector
-        T = detector.T_level_imu(older) @ edge.T_older_newer @ lie.inverse(detector.T_level_imu(newer))
-        a, b = detector.context(older), detector.context(newer)
-        return LoopDetail(
-            older=detector.submap(older).submap.points,
-            newer=detector.submap(newer).submap.points,
-            T_imu_level=lie.inverse(detector.T_level_imu(older)),
-            T_guess=detector.guess(older, newer, self.poses),
-            T_registered=T,
-            older_context=np.where(a.seen, a.cells, np.float32(np.nan)),
-            newer_context=np.where(b.seen, b.cells, np.float32(np.nan)),
-            shift_distances=scan_context.shift_distances(a, b),
-            residuals=detector.assess(older, newer, T).residuals,
-        )
+        """What the inspector shows of two keyframes. Raises HemislamError if there are none such."""
+        self._check_there(older, newer)
+        edge = self._edges(self._found).get((older, newer))
+        measured = None if edge is None else edge.T_older_newer
+        return inspection.detail(self._detector, older, newer, self.poses, measured)
 
-    def write_g2o(self, path: Path) -> None:
-        """The graph as a g2o file. Raises HemislamError if it can not be written."""
-        try:
-            write_g2o(path, self.poses, self._factors(self.edges))
-        except OSError as error:
-            raise HemislamError(f"{path} can not be written ({error.strerror}); choose another place.") from error
+    def g2o(self) -> str:
+        """The graph as the text of a g2o file."""
+        return g2o_text(self.poses, self._factors(self.edges))
 
     # --- overruling ------------------------------------------------------------------------------
-    def apply(self, command: Command) -> LoopEdge:
-        """Overrule. What was undone before can no longer be redone. Returns the loop as it is now.
-
-        Raises:
-            HemislamError: there is no such candidate or keyframe, or the weight is not positive.
-        """
-        self._done.append(self._resolve(command))
-        self._undone.clear()
-        self._solve()
-        return self._edge(command.older, command.newer)
-
-    def undo(self) -> Command | None:
-        """Take the last command back; None if there is none."""
-        if not self._done:
-            return None
-        self._undone.append(self._done.pop())
-        self._solve()
-        return self._undone[-1].command
-
-    def redo(self) -> Command | None:
-        """Do the command again that was last undone; None if there is none."""
-        if not self._undone:
-            return None
-        self._done.append(self._undone.pop())
-        self._solve()
-        return self._done[-1].command
-
     @property
     def commands(self) -> tuple[Command, ...]:
         """The commands in force, in order."""
-        return tuple(entry.command for entry in self._done)
+        return self._overrulings.commands
 
     @property
     def undone(self) -> tuple[Command, ...]:
         """The commands that `redo` would do again, the next one last."""
-        return tuple(entry.command for entry in self._undone)
+        return self._overrulings.undone
+
+    def apply(self, command: Command) -> None:
+        """Overrule. What was undone before can no longer be redone. Raises HemislamError if it makes no sense."""
+        check(command)
+        waits = not isinstance(command, Add) and (command.older, command.newer) not in self._edges(self._found)
+        self._overrulings.give(self._entry(command))
+        self._solve()
+        if waits or command.newer >= len(self):
+            self._notices.append(f"{in_words(command)} waits until there is such a loop.")
+
+    def load(self, commands: tuple[Command, ...], undone: tuple[Command, ...] = ()) -> None:
+        """These commands in place of all there are. Raises as `apply`, and then nothing has changed."""
+        for command in (*commands, *undone):
+            check(command)
+        self._overrulings.load(commands, undone)
+        self._solve()
+        self._resolve()
+
+    def undo(self) -> None:
+        """Take the last command back. Raises HemislamError if there is none."""
+        self._overrulings.undo()
+        self._solve()
+
+    def redo(self) -> None:
+        """Do the command again that was last undone. Raises HemislamError if there is none."""
+        self._overrulings.redo()
+        self._solve()
+        self._resolve()
 
     def preview(self, command: Command) -> Preview:
-        """What the graph would become by a command, without doing it. Raises as `apply`."""
-        edges = self._edges([*self._done, self._resolve(command)])
-        poses = self._batch(edges)
-        return Preview(poses, _residuals(self._factors(edges), poses))
+        """What the graph would become by a command, without doing it.
 
-    def _resolve(self, command: Command) -> Done:
+        Raises:
+            HemislamError: it makes no sense, or there is no such loop or keyframe yet.
+        """
+        check(command)
+        self._check_there(command.older, command.newer)
+        if not isinstance(command, Add) and (command.older, command.newer) not in self._edges(self._found):
+            raise HemislamError(f"There is no loop candidate of keyframes {command.older} and {command.newer}.")
+        edges = tuple(self._edges(self._found, self._entry(command)).values())
+        poses = self._batch(edges)
+        return Preview(poses, inspection.residuals(self._factors(edges), poses))
+
+    def _entry(self, command: Command) -> Entry:
+        there = isinstance(command, Add) and command.newer < len(self)
+        return Entry(command, self._made(command) if isinstance(command, Add) and there else None)
+
+    def _made(self, command: Add) -> LoopEdge:
         older, newer = command.older, command.newer
-        if not isinstance(command, Add):
-            self._edge(older, newer)
-            if isinstance(command, SetWeight) and not (np.isfinite(command.weight) and command.weight > 0):
-                raise HemislamError(f"A loop's weight can not be {command.weight:g}; it must be greater than 0.")
-            return Done(command)
+        poses = self.poses
+        present = np.asarray(lie.inverse(poses[older]) @ poses[newer])
+        guess = present if command.guess is None else np.array(command.guess, dtype=np.float64)
+        return by_hand(older, newer, self._detector, guess, register=command.register)
+
+    def _resolve(self) -> None:
+        """Make the loops by hand that waited for keyframes, once the surroundings of these are complete."""
+        if not len(self):
+            return
+        half = 0 if self._finished else self._start.submap_keyframes
+        if self._overrulings.resolve(lambda pair: pair[1] + half < len(self), self._made):
+            self._solve()
+
+    def _idle(self) -> list[Command]:
+        there = self._edges(self._found)
+        return [entry.command for entry in self._overrulings if entry.pair not in there]
+
+    def _check_there(self, older: int, newer: int) -> None:
         if not 0 <= older < newer < len(self):
             raise HemislamError(
-                f"Keyframes {older} and {newer} can not be tied together; choose an older and a newer one"
-                f" of the {len(self)} there are."
+                f"Keyframes {older} and {newer} can not be compared; choose an older and a newer one of the"
+                f" {len(self)} there are."
             )
-        poses = self.poses
-        present = lie.inverse(poses[older]) @ poses[newer]
-        guess = present if command.guess is None else np.array(command.guess, dtype=np.float64)
-        if guess.shape != (4, 4) or not np.isfinite(guess).all():
-            raise HemislamError("The guess of a loop must be a 4x4 matrix T_older_newer of finite numbers.")
-        return Done(command, by_hand(older, newer, self._detector, guess, register=command.register))
-
-    def _edge(self, older: int, newer: int) -> LoopEdge:
-        for edge in self.edges:
-            if edge.pair == (older, newer):
-                return edge
-        raise HemislamError(f"There is no loop candidate of keyframes {older} and {newer}; loops.csv lists them.")
 
     # --- the graph -------------------------------------------------------------------------------
+    def _edges(self, found: dict[Pair, LoopEdge], extra: Entry | None = None) -> dict[Pair, LoopEdge]:
+        edges = self._overrulings.lay_over(found, len(self), extra)
+        for pair in self._solution.broken & edges.keys():
+            edges[pair] = replace(edges[pair], verdict=Verdict.REJECTED, reason="the solver failed with it")
+        return edges
+
     def _solve(self) -> None:
         """Solve again, in the order in which keyframes and loops came."""
-        self._broken = frozenset()
+        if not len(self):
+            self._solution.clear()
+            return
         arrivals: dict[int, list[Factor]] = {}
-        for edge in self.edges:
-            if edge.verdict is Verdict.ACCEPTED:
-                arrivals.setdefault(edge.decided_at, []).append(_factor(edge))
+        for edge in self._accepted(self._overrulings.lay_over(self._found, len(self)).values()):
+            arrivals.setdefault(edge.decided_at, []).append(loop_factor(edge))
         steps = []
-        for index in range(len(self)):
-            if index:
-                steps.append(Step(self._odometry[index - 1]))
+        for index, record in enumerate(self._history[: len(self)]):
+            if record.odometry is not None:
+                steps.append(Step(record.odometry))
             if index in arrivals:
                 steps.append(Step(None, tuple(arrivals[index])))
-        self._report(self._graph.replay(steps))
+        self._solution.solve(self._history[0].head.T_odom_imu, self._start.window, steps)
 
-    def _report(self, failed: tuple[Factor, ...]) -> None:
-        for factor in failed:
-            pair = factor.first, factor.second
-            if factor.robust:
-                self._broken |= {pair}
-                self.notices.append(f"The solver failed with the loop {pair[0]}-{pair[1]}; the graph goes on without.")
-            else:
-                self._odometry[factor.second - 1] = self._graph.steps[-1].odometry or factor
-                self.notices.append(f"The solver failed with the step to keyframe {pair[1]}; it now says little.")
+    @staticmethod
+    def _accepted(edges: Iterable[LoopEdge]) -> list[LoopEdge]:
+        return [edge for edge in edges if edge.verdict is Verdict.ACCEPTED]
 
     def _factors(self, edges: tuple[LoopEdge, ...]) -> list[Factor]:
-        return self._odometry + [_factor(edge) for edge in edges if edge.verdict is Verdict.ACCEPTED]
+        odometry = [record.odometry for record in self._history[: len(self)] if record.odometry is not None]
+        return odometry + [loop_factor(edge) for edge in self._accepted(edges)]
 
     def _batch(self, edges: tuple[LoopEdge, ...]) -> F64:
         poses = self.poses
@@ -297,48 +366,14 @@ class LoopBackend:
         except ArithmeticError as error:
             raise HemislamError(f"The solver fails with this graph ({error}); reject the loop added last.") from error
 
-    # --- going back ------------------------------------------------------------------------------
-    def checkpoint(self) -> Checkpoint:
-        return Checkpoint(
-            memory=self._detector.memory(),
-            found=dict(self._found),
-            done=tuple(self._done),
-            undone=tuple(self._undone),
-            steps=self._graph.steps,
-            broken=self._broken,
-            notices=tuple(self.notices),
-        )
 
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to (or, in another back end of the same walk, on from) a checkpoint, exactly."""
-        self._detector.restore(checkpoint.memory)
-        self._found = dict(checkpoint.found)
-        self._done, self._undone = list(checkpoint.done), list(checkpoint.undone)
-        self._odometry = [step.odometry for step in checkpoint.steps if step.odometry is not None]
-        heads = self._detector.heads
-        self._graph = PoseGraph(heads[0].T_odom_imu if heads else np.eye(4), self.params.window)
-        self._graph.replay(checkpoint.steps)
-        self._broken, self.notices = checkpoint.broken, list(checkpoint.notices)
+def _drift(params: Loops) -> Drift:
+    return Drift(params.drift_translation / 100, np.radians(params.drift_rotation))
 
 
-def _factor(edge: LoopEdge) -> Factor:
-    return Factor(edge.older, edge.newer, edge.T_older_newer, edge.covariance / edge.weight, robust=True)
-
-
-def _overruled(edge: LoopEdge, command: Command) -> LoopEdge:
-    if isinstance(command, SetWeight):
-        return replace(edge, weight=command.weight)
-    verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
-    if isinstance(command, Accept | Reject) and verdict is not edge.verdict:
-        reason = f"{verdict} by hand; found {edge.verdict}: {edge.reason}"
-        return replace(edge, verdict=verdict, overruled=True, reason=reason)
-    return replace(edge, overruled=True)
-
-
-def _residuals(factors: list[Factor], poses: F64) -> tuple[FactorResidual, ...]:
-    out = []
-    for factor in factors:
-        error, sigmas = whitened(factor, poses)
-        turned, moved = float(np.degrees(np.linalg.norm(error[:3]))), float(np.linalg.norm(error[3:]))
-        out.append(FactorResidual((factor.first, factor.second), factor.robust, turned, moved, sigmas))
-    return tuple(out)
+def _same(a: Head, b: Head) -> bool:
+    return (
+        a.stamp_ns == b.stamp_ns
+        and np.array_equal(a.T_odom_imu, b.T_odom_imu)
+        and np.array_equal(a.covariance, b.covariance, equal_nan=True)
+    )

@@ -4,18 +4,17 @@ A keyframe is looked at once the keyframes after it that belong to its submap ha
 on either side of it is then as dense as at the older ones it is compared with.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from app.slam import lie
-from app.slam.keyframes import KeyframeStore
 from app.slam.loops import scan_context, verification
 from app.slam.loops.drift import Expectation
 from app.slam.loops.scan_context import ScanContext
-from app.slam.loops.submap import Recent, Submaps
+from app.slam.loops.submap import Recent, Submap, Submaps
 from app.slam.loops.verification import Fit, Prepared
 from app.slam.params import Loops
 from app.slam.types import F64, I64, Keyframe
@@ -50,21 +49,17 @@ class Head:
     covariance: F64
 
 
-@dataclass(frozen=True, slots=True)
-class Memory:
-    """What a detector remembers: every keyframe's head, and the contexts of the first ones."""
-
-    heads: tuple[Head, ...] = ()
-    contexts: tuple[ScanContext, ...] = ()
-
-
 class Detector:
-    """Describes keyframes and compares them. What it remembers follows from the keyframes alone."""
+    """Describes keyframes and compares them. What it answers follows from the keyframes it stands at alone.
 
-    def __init__(self, params: Loops, keyframes: KeyframeStore) -> None:
-        self._params = params
-        self._submaps = Submaps(keyframes, params.submap_voxel, scan_context.RADIUS)
-        self._prepared: Recent[int, Prepared] = Recent(KEPT_PREPARED, self._prepare)
+    Args:
+        params: those that act on restart are read here; others are given where they are used.
+    """
+
+    def __init__(self, params: Loops) -> None:
+        self._half = params.submap_keyframes
+        self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS)
+        self._prepared: Recent[tuple[int, int], Prepared] = Recent(KEPT_PREPARED, self._prepare)
         self._heads: list[Head] = []
         self._contexts: list[ScanContext] = []
 
@@ -85,45 +80,55 @@ class Detector:
         """(k, 4, 4) T_odom_imu."""
         return np.array([head.T_odom_imu for head in self._heads]).reshape(-1, 4, 4)
 
-    def add(self, keyframe: Keyframe) -> None:
-        self._heads.append(Head(keyframe.stamp_ns, keyframe.T_odom_imu, keyframe.covariance))
-        self._submaps.offer(keyframe)
+    def take(self, keyframe: Keyframe) -> None:
+        """Store the cloud of a keyframe that was never there before; `stand` goes to it."""
+        self._submaps.append(keyframe)
 
-    def describe(self, index: int) -> None:
-        """Make the context of the next keyframe, from the keyframes around it that there are."""
-        if index != self.described:
-            raise ValueError(f"keyframe {self.described} comes next, not {index}")
-        self._contexts.append(scan_context.describe(self.submap(index).submap.points))
+    def stand(self, heads: Iterable[Head], contexts: Iterable[ScanContext]) -> None:
+        """Be where these keyframes and contexts, the first ones of those there ever were, are all there are."""
+        self._heads, self._contexts = list(heads), list(contexts)
 
-    def memory(self) -> Memory:
-        return Memory(tuple(self._heads), tuple(self._contexts))
+    def go_on(self, head: Head) -> None:
+        """The next keyframe, whose cloud was taken."""
+        self._heads.append(head)
 
-    def restore(self, memory: Memory) -> None:
-        self._heads, self._contexts = list(memory.heads), list(memory.contexts)
-        self._submaps.clear()
+    def learn(self, contexts: Iterable[ScanContext]) -> None:
+        """The contexts of the next keyframes that have none, as they were described before."""
+        self._contexts.extend(contexts)
+
+    def forget(self) -> None:
+        """Forget the clouds beyond where it stands."""
+        self._submaps.truncate(len(self))
         self._prepared.clear()
 
+    def close(self) -> None:
+        self._submaps.close()
+
+    def describe(self, index: int) -> ScanContext:
+        """The context of a keyframe, from the keyframes around it that there are."""
+        return scan_context.describe(self._around(index, self._last(index)).points)
+
     def context(self, index: int) -> ScanContext:
-        return self._contexts[index]
+        return self._contexts[index] if index < self.described else self.describe(index)
 
     def submap(self, index: int) -> Prepared:
-        return self._prepared[index]
+        return self._prepared[index, self._last(index)]
 
     def T_level_imu(self, index: int) -> F64:
         """(4, 4) from a keyframe's IMU frame to its level frame: a rotation."""
         return lie.transform(self._heads[index].T_odom_imu[:3, :3], np.zeros(3))
 
-    def look(self, newer: int, expectation: Expectation) -> list[Sighting]:
+    def look(self, newer: int, expectation: Expectation, params: Loops) -> list[Sighting]:
         """Older places that look like this one, the most alike first, each well apart from the others."""
-        p = self._params
-        candidates = self._eligible(newer, expectation)
+        p = params
+        candidates = self._eligible(newer, expectation, p)
         if not len(candidates):
             return []
         context = self._contexts[newer]
         keys = np.array([self._contexts[i].ring_key for i in candidates])
         alike = np.linalg.norm(keys - context.ring_key, axis=1)
         nearest = candidates[np.argsort(alike, kind="stable")[: p.candidates]]
-        sightings = [self._compare(int(older), newer, expectation) for older in nearest]
+        sightings = [self._compare(int(older), newer, expectation, p) for older in nearest]
         chosen: list[Sighting] = []
         for sighting in sorted(sightings, key=lambda s: s.distance):
             where = self._heads[sighting.older].T_odom_imu[:3, 3]
@@ -148,29 +153,35 @@ class Detector:
     def slide(self, older: int, newer: int, fit: Fit) -> float:
         return verification.slide(self.submap(older), self.submap(newer), fit)
 
-    def _eligible(self, newer: int, expectation: Expectation) -> I64:
+    def _eligible(self, newer: int, expectation: Expectation, params: Loops) -> I64:
         """Keyframes left long enough ago, as near as drift may have brought them."""
         stamps = np.array([head.stamp_ns for head in self._heads[: self.described]])
-        old = np.flatnonzero(stamps <= self._heads[newer].stamp_ns - round(self._params.min_time * 1e9))
+        old = np.flatnonzero(stamps <= self._heads[newer].stamp_ns - round(params.min_time * 1e9))
         away = np.linalg.norm(expectation.poses[old, :3, 3] - expectation.poses[newer, :3, 3], axis=1)
-        reach = self._params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M
+        reach = params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M
         return np.asarray(old[away < reach])
 
-    def _compare(self, older: int, newer: int, expectation: Expectation) -> Sighting:
+    def _compare(self, older: int, newer: int, expectation: Expectation, params: Loops) -> Sighting:
         """Scan Contexts at the column shifts that odometry allows."""
         distances = scan_context.shift_distances(self._contexts[older], self._contexts[newer])
         expected = self.guess(older, newer, expectation.poses)
         yaw = np.arctan2(expected[1, 0], expected[0, 0])
         sigma = np.sqrt(expectation.covariance(older)[2, 2])
         away = np.abs(_wrapped(scan_context.YAWS - yaw))
-        allowed = away <= self._params.max_mahalanobis * sigma + scan_context.SECTOR
+        allowed = away <= params.max_mahalanobis * sigma + scan_context.SECTOR
         shift = int(np.argmin(np.where(allowed, distances, np.inf)))
         return Sighting(older, newer, float(distances[shift]), float(scan_context.YAWS[shift]))
 
-    def _prepare(self, index: int) -> Prepared:
-        half = self._params.submap_keyframes
-        first, last = max(0, index - half), min(len(self) - 1, index + half)
-        return verification.prepare(self._submaps.around(index, [head.T_odom_imu for head in self._heads], first, last))
+    def _last(self, index: int) -> int:
+        """The last keyframe of a submap, of those there are."""
+        return min(len(self) - 1, index + self._half)
+
+    def _around(self, index: int, last: int) -> Submap:
+        poses = [head.T_odom_imu for head in self._heads]
+        return self._submaps.around(index, poses, max(0, index - self._half), last)
+
+    def _prepare(self, key: tuple[int, int]) -> Prepared:
+        return verification.prepare(self._around(*key))
 
 
 def _wrapped(angle: npt.NDArray[np.float64]) -> F64:

@@ -7,6 +7,7 @@ the poses are a function of the list alone, to the last bit.
 A pose is T_map_imu of a keyframe; its error is a right perturbation, rotation then translation.
 """
 
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -145,22 +146,17 @@ def optimise(first: F64, factors: Sequence[Factor], start: Sequence[F64] | F64) 
         raise ArithmeticError(str(error)) from error
 
 
-def whitened(factor: Factor, poses: Sequence[F64] | F64) -> tuple[F64, float]:
-    """A factor's error (6,), rotation (rad) then translation (m), and its length in standard deviations."""
-    between = gtsam.Pose3(poses[factor.first]).between(gtsam.Pose3(poses[factor.second]))
-    error = np.asarray(gtsam.Pose3(factor.T_first_second).localCoordinates(between))
-    return error, float(np.sqrt(error @ np.linalg.solve(factor.covariance, error)))
-
-
-def write_g2o(path: Path, poses: F64, factors: Sequence[Factor]) -> None:
-    """A g2o text file of poses and factors. Raises OSError if it can not be written."""
+def g2o_text(poses: F64, factors: Sequence[Factor]) -> str:
+    """Poses (n, 4, 4) and factors as the text of a g2o file."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for factor in factors:
         graph.add(_between(replace(factor, robust=False)))  # g2o has no word for a robust loss
     for key, pose in enumerate(poses):
         values.insert(key, gtsam.Pose3(pose))
-    path.write_text("", encoding="utf-8")  # gtsam says nothing where it can not write
-    gtsam.writeG2o(graph, values, str(path))
+    with tempfile.TemporaryDirectory(prefix="hemislam-") as folder:  # gtsam writes files only
+        path = Path(folder) / "graph.g2o"
+        gtsam.writeG2o(graph, values, str(path))
+        return path.read_text(encoding="utf-8")
 
 
 class _All:

@@ -6,6 +6,9 @@ and neighbours only have to be shifted. Poses within a submap are the odometry's
 changes, so a submap never has to be made again.
 """
 
+import os
+import tempfile
+from array import array
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +16,6 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from app.slam.keyframes import KeyframeStore
 from app.slam.types import F32, F64, Keyframe
 from app.slam.voxel import VoxelGrid
 
@@ -58,23 +60,62 @@ class Recent(Generic[K, V]):
         self._values.clear()
 
 
+class Clouds:
+    """Point clouds (n, 3) float32 in an unnamed temporary file, appended; the newest ones stay in memory."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile(prefix="hemislam-loops-")  # noqa: SIM115 - closed by close()
+        self._ends = array("q", [0])  # file offset after each cloud
+        self._recent: Recent[int, F32] = Recent(KEPT_CLOUDS, self._read)
+
+    def __len__(self) -> int:
+        return len(self._ends) - 1
+
+    def __getitem__(self, index: int) -> F32:
+        return self._recent[index]
+
+    def append(self, points: F32) -> None:
+        self._file.seek(self._ends[-1])
+        self._file.write(np.ascontiguousarray(points).tobytes())
+        self._file.flush()
+        self._ends.append(self._ends[-1] + points.nbytes)
+        self._recent[len(self) - 1] = points
+
+    def truncate(self, count: int) -> None:
+        """Keep the first `count`."""
+        del self._ends[count + 1 :]
+        self._recent.clear()
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _read(self, index: int) -> F32:
+        begin, end = self._ends[index], self._ends[index + 1]
+        return np.frombuffer(os.pread(self._file.fileno(), end - begin, begin), dtype=np.float32).reshape(-1, 3)
+
+
 class Submaps:
-    """Makes submaps from the keyframes on disk, reading few.
+    """Makes submaps from thinned clouds, which it keeps on disk.
 
     Args:
-        keyframes: where clouds come from. voxel_size: m, of the thinning. radius: m around the
-            keyframe that a submap reaches.
+        voxel_size: m, of the thinning. radius: m around the keyframe that a submap reaches.
     """
 
-    def __init__(self, keyframes: KeyframeStore, voxel_size: float, radius: float) -> None:
-        self._keyframes = keyframes
+    def __init__(self, voxel_size: float, radius: float) -> None:
         self._voxel_size, self._radius = voxel_size, radius
         self._grid = VoxelGrid()
-        self._clouds: Recent[int, F32] = Recent(KEPT_CLOUDS, lambda index: self._level(keyframes[index]))
+        self._clouds = Clouds()
 
-    def offer(self, keyframe: Keyframe) -> None:
-        """Take a cloud that is in memory already, so that it need not be read."""
-        self._clouds[keyframe.index] = self._level(keyframe)
+    def append(self, keyframe: Keyframe) -> None:
+        """Take the cloud of the next keyframe."""
+        self._clouds.append(self._level(keyframe))
+
+    def truncate(self, count: int) -> None:
+        """Forget all clouds but the first `count`."""
+        self._clouds.truncate(count)
+
+    def close(self) -> None:
+        self._clouds.close()
 
     def around(self, index: int, poses: Sequence[F64], first: int, last: int) -> Submap:
         """The submap about a keyframe, from the clouds of keyframes `first` to `last`, both included.
@@ -91,10 +132,6 @@ class Submaps:
             eyes.append(np.broadcast_to(eye, clouds[-1].shape))
         thin = self._grid.downsample(np.concatenate(clouds), self._voxel_size)
         return Submap(index, thin.points, np.concatenate(eyes)[thin.source])
-
-    def clear(self) -> None:
-        """Forget all clouds: keyframes may be others from now on."""
-        self._clouds.clear()
 
     def _level(self, keyframe: Keyframe) -> F32:
         """(n, 3) one keyframe's own points in its level frame, thinned."""

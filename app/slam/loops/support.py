@@ -4,14 +4,14 @@ One registration can be fooled by a place that looks the same; several, at diffe
 that tell the same story are fooled more rarely. Where two stories are told, neither is believed.
 """
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from app.slam.loops.drift import Drift, agree
 from app.slam.loops.judgement import summary
-from app.slam.loops.types import LoopEdge, Verdict
+from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.params import Loops
 from app.slam.types import F64
 
@@ -20,28 +20,28 @@ NEIGHBOURHOOD_M = 15.0
 
 
 def settle(
-    seen: list[LoopEdge], edges: Iterable[LoopEdge], poses: F64, drift: Drift, params: Loops, now: int
+    fresh: Mapping[Pair, LoopEdge], edges: Mapping[Pair, LoopEdge], poses: F64, drift: Drift, params: Loops, now: int
 ) -> list[LoopEdge]:
     """Verdicts on the candidates seen just now, and on those before that they bear on.
 
     Args:
-        seen: judged each by itself. edges: all before. poses: (k, 4, 4) T_odom_imu. now: newest keyframe.
+        fresh: seen just now, judged each by itself. edges: all, with those, as they count with the
+            user's commands; what the user has decided is not decided here.
+        poses: (k, 4, 4) T_odom_imu. now: newest keyframe.
 
     Returns:
-        All of `seen`, and those of `edges` whose verdict changed.
+        All of `fresh`, and those before whose verdict changed, without the user's commands.
     """
-    kept = {edge.pair for edge in edges}
-    fresh = [edge for edge in seen if edge.pair not in kept]
-    if not any(edge.verdict is Verdict.CANDIDATE for edge in fresh):
-        return fresh
+    if not any(edge.verdict is Verdict.CANDIDATE for edge in fresh.values()):
+        return list(fresh.values())
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
 
     def ways(a: LoopEdge, b: LoopEdge) -> tuple[float, float]:
         return abs(float(walked[a.older] - walked[b.older])), abs(float(walked[a.newer] - walked[b.newer]))
 
-    alive = [edge for edge in [*edges, *fresh] if edge.verdict is not Verdict.REJECTED or edge.evidence.ambiguous]
-    near = [edge for edge in alive if any(max(ways(edge, other)) < NEIGHBOURHOOD_M for other in fresh)]
-    out = {edge.pair: edge for edge in fresh}
+    alive = [edge for edge in edges.values() if edge.verdict is not Verdict.REJECTED or edge.evidence.ambiguous]
+    near = [edge for edge in alive if any(max(ways(edge, other)) < NEIGHBOURHOOD_M for other in fresh.values())]
+    out = dict(fresh)
     for edge in near:
         if edge.verdict is not Verdict.CANDIDATE or edge.overruled:
             continue
@@ -53,9 +53,11 @@ def settle(
         evidence = replace(edge.evidence, support=support)
         if support >= params.support and support > 2 * against:
             reason = f"{summary(evidence)}; {support} others agree"
-            out[edge.pair] = replace(edge, verdict=Verdict.ACCEPTED, reason=reason, evidence=evidence, decided_at=now)
+            out[edge.pair] = replace(
+                edge, verdict=Verdict.ACCEPTED, reason=reason, evidence=evidence, decided_at=now, weight=1.0
+            )
         elif edge.pair in out:
             waits = f"{summary(evidence)}; {support} of {params.support} others agree"
             contradicted = f", {against} contradict it" if against else ""
-            out[edge.pair] = replace(edge, reason=waits + contradicted, evidence=evidence)
+            out[edge.pair] = replace(edge, reason=waits + contradicted, evidence=evidence, weight=1.0)
     return list(out.values())

@@ -1,0 +1,130 @@
+"""The user's commands: a list that lies over whatever was found, and of which any number can be undone.
+
+A command is for a pair of keyframes, whether the pair was found already or not. One that finds
+nothing to act on waits, so that a list of commands may be given before the walk begins.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from app.slam.errors import HemislamError
+from app.slam.loops.types import Accept, Add, Command, LoopEdge, Pair, SetWeight, Verdict
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A command, and for Add the loop that it came to; None as long as it waits for its keyframes."""
+
+    command: Command
+    added: LoopEdge | None = None
+
+    @property
+    def pair(self) -> Pair:
+        return self.command.older, self.command.newer
+
+
+class Overrulings:
+    """Commands in force, and those taken back."""
+
+    def __init__(self) -> None:
+        self._done: list[Entry] = []
+        self._undone: list[Entry] = []
+
+    def __iter__(self) -> Iterator[Entry]:
+        return iter(self._done)
+
+    @property
+    def commands(self) -> tuple[Command, ...]:
+        """In force, in order."""
+        return tuple(entry.command for entry in self._done)
+
+    @property
+    def undone(self) -> tuple[Command, ...]:
+        """Those that `redo` would give again, the next one last."""
+        return tuple(entry.command for entry in self._undone)
+
+    def give(self, entry: Entry) -> None:
+        self._done.append(entry)
+        self._undone.clear()
+
+    def load(self, commands: tuple[Command, ...], undone: tuple[Command, ...]) -> None:
+        self._done = [Entry(command) for command in commands]
+        self._undone = [Entry(command) for command in undone]
+
+    def undo(self) -> None:
+        """Raises HemislamError if there is nothing to undo."""
+        if not self._done:
+            raise HemislamError("There is no overruling to undo.")
+        self._undone.append(self._done.pop())
+
+    def redo(self) -> None:
+        """Raises HemislamError if there is nothing to redo."""
+        if not self._undone:
+            raise HemislamError("There is no overruling to redo.")
+        self._done.append(self._undone.pop())
+
+    def resolve(self, due: Callable[[Pair], bool], make: Callable[[Add], LoopEdge]) -> bool:
+        """Make the loops of those that wait and are due. Returns whether there were any."""
+        before = self._done
+        self._done = [
+            replace(entry, added=make(entry.command))
+            if isinstance(entry.command, Add) and entry.added is None and due(entry.pair)
+            else entry
+            for entry in before
+        ]
+        return any(new is not old for new, old in zip(self._done, before, strict=True))
+
+    def wait_again(self, lost: Callable[[Pair], bool]) -> None:
+        """Loops by hand between keyframes that were forgotten wait for those that come in their place."""
+
+        def kept(entry: Entry) -> Entry:
+            return replace(entry, added=None) if lost(entry.pair) else entry
+
+        self._done, self._undone = [kept(e) for e in self._done], [kept(e) for e in self._undone]
+
+    def lay_over(self, found: Mapping[Pair, LoopEdge], count: int, extra: Entry | None = None) -> dict[Pair, LoopEdge]:
+        """What was found, as it counts with the commands, and with one more if there is one.
+
+        Args:
+            count: keyframes there are; loops by hand beyond them do not count.
+        """
+        edges = dict(found)
+        for entry in [*self._done, *([extra] if extra else [])]:
+            if entry.added is not None:
+                if entry.added.newer < count:
+                    edges[entry.pair] = entry.added
+            elif entry.pair in edges:
+                edges[entry.pair] = _overruled(edges[entry.pair], entry.command)
+        return {pair: edges[pair] for pair in sorted(edges)}
+
+
+def check(command: Command) -> None:
+    """Raises HemislamError if the command can never make sense, whatever is found."""
+    older, newer = command.older, command.newer
+    if not 0 <= older < newer:
+        raise HemislamError(f"Keyframes {older} and {newer} can not be tied together; name an older and a newer one.")
+    if isinstance(command, SetWeight) and not (np.isfinite(command.weight) and command.weight > 0):
+        raise HemislamError(f"A loop's weight can not be {command.weight:g}; it must be greater than 0.")
+    if isinstance(command, Add) and command.guess is not None:
+        lengths = {len(row) for row in command.guess}
+        if len(command.guess) != 4 or lengths != {4} or not np.isfinite(command.guess).all():
+            raise HemislamError("The guess of a loop must be a 4x4 matrix T_older_newer of finite numbers.")
+
+
+def in_words(command: Command) -> str:
+    """A command's name and pair, to begin a sentence with."""
+    return f"{type(command).__name__} {command.older}-{command.newer}"
+
+
+def _overruled(edge: LoopEdge, command: Command) -> LoopEdge:
+    if isinstance(command, SetWeight):
+        return replace(edge, weight=command.weight)
+    if isinstance(command, Add):  # one that waits
+        return edge
+    verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
+    if verdict is edge.verdict:
+        return replace(edge, overruled=True)
+    reason = f"{verdict} by hand; found {edge.verdict}: {edge.reason}"
+    return replace(edge, verdict=verdict, overruled=True, reason=reason)

@@ -1,0 +1,72 @@
+"""The graph as the back end uses it: whatever the solver fails with is left out, remembered, and said once."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from app.slam.loops.pose_graph import Factor, PoseGraph, Step
+from app.slam.loops.types import LoopEdge, Pair
+from app.slam.types import F64
+
+
+class Solution:
+    """Poses of keyframes by odometry and loops.
+
+    Attributes:
+        broken: pairs of loops that the solver failed with; they are not in the graph.
+    """
+
+    def __init__(self) -> None:
+        self.broken: frozenset[Pair] = frozenset()
+        self._graph: PoseGraph | None = None
+        self._failures: set[str] = set()  # of the present graph
+        self._notices: list[str] = []
+
+    @property
+    def poses(self) -> F64:
+        """(k, 4, 4) T_map_imu."""
+        return np.empty((0, 4, 4)) if self._graph is None else self._graph.poses
+
+    def clear(self) -> None:
+        self._graph, self.broken, self._failures = None, frozenset(), set()
+
+    def begin(self, first: F64, window: int) -> None:
+        """The first pose, (4, 4)."""
+        self.clear()
+        self._graph = PoseGraph(first, window)
+
+    def extend(self, odometry: Factor) -> None:
+        """The next pose."""
+        if self._graph is not None:
+            self._report(self._graph.extend(odometry))
+
+    def close(self, loops: Sequence[Factor]) -> None:
+        if self._graph is not None:
+            self._report(self._graph.close(loops))
+
+    def solve(self, first: F64, window: int, steps: Iterable[Step]) -> None:
+        """All over again. A failure that was there before is not said again."""
+        before = self._failures
+        self.begin(first, window)
+        if self._graph is not None:
+            self._report(self._graph.replay(steps), before)
+
+    def take_notices(self) -> list[str]:
+        """What went wrong since this was last asked, in sentences."""
+        notices, self._notices = self._notices, []
+        return notices
+
+    def _report(self, failed: Iterable[Factor], told: Iterable[str] = ()) -> None:
+        for factor in failed:
+            if factor.robust:
+                self.broken |= {(factor.first, factor.second)}
+                text = f"The solver failed with the loop {factor.first}-{factor.second}; the graph goes on without."
+            else:
+                text = f"The solver failed with the step to keyframe {factor.second}; it now says little."
+            self._failures.add(text)
+            if text not in told:
+                self._notices.append(text)
+
+
+def loop_factor(edge: LoopEdge) -> Factor:
+    return Factor(edge.older, edge.newer, edge.T_older_newer, edge.covariance / edge.weight, robust=True)
