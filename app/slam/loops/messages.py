@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from app.slam.errors import HemislamError
 from app.slam.loops.types import Command, FactorResidual, LoopDetail, LoopEdge, Pair, Preview
 from app.slam.params import Loops
 from app.slam.types import F64, Keyframe
@@ -191,3 +192,31 @@ class Failure:
 
 
 Reply = LoopState | Tried | Inspected | Residuals | Optimum | G2o | Failure
+
+
+# --- who answers ---------------------------------------------------------------------------------
+class LoopWorkerDied(HemislamError):
+    """Whoever answered is gone, and what was pending with it; another one can be given the keyframes again."""
+
+
+class LoopClient(Protocol):
+    """Whoever answers: `app.slam.loops.service.InlineLoops`, or a process of its own (`app.server.loop_process`)."""
+
+    @property
+    def pending(self) -> int:
+        """Requests whose replies were not received yet."""
+
+    def send(self, request: Request) -> None:
+        """Hand a request over. Never waits for the answer."""
+
+    def receive(self, timeout: float | None = None) -> Reply | None:
+        """The answer to the oldest request that has none yet; None if there is none within the time (s).
+
+        None at once if nothing is pending; `timeout` None waits as long as it takes.
+
+        Raises:
+            LoopWorkerDied: there will be no answer.
+        """
+
+    def close(self) -> None:
+        """Give back what is held; pending requests are dropped."""

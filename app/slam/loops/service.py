@@ -1,7 +1,6 @@
 """The loop back end behind one method, and the client that runs it in the caller's own process."""
 
 from collections import deque
-from typing import Protocol
 
 import numpy as np
 
@@ -99,26 +98,6 @@ class LoopService:
             redo=backend.undone,
             notices=backend.take_notices(),
         )
-
-
-class LoopClient(Protocol):
-    """Whoever answers: `InlineLoops` here, or a process of its own (`app.server.loop_process`)."""
-
-    @property
-    def pending(self) -> int:
-        """Requests whose replies were not received yet."""
-
-    def send(self, request: Request) -> None:
-        """Hand a request over. Never waits for the answer."""
-
-    def receive(self, timeout: float | None = None) -> Reply | None:
-        """The answer to the oldest request that has none yet; None if there is none within the time (s).
-
-        None at once if nothing is pending; `timeout` None waits as long as it takes.
-        """
-
-    def close(self) -> None:
-        """Give back what is held; pending requests are dropped."""
 
 
 class InlineLoops:
