@@ -5,6 +5,7 @@ One request, one reply, in order. Most are answered by a `LoopState`; what can n
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
