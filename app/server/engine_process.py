@@ -12,7 +12,7 @@ from pathlib import Path
 
 from app.server import wire
 from app.server.delta import Delta, Outbox
-from app.server.protocol import Command, Progress, SetSpeed, Shutdown
+from app.server.protocol import Command, Progress, SetBreakpoints, SetSpeed, Shutdown
 from app.server.run import Run, open_run
 from app.server.session import OpenRun, Session
 from app.server.setup import Setup
@@ -119,6 +119,7 @@ def run_loop(
     link = Link(commands, updates, outbox)
     session = Session(outbox, setup.params, opener, resolve=setup.resolve, chunk_voxel=setup.chunk_voxel)
     session.handle(SetSpeed(setup.speed))
+    session.handle(SetBreakpoints(setup.breakpoints))
     if prepare is not None:
 
         def progress(name: str, fraction: float) -> None:

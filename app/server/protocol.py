@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from app.sensors.findings import Finding
+from app.server.breakpoints import Breakpoints
 from app.slam.loops import types as loops
 from app.slam.params import Params
 from app.slam.types import F32, F64, I64, U8, U16, StepResult
@@ -47,6 +48,13 @@ class Seek:
     """
 
     frame: int
+
+
+@dataclass(frozen=True, slots=True)
+class SetBreakpoints:
+    """Pause at frames where one of these holds, from now on."""
+
+    breakpoints: Breakpoints
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +139,7 @@ Command = (
     | StepFrame
     | SetSpeed
     | Seek
+    | SetBreakpoints
     | SetParams
     | LoadParams
     | OpenRecording
@@ -265,6 +274,7 @@ class Snapshot:
         series: (n,) arrays by SERIES name.
         T_map_truth: (4, 4) that lays the truth's positions over the map, None until the walk
             determines it.
+        breakpoints: where playing pauses.
         progress: what takes long just now, or None. notices: the newest 50.
         saved: the newest 10 `Save`s that ended.
         engine_alive: False when the engine's process has died.
@@ -283,6 +293,7 @@ class Snapshot:
     loops: LoopsView = LoopsView()
     series: dict[str, F64] = field(default_factory=dict)
     T_map_truth: F64 | None = None
+    breakpoints: Breakpoints = field(default_factory=Breakpoints)
     progress: Progress | None = None
     notices: tuple[Notice, ...] = ()
     saved: tuple[Saved, ...] = ()

@@ -30,6 +30,7 @@ class Readouts:
 
     Attributes:
         T_map_truth: (4, 4), the truth laid over the walk so far; None until that is determined.
+        error: of the newest frame to it, m; nan where there is none.
     """
 
     def __init__(self, start_ns: int, truth: Trajectory | None = None) -> None:
@@ -39,6 +40,7 @@ class Readouts:
         self._last: F64 | None = None
         self._theirs, self._ours = Rows(3), Rows(3)  # row by frame; theirs is nan where there is no truth
         self.T_map_truth: F64 | None = None
+        self.error = float("nan")
 
     def checkpoint(self) -> ReadoutsState:
         return ReadoutsState(self._walked, self._last, len(self._ours), self.T_map_truth)
@@ -55,6 +57,7 @@ class Readouts:
         if self._last is not None:
             self._walked += float(np.linalg.norm(position - self._last))
         self._last = position
+        self.error = self._error(result.stamp_ns, position)
         state, ground, registration = result.state, result.ground, result.registration
         values = {
             "stamp_s": (result.stamp_ns - self._start_ns) * 1e-9,
@@ -75,7 +78,7 @@ class Readouts:
             "gyro_bias": np.linalg.norm(state.b_gyro),
             "accel_bias": np.linalg.norm(state.b_accel),
             "distance": self._walked,
-            "error_m": self._error(result.stamp_ns, position),
+            "error_m": self.error,
         } | {f"{stage}_ms": ms for stage, ms in result.timings_ms.items()}
         return [float(values.get(name, np.nan)) for name in SERIES]
 

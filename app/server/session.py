@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, assert_never
 
+from app.server.breakpoints import Breakpoints, Moment, reasons
 from app.server.checkpoints import NEAR
 from app.server.delta import Outbox
 from app.server.pacing import Pacer
@@ -24,6 +25,7 @@ from app.server.protocol import (
     Restart,
     Save,
     Seek,
+    SetBreakpoints,
     SetParams,
     SetSpeed,
     Shutdown,
@@ -111,6 +113,8 @@ class Session:
         self._journey: Journey | None = None
         self._unseen: StepResult | None = None
         self._page_behind = False
+        self._breakpoints = Breakpoints()
+        self._moment: Moment | None = None  # the frame that the page shows
 
     def open(self, path: Path, truth: Path | None, *, play: bool = False) -> None:
         """Open a recording with exactly the parameters given so far."""
@@ -150,6 +154,9 @@ class Session:
                 self._page.show(speed=factor)
             case Seek(frame):
                 self._seek(frame)
+            case SetBreakpoints(breakpoints):
+                self._breakpoints = breakpoints
+                self._outbox.put(breakpoints=breakpoints, urgent=True)
             case SetParams(values):
                 self._set_params(self._params.with_values(values))
             case LoadParams(text):
@@ -300,8 +307,16 @@ class Session:
             self._page.frame(run, result)
             self._page.show(frames_per_second=self._pacer.tick(), urgent=False)
             run.remember()
+            self._passed(run, result, played=journey is None)
         self._approach(run.frame)
         return 0.0
+
+    def _passed(self, run: Run, result: StepResult, *, played: bool) -> None:
+        """Pause where a breakpoint holds, unless the frame is one on the way to another."""
+        before, self._moment = self._moment, Moment(result, run.readouts.error)
+        if played and (why := reasons(self._breakpoints, before, self._moment)):
+            self._halt()
+            self._outbox.notice("info", f"Paused at frame {run.frame:,}. {' '.join(why)}")
 
     def _catch_up(self) -> None:
         """Show the frame that was gone to, if the page does not."""
@@ -309,6 +324,7 @@ class Session:
             run, result = self._run, self._unseen
             self._page_behind, self._unseen = False, None
             self._page.arrived(run, result)
+            self._moment = Moment(result, run.readouts.error) if result is not None else None
             then = run.params_of(run.frame)
             changed = then.changed(run.params) if then is not None else {}
             self._relabelling = any(_EFFECT[path] == "now" for path in changed)
@@ -393,6 +409,7 @@ class Session:
             self._run.close()
         self._run = run
         self._relabelling = self._page_behind = False
+        self._moment = None
         self._unseen = None
         run.remember()
         self._page.opened(run)

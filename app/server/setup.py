@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from app.server.breakpoints import Breakpoints
 from app.slam.params import Params
 
 
@@ -15,7 +16,7 @@ class Setup:
         recording: to open, or None to wait for OpenRecording. truth: its truth, if not beside it.
         start_s, duration_s: the part of that recording to process.
         resolve: parameters for recordings opened later; None keeps the present ones.
-        play: begin at once. speed: to play at.
+        play: begin at once. speed: to play at. breakpoints: where to pause.
         chunk_voxel: m, see `Session`. checkpoint_bytes: see `app.server.checkpoints`.
         session, notices: how many there were before, for a process that takes over from another.
     """
@@ -28,6 +29,7 @@ class Setup:
     resolve: Callable[[Path], Params] | None = None
     play: bool = False
     speed: float = 1.0
+    breakpoints: Breakpoints = field(default_factory=Breakpoints)
     chunk_voxel: float = 0.05
     checkpoint_bytes: int = 1 << 30
     session: int = 0

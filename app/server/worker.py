@@ -91,6 +91,7 @@ class EngineProcess:
                 params=last.params,
                 play=False,
                 speed=last.transport.speed,
+                breakpoints=last.breakpoints,
                 session=last.session,
                 notices=last.notices[-1].number if last.notices else 0,
             )

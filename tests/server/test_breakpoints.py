@@ -1,0 +1,176 @@
+"""Where playing pauses by itself: the conditions on their own, and in a session."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import server_fakes as fakes
+
+from app.server.breakpoints import Breakpoints, Moment, reasons
+from app.server.delta import Fold, Outbox
+from app.server.protocol import Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot, StepFrame
+from app.server.run import Run
+from app.server.session import Session
+from app.slam.errors import HemislamError
+from app.slam.loops.types import Evidence, LoopEdge, Verdict
+from app.slam.params import Params
+from app.slam.types import ImuSamples, Scan, StepResult
+
+BAD = range(20, 25)
+"""Frames at which the engine below finds no ground, is slow, is degenerate and fits badly."""
+FRAMES = 40
+
+
+class MoodyEngine(fakes.FakeEngine):
+    def step(self, scan: Scan, imu: ImuSamples) -> StepResult:
+        result = super().step(scan, imu)
+        return spoilt(result) if result.index in BAD else result
+
+
+def spoilt(result: StepResult) -> StepResult:
+    ground = replace(result.ground, found=False, reason="only 3 seed points; a plane takes 20", planarity=0.4)
+    update = replace(result.registration, residual_rms=0.08, degenerate=True)
+    return replace(result, ground=ground, registration=update, timings_ms={"total": 130.0})
+
+
+def frame(**changes: object) -> StepResult:
+    engine = fakes.FakeEngine(Params())
+    entry = next(iter(fakes.FakeRecording(Path("x"), 1)._read(0)))
+    return replace(engine.step(entry.scan, entry.imu), **changes)  # type: ignore[union-attr, arg-type]
+
+
+def edge(verdict: Verdict, newer: int = 9) -> LoopEdge:
+    return LoopEdge(2, newer, newer, np.eye(4), np.eye(6), verdict, "overlap 0.2 is below 0.5", Evidence())
+
+
+GOOD = frame()
+
+
+# --- conditions ----------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("chosen", "says"),
+    [
+        (Breakpoints(no_ground=True), "No ground plane: only 3 seed points; a plane takes 20."),
+        (Breakpoints(planarity=0.3), "λ3/λ2 of the seeds is 0.400, over 0.3."),
+        (Breakpoints(residual=0.05), "The residual is 80.0 mm, over 50 mm."),
+        (Breakpoints(degenerate=True), "Degenerate: one direction is not held by this scan."),
+        (Breakpoints(frame_ms=100.0), "The frame took 130.0 ms, over 100 ms."),
+    ],
+)
+def test_a_state_pauses_where_it_begins_and_says_so_with_its_number(chosen: Breakpoints, says: str) -> None:
+    good, bad = Moment(GOOD), Moment(spoilt(GOOD))
+    assert reasons(chosen, good, bad) == (says,)
+    assert reasons(chosen, bad, bad) == ()
+    assert reasons(chosen, bad, good) == ()
+    assert reasons(chosen, None, bad) == (says,)
+    assert reasons(Breakpoints(), good, bad) == ()
+
+
+def test_an_error_that_is_not_known_is_no_error() -> None:
+    chosen = Breakpoints(error=0.5)
+    assert reasons(chosen, Moment(GOOD), Moment(GOOD, math.nan)) == ()
+    assert reasons(chosen, Moment(GOOD, math.nan), Moment(GOOD, 0.512)) == (
+        "The error to truth is 51.2 cm, over 50 cm.",
+    )
+
+
+def test_scans_left_out_pause_every_time() -> None:
+    before, now = Moment(frame(dropped=1)), Moment(frame(dropped=2))
+    assert reasons(Breakpoints(dropped=True), before, now) == ("2 scans were left out just before this frame.",)
+    assert reasons(Breakpoints(dropped=True), now, Moment(GOOD)) == ()
+
+
+def test_a_loop_pauses_once_with_its_verdict() -> None:
+    accepted, rejected = edge(Verdict.ACCEPTED), edge(Verdict.REJECTED, 11)
+    before, now = Moment(GOOD, loops=(rejected,)), Moment(GOOD, loops=(rejected, accepted))
+    found, turned_down = Breakpoints(loop_found=True), Breakpoints(loop_rejected=True)
+    assert [text[:39] for text in reasons(found, before, now)] == ["Loop found between keyframes 2 and 9: o"]
+    assert reasons(turned_down, before, now) == () == reasons(found, now, now)
+    assert len(reasons(turned_down, Moment(GOOD), now)) == 1
+
+
+def test_a_loop_that_waited_pauses_when_it_is_decided() -> None:
+    waiting, decided = edge(Verdict.CANDIDATE), edge(Verdict.ACCEPTED)
+    both = Breakpoints(loop_found=True, loop_rejected=True)
+    assert reasons(both, Moment(GOOD), Moment(GOOD, loops=(waiting,))) == ()
+    assert len(reasons(both, Moment(GOOD, loops=(waiting,)), Moment(GOOD, loops=(decided,)))) == 1
+
+
+@pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
+def test_a_limit_that_is_no_limit_is_refused_by_name(value: float) -> None:
+    with pytest.raises(HemislamError, match="residual"):
+        Breakpoints(residual=value)
+
+
+# --- in a session --------------------------------------------------------------------------------
+class Desk:
+    def __init__(self, name: str = f"walk-{FRAMES}.mcap") -> None:
+        self.now = 0.0
+        self.outbox, self.fold = Outbox(Params()), Fold()
+        self.session = Session(self.outbox, Params(), self._open, clock=lambda: self.now)
+        self.session.open(Path(name), None)
+        self.settle()
+
+    def _open(self, path: Path, truth: Path | None, params: Params, /) -> Run:
+        run = fakes.open_fake(path, truth, params)
+        run.engine = MoodyEngine(params)  # type: ignore[assignment]
+        return run
+
+    def settle(self) -> Snapshot:
+        while self.session.work() == 0:
+            pass
+        return self.fold.apply(self.outbox.take()) if self.outbox.filled else self.fold.snapshot
+
+    def do(self, *commands: object) -> Snapshot:
+        for command in commands:
+            self.session.handle(command)  # type: ignore[arg-type]
+        return self.settle()
+
+
+FAST = SetSpeed(math.inf)
+NO_GROUND = SetBreakpoints(Breakpoints(no_ground=True))
+
+
+def test_playing_pauses_there_also_at_full_speed_tells_why_and_play_goes_on() -> None:
+    desk = Desk()
+    snapshot = desk.do(NO_GROUND, FAST, Play())
+    assert snapshot.breakpoints == NO_GROUND.breakpoints
+    assert snapshot.transport.frame == BAD[0] and not snapshot.transport.playing
+    assert snapshot.notices[-1].text == (
+        f"Paused at frame {BAD[0]}. No ground plane: only 3 seed points; a plane takes 20."
+    )
+    assert desk.do(Play()).transport.frame == FRAMES - 1
+
+
+def test_a_seek_passes_but_playing_over_known_frames_pauses_again() -> None:
+    desk = Desk()
+    snapshot = desk.do(NO_GROUND, FAST, Seek(BAD[-1] + 5))
+    assert snapshot.transport.frame == BAD[-1] + 5
+    assert desk.do(Seek(BAD[0] - 3)).transport.frame == BAD[0] - 3
+    assert desk.do(Play()).transport.frame == BAD[0]
+
+
+def test_playing_on_from_within_does_not_pause_for_what_already_was_so() -> None:
+    desk = Desk()
+    desk.do(NO_GROUND, FAST, Seek(FRAMES - 2))
+    assert desk.do(Seek(BAD[1]), Play()).transport.frame == FRAMES - 1
+    desk = Desk()
+    desk.do(NO_GROUND, FAST, StepFrame(BAD[1]))
+    assert desk.do(Play()).transport.frame == FRAMES - 1
+
+
+def test_a_scan_left_out_pauses_at_the_frame_after_it() -> None:
+    desk = Desk("dropped-30-12.mcap")
+    snapshot = desk.do(SetBreakpoints(Breakpoints(dropped=True)), FAST, Play())
+    assert snapshot.transport.frame == 12 and not snapshot.transport.playing
+    assert "1 scan was left out" in snapshot.notices[-1].text
+    assert snapshot.series["dropped"][-2:].tolist() == [0.0, 1.0]
+
+
+def test_breakpoints_taken_off_pause_nothing() -> None:
+    desk = Desk()
+    desk.do(NO_GROUND, SetBreakpoints(Breakpoints()), FAST)
+    assert desk.do(Play(), Pause()).transport.frame >= 0
+    assert desk.do(Play()).transport.frame == FRAMES - 1
