@@ -3,10 +3,17 @@
 import os
 import sys
 
-from benchmarks import frame, page, replay, seek, walk
+from benchmarks import frame, packets, page, replay, seek, walk
 from benchmarks.record import show
 
-BENCHMARKS = {"frame": frame.run, "replay": replay.run, "seek": seek.run, "page": page.run, "walk": walk.run}
+BENCHMARKS = {
+    "frame": frame.run,
+    "packets": packets.run,
+    "replay": replay.run,
+    "seek": seek.run,
+    "page": page.run,
+    "walk": walk.run,
+}
 
 
 def main() -> None:

@@ -1,0 +1,142 @@
+"""DIFOP, the RS-Bpearl's packet about itself: speed, field of view, calibration; and calibrations from CSV."""
+
+import csv
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from app.sensors.live.msop import PACKET_BYTES, date_bytes
+from app.sensors.rsbpearl import CHANNELS, ELEVATIONS_DEG
+from app.slam.errors import HemislamError
+from app.slam.types import F64, U16
+
+DIFOP_PORT = 7788
+DIFOP_ID = bytes.fromhex("a5ff005a11115555")
+RETURN_MODES = ("dual", "strongest", "last")
+_ANGLES = np.dtype([("sign", "u1"), ("value", ">u2")])
+_ELEVATION_AT, _HORIZONTAL_AT = 468, 564
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Where each channel of one unit looks.
+
+    Attributes:
+        elevations_deg, horizontal_deg: (32,) by channel, above the base plane and added to the azimuth.
+    """
+
+    elevations_deg: F64
+    horizontal_deg: F64
+
+    @property
+    def rings(self) -> U16:
+        """(32,) ring by channel: the rank of its elevation."""
+        return np.argsort(np.argsort(self.elevations_deg, kind="stable")).astype(np.uint16)
+
+    def same(self, other: "Calibration") -> bool:
+        return bool(
+            np.array_equal(self.elevations_deg, other.elevations_deg)
+            and np.array_equal(self.horizontal_deg, other.horizontal_deg)
+        )
+
+
+NOMINAL = Calibration(ELEVATIONS_DEG, np.zeros(CHANNELS))
+
+
+@dataclass(frozen=True, slots=True)
+class Difop:
+    """Attributes:
+    rpm: 600 or 1200. fov_deg: azimuths between which it measures; (0, 360) is all around.
+    return_mode: of RETURN_MODES. reverse: whether it spins the other way.
+    calibration: None if the unit has not been calibrated.
+    """
+
+    rpm: int = 600
+    fov_deg: tuple[float, float] = (0.0, 360.0)
+    serial: str = ""
+    return_mode: str = "strongest"
+    reverse: bool = False
+    calibration: Calibration | None = None
+
+    def describe(self) -> str:
+        begin, end = self.fov_deg
+        view = "" if (end - begin) % 360.0 == 0.0 else f", {begin:g} to {end:g} deg"
+        return f"{self.rpm} rpm, {self.return_mode} return{view}{', reversed' if self.reverse else ''}"
+
+
+def read_difop(packet: bytes) -> Difop | None:
+    """None if it is no DIFOP packet."""
+    if len(packet) != PACKET_BYTES or packet[:8] != DIFOP_ID:
+        return None
+    rpm, begin, end = (int(struct.unpack_from(">H", packet, at)[0]) for at in (8, 32, 34))
+    elevations, horizontal = _read_angles(packet, _ELEVATION_AT), _read_angles(packet, _HORIZONTAL_AT)
+    calibration = None
+    # A unit without calibration has no signs, or nothing but zeros, which can be no elevations.
+    if elevations is not None and elevations.any() and np.abs(elevations).max() <= 91.0:
+        calibration = Calibration(elevations, np.zeros(CHANNELS) if horizontal is None else horizontal)
+    mode = packet[300]
+    return Difop(
+        rpm=rpm if 60 <= rpm <= 6000 else 600,
+        fov_deg=(begin / 100.0, end / 100.0) if begin != end else (0.0, 360.0),
+        serial=packet[292:298].hex(),
+        return_mode=RETURN_MODES[mode] if mode < len(RETURN_MODES) else RETURN_MODES[1],
+        reverse=packet[337] != 0,
+        calibration=calibration,
+    )
+
+
+def write_difop(difop: Difop, stamp_ns: int) -> bytes:
+    """The packet that says so."""
+    packet = bytearray(PACKET_BYTES)
+    packet[:8] = DIFOP_ID
+    struct.pack_into(">H", packet, 8, difop.rpm)
+    struct.pack_into(">HH", packet, 32, *(round(angle * 100) for angle in difop.fov_deg))
+    packet[292:298] = bytes.fromhex(difop.serial or "000000000000")[:6]
+    packet[300] = RETURN_MODES.index(difop.return_mode)
+    packet[303:313] = date_bytes(stamp_ns)
+    packet[337] = difop.reverse
+    if difop.calibration is None:
+        packet[_ELEVATION_AT : _HORIZONTAL_AT + 3 * CHANNELS] = b"\xff" * (6 * CHANNELS)
+    else:
+        _write_angles(packet, _ELEVATION_AT, difop.calibration.elevations_deg)
+        _write_angles(packet, _HORIZONTAL_AT, difop.calibration.horizontal_deg)
+    return bytes(packet)
+
+
+def read_angles(path: Path) -> Calibration:
+    """A calibration from CSV: 32 lines by channel, `elevation, horizontal correction` in degrees.
+
+    Raises:
+        HemislamError: the file can not be read, or holds something else.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = [tuple(map(float, row[:2])) for row in csv.reader(file) if row]
+        table = np.array(rows, np.float64)
+    except OSError as error:
+        raise HemislamError(f"The angles {path} can not be read ({error.strerror}); check the path.") from None
+    except (ValueError, UnicodeDecodeError):
+        table = np.empty((0, 0))
+    if table.shape != (CHANNELS, 2) or not np.isfinite(table).all() or np.abs(table[:, 0]).max() > 91.0:
+        raise HemislamError(
+            f"{path} is no calibration of an RS-Bpearl; it must hold {CHANNELS} lines, one for each channel, of "
+            "elevation and horizontal correction in degrees."
+        )
+    return Calibration(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
+
+
+def _read_angles(packet: bytes, at: int) -> F64 | None:
+    table = np.frombuffer(packet, _ANGLES, CHANNELS, at)
+    if (table["sign"] > 1).any():
+        return None
+    angles: F64 = np.where(table["sign"] == 0, 1.0, -1.0) * table["value"] * 0.01
+    return angles
+
+
+def _write_angles(packet: bytearray, at: int, angles_deg: F64) -> None:
+    table = np.zeros(CHANNELS, _ANGLES)
+    table["sign"] = angles_deg < 0
+    table["value"] = np.rint(np.abs(angles_deg) * 100)
+    packet[at : at + 3 * CHANNELS] = table.tobytes()
