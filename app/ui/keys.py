@@ -27,6 +27,6 @@ if (!window.hemislamKeys) {
 """Sideways arrows move a focused slider or else step frames, and never the camera; space plays and
 pauses, also just after a button was clicked (Firefox would click that again when the key comes up)."""
 
-_ONE_PIXEL: Final = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
+ONE_PIXEL: Final = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 
-KEYS: Final = f'<img src="{_ONE_PIXEL}" hidden onload="{escape(_SCRIPT)}">'
+KEYS: Final = f'<img src="{ONE_PIXEL}" hidden onload="{escape(_SCRIPT)}">'

@@ -1,0 +1,133 @@
+"""Loops in the scene: an arch from keyframe to keyframe, and which one a click meant.
+
+A good loop ties keyframes at nearly the same place, so that a straight line would be too short to
+see: every edge rises to a knob above its middle.
+"""
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import viser
+
+from app.slam.loops.types import LoopEdge, Pair
+from app.slam.types import F32, F64
+from app.ui.loops.kinds import COLOURS, Kind, in_graph, kind_of, name
+
+_RISE: Final = (0.7, 0.12)
+"""Height of a knob above the edge's middle: m, and its share of the edge's length."""
+_WIDTH: Final = {Kind.ACCEPTED: 3.0, Kind.CANDIDATE: 2.0, Kind.REJECTED: 1.0, Kind.USER: 3.5}
+_OUT_WIDTH: Final = 1.0
+_KNOB_M: Final = {Kind.ACCEPTED: 0.22, Kind.CANDIDATE: 0.2, Kind.REJECTED: 0.12, Kind.USER: 0.24}
+_CHOSEN: Final = (255, 255, 255)
+_PICK_RAD: Final = np.radians(1.5)
+_STILL_M: Final = 1e-3
+_SAMPLES: Final = np.linspace(0.0, 1.0, 12)
+
+Style = tuple[Kind, bool]
+"""How an edge is drawn: its kind, and whether it is in the graph."""
+
+
+def arches(edges: list[LoopEdge], poses: F64) -> F32:
+    """(n, 3, 3) older keyframe, knob and newer keyframe of each edge in the map, from poses (k, 4, 4)."""
+    ends = poses[[edge.pair for edge in edges], :3, 3].reshape(-1, 2, 3) if edges else np.empty((0, 2, 3))
+    knobs = ends.mean(axis=1)
+    knobs[:, 2] += _RISE[0] + _RISE[1] * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    return np.stack((ends[:, 0], knobs, ends[:, 1]), axis=1).astype(np.float32)
+
+
+def nearest(lines: npt.NDArray[np.floating], origin: F64, direction: F64, within: float = _PICK_RAD) -> int | None:
+    """Which of (n, k, 3) polylines passes nearest to a ray, as the eye at its origin sees them.
+
+    Args:
+        origin: (3,). direction: (3,). within: rad, beyond which nothing was meant.
+    """
+    if not len(lines):
+        return None
+    a, b = lines[:, :-1, None], lines[:, 1:, None]
+    points = (a + _SAMPLES[:, None] * (b - a)).reshape(len(lines), -1, 3) if lines.shape[1] > 1 else lines
+    rays = points - origin
+    along = rays @ (direction / np.linalg.norm(direction))
+    off = np.linalg.norm(rays - along[..., None] * (direction / np.linalg.norm(direction)), axis=-1)
+    angle = np.where(along > 0, np.arctan2(off, along), np.pi).min(axis=1)
+    best = int(angle.argmin())
+    return best if angle[best] <= within else None
+
+
+class LoopEdges:
+    """Arches and knobs of the loops shown: one node of lines and one of points for each style."""
+
+    def __init__(self, scene: viser.SceneApi, root: str) -> None:
+        self._scene = scene
+        self._root = root
+        self._nodes: dict[str, viser.LineSegmentsHandle | viser.PointCloudHandle | viser.LabelHandle] = {}
+        self._drawn: dict[str, F32] = {}
+        self._asked: tuple[object, ...] = ()
+        self._pickable: tuple[list[Pair], F32] = ([], np.empty((0, 3, 3), np.float32))
+
+    def draw(self, edges: tuple[LoopEdge, ...], poses: F64, shown: frozenset[Kind], chosen: Pair | None) -> None:
+        """Draw the edges of the kinds `shown` and the chosen one, sending what differs.
+
+        Args:
+            poses: (k, 4, 4) T_map_imu of the keyframes; edges of later ones are left out.
+        """
+        if self._asked and all(a is b for a, b in zip(self._asked, (edges, poses, shown, chosen), strict=True)):
+            return
+        self._asked = (edges, poses, shown, chosen)
+        there = [edge for edge in edges if edge.newer < len(poses)]
+        seen = [edge for edge in there if kind_of(edge) in shown or edge.pair == chosen]
+        lines = arches(seen, poses)
+        self._pickable = ([edge.pair for edge in seen], lines)
+        styles = np.array([list(Kind).index(kind_of(edge)) * 2 + in_graph(edge) for edge in seen], dtype=np.int64)
+        for number in range(2 * len(Kind)):
+            self._draw_style(list(Kind)[number // 2], bool(number % 2), lines[styles == number])
+        marked = [index for index, edge in enumerate(seen) if edge.pair == chosen]
+        self._draw_chosen(name(chosen) if chosen is not None else "", lines[marked])
+
+    def pick(self, origin: F64, direction: F64) -> Pair | None:
+        """The loop that a ray in the map points at."""
+        pairs, lines = self._pickable
+        index = nearest(lines, origin, direction)
+        return None if index is None else pairs[index]
+
+    def _draw_style(self, kind: Kind, inside: bool, lines: F32) -> None:
+        node = f"{self._root}/{kind.replace(' ', '-')}-{'in' if inside else 'out'}"
+        if self._differs(node, lines):
+            width = _WIDTH[kind] if inside or kind is Kind.CANDIDATE else _OUT_WIDTH
+            self._nodes[node] = self._scene.add_line_segments(
+                node, _legs(lines), COLOURS[kind], thickness=width, thickness_units="screen"
+            )
+            self._nodes[f"{node}-knobs"] = self._scene.add_point_cloud(
+                f"{node}-knobs",
+                np.ascontiguousarray(lines[:, 1]),
+                COLOURS[kind],
+                point_size=_KNOB_M[kind],
+                point_shape="circle",
+            )
+
+    def _draw_chosen(self, text: str, lines: F32) -> None:
+        node = f"{self._root}/chosen"
+        label = self._nodes.get(f"{node}-label")
+        renamed = isinstance(label, viser.LabelHandle) and label.text != text
+        if self._differs(node, lines) or (renamed and len(lines)):
+            self._nodes[node] = self._scene.add_line_segments(
+                node, _legs(lines), _CHOSEN, thickness=5.0, thickness_units="screen"
+            )
+            self._nodes[f"{node}-label"] = self._scene.add_label(f"{node}-label", text, position=lines[0, 1])
+
+    def _differs(self, node: str, lines: F32) -> bool:
+        """Whether a node has to be sent; one of no lines is taken away."""
+        before = self._drawn.get(node)
+        if before is not None and before.shape == lines.shape and np.allclose(before, lines, atol=_STILL_M):
+            return False
+        self._drawn[node] = lines
+        if len(lines):
+            return True
+        for key in [key for key in self._nodes if key == node or key.startswith(f"{node}-")]:
+            self._nodes.pop(key).remove()
+        return False
+
+
+def _legs(lines: F32) -> F32:
+    """(n, 3, 3) arches -> (2n, 2, 3) segments."""
+    return np.stack((lines[:, :-1], lines[:, 1:]), axis=2).reshape(-1, 2, 3)
