@@ -17,6 +17,7 @@ import viser
 from app.server.folders import Folders
 from app.server.protocol import Command, Snapshot
 from app.ui.appearance import AppearancePanel
+from app.ui.breakpoints import BreakpointPanel
 from app.ui.doctor import DoctorPanel
 from app.ui.files import FilesPanel
 from app.ui.header import HELP, HeaderPanel
@@ -83,6 +84,8 @@ class Workbench:
         gui.add_html(STYLE + KEYS)
         self._header = HeaderPanel(gui)
         self._transport = TransportPanel(gui, engine.send, lambda: engine.snapshot)
+        with gui.add_folder("Pause when", expand_by_default=False):
+            self._breakpoints = BreakpointPanel(gui, engine.send)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Tune", viser.Icon.ADJUSTMENTS_HORIZONTAL):
             self._parameters = ParameterPanel(gui, first.params, engine.send)
@@ -137,6 +140,7 @@ class Workbench:
         """Bring the page up to `current`: at once what a user waits for, the rest no faster than one can see."""
         now, view, drawn = self._now(), self._appearance.view, self._drawn
         self._transport.tick(current)
+        self._breakpoints.tick(current)
         self._parameters.tick(current)
         self._notices.draw(current)
         self._header.draw(current)

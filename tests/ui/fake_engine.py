@@ -25,6 +25,7 @@ from app.server.protocol import (
     Play,
     Restart,
     Seek,
+    SetBreakpoints,
     SetParams,
     SetSpeed,
     Snapshot,
@@ -198,6 +199,8 @@ class FakeEngine:
                     self._step()
             case SetSpeed(factor):
                 self._transport(speed=factor)
+            case SetBreakpoints(breakpoints):
+                self.publish(breakpoints=breakpoints)
             case Seek(frame):
                 self._go_back(frame)
                 while self._snapshot.transport.frame < frame:
@@ -308,6 +311,13 @@ class FakeEngine:
             "stamp_s": 0.1 * frame,
             "planarity": result.ground.planarity,
             "residual_rms": result.registration.residual_rms,
+            "ground_share": result.ground.share,
+            "used": result.registration.used,
+            "inliers": result.registration.inliers,
+            "degeneracy": result.registration.eigenvalues[0],
+            "imu_gap_s": result.imu_gap_s,
+            "dropped": result.dropped,
+            "total_ms": result.timings_ms["total"],
             "distance": 0.08 * frame,
             "error_m": error,
             **{f"{stage}_ms": ms for stage, ms in result.timings_ms.items()},

@@ -21,14 +21,15 @@ def _commands(draw: st.DrawFn) -> Command:
     guess[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
     guess[:3, 3] = draw(st.tuples(*(st.floats(-1e4, 1e4) for _ in range(3))))
     register = draw(st.booleans())
+    since = draw(st.integers(0, 20_000))
     return draw(
         st.sampled_from(
             (
-                Accept(older, newer),
-                Reject(older, newer),
-                SetWeight(older, newer, weight),
-                Add(older, newer, None, register),
-                Add(older, newer, rows(guess), register),
+                Accept(older, newer, since),
+                Reject(older, newer, since),
+                SetWeight(older, newer, weight, since),
+                Add(older, newer, None, register, since),
+                Add(older, newer, rows(guess), register, since),
             )
         )
     )
@@ -36,7 +37,9 @@ def _commands(draw: st.DrawFn) -> Command:
 
 @given(st.lists(_commands(), max_size=6))
 def test_what_is_written_is_read_again_to_the_last_digit(commands: list[Command]) -> None:
-    assert read(write(commands)) == tuple(commands)
+    again = read(write(commands))
+    assert again == tuple(commands)
+    assert [command.since for command in again] == [command.since for command in commands]
 
 
 def test_a_list_written_by_hand_is_understood() -> None:
@@ -58,6 +61,7 @@ def test_an_empty_file_overrules_nothing() -> None:
         ("accept: [1, 2, 3]", "two keyframes"),
         ("accept: [1.5, 2]", "two keyframes"),
         ("{accept: [1, 2], weight: 3}", "weight means nothing to accept"),
+        ("{accept: [1, 2], since: -1}", "number of keyframes"),
         ("weigh: [1, 2]", "weight is None"),
         ("{weigh: [1, 2], weight: 0}", "greater than 0"),
         ("{weigh: [1, 2], weight: .nan}", "greater than 0"),

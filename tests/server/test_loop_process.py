@@ -1,0 +1,159 @@
+"""The loop back end in a process of its own. The walks are short: what is found is tested in tests/slam/loops."""
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.server.loop_process import LoopProcess
+from app.slam import lie
+from app.slam.loops.messages import AddKeyframe, Finish, GoTo, LoopState, LoopWorkerDied, Overrule, Request, Undo
+from app.slam.loops.service import InlineLoops
+from app.slam.loops.types import Add, Reject, rows
+from app.slam.params import Loops
+from app.slam.types import NON_GROUND, Cloud, Keyframe
+
+PARAMS = Loops(submap_keyframes=1, min_time=1.0, support=0)
+PATIENCE_S = 60.0
+
+
+def keyframes(count: int = 8, points: int = 4000) -> tuple[Keyframe, ...]:
+    """To and fro in a room with a pillar."""
+    rng = np.random.default_rng(1)
+    walls = rng.uniform(-4.0, 4.0, (points, 3)) * [1.0, 0.7, 0.4]
+    side = rng.integers(0, 3, points)
+    walls[np.arange(points), side] = np.array([4.0, 2.8, 1.6])[side] * rng.choice([-1.0, 1.0], points)
+    walls[: points // 10] = rng.uniform(0.0, 1.0, (points // 10, 3)) * [0.4, 0.4, 3.0] + [1.0, 0.5, -1.6]
+    out = []
+    for index in range(count):
+        x = abs(index - count // 2) * 0.5
+        cloud = Cloud(
+            (walls - [x, 0.0, 0.0]).astype(np.float32), np.full(points, NON_GROUND, np.uint8),
+            np.zeros(points, np.float32), np.zeros(points, np.uint16), np.zeros(points, np.int32),
+        )  # fmt: skip
+        T = lie.transform(np.eye(3), np.array([x, 0.0, 0.0]))
+        out.append(Keyframe(index, 10 * index, index * 1_000_000_000, T, np.eye(4), np.eye(6) * 1e-6, cloud))
+    return tuple(out)
+
+
+@pytest.fixture
+def process() -> Iterator[LoopProcess]:
+    process = LoopProcess()
+    yield process
+    process.close()
+
+
+def alive(pid: int) -> bool:
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except OSError:
+        return False
+
+
+def until_gone(pid: int) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while alive(pid):
+        assert time.monotonic() < deadline, "it still lives"
+        time.sleep(0.02)
+
+
+def test_it_answers_as_one_in_this_process_would(process: LoopProcess) -> None:
+    far = rows(lie.transform(np.eye(3), np.array([0.5, 0.1, 0.0])))
+    requests: list[Request] = [AddKeyframe(keyframe, PARAMS) for keyframe in keyframes()]
+    requests += [Finish(), Overrule(Add(1, 5, far, register=False)), Overrule(Reject(1, 5)), Undo(), Undo()]
+    requests += [GoTo(4), GoTo(5), GoTo(2, forget=True), Overrule(Reject(3, 3))]
+    inline = InlineLoops()
+    for request in requests:
+        process.send(request)
+        inline.send(request)
+    assert process.pending == len(requests)
+    found = 0
+    for _ in requests:
+        theirs, ours = process.receive(PATIENCE_S), inline.receive()
+        assert type(theirs) is type(ours)
+        if isinstance(theirs, LoopState) and isinstance(ours, LoopState):
+            found = max(found, len(ours.edges))
+            assert theirs.corrections.tobytes() == ours.corrections.tobytes()
+            for a, b in ((theirs.edges, ours.edges), (theirs.changed, ours.changed)):
+                assert [(e.pair, e.verdict, e.reason) for e in a] == [(e.pair, e.verdict, e.reason) for e in b]
+            assert (theirs.count, theirs.known, theirs.finished, theirs.undo, theirs.redo, theirs.notices) == (
+                *(ours.count, ours.known, ours.finished, ours.undo, ours.redo, ours.notices),
+            )
+        else:
+            assert theirs == ours
+    assert found > 1
+    assert process.pending == 0
+    assert process.receive() is None, "nothing is pending"
+
+
+def test_sending_does_not_wait_for_a_process_that_stands_still(process: LoopProcess) -> None:
+    """Stopped, it takes nothing: far more than a pipe holds is handed over all the same, and answered afterwards."""
+    os.kill(process.pid, signal.SIGSTOP)
+    many = keyframes(12, points=60_000)  # 27 bytes each
+    for keyframe in many:
+        process.send(AddKeyframe(keyframe, PARAMS))
+    assert process.receive(0.05) is None
+    assert process.pending == len(many)
+    os.kill(process.pid, signal.SIGCONT)
+    for count in range(1, len(many) + 1):
+        reply = process.receive(PATIENCE_S)
+        assert isinstance(reply, LoopState)
+        assert reply.count == count
+
+
+def test_a_process_that_is_killed_is_noticed_and_another_one_can_take_over(process: LoopProcess) -> None:
+    walk = keyframes(4)
+    process.send(AddKeyframe(walk[0], PARAMS))
+    assert process.receive(PATIENCE_S) is not None
+    process.send(AddKeyframe(walk[1], PARAMS))
+    os.kill(process.pid, signal.SIGKILL)
+    process.send(AddKeyframe(walk[2], PARAMS))
+    with pytest.raises(LoopWorkerDied, match="signal 9"):
+        for _ in range(3):  # an answer may have come before
+            process.receive(PATIENCE_S)
+    with pytest.raises(LoopWorkerDied):
+        process.receive(PATIENCE_S)
+    second = LoopProcess()
+    for keyframe in walk:
+        second.send(AddKeyframe(keyframe, PARAMS))
+    counts = [reply.count for reply in (second.receive(PATIENCE_S) for _ in walk) if isinstance(reply, LoopState)]
+    assert counts == [1, 2, 3, 4]
+    second.close()
+    assert not alive(second.pid)
+
+
+def _owner(out: "Connection[object, object]") -> None:
+    process = LoopProcess()
+    process.send(AddKeyframe(keyframes(1)[0], PARAMS))
+    reply = process.receive(PATIENCE_S)
+    out.send((process.pid, reply.count if isinstance(reply, LoopState) else -1))
+    time.sleep(10 * PATIENCE_S)
+
+
+def test_it_can_belong_to_a_daemon_of_multiprocessing_and_dies_with_it() -> None:
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    owner = context.Process(target=_owner, args=(theirs,), daemon=True)
+    owner.start()
+    assert ours.poll(PATIENCE_S)
+    pid, count = ours.recv()
+    assert count == 1
+    assert alive(pid)
+    owner.kill()
+    owner.join()
+    until_gone(pid)
+
+
+def test_closing_ends_it_even_at_work(process: LoopProcess) -> None:
+    for keyframe in keyframes(12, points=60_000):
+        process.send(AddKeyframe(keyframe, PARAMS))
+    process.close()
+    assert not alive(process.pid)
+    assert process.pending == 0
+    assert process.receive() is None

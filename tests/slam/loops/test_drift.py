@@ -1,0 +1,76 @@
+import numpy as np
+import pytest
+
+from app.slam import lie
+from app.slam.loops.drift import POSITION_M, ROTATION, Drift, agree, expect
+from app.slam.loops.types import Evidence, LoopEdge, Verdict
+from app.slam.types import F64
+
+DRIFT = Drift(0.01, np.radians(0.02))
+
+
+def path(points: F64) -> F64:
+    """(k, 4, 4) poses along (k, 2) points, without turning."""
+    return np.array([lie.transform(np.eye(3), np.array([x, y, 0.0])) for x, y in points])
+
+
+def square(side: float = 10.0, step: float = 0.5) -> F64:
+    s = np.arange(0.0, side, step)
+    zero, full = np.zeros_like(s), np.full_like(s, side)
+    return np.vstack([np.c_[s, zero], np.c_[full, s], np.c_[side - s, full], np.c_[zero, side - s], [[0.0, 0.0]]])
+
+
+def loop(older: int, newer: int, poses: F64, off: tuple[float, float, float] = (0, 0, 0)) -> LoopEdge:
+    T = lie.inverse(poses[older]) @ poses[newer]
+    T[:3, 3] += off
+    return LoopEdge(older, newer, newer, T, np.eye(6) * 1e-4, Verdict.ACCEPTED, "", Evidence())
+
+
+def test_doubt_grows_with_the_way_not_with_the_distance() -> None:
+    expectation = expect(80, path(square()), [], DRIFT)
+    np.testing.assert_allclose(expectation.way, np.arange(80, -1, -1) * 0.5, atol=1e-3)
+    assert expectation.position_sigmas()[0] > 0.4 > expectation.position_sigmas()[60]
+
+
+def test_the_lever_arm_is_what_a_steady_turn_does_to_the_end_of_the_walk() -> None:
+    """Against walking the square again with a small steady turn."""
+    poses, rate = path(square()), 1e-5
+    expectation = expect(80, poses, [], Drift(1e-9, rate))
+    steps = np.diff(square(), axis=0)
+    turned = np.cumsum(np.linalg.norm(steps, axis=1)) * rate - 0.25 * rate
+    rotated = np.c_[steps[:, 0] - turned * steps[:, 1], steps[:, 1] + turned * steps[:, 0]]
+    moved = rotated.sum(axis=0) - steps.sum(axis=0)
+    covariance = expectation.covariance(0)[3:5, 3:5] - POSITION_M**2 * np.eye(2)
+    np.testing.assert_allclose(covariance, np.outer(moved, moved), rtol=0.01, atol=1e-12)
+    heading = expectation.covariance(0)[2, 2] - ROTATION**2
+    assert np.sqrt(heading) == pytest.approx(40 * rate, rel=0.01)
+
+
+def test_a_loop_is_a_short_cut_and_one_that_is_not_met_a_longer_one() -> None:
+    poses = path(square())
+    met = expect(78, poses, [loop(2, 80, poses)], DRIFT)
+    assert met.way[0] == pytest.approx(2.0, abs=0.01)
+    missed = expect(78, poses, [loop(2, 80, poses, (0.15, 0.0, 0.0))], DRIFT)
+    assert missed.way[0] == pytest.approx(2.0 + (0.15 - POSITION_M) / DRIFT.translation, abs=0.01)
+
+
+def test_what_odometry_expects_is_no_deviation_and_a_sigma_off_is_one() -> None:
+    poses = path(square())
+    expectation = expect(80, poses, [], DRIFT)
+    exact = lie.inverse(poses[0]) @ poses[80]
+    assert expectation.mahalanobis(0, exact) == pytest.approx(0.0, abs=1e-9)
+    up = exact.copy()
+    up[2, 3] += np.hypot(DRIFT.translation * 40.0, POSITION_M)
+    assert expectation.mahalanobis(0, up) == pytest.approx(1.0, rel=1e-3)
+    tilted = lie.transform(lie.exp(np.array([2 * ROTATION, 0.0, 0.0])), np.zeros(3)) @ exact
+    assert expectation.mahalanobis(0, tilted) == pytest.approx(2.0, rel=1e-3)
+
+
+def test_loops_agree_that_go_round_to_nothing() -> None:
+    poses = path(square())
+    a = loop(0, 78, poses)
+    assert agree(a, loop(3, 80, poses), poses, 2.5, DRIFT)
+    assert agree(a, loop(3, 80, poses, (0.05, 0.05, 0.0)), poses, 2.5, DRIFT)
+    assert not agree(a, loop(3, 80, poses, (0.5, 0.0, 0.0)), poses, 2.5, DRIFT)
+    both = loop(0, 78, poses, (4.0, 0.0, 0.0)), loop(3, 80, poses, (4.0, 0.0, 0.0))
+    assert agree(*both, poses, 2.5, DRIFT), "two that err alike agree: why rivals are looked for as well"

@@ -1,0 +1,208 @@
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from app.slam import lie
+from app.slam.loops.inspection import residuals
+from app.slam.loops.pose_graph import HUBER, Factor, PoseGraph, Step, g2o_text, optimise
+from app.slam.types import F64
+
+
+def random_pose(rng: np.random.Generator, spread: float) -> F64:
+    return lie.transform(lie.exp(rng.normal(scale=spread, size=3)), rng.normal(scale=spread, size=3))
+
+
+def covariance(rng: np.random.Generator, scale: float) -> F64:
+    A = rng.normal(size=(6, 6))
+    return scale**2 * (A @ A.T / 6 + np.eye(6))
+
+
+def chain(count: int, seed: int = 0, noise: float = 0.02) -> tuple[list[Factor], list[Factor]]:
+    """Odometry round a circle, measured with noise, and loops across it."""
+    rng = np.random.default_rng(seed)
+    step = lie.transform(lie.exp(np.array([0.0, 0.0, 2 * np.pi / count])), np.array([1.0, 0.0, 0.0]))
+    truth = [np.eye(4)]
+    for _ in range(count - 1):
+        truth.append(truth[-1] @ step)
+
+    def measured(i: int, j: int) -> F64:
+        return lie.inverse(truth[i]) @ truth[j] @ random_pose(rng, noise)
+
+    odometry = [Factor(k - 1, k, measured(k - 1, k), covariance(rng, 0.05)) for k in range(1, count)]
+    loops = [Factor(i, j, measured(i, j), covariance(rng, 0.02)) for i, j in ((0, count - 1), (1, count // 2))]
+    return odometry, loops
+
+
+def graph_of(odometry: list[Factor], loops: list[Factor], window: int = 0) -> PoseGraph:
+    graph = PoseGraph(np.eye(4), window)
+    for factor in odometry:
+        graph.extend(factor, [loop for loop in loops if loop.second == factor.second])
+    return graph
+
+
+def errors(x: F64, factors: list[Factor]) -> F64:
+    """Whitened errors, rotation and translation of inv(measured) inv(T_i) T_j by the SE(3) logarithm (Barfoot 2017)."""
+    poses = [np.eye(4)] + [lie.transform(lie.exp(v[:3]), v[3:]) for v in x.reshape(-1, 6)]
+    out = []
+    for factor in factors:
+        E = lie.inverse(factor.T_first_second) @ lie.inverse(poses[factor.first]) @ poses[factor.second]
+        w = lie.log(E[:3, :3])
+        # left Jacobian of SO(3): J(w) = Jr(-w)
+        v = np.linalg.solve(lie.right_jacobian(-w), E[:3, 3])
+        out.append(np.linalg.solve(np.linalg.cholesky(factor.covariance), np.concatenate([w, v])))
+    return np.concatenate(out)
+
+
+def test_the_optimum_is_that_of_an_independent_least_squares_solver() -> None:
+    odometry, loops = chain(12)
+    graph = graph_of(odometry, loops)
+    start = np.concatenate([np.concatenate([lie.log(T[:3, :3]), T[:3, 3]]) for T in graph.poses[1:]])
+    solved = least_squares(lambda x: errors(x, odometry + loops), start, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    oracle = np.array([np.eye(4)] + [lie.transform(lie.exp(v[:3]), v[3:]) for v in solved.reshape(-1, 6)])
+    batch = optimise(np.eye(4), odometry + loops, graph.poses)
+    np.testing.assert_allclose(batch, oracle, atol=1e-6)
+    np.testing.assert_allclose(graph.poses, oracle, atol=2e-3)
+    assert np.abs(graph_of(odometry, []).poses - oracle).max() > 0.05, "the loops matter"
+
+
+def test_a_factors_error_is_what_it_says() -> None:
+    odometry, loops = chain(6)
+    poses = graph_of(odometry, loops).poses
+    x = np.concatenate([np.concatenate([lie.log(T[:3, :3]), T[:3, 3]]) for T in poses[1:]])
+    for factor, residual in zip(odometry + loops, residuals(odometry + loops, poses), strict=True):
+        assert residual.sigmas == pytest.approx(np.linalg.norm(errors(x, [factor])), rel=1e-6)
+
+
+def test_doing_it_again_gives_the_same_poses_to_the_last_bit() -> None:
+    odometry, loops = chain(40)
+    graph = graph_of(odometry, loops)
+    again = PoseGraph(np.eye(4))
+    again.replay(graph.steps)
+    np.testing.assert_array_equal(graph.poses, again.poses)
+    again.poses  # noqa: B018 - looking must not change what comes
+    for g in (graph, again):
+        g.close([Factor(5, 30, np.eye(4), np.eye(6) * 0.1, robust=True)])
+    np.testing.assert_array_equal(graph.poses, again.poses)
+
+
+def straight(count: int, sigma: float) -> list[Factor]:
+    step = lie.transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    return [Factor(k - 1, k, step, np.eye(6) * sigma**2) for k in range(1, count)]
+
+
+def along(x: float) -> F64:
+    return lie.transform(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def test_a_robust_loop_pulls_with_bounded_force() -> None:
+    def last(x: float, robust: bool = True) -> float:
+        graph = graph_of(straight(11, 0.1), [Factor(0, 10, along(x), np.eye(6) * 0.05**2, robust=robust)])
+        return float(graph.poses[10, 0, 3])
+
+    # the chain is a spring of variance 10 x 0.1^2, the loop one of 0.05^2; far off, a constant force HUBER / sigma
+    assert last(10.3) == pytest.approx(10 + 0.3 * 0.1 / (0.1 + 0.0025), abs=1e-3)
+    assert last(30.0) == pytest.approx(10 + 10 * 0.1**2 * HUBER / 0.05, abs=0.02)
+    assert last(30.0, robust=False) > 29.0, "without the loss it would follow"
+
+
+@pytest.mark.parametrize("window", [0, 8])
+@pytest.mark.parametrize("broken", ["covariance", "measurement", "key"])
+def test_a_loop_that_breaks_the_solver_is_left_out_and_the_rest_goes_on(broken: str, window: int) -> None:
+    odometry, loops = chain(20)
+    bad = {
+        "covariance": Factor(14, 18, np.eye(4), np.full((6, 6), np.nan), robust=True),
+        "measurement": Factor(14, 18, np.full((4, 4), np.nan), np.eye(6), robust=True),
+        "key": Factor(14, 99, np.eye(4), np.eye(6), robust=True),
+    }[broken]
+    graph, clean = graph_of(odometry[:18], loops, window), graph_of(odometry[:18], loops, window)
+    good = Factor(13, 18, lie.inverse(clean.poses[13]) @ clean.poses[18], np.eye(6) * 0.01, robust=True)
+    assert graph.close([good, bad]) == (bad,)
+    assert clean.close([good]) == ()
+    for factor in odometry[18:]:
+        assert graph.extend(factor) == clean.extend(factor) == ()
+    np.testing.assert_array_equal(graph.poses, clean.poses)
+
+
+def test_a_step_that_breaks_the_solver_leaves_a_pose_all_the_same() -> None:
+    odometry, _ = chain(10)
+    graph = graph_of(odometry[:5], [])
+    bad = Factor(5, 6, odometry[5].T_first_second, np.zeros((6, 6)) * np.nan)
+    assert graph.extend(bad) == (bad,)
+    assert graph.extend(odometry[6]) == ()
+    assert len(graph) == len(graph.poses) == 8
+    assert np.isfinite(graph.poses).all()
+
+
+def test_a_window_leaves_old_poses_where_they_are_and_solves_for_the_new_ones() -> None:
+    odometry, _ = chain(30)
+    graph = graph_of(odometry, [], window=10)
+    before = graph.poses
+    off = lie.inverse(before[2]) @ before[29] @ along(0.5)
+    graph.close([Factor(2, 29, off, np.eye(6) * 0.01**2, robust=True)])
+    moved = np.linalg.norm((graph.poses - before)[:, :3, 3], axis=1)
+    assert (moved[:20] == 0).all()
+    assert moved[29] > 0.1
+
+
+def test_a_window_wider_than_the_walk_is_no_window() -> None:
+    odometry, loops = chain(20)
+    np.testing.assert_allclose(graph_of(odometry, loops, window=50).poses, graph_of(odometry, loops).poses, atol=2e-3)
+
+
+def test_the_g2o_file_holds_the_poses_and_factors(tmp_path: Path) -> None:
+    odometry, loops = chain(8)
+    poses = graph_of(odometry, loops).poses
+    (tmp_path / "graph.g2o").write_text(
+        g2o_text(poses, [*odometry, Factor(0, 5, along(3.0), np.eye(6) * 0.04, robust=True)])
+    )
+    graph, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
+    assert (values.size(), graph.size()) == (8, 8)
+    np.testing.assert_allclose([values.atPose3(k).matrix() for k in range(8)], poses, atol=1e-5)
+    last = graph.at(7)
+    np.testing.assert_allclose(last.measured().matrix(), along(3.0), atol=1e-5)
+    np.testing.assert_allclose(last.noiseModel().covariance(), np.eye(6) * 0.04, rtol=1e-4)
+
+
+def test_the_parking_garage_fed_pose_by_pose_ends_at_the_batch_optimum(shared_data: Path) -> None:
+    read, values = gtsam.readG2o(str(shared_data / "pose_graphs" / "parking-garage.g2o"), True)
+    count = 500
+    odometry: dict[int, Factor] = {}
+    loops: list[Factor] = []
+    for k in range(read.size()):
+        factor = read.at(k)
+        i, j = factor.keys()
+        if max(i, j) >= count:
+            continue
+        T, noise = factor.measured(), factor.noiseModel().covariance()
+        if i > j:
+            adjoint = T.AdjointMap()
+            i, j, T, noise = j, i, T.inverse(), adjoint @ noise @ adjoint.T
+        ours = Factor(i, j, T.matrix(), noise)
+        if j == i + 1 and j not in odometry:
+            odometry[j] = ours
+        else:
+            loops.append(ours)
+    first = values.atPose3(0).matrix()
+    graph = PoseGraph(first)
+    for j in range(1, count):
+        assert graph.extend(odometry[j], [loop for loop in loops if loop.second == j]) == ()
+    factors = [*odometry.values(), *loops]
+    batch = optimise(first, factors, [values.atPose3(k).matrix() for k in range(count)])
+
+    def cost(poses: F64) -> float:
+        return sum(residual.sigmas**2 for residual in residuals(factors, poses))
+
+    assert cost(graph.poses) == pytest.approx(cost(batch), rel=1e-3)
+    assert cost(graph_of(list(odometry.values()), []).poses) > 10 * cost(batch)
+
+
+def test_steps_say_what_was_done() -> None:
+    odometry, loops = chain(6)
+    graph = graph_of(odometry, [])
+    graph.close(loops)
+    assert graph.steps == (*(Step(factor) for factor in odometry), Step(None, tuple(loops)))
+    assert graph.close([]) == ()
+    assert len(graph.steps) == 6
