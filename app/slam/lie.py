@@ -134,9 +134,12 @@ def inverse(T: F64) -> F64:
 
 
 def tangent_basis(g: F64) -> F64:
-    """(3, 2) orthonormal basis of the plane across `g` (3,): the two directions of S² at g."""
+    """(3, 2) orthonormal basis of the plane across `g` (3,): the two directions of S² at g.
+
+    Smooth but where |g_x| passes 0.8 |g|: not near the vertical, where gravity is.
+    """
     u = g / np.linalg.norm(g)
-    e = np.eye(3)[np.argmin(np.abs(u))]
+    e = np.eye(3)[0 if abs(u[0]) < 0.8 else 1]
     b1 = np.cross(u, e)
     b1 /= np.linalg.norm(b1)
     return np.stack([b1, np.cross(u, b1)], axis=1)

@@ -44,6 +44,16 @@ def test_the_tangent_basis_equals_the_readable_form(u: np.ndarray, length: float
     np.testing.assert_allclose(manifold.tangent_basis(length * u), lie.tangent_basis(length * u), atol=1e-14)
 
 
+@given(st.floats(0.0, 2 * np.pi), st.floats(0.0, 0.1), st.floats(0.0, 2 * np.pi))
+def test_a_little_tilt_of_gravity_turns_its_tangent_basis_as_little(at: float, tilt: float, to: float) -> None:
+    """The covariance of gravity is expressed in this basis from frame to frame: it may not jump where gravity is."""
+    before = -np.array([1e-3 * np.cos(at), 1e-3 * np.sin(at), 1.0])
+    after = -np.array([tilt * np.cos(to), tilt * np.sin(to), 1.0])
+    apart = np.linalg.norm(after / np.linalg.norm(after) - before / np.linalg.norm(before))
+    change = manifold.tangent_basis(9.81 * after) - manifold.tangent_basis(9.81 * before)
+    assert np.linalg.norm(change) <= 2.0 * apart + 1e-12
+
+
 @given(directions(), rotvecs(largest=3.0))
 def test_the_turn_between_two_directions_is_the_smallest(u: np.ndarray, v: np.ndarray) -> None:
     w = Rotation.from_rotvec(v).apply(u)

@@ -68,16 +68,16 @@ def right_jacobian_inverse(v):
 
 @njit(cache=True)
 def tangent_basis(g):
-    """(3, 2) orthonormal basis of the plane across g (3,)."""
+    """(3, 2) orthonormal basis of the plane across g (3,), smooth but where |g_x| passes 0.8 |g|.
+
+    It must not jump near the vertical, where gravity is: the covariance is expressed in it.
+    """
     n = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
     ux, uy, uz = g[0] / n, g[1] / n, g[2] / n
-    ax, ay, az = abs(ux), abs(uy), abs(uz)
-    if ax <= ay and ax <= az:  # u x e for the axis e that is least along u
+    if abs(ux) < 0.8:  # u x e for an axis e well across u
         bx, by, bz = 0.0, uz, -uy
-    elif ay <= az:
-        bx, by, bz = -uz, 0.0, ux
     else:
-        bx, by, bz = uy, -ux, 0.0
+        bx, by, bz = -uz, 0.0, ux
     s = 1.0 / math.sqrt(bx * bx + by * by + bz * bz)
     bx, by, bz = bx * s, by * s, bz * s
     B = np.empty((3, 2))
