@@ -27,6 +27,7 @@ from app.ui.notices import NoticePanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.readouts import ReadoutPanel
 from app.ui.scene import Scene
+from app.ui.timeline import TimelinePanel
 from app.ui.transport import TransportPanel
 from app.ui.view import View
 
@@ -84,6 +85,7 @@ class Workbench:
         gui.add_html(STYLE + KEYS)
         self._header = HeaderPanel(gui)
         self._transport = TransportPanel(gui, engine.send, lambda: engine.snapshot)
+        self._timeline = TimelinePanel(gui, engine.send, lambda: engine.snapshot, now)
         with gui.add_folder("Pause when", expand_by_default=False):
             self._breakpoints = BreakpointPanel(gui, engine.send)
         tabs = gui.add_tab_group()
@@ -140,6 +142,7 @@ class Workbench:
         """Bring the page up to `current`: at once what a user waits for, the rest no faster than one can see."""
         now, view, drawn = self._now(), self._appearance.view, self._drawn
         self._transport.tick(current)
+        self._timeline.draw(current)
         self._breakpoints.tick(current)
         self._parameters.tick(current)
         self._notices.draw(current)
