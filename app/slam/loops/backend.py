@@ -24,7 +24,7 @@ from app.slam.loops.pose_graph import Factor, Step, g2o_text, optimise
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.solution import Solution, loop_factor
 from app.slam.loops.support import settle
-from app.slam.loops.types import Add, Command, FactorResidual, LoopDetail, LoopEdge, Pair, Preview, Verdict
+from app.slam.loops.types import Add, Command, FactorResidual, LoopDetail, LoopEdge, Pair, Preview, Verdict, rows
 from app.slam.params import Loops
 from app.slam.types import F64, Keyframe
 
@@ -111,7 +111,7 @@ class LoopBackend:
             found = self._look(max(complete, self._detector.described), complete + 1, params)
         self._history.append(Record(head, odometry, params, found))
         self._learn(found)
-        self._resolve()
+        self._reach(self.known)
 
     def finish(self) -> None:
         """The walk ends here: look for loops of the last keyframes too. The next step of the walk takes it back."""
@@ -122,7 +122,7 @@ class LoopBackend:
             self._ends[count] = self._look(self._detector.described, count, params) if params.enabled else Found()
         self._finished = True
         self._stand(count)
-        self._resolve()
+        self._reach(self.known + (count == self.known))
         for command in self._idle():
             self._notices.append(f"{in_words(command)} has no effect: there is no such loop; loops.csv lists all.")
 
@@ -149,8 +149,14 @@ class LoopBackend:
         del self._history[count:]
         self._ends = {end: found for end, found in self._ends.items() if end <= count}
         self._detector.forget()
-        self._overrulings.wait_again(lambda pair: pair[1] + half >= count)
+        self._overrulings.go_back(count, lambda pair: pair[1] + half >= count)
         self._stand(count)
+
+    def _reach(self, reached: int) -> None:
+        """The walk has come so far: commands that were given here the last time act from now on."""
+        if self._overrulings.reach(reached):
+            self._solve()
+        self._resolve()
 
     def _begin(self, params: Loops) -> None:
         self._detector.close()
@@ -257,10 +263,15 @@ class LoopBackend:
     def apply(self, command: Command) -> None:
         """Overrule. What was undone before can no longer be redone. Raises HemislamError if it makes no sense."""
         check(command)
-        waits = not isinstance(command, Add) and (command.older, command.newer) not in self._edges(self._found)
-        self._overrulings.give(self._entry(command))
+        there = command.newer < len(self)
+        if isinstance(command, Add):
+            if there and command.guess is None:  # as it is now, so that it is the same when given again
+                command = replace(command, guess=rows(self._present(command.older, command.newer)))
+        elif (command.older, command.newer) not in self._edges(self._found):
+            there = False
+        self._overrulings.give(self._entry(replace(command, since=self._overrulings.reached if there else 0)))
         self._solve()
-        if waits or command.newer >= len(self):
+        if not there:
             self._notices.append(f"{in_words(command)} waits until there is such a loop.")
 
     def load(self, commands: tuple[Command, ...], undone: tuple[Command, ...] = ()) -> None:
@@ -292,7 +303,7 @@ class LoopBackend:
         self._check_there(command.older, command.newer)
         if not isinstance(command, Add) and (command.older, command.newer) not in self._edges(self._found):
             raise HemislamError(f"There is no loop candidate of keyframes {command.older} and {command.newer}.")
-        edges = tuple(self._edges(self._found, self._entry(command)).values())
+        edges = tuple(self._edges(self._found, self._entry(replace(command, since=0))).values())
         poses = self._batch(edges)
         return Preview(poses, inspection.residuals(self._factors(edges), poses))
 
@@ -302,17 +313,19 @@ class LoopBackend:
 
     def _made(self, command: Add) -> LoopEdge:
         older, newer = command.older, command.newer
-        poses = self.poses
-        present = np.asarray(lie.inverse(poses[older]) @ poses[newer])
-        guess = present if command.guess is None else np.array(command.guess, dtype=np.float64)
+        guess = self._present(older, newer) if command.guess is None else np.array(command.guess, dtype=np.float64)
         return by_hand(older, newer, self._detector, guess, register=command.register)
 
+    def _present(self, older: int, newer: int) -> F64:
+        """(4, 4) T_older_newer as the graph has it."""
+        poses = self.poses
+        return np.asarray(lie.inverse(poses[older]) @ poses[newer])
+
     def _resolve(self) -> None:
-        """Make the loops by hand that waited for keyframes, once the surroundings of these are complete."""
-        if not len(self):
-            return
-        half = 0 if self._finished else self._start.submap_keyframes
-        if self._overrulings.resolve(lambda pair: pair[1] + half < len(self), self._made):
+        """Make the loops by hand that waited for keyframes."""
+        count = len(self)
+        complete = count if self._finished else count - self._start.submap_keyframes
+        if self._overrulings.resolve(count, complete, self._made):
             self._solve()
 
     def _idle(self) -> list[Command]:

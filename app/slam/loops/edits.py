@@ -9,7 +9,8 @@
       guess: [[1.0, 0.0, 0.0, 0.2], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 
 A loop is named by its older and its newer keyframe. `guess` is T_older_newer of the IMU frames,
-left out: where the graph has them; `register` is true if left out.
+left out: where the graph has them; `register` is true if left out. `since`, of any entry, is how
+many keyframes the walk had when it was given; it acts from there on, left out: from the start.
 """
 
 import math
@@ -28,7 +29,7 @@ _FIELDS: Final[dict[str, frozenset[str]]] = {
     "weigh": frozenset({"weight"}),
     "add": frozenset({"guess", "register"}),
 }
-"""What an entry may hold beside its verb and keyframes."""
+"""What an entry may hold beside its verb, keyframes and `since`."""
 
 _HEAD: Final = "# Overrulings of loops, in their order: hemislam run RECORDING --loops THIS_FILE\n"
 
@@ -68,14 +69,16 @@ def _entry(command: Command) -> dict[str, Any]:
     pair = [command.older, command.newer]
     match command:
         case Accept():
-            return {"accept": pair}
+            entry: dict[str, Any] = {"accept": pair}
         case Reject():
-            return {"reject": pair}
+            entry = {"reject": pair}
         case SetWeight(weight=weight):
-            return {"weigh": pair, "weight": float(weight)}
+            entry = {"weigh": pair, "weight": float(weight)}
         case Add(guess=guess, register=register):
-            entry: dict[str, Any] = {"add": pair, "register": register}
-            return entry if guess is None else {**entry, "guess": [list(row) for row in guess]}
+            entry = {"add": pair, "register": register}
+            if guess is not None:
+                entry["guess"] = [list(row) for row in guess]
+    return {**entry, "since": command.since} if command.since else entry
 
 
 def _command(entry: object) -> Command:
@@ -83,23 +86,24 @@ def _command(entry: object) -> Command:
     if not isinstance(entry, dict) or len(verbs) != 1:
         raise HemislamError("it must hold one of accept, reject, weigh or add, with two keyframes: accept: [12, 340].")
     verb = verbs[0]
-    unknown = sorted(str(name) for name in entry.keys() - {verb} - _FIELDS[verb])
+    unknown = sorted(str(name) for name in entry.keys() - {verb, "since"} - _FIELDS[verb])
     if unknown:
         allowed = " and ".join(sorted(_FIELDS[verb])) or "nothing else"
         raise HemislamError(f"{unknown[0]} means nothing to {verb}; it takes {allowed}.")
     older, newer = _pair(verb, entry[verb])
+    since = _since(entry.get("since", 0))
     match verb:
         case "accept":
-            return Accept(older, newer)
+            return Accept(older, newer, since)
         case "reject":
-            return Reject(older, newer)
+            return Reject(older, newer, since)
         case "weigh":
-            return SetWeight(older, newer, _weight(entry.get("weight")))
+            return SetWeight(older, newer, _weight(entry.get("weight")), since)
         case _:
             register = entry.get("register", True)
             if not isinstance(register, bool):
                 raise HemislamError(f"register is {register!r}; it must be true or false.")
-            return Add(older, newer, _guess(entry.get("guess")), register)
+            return Add(older, newer, _guess(entry.get("guess")), register, since)
 
 
 def _pair(verb: str, value: object) -> Pair:
@@ -111,6 +115,12 @@ def _pair(verb: str, value: object) -> Pair:
     if not good or not isinstance(value, list) or not 0 <= value[0] < value[1]:
         raise HemislamError(f"{verb} is {value!r}; it takes two keyframes, the older one first: [12, 340].")
     return value[0], value[1]
+
+
+def _since(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise HemislamError(f"since is {value!r}; it must be a number of keyframes.")
+    return value
 
 
 def _weight(value: object) -> float:

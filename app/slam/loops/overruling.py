@@ -26,9 +26,14 @@ class Entry:
 
 
 class Overrulings:
-    """Commands in force, and those taken back."""
+    """Commands in force, and those taken back.
+
+    Attributes:
+        reached: keyframes that the walk ever had, and one more after its end, to hold against `since`.
+    """
 
     def __init__(self) -> None:
+        self.reached = 0
         self._done: list[Entry] = []
         self._undone: list[Entry] = []
 
@@ -49,6 +54,11 @@ class Overrulings:
         self._done.append(entry)
         self._undone.clear()
 
+    def reach(self, reached: int) -> bool:
+        """The walk has come on. Returns whether commands act from now on that did not before."""
+        before, self.reached = self.reached, max(self.reached, reached)
+        return any(before < entry.command.since <= reached for entry in self._done)
+
     def load(self, commands: tuple[Command, ...], undone: tuple[Command, ...]) -> None:
         self._done = [Entry(command) for command in commands]
         self._undone = [Entry(command) for command in undone]
@@ -65,22 +75,36 @@ class Overrulings:
             raise HemislamError("There is no overruling to redo.")
         self._done.append(self._undone.pop())
 
-    def resolve(self, due: Callable[[Pair], bool], make: Callable[[Add], LoopEdge]) -> bool:
-        """Make the loops of those that wait and are due. Returns whether there were any."""
+    def resolve(self, count: int, complete: int, make: Callable[[Add], LoopEdge]) -> bool:
+        """Make the loops by hand that wait for their keyframes, where these are there.
+
+        Args:
+            count: keyframes there are. complete: how many of them have complete surroundings; commands
+                given from the start wait for those, others were given without.
+
+        Returns:
+            Whether there were any.
+        """
         before = self._done
-        self._done = [
-            replace(entry, added=make(entry.command))
-            if isinstance(entry.command, Add) and entry.added is None and due(entry.pair)
-            else entry
-            for entry in before
-        ]
+
+        def resolved(entry: Entry) -> Entry:
+            command = entry.command
+            if not isinstance(command, Add) or entry.added is not None or command.since > self.reached:
+                return entry
+            there = command.newer < (count if command.since else complete)
+            return replace(entry, added=make(command)) if there else entry
+
+        self._done = [resolved(entry) for entry in before]
         return any(new is not old for new, old in zip(self._done, before, strict=True))
 
-    def wait_again(self, lost: Callable[[Pair], bool]) -> None:
-        """Loops by hand between keyframes that were forgotten wait for those that come in their place."""
+    def go_back(self, reached: int, lost: Callable[[Pair], bool]) -> None:
+        """Keyframes were forgotten: commands go on acting, but loops by hand that lost theirs wait for others."""
+        self.reached = reached
 
         def kept(entry: Entry) -> Entry:
-            return replace(entry, added=None) if lost(entry.pair) else entry
+            if lost(entry.pair):
+                return Entry(replace(entry.command, since=0))
+            return replace(entry, command=replace(entry.command, since=min(entry.command.since, reached)))
 
         self._done, self._undone = [kept(e) for e in self._done], [kept(e) for e in self._undone]
 
@@ -92,6 +116,8 @@ class Overrulings:
         """
         edges = dict(found)
         for entry in [*self._done, *([extra] if extra else [])]:
+            if entry.command.since > self.reached:
+                continue
             if entry.added is not None:
                 if entry.added.newer < count:
                     edges[entry.pair] = entry.added

@@ -4,7 +4,7 @@ A loop is named by the two keyframes it ties together, `(older, newer)`: the nam
 whatever else is found, so that a list of overrulings can be replayed.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -95,12 +95,15 @@ class LoopEdge:
 
 
 # --- the user's commands -------------------------------------------------------------------------
+# `since` of each: how many keyframes the walk had when it was given, one more after its end. The first
+# time round a command acts from there on, so that a session given again goes as it went; 0: from the start.
 @dataclass(frozen=True, slots=True)
 class Accept:
     """Make a candidate a factor of the graph, whatever was found against it."""
 
     older: int
     newer: int
+    since: int = field(default=0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +112,7 @@ class Reject:
 
     older: int
     newer: int
+    since: int = field(default=0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +122,7 @@ class SetWeight:
     older: int
     newer: int
     weight: float
+    since: int = field(default=0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +139,7 @@ class Add:
     newer: int
     guess: tuple[tuple[float, ...], ...] | None = None
     register: bool = True
+    since: int = field(default=0, compare=False)
 
 
 Command = Accept | Reject | SetWeight | Add
