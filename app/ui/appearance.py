@@ -55,6 +55,10 @@ class AppearancePanel:
             **{name: layer.value for name, layer in self._layers.items()},
         )
 
+    def look_freely(self) -> None:
+        """Follow no more, so that a camera stays where it is put."""
+        show(self._follow, False)
+
     def draw(self, view: View, limits: Limits | None, points: int, budget: int) -> None:
         """Explain the colours as drawn and say how many points the page holds."""
         self._legend.content = legend(view.colour_by, limits)

@@ -58,6 +58,11 @@ class Scene:
         server.initial_camera.fov = float(np.radians(60.0))
 
     @property
+    def offset(self) -> F64:
+        """(3,) m where the map's origin is in the scene: moved against the sensor while that is followed."""
+        return np.array(self._root.position)
+
+    @property
     def points(self) -> int:
         """Map points in the page."""
         return self._chunks.points

@@ -23,10 +23,11 @@ from app.ui.files import FilesPanel
 from app.ui.header import HELP, HeaderPanel
 from app.ui.html import ACCENT, STYLE, heading
 from app.ui.keys import KEYS
+from app.ui.loops.panel import LoopsPanel
 from app.ui.notices import NoticePanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.readouts import ReadoutPanel
-from app.ui.scene import Scene
+from app.ui.scene import ROOT, Scene
 from app.ui.timeline import TimelinePanel
 from app.ui.transport import TransportPanel
 from app.ui.view import View
@@ -107,6 +108,16 @@ class Workbench:
             self._doctor = DoctorPanel(gui)
             gui.add_html(heading("Log"))
             self._notices = NoticePanel(server)
+        with left.add_tab("Loops", viser.Icon.INFINITY):
+            self._loops = LoopsPanel(
+                server,
+                ROOT,
+                engine.send,
+                lambda: engine.snapshot,
+                lambda: self._scene.offset,
+                self._appearance.look_freely,
+                now,
+            )
         left.dock_left()
         left.set_width(300)
 
@@ -140,13 +151,14 @@ class Workbench:
 
     def draw(self, current: Snapshot) -> None:
         """Bring the page up to `current`: at once what a user waits for, the rest no faster than one can see."""
-        now, view, drawn = self._now(), self._appearance.view, self._drawn
+        now, view, drawn = self._now(), self._loops.seen(self._appearance.view), self._drawn
         self._transport.tick(current)
         self._timeline.draw(current)
         self._breakpoints.tick(current)
         self._parameters.tick(current)
         self._notices.draw(current)
         self._header.draw(current)
+        self._loops.tick(current, view)
         news = drawn is None or drawn.revision != current.revision
         awaited = drawn is not None and _changed_by_user(drawn, current)
         due = now - self._scene_drawn_at >= _SCENE_PERIOD_S

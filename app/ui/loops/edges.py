@@ -21,6 +21,7 @@ _OUT_WIDTH: Final = 1.0
 _KNOB_M: Final = {Kind.ACCEPTED: 0.22, Kind.CANDIDATE: 0.2, Kind.REJECTED: 0.12, Kind.USER: 0.24}
 _CHOSEN: Final = (255, 255, 255)
 _PICK_RAD: Final = np.radians(1.5)
+_LABEL: Final = np.array([0.0, 0.0, 0.5])
 _STILL_M: Final = 1e-3
 _SAMPLES: Final = np.linspace(0.0, 1.0, 12)
 
@@ -113,7 +114,7 @@ class LoopEdges:
             self._nodes[node] = self._scene.add_line_segments(
                 node, _legs(lines), _CHOSEN, thickness=5.0, thickness_units="screen"
             )
-            self._nodes[f"{node}-label"] = self._scene.add_label(f"{node}-label", text, position=lines[0, 1])
+            self._nodes[f"{node}-label"] = self._scene.add_label(f"{node}-label", text, position=lines[0, 1] + _LABEL)
 
     def _differs(self, node: str, lines: F32) -> bool:
         """Whether a node has to be sent; one of no lines is taken away."""

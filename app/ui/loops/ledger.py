@@ -17,12 +17,12 @@ STYLE: Final = """<style>
 .hs-chips{display:flex;flex-wrap:wrap;gap:5px;padding:4px 10px 6px}
 .hs-toggle{cursor:pointer;border:1px solid;border-radius:10px;padding:0 8px;font-size:11px;line-height:19px;
 user-select:none;white-space:nowrap}.hs-toggle[aria-pressed=false]{opacity:.45;border-style:dashed}
-.hs-scroll{max-height:250px;overflow-y:auto;margin:0 8px 6px;border:1px solid rgba(127,140,160,.25);border-radius:5px}
+.hs-scroll{max-height:270px;overflow-y:auto;margin:0 8px 6px;border:1px solid rgba(127,140,160,.25);border-radius:5px}
 .hs-table{border-collapse:collapse;width:100%;font-size:11px;font-variant-numeric:tabular-nums;line-height:1.2}
 .hs-table th{position:sticky;top:0;background:#262b33;font-weight:600;color:#aeb8c6;text-align:right;padding:4px 5px;
 cursor:pointer;user-select:none;white-space:nowrap}
 .hs-table td{text-align:right;padding:3px 5px;white-space:nowrap}
-.hs-table th:first-child,.hs-table td:first-child{text-align:left}
+.hs-table th:first-child,.hs-table td:first-child{text-align:left}.hs-table th:first-child{min-width:18px}
 .hs-table tr[data-hs]{cursor:pointer}.hs-table tr[data-hs]:hover{background:rgba(127,140,160,.16)}
 .hs-table tr[aria-selected=true]{background:rgba(38,166,154,.35)!important}
 .hs-table :focus-visible,.hs-toggle:focus-visible{outline:2px solid #26a69a;outline-offset:-2px}
@@ -42,11 +42,11 @@ class Column:
 
 
 COLUMNS: Final[dict[str, Column]] = {
-    "keyframe": Column(
-        "loop", "Older and newer keyframe", lambda e: e.newer + e.older * 1e-7, lambda e: _dot(e) + name(e.pair)
-    ),
     "verdict": Column(
-        "verdict", "What became of it", lambda e: list(Kind).index(kind_of(e)) + 0.1 * _rank(e), lambda e: _word(e)
+        "", "What became of it", lambda e: list(Kind).index(kind_of(e)) + 0.1 * _rank(e), lambda e: _sign(e)
+    ),
+    "keyframe": Column(
+        "loop", "Older and newer keyframe", lambda e: e.newer + e.older * 1e-7, lambda e: name(e.pair)
     ),
     "context": Column(
         "ctx", "Distance of the Scan Contexts, 0 (same) to 1",
@@ -112,7 +112,7 @@ def table(rows: list[LoopEdge], order: Order, chosen: Pair | None) -> str:
     arrow = "▾" if order.descending else "▴"
     heads = "".join(
         f'<th tabindex="0" data-hs="sort {column}" title="{escape(entry.meaning)}">'
-        f"{escape(entry.title)}{arrow if column == order.column else ''}</th>"
+        f"{escape(entry.title)}{arrow if column == order.column else '' if entry.title else '•'}</th>"
         for column, entry in COLUMNS.items()
     )
     body = "".join(_row(edge, edge.pair == chosen) for edge in rows[:MOST_ROWS])
@@ -145,9 +145,6 @@ def _rank(edge: LoopEdge) -> int:
     return ("accepted", "candidate", "rejected").index(edge.verdict.value)
 
 
-def _dot(edge: LoopEdge) -> str:
-    return f'<span class="hs-dot" style="background:{css(COLOURS[kind_of(edge)])}"></span>'
-
-
-def _word(edge: LoopEdge) -> str:
-    return f"{edge.verdict} ✎" if kind_of(edge) is Kind.USER else str(edge.verdict)
+def _sign(edge: LoopEdge) -> str:
+    sign = ("✓", "?", "✕")[_rank(edge)] + ("✎" if kind_of(edge) is Kind.USER else "")
+    return f'<b style="color:{css(COLOURS[kind_of(edge)])}">{sign}</b>'

@@ -14,7 +14,7 @@ from app.slam.loops.types import Accept, LoopEdge, Pair, Preview, Reject, SetWei
 from app.slam.loops.types import Command as Overrule
 from app.ui.loops.kinds import say
 from app.ui.loops.overlay import Ghost
-from app.ui.loops.words import forecast
+from app.ui.loops.words import forecast, headline
 from app.ui.widgets import by_user, show
 
 _REST_S: Final = 0.3
@@ -102,6 +102,7 @@ class VerdictPanel:
         self._propose, self._now = propose, now
         self._pair: Pair | None = None
         self._dragged: tuple[float, float] | None = None
+        self._headline = gui.add_html("")
         self._accept = gui.add_button("Accept it …", icon=viser.Icon.THUMB_UP, color="teal")
         self._reject = gui.add_button("Reject it …", icon=viser.Icon.THUMB_DOWN, color="red")
         self._weight = gui.add_slider(
@@ -117,6 +118,7 @@ class VerdictPanel:
         if edge is None:
             self._dragged = None
             return
+        self._headline.content = headline(edge)
         self._accept.visible = edge.verdict is not Verdict.ACCEPTED
         self._reject.visible = edge.verdict is not Verdict.REJECTED
         self._weight.disabled = edge.verdict is not Verdict.ACCEPTED

@@ -16,10 +16,20 @@ _WORST: Final = 12
 _COMPARED: Final = 3
 
 
-def evidence(edge: LoopEdge, params: Loops) -> str:
-    """Verdict, reason and numbers of a loop, green or red by the present limits."""
-    e = edge.evidence
+def headline(edge: LoopEdge) -> str:
+    """Which loop, what became of it and why."""
     colour = css(COLOURS[kind_of(edge)])
+    weight = f" · weight {edge.weight:g}" if edge.weight != 1.0 else ""
+    return box(
+        f'<div class="hs-row"><span>keyframes <b>{name(edge.pair)}</b></span><b style="color:{colour}">'
+        f"{escape(edge.verdict)}{escape(weight)}</b></div>",
+        f'<div class="hs-item" style="border-color:{colour}">{escape(edge.reason)}</div>',
+    )
+
+
+def evidence(edge: LoopEdge, params: Loops) -> str:
+    """The numbers of a loop, green or red by the present limits."""
+    e = edge.evidence
     alone = "none" if np.isinf(e.rival_m) and e.rival_m > 0 else f"{number(e.rival_m, 1)}"
     parts = [
         tile("overlap", number(100 * e.overlap, 0), "%", colour=_fits(e.overlap, params.min_overlap, least=True),
@@ -37,12 +47,7 @@ def evidence(edge: LoopEdge, params: Loops) -> str:
         tile("contexts", number(e.context_distance), colour=_fits(e.context_distance, params.context_distance),
              note=f"≤ {params.context_distance:g}"),
     ]  # fmt: skip
-    weight = f" · weight {edge.weight:g}" if edge.weight != 1.0 else ""
-    return box(
-        f'<div class="hs-row"><b>{name(edge.pair)}</b><span style="color:{colour}">{escape(edge.verdict)}'
-        f"{escape(weight)}</span></div>",
-        f'<div class="hs-item" style="border-color:{colour}">{escape(edge.reason)}</div>',
-    ) + tiles(parts)
+    return tiles(parts)
 
 
 def submap_legend(pair: Pair) -> str:
