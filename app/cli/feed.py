@@ -1,0 +1,61 @@
+"""`hemislam feed`: a recording played out as if its sensors were here."""
+
+import math
+from typing import Annotated
+
+import typer
+
+from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic, Preset, RecordingPath, resolve
+from app.slam.errors import HemislamError
+
+
+def feed(
+    recording: RecordingPath,
+    to: Annotated[
+        str,
+        typer.Option("--to", metavar="URL", help="rsbpearl://HOST:MSOP,DIFOP, or foxglove://HOST:PORT to serve at."),
+    ],
+    imu_to: Annotated[
+        str | None, typer.Option("--imu-to", metavar="URL", help="imu-udp://HOST:PORT, beside packets.")
+    ] = None,
+    speed: Annotated[float, typer.Option("--speed", metavar="X", help="Times real time; 0: as fast as it goes.")] = 1.0,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Assignments = None,
+    lidar_topic: LidarTopic = None,
+    imu_topic: ImuTopic = None,
+    duration: Duration = None,
+) -> None:
+    """Play a recording out as live data: to try `serve --live` without a sensor.
+
+    As RS-Bpearl packets with the IMU beside them, or as a Foxglove server like foxglove_bridge.
+
+    \b
+    Examples:
+      hemislam feed walk.mcap --to rsbpearl://127.0.0.1:6699,7788 --imu-to imu-udp://127.0.0.1:6700
+      hemislam feed walk.mcap --to foxglove://127.0.0.1:8765 --speed 2
+    """
+    from tqdm import tqdm
+
+    from app.sensors.live.feed import Pace
+    from app.sensors.live.feed import feed as play
+    from app.sensors.live.urls import parse_address
+
+    if speed < 0:
+        raise HemislamError(f"`--speed {speed:g}` is less than nothing; 1 is real time, 0 as fast as it goes.")
+    params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
+    target, beside = parse_address(to), parse_address(imu_to) if imu_to else None
+    if target.scheme == "rsbpearl" and beside is None:
+        beside = parse_address(f"imu-udp://{target.host}")
+        typer.echo(f"IMU samples go to imu-udp://{target.host}:{beside.ports[0]}")
+    if target.scheme == "foxglove":
+        typer.echo(f"Waiting at {to} for somebody to receive; Ctrl+C ends it.")
+    with tqdm(desc="Playing", unit=" s", leave=False, disable=None, bar_format="{desc}: {n:.1f} s") as bar:
+
+        def show(seconds: float) -> None:
+            bar.update(seconds - bar.n)
+
+        count = play(
+            recording, params, target, beside, pace=Pace(speed or math.inf, progress=show), duration_s=duration
+        )
+    typer.echo(f"{count} {'packets' if target.scheme == 'rsbpearl' else 'messages'} sent.")

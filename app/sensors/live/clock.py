@@ -1,0 +1,99 @@
+"""The clocks of live sensors: mapped onto one time that goes on steadily, whatever they are set to."""
+
+from collections import deque
+from dataclasses import dataclass, field
+
+JUMP_NS = 500_000_000
+"""A stamp this much out of step with the one before is another setting of the clock."""
+_WINDOW_NS = 10_000_000_000
+_SLEW = 1e-3
+"""Of host time: drifting clocks are a hundred times slower."""
+
+
+@dataclass(slots=True)
+class ClockMap:
+    """Maps one sensor's stamps onto the time that the engine gets.
+
+    Attributes:
+        host: onto the host's clock (for sensors that have no date, or drift), else the sensor's own.
+        shift_ns: added to stamps at present. jump_ns: by how much the clock was last set, and jumped_at
+            (host's clock) when.
+    """
+
+    host: bool = False
+    shift_ns: int = 0
+    jump_ns: int = 0
+    jumped_at_ns: int = 0
+    _last: tuple[int, int] | None = None
+    _delays: deque[tuple[int, int]] = field(default_factory=deque)
+    _started_ns: int = 0
+
+    def jumps(self, stamp_ns: int, arrival_ns: int) -> bool:
+        """Whether the clock was set since the last stamp; a sensor that is late or was silent is none."""
+        if self._last is None:
+            return False
+        stamp, arrival = stamp_ns - self._last[0], arrival_ns - self._last[1]
+        return stamp < -JUMP_NS or (stamp > JUMP_NS and stamp - arrival > JUMP_NS)
+
+    def map(self, stamp_ns: int, arrival_ns: int, other: "ClockMap | None" = None) -> int:
+        """The stamp in the engine's time; a jump is taken out, so that time goes on.
+
+        Args:
+            other: of another sensor; one that was set at the same time by as much shares its clock.
+        """
+        if self._last is not None and self.jumps(stamp_ns, arrival_ns):
+            jump = stamp_ns - self._last[0] - max(arrival_ns - self._last[1], 0)
+            if other is not None and abs(other.jump_ns - jump) < 150_000_000 and other.jumped_at_ns:
+                near = abs(arrival_ns - other.jumped_at_ns) < 5_000_000_000
+                jump = other.jump_ns if near else jump
+            self.jump_ns, self.jumped_at_ns = jump, arrival_ns
+            self.shift_ns -= jump
+            self._delays.clear()
+        self._last = (stamp_ns, arrival_ns)
+        if self.host:
+            self._follow(stamp_ns, arrival_ns)
+        return stamp_ns + self.shift_ns
+
+    def _follow(self, stamp_ns: int, arrival_ns: int) -> None:
+        """Onto the host's clock by the least delay of the last seconds: what came without waiting."""
+        delay = arrival_ns - stamp_ns
+        delays = self._delays
+        if not delays:
+            self._started_ns = arrival_ns
+            if not self.jumped_at_ns:
+                self.shift_ns = delay
+        elapsed = arrival_ns - delays[-1][0] if delays else 0
+        while delays and delays[-1][1] >= delay:
+            delays.pop()
+        delays.append((arrival_ns, delay))
+        while delays[0][0] < arrival_ns - _WINDOW_NS:
+            delays.popleft()
+        step = delays[0][1] - self.shift_ns
+        if arrival_ns - self._started_ns > 1_000_000_000 or self.jumped_at_ns:
+            limit = round(_SLEW * max(elapsed, 0))
+            step = max(-limit, min(limit, step))
+        self.shift_ns += step
+
+
+@dataclass(slots=True)
+class OffsetEstimate:
+    """How far one sensor's stamps lag behind their arrival: the least and the median of the last ones.
+
+    The difference of two sensors' is the offset of their clocks, up to their drivers' delays.
+    """
+
+    _delays: deque[int] = field(default_factory=lambda: deque(maxlen=400))
+
+    def add(self, stamp_ns: int, arrival_ns: int) -> None:
+        self._delays.append(arrival_ns - stamp_ns)
+
+    def __len__(self) -> int:
+        return len(self._delays)
+
+    def clear(self) -> None:
+        self._delays.clear()
+
+    def delay_s(self) -> float:
+        """Median; the offset of clocks is judged by it as for recordings."""
+        ordered = sorted(self._delays)
+        return ordered[len(ordered) // 2] / 1e9

@@ -1,0 +1,200 @@
+"""A client of foxglove_bridge: any ROS 1 or ROS 2 robot, without ROS here.
+
+The protocol: JSON texts announce channels and ask for them; a binary message is 0x01, the number of the
+subscription (u32), a log time (u64 ns), little-endian, and the ROS message as it is (CDR or ROS 1).
+"""
+
+import json
+import struct
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from rosbags.typesys import Stores, get_typestore
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
+from websockets.typing import Subprotocol
+
+from app.sensors.live.clouds import CloudReader
+from app.sensors.live.intake import Intake
+from app.sensors.pointcloud import stamp_ns
+from app.sensors.probe import TYPES
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+
+SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
+MAX_MESSAGE = 256 << 20
+RETRY_S = 1.0
+MESSAGE = struct.Struct("<BIQ")
+_ENCODINGS = ("cdr", "ros1")
+
+Sensor = Literal["lidar", "imu"]
+NAMES: dict[Sensor, Literal["LiDAR", "IMU"]] = {"lidar": "LiDAR", "imu": "IMU"}
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """What a server announces. type: as rosbags spells it."""
+
+    id: int
+    topic: str
+    encoding: str
+    type: str
+
+
+class FoxgloveReceiver:
+    """Receives point clouds and IMU samples; connects again whenever the connection ends.
+
+    Args:
+        wanted: "lidar", "imu" or both. params: topics by name, else the first of the type.
+    """
+
+    def __init__(self, host: str, port: int, wanted: frozenset[str], params: Params) -> None:
+        self._url = f"ws://{f'[{host}]' if ':' in host else host}:{port}"
+        self._wanted: list[Sensor] = [sensor for sensor in NAMES if sensor in wanted]
+        self._params = params
+        chosen = params.recording
+        self._topics: dict[Sensor, str] = {"lidar": chosen.lidar_topic, "imu": chosen.imu_topic}
+        self._ros2, self._ros1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+        self._reader: CloudReader | None = None
+        self._told = ""
+
+    def __call__(self, intake: Intake, stop: threading.Event) -> None:
+        connected = False
+        while not stop.is_set():
+            try:
+                with connect(
+                    self._url, subprotocols=SUBPROTOCOLS, max_size=MAX_MESSAGE, compression=None, open_timeout=5.0,
+                    close_timeout=1.0, max_queue=64, proxy=None,
+                ) as connection:  # fmt: skip
+                    intake.counters.reconnects += connected
+                    connected = True
+                    self._told = ""
+                    intake.put_status("connected", "source", f"connected to {self._url}")
+                    self._session(connection, intake, stop)
+            except (OSError, WebSocketException, TimeoutError) as error:
+                text = f"no connection to {self._url} ({_brief(error)}); trying again"
+                self._tell("disconnected", text, intake)
+            stop.wait(RETRY_S)
+
+    def _session(self, connection: Connection, intake: Intake, stop: threading.Event) -> None:
+        channels: dict[int, Channel] = {}
+        subscribed: dict[int, tuple[Sensor, Channel]] = {}
+        while not stop.is_set():
+            try:
+                message = connection.recv(timeout=0.1)
+            except TimeoutError:
+                continue
+            if isinstance(message, str):
+                if self._read_text(message, channels, subscribed):
+                    self._subscribe(connection, channels, subscribed, intake)
+            elif len(message) >= MESSAGE.size and message[0] == 1:
+                _, number, log_ns = MESSAGE.unpack_from(message)
+                if number in subscribed:
+                    sensor, channel = subscribed[number]
+                    self._receive(sensor, channel, message[MESSAGE.size :], log_ns, intake)
+
+    def _read_text(self, text: str, channels: dict[int, Channel], subscribed: dict[int, Any]) -> bool:
+        """Take note of the channels that come and go; whether any did."""
+        try:
+            said = json.loads(text)
+            operation = said["op"]
+            if operation == "advertise":
+                for channel in said["channels"]:
+                    kind = _normalised(str(channel["schemaName"]))
+                    found = Channel(int(channel["id"]), str(channel["topic"]), str(channel["encoding"]), kind)
+                    channels[found.id] = found
+            elif operation == "unadvertise":
+                gone = {int(number) for number in said["channelIds"]}
+                for number in gone:
+                    channels.pop(number, None)
+                for number in [n for n, (_, channel) in subscribed.items() if channel.id in gone]:
+                    del subscribed[number]
+            else:
+                return False
+        except (ValueError, KeyError, TypeError, AttributeError):  # not of this protocol
+            return False
+        return True
+
+    def _subscribe(
+        self,
+        connection: Connection,
+        channels: dict[int, Channel],
+        subscribed: dict[int, tuple[Sensor, Channel]],
+        intake: Intake,
+    ) -> None:
+        missing = []
+        for sensor in self._wanted:
+            if any(sensor == known for known, _ in subscribed.values()):
+                continue
+            usable = [c for c in channels.values() if c.type == TYPES[sensor] and c.encoding in _ENCODINGS]
+            wanted = self._topics[sensor]
+            found = next((c for c in usable if not wanted or c.topic == wanted), None)
+            if found is None:
+                there = ", ".join(c.topic for c in usable) or ", ".join(sorted(c.topic for c in channels.values()))
+                missing.append(f"no topic {wanted or f'of type {TYPES[sensor]}'} (it has {there or 'none'})")
+                continue
+            number = found.id
+            subscribed[number] = (sensor, found)
+            request = {"op": "subscribe", "subscriptions": [{"id": number, "channelId": found.id}]}
+            connection.send(json.dumps(request))
+            others = [c.topic for c in usable if c is not found]
+            hint = f"; there are also {', '.join(others)}" if others and not wanted else ""
+            intake.put_status("connected", NAMES[sensor], f"{NAMES[sensor]} on {found.topic}{hint}")
+            if sensor == "lidar":
+                self._reader = CloudReader(self._params, found.topic)
+                intake.sensor = f"{found.topic} from {self._url}"
+        if missing:
+            self._tell("configuration", f"{self._url} offers {'; '.join(missing)}; waiting for it", intake)
+
+    def _receive(self, sensor: Sensor, channel: Channel, data: bytes, log_ns: int, intake: Intake) -> None:
+        arrival = time.time_ns()
+        message: Any
+        try:
+            if channel.encoding == "ros1":
+                message = self._ros1.deserialize_ros1(data, channel.type)
+            else:
+                message = self._ros2.deserialize_cdr(data, channel.type)
+        except Exception:  # rosbags lets those of struct, numpy and asserts through
+            intake.counters.unreadable += 1
+            return
+        if sensor == "imu":
+            w, a = message.angular_velocity, message.linear_acceleration
+            intake.counters.imu += 1
+            stamp = stamp_ns(message.header.stamp) or log_ns
+            intake.put_imu(stamp, (w.x, w.y, w.z), (a.x, a.y, a.z), arrival)
+            return
+        intake.counters.packets += 1
+        assert self._reader is not None
+        known = self._reader.findings
+        try:
+            for arrived in self._reader.add(message, log_ns, arrival):
+                intake.counters.frames += 1
+                intake.put_scan(arrived.scan, arrived.arrival_ns)
+        except HemislamError as error:
+            intake.counters.unreadable += 1
+            self._tell("configuration", str(error), intake)
+        if self._reader.findings is not known:
+            for finding in self._reader.findings:
+                if finding.verdict != "fine":
+                    text = f"{finding.subject}: {finding.text} {finding.option}".rstrip()
+                    intake.put_status("configuration", "LiDAR", text)
+
+    def _tell(self, kind: Literal["disconnected", "configuration"], text: str, intake: Intake) -> None:
+        """Once, however often it is tried."""
+        if text != self._told:
+            self._told = text
+            intake.put_status(kind, "source", text)
+
+
+def _normalised(name: str) -> str:
+    """`sensor_msgs/Imu` of ROS 1 as `sensor_msgs/msg/Imu`."""
+    package, slash, rest = name.partition("/")
+    return f"{package}/msg/{rest}" if slash and not rest.startswith("msg/") else name
+
+
+def _brief(error: BaseException) -> str:
+    strerror = getattr(error, "strerror", None)
+    return str(strerror or " ".join(str(error).split())[:120] or type(error).__name__).rstrip(".")

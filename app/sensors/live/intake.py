@@ -1,0 +1,272 @@
+"""Where the receiving threads put what comes, and the engine's side takes it: bounded, and it never blocks them.
+
+The rule when the engine falls behind: whole scans are let go, the oldest first, each of them reported
+as a `DroppedScan`; IMU samples never are.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
+
+import numpy as np
+
+from app.sensors.clocks import TOLERANCE_S
+from app.sensors.layout import ImuProbe, settle_imu
+from app.sensors.live.clock import JUMP_NS, ClockMap, OffsetEstimate
+from app.sensors.live.counters import Counters
+from app.sensors.live.status import Kind, LiveState, Status
+from app.slam.params import Params
+from app.slam.types import DroppedScan, Scan
+
+MAX_BACKLOG = 10
+"""Scans that may wait for the engine: a second of them."""
+MAX_WAITING = 600_000
+"""IMU samples and news that may wait: twenty minutes at 500 Hz. If there are more, nobody reads any longer."""
+_SETTLE_NS = 1_000_000_000
+_SETTLE_SCANS = 3
+BUSY, NO_IMU = "the engine was too busy", "no IMU sample came to cover it"
+
+Clock = Literal["auto", "sensor", "host"]
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class LiveImu:
+    """One sample: rad/s and m/s^2 in the IMU frame, stamped in the engine's time."""
+
+    stamp_ns: int
+    gyro: Vector
+    accel: Vector
+    arrival_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class LiveScan:
+    """A scan, or the news that one could not be read."""
+
+    scan: Scan | DroppedScan
+    arrival_ns: int
+
+
+class Tap(Protocol):
+    """Whoever wants to see everything that comes, in the engine's time: the recorder."""
+
+    def add_scan(self, scan: Scan, arrival_ns: int) -> None: ...
+
+    def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, arrival_ns: int) -> None: ...
+
+
+class Intake:
+    """Between the receiving threads (`put_...`) and one reader (`take`).
+
+    For the first second it holds everything back, until it knows the accelerometer's unit and whether
+    the two sensors' clocks agree.
+
+    Attributes:
+        counters: shared with the receiving threads. sensor: what the LiDAR says about itself.
+    """
+
+    def __init__(self, params: Params, clock: Clock = "auto", tap: Tap | None = None) -> None:
+        self.counters = Counters()
+        self.sensor = ""
+        self._params = params
+        self._clock: Clock = clock
+        self._tap = tap
+        self._changed = threading.Condition()
+        self._scans: deque[LiveScan] = deque()
+        self._rest: deque[LiveImu | DroppedScan | Status] = deque()
+        self._held: deque[LiveScan | LiveImu] | None = deque()
+        self._suspect: LiveImu | None = None
+        self._maps = {"LiDAR": ClockMap(), "IMU": ClockMap()}
+        self._offsets = {"LiDAR": OffsetEstimate(), "IMU": OffsetEstimate()}
+        self._arrivals: dict[str, deque[int]] = {"LiDAR": deque(maxlen=50), "IMU": deque(maxlen=1000)}
+        self._accel_scale = 1.0
+
+    # --- the receiving threads -------------------------------------------------------------------
+
+    def put_scan(self, scan: Scan | DroppedScan, arrival_ns: int) -> None:
+        with self._changed:
+            if isinstance(scan, Scan):
+                self._seen("LiDAR", scan.end_ns, arrival_ns)
+            self._put(LiveScan(scan, arrival_ns))
+
+    def put_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, arrival_ns: int) -> None:
+        with self._changed:
+            stamp_ns += round(self._params.recording.imu_time_offset * 1e9)
+            self._seen("IMU", stamp_ns, arrival_ns)
+            self._put(LiveImu(stamp_ns, gyro, accel, arrival_ns))
+
+    def put_status(self, kind: Kind, sensor: Literal["LiDAR", "IMU", "source"], text: str) -> None:
+        with self._changed:
+            self._tell(kind, sensor, text)
+            self._changed.notify()
+
+    # --- the reader ------------------------------------------------------------------------------
+
+    def take(self, timeout_s: float, *, scan: bool) -> tuple[list[LiveImu | DroppedScan | Status], Scan | None]:
+        """All there is but scans, in the order of arrival, and the oldest scan if wanted; waits so long for any."""
+
+        def some() -> bool:
+            return bool(self._rest) or (scan and bool(self._scans))
+
+        with self._changed:
+            if not some():
+                self._changed.wait_for(some, timeout_s)
+            rest = list(self._rest)
+            self._rest.clear()
+            found = self._scans.popleft().scan if scan and self._scans else None
+            assert not isinstance(found, DroppedScan)
+            return rest, found
+
+    def state(self) -> LiveState:
+        now = time.time_ns()
+        with self._changed:
+            ages = {name: (now - times[-1]) / 1e9 if times else None for name, times in self._arrivals.items()}
+            both = all(len(offset) > 2 for offset in self._offsets.values())
+            return LiveState(
+                counters=replace(self.counters),
+                lidar_hz=_rate(self._arrivals["LiDAR"], now),
+                imu_hz=_rate(self._arrivals["IMU"], now),
+                lidar_age_s=ages["LiDAR"],
+                imu_age_s=ages["IMU"],
+                backlog=len(self._scans),
+                clock="" if self._held is not None else self._clock,
+                offset_s=self._offset_s() if both else None,
+                sensor=self.sensor,
+            )
+
+    # --- under the lock --------------------------------------------------------------------------
+
+    def _seen(self, name: str, stamp_ns: int, arrival_ns: int) -> None:
+        self._offsets[name].add(stamp_ns, arrival_ns)
+        self._arrivals[name].append(arrival_ns)
+
+    def _put(self, entry: LiveScan | LiveImu) -> None:
+        if self._held is None:
+            self._release(entry)
+        else:
+            self._held.append(entry)
+            if self._settled():
+                held, self._held = self._held, None
+                for waiting in held:
+                    self._release(waiting)
+        self._bound()
+        self._changed.notify()
+
+    def _settled(self) -> bool:
+        """Once there is a second of the IMU and a few scans: decide unit and clock. Holds on to 10 s at most."""
+        assert self._held is not None
+        while self._held[-1].arrival_ns - self._held[0].arrival_ns > 10 * _SETTLE_NS:
+            old = self._held.popleft()
+            if isinstance(old, LiveScan):
+                self.counters.dropped += 1
+                self._rest.append(DroppedScan(old.scan.stamp_ns, NO_IMU))
+        samples = [entry for entry in self._held if isinstance(entry, LiveImu)] if len(self._held) > 20 else []
+        scans = sum(isinstance(entry, LiveScan) and isinstance(entry.scan, Scan) for entry in self._held)
+        if scans < _SETTLE_SCANS or len(samples) < 20:
+            return False
+        if abs(samples[-1].stamp_ns - samples[0].stamp_ns) < _SETTLE_NS:
+            return False
+        stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
+        accel = np.array([sample.accel for sample in samples], np.float64)
+        gyro = np.array([sample.gyro for sample in samples], np.float64)
+        finite = np.isfinite(accel).all(axis=1)
+        if not finite.any():
+            return False
+        probe = ImuProbe(stamps[finite], stamps[finite], gyro[finite], accel[finite])
+        self._accel_scale, findings = settle_imu(probe, self._params.recording)
+        for finding in findings:
+            if finding.verdict != "fine":
+                self._tell("units", "IMU", f"{finding.subject}: {finding.text} {finding.option}".rstrip())
+        self._settle_clock()
+        return True
+
+    def _offset_s(self) -> float:
+        return self._offsets["IMU"].delay_s() - self._offsets["LiDAR"].delay_s()
+
+    def _settle_clock(self) -> None:
+        offset = self._offset_s()
+        apart = abs(offset) > TOLERANCE_S
+        wrong = f"the IMU's stamps are {abs(offset):.3f} s {'behind' if offset > 0 else 'ahead of'} the LiDAR's"
+        if self._clock == "auto":
+            self._clock = "host" if apart else "sensor"
+            if apart:
+                self._tell("clocks", "source", f"{wrong}: both are stamped by the host's clock instead, on arrival")
+        elif self._clock == "sensor" and apart:
+            self._tell("clocks", "source", f"{wrong}; use ?clock=host, or --set recording.imu_time_offset={offset:.3f}")
+        for clock_map in self._maps.values():
+            clock_map.host = self._clock == "host"
+
+    def _release(self, entry: LiveScan | LiveImu) -> None:
+        """Into the engine's time, to the recorder, and to the reader."""
+        if isinstance(entry, LiveScan):
+            self._release_scan(entry)
+        elif not self._maps["IMU"].jumps(entry.stamp_ns, entry.arrival_ns):
+            self.counters.strays += self._suspect is not None
+            self._suspect = None
+            self._release_imu(entry)
+        elif self._suspect is not None and abs(entry.stamp_ns - self._suspect.stamp_ns) < JUMP_NS:
+            suspect, self._suspect = self._suspect, None
+            self._release_imu(suspect)
+            self._release_imu(entry)
+        else:  # another time: the next sample must confirm it
+            self.counters.strays += self._suspect is not None
+            self._suspect = entry
+
+    def _release_imu(self, entry: LiveImu) -> None:
+        stamp = self._mapped("IMU", entry.stamp_ns, entry.arrival_ns)
+        x, y, z = entry.accel
+        k = self._accel_scale
+        accel = (k * x, k * y, k * z)
+        if self._tap is not None:
+            self._tap.add_imu(stamp, entry.gyro, accel, entry.arrival_ns)
+        self._rest.append(LiveImu(stamp, entry.gyro, accel, entry.arrival_ns))
+
+    def _release_scan(self, entry: LiveScan) -> None:
+        scan = entry.scan
+        if isinstance(scan, DroppedScan):
+            self._rest.append(DroppedScan(scan.stamp_ns + self._maps["LiDAR"].shift_ns, scan.reason))
+            return
+        shift = self._mapped("LiDAR", scan.end_ns, entry.arrival_ns) - scan.end_ns
+        scan = replace(scan, stamp_ns=scan.stamp_ns + shift) if shift else scan
+        if self._tap is not None:
+            self._tap.add_scan(scan, entry.arrival_ns)
+        self._scans.append(LiveScan(scan, entry.arrival_ns))
+
+    def _mapped(self, name: Literal["LiDAR", "IMU"], stamp_ns: int, arrival_ns: int) -> int:
+        clock_map, other = self._maps[name], self._maps["IMU" if name == "LiDAR" else "LiDAR"]
+        before = clock_map.jumped_at_ns
+        mapped = clock_map.map(stamp_ns, arrival_ns, other)
+        if clock_map.jumped_at_ns != before:
+            self.counters.jumps += 1
+            self._offsets[name].clear()
+            self._tell(
+                "jump", name, f"the {name}'s clock was set by {clock_map.jump_ns / 1e9:+.3f} s; its time goes on"
+            )
+        return mapped
+
+    def _tell(self, kind: Kind, sensor: Literal["LiDAR", "IMU", "source"], text: str) -> None:
+        self._rest.append(Status(kind, sensor, text, time.time_ns()))
+
+    def _bound(self) -> None:
+        while len(self._scans) > MAX_BACKLOG:
+            oldest = self._scans.popleft()
+            times = self._arrivals["IMU"]
+            silent = not times or time.time_ns() - times[-1] > 500_000_000
+            self._rest.append(DroppedScan(oldest.scan.stamp_ns, NO_IMU if silent else BUSY))
+            self.counters.dropped += 1
+        while len(self._rest) > MAX_WAITING:
+            self._rest.popleft()
+
+
+def _rate(times: deque[int], now: int) -> float:
+    """Arrivals a second over the last three."""
+    recent = [time for time in times if time > now - 3_000_000_000]
+    return (len(recent) - 1) * 1e9 / (recent[-1] - recent[0]) if len(recent) > 1 and recent[-1] > recent[0] else 0.0
+
+
+Receive = Callable[[Intake, threading.Event], None]
+"""A receiving thread's work: put what comes, until the event is set."""

@@ -1,0 +1,228 @@
+"""UDP datagrams from .pcap and .pcapng files: VLAN tags, fragmented IP, IPv6; nothing else of a capture matters.
+
+Written here, since there is no well-kept wheel that keeps file positions, which seeking needs.
+"""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+CLASSIC_MAGIC = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
+NEXT_MAGIC = b"\x0a\x0d\x0d\x0a"
+MAX_RECORD = 1 << 22
+_FRAGMENTS_KEPT = 64
+"""Datagrams of which parts wait for the rest; older ones are given up."""
+
+_ETHERNET, _RAW, _LOOPBACK, _LINUX_COOKED, _LINUX_COOKED2, _RAW_IPV4 = 1, 101, 0, 113, 276, 228
+_TAGS = (0x8100, 0x88A8, 0x9100)
+
+
+class CaptureError(ValueError):
+    """The file is no capture, or is damaged; the text says how."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One captured frame: where it begins in the file, when it was captured, and from which kind of network."""
+
+    position: int
+    time_ns: int
+    link: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Datagram:
+    """One UDP datagram. first, position: where its first and its last fragment begin in the file."""
+
+    first: int
+    position: int
+    time_ns: int
+    port: int
+    payload: bytes
+
+
+class Capture:
+    """A capture file. Reading can begin at the position of any record.
+
+    Attributes:
+        complete: False once the end was found to be in the middle of a record.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises CaptureError: not a capture."""
+        self._path = path
+        self.complete = True
+        with path.open("rb") as file:
+            start = file.read(24)
+        self._next = start[:4] == NEXT_MAGIC
+        if not self._next and (start[:4] not in CLASSIC_MAGIC or len(start) < 24):
+            raise CaptureError("it does not begin like a capture")
+        self._order = "<" if start[:4] in (CLASSIC_MAGIC[0], CLASSIC_MAGIC[2]) else ">"
+        self._fraction_ns = 1 if start[:4] in CLASSIC_MAGIC[2:] else 1_000
+        self._link = 0 if self._next else int(struct.unpack_from(self._order + "I", start, 20)[0]) & 0xFFFF
+        self._interfaces: list[tuple[int, int, int]] = []
+        """Of a .pcapng: link type, time units in a second, and ns to add; of the present section."""
+
+    def datagrams(self, position: int | None = None) -> Iterator[Datagram]:
+        """UDP datagrams from a record's position on, or all."""
+        fragments: dict[bytes, _Fragments] = {}
+        for record in self.records(position):
+            network = _network_layer(record)
+            if network:
+                found = _udp(record, network, fragments)
+                if found:
+                    yield found
+
+    def records(self, position: int | None = None) -> Iterator[Record]:
+        """Captured frames up to the end or to where the file is cut or makes no sense."""
+        with self._path.open("rb") as file:
+            if position is not None:
+                file.seek(position)
+            yield from self._next_records(file) if self._next else self._classic_records(file)
+
+    def _classic_records(self, file: BinaryIO) -> Iterator[Record]:
+        if file.tell() < 24:
+            file.seek(24)
+        header = struct.Struct(self._order + "4I")
+        while True:
+            position = file.tell()
+            raw = file.read(16)
+            if not raw:
+                return
+            if len(raw) < 16:
+                break
+            seconds, fraction, length, _ = header.unpack(raw)
+            data = file.read(length) if length <= MAX_RECORD else b""
+            if len(data) < length:
+                break
+            yield Record(position, seconds * 1_000_000_000 + fraction * self._fraction_ns, self._link, data)
+        self.complete = False
+
+    def _next_records(self, file: BinaryIO) -> Iterator[Record]:
+        while True:
+            position = file.tell()
+            raw = file.read(8)
+            if not raw:
+                return
+            if len(raw) < 8:
+                break
+            if raw[:4] == NEXT_MAGIC:  # a section begins, perhaps in another byte order
+                magic = file.read(4)
+                self._order = "<" if magic == b"\x4d\x3c\x2b\x1a" else ">"
+                if position == 0 or not self._interfaces:
+                    self._interfaces = []
+                file.seek(position + 8)
+            kind, length = struct.unpack(self._order + "2I", raw)
+            if not 12 <= length <= MAX_RECORD or length % 4:
+                break
+            body = file.read(length - 8)
+            if len(body) < length - 8:
+                break
+            if raw[:4] == NEXT_MAGIC:
+                self._interfaces = []
+            elif kind == 1:
+                self._interfaces.append(self._interface(body))
+            elif kind == 6 and len(body) >= 24:
+                interface, high, low, captured, _ = struct.unpack_from(self._order + "5I", body)
+                if interface < len(self._interfaces):
+                    link, units, offset_ns = self._interfaces[interface]
+                    time_ns = (high << 32 | low) * 1_000_000_000 // units + offset_ns
+                    yield Record(position, time_ns, link, body[20 : 20 + captured])
+        self.complete = False
+
+    def _interface(self, body: bytes) -> tuple[int, int, int]:
+        link = int(struct.unpack_from(self._order + "H", body)[0])
+        units, offset_s = 1_000_000, 0
+        at = 8
+        while at + 4 <= len(body) - 4:
+            code, length = struct.unpack_from(self._order + "2H", body, at)
+            value = body[at + 4 : at + 4 + length]
+            if code == 0:
+                break
+            if code == 9 and value:  # if_tsresol
+                units = 2 ** (value[0] & 0x7F) if value[0] & 0x80 else 10 ** value[0]
+            elif code == 14 and len(value) == 8:  # if_tsoffset
+                offset_s = int(struct.unpack(self._order + "q", value)[0])
+            at += 4 + (length + 3) // 4 * 4
+        return link, units, offset_s * 1_000_000_000
+
+
+@dataclass(slots=True)
+class _Fragments:
+    """Parts of one IP datagram. parts: offset -> bytes. length: in all, once the last part is there."""
+
+    first: int
+    parts: dict[int, bytes]
+    length: int | None = None
+
+    def whole(self) -> bytes | None:
+        if self.length is None or sum(map(len, self.parts.values())) < self.length:
+            return None
+        data = b"".join(self.parts[at] for at in sorted(self.parts))
+        return data if len(data) == self.length else None
+
+
+def _network_layer(record: Record) -> bytes:
+    """The IP packet of a frame; empty if it holds none."""
+    data = record.data
+    match record.link:
+        case 1:
+            at = 12
+        case 113:
+            at = 14
+        case 276:
+            return data[20:] if data[:2] in (b"\x08\x00", b"\x86\xdd") else b""
+        case 0 | 108:
+            return data[4:]
+        case 101 | 228 | 229 | 12 | 14:
+            return data
+        case _:
+            return b""
+    while int.from_bytes(data[at : at + 2], "big") in _TAGS:
+        at += 4
+    return data[at + 2 :] if data[at : at + 2] in (b"\x08\x00", b"\x86\xdd") else b""
+
+
+def _udp(record: Record, packet: bytes, fragments: dict[bytes, _Fragments]) -> Datagram | None:
+    """The datagram that this packet is, or completes."""
+    version = packet[0] >> 4
+    first = record.position
+    if version == 4 and len(packet) >= 20:
+        header = (packet[0] & 15) * 4
+        total = int.from_bytes(packet[2:4], "big") or len(packet)
+        flags = int.from_bytes(packet[6:8], "big")
+        if packet[9] != 17:
+            return None
+        data, at, more = packet[header:total], (flags & 0x1FFF) * 8, bool(flags & 0x2000)
+        key = packet[4:6] + packet[12:20]
+    elif version == 6 and len(packet) >= 48:
+        end = 40 + int.from_bytes(packet[4:6], "big")
+        if packet[6] == 17:
+            data, at, more, key = packet[40:end], 0, False, b""
+        elif packet[6] == 44 and packet[40] == 17:
+            flags = int.from_bytes(packet[42:44], "big")
+            data, at, more, key = packet[48:end], flags & 0xFFF8, bool(flags & 1), packet[44:48] + packet[8:40]
+        else:
+            return None
+    else:
+        return None
+    if at or more:
+        known = fragments.setdefault(key, _Fragments(record.position, {}))
+        known.parts[at] = data
+        if not more:
+            known.length = at + len(data)
+        if len(fragments) > _FRAGMENTS_KEPT:
+            del fragments[next(iter(fragments))]
+        whole = known.whole()
+        if whole is None:
+            return None
+        fragments.pop(key, None)
+        data, first = whole, known.first
+    if len(data) < 8:
+        return None
+    _, port, length, _ = struct.unpack_from(">4H", data)
+    payload = data[8 : length if length >= 8 else None]
+    return Datagram(first, record.position, record.time_ns, port, payload)

@@ -1,0 +1,106 @@
+"""A live session as a ROS 2 recording, written while it runs: readable by `ros2 bag`, and by `open_recording`.
+
+On a thread of its own, so that a slow disk delays nothing. Twice a second a chunk is ended and handed to
+the disk: a crash costs less than the last second, and a missing end is no obstacle to reading
+(`mcap_stream.py`).
+"""
+
+import os
+import threading
+from collections import deque
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+from app.sensors.live import messages
+from app.slam.errors import HemislamError
+from app.slam.types import Scan
+
+FLUSH_S = 0.5
+MAX_WAITING = 50_000
+"""Messages that may wait for the disk; if there are more, it has stopped, and the newest are left out."""
+
+Vector = tuple[float, float, float]
+_Scan = tuple[Scan, int]
+_Imu = tuple[int, Vector, Vector, int]
+
+
+class Recorder:
+    """Attributes:
+    path: the .mcap. bytes_written: so far. left_out: messages that the disk was too slow for.
+    failure: why it stopped before its end, "" if it did not.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises HemislamError: the file is there already, or can not be made."""
+        self.path = path
+        self.bytes_written = 0
+        self.left_out = 0
+        self.failure = ""
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("xb")
+        except FileExistsError:
+            raise HemislamError(f"{path} is there already; record into another file.") from None
+        except OSError as error:
+            raise HemislamError(f"{path} can not be written ({error.strerror}); choose another place.") from None
+        self._mcap = Writer(self._file, compression=CompressionType.ZSTD)
+        self._mcap.start(profile="ros2")
+        self._lidar = self._channel(messages.LIDAR_TOPIC, messages.CLOUD)
+        self._imu = self._channel(messages.IMU_TOPIC, messages.IMU)
+        self._waiting: deque[_Scan | _Imu] = deque()
+        self._wake = threading.Event()
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, daemon=True, name="recorder")
+        self._thread.start()
+
+    def add_scan(self, scan: Scan, arrival_ns: int) -> None:
+        self._add((scan, arrival_ns))
+
+    def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, arrival_ns: int) -> None:
+        self._add((stamp_ns, gyro, accel, arrival_ns))
+
+    def close(self) -> None:
+        """Write what waits, and the file's end."""
+        self._closing = True
+        self._wake.set()
+        self._thread.join(30.0)
+
+    def _add(self, message: _Scan | _Imu) -> None:
+        if len(self._waiting) >= MAX_WAITING or self.failure:
+            self.left_out += 1
+            return
+        self._waiting.append(message)
+
+    def _run(self) -> None:
+        try:
+            with self._file:
+                closing = False
+                while not closing:
+                    self._wake.wait(FLUSH_S)
+                    closing = self._closing
+                    while self._waiting:
+                        self._write(self._waiting.popleft())
+                    if closing:
+                        self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
+                    else:
+                        self._mcap.flush()  # type: ignore[no-untyped-call]
+                    self._file.flush()
+                    os.fsync(self._file.fileno())
+                    self.bytes_written = self._file.tell()
+        except OSError as error:
+            self.failure = f"{self.path} can not be written any more ({error.strerror})"
+            self._waiting.clear()
+
+    def _channel(self, topic: str, msgtype: str) -> int:
+        schema = self._mcap.register_schema(msgtype, "ros2msg", messages.definition(msgtype).encode())
+        return self._mcap.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
+
+    def _write(self, message: _Scan | _Imu) -> None:
+        if len(message) == 4:
+            stamp_ns, gyro, accel, arrival_ns = message
+            channel, data = self._imu, messages.serialised(messages.imu_message(stamp_ns, gyro, accel), messages.IMU)
+        else:
+            scan, arrival_ns = message
+            channel, data = self._lidar, messages.serialised(messages.cloud_message(scan), messages.CLOUD)
+        self._mcap.add_message(channel, arrival_ns, data, publish_time=arrival_ns)

@@ -1,0 +1,122 @@
+"""A live source: what a recording gives, as it happens."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Literal
+
+from app.sensors.live.intake import Intake, LiveImu, Receive
+from app.sensors.live.recorder import Recorder
+from app.sensors.live.status import LiveState, Status
+from app.sensors.sequencer import Counts, Sequencer
+from app.slam.params import Params
+from app.slam.types import DroppedScan, Measurement
+
+SILENCE_S = 1.0
+"""A sensor that sent nothing for so long is silent."""
+
+Event = Measurement | DroppedScan | Status
+
+
+class LiveSource:
+    """Receives on threads of its own; `poll` gives scans paired with IMU samples, and what happened.
+
+    One thread may poll. A context manager; `close` ends the threads and the recording.
+    """
+
+    def __init__(
+        self, receivers: list[Receive], intake: Intake, params: Params, recorder: Recorder | None = None
+    ) -> None:
+        self._intake = intake
+        self._recorder = recorder
+        self._sequencer = Sequencer(params.imu.max_gap)
+        self._stop = threading.Event()
+        self._events: deque[Event] = deque()
+        self._pairing = False
+        self._silent: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": None, "IMU": None}
+        self._watched_at = 0.0
+        self._threads = [
+            threading.Thread(target=receive, args=(intake, self._stop), daemon=True, name=f"receive-{number}")
+            for number, receive in enumerate(receivers)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def poll(self, timeout_s: float = 0.1) -> Event | None:
+        """The next scan with its IMU samples, one that is not used and why, or news; None: nothing in that time."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._watch()
+            if self._events:
+                return self._events.popleft()
+            remaining = deadline - time.monotonic()
+            self._gather(max(0.0, min(remaining, 0.25)))
+            if not self._events and remaining <= 0:
+                return None
+
+    def events(self) -> Iterator[Event]:
+        """All that comes, waiting for it, until `close`."""
+        while not self._stop.is_set():
+            event = self.poll(0.25)
+            if event is not None:
+                yield event
+
+    def state(self) -> LiveState:
+        """How it is doing, now."""
+        recorded = None if self._recorder is None else self._recorder.bytes_written
+        return replace(self._intake.state(), recorded=recorded)
+
+    @property
+    def pairing(self) -> Counts:
+        return self._sequencer.counts
+
+    def close(self) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(5.0)
+        if self._recorder is not None:
+            self._recorder.close()
+
+    def __enter__(self) -> "LiveSource":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _gather(self, timeout_s: float) -> None:
+        """One scan at a time goes to the sequencer, so that those behind it can still be let go."""
+        rest, scan = self._intake.take(timeout_s, scan=not self._pairing)
+        for entry in rest:
+            if isinstance(entry, LiveImu):
+                self._sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
+            else:
+                self._events.append(entry)
+        if scan is not None:
+            self._sequencer.add_scan(scan)
+            self._pairing = True
+        for paired in self._sequencer.ready():
+            self._pairing = False
+            self._events.append(paired)
+
+    def _watch(self) -> None:
+        """Who has fallen silent, and who is back."""
+        now = time.monotonic()
+        if now - self._watched_at < 0.1:
+            return
+        self._watched_at = now
+        state = self._intake.state()
+        ages: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": state.lidar_age_s, "IMU": state.imu_age_s}
+        for sensor, age in ages.items():
+            since = self._silent[sensor]
+            if age is None:
+                continue
+            if age > SILENCE_S and since is None:
+                self._silent[sensor] = now - age
+                text = f"the {sensor} has been silent for {age:.1f} s"
+                self._events.append(Status("silent", sensor, text, time.time_ns()))
+            elif age <= SILENCE_S and since is not None:
+                self._silent[sensor] = None
+                text = f"the {sensor} is back after {now - since:.1f} s"
+                self._events.append(Status("back", sensor, text, time.time_ns()))

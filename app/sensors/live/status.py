@@ -1,0 +1,46 @@
+"""What a live source has to tell beside measurements."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from app.sensors.live.counters import Counters
+
+Kind = Literal["connected", "disconnected", "silent", "back", "jump", "configuration", "clocks", "units", "late"]
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Something happened to a source; it was survived.
+
+    Attributes:
+        kind: as named. sensor: whose it is, "LiDAR", "IMU" or "source".
+        text: one sentence for the user. at_ns: when, by the host's clock.
+    """
+
+    kind: Kind
+    sensor: Literal["LiDAR", "IMU", "source"]
+    text: str
+    at_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class LiveState:
+    """How a live source is doing; a value to be shown.
+
+    Attributes:
+        lidar_hz, imu_hz: over the last seconds. lidar_age_s, imu_age_s: since the last arrival, None before the first.
+        backlog: scans that wait for the engine. clock: whose time the measurements have, "" while not settled.
+        offset_s: by how much the IMU's stamps lag behind the LiDAR's, by when they came; None if unknown.
+        sensor: what the LiDAR says about itself. recorded: bytes written, None if not recording.
+    """
+
+    counters: Counters = field(default_factory=Counters)
+    lidar_hz: float = 0.0
+    imu_hz: float = 0.0
+    lidar_age_s: float | None = None
+    imu_age_s: float | None = None
+    backlog: int = 0
+    clock: str = ""
+    offset_s: float | None = None
+    sensor: str = ""
+    recorded: int | None = None

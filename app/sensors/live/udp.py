@@ -1,0 +1,169 @@
+"""Receiving threads for UDP: the RS-Bpearl's packets, and IMU samples."""
+
+import contextlib
+import select
+import socket
+import threading
+import time
+from collections import deque
+
+from app.sensors.live.decoder import Decoder, Frame
+from app.sensors.live.difop import DIFOP_ID, Calibration, Difop, read_difop
+from app.sensors.live.frames import Assembler
+from app.sensors.live.imu_udp import ImuOrder
+from app.sensors.live.intake import Intake
+from app.slam.errors import HemislamError
+from app.slam.types import Scan
+
+BUFFER_BYTES = 16 << 20
+"""Asked of the kernel, so that nothing is lost while this process is busy; it may grant less."""
+_DRAIN = 128
+_REST_NS = 60_000_000
+"""Packets wait so long for the rest of their revolution."""
+_DEVICE_WAIT_NS = 1_500_000_000
+"""The device tells its angles once a second; scans wait for them at the start."""
+
+
+def open_socket(host: str, port: int) -> socket.socket:
+    """A bound UDP socket.
+
+    Raises:
+        HemislamError: the port is taken, or the address is not this machine's.
+    """
+    made = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        made.bind((host, port))
+    except OSError as error:
+        made.close()
+        raise HemislamError(
+            f"UDP port {port} on {host or 'all addresses'} can not be opened ({error.strerror}); "
+            "is another program receiving there?"
+        ) from None
+    force = getattr(socket, "SO_RCVBUFFORCE", 33)
+    try:
+        made.setsockopt(socket.SOL_SOCKET, force, BUFFER_BYTES)
+    except OSError:  # only root may go beyond the system's limit
+        with contextlib.suppress(OSError):
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+    made.setblocking(False)
+    return made
+
+
+def _drain(ready: socket.socket) -> list[bytes]:
+    """The datagrams that wait there, some at a time."""
+    found: list[bytes] = []
+    while len(found) < _DRAIN:
+        try:
+            found.append(ready.recv(65_536))
+        except (BlockingIOError, ConnectionError):
+            break
+    return found
+
+
+class RsbpearlReceiver:
+    """The sensor's own packets. Sockets are open once it is made, so that what comes then is kept.
+
+    Raises:
+        HemislamError: a port can not be opened.
+    """
+
+    def __init__(self, host: str, msop_port: int, difop_port: int, angles: Calibration | None = None) -> None:
+        self._sockets = [open_socket(host, msop_port)]
+        if difop_port != msop_port:
+            try:
+                self._sockets.append(open_socket(host, difop_port))
+            except HemislamError:
+                self._sockets[0].close()
+                raise
+        self.ports = [int(made.getsockname()[1]) for made in self._sockets]
+        self._decoder = Decoder(angles)
+        self._assembler = Assembler()
+        self._wait_until_ns: int | None = None
+        self._device: Difop | None = None
+        self._frames: deque[Frame] = deque()
+        self._known_angles = angles is not None
+
+    def __call__(self, intake: Intake, stop: threading.Event) -> None:
+        self._assembler.counters = intake.counters
+        with contextlib.ExitStack() as stack:
+            for opened in self._sockets:
+                stack.enter_context(opened)
+            while not stop.is_set():
+                ready, _, _ = select.select(self._sockets, [], [], 0.05)
+                now = time.time_ns()
+                for readable in ready:
+                    for packet in _drain(readable):
+                        self._take(packet, now, intake)
+                since = self._assembler.pending_since()
+                if since is not None and now - since > _REST_NS:
+                    self._frames += self._assembler.flush()
+                self._give(now, intake)
+
+    def _take(self, packet: bytes, now: int, intake: Intake) -> None:
+        if packet[:8] == DIFOP_ID:
+            said = read_difop(packet)
+            if said is None:
+                intake.counters.truncated += 1
+            else:
+                intake.counters.difop += 1
+                self._configure(said, now, intake)
+            return
+        self._frames += self._assembler.add(packet, now)
+
+    def _configure(self, said: Difop, now: int, intake: Intake) -> None:
+        before, self._device = self._device, said
+        if before is not None and before.describe() == said.describe() and _same(before, said):
+            return
+        if before is not None:
+            self._give(now, intake)  # what came before was measured as it was before
+        self._decoder.configure(said)
+        self._assembler.turn_ns = round(60e9 / said.rpm)
+        intake.sensor = f"RS-Bpearl {said.serial}: {said.describe()}"
+        if before is None:
+            intake.put_status("connected", "LiDAR", intake.sensor)
+        else:
+            intake.put_status("configuration", "LiDAR", f"the LiDAR was set to {said.describe()}")
+
+    def _give(self, now: int, intake: Intake) -> None:
+        """Decode and hand on; at the start once the device has told its angles."""
+        if not self._frames:
+            return
+        if self._device is None and not self._known_angles:
+            self._wait_until_ns = self._wait_until_ns or now + _DEVICE_WAIT_NS
+            if now < self._wait_until_ns:
+                return
+            self._known_angles = True
+            text = "no DIFOP packet came with this unit's angles; the nominal ones are used until one does"
+            intake.put_status("configuration", "LiDAR", text)
+        while self._frames:
+            frame = self._frames.popleft()
+            scan = self._decoder.decode(frame)
+            intake.counters.bad_blocks = self._decoder.bad_blocks
+            intake.put_scan(scan, frame.arrival_ns)
+            if isinstance(scan, Scan) and not intake.sensor:
+                intake.sensor = f"{frame.model.name}, without device packets"
+
+
+class ImuReceiver:
+    """IMU samples from datagrams (see `imu_udp.py`). Raises HemislamError: the port can not be opened."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._socket = open_socket(host, port)
+        self.port = int(self._socket.getsockname()[1])
+        self._order = ImuOrder()
+
+    def __call__(self, intake: Intake, stop: threading.Event) -> None:
+        self._order.counters = intake.counters
+        with self._socket:
+            while not stop.is_set():
+                ready, _, _ = select.select([self._socket], [], [], 0.05)
+                now = time.time_ns()
+                samples = [s for datagram in _drain(self._socket) for s in self._order.add(datagram)] if ready else []
+                for sample in samples or ([] if ready else self._order.flush()):
+                    intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, now)
+
+
+def _same(one: Difop, other: Difop) -> bool:
+    if one.calibration is None or other.calibration is None:
+        return one.calibration is other.calibration
+    return one.calibration.same(other.calibration)
