@@ -18,10 +18,21 @@ HELP: Final = (
         "or is paused: the frame you see is labelled anew at once, the engine uses the values from the next frame on. "
         "<b>Read</b> on the left how well ground and motion are found."
     )
+    + heading("Loops")
+    + box(
+        "Where the walk comes back, a <b>loop</b> ties two keyframes together and straightens the map. Arches show "
+        "them: green counts, amber waits for others that agree, red was turned down, violet is your word. Click an "
+        "arch, or a row under <b>Loops</b> on the left, to see both submaps (blue the older, orange the newer) and "
+        "why it was judged so. <b>Accept</b>, <b>reject</b>, weigh or add one: a pale ghost shows the walk as it would "
+        "become, then commit or cancel. Every word can be undone; <b>Save edits</b> keeps them for "
+        "<code>hemislam run --loops</code>."
+    )
     + heading("Keys")
     + box(
         f"{key('space')} play or pause<br>{key('←')} {key('→')} one frame back or on<br>"
         f"{key('F')} follow the sensor or look freely<br>{key('C')} next colouring<br>"
+        f"{key('J')} {key('K')} next or previous loop<br>"
+        f"{key('Ctrl')} {key('Z')} undo your word on a loop, with {key('Shift')} redo<br>"
         f"{key('Ctrl')} {key('K')} all commands"
     )
     + heading("Mouse")

@@ -15,7 +15,7 @@ from app.ui.loops.overlay import Overlay, Pairing, on_the_way
 from app.ui.loops.words import evidence, submap_legend
 from app.ui.widgets import by_user
 
-FLY, SEEK, CLOSE = "fly there", "to its frame", "close"
+FLY, SEEK, CLOSE = "fly there", "frame", "close"
 _NO_CONTEXTS: Final = np.zeros((1, 1, 4), np.uint8)
 
 
@@ -33,12 +33,14 @@ class Inspector:
         self._detail: LoopDetail | None = None
         self._told: tuple[object, ...] = ()
         self._evidence = gui.add_html("")
-        self._go = gui.add_button_group("", (FLY, SEEK, CLOSE), hint="Its frame is the one at which it was decided.")
+        self._go = gui.add_button_group(
+            "go", (FLY, SEEK, CLOSE), hint="Fly to the loop, seek to the frame at which it was decided, or close it."
+        )
         self._go.on_click(by_user(act))
         self._waiting = gui.add_html(box('<span class="hs-quiet">The engine gets the submaps …</span>'))
         self._laid = gui.add_slider(
             "submaps", 0.0, 1.0, 0.01, 1.0, hint="Left: where the graph had them. Right: as they were registered.",
-            marks=((0.0, "graph"), (1.0, "registered")),
+            marks=((0.0, "graph"), (1.0, "fit")),
         )  # fmt: skip
         self._alone = gui.add_checkbox("these alone", True, hint="Hide the map and the scan behind the two submaps.")
         self._legend = gui.add_html("")

@@ -106,9 +106,10 @@ def _moves(after: F64, before: F64) -> str:
     far = int(moved.argmax())
     if moved[far] < 5e-4 and max(turned) < 5e-3:
         return "<div>No keyframe would move.</div>"
+    turn = f", and turn by up to <b>{max(turned):.2f}°</b>" if max(turned) >= 5e-3 else ""
     return (
         f"<div>Keyframes would move by up to <b>{_length(moved[far])}</b> (keyframe {far}), {_length(moved.mean())} on "
-        f"average, and turn by up to <b>{max(turned):.2f}°</b>.</div>"
+        f"average{turn}.</div>"
     )
 
 
