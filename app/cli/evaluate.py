@@ -107,8 +107,7 @@ def evaluate(
     for variant in chosen:
         variant.applied(subjects[0].params)  # refuses what is misspelt before anything runs
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    runnable = sum(not variant.missing for variant in chosen) * len(subjects)
-    parallel = max(1, min(jobs or cores, runnable))
+    parallel = max(1, min(jobs or cores, len(chosen) * len(subjects)))
     compile_behind_bar()
     findings, failures = run_evaluation(
         Plan(
@@ -126,7 +125,7 @@ def evaluate(
     typer.echo(f"report     {out / 'report.html'}")
     if failures:
         (recording, name), why = next(iter(failures.items()))
-        raise HemislamError(f"{len(failures)} of {runnable} runs failed; {recording}, {name}: {why}")
+        raise HemislamError(f"{len(failures)} of {len(chosen) * len(subjects)} runs failed; {recording}, {name}: {why}")
 
 
 def _make_folder(folder: Path) -> None:

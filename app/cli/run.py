@@ -24,6 +24,7 @@ from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
     from app.server.run import Run
+    from app.slam.loops.types import Command as Overruling
     from app.slam.trajectory import Trajectory
 
 
@@ -41,12 +42,18 @@ def run(
     start: Start = 0.0,
     duration: Duration = None,
     truth: Truth = None,
+    loops: Annotated[
+        Path | None, typer.Option("--loops", metavar="FILE", help="Overrulings of loops, as the workbench saves them.")
+    ] = None,
 ) -> None:
     """Process a recording without a browser and write the results.
 
     \b
     Writes into DIR:
       trajectory.tum   pose of the IMU in the map at each scan's end: stamp x y z qx qy qz qw
+      trajectory_odometry.tum   the same before loops moved it
+      loops.csv        every loop that was thought of, its verdict, the numbers and the reason
+      graph.g2o        the pose graph of the keyframes
       timings.csv      milliseconds of each stage, frame by frame; reading the file not counted
       map.ply          the map: x y z intensity ground
       report.json      parameters, frames processed and dropped, ground share, errors against truth
@@ -56,12 +63,14 @@ def run(
       hemislam run walk.mcap
       hemislam run indoor1.bag --preset h2lid --out results/indoor1
       hemislam run walk.mcap --set ground.alpha=30 --start 10 --duration 60 --truth walk.tum
+      hemislam run walk.mcap --loops edits.yaml
     """
     from app.server.run import open_run
     from app.slam.results import RunInfo, prepare_folder, save_results, summarise
     from app.slam.trajectory import read_tum
 
     params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
+    overrulings = _read_overrulings(loops) if loops else ()
     folder = out or _free_folder(recording)
     work = open_run(recording, truth, params, start, duration)
     try:
@@ -76,6 +85,8 @@ def run(
             if finding.verdict != "fine":
                 typer.echo(f"{finding.verdict}: {finding.subject}: {finding.text} {finding.option}".rstrip())
         compile_behind_bar()
+        if overrulings:
+            work.overrule(overrulings)
         stop = _process(work)
         if not len(work.log):
             with contextlib.suppress(OSError):
@@ -90,7 +101,8 @@ def run(
             truth_path=truth_path,
             stopped="" if stop is None else str(stop) or type(stop).__name__,
         )
-        report = save_results(folder, work.log, work.engine.keyframes, info, replace=force)
+        found = work.engine.loops.results() if work.engine.loops else None
+        report = save_results(folder, work.log, work.engine.keyframes, info, found, replace=force)
     finally:
         work.close()
     typer.echo(summarise(report, folder))
@@ -99,6 +111,17 @@ def run(
     if stop is not None:
         typer.echo(f"hemislam: stopped early; the frames so far are saved in {folder}.", err=True)
         raise stop
+
+
+def _read_overrulings(path: Path) -> "tuple[Overruling, ...]":
+    from app.slam.loops import edits
+
+    try:
+        return edits.read(path.read_text(encoding="utf-8"), str(path))
+    except UnicodeDecodeError:
+        raise HemislamError(f"{path} is not a text file; save overrulings of loops in the workbench.") from None
+    except OSError as error:
+        raise HemislamError(f"{path} can not be read: {error.strerror}.") from None
 
 
 def _free_folder(recording: Path) -> Path:

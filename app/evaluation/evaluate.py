@@ -71,18 +71,17 @@ def evaluate(plan: Plan) -> tuple[list[str], dict[tuple[str, str], str]]:
             raise HemislamError(f"{subject.recording} can not be read; check its permissions.")
         hashes[subject.name] = digest
         for variant in plan.variants:
-            if not variant.missing:
-                jobs[subject.name, variant.name] = Job(
-                    recording=subject.recording,
-                    sha256=digest,
-                    name=subject.name,
-                    variant=variant.name,
-                    params=variant.applied(subject.params),
-                    folder=plan.folder / "runs" / subject.name / variant.name,
-                    threads=plan.threads,
-                    start_s=plan.start_s,
-                    duration_s=plan.duration_s,
-                )
+            jobs[subject.name, variant.name] = Job(
+                recording=subject.recording,
+                sha256=digest,
+                name=subject.name,
+                variant=variant.name,
+                params=variant.applied(subject.params),
+                folder=plan.folder / "runs" / subject.name / variant.name,
+                threads=plan.threads,
+                start_s=plan.start_s,
+                duration_s=plan.duration_s,
+            )
     failures = run_jobs(list(jobs.values()), plan.parallel, plan.folder / "runs")
     evaluated = [_evaluated(plan, subject, jobs, failures, hashes[subject.name]) for subject in plan.subjects]
     return write_report(plan.folder, evaluated), failures
@@ -98,7 +97,7 @@ def _evaluated(
     columns: list[Column] = []
     for variant in plan.variants:
         which = (subject.name, variant.name)
-        if missing := variant.missing or failures.get(which, ""):
+        if missing := failures.get(which, ""):
             columns.append(Column(variant.name, variant.meaning, missing=missing))
         else:
             columns.append(load(jobs[which], variant.meaning))

@@ -96,6 +96,7 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
     """
     import numba
 
+    from app.slam.loops.service import InlineLoops
     from app.slam.warmup import compile_kernels
 
     numba.set_num_threads(min(job.threads, numba.get_num_threads()))
@@ -105,7 +106,7 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
         rest = max(0.0, recording.duration_s - job.start_s)
         part = (rest if job.duration_s is None else min(rest, job.duration_s)) / max(recording.duration_s, 1e-9)
         total = round(recording.scan_count * part)
-        engine = Engine(job.params)
+        engine = Engine(job.params, InlineLoops if job.params.loops.enabled else None)
         try:
             for entry in recording.measurements(job.start_s, job.duration_s):
                 if isinstance(entry, DroppedScan):
@@ -117,13 +118,16 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
                 log.add(result)
                 _score_ground(ground, result)
                 progress(len(log), total)
+            if engine.loops:
+                engine.loops.finish()
+                engine.loops.poll()
             memory = peak_memory_mb()
-            _write(job, log, engine, _facts(job, log, ground, memory), cpu_ms)
+            _write(job, log, engine, _facts(job, log, engine, ground, memory), cpu_ms)
         finally:
             engine.close()
 
 
-def _facts(job: Job, log: RunLog, ground: list[GroundScore], memory_mb: float) -> dict[str, Any]:
+def _facts(job: Job, log: RunLog, engine: Engine, ground: list[GroundScore], memory_mb: float) -> dict[str, Any]:
     """What run.json holds but for what needs the map."""
     return {
         "key": job.key,
@@ -138,7 +142,8 @@ def _facts(job: Job, log: RunLog, ground: list[GroundScore], memory_mb: float) -
         "frames": len(log),
         "lost": log.statuses[FrameStatus.LOST],
         "dropped": dict(log.dropped.most_common()),
-        "distance_m": log.trajectory.distance,
+        "distance_m": engine.map_frame.trajectory(log.odometry).distance,
+        "loops": None if engine.loops is None else engine.loops.accepted,
         "ground_share": log.ground_points / log.points if log.points else None,
         "ground": None if log.ground_score is None else [asdict(score) for score in ground],
         "peak_memory_mb": memory_mb,
@@ -150,8 +155,8 @@ def _facts(job: Job, log: RunLog, ground: list[GroundScore], memory_mb: float) -
 
 def _write(job: Job, log: RunLog, engine: Engine, facts: dict[str, Any], cpu_ms: list[float]) -> None:
     """All files beside their places, then moved there, run.json last: a kill in between leaves no result."""
-    trajectory = log.trajectory
-    poses = _map_poses(log, engine)
+    trajectory = engine.map_frame.trajectory(log.odometry)
+    poses = engine.map_frame.poses(np.array([keyframe.T_odom_imu for keyframe in engine.keyframes]).reshape(-1, 4, 4))
     measured = fineness.measure(fineness.collect(engine.keyframes, poses))
     facts["fineness"] = {name: value if np.isfinite(value) else None for name, value in asdict(measured).items()}
 
@@ -173,11 +178,6 @@ def _write(job: Job, log: RunLog, engine: Engine, facts: dict[str, Any], cpu_ms:
             (part / name).replace(job.folder / name)
     finally:
         shutil.rmtree(part, ignore_errors=True)
-
-
-def _map_poses(log: RunLog, engine: Engine) -> F64:
-    """T_map_imu (k, 4, 4) of all keyframes as the map shows them at the end."""
-    return np.array([log.T_map_odom @ keyframe.T_odom_imu for keyframe in engine.keyframes]).reshape(-1, 4, 4)
 
 
 def clear_remains(folder: Path) -> None:

@@ -11,8 +11,6 @@ from app.slam.errors import HemislamError
 from app.slam.params import Params
 
 LOOPS = "loops.enabled"
-HAS_LOOPS = False
-"""Whether the engine closes loops. Until it does, variants with loops are left out, not shown as if they had some."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,21 +24,14 @@ class Variant:
     values: Mapping[str, Any]
     meaning: str = ""
 
-    @property
-    def missing(self) -> str:
-        """Why this can not be run in this version, in words; "" if it can."""
-        without = self.values.get(LOOPS) and not HAS_LOOPS
-        return "loop closure is not part of this version, so there are no figures" if without else ""
-
     def applied(self, params: Params) -> Params:
         """`params` with this variant's values.
 
         Raises:
             HemislamError: a parameter is unknown or out of range.
         """
-        values = {name: value for name, value in self.values.items() if HAS_LOOPS or name != LOOPS}
         try:
-            return params.with_values(values)
+            return params.with_values(self.values)
         except HemislamError as error:
             raise HemislamError(f"Variant {self.name}: {error}") from None
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from app.server.protocol import SERIES, Chunk, Notice, Snapshot
+from app.server.protocol import SERIES, Chunk, LoopsView, Notice, Snapshot
 from app.slam.params import Params
 from app.slam.types import F64
 
@@ -26,6 +26,7 @@ class Delta:
         session: of all that follows; a new number empties the scene first.
         kept: how many frames and how many chunks are left of what there was, before those that
             follow; None: all.
+        moved: frame and (m, 3) positions from it on, in place of those that there were.
         replaced: new values of fields of `Snapshot`.
         positions: (m, 3) and series: (m, len(SERIES)), rows of the frames since then.
         chunks, notices: new since then.
@@ -33,6 +34,7 @@ class Delta:
 
     session: int
     kept: tuple[int, int] | None
+    moved: tuple[int, F64] | None
     replaced: dict[str, Any]
     positions: F64
     series: F64
@@ -56,6 +58,7 @@ class Outbox:
         self._rows: list[list[float]] = []
         self._chunks: list[Chunk] = []
         self._kept: tuple[int, int] | None = None
+        self._moved: tuple[int, F64] | None = None
         self.frames = 0
         self.chunks = 0
         self._notices: list[Notice] = []
@@ -66,8 +69,8 @@ class Outbox:
         self._session += 1
         self.urgent = True
         self._positions, self._rows, self._chunks = [], [], []
-        self._kept, self.frames, self.chunks = None, 0, 0
-        self._replaced |= {"result": None, "keyframe_poses": None, "T_map_truth": None}
+        self._kept, self._moved, self.frames, self.chunks = None, None, 0, 0
+        self._replaced |= {"result": None, "keyframe_poses": None, "T_map_truth": None, "loops": LoopsView()}
 
     def put(self, *, urgent: bool = False, **values: Any) -> None:
         """Set fields of the snapshot. Only the newest value of each is sent."""
@@ -84,12 +87,27 @@ class Outbox:
         self._chunks.append(chunk)
         self.chunks += 1
 
+    def move(self, first: int, positions: F64) -> None:
+        """The frames from `first` on lie elsewhere now.
+
+        Args:
+            positions: (frames, 3) of all frames.
+        """
+        taken = self.frames - len(self._positions)
+        if first < taken:
+            first = min(first, self._moved[0]) if self._moved else first
+            self._moved = first, positions[first:taken]
+        self._positions = list(positions[taken:])
+
     def rewind(self, frames: int, chunks: int) -> None:
         """Take frames and chunks back, the newest first, so that so many are left."""
         frames, chunks = min(frames, self.frames), min(chunks, self.chunks)
         taken_frames, taken_chunks = self.frames - len(self._rows), self.chunks - len(self._chunks)
         if frames < taken_frames or chunks < taken_chunks:
             self._kept = min(frames, taken_frames), min(chunks, taken_chunks)
+        if self._moved:
+            first, moved = self._moved
+            self._moved = (first, moved[: frames - first]) if first < frames else None
         del self._positions[max(frames - taken_frames, 0) :], self._rows[max(frames - taken_frames, 0) :]
         del self._chunks[max(chunks - taken_chunks, 0) :]
         self.frames, self.chunks = frames, chunks
@@ -102,13 +120,14 @@ class Outbox:
     @property
     def filled(self) -> bool:
         """Whether there is anything to take."""
-        return bool(self._replaced or self._rows or self._chunks or self._notices or self._kept)
+        return bool(self._replaced or self._rows or self._chunks or self._notices or self._kept or self._moved)
 
     def take(self) -> Delta:
         """All changes since the last call."""
         delta = Delta(
             session=self._session,
             kept=self._kept,
+            moved=self._moved,
             replaced=self._replaced,
             positions=np.array(self._positions, dtype=np.float64).reshape(-1, 3),
             series=np.array(self._rows, dtype=np.float64).reshape(-1, len(SERIES)),
@@ -116,7 +135,7 @@ class Outbox:
             notices=tuple(self._notices),
         )
         self._replaced, self._positions, self._rows, self._chunks, self._notices = {}, [], [], [], []
-        self._kept = None
+        self._kept = self._moved = None
         self.urgent = False
         return delta
 
@@ -176,6 +195,10 @@ class Fold:
             frames, count = delta.kept
             self._positions, self._series = self._positions.rewound(frames), self._series.rewound(frames)
             chunks = chunks[:count]
+        if delta.moved is not None:
+            first, positions = delta.moved
+            self._positions = self._positions.rewound(first)
+            self._positions.extend(positions)
         self._positions.extend(delta.positions)
         self._series.extend(delta.series)
         series = self._series.view()

@@ -246,7 +246,8 @@ class LoopsView:
 
 SERIES = (
     "stamp_s", "planarity", "seeds", "ground_share", "points_in", "points_reduced", "points_filter",
-    "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "total_ms",
+    "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "loops_ms",
+    "total_ms",
     "iterations", "used", "inliers", "residual_rms", "degeneracy", "imu_gap_s", "dropped",
     "speed", "gyro_bias", "accel_bias", "distance", "error_m",
 )  # fmt: skip

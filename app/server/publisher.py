@@ -13,12 +13,15 @@ from app.server.delta import Outbox, Rows
 from app.server.protocol import SERIES, Chunk, Saved, Transport
 from app.server.run import Run
 from app.server.spill import Slot, Spill
+from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import F64, Keyframe, StepResult
 
 REPEAT_AFTER_S = 10.0
 """The same kind of notice is shown again only after so much of the recording's time."""
 SAVED_KEPT = 10
+SAME = 1e-6
+"""Corrections (m, and of rotation matrices) closer than this are not told to the page."""
 
 
 class Publisher:
@@ -39,7 +42,8 @@ class Publisher:
 
     def _begin_history(self) -> None:
         """Of all frames that are known, also those that the page was taken back over."""
-        self._positions, self._rows, self._poses = Rows(3), Rows(len(SERIES)), Rows(16)
+        self._rows, self._odometry = Rows(len(SERIES)), Rows(16)  # the latter: T_odom_imu of keyframes
+        self._positions, self._frame = Rows(3), MapFrame()  # as the page has them
         self._chunks: list[Slot | Chunk] = []  # on disk, while that has room
         self._spill = Spill()
 
@@ -68,13 +72,13 @@ class Publisher:
     def frame(self, run: Run, result: StepResult) -> None:
         """A frame was processed, the one after that which the page shows."""
         frame, position, row = run.frame, result.T_map_imu[:3, 3].copy(), run.readouts.row(result)
-        self._positions.go_to(frame)
-        self._positions.extend(position[None])
         self._rows.go_to(frame)
         self._rows.extend(np.array([row]))
+        self._positions.extend(position[None])
         self.outbox.frame(position, row)
         if result.keyframe is not None:
-            self._keyframe(len(run.engine.keyframes) - 1, result.T_map_odom, result.keyframe)
+            self._keyframe(len(run.engine.keyframes) - 1, result.keyframe)
+        self._lay_anew(run)
         self._newest(run, result)
         self.show(frame=frame, stamp_ns=result.stamp_ns, urgent=False)
         for notice in result.notices:
@@ -84,12 +88,20 @@ class Publisher:
         """The run went to another frame, one that is known, with this result: show all as it was there."""
         frames, chunks = run.frame + 1, len(run.engine.keyframes)
         self.outbox.rewind(frames, chunks)
-        self._positions.go_to(frames)
         self._rows.go_to(frames)
-        self._poses.go_to(chunks)
-        positions, rows = self._positions.view(), self._rows.view()
-        for index in range(self.outbox.frames, frames):
-            self.outbox.frame(positions[index].copy(), rows[index].tolist())
+        self._odometry.go_to(chunks)
+        self._frame = run.engine.map_frame
+        positions, rows = self._frame.trajectory(run.log.odometry).positions, self._rows.view()
+        sent = self.outbox.frames
+        apart = np.abs(positions[:sent] - self._positions.view()[:sent]).max(axis=1, initial=0.0)
+        first = int(np.argmax(apart > SAME)) if (apart > SAME).any() else sent
+        self._positions.go_to(first)
+        self._positions.extend(positions[first:])
+        for index in range(sent, frames):
+            self.outbox.frame(positions[index], rows[index].tolist())
+        if first < sent:
+            self.outbox.move(first, positions)
+        run.readouts.moved(positions)
         for kept in self._chunks[self.outbox.chunks : chunks]:
             self.outbox.chunk(kept if isinstance(kept, Chunk) else wire.unpack(self._spill.get(kept)))
         self._newest(run, result)
@@ -102,18 +114,41 @@ class Publisher:
 
     def _newest(self, run: Run, result: StepResult | None) -> None:
         self.result = result and replace(result, keyframe=None)
-        poses = self._poses.view().reshape(-1, 4, 4).copy()
+        poses = self._frame.poses(self._odometry.view().reshape(-1, 4, 4))
         self.outbox.put(
             result=self.result,
             T_map_truth=run.readouts.T_map_truth,
             keyframe_poses=poses if len(poses) else None,
         )
 
-    def _keyframe(self, index: int, T_map_odom: F64, keyframe: Keyframe) -> None:
+    def map_moved(self, run: Run) -> None:
+        """Loops have moved keyframes: show them, the walk and the sensor where they are now."""
+        self._lay_anew(run)
+        self._newest(run, self.result and replace(self.result, T_map_odom=run.engine.T_map_odom))
+
+    def _lay_anew(self, run: Run) -> None:
+        """Send the part of the walk whose corrections are others than those that the page has."""
+        before, frame = self._frame, run.engine.map_frame
+        if frame is before:
+            return
+        self._frame = frame
+        first = _first_stamp(before, frame)
+        if first is None:
+            return
+        walk = run.log.odometry
+        begin = int(np.searchsorted(walk.stamps_ns, first))
+        positions = self._positions.view().copy()
+        positions[begin:] = frame.trajectory(walk.since(begin)).positions
+        run.readouts.moved(positions)
+        self._positions.go_to(begin)
+        self._positions.extend(positions[begin:])
+        self.outbox.move(begin, positions)
+
+    def _keyframe(self, index: int, keyframe: Keyframe) -> None:
         chunk = thinned(keyframe, self._chunk_voxel)
         self.outbox.chunk(chunk)
-        self._poses.go_to(index)
-        self._poses.extend((T_map_odom @ keyframe.T_odom_imu).reshape(1, 16))
+        self._odometry.go_to(index)
+        self._odometry.extend(keyframe.T_odom_imu.reshape(1, 16))
         for replaced in self._chunks[index : index + 1]:
             if isinstance(replaced, Slot):
                 self._spill.release(replaced)
@@ -143,3 +178,21 @@ class Publisher:
         if last is None or abs(stamp_ns - last) > REPEAT_AFTER_S * 1e9:
             self._noticed[kind] = stamp_ns
             self.outbox.notice("warning", text)
+
+
+def _first_stamp(before: MapFrame, after: MapFrame) -> int | None:
+    """From when on two corrections of the same walk differ; None if they do not."""
+    count = max(len(before.T_map_odom), len(after.T_map_odom))
+    if not count:
+        return None
+    differ = np.abs(_padded(before, count) - _padded(after, count)).max(axis=(1, 2)) > SAME
+    if not differ.any():
+        return None
+    index = int(np.argmax(differ))
+    return int(after.stamps_ns[index - 1]) if index else 0
+
+
+def _padded(frame: MapFrame, count: int) -> F64:
+    """(count, 4, 4) corrections; later ones are the last."""
+    missing = count - len(frame.T_map_odom)
+    return np.concatenate([frame.T_map_odom, np.broadcast_to(frame.at(count), (missing, 4, 4))])

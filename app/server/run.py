@@ -7,13 +7,17 @@ from pathlib import Path
 
 from app.sensors.recording import Place, Recording, open_recording
 from app.server.checkpoints import DEFAULT_BYTES, Checkpoints
+from app.server.loop_process import LoopProcess
 from app.server.protocol import OpenedRecording
 from app.server.readouts import Readouts, ReadoutsState
 from app.slam.engine import Checkpoint, Engine
+from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
+from app.slam.loops.messages import LoadCommands
+from app.slam.loops.types import Command as Overruling
 from app.slam.params import Params
 from app.slam.results import LogState, RunInfo, RunLog, prepare_folder, save_results
-from app.slam.trajectory import read_tum, truth_beside, write_tum
+from app.slam.trajectory import Trajectory, read_tum, truth_beside, write_tum
 from app.slam.types import DroppedScan, Keyframe, Measurement, StepResult
 
 
@@ -86,9 +90,11 @@ class Run:
             HemislamError: the recording is damaged here; it can not be read on.
         """
         if self._waiting is None:
-            self.finished = True  # also if reading fails: it can not be taken up again
+            was_finished, self.finished = self.finished, True  # also if reading fails: it can not be taken up again
             entry = next(self._incoming, None)
             self.finished = entry is None
+            if self.engine.loops and self.finished and not was_finished:
+                self.engine.loops.finish()
             if not isinstance(entry, Measurement):
                 if entry is not None:
                     self.log.drop(entry)
@@ -120,6 +126,16 @@ class Run:
         self.log.add(result)
         return result
 
+    def overrule(self, commands: tuple[Overruling, ...]) -> None:
+        """Put these commands over the loops that are found, now and later.
+
+        Raises:
+            HemislamError: loops are not looked for.
+        """
+        if self.engine.loops is None:
+            raise HemislamError("Loops are not looked for, so none can be overruled; set loops.enabled.")
+        self.engine.loops.command(LoadCommands(commands))
+
     # --- going back ------------------------------------------------------------------------------
     def choose(self, params: Params) -> None:
         """Take these parameters for all frames not yet processed."""
@@ -132,6 +148,8 @@ class Run:
     def forget_after(self, frame: int) -> None:
         """What comes after a frame will be another walk."""
         self.known = min(self.known, frame)
+        if self.engine.loops:
+            self.engine.loops.forget_after(frame)
         self.checkpoints.forget_after(frame)
         self._params_from = [entry for entry in self._params_from if entry[0] <= frame]
 
@@ -172,7 +190,8 @@ class Run:
         """
         log = copy.deepcopy(self.log)
         if trajectory_only:
-            return lambda: _save_trajectory(folder, log)
+            frame = self.engine.map_frame
+            return lambda: _save_trajectory(folder, frame.trajectory(log.odometry))
         start_s, duration_s = self._part
         info = RunInfo(
             recording=self.opened.path,
@@ -183,9 +202,10 @@ class Run:
             truth_path=self.opened.truth,
         )
         keyframes = _Present(self.engine.keyframes)
+        loops = self.engine.loops.results() if self.engine.loops else None
 
         def save() -> None:
-            save_results(folder, log, keyframes, info, replace=True)
+            save_results(folder, log, keyframes, info, loops, replace=True)
 
         return save
 
@@ -208,9 +228,9 @@ class _Present:
         return self._keyframes[index]
 
 
-def _save_trajectory(folder: Path, log: RunLog) -> None:
+def _save_trajectory(folder: Path, trajectory: Trajectory) -> None:
     prepare_folder(folder, replace=True)
-    write_tum(folder / "trajectory.tum", log.trajectory)
+    write_tum(folder / "trajectory.tum", trajectory)
 
 
 def open_run(
@@ -234,7 +254,7 @@ def open_run(
         truth_path = truth or truth_beside(path)
         return Run(
             recording,
-            Engine(params),
+            Engine(params, LoopProcess if params.loops.enabled else None),
             truth_path=truth_path,
             start_s=start_s,
             duration_s=duration_s,

@@ -11,6 +11,7 @@ from typing import Protocol, assert_never
 from app.server.breakpoints import Breakpoints, Moment, reasons
 from app.server.checkpoints import NEAR
 from app.server.delta import Outbox
+from app.server.loop_desk import LoopDesk
 from app.server.pacing import Pacer
 from app.server.protocol import (
     Command,
@@ -37,6 +38,7 @@ from app.server.publisher import Publisher
 from app.server.run import Run
 from app.server.saver import Saver
 from app.slam.errors import HemislamError
+from app.slam.loops.line import LoopLine
 from app.slam.params import Params, leaves
 from app.slam.types import DroppedScan, StepResult
 
@@ -45,7 +47,8 @@ log = logging.getLogger(__name__)
 SLOWEST = 0.1
 LONG_SEEK = 20
 """Frames to process on the way to a frame, from which on progress is shown."""
-SAVE_POLL_S = 0.05
+POLL_S = 0.02
+"""How often to look for what others are at work on."""
 
 _EFFECT = {leaf.path: leaf.effect for leaf in leaves()}
 
@@ -100,6 +103,7 @@ class Session:
     ) -> None:
         self._outbox = outbox
         self._page = Publisher(outbox, chunk_voxel)
+        self._desk = LoopDesk(outbox)
         self._pacer = Pacer(clock)
         self._saver = Saver()
         self._open_run = open_run
@@ -169,7 +173,7 @@ class Session:
             case Save(folder, trajectory_only):
                 self._saver.start(folder, self._need_run().saver(folder, trajectory_only=trajectory_only))
             case OverruleLoop() | UndoLoop() | RedoLoop() | TryLoop() | InspectLoop():
-                raise HemislamError("Loops are not looked for yet.")
+                self._desk.handle(command, self._need_loops())
             case _:
                 assert_never(command)
 
@@ -231,6 +235,12 @@ class Session:
             raise HemislamError("No recording is open; open one first.")
         return self._run
 
+    def _need_loops(self) -> LoopLine:
+        loops = self._need_run().engine.loops
+        if loops is None:
+            raise HemislamError("Loops are not looked for; set loops.enabled and restart.")
+        return loops
+
     # --- work ------------------------------------------------------------------------------------
     def work(self) -> float | None:
         """Do the next piece of due work.
@@ -252,7 +262,17 @@ class Session:
             return 0.0
         moving = self._page.transport.playing or self._journey is not None
         wait = self._advance(self._run) if self._run is not None and moving else None
-        return SAVE_POLL_S if wait is None and self._saver.busy else wait
+        waits = [wait, POLL_S if self._saver.busy else None, self._look_at_loops()]
+        return min((seconds for seconds in waits if seconds is not None), default=None)
+
+    def _look_at_loops(self) -> float | None:
+        """Take in what came of them. Returns when (s) to look again if something is awaited."""
+        loops = self._run.engine.loops if self._run is not None else None
+        if self._run is None or loops is None:
+            return None
+        if self._desk.update(loops):
+            self._page.map_moved(self._run)
+        return None if loops.idle else POLL_S
 
     def _go_back(self, run: Run, journey: Journey) -> None:
         """To the checkpoint, and on by a frame: there is something to show then, should that be the end of it."""
@@ -412,6 +432,7 @@ class Session:
         self._moment = None
         self._unseen = None
         run.remember()
+        self._desk.clear()
         self._page.opened(run)
         self._page.params(self._params, self._pending_restart())
         self._pacer.release()

@@ -1,15 +1,19 @@
 """The engine: one frame in, one result out. Synchronous and deterministic."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.slam import ground, iekf, imu, keyframes, start
+from app.slam import ground, iekf, imu, keyframes, rest, start
 from app.slam.imu import Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
 from app.slam.local_map import LocalMap, MapState
+from app.slam.loops.line import LoopLine
+from app.slam.loops.messages import LoopClient
+from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
 from app.slam.voxel import VoxelGrid
@@ -30,19 +34,24 @@ class Checkpoint:
 
 
 class Engine:
-    """LiDAR-inertial odometry and mapping of one walk (paper 2.2-2.3).
+    """LiDAR-inertial odometry and mapping of one walk (paper 2.2-2.4).
 
     Feed it scans in order of time, each with the IMU samples that cover it (`Measurement`). The
     same scans, samples and parameters give the same results to the last bit.
 
+    Args:
+        loops: makes who looks for loops, for example `InlineLoops`; None: nobody, it is odometry alone.
+
     Attributes:
         params: used from the next step on; those that act on restart are read only once, here.
         keyframes: the full map so far.
+        loops: what was found, and the way to overrule it; None for odometry alone.
     """
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Params, loops: Callable[[], LoopClient] | None = None) -> None:
         self.params = params
         self.keyframes = KeyframeStore()
+        self.loops = LoopLine(loops, self.keyframes, params.loops) if loops else None
         self._map = LocalMap(params.map)
         self._grid = VoxelGrid()
         self._belief: Belief | None = None  # None until the start is over
@@ -55,6 +64,8 @@ class Engine:
         """Process one scan with the samples that cover the time from the previous scan's end to its own."""
         p, watch = self.params, _Stopwatch()
         end_ns, notices = scan.end_ns, []
+        news = self.loops.due(self._frame) if self.loops else ()
+        watch.lap("loops")
         scan = _in_range(scan, p.sensor.min_range, p.sensor.max_range)
 
         belief, waiting = self._belief, False
@@ -63,6 +74,7 @@ class Engine:
             belief, waiting, self._still = started.belief, started.waiting, started.still
             notices += [started.notice] if started.notice else []
         predicted, path = imu.propagate(belief, samples, end_ns, p.imu)
+        predicted = rest.hold(predicted, samples)
         watch.lap("propagate")
         points = imu.deskew(scan, path, predicted.state)
         watch.lap("deskew")
@@ -93,6 +105,11 @@ class Engine:
             array.setflags(write=False)
         keyframe = None if waiting else self._keyframe(posterior, cloud)
         watch.lap("keyframe")
+        if self.loops:
+            if keyframe is not None:
+                self.loops.add(keyframe, p.loops)
+            notices += self.loops.take_notices()
+        watch.lap("loops")
 
         if status is not self._status and FrameStatus.LOST in (status, self._status):
             notices.append(f"Lost: {registration.reason}." if status is FrameStatus.LOST else "Tracking again.")
@@ -101,7 +118,7 @@ class Engine:
             stamp_ns=end_ns,
             status=status,
             state=posterior.state,
-            T_map_odom=np.eye(4),
+            T_map_odom=self.T_map_odom,
             cloud=cloud,
             ground=surface,
             registration=registration,
@@ -110,6 +127,7 @@ class Engine:
             points_filter=len(sampled.points),
             timings_ms=watch.laps(),
             keyframe=keyframe,
+            loops=news,
             notices=tuple(notices),
             truth_ground=scan.truth_ground,
             imu_gap_s=float(np.diff(samples.stamps_ns).max(initial=0)) * 1e-9,
@@ -128,7 +146,17 @@ class Engine:
             result, cloud=replace(cloud, labels=surface.labels), ground=surface, points_reduced=len(reduced.points)
         )
 
+    @property
+    def map_frame(self) -> MapFrame:
+        """Where loops lay odometry in the map, at the newest frame."""
+        return self.loops.frame if self.loops else _NO_LOOPS
+
+    @property
+    def T_map_odom(self) -> np.ndarray:
+        return self.map_frame.newest
+
     def checkpoint(self) -> Checkpoint:
+        """Loops need no more than the numbers of frames and keyframes."""
         return Checkpoint(
             params=self.params,
             frame=self._frame,
@@ -150,9 +178,13 @@ class Engine:
         self._map.restore(checkpoint.map)
         self.keyframes.truncate(checkpoint.keyframes)
         self._last_keyframe = checkpoint.last_keyframe
+        if self.loops:
+            self.loops.go_to(self._frame)
 
     def close(self) -> None:
         """Give the disk space of the keyframes back."""
+        if self.loops:
+            self.loops.close()
         self.keyframes.close()
 
     def _insert(self, belief: Belief, points: np.ndarray) -> None:
@@ -177,6 +209,7 @@ class Engine:
         return keyframe
 
 
+_NO_LOOPS = MapFrame()
 _NOT_REGISTERED = Registration(
     False, 0, 0, 0, float("nan"), np.full(6, np.nan), False, "the map is still empty; this scan begins it"
 )
@@ -224,7 +257,7 @@ class _Stopwatch:
 
     def lap(self, stage: str) -> None:
         now = time.perf_counter()
-        self._laps[stage] = (now - self._last) * 1e3
+        self._laps[stage] += (now - self._last) * 1e3
         self._last = now
 
     def laps(self) -> dict[str, float]:

@@ -52,6 +52,7 @@ class Params(Section):
     filter: Filter = Filter()
     map: LocalMap = LocalMap()
     keyframe: Keyframes = Keyframes()
+    loops: Loops = Loops()
 
     @classmethod
     def parse(cls, tree: Mapping[str, Any]) -> "Params":

@@ -5,6 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
+from app.slam.map_frame import MapFrame
 from app.slam.types import F64, NON_GROUND, Keyframe
 
 VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ground", "u1")])
@@ -17,8 +18,8 @@ class Keyframes(Protocol):
     def __getitem__(self, index: int, /) -> Keyframe: ...
 
 
-def write_map(path: Path, keyframes: Keyframes, T_map_odom: F64) -> int:
-    """Write all keyframes' points in the map frame and return their number.
+def write_map(path: Path, keyframes: Keyframes, frame: MapFrame) -> int:
+    """Write all keyframes' points where `frame` has them in the map, and return their number.
 
     Vertices are x y z (m), intensity (the sensor's scale) and ground (1 = ground). Only one
     keyframe is held at a time; the number of points is written into the header at the end.
@@ -27,7 +28,7 @@ def write_map(path: Path, keyframes: Keyframes, T_map_odom: F64) -> int:
     with path.open("wb") as file:
         file.write(_header(0))
         for index in range(len(keyframes)):
-            vertices = _vertices(keyframes[index], T_map_odom)
+            vertices = _vertices(keyframes[index], frame.at(index))
             file.write(vertices.tobytes())
             count += len(vertices)
         file.seek(0)

@@ -1,4 +1,4 @@
-"""What a run leaves behind: trajectory.tum, timings.csv, map.ply and report.json in one folder.
+"""What a run leaves behind: trajectories, timings, map, loops and report.json in one folder.
 
 `RunLog` collects one small row a frame while the run goes on; `save_results` writes the files from
 it, at the end or at any moment in between.
@@ -19,6 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from app import __version__
 from app.slam.errors import HemislamError
+from app.slam.loops.files import LoopResults, loops_csv
+from app.slam.loops.types import Verdict
+from app.slam.map_frame import MapFrame
 from app.slam.metrics import GroundScore, Trajectory, ate, rpe, write_tum
 from app.slam.params import Params
 from app.slam.ply import Keyframes, write_map
@@ -27,10 +30,12 @@ from app.slam.trajectory import stamp_text
 from app.slam.types import F64, I64, NON_GROUND, STAGES, DroppedScan, FrameStatus, StepResult
 
 RESULT_FILES = ("trajectory.tum", "timings.csv", "map.ply", "report.json")
+LOOP_FILES = ("trajectory_odometry.tum", "loops.csv", "graph.g2o")
+"""Beside them, if loops were looked for."""
 TIMINGS = (*STAGES, "total")
 RPE_METRES = (1.0, 10.0, 50.0)
 MOST_NOTICES = 200
-_SUMS = ("statuses", "dropped", "notices", "points", "ground_points", "ground_score", "T_map_odom")
+_SUMS = ("statuses", "dropped", "notices", "points", "ground_points", "ground_score")
 """Attributes of `RunLog` that are no rows."""
 
 
@@ -78,15 +83,14 @@ class RunLog:
         self.points = 0
         self.ground_points = 0
         self.ground_score: GroundScore | None = None
-        self.T_map_odom: F64 = np.eye(4)
 
     def __len__(self) -> int:
         return self._frames
 
     def add(self, result: StepResult) -> None:
         """Take in a processed frame."""
-        T_map_imu, frame = result.T_map_imu, self._frames
-        pose = (*T_map_imu[:3, 3], *Rotation.from_matrix(T_map_imu[:3, :3]).as_quat())
+        T_odom_imu, frame = result.state.T_odom_imu, self._frames
+        pose = (*T_odom_imu[:3, 3], *Rotation.from_matrix(T_odom_imu[:3, :3]).as_quat())
         timings = [result.timings_ms.get(stage, 0.0) for stage in TIMINGS]
         self._stamps[frame : frame + 1] = array("q", [result.stamp_ns])
         self._poses[7 * frame : 7 * (frame + 1)] = array("d", pose)
@@ -99,7 +103,6 @@ class RunLog:
         if result.truth_ground is not None:
             score = GroundScore.of(result.cloud.labels, result.truth_ground)
             self.ground_score = score if self.ground_score is None else self.ground_score + score
-        self.T_map_odom = result.T_map_odom
 
     def drop(self, scan: DroppedScan) -> None:
         """Take in a scan that was not processed."""
@@ -130,8 +133,8 @@ class RunLog:
         return np.array(self._timings).reshape(-1, len(TIMINGS))[: self._frames]
 
     @property
-    def trajectory(self) -> Trajectory:
-        """T_map_imu at every scan's end; while the filter waits at rest to start, the origin."""
+    def odometry(self) -> Trajectory:
+        """T_odom_imu at every scan's end; while the filter waits at rest to start, the origin."""
         rows = np.array(self._poses).reshape(-1, 7)[: self._frames]
         return Trajectory(self.stamps_ns, rows[:, :3], rows[:, 3:])
 
@@ -142,7 +145,7 @@ def prepare_folder(folder: Path, *, replace: bool = False) -> None:
     Raises:
         HemislamError: it holds results and `replace` is not set, or it can not be written to.
     """
-    held = [name for name in RESULT_FILES if (folder / name).exists()]
+    held = [name for name in (*RESULT_FILES, *LOOP_FILES) if (folder / name).exists()]
     if held and not replace:
         raise HemislamError(
             f"{folder} already holds results ({', '.join(held)}); choose another folder or add --force."
@@ -156,26 +159,48 @@ def prepare_folder(folder: Path, *, replace: bool = False) -> None:
 
 
 def save_results(
-    folder: Path, log: RunLog, keyframes: Keyframes, info: RunInfo, *, replace: bool = False
+    folder: Path,
+    log: RunLog,
+    keyframes: Keyframes,
+    info: RunInfo,
+    loops: LoopResults | None = None,
+    *,
+    replace: bool = False,
 ) -> dict[str, Any]:
-    """Write the four result files and return what report.json holds.
+    """Write the result files and return what report.json holds.
 
     Older results in the folder stay until all new files are complete.
+
+    Args:
+        loops: what they made of it; None if none were looked for.
 
     Raises:
         HemislamError: as `prepare_folder`, or the disk is full or fails.
     """
     prepare_folder(folder, replace=replace)
-    parts = {name: folder / f".{name}.part" for name in RESULT_FILES}
+    frame = loops.frame if loops else MapFrame()
+    names = (*RESULT_FILES, *(LOOP_FILES if loops else ()))
+    parts = {name: folder / f".{name}.part" for name in names}
     try:
-        write_tum(parts["trajectory.tum"], log.trajectory)
+        trajectory = frame.trajectory(log.odometry)
+        write_tum(parts["trajectory.tum"], trajectory)
         parts["timings.csv"].write_text(_timings_csv(log), encoding="utf-8")
-        map_points = write_map(parts["map.ply"], keyframes, log.T_map_odom)
-        report = make_report(log, info)
+        map_points = write_map(parts["map.ply"], keyframes, frame)
+        report = make_report(log, trajectory, info)
         report["map"] = {"keyframes": len(keyframes), "points": map_points}
+        report["loops"] = None
+        if loops:
+            write_tum(parts["trajectory_odometry.tum"], log.odometry)
+            parts["loops.csv"].write_text(loops_csv(loops.edges, loops.stamps_ns), encoding="utf-8")
+            parts["graph.g2o"].write_text(loops.g2o, encoding="utf-8")
+            report["loops"] = {verdict.value: loops.count(verdict) for verdict in Verdict}
+            if info.truth is not None:
+                report["accuracy_odometry"] = _finite(_accuracy(log.odometry, info))
         parts["report.json"].write_text(json.dumps(report, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
         for name, part in parts.items():
             part.replace(folder / name)
+        for name in {*LOOP_FILES} - {*names}:
+            (folder / name).unlink(missing_ok=True)  # of an older run
     except OSError as error:
         raise HemislamError(f"Results can not be written to {folder}: {error.strerror}.") from error
     finally:
@@ -196,6 +221,11 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
         f"map        {report['map']['points']:,} points in {report['map']['keyframes']} keyframes;"
         f" {100 * (ground['share'] or 0):.0f} % ground",
     ]
+    if report["loops"]:
+        found = report["loops"]
+        lines.append(
+            f"loops      {found['accepted']} accepted, {found['candidate']} undecided, {found['rejected']} rejected"
+        )
     lines += [f"dropped    {count} x {reason}" for reason, count in frames["dropped_reasons"].items()]
     if ground["f1"] is not None:
         lines.append(
@@ -209,6 +239,8 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
             f"error      ATE {accuracy['ate_m']['rmse']:.4f} m (max {accuracy['ate_m']['max']:.4f}),"
             f" {accuracy['ate_deg']['rmse']:.3f}° over {accuracy['poses']} poses"
         )
+        if (before := report.get("accuracy_odometry")) and "ate_m" in before:
+            lines.append(f"           without loops ATE {before['ate_m']['rmse']:.4f} m")
     lines += [f"memory     {report['peak_memory_mb']:.0f} MB at most", f"saved in   {folder}"]
     return "\n".join(lines)
 
@@ -220,9 +252,8 @@ def _timings_csv(log: RunLog) -> str:
     return "\n".join(lines) + "\n"
 
 
-def make_report(log: RunLog, info: RunInfo) -> dict[str, Any]:
+def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo) -> dict[str, Any]:
     """What report.json holds; numbers that do not exist are null."""
-    trajectory = log.trajectory
     score = log.ground_score
     report = {
         "hemislam": __version__,

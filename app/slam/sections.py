@@ -269,7 +269,7 @@ class Keyframes(Section):
 class Loops(Section):
     """Recognising places seen before, and the graph that they straighten (paper 2.4, eq. 8)."""
 
-    enabled: bool = _param(True, "Look for loops and correct the map by them.")
+    enabled: bool = _param(True, "Look for loops and correct the map by them.", effect="restart")
     min_time: float = _param(15.0, "Places left less long ago than this are no loops.", unit="s", ge=1, le=600, step=1)
     candidates: int = _param(
         10, "Nearest places by ring key whose Scan Contexts are compared.", ge=1, le=100, step=1, symbol="M"

@@ -11,9 +11,13 @@ Conventions (all of hemislam):
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from app.slam.loops.types import LoopEdge
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -244,7 +248,7 @@ class FrameStatus(StrEnum):
     """Too few points matched the map; the pose is the IMU's prediction."""
 
 
-STAGES = ("propagate", "deskew", "ground", "downsample", "update", "insert", "keyframe")
+STAGES = ("propagate", "deskew", "ground", "downsample", "update", "insert", "keyframe", "loops")
 """Stages of `Engine.step`, in order; keys of `StepResult.timings_ms` beside "total"."""
 
 
@@ -259,6 +263,7 @@ class StepResult:
         points_in: points of the scan. points_reduced: after ground downsampling.
         points_filter: handed to the filter after the scan voxel.
         timings_ms: of STAGES and "total". keyframe: if this frame became one.
+        loops: candidates that came into effect with this frame, or whose verdict changed.
         notices: what a user should know about this frame, in sentences.
         imu_gap_s: longest time between the IMU samples that cover it.
         dropped: scans left out between the frame before and this one.
@@ -277,6 +282,7 @@ class StepResult:
     points_filter: int
     timings_ms: dict[str, float]
     keyframe: Keyframe | None = None
+    loops: "tuple[LoopEdge, ...]" = ()
     notices: tuple[str, ...] = field(default=())
     truth_ground: U8 | None = None
     imu_gap_s: float = 0.0

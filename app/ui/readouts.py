@@ -21,6 +21,7 @@ STAGE_COLOURS: Final[dict[str, Rgb]] = {
     "update": (255, 176, 32),
     "insert": (255, 120, 92),
     "keyframe": (206, 112, 220),
+    "loops": (150, 150, 165),
 }
 
 

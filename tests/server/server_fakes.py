@@ -15,6 +15,7 @@ from app.server.run import Run
 from app.server.setup import Setup
 from app.server.wire import Pipe
 from app.slam.errors import HemislamError
+from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import (
     GROUND,
@@ -120,6 +121,7 @@ class FakeEngine:
         self.steps_with: list[Params] = []
         self._fails_at = fails_at
         self._index, self._memory = 0, 0.1
+        self.loops, self.map_frame, self.T_map_odom = None, MapFrame(), np.eye(4)
 
     def close(self) -> None:
         self.keyframes.close()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from app.slam.errors import HemislamError
+from app.slam.map_frame import MapFrame
 from app.slam.metrics import Trajectory, read_tum
 from app.slam.params import Params
 from app.slam.ply import VERTEX, write_map
@@ -114,7 +115,7 @@ def test_a_log_that_went_back_and_forth_and_back_is_as_it_was_then() -> None:
 
 
 def facts(log: RunLog) -> tuple[object, ...]:
-    trajectory = log.trajectory
+    trajectory = log.odometry
     arrays = (log.stamps_ns, log.timings_ms, trajectory.positions, trajectory.quaternions)
     sums = (len(log), log.dropped.copy(), log.statuses.copy(), log.points, log.ground_points, log.ground_score)
     return *sums, *(array.tobytes() for array in arrays)
@@ -173,7 +174,7 @@ def test_the_report_counts_frames_ground_and_the_input(tmp_path: Path, recording
 
 def test_the_report_measures_against_truth(tmp_path: Path, recording: Path) -> None:
     log = logged(8)
-    ours = log.trajectory
+    ours = log.odometry
     shifted = Trajectory(ours.stamps_ns, ours.positions + np.array([5.0, 0, 0]), ours.quaternions)
     report = save_results(tmp_path / "out", log, [], RunInfo(recording, Params(), truth=shifted))
     assert report["accuracy"]["ate_m"]["rmse"] < 1e-9
@@ -183,7 +184,7 @@ def test_the_report_measures_against_truth(tmp_path: Path, recording: Path) -> N
 
 def test_a_truth_that_does_not_fit_is_told_in_the_report(tmp_path: Path, recording: Path) -> None:
     log = logged(8)
-    other_day = Trajectory(log.trajectory.stamps_ns + 10**14, log.trajectory.positions, log.trajectory.quaternions)
+    other_day = Trajectory(log.odometry.stamps_ns + 10**14, log.odometry.positions, log.odometry.quaternions)
     report = save_results(tmp_path / "out", log, [], RunInfo(recording, Params(), truth=other_day))
     assert "same clock" in report["accuracy"]["error"]
 
@@ -195,15 +196,15 @@ def test_a_run_without_a_single_frame_still_has_a_report(tmp_path: Path, recordi
     assert (tmp_path / "out" / "trajectory.tum").read_text() == ""
 
 
-def test_the_map_holds_every_keyframe_in_the_map_frame(tmp_path: Path) -> None:
+def test_the_map_holds_every_keyframe_where_loops_lay_it(tmp_path: Path) -> None:
     keyframes = [keyframe(0, [[1, 0, 0], [0, 2, 0]], [GROUND, NON_GROUND]), keyframe(1, [[1, 0, 0]], [SEED])]
-    T_map_odom = np.eye(4)
-    T_map_odom[1, 3] = 100.0
-    count = write_map(tmp_path / "map.ply", keyframes, T_map_odom)
+    T_map_odom = np.tile(np.eye(4), (2, 1, 1))
+    T_map_odom[:, 1, 3] = 100.0, 200.0
+    count = write_map(tmp_path / "map.ply", keyframes, MapFrame(np.array([0, 1]), T_map_odom))
     points = read_ply(tmp_path / "map.ply")
     assert count == len(points) == 3
     np.testing.assert_allclose(
-        np.stack([points["x"], points["y"], points["z"]], axis=1), [[0, 101, 0.5], [-2, 100, 0.5], [10, 101, 0.5]]
+        np.stack([points["x"], points["y"], points["z"]], axis=1), [[0, 101, 0.5], [-2, 100, 0.5], [10, 201, 0.5]]
     )
     assert points["ground"].tolist() == [1, 0, 1]
     assert points["intensity"].tolist() == [0, 1, 0]

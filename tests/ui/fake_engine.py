@@ -347,7 +347,7 @@ class FakeEngine:
         ground = label(world, frame, points, params)
         stamp = START_NS + 100_000_000 * frame
         rng = np.random.default_rng(frame)
-        stages = dict(zip(STAGES, rng.uniform(0.8, 1.2, 7) * [0.2, 0.6, 1.1, 0.7, 3.2, 0.9, 0.3], strict=True))
+        stages = dict(zip(STAGES, rng.uniform(0.8, 1.2, 8) * [0.2, 0.6, 1.1, 0.7, 3.2, 0.9, 0.3, 0.1], strict=True))
         stages["total"] = sum(stages.values())
         state = NavState(
             stamp_ns=stamp,

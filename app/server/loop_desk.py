@@ -1,0 +1,93 @@
+"""What the page asks about loops and does to them, and what it is shown of them."""
+
+from dataclasses import replace
+
+from app.server.delta import Outbox
+from app.server.protocol import InspectLoop, LoopCommand, LoopsView, OverruleLoop, RedoLoop, TryLoop, UndoLoop
+from app.slam.loops.line import LoopLine
+from app.slam.loops.messages import (
+    AskResiduals,
+    Failure,
+    Inspect,
+    Inspected,
+    LoopState,
+    Overrule,
+    Redo,
+    Residuals,
+    Tried,
+    TryOut,
+    Undo,
+)
+from app.slam.loops.types import LoopEdge
+
+
+class LoopDesk:
+    """Between the page and the loops of the open recording."""
+
+    def __init__(self, outbox: Outbox) -> None:
+        self._outbox = outbox
+        self._view = LoopsView()
+        self._state: LoopState | None = None
+
+    def clear(self) -> None:
+        """Another walk begins."""
+        self._view, self._state = LoopsView(), None
+        self._outbox.put(loops=self._view)
+
+    def handle(self, command: LoopCommand, loops: LoopLine) -> None:
+        """Pass a command of the page on; `update` brings what comes of it."""
+        view = self._view
+        match command:
+            case OverruleLoop(overruling):
+                loops.command(Overrule(overruling))
+                view = replace(view, tried=None)
+            case UndoLoop():
+                loops.command(Undo())
+            case RedoLoop():
+                loops.command(Redo())
+            case TryLoop(tried) if tried is not None:
+                loops.command(TryOut(tried))
+            case TryLoop():
+                view = replace(view, tried=None)
+            case InspectLoop(pair) if pair is not None:
+                loops.command(Inspect(*pair))
+            case InspectLoop():
+                view = replace(view, inspected=None)
+        if not isinstance(command, TryLoop):
+            loops.command(AskResiduals())
+        self._show(view)
+
+    def update(self, loops: LoopLine) -> bool:
+        """Take in what was answered and what came into effect. Returns whether the map has moved by it."""
+        loops.poll()
+        view = self._view
+        for answer in loops.take_answers():
+            match answer:
+                case Inspected(pair, detail):
+                    view = replace(view, inspected=(pair, detail))
+                case Tried(command, preview):
+                    view = replace(view, tried=(command, preview))
+                case Residuals(residuals):
+                    view = replace(view, residuals=residuals)
+                case Failure(text):
+                    self._outbox.notice("error", text)
+        for notice in loops.take_notices():
+            self._outbox.notice("warning", notice)
+        state, moved = loops.state, loops.state is not self._state
+        self._state = state
+        if state is not None and moved:
+            if not _same(view.edges, state.edges):
+                view = replace(view, edges=state.edges)
+            if (view.undo, view.redo) != (state.undo, state.redo):
+                view = replace(view, undo=state.undo, redo=state.redo)
+        self._show(view)
+        return moved
+
+    def _show(self, view: LoopsView) -> None:
+        if view is not self._view:
+            self._view = view
+            self._outbox.put(loops=view, urgent=True)
+
+
+def _same(a: tuple[LoopEdge, ...], b: tuple[LoopEdge, ...]) -> bool:
+    return len(a) == len(b) and all(one is other for one, other in zip(a, b, strict=True))

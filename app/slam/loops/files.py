@@ -1,0 +1,69 @@
+"""What is written about loops beside the other results of a run."""
+
+import csv
+import io
+from dataclasses import dataclass
+
+from scipy.spatial.transform import Rotation
+
+from app.slam.loops.types import LoopEdge, Verdict
+from app.slam.map_frame import MapFrame
+from app.slam.trajectory import stamp_text
+from app.slam.types import I64
+
+COLUMNS = (
+    "older", "newer", "older_stamp_s", "newer_stamp_s", "verdict", "origin", "overruled", "weight",
+    "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw",
+    "context_distance", "overlap", "residual_m", "slide_m", "rival_m", "mahalanobis_sigma", "gate_m", "support",
+    "reason",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class LoopResults:
+    """What loops made of a walk.
+
+    Attributes:
+        frame: where odometry lies in the map. stamps_ns: (k,) of keyframes.
+        edges: every candidate. g2o: the graph as text.
+    """
+
+    frame: MapFrame
+    stamps_ns: I64
+    edges: tuple[LoopEdge, ...]
+    g2o: str
+
+    def count(self, verdict: Verdict) -> int:
+        return sum(edge.verdict is verdict for edge in self.edges)
+
+
+def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
+    """One line a candidate; the pose is T_older_newer of the IMU frames, numbers not looked at are empty.
+
+    Args:
+        stamps_ns: (k,) of keyframes.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for edge in edges:
+        T, e = edge.T_older_newer, edge.evidence
+        pose = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
+        measures = (e.context_distance, e.overlap, e.residual_rms, e.slide, e.rival_m, e.mahalanobis, e.gate_m)
+        writer.writerow(
+            [
+                edge.older,
+                edge.newer,
+                stamp_text(int(stamps_ns[edge.older])),
+                stamp_text(int(stamps_ns[edge.newer])),
+                edge.verdict.value,
+                edge.origin.value,
+                int(edge.overruled),
+                f"{edge.weight:g}",
+                *(f"{value:.6f}" for value in pose),
+                *("" if value != value else f"{value:.4f}" for value in measures),
+                e.support,
+                edge.reason,
+            ]
+        )
+    return out.getvalue()

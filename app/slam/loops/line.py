@@ -1,0 +1,275 @@
+"""Loop work beside the frames: keyframes go out, what was found comes back a fixed number of frames later.
+
+Whoever does the work (`LoopClient`: in this process or in another) takes the time it takes; what was
+found with a keyframe takes effect `loops.latency` frames after it, no sooner and no later. So the
+poses shown never depend on the speed of the machine, and a frame waits only if the work is late.
+What the user commands takes effect as soon as it is answered.
+"""
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.slam.keyframes import KeyframeStore
+from app.slam.loops.files import LoopResults
+from app.slam.loops.messages import (
+    AddKeyframe,
+    AskG2o,
+    Failure,
+    Finish,
+    G2o,
+    GoTo,
+    LoadCommands,
+    LoopClient,
+    LoopState,
+    LoopWorkerDied,
+    Reply,
+    Request,
+)
+from app.slam.loops.types import LoopEdge, Verdict
+from app.slam.map_frame import MapFrame
+from app.slam.params import Loops
+from app.slam.types import Keyframe
+
+MOST_DEATHS = 3
+"""So often the work is begun again when it dies; after that, loops stay as they are."""
+MOST_PENDING = 4
+"""Keyframes handed over again that wait at the worker's."""
+
+
+@dataclass(slots=True)
+class _Asked:
+    """An answer that is outstanding.
+
+    Attributes:
+        keyframes: it is the state after so many of them, and takes effect when they are due; None:
+            it answers the user. void: the walk went elsewhere since; only failures are told.
+    """
+
+    keyframes: int | None
+    void: bool = False
+
+
+class LoopLine:
+    """The loops of one walk, as they count at its newest frame.
+
+    Args:
+        client: makes who does the work; called again if that dies.
+        keyframes: of the walk.
+        params: in force at the start; `latency` is read only here.
+
+    Attributes:
+        state: in effect; None before the first. frame: where that lays odometry in the map.
+    """
+
+    def __init__(self, client: Callable[[], LoopClient], keyframes: KeyframeStore, params: Loops) -> None:
+        self.state: LoopState | None = None
+        self.frame = MapFrame()
+        self._answers: list[Reply] = []
+        self._notices: list[str] = []
+        self._make_client = client
+        self._client = client()
+        self._keyframes = keyframes
+        self._params = params
+        self._latency = params.latency
+        self._frames: list[int] = []  # of all keyframes known, those gone back over included
+        self._stamps: list[int] = []
+        self._count = 0
+        self._in_effect = 0
+        self._asked: deque[_Asked] = deque()
+        self._arrived: deque[tuple[int, LoopState]] = deque()
+        self._news: list[LoopEdge] = []
+        self._again: int | None = None  # the next keyframe to hand over again, after the work has died
+        self._deaths = 0
+
+    # --- the walk --------------------------------------------------------------------------------
+    def due(self, frame: int) -> tuple[LoopEdge, ...]:
+        """Let take effect what must before this frame is processed, waiting for it if it is late.
+
+        Returns:
+            Candidates that are new by it or have another verdict.
+        """
+        due = bisect_right(self._frames, frame - self._latency, hi=self._count)
+        while self._again is None and self._in_effect < due:
+            if self._arrived:
+                self._in_effect, state = self._arrived.popleft()
+                self._take(state)
+            elif not self._receive(None):
+                break
+        self.poll()
+        news, self._news = tuple(self._news), []
+        return news
+
+    def add(self, keyframe: Keyframe, params: Loops) -> None:
+        """The walk has a new keyframe, or comes by a known one again."""
+        index = self._count
+        known = index < len(self._frames) and self._frames[index] == keyframe.frame
+        if not known:
+            del self._frames[index:], self._stamps[index:]
+            self._frames.append(keyframe.frame)
+            self._stamps.append(keyframe.stamp_ns)
+        self._count += 1
+        self._params = params
+        if self._again is None:
+            self._ask(GoTo(index + 1) if known else AddKeyframe(keyframe, params), index + 1)
+
+    def go_to(self, frame: int) -> None:
+        """The walk went back, or forth again: `frame` is the next.
+
+        Nothing waits here; the state follows with the next frame or `poll`.
+        """
+        for asked in self._asked:
+            asked.void = True
+        self._arrived.clear()
+        self._count = len(self._keyframes)
+        if self._again is not None or self._count > len(self._frames):  # or another engine's walk goes on here
+            self._begin_again()
+            return
+        due = bisect_right(self._frames, frame - self._latency, hi=self._count)
+        self._in_effect = -1
+        for index in range(due, self._count + 1):
+            self._ask(GoTo(index), index)
+
+    def forget_after(self, frame: int) -> None:
+        """Keyframes after this frame will be others."""
+        keep = max(bisect_right(self._frames, frame), self._count)
+        del self._frames[keep:], self._stamps[keep:]
+
+    def finish(self) -> None:
+        """The walk has ended: look for loops of the last keyframes too, and let all take effect that comes."""
+        self._ask(Finish(), None)
+
+    # --- the user --------------------------------------------------------------------------------
+    def command(self, request: Request) -> None:
+        """Ask on behalf of the user; `poll` until it is `idle` brings the answer."""
+        self._ask(request, None)
+
+    def poll(self) -> bool:
+        """Take in what has been answered, without waiting. Returns whether anything was."""
+        came = False
+        while self._asked and self._receive(0.0):
+            came = True
+        if self._again is not None:
+            self._hand_over_again()
+        return came
+
+    @property
+    def idle(self) -> bool:
+        """Whether every question of the user was answered and the state is that of this frame."""
+        return self._in_effect >= 0 and all(asked.keyframes is not None for asked in self._asked)
+
+    # --- what there is ---------------------------------------------------------------------------
+    @property
+    def accepted(self) -> int:
+        """Loops that count now."""
+        edges = self.state.edges if self.state is not None else ()
+        return sum(edge.verdict is Verdict.ACCEPTED for edge in edges)
+
+    def take_notices(self) -> list[str]:
+        """What the user should know, in sentences, since the last call."""
+        taken, self._notices = self._notices, []
+        return taken
+
+    def take_answers(self) -> list[Reply]:
+        """Replies to the user's questions since the last call."""
+        taken, self._answers = self._answers, []
+        return taken
+
+    def results(self) -> LoopResults:
+        """All that is written of loops, by all keyframes so far, whether in effect or not; waits for it."""
+        self._ask(AskG2o(), None)
+        while self._asked and self._receive(None):
+            pass
+        state = self._arrived[-1][1] if self._arrived else self.state
+        texts = [answer.text for answer in self._answers if isinstance(answer, G2o)]
+        self._answers = [answer for answer in self._answers if not isinstance(answer, G2o)]
+        g2o = texts[-1] if texts else ""
+        frame, edges = (MapFrame(), ()) if state is None else (self._lay(state), state.edges)
+        return LoopResults(frame, np.array(self._stamps[: self._count], dtype=np.int64), edges, g2o)
+
+    def close(self) -> None:
+        self._client.close()
+
+    # --- the work --------------------------------------------------------------------------------
+    def _ask(self, request: Request, keyframes: int | None) -> None:
+        if self._deaths <= MOST_DEATHS:
+            self._asked.append(_Asked(keyframes))
+            self._client.send(request)
+        elif keyframes is None:
+            self._answers.append(Failure("Loops are no longer worked on; restart to try again."))
+
+    def _receive(self, timeout: float | None) -> bool:
+        """Take in one answer; whether there was one."""
+        try:
+            reply = self._client.receive(timeout)
+        except LoopWorkerDied as error:
+            self._died(error)
+            return False
+        if reply is None:
+            return False
+        asked = self._asked.popleft()
+        if isinstance(reply, LoopState):
+            self._notices += reply.notices
+            if asked.void:
+                pass
+            elif asked.keyframes is None:
+                self._news += [edge for _, state in self._arrived for edge in state.changed]
+                self._arrived.clear()
+                self._in_effect = reply.count
+                self._take(reply)
+            else:
+                self._arrived.append((asked.keyframes, reply))
+        elif asked.keyframes is None:
+            self._answers.append(reply)
+        elif isinstance(reply, Failure):
+            self._notices.append(reply.text)
+        return True
+
+    def _take(self, state: LoopState) -> None:
+        self.state = state
+        self.frame = self._lay(state)
+        self._news += state.changed
+
+    def _lay(self, state: LoopState) -> MapFrame:
+        if not any(edge.verdict is Verdict.ACCEPTED for edge in state.edges):
+            return self.frame if not len(self.frame.T_map_odom) else MapFrame()  # nothing to the last bit, as solved
+        return MapFrame(np.array(self._stamps[: state.count], dtype=np.int64), state.corrections)
+
+    def _died(self, error: LoopWorkerDied) -> None:
+        self._deaths += 1
+        self._asked.clear()
+        self._arrived.clear()
+        self._client.close()
+        if self._deaths > MOST_DEATHS:
+            self._notices.append(f"{error} Loops stay as they are from here on; restart to look for them again.")
+            self._again = None
+            return
+        self._notices.append(f"{error} It is started again; loops follow once it has caught up.")
+        self._client = self._make_client()
+        self._begin_again()
+
+    def _begin_again(self) -> None:
+        """Hand all keyframes over from the first on, while frames go on with the state that there is."""
+        self._frames, self._stamps, self._again = [], [], 0
+        self._asked.append(_Asked(0, void=True))
+        commands = (self.state.undo, self.state.redo) if self.state is not None else ((), ())
+        self._client.send(LoadCommands(*commands))
+        self._hand_over_again()
+
+    def _hand_over_again(self) -> None:
+        """A few at a time, so that they do not pile up in memory. The last of them brings the state."""
+        while self._again is not None and self._client.pending < MOST_PENDING:
+            if self._again >= min(self._count, len(self._keyframes)):
+                self._again = None
+                self._in_effect = -1
+                self._ask(GoTo(self._count), self._count)
+                return
+            keyframe = self._keyframes[self._again]
+            self._frames.append(keyframe.frame)
+            self._stamps.append(keyframe.stamp_ns)
+            self._asked.append(_Asked(0, void=True))
+            self._client.send(AddKeyframe(keyframe, self._params))
+            self._again += 1

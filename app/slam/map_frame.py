@@ -1,0 +1,50 @@
+"""Where odometry lies in the map: the corrections that loops make, keyframe by keyframe."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from app.slam.loops.corrections import corrected
+from app.slam.trajectory import Trajectory
+from app.slam.types import F64, I64
+
+
+@dataclass(frozen=True, slots=True)
+class MapFrame:
+    """Corrections of keyframes; without any, map and odometry are one.
+
+    Attributes:
+        stamps_ns: (n,) of all keyframes. T_map_odom: (k, 4, 4) at the first k <= n of them; at later
+            ones it is that of the last.
+    """
+
+    stamps_ns: I64 = field(default_factory=lambda: np.empty(0, np.int64))
+    T_map_odom: F64 = field(default_factory=lambda: np.empty((0, 4, 4)))
+
+    def at(self, keyframe: int) -> F64:
+        """(4, 4) T_map_odom at a keyframe."""
+        count = len(self.T_map_odom)
+        return self.T_map_odom[min(keyframe, count - 1)] if count else np.eye(4)
+
+    @property
+    def newest(self) -> F64:
+        """(4, 4) T_map_odom at the last one."""
+        return self.at(len(self.T_map_odom))
+
+    def poses(self, T_odom_imu: F64) -> F64:
+        """(k, 4, 4) T_map_imu of the first k keyframes from their (k, 4, 4) T_odom_imu."""
+        count = min(len(T_odom_imu), len(self.T_map_odom))
+        out = np.empty_like(T_odom_imu)
+        out[:count] = self.T_map_odom[:count] @ T_odom_imu[:count]
+        out[count:] = self.at(count) @ T_odom_imu[count:]
+        return out
+
+    def trajectory(self, odometry: Trajectory) -> Trajectory:
+        """In the map. Between two keyframes the correction goes over from one's to the other's."""
+        if not len(self.T_map_odom) or not len(odometry):
+            return odometry
+        T = np.tile(np.eye(4), (len(odometry), 1, 1))
+        T[:, :3, :3] = odometry.rotations.as_matrix()
+        T[:, :3, 3] = odometry.positions
+        stamps = self.stamps_ns[: len(self.T_map_odom)]
+        return Trajectory.from_poses(odometry.stamps_ns, corrected(odometry.stamps_ns, T, stamps, self.T_map_odom))
