@@ -4,17 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.slam import lie
+from app.slam import lie, rest
 from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
 from app.slam.params import Params
-from app.slam.types import ImuSamples, NavState, Scan
+from app.slam.types import F64, ImuSamples, NavState, Scan
 
-MOVING_GYRO = 0.05
-MOVING_ACCEL = 0.4
-"""Standard deviations (rad/s, m/s²) above which a device is not standing still: ten to thirty times
-the noise of a consumer IMU at 200-500 Hz, and well below any step."""
-LARGEST_BIAS = 0.2
-"""rad/s; an even turn faster than this is a turn and not a gyroscope's bias."""
 LEAST_STILL = 0.3
 """s; a shorter rest says too little about the gyroscope's bias."""
 
@@ -43,33 +37,29 @@ def proceed(still: ImuSamples | None, scan: Scan, samples: ImuSamples, params: P
         samples: IMU samples up to this scan's end.
     """
     together = samples if still is None else _joined(still, samples)
-    if not is_moving(together):
-        rest = (together.stamps_ns[-1] - together.stamps_ns[0]) * 1e-9
-        waiting = bool(rest < params.imu.start_duration)
+    if not rest.is_moving(together):
+        lasted_s = (together.stamps_ns[-1] - together.stamps_ns[0]) * 1e-9
+        waiting = bool(lasted_s < params.imu.start_duration)
         belief = standing(together, scan.end_ns, params)
         return Started(belief, together, waiting, "")
     if still is not None and (still.stamps_ns[-1] - still.stamps_ns[0]) * 1e-9 >= LEAST_STILL:
-        rest = (still.stamps_ns[-1] - still.stamps_ns[0]) * 1e-9
+        lasted_s = (still.stamps_ns[-1] - still.stamps_ns[0]) * 1e-9
         belief = standing(still, int(still.stamps_ns[-1]), params)
-        return Started(belief, still, False, f"Started after only {rest:.1f} s at rest.")
+        return Started(belief, still, False, f"Started after only {lasted_s:.1f} s at rest.")
     notice = "The device was already moving at the start: biases and gravity begin as rough guesses."
     begin_ns = max(scan.stamp_ns, int(samples.stamps_ns[0]))
     return Started(moving(together, begin_ns, params), together, False, notice)
 
 
-def is_moving(imu: ImuSamples) -> bool:
-    """Whether the samples spread more than a device standing still would show, or tell of an even turn."""
-    turning = np.linalg.norm(imu.gyro.mean(axis=0)) > LARGEST_BIAS
-    return bool(turning or np.any(imu.gyro.std(axis=0) > MOVING_GYRO) or np.any(imu.accel.std(axis=0) > MOVING_ACCEL))
-
-
 def standing(imu: ImuSamples, stamp_ns: int, params: Params) -> Belief:
-    """Belief at rest: the gyroscope's mean is its bias, the mean specific force points up."""
+    """Belief at rest: the gyroscope's mean is its bias, the mean specific force is gravity and bias."""
     sigma = _sigma()
-    sigma[VEL] = 0.01
+    sigma[VEL] = rest.TREMOR
     sigma[BG] = 3.0 * np.maximum(imu.gyro.std(axis=0) / np.sqrt(len(imu)), 1e-5)
-    sigma[GRAV] = 0.05 / params.imu.gravity  # as far as an accelerometer bias tilts it
-    return _belief(imu, stamp_ns, imu.gyro.mean(axis=0), sigma, params)
+    sigma[GRAV] = 0.15  # the specific force says how much better it is known, and what that leaves to the bias
+    belief = _belief(imu, stamp_ns, imu.gyro.mean(axis=0), sigma, params)
+    spread = np.maximum(imu.accel.std(axis=0), 1e-3)
+    return rest.level(belief, imu.accel.mean(axis=0), 3.0 * spread / np.sqrt(len(imu)))
 
 
 def moving(imu: ImuSamples, stamp_ns: int, params: Params) -> Belief:
@@ -103,7 +93,21 @@ def _belief(imu: ImuSamples, stamp_ns: int, b_gyro: np.ndarray, sigma: np.ndarra
         R_imu_lidar=lie.from_rpy_degrees(params.sensor.rotation),
         p_imu_lidar=np.array(params.sensor.translation, dtype=np.float64),
     )
-    return Belief(state, np.diag(sigma**2))
+    covariance = np.diag(sigma**2)
+    if params.filter.estimate_extrinsics:
+        covariance = _seen_from_the_lidar(state, covariance)
+    return Belief(state, covariance)
+
+
+def _seen_from_the_lidar(state: NavState, covariance: F64) -> F64:
+    """The first scan makes the map, so it is the LiDAR's pose that defines odom, and the IMU's is as uncertain
+    as the extrinsics between them."""
+    follows = np.eye(DIM)
+    R_odom_imu, R_imu_lidar = state.R_odom_imu, state.R_imu_lidar
+    follows[ROT, EXT_ROT] = -R_imu_lidar
+    follows[POS, EXT_ROT] = -R_odom_imu @ lie.hat(state.p_imu_lidar) @ R_imu_lidar
+    follows[POS, EXT_POS] = -R_odom_imu
+    return np.asarray(follows @ covariance @ follows.T)
 
 
 def _joined(a: ImuSamples, b: ImuSamples) -> ImuSamples:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from app.slam import start
+from app.slam import rest, start
 from app.slam.imu import BG, GRAV, ROT, VEL
 from app.slam.params import Params
 from app.slam.types import Scan
@@ -124,8 +124,8 @@ def test_turning_evenly_is_not_a_rest() -> None:
     """A turntable, or a person turning on the spot: the rates do not scatter, but they are no bias."""
     even = samples(RESTING, 0, 0.1)
     turning = start.ImuSamples(even.stamps_ns, np.add(even.gyro, [0.0, 0.0, 0.6]), even.accel)
-    assert start.is_moving(turning)
-    assert not start.is_moving(even)
+    assert rest.is_moving(turning)
+    assert not rest.is_moving(even)
 
 
 def test_the_mounting_of_the_lidar_is_taken_from_the_parameters() -> None:
