@@ -12,14 +12,16 @@ import viser
 
 from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F32, F64
+from app.ui.colours import Rgb
 from app.ui.loops.kinds import COLOURS, Kind, in_graph, kind_of, name
 
 _RISE: Final = (0.7, 0.12)
 """Height of a knob above the edge's middle: m, and its share of the edge's length."""
 _WIDTH: Final = {Kind.ACCEPTED: 3.0, Kind.CANDIDATE: 2.0, Kind.REJECTED: 1.0, Kind.USER: 3.5}
 _OUT_WIDTH: Final = 1.0
-_KNOB_M: Final = {Kind.ACCEPTED: 0.22, Kind.CANDIDATE: 0.2, Kind.REJECTED: 0.12, Kind.USER: 0.24}
-_CHOSEN: Final = (255, 255, 255)
+_KNOB_M: Final = {Kind.ACCEPTED: 0.16, Kind.CANDIDATE: 0.14, Kind.REJECTED: 0.09, Kind.USER: 0.17}
+_CHOSEN: Final[Rgb] = (255, 255, 255)
+_CHOSEN_WIDTH: Final = 5.0
 _PICK_RAD: Final = np.radians(1.5)
 _LABEL: Final = np.array([0.0, 0.0, 0.5])
 _STILL_M: Final = 1e-3
@@ -80,9 +82,9 @@ class LoopEdges:
         lines = arches(seen, poses)
         self._pickable = ([edge.pair for edge in seen], lines)
         styles = np.array([list(Kind).index(kind_of(edge)) * 2 + in_graph(edge) for edge in seen], dtype=np.int64)
+        marked = np.array([edge.pair == chosen for edge in seen], dtype=np.bool_)
         for number in range(2 * len(Kind)):
-            self._draw_style(list(Kind)[number // 2], bool(number % 2), lines[styles == number])
-        marked = [index for index, edge in enumerate(seen) if edge.pair == chosen]
+            self._draw_style(list(Kind)[number // 2], bool(number % 2), lines[(styles == number) & ~marked])
         self._draw_chosen(name(chosen) if chosen is not None else "", lines[marked])
 
     def pick(self, origin: F64, direction: F64) -> Pair | None:
@@ -95,26 +97,24 @@ class LoopEdges:
         node = f"{self._root}/{kind.replace(' ', '-')}-{'in' if inside else 'out'}"
         if self._differs(node, lines):
             width = _WIDTH[kind] if inside or kind is Kind.CANDIDATE else _OUT_WIDTH
-            self._nodes[node] = self._scene.add_line_segments(
-                node, _legs(lines), COLOURS[kind], thickness=width, thickness_units="screen"
-            )
-            self._nodes[f"{node}-knobs"] = self._scene.add_point_cloud(
-                f"{node}-knobs",
-                np.ascontiguousarray(lines[:, 1]),
-                COLOURS[kind],
-                point_size=_KNOB_M[kind],
-                point_shape="circle",
-            )
+            self._send(node, lines, COLOURS[kind], width, _KNOB_M[kind])
 
     def _draw_chosen(self, text: str, lines: F32) -> None:
         node = f"{self._root}/chosen"
         label = self._nodes.get(f"{node}-label")
         renamed = isinstance(label, viser.LabelHandle) and label.text != text
         if self._differs(node, lines) or (renamed and len(lines)):
-            self._nodes[node] = self._scene.add_line_segments(
-                node, _legs(lines), _CHOSEN, thickness=5.0, thickness_units="screen"
-            )
+            self._send(node, lines, _CHOSEN, _CHOSEN_WIDTH, _KNOB_M[Kind.USER])
             self._nodes[f"{node}-label"] = self._scene.add_label(f"{node}-label", text, position=lines[0, 1] + _LABEL)
+
+    def _send(self, node: str, lines: F32, colour: Rgb, width: float, knob_m: float) -> None:
+        self._nodes[node] = self._scene.add_line_segments(
+            node, _legs(lines), colour, thickness=width, thickness_units="screen"
+        )
+        knobs = np.ascontiguousarray(lines[:, 1])
+        self._nodes[f"{node}-knobs"] = self._scene.add_point_cloud(
+            f"{node}-knobs", knobs, colour, point_size=knob_m, point_shape="circle"
+        )
 
     def _differs(self, node: str, lines: F32) -> bool:
         """Whether a node has to be sent; one of no lines is taken away."""

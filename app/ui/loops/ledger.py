@@ -17,7 +17,8 @@ STYLE: Final = """<style>
 .hs-chips{display:flex;flex-wrap:wrap;gap:5px;padding:4px 10px 6px}
 .hs-toggle{cursor:pointer;border:1px solid;border-radius:10px;padding:0 8px;font-size:11px;line-height:19px;
 user-select:none;white-space:nowrap}.hs-toggle[aria-pressed=false]{opacity:.45;border-style:dashed}
-.hs-scroll{max-height:270px;overflow-y:auto;margin:0 8px 6px;border:1px solid rgba(127,140,160,.25);border-radius:5px}
+.hs-scroll{position:relative;max-height:270px;overflow-y:auto;margin:0 8px 6px;
+border:1px solid rgba(127,140,160,.25);border-radius:5px}
 .hs-table{border-collapse:collapse;width:100%;font-size:11px;font-variant-numeric:tabular-nums;line-height:1.2}
 .hs-table th{position:sticky;top:0;background:#262b33;font-weight:600;color:#aeb8c6;text-align:right;padding:4px 5px;
 cursor:pointer;user-select:none;white-space:nowrap}
@@ -27,6 +28,19 @@ cursor:pointer;user-select:none;white-space:nowrap}
 .hs-table tr[aria-selected=true]{background:rgba(38,166,154,.35)!important}
 .hs-table :focus-visible,.hs-toggle:focus-visible{outline:2px solid #26a69a;outline-offset:-2px}
 </style>"""
+
+
+_KEEP: Final = """
+const box = this.parentNode, row = box.querySelector('[aria-selected=true]');
+box.scrollTop = window.hemislamLedger || 0;
+if (row && row.dataset.hs !== window.hemislamRow) {
+  const low = row.offsetTop - 26, high = row.offsetTop + row.offsetHeight - box.clientHeight;
+  if (box.scrollTop > low) box.scrollTop = low; else if (box.scrollTop < high) box.scrollTop = high;
+}
+window.hemislamRow = row ? row.dataset.hs : '';
+"""
+"""The page puts in the whole table anew at every change: it stays where it was scrolled to, but for showing
+a row that was newly chosen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +130,7 @@ def table(rows: list[LoopEdge], order: Order, chosen: Pair | None) -> str:
         for column, entry in COLUMNS.items()
     )
     body = "".join(_row(edge, edge.pair == chosen) for edge in rows[:MOST_ROWS])
-    # the page puts in the whole table anew at every change: where it was scrolled to is kept outside
-    keep = f'<img src="{ONE_PIXEL}" hidden onload="this.parentNode.scrollTop=window.hemislamLedger||0">'
+    keep = f'<img src="{ONE_PIXEL}" hidden onload="{escape(_KEEP)}">'
     return (
         f'<div class="hs-scroll" onscroll="window.hemislamLedger=this.scrollTop"><table class="hs-table"><thead><tr>'
         f"{heads}</tr></thead><tbody>{body}</tbody></table>{keep}</div>{_remark(rows)}"

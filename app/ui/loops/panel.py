@@ -12,7 +12,7 @@ from app.server.protocol import Command, InspectLoop, Seek, Snapshot
 from app.slam.loops.types import Command as Overrule
 from app.slam.loops.types import LoopEdge, Pair, SetWeight
 from app.slam.types import F64
-from app.ui.html import box, heading
+from app.ui.html import box
 from app.ui.loops import ledger
 from app.ui.loops.bridge import Bridge
 from app.ui.loops.edges import LoopEdges
@@ -68,7 +68,7 @@ class LoopsPanel:
             self._verdict = VerdictPanel(gui, self._proposal.propose, now)
             self._inspector = Inspector(server, f"{root}/submaps", self._go)
         with gui.add_folder("Tie two keyframes by hand", expand_by_default=False):
-            self._tie = TiePanel(server, f"{root}/tie", self._proposal.propose, snapshot, now)
+            self._tie = TiePanel(server, f"{root}/tie", self._proposal.propose, snapshot, self._fly, now)
         with gui.add_folder("Overrulings"):
             self._edits = EditsPanel(gui, send, snapshot)
         with gui.add_folder("How well the graph is met", expand_by_default=False):
@@ -129,7 +129,7 @@ class LoopsPanel:
             self._ledger.content = self._bridge.live(
                 ledger.chips(loops.edges, self._shown) + ledger.table(rows, self._order, self._chosen)
             )
-        self._factors.content = self._bridge.live(heading("Factors") + worst_factors(loops.residuals))
+        self._factors.content = self._bridge.live(worst_factors(loops.residuals))
 
     def _edge(self, snapshot: Snapshot) -> LoopEdge | None:
         """The chosen loop as it is now; nothing is chosen any more when it is gone."""
@@ -186,8 +186,12 @@ class LoopsPanel:
                 self._send(Seek(frame))
         elif what == FLY and snapshot.keyframe_poses is not None and edge.newer < len(snapshot.keyframe_poses):
             ends = snapshot.keyframe_poses[[edge.older, edge.newer], :3, 3]
-            self._look_freely()
-            fly(client, ends.mean(axis=0) + self._offset(), 7.0 + 1.2 * float(np.linalg.norm(ends[1] - ends[0])))
+            self._fly(client, ends.mean(axis=0), 7.0 + 1.2 * float(np.linalg.norm(ends[1] - ends[0])))
+
+    def _fly(self, client: viser.ClientHandle, place: F64, distance: float) -> None:
+        """Take a browser's camera to a place (3,) of the map."""
+        self._look_freely()
+        fly(client, place + self._offset(), distance)
 
     def _committed(self, command: Overrule) -> None:
         self._tie.done()

@@ -20,6 +20,7 @@ from app.ui.widgets import by_user, show
 _REST_S: Final = 0.4
 """The guess is tried when the hand has rested for so long."""
 _PICK, _FIRST, _SECOND = "Pick in the scene", "Click a keyframe …", "Click the other one …"
+_FROM_M: Final = 12.0
 _DOT: Final = (236, 240, 246)
 
 
@@ -27,7 +28,8 @@ class TiePanel:
     """Widgets in the caller's container.
 
     Args:
-        propose: takes the command to be tried. now: monotonic seconds.
+        propose: takes the command to be tried. fly: takes a browser's camera to a place (3,) of the map, to see it
+            from so many metres. now: monotonic seconds.
     """
 
     def __init__(
@@ -36,11 +38,12 @@ class TiePanel:
         root: str,
         propose: Callable[[Add], None],
         snapshot: Callable[[], Snapshot],
+        fly: Callable[[viser.ClientHandle, F64, float], None],
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         gui = server.gui
         self._scene, self._root = server.scene, root
-        self._propose, self._snapshot, self._now = propose, snapshot, now
+        self._propose, self._snapshot, self._fly, self._now = propose, snapshot, fly, now
         self._overlay = Overlay(server.scene, f"{root}/clouds")
         self._gizmo = Gizmo(server.scene, f"{root}/gizmo")
         self._dots: viser.PointCloudHandle | None = None
@@ -63,6 +66,7 @@ class TiePanel:
         self._try = gui.add_button("Try it", icon=viser.Icon.LINK)
         self._problem = gui.add_html("", visible=False)
         self._pick.on_click(by_user(lambda _, __: self._toggle_picking()))
+        self._nudge.on_update(by_user(self._look))
         self._try.on_click(by_user(lambda _, __: self.suggest()))
 
     @property
@@ -149,6 +153,12 @@ class TiePanel:
         nudged = T @ lie.inverse(upright(T_map_newer)) @ T_map_newer
         return rows(lie.inverse(T_map_older) @ nudged)
 
+    def _look(self, nudging: bool, client: viser.ClientHandle) -> None:
+        """To where there is something to nudge."""
+        poses, newer = _poses(self._snapshot()), self.pair[1]
+        if nudging and newer < len(poses):
+            self._fly(client, poses[newer][:3, 3], _FROM_M)
+
     def _toggle_picking(self) -> None:
         self._picked = [] if self._picked is None else None
 
@@ -171,7 +181,7 @@ class TiePanel:
         colours = np.tile(np.array(_DOT, np.uint8), (len(positions), 1))
         colours[list(marked)] = OLDER if len(marked) < 2 else NEWER
         self._dots = self._scene.add_point_cloud(
-            f"{self._root}/keyframes", positions.astype(np.float32), colours, point_size=0.25, point_shape="circle"
+            f"{self._root}/keyframes", positions.astype(np.float32), colours, point_size=0.15, point_shape="circle"
         )
 
 
