@@ -4,9 +4,9 @@ import time
 
 import numpy as np
 
-from app.sensors.live.decoder import Decoder, Frame
+from app.sensors.live.decoder import Decoder
 from app.sensors.live.difop import NOMINAL, Calibration, Difop
-from app.sensors.live.frames import Assembler
+from app.sensors.live.frames import Assembler, Frame
 from app.sensors.live.msop import PacketWriter
 from app.sensors.rsbpearl import BPEARL, BPV4, CHANNELS, Model
 from app.slam.types import Scan

@@ -11,18 +11,22 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from app.sensors.findings import Finding
+from app.sensors.live.capture import SUFFIXES as CAPTURES
+from app.sensors.live.capture import CaptureStream
+from app.sensors.live.pcap import CaptureError
 from app.sensors.mcap_stream import McapStream
 from app.slam.errors import HemislamError
 
-SUFFIXES = (".bag", ".mcap", ".db3")
+SUFFIXES = (".bag", ".mcap", ".db3", *CAPTURES)
 _MAGIC = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
 _REPAIR = {
     ".bag": "`rosbag reindex {path}` repairs it",
     ".mcap": "`mcap recover {path} -o repaired.mcap` saves what is whole",
     ".db3": "`sqlite3 {path} .recover | sqlite3 repaired.db3` saves what is whole",
+    **dict.fromkeys(CAPTURES, "`tcpdump -r {path} -w repaired.pcap` saves what is whole"),
     "": "`ros2 bag reindex {path}` may repair it",
 }
-_KINDS = "a ROS 1 .bag, a ROS 2 folder, an .mcap or a .db3"
+_KINDS = "a ROS 1 .bag, a ROS 2 folder, an .mcap, a .db3, or a .pcap of an RS-Bpearl"
 _FOREVER = 2**63 - 1
 
 
@@ -68,8 +72,8 @@ class Source:
         self.path = path
         self.findings: tuple[Finding, ...] = ()
         files = _recording_files(path)
-        self._reader: AnyReader | McapStream = self._open(files)
-        if isinstance(self._reader, McapStream):
+        self._reader: AnyReader | McapStream | CaptureStream = self._open(files)
+        if isinstance(self._reader, McapStream | CaptureStream):
             counts = self._reader.counts
             self.start_ns, self.end_ns = self._reader.start_ns, self._reader.end_ns
         else:
@@ -104,8 +108,12 @@ class Source:
             stream = self._reader.messages(topics, first, stop)
             known = after.read if after else 0
         else:
-            stream = self._rosbags_messages(self._reader, topics, after.log_ns if after else first, stop)
             known = after.at_log_ns if after else 0
+            first = after.log_ns if after else first
+            if isinstance(self._reader, CaptureStream):
+                stream = self._reader.messages(topics, first, stop)
+            else:
+                stream = self._rosbags_messages(self._reader, topics, first, stop)
         stream = islice(stream, known, None)
         log_ns = self.start_ns
         while True:
@@ -134,7 +142,9 @@ class Source:
         for connection, log_ns, raw in reader.messages(connections, start=start_ns, stop=stop_ns):
             yield connection.topic, log_ns, reader.deserialize(raw, connection.msgtype)
 
-    def _open(self, files: list[Path]) -> AnyReader | McapStream:
+    def _open(self, files: list[Path]) -> AnyReader | McapStream | CaptureStream:
+        if self.path.suffix in CAPTURES:
+            return self._open_capture()
         reader = None
         try:
             reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
@@ -148,6 +158,19 @@ class Source:
             text = f"the folder has no metadata.yaml; its {len(files)} {files[0].suffix} file(s) were read without it"
             self.findings = (Finding("file", "corrected", text),)
         return reader
+
+    def _open_capture(self) -> CaptureStream:
+        try:
+            stream = CaptureStream(self.path)
+        except CaptureError as error:
+            raise HemislamError(f"{self.path} is no capture of a network ({error}); {_KINDS} can be read.") from None
+        if not stream.counts:
+            raise HemislamError(
+                f"{self.path} holds no packets of an RS-Bpearl and no imu-udp datagrams; capture its UDP ports, mostly "
+                "6699 and 7788."
+            )
+        self.findings = stream.findings
+        return stream
 
     def _salvage(self, files: list[Path], why: str) -> McapStream | None:
         """A single MCAP read from front to back, if that yields anything."""
@@ -205,6 +228,8 @@ def _recording_files(path: Path) -> list[Path]:
         raise HemislamError(
             f"{path} can not be opened ({error.strerror}); check the path and its permissions."
         ) from error
+    if path.suffix in CAPTURES:
+        return [path]
     magic = _MAGIC[path.suffix]
     if not start.startswith(magic[: len(start)]):
         other = next((suffix for suffix, known in _MAGIC.items() if start.startswith(known)), None)

@@ -1,35 +1,16 @@
 """A revolution of packets as a `Scan`."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from app.sensors.live.difop import NOMINAL, Calibration, Difop
+from app.sensors.live.frames import Frame
 from app.sensors.live.kernels import decode_blocks
 from app.sensors.live.msop import BLOCK_BYTES, BLOCKS, HEADER_BYTES, TURN
-from app.sensors.rsbpearl import CHANNELS, Model
-from app.slam.types import F64, I64, U8, U16, DroppedScan, Scan
+from app.sensors.rsbpearl import CHANNELS
+from app.slam.types import F64, U16, DroppedScan, Scan
 
 MIN_RANGE_M, MAX_RANGE_M = 0.1, 150.0
 """A packet's distance outside is no return."""
-
-
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """The packets of one revolution, in order of time.
-
-    Attributes:
-        packets: (n, 1248). stamps_ns: (n,) of each packet's first block.
-        first, stop: the revolution begins with this block of the first packet and ends before that
-            one of the last. arrival_ns: when its last packet came, by the host's clock.
-    """
-
-    model: Model
-    packets: U8
-    stamps_ns: I64
-    first: int
-    stop: int
-    arrival_ns: int
 
 
 class Decoder:

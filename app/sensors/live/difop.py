@@ -60,6 +60,14 @@ class Difop:
     reverse: bool = False
     calibration: Calibration | None = None
 
+    def same(self, other: "Difop") -> bool:
+        """Whether nothing that matters to decoding differs."""
+        if self.calibration is None or other.calibration is None:
+            angles = self.calibration is other.calibration
+        else:
+            angles = self.calibration.same(other.calibration)
+        return angles and self.describe() == other.describe()
+
     def describe(self) -> str:
         begin, end = self.fov_deg
         view = "" if (end - begin) % 360.0 == 0.0 else f", {begin:g} to {end:g} deg"

@@ -76,6 +76,8 @@ def packets_of(
 
     for entry in recording.entries():
         if isinstance(entry, ScanEntry):
+            if entry.scan.stamp_ns >= stop_ns + 3e8:
+                break
             if not isinstance(entry.scan, Scan) or entry.scan.stamp_ns >= stop_ns:
                 continue
             firings = firings_of(entry.scan, calibration, model, rate)

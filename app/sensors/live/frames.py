@@ -6,13 +6,14 @@ one are there, so that a packet overtaken on the way still finds its place.
 
 import bisect
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from app.sensors.live.counters import Counters
-from app.sensors.live.decoder import Frame
 from app.sensors.live.msop import BLOCKS, MSOP_ID, PACKET_BYTES, TURN, azimuths_of, index_of, model_of, stamp_of
 from app.sensors.rsbpearl import Model
+from app.slam.types import I64, U8
 
 HOLD = 3
 """Packets of the next revolution to wait for: 2 ms, and the network's reordering is seldom wider."""
@@ -23,6 +24,24 @@ MAX_PACKETS = 1024
 
 Pending = tuple[int, int, bytes]
 """Time of the first block, arrival, packet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The packets of one revolution, in order of time.
+
+    Attributes:
+        packets: (n, 1248). stamps_ns: (n,) of each packet's first block.
+        first, stop: the revolution begins with this block of the first packet and ends before that
+            one of the last. arrival_ns: when its last packet came, by the host's clock.
+    """
+
+    model: Model
+    packets: U8
+    stamps_ns: I64
+    first: int
+    stop: int
+    arrival_ns: int
 
 
 class Assembler:
@@ -85,6 +104,14 @@ class Assembler:
         if self._pending:
             yield self._take(len(self._pending), BLOCKS)
             self._pending, self._first, self._checked = [], 0, 0
+
+    def resume(self, model: Model, first: int, given_ns: int | None) -> None:
+        """Begin as after a revolution that ended before block `first` of the next packet.
+
+        Args:
+            given_ns: time of the last packet that belongs to that one alone.
+        """
+        self._model, self._first, self._given_ns = model, first, given_ns
 
     def pending_since(self) -> int | None:
         """When the newest packet that waits came, by the host's clock; None if none does."""

@@ -61,6 +61,13 @@ def cloud_message(scan: Scan, *, exact: bool = False) -> Any:
     )
 
 
+def empty_cloud(stamp_ns: int) -> Any:
+    """A PointCloud2 without a point, for a revolution that saw nothing."""
+    nothing = np.empty(0)
+    scan = Scan(stamp_ns, np.empty((0, 3), np.float32), *(nothing.astype(kind) for kind in ("i4", "f4", "u2")))
+    return cloud_message(scan, exact=True)
+
+
 def imu_message(stamp_ns: int, gyro: Vector, accel: Vector) -> Any:
     """An Imu in rad/s and m/s^2, without orientation."""
     vector = _TYPES["geometry_msgs/msg/Vector3"]

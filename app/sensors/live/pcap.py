@@ -5,7 +5,7 @@ Written here, since there is no well-kept wheel that keeps file positions, which
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,8 +15,8 @@ MAX_RECORD = 1 << 22
 _FRAGMENTS_KEPT = 64
 """Datagrams of which parts wait for the rest; older ones are given up."""
 
-_ETHERNET, _RAW, _LOOPBACK, _LINUX_COOKED, _LINUX_COOKED2, _RAW_IPV4 = 1, 101, 0, 113, 276, 228
 _TAGS = (0x8100, 0x88A8, 0x9100)
+_IP = (b"\x08\x00", b"\x86\xdd")
 
 
 class CaptureError(ValueError):
@@ -63,8 +63,8 @@ class Capture:
         self._order = "<" if start[:4] in (CLASSIC_MAGIC[0], CLASSIC_MAGIC[2]) else ">"
         self._fraction_ns = 1 if start[:4] in CLASSIC_MAGIC[2:] else 1_000
         self._link = 0 if self._next else int(struct.unpack_from(self._order + "I", start, 20)[0]) & 0xFFFF
-        self._interfaces: list[tuple[int, int, int]] = []
-        """Of a .pcapng: link type, time units in a second, and ns to add; of the present section."""
+        self._sections: dict[int, _Section] = {}
+        """Of a .pcapng, by position; known as far as it was read."""
 
     def datagrams(self, position: int | None = None) -> Iterator[Datagram]:
         """UDP datagrams from a record's position on, or all."""
@@ -102,6 +102,8 @@ class Capture:
         self.complete = False
 
     def _next_records(self, file: BinaryIO) -> Iterator[Record]:
+        begin = file.tell()
+        section = self._sections[max(at for at in self._sections if at <= begin)] if begin else _Section("<")
         while True:
             position = file.tell()
             raw = file.read(8)
@@ -110,44 +112,58 @@ class Capture:
             if len(raw) < 8:
                 break
             if raw[:4] == NEXT_MAGIC:  # a section begins, perhaps in another byte order
-                magic = file.read(4)
-                self._order = "<" if magic == b"\x4d\x3c\x2b\x1a" else ">"
-                if position == 0 or not self._interfaces:
-                    self._interfaces = []
+                order = "<" if file.read(4) == b"\x4d\x3c\x2b\x1a" else ">"
                 file.seek(position + 8)
-            kind, length = struct.unpack(self._order + "2I", raw)
+                section = self._sections.setdefault(position, _Section(order))
+            kind, length = struct.unpack(section.order + "2I", raw)
             if not 12 <= length <= MAX_RECORD or length % 4:
                 break
             body = file.read(length - 8)
             if len(body) < length - 8:
                 break
-            if raw[:4] == NEXT_MAGIC:
-                self._interfaces = []
-            elif kind == 1:
-                self._interfaces.append(self._interface(body))
+            if kind == 1 and raw[:4] != NEXT_MAGIC and len(body) >= 12:
+                section.interfaces.setdefault(position, _interface(body, section.order))
             elif kind == 6 and len(body) >= 24:
-                interface, high, low, captured, _ = struct.unpack_from(self._order + "5I", body)
-                if interface < len(self._interfaces):
-                    link, units, offset_ns = self._interfaces[interface]
-                    time_ns = (high << 32 | low) * 1_000_000_000 // units + offset_ns
-                    yield Record(position, time_ns, link, body[20 : 20 + captured])
+                number, high, low, captured, _ = struct.unpack_from(section.order + "5I", body)
+                if number < len(section.interfaces):
+                    interface = list(section.interfaces.values())[number]
+                    time_ns = (high << 32 | low) * 1_000_000_000 // interface.units + interface.offset_ns
+                    yield Record(position, time_ns, interface.link, body[20 : 20 + captured])
         self.complete = False
 
-    def _interface(self, body: bytes) -> tuple[int, int, int]:
-        link = int(struct.unpack_from(self._order + "H", body)[0])
-        units, offset_s = 1_000_000, 0
-        at = 8
-        while at + 4 <= len(body) - 4:
-            code, length = struct.unpack_from(self._order + "2H", body, at)
-            value = body[at + 4 : at + 4 + length]
-            if code == 0:
-                break
-            if code == 9 and value:  # if_tsresol
-                units = 2 ** (value[0] & 0x7F) if value[0] & 0x80 else 10 ** value[0]
-            elif code == 14 and len(value) == 8:  # if_tsoffset
-                offset_s = int(struct.unpack(self._order + "q", value)[0])
-            at += 4 + (length + 3) // 4 * 4
-        return link, units, offset_s * 1_000_000_000
+
+@dataclass(frozen=True, slots=True)
+class _Interface:
+    """Link type, time units in a second, ns to add."""
+
+    link: int
+    units: int
+    offset_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """Byte order, and interfaces by the position of their block."""
+
+    order: str
+    interfaces: dict[int, _Interface] = field(default_factory=dict)
+
+
+def _interface(body: bytes, order: str) -> _Interface:
+    link = int(struct.unpack_from(order + "H", body)[0])
+    units, offset_s = 1_000_000, 0
+    at = 8
+    while at + 4 <= len(body) - 4:
+        code, length = struct.unpack_from(order + "2H", body, at)
+        value = body[at + 4 : at + 4 + length]
+        if code == 0:
+            break
+        if code == 9 and value:  # if_tsresol
+            units = 2 ** (value[0] & 0x7F) if value[0] & 0x80 else 10 ** min(value[0], 18)
+        elif code == 14 and len(value) == 8:  # if_tsoffset
+            offset_s = int(struct.unpack(order + "q", value)[0])
+        at += 4 + (length + 3) // 4 * 4
+    return _Interface(link, units, offset_s * 1_000_000_000)
 
 
 @dataclass(slots=True)
@@ -169,21 +185,21 @@ def _network_layer(record: Record) -> bytes:
     """The IP packet of a frame; empty if it holds none."""
     data = record.data
     match record.link:
-        case 1:
+        case 1:  # Ethernet
             at = 12
-        case 113:
+        case 113:  # Linux, captured on "any"
             at = 14
-        case 276:
-            return data[20:] if data[:2] in (b"\x08\x00", b"\x86\xdd") else b""
-        case 0 | 108:
+        case 276:  # the same, second version
+            return data[20:] if data[:2] in _IP else b""
+        case 0 | 108:  # BSD loopback
             return data[4:]
-        case 101 | 228 | 229 | 12 | 14:
+        case 12 | 14 | 101 | 228 | 229:  # bare IP
             return data
         case _:
             return b""
     while int.from_bytes(data[at : at + 2], "big") in _TAGS:
         at += 4
-    return data[at + 2 :] if data[at : at + 2] in (b"\x08\x00", b"\x86\xdd") else b""
+    return data[at + 2 :] if data[at : at + 2] in _IP else b""
 
 
 def _udp(record: Record, packet: bytes, fragments: dict[bytes, _Fragments]) -> Datagram | None:

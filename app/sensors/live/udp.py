@@ -7,9 +7,9 @@ import threading
 import time
 from collections import deque
 
-from app.sensors.live.decoder import Decoder, Frame
+from app.sensors.live.decoder import Decoder
 from app.sensors.live.difop import DIFOP_ID, Calibration, Difop, read_difop
-from app.sensors.live.frames import Assembler
+from app.sensors.live.frames import Assembler, Frame
 from app.sensors.live.imu_udp import ImuOrder
 from app.sensors.live.intake import Intake
 from app.slam.errors import HemislamError
@@ -112,7 +112,7 @@ class RsbpearlReceiver:
 
     def _configure(self, said: Difop, now: int, intake: Intake) -> None:
         before, self._device = self._device, said
-        if before is not None and before.describe() == said.describe() and _same(before, said):
+        if before is not None and before.same(said):
             return
         if before is not None:
             self._give(now, intake)  # what came before was measured as it was before
@@ -161,9 +161,3 @@ class ImuReceiver:
                 samples = [s for datagram in _drain(self._socket) for s in self._order.add(datagram)] if ready else []
                 for sample in samples or ([] if ready else self._order.flush()):
                     intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, now)
-
-
-def _same(one: Difop, other: Difop) -> bool:
-    if one.calibration is None or other.calibration is None:
-        return one.calibration is other.calibration
-    return one.calibration.same(other.calibration)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from app.sensors.live.counters import Counters
-from app.sensors.live.decoder import Decoder, Frame
-from app.sensors.live.frames import Assembler
+from app.sensors.live.decoder import Decoder
+from app.sensors.live.frames import Assembler, Frame
 from app.slam.types import Scan
 from tests.sensors.live import sensor
 

@@ -1,0 +1,169 @@
+"""A capture of the sensor's packets is a recording like any other."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.sensors.doctor import examine
+from app.sensors.live.capture import CaptureStream
+from app.sensors.recording import find_recordings, open_recording
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import Measurement
+from tests.sensors.live import captures, sensor
+
+TURNS = 8
+TURN_NS = 1801 * 55_520
+
+
+def imu(number: int, stamp_ns: int) -> bytes:
+    return struct.pack("<4sIq6d", b"HIMU", number, stamp_ns, 0.01 * number, 0, 0, 0, 0, 9.81)
+
+
+def walk(*, host_ns: int = 0, imu_ns: int = 0) -> list[captures.Entry]:
+    """What a network card sees of eight turns. host_ns: its clock is ahead of the LiDAR's; imu_ns: the IMU's is."""
+    entries = [(sensor.START_NS - 1_000, 7788, sensor.difop())]
+    block = 12 * 55_520
+    entries += [(sensor.START_NS + (k + 1) * block, 6699, packet) for k, packet in enumerate(sensor.turns(TURNS))]
+    for number in range(-2, TURNS * 20 + 4):
+        stamp = sensor.START_NS + number * 5_000_000
+        entries.append((stamp + 300_000, 6700, imu(number + 2, stamp + imu_ns)))
+    entries.append((sensor.START_NS + 5_000, 53, b"something else"))
+    return sorted((time + host_ns, port, payload) for time, port, payload in entries)
+
+
+def measurements(path: Path, start_s: float = 0.0) -> list[Measurement]:
+    with open_recording(path, Params()) as recording:
+        return [m for m in recording.measurements(start_s) if isinstance(m, Measurement)]
+
+
+@pytest.mark.parametrize("shape", ["plain", "vlan", "double-vlan", "fragments", "ipv6", "raw", "cooked", "loopback"])
+@pytest.mark.parametrize("kind", ["pcap", "pcapng"])
+def test_every_shape_of_capture_gives_the_same_scans(tmp_path: Path, kind: str, shape: str) -> None:
+    path = tmp_path / f"walk.{kind}"
+    path.write_bytes((captures.pcap if kind == "pcap" else captures.pcapng)(walk(), shape))
+    found = measurements(path)
+    assert [round((m.scan.stamp_ns - sensor.START_NS) / TURN_NS) for m in found] == list(range(TURNS))
+    for turn, m in enumerate(found):
+        assert len(m.scan) == pytest.approx(1801 * 32, abs=13 * 32)
+        assert m.scan.stamp_ns == pytest.approx(sensor.START_NS + turn * TURN_NS, abs=1_000)
+        assert np.median(np.linalg.norm(m.scan.points - [0, 0, 0.094], axis=1)) == pytest.approx(
+            5.0105 + 0.005 * turn, abs=0.002
+        )
+        stamps = m.imu.stamps_ns
+        np.testing.assert_allclose(m.imu.gyro[:, 0], 0.01 * ((stamps - sensor.START_NS) / 5e6 + 2), atol=1e-9)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("kind", ["ns", "us", "pcapng"])
+def test_capture_times_are_read_in_every_unit_and_byte_order(tmp_path: Path, order: str, kind: str) -> None:
+    path = tmp_path / "walk.pcap"
+    entries = walk()
+    if kind == "pcapng":
+        path = tmp_path / "walk.pcapng"
+        path.write_bytes(captures.pcapng(entries, order=order, exponent=6))
+    else:
+        path.write_bytes(captures.pcap(entries, order=order, nanoseconds=kind == "ns"))
+    stream = CaptureStream(path)
+    assert stream.start_ns == pytest.approx(entries[0][0] if entries[0][1] == 6700 else entries[1][0], abs=1_000)
+    assert stream.end_ns == pytest.approx(entries[-1][0], abs=1_000)
+
+
+@pytest.mark.parametrize("shape", ["plain", "fragments"])
+def test_reading_begins_anywhere_as_if_it_had_gone_on(tmp_path: Path, shape: str) -> None:
+    path = tmp_path / "walk.pcapng"
+    path.write_bytes(captures.pcapng(walk(), shape))
+    stream = CaptureStream(path)
+    everything = list(stream.messages(("/rslidar_points", "/imu/data"), 0, 2**62))
+    assert len(everything) == TURNS + TURNS * 20 + 6
+    for at in range(0, len(everything), 7):
+        start = everything[at][1]
+        rest = list(stream.messages(("/rslidar_points", "/imu/data"), start, 2**62))
+        expected = [entry for entry in everything if entry[1] >= start]
+        assert [entry[:2] for entry in rest] == [entry[:2] for entry in expected]
+        for one, other in zip(rest, expected, strict=True):
+            assert one[2].header.stamp == other[2].header.stamp
+            if one[0] == "/rslidar_points":
+                np.testing.assert_array_equal(one[2].data, other[2].data)
+
+
+def test_a_recordings_place_is_taken_up_again(tmp_path: Path) -> None:
+    path = tmp_path / "walk.pcap"
+    path.write_bytes(captures.pcap(walk(), "vlan"))
+    with open_recording(path, Params()) as recording:
+        reading = recording.measurements()
+        for _ in range(3):
+            next(reading)
+        place = reading.place()
+        rest = list(reading)
+        again = list(recording.measurements(after=place))
+    assert len(rest) == len(again) == TURNS - 3
+    for one, other in zip(rest, again, strict=True):
+        assert isinstance(one, Measurement) and isinstance(other, Measurement)
+        np.testing.assert_array_equal(one.scan.points, other.scan.points)
+        np.testing.assert_array_equal(one.imu.stamps_ns, other.imu.stamps_ns)
+
+
+def test_sensors_whose_clocks_disagree_are_put_on_the_captures(tmp_path: Path) -> None:
+    path = tmp_path / "walk.pcap"
+    path.write_bytes(captures.pcap(walk(host_ns=40 * 10**9, imu_ns=40 * 10**9)))
+    found = measurements(path)
+    assert len(found) >= TURNS - 1
+    for m in found:
+        turn = round((m.scan.stamp_ns - 40e9 - sensor.START_NS) / TURN_NS)
+        assert m.scan.stamp_ns == pytest.approx(sensor.START_NS + 40 * 10**9 + turn * TURN_NS, abs=5e6)
+    text = next(f.text for f in examine(path, Params()) if f.subject == "sensor clocks")
+    assert "40.00" in text and "ahead of" in text
+
+
+def test_a_clock_set_on_the_way_does_not_end_the_recording(tmp_path: Path) -> None:
+    half = TURNS // 2 * TURN_NS
+    entries = walk()
+    shifted = []
+    for time, port, payload in entries:
+        if time > sensor.START_NS + half and port == 6700:
+            number, stamp = struct.unpack_from("<Iq", payload, 4)
+            payload = imu(number, stamp - 3600 * 10**9)
+        shifted.append((time, port, payload))
+    path = tmp_path / "walk.pcap"
+    path.write_bytes(captures.pcap(shifted))
+    assert len(measurements(path)) == TURNS
+
+
+def test_a_file_cut_off_is_used_up_to_there(tmp_path: Path) -> None:
+    path = tmp_path / "walk.pcap"
+    whole = captures.pcap(walk())
+    path.write_bytes(whole[: len(whole) * 6 // 10])
+    assert 3 <= len(measurements(path)) < TURNS - 2
+    findings = examine(path, Params())
+    assert any("cut off" in finding.text for finding in findings)
+
+
+def test_what_is_no_capture_of_it_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "x.pcap"
+    for content, words in (
+        (b"hello", "is no capture"),
+        (captures.pcap([(1, 53, b"dns")]), "holds no packets"),
+        (captures.pcap([(sensor.START_NS + k, 6699, p) for k, p in enumerate(sensor.turns(2))]), "no IMU samples"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(HemislamError, match=words):
+            open_recording(path, Params())
+    path.write_bytes(b"")
+    with pytest.raises(HemislamError, match="is empty"):
+        open_recording(path, Params())
+    assert find_recordings(tmp_path) == [path]
+
+
+def test_angles_beside_the_capture_win(tmp_path: Path) -> None:
+    path = tmp_path / "walk.pcap"
+    path.write_bytes(captures.pcap(walk()))
+    (tmp_path / "walk.angles.csv").write_text("".join(f"{e - 0.5:.2f},0\n" for e in sensor.ELEVATIONS))
+    text = next(finding.text for finding in examine(path, Params()) if finding.subject == "angles")
+    assert "walk.angles.csv" in text
+    scan = measurements(path)[0].scan
+    lowest = scan.points[scan.ring == 0]
+    tilt = np.degrees(np.arctan2(lowest[:, 2] - 0.09427, np.hypot(lowest[:, 0], lowest[:, 1]) - 0.01473))
+    assert np.median(tilt) == pytest.approx(2.3125 - 0.5, abs=0.01)
