@@ -23,6 +23,8 @@ NEAR_M = 3.0
 """Beyond the reach of drift, places this far apart still see each other."""
 KEPT_PREPARED = 16
 """Submaps ready for registration that stay in memory, some 1 MB each."""
+KEPT_SUBMAPS = 2
+"""Others; of a keyframe that is looked at one is needed twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +61,10 @@ class Detector:
     def __init__(self, params: Loops) -> None:
         self._half = params.submap_keyframes
         self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS)
-        self._prepared: Recent[tuple[int, int], Prepared] = Recent(KEPT_PREPARED, self._prepare)
+        self._around: Recent[tuple[int, int], Submap] = Recent(KEPT_SUBMAPS, self._make)
+        self._prepared: Recent[tuple[int, int], Prepared] = Recent(
+            KEPT_PREPARED, lambda key: verification.prepare(self._around[key])
+        )
         self._heads: list[Head] = []
         self._contexts: list[ScanContext] = []
 
@@ -99,6 +104,7 @@ class Detector:
     def forget(self) -> None:
         """Forget the clouds beyond where it stands."""
         self._submaps.truncate(len(self))
+        self._around.clear()
         self._prepared.clear()
 
     def close(self) -> None:
@@ -106,7 +112,7 @@ class Detector:
 
     def describe(self, index: int) -> ScanContext:
         """The context of a keyframe, from the keyframes around it that there are."""
-        return scan_context.describe(self._around(index, self._last(index)).points)
+        return scan_context.describe(self._around[index, self._last(index)].points)
 
     def context(self, index: int) -> ScanContext:
         return self._contexts[index] if index < self.described else self.describe(index)
@@ -176,12 +182,10 @@ class Detector:
         """The last keyframe of a submap, of those there are."""
         return min(len(self) - 1, index + self._half)
 
-    def _around(self, index: int, last: int) -> Submap:
+    def _make(self, key: tuple[int, int]) -> Submap:
+        index, last = key
         poses = [head.T_odom_imu for head in self._heads]
         return self._submaps.around(index, poses, max(0, index - self._half), last)
-
-    def _prepare(self, key: tuple[int, int]) -> Prepared:
-        return verification.prepare(self._around(*key))
 
 
 def _wrapped(angle: npt.NDArray[np.float64]) -> F64:

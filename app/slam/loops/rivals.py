@@ -55,7 +55,7 @@ def rival(target: Prepared, source: Prepared, fit: Fit, reach_m: float, allowed:
         meeting[best] = -1.0
         guess = at.copy()
         guess[:2, 3] += dx[best], dy[best]
-        T = register(target, source, guess, coarse=False)
+        T = register(target, source, guess, rough=True)
         apart = float(np.linalg.norm(T[:3, 3] - at[:3, 3]))
         if APART_M / 2 < apart < nearest and allowed(T) and _as_good(assess(target, source, T), fit):
             nearest = apart

@@ -122,6 +122,8 @@ class InlineLoops:
 
 
 def _differs(edge: LoopEdge, before: LoopEdge | None) -> bool:
+    if edge is before:
+        return False
     return (
         before is None
         or (edge.verdict, edge.weight) != (before.verdict, before.weight)

@@ -29,8 +29,8 @@ PASSES = ((1.2, 0.3, 8), (0.5, 0.08, 12))
 """Reach of correspondences, m; residual from which they count less, m; most iterations."""
 ENOUGH = 2e-4
 """Change (rad, m) that ends a pass."""
-MOST_POINTS = 2500
-"""Points of the source that take part; all are judged."""
+MOST_POINTS, FEW_POINTS = 2500, 800
+"""Points of the source that take part, and of those that do where a rough answer is enough; all are judged."""
 PARTNER_M = 0.3
 """A point with another within this distance in the other submap has a partner."""
 COMMON_M = 10.0
@@ -45,7 +45,8 @@ class Prepared:
 
     Attributes:
         points: (n, 3). normals: (n, 3) unit, towards where the point was seen from.
-        flat: (n,) bool. tree: over the points. chosen: indices of flat points that take part as source.
+        flat: (n,) bool. tree: over the points. chosen, few: indices of flat points that take part as
+            source, and of those that do for a rough answer.
     """
 
     submap: Submap
@@ -54,6 +55,7 @@ class Prepared:
     flat: Flags
     tree: small_gicp.KdTree
     chosen: I64
+    few: I64
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,16 +100,22 @@ def prepare(submap: Submap) -> Prepared:
     normals, flat = np.empty_like(points), np.empty(len(points), np.bool_)
     patches.planes(points, np.asarray(index, np.int64), submap.eyes, FLAT_M, normals, flat)
     candidates = np.flatnonzero(flat)
-    step = max(1, -(-len(candidates) // MOST_POINTS))
-    return Prepared(submap, points, normals, flat, tree, candidates[::step])
+    chosen, few = (candidates[:: max(1, -(-len(candidates) // most))] for most in (MOST_POINTS, FEW_POINTS))
+    return Prepared(submap, points, normals, flat, tree, chosen, few)
 
 
-def register(target: Prepared, source: Prepared, T_guess: F64, *, coarse: bool = True) -> F64:
-    """(4, 4) T_target_source of the level frames, by Gauss-Newton with Cauchy weights from a guess."""
+def register(target: Prepared, source: Prepared, T_guess: F64, *, rough: bool = False) -> F64:
+    """(4, 4) T_target_source of the level frames, by Gauss-Newton with Cauchy weights from a guess.
+
+    `rough`: from nearby, to a centimetre or so, in a fraction of the time.
+    """
     T = T_guess.copy()
-    for reach, scale, iterations in PASSES if coarse else PASSES[1:]:
+    coarse, fine = PASSES
+    for (reach, scale, iterations), chosen in (
+        [(fine, source.few)] if rough else [(coarse, source.few), (fine, source.chosen)]
+    ):
         for _ in range(iterations):
-            moved, partner, residual = _correspond(target, source, source.chosen, T, reach)
+            moved, partner, residual = _correspond(target, source, chosen, T, reach)
             if len(moved) < 6:
                 return T
             weight = 1.0 / (1.0 + (residual / scale) ** 2)
@@ -140,7 +148,7 @@ def slide(target: Prepared, source: Prepared, fit: Fit) -> float:
     for sign in (-1.0, 1.0):
         pushed = fit.T_target_source.copy()
         pushed[:3, 3] += sign * DISTURBANCE_M * fit.weakest
-        ends.append(register(target, source, pushed, coarse=False)[:3, 3])
+        ends.append(register(target, source, pushed, rough=True)[:3, 3])
     return float(max(np.linalg.norm(end - fit.T_target_source[:3, 3]) for end in ends))
 
 
