@@ -85,6 +85,8 @@ def run(
             if finding.verdict != "fine":
                 typer.echo(f"{finding.verdict}: {finding.subject}: {finding.text} {finding.option}".rstrip())
         compile_behind_bar()
+        if work.engine.loops:
+            work.engine.loops.wait_ready()
         if overrulings:
             work.overrule(overrulings)
         stop = _process(work)

@@ -189,7 +189,8 @@ def _first_stamp(before: MapFrame, after: MapFrame) -> int | None:
     if not differ.any():
         return None
     index = int(np.argmax(differ))
-    return int(after.stamps_ns[index - 1]) if index else 0
+    longer = max(before, after, key=lambda frame: len(frame.stamps_ns))
+    return int(longer.stamps_ns[index - 1]) if index else 0
 
 
 def _padded(frame: MapFrame, count: int) -> F64:

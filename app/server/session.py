@@ -270,7 +270,7 @@ class Session:
         loops = self._run.engine.loops if self._run is not None else None
         if self._run is None or loops is None:
             return None
-        if self._desk.update(loops):
+        if self._desk.update(loops) and not self._page_behind:
             self._page.map_moved(self._run)
         return None if loops.idle else POLL_S
 

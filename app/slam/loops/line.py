@@ -92,7 +92,7 @@ class LoopLine:
         Returns:
             Candidates that are new by it or have another verdict.
         """
-        due = bisect_right(self._frames, frame - self._latency, hi=self._count)
+        due = bisect_right(self._frames, frame - self._latency, hi=min(self._count, len(self._frames)))
         while self._again is None and self._in_effect < due:
             if self._arrived:
                 self._in_effect, state = self._arrived.popleft()
@@ -141,6 +141,13 @@ class LoopLine:
     def finish(self) -> None:
         """The walk has ended: look for loops of the last keyframes too, and let all take effect that comes."""
         self._ask(Finish(), None)
+
+    def wait_ready(self) -> None:
+        """Wait until the work can begin, so that no frame has to: a process of its own takes a second to start."""
+        self._asked.append(_Asked(0, void=True))
+        self._client.send(GoTo(0))
+        while self._asked and self._receive(None):
+            pass
 
     # --- the user --------------------------------------------------------------------------------
     def command(self, request: Request) -> None:
@@ -253,7 +260,7 @@ class LoopLine:
 
     def _begin_again(self) -> None:
         """Hand all keyframes over from the first on, while frames go on with the state that there is."""
-        self._frames, self._stamps, self._again = [], [], 0
+        self._again = 0
         self._asked.append(_Asked(0, void=True))
         commands = (self.state.undo, self.state.redo) if self.state is not None else ((), ())
         self._client.send(LoadCommands(*commands))
@@ -268,8 +275,9 @@ class LoopLine:
                 self._ask(GoTo(self._count), self._count)
                 return
             keyframe = self._keyframes[self._again]
-            self._frames.append(keyframe.frame)
-            self._stamps.append(keyframe.stamp_ns)
+            if self._again == len(self._frames):  # another engine had it
+                self._frames.append(keyframe.frame)
+                self._stamps.append(keyframe.stamp_ns)
             self._asked.append(_Asked(0, void=True))
             self._client.send(AddKeyframe(keyframe, self._params))
             self._again += 1

@@ -1,0 +1,151 @@
+"""Loops of the recording that ships, through a session: found beside the frames, overruled, taken back, replayed."""
+
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_rewind import SAMPLE, Desk
+from typer.testing import CliRunner
+
+from app.__main__ import cli
+from app.sensors.presets import resolve_params
+from app.server.protocol import (
+    InspectLoop,
+    OverruleLoop,
+    Pause,
+    Play,
+    RedoLoop,
+    Save,
+    Seek,
+    SetSpeed,
+    Snapshot,
+    TryLoop,
+    UndoLoop,
+)
+from app.server.run import open_run
+from app.slam.loops import edits
+from app.slam.loops.types import Accept, LoopEdge, Reject, SetWeight, Verdict
+from app.slam.results import LOOP_FILES
+
+FILES = ("trajectory.tum", *LOOP_FILES)
+LAST = 498
+
+
+class Walk(Desk):
+    """The whole recording, walked to its end."""
+
+    def __init__(self) -> None:
+        super().__init__(resolve_params(SAMPLE, None, None, []), open_run, SAMPLE)
+
+    def settle(self) -> None:
+        """Until nothing is awaited any more, of the loops' process neither."""
+        deadline = time.monotonic() + 60
+        while (wait := self.session.work()) is not None:
+            assert time.monotonic() < deadline
+            time.sleep(wait)
+
+    def saved(self, folder: Path) -> dict[str, bytes]:
+        assert not self.do(Save(folder)).saved[-1].error
+        return {name: (folder / name).read_bytes() for name in FILES}
+
+    def end(self) -> Snapshot:
+        return self.do(Pause(), Seek(LAST - 5), SetSpeed(math.inf), Play())
+
+
+@pytest.fixture(scope="module")
+def walk() -> Iterator[Walk]:
+    walk = Walk()
+    walk.end()
+    yield walk
+    walk.session.close()
+
+
+@pytest.fixture(scope="module")
+def files(walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """As saved at the end, nothing overruled."""
+    return walk.saved(tmp_path_factory.mktemp("never_stopped"))
+
+
+def accepted(snapshot: Snapshot) -> list[LoopEdge]:
+    return [edge for edge in snapshot.loops.edges if edge.verdict is Verdict.ACCEPTED]
+
+
+def test_the_walk_ends_where_it_began_and_that_is_found(walk: Walk) -> None:
+    snapshot = walk.end()
+    assert len(accepted(snapshot)) >= 3
+    assert all(edge.newer - edge.older > 50 for edge in accepted(snapshot))
+    assert not np.array_equal(snapshot.result.T_map_odom, np.eye(4))
+
+
+def test_back_and_on_again_gives_the_same_files(walk: Walk, files: dict[str, bytes], tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    for frame in [*rng.integers(0, LAST, 4).tolist(), 480, 5]:
+        snapshot = walk.do(Seek(frame))
+        assert snapshot.trajectory is not None and len(snapshot.trajectory) == frame + 1
+        assert all(edge.decided_at < len(snapshot.chunks) for edge in snapshot.loops.edges)
+    walk.end()
+    assert walk.saved(tmp_path) == files
+
+
+def test_before_a_loop_is_found_the_map_is_where_odometry_has_it(walk: Walk) -> None:
+    early = walk.do(Seek(200))
+    assert not accepted(early)
+    np.testing.assert_array_equal(early.result.T_map_odom, np.eye(4))
+    walk.end()
+
+
+def test_all_rejected_leaves_odometry_and_undone_leaves_nothing(
+    walk: Walk, files: dict[str, bytes], tmp_path: Path
+) -> None:
+    before = walk.end()
+    loops = accepted(before)
+    after = walk.do(*(OverruleLoop(Reject(*edge.pair)) for edge in loops))
+    assert not accepted(after) and len(after.loops.undo) == len(loops)
+    np.testing.assert_array_equal(after.result.T_map_odom, np.eye(4))
+    assert after.trajectory is not None and before.trajectory is not None
+    moved = np.linalg.norm(after.trajectory - before.trajectory, axis=1)
+    assert moved.max() > 1e-4
+    back = walk.do(*(UndoLoop() for _ in loops))
+    assert len(accepted(back)) == len(loops) and len(back.loops.redo) == len(loops)
+    assert walk.saved(tmp_path / "undone") == files
+
+
+def test_the_file_of_what_was_done_in_the_page_repeats_it_headless(walk: Walk, tmp_path: Path) -> None:
+    loops = accepted(walk.end())
+    snapshot = walk.do(
+        OverruleLoop(Reject(*loops[0].pair)),
+        OverruleLoop(SetWeight(*loops[-1].pair, 0.1)),
+        OverruleLoop(Accept(*loops[0].pair)),
+        UndoLoop(),
+        RedoLoop(),
+        UndoLoop(),
+    )
+    path = tmp_path / "edits.yaml"
+    path.write_text(edits.write(snapshot.loops.undo))
+    ours = walk.saved(tmp_path / "page")
+    walk.do(UndoLoop(), UndoLoop())
+    result = CliRunner().invoke(cli, ["run", str(SAMPLE), "--loops", str(path), "--out", str(tmp_path / "headless")])
+    assert result.exit_code == 0, result.output
+    assert {name: (tmp_path / "headless" / name).read_bytes() for name in FILES} == ours
+
+
+def test_a_loop_can_be_looked_at_and_a_command_tried_without_doing_it(walk: Walk) -> None:
+    before = walk.end()
+    edge = accepted(before)[0]
+    seen = walk.do(InspectLoop(edge.pair))
+    assert seen.loops.inspected is not None and seen.loops.inspected[0] == edge.pair
+    assert len(seen.loops.inspected[1].older) > 100 and seen.loops.residuals
+    tried = walk.do(TryLoop(Reject(*edge.pair)))
+    assert tried.loops.tried is not None and tried.loops.tried[0] == Reject(*edge.pair)
+    assert tried.loops.edges == before.loops.edges and not tried.loops.undo
+    assert walk.do(TryLoop(None), InspectLoop(None)).loops.tried is None
+
+
+def test_what_can_not_be_done_is_said_and_changes_nothing(walk: Walk) -> None:
+    before = walk.end()
+    after = walk.do(OverruleLoop(SetWeight(*accepted(before)[0].pair, -1.0)))
+    assert after.notices[-1].level == "error" and "weight" in after.notices[-1].text
+    assert after.loops.edges == before.loops.edges

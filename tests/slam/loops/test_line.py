@@ -1,0 +1,223 @@
+"""When what was found takes effect: at a frame that depends on nothing but the walk."""
+
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from app.slam.keyframes import KeyframeStore
+from app.slam.loops.line import MOST_DEATHS, LoopLine
+from app.slam.loops.messages import (
+    AddKeyframe,
+    Failure,
+    GoTo,
+    LoadCommands,
+    LoopState,
+    LoopWorkerDied,
+    Overrule,
+    Reply,
+    Request,
+)
+from app.slam.loops.types import Accept, Command, Evidence, LoopEdge, Verdict
+from app.slam.params import Loops
+from app.slam.types import Cloud, Keyframe
+
+LATENCY = 5
+EVERY = 3  # frames between keyframes
+
+
+class Client:
+    """Finds with every keyframe a loop that shifts the map by as many metres as there are keyframes.
+
+    Answers once `answered` is raised, or at once when somebody waits for it.
+    """
+
+    def __init__(self) -> None:
+        self.requests: list[Request] = []
+        self.added: list[int] = []
+        self.answered = 0
+        self.waits = 0
+        self.dead = False
+        self._pending: deque[Reply] = deque()
+        self._commands: tuple[Command, ...] = ()
+
+    @property
+    def pending(self) -> int:
+        return len(self._pending)
+
+    def send(self, request: Request) -> None:
+        self.requests.append(request)
+        match request:
+            case AddKeyframe(keyframe, _):
+                self.added.append(keyframe.index)
+                count = keyframe.index + 1
+            case GoTo(count, _):
+                pass
+            case Overrule(command):
+                count, self._commands = len(self.added), (*self._commands, command)
+            case LoadCommands(commands, _):
+                count, self._commands = 0, commands
+            case _:
+                count = len(self.added)
+        self._pending.append(state(count, self._commands))
+
+    def receive(self, timeout: float | None = None) -> Reply | None:
+        if self.dead:
+            raise LoopWorkerDied("It is gone.")
+        if not self._pending:
+            return None
+        if timeout is None:
+            self.waits += 1
+        elif not self.answered:
+            return None
+        else:
+            self.answered -= 1
+        return self._pending.popleft()
+
+    def close(self) -> None:
+        pass
+
+
+def state(count: int, commands: tuple[Command, ...] = ()) -> LoopState:
+    shifted = np.tile(np.eye(4), (count, 1, 1))
+    shifted[:, 0, 3] = count
+    found = (edge(count - 1),) if count else ()
+    return LoopState(count, count, False, shifted, found, found, commands, (), ())
+
+
+def edge(newer: int) -> LoopEdge:
+    return LoopEdge(0, newer, newer, np.eye(4), np.eye(6), Verdict.ACCEPTED, "it fits", Evidence())
+
+
+class Walk:
+    """Every third frame is a keyframe; the first is frame 0."""
+
+    def __init__(self) -> None:
+        self.store = KeyframeStore()
+        self.clients: list[Client] = []
+        self.line = LoopLine(self._client, self.store, Loops(latency=LATENCY))
+        self.frame = 0
+
+    def _client(self) -> Client:
+        self.clients.append(Client())
+        return self.clients[-1]
+
+    @property
+    def client(self) -> Client:
+        return self.clients[-1]
+
+    def step(self) -> tuple[tuple[LoopEdge, ...], float]:
+        """The next frame: loops that came into effect, and the map's shift."""
+        news = self.line.due(self.frame)
+        if self.frame % EVERY == 0:
+            keyframe = a_keyframe(len(self.store), self.frame)
+            self.store.append(keyframe)
+            self.line.add(keyframe, Loops())
+        self.frame += 1
+        return news, float(self.line.frame.newest[0, 3])
+
+    def go_to(self, frame: int) -> None:
+        self.frame = frame
+        self.store.truncate(-(-frame // EVERY))
+        self.line.go_to(frame)
+
+
+def a_keyframe(index: int, frame: int) -> Keyframe:
+    none = Cloud(*(np.zeros(shape, dtype) for shape, dtype in CLOUD))
+    return Keyframe(index, frame, 100 * frame, np.eye(4), np.eye(4), np.eye(6), none)
+
+
+CLOUD = (((0, 3), np.float32), (0, np.uint8), (0, np.float32), (0, np.uint16), (0, np.int32))
+
+
+@pytest.fixture
+def walk() -> Iterator[Walk]:
+    walk = Walk()
+    yield walk
+    walk.store.close()
+
+
+def shift_at(frame: int) -> int:
+    """Keyframes that are `LATENCY` frames past at a frame."""
+    return 0 if frame < LATENCY else (frame - LATENCY) // EVERY + 1
+
+
+@pytest.mark.parametrize("speed", [0, 1, 100])
+def test_a_loop_takes_effect_at_its_frame_however_fast_the_work_is(walk: Walk, speed: int) -> None:
+    for frame in range(40):
+        walk.client.answered = speed
+        news, shift = walk.step()
+        assert shift == shift_at(frame)
+        assert [e.newer for e in news] == ([shift - 1] if shift != shift_at(frame - 1) else [])
+    assert bool(walk.client.waits) == (speed == 0)
+
+
+def test_nobody_waits_for_work_that_is_done_in_time(walk: Walk) -> None:
+    for _ in range(30):
+        walk.client.answered = 1
+        walk.step()
+    assert walk.client.waits == 0
+
+
+@pytest.mark.parametrize("frame", [1, 7, 20, 28])
+def test_gone_back_and_on_again_every_frame_is_as_it_was(walk: Walk, frame: int) -> None:
+    before = [walk.step() for _ in range(30)]
+    sent = len(walk.client.added)
+    walk.go_to(frame)
+    again = [walk.step() for _ in range(frame, 30)]
+    assert [shift for _, shift in again] == [shift for _, shift in before[frame:]]
+    assert len(walk.client.added) == sent, "what is known is not handed over twice"
+
+
+def test_a_walk_that_goes_on_differently_hands_its_keyframes_over_anew(walk: Walk) -> None:
+    for _ in range(30):
+        walk.step()
+    walk.go_to(10)
+    walk.line.forget_after(9)
+    walk.client.added.clear()
+    for _ in range(10, 20):
+        walk.step()
+    assert walk.client.added == [4, 5, 6]
+
+
+def test_a_command_takes_effect_when_it_is_answered_and_holds(walk: Walk) -> None:
+    for _ in range(10):
+        walk.step()
+    walk.line.command(Overrule(Accept(0, 2)))
+    assert not walk.line.idle
+    walk.client.answered = 10
+    walk.line.poll()
+    assert walk.line.idle and walk.line.state is not None
+    assert walk.line.state.undo == (Accept(0, 2),)
+    for _ in range(20):
+        walk.step()
+    assert walk.line.state.undo == (Accept(0, 2),)
+
+
+def test_work_that_died_is_begun_again_with_all_keyframes_and_commands(walk: Walk) -> None:
+    for _ in range(20):
+        walk.step()
+    walk.line.command(Overrule(Accept(0, 2)))
+    walk.client.answered = 100
+    walk.line.poll()
+    walk.client.dead = True
+    walk.line.poll()
+    for _ in range(30):
+        walk.step()
+        walk.client.answered = 100
+    assert len(walk.clients) == 2
+    assert walk.client.added[:5] == [0, 1, 2, 3, 4]
+    assert walk.line.state is not None and walk.line.state.undo == (Accept(0, 2),)
+    assert walk.line.frame.newest[0, 3] == shift_at(walk.frame - 1)
+    assert any("started again" in notice for notice in walk.line.take_notices())
+
+
+def test_work_that_keeps_dying_is_given_up_and_frames_go_on(walk: Walk) -> None:
+    for _ in range(60):
+        walk.client.dead = True
+        walk.step()
+    assert len(walk.clients) == MOST_DEATHS + 1
+    assert any("stay as they are" in notice for notice in walk.line.take_notices())
+    walk.line.command(Overrule(Accept(0, 2)))
+    assert any(isinstance(answer, Failure) for answer in walk.line.take_answers())
