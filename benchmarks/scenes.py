@@ -21,6 +21,11 @@ def long_recording() -> Path:
     return _simulated("long.mcap", "outdoor", 600.0, seed=5, every_block=24)
 
 
+def walk_in_laps() -> Path:
+    """Eight minutes round and round a building, with one azimuth of 6: over 1,000 keyframes, most of them revisits."""
+    return _simulated("laps.mcap", "building", 480.0, seed=3, every_block=6)
+
+
 def _simulated(name: str, scene: str, duration_s: float, *, seed: int, every_block: int = 1) -> Path:
     path = FOLDER / name
     if not path.exists():
