@@ -4,6 +4,7 @@ Its graph is none: the more loops count, the nearer keyframes lie to where they 
 enough to tell whether the page shows what it is given and sends what it is told.
 """
 
+import functools
 import itertools
 from dataclasses import replace
 
@@ -86,19 +87,41 @@ def _building(rng: np.random.Generator) -> np.ndarray:
     return np.concatenate(parts)
 
 
+def _near(T_map_imu: np.ndarray, points: np.ndarray, reach: float, ahead: bool = False) -> np.ndarray:
+    away = points - T_map_imu[:3, 3]
+    near = np.linalg.norm(away, axis=1) < reach
+    if ahead:
+        near &= away @ (T_map_imu[:3, 0] * [1, 1, 0]) > 0
+    return np.asarray(points[near])
+
+
+def _chunk(index: int, T_map_imu: np.ndarray, building: np.ndarray) -> Chunk:
+    T_imu_map = lie.inverse(T_map_imu)
+    points = np.random.default_rng(index).permutation(_near(T_map_imu, building, 7.0, ahead=True))[:700]
+    local = (points @ T_imu_map[:3, :3].T + T_imu_map[:3, 3]).astype(np.float32)
+    labels = (points[:, 2] < 0.03).astype(np.uint8)
+    n = len(local)
+    stamp = START_NS + 600_000_000 * index
+    return Chunk(index, 6 * index, stamp, local, labels, np.full(n, 30, np.float32), np.zeros(n, np.uint16), np.eye(4))
+
+
+@functools.cache
+def _world() -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[Pair, LoopEdge], tuple[Chunk, ...]]:
+    """True and drifting poses, the building's points, what was found, and the keyframes' points."""
+    rng = np.random.default_rng(3)
+    truth, building = _walk(), _building(rng)
+    chunks = tuple(_chunk(index, T, building) for index, T in enumerate(truth))
+    return truth, _drifting(truth), building, _found(truth, rng), chunks
+
+
 class LoopEngine(FakeEngine):
     """Two laps that are done, with 6 loops accepted, 3 waiting and 20 rejected."""
 
     def __init__(self) -> None:
         super().__init__(columns=30, frames=6 * KEYFRAMES, truth=False)
-        rng = np.random.default_rng(3)
-        self.truth = _walk()
-        self.odometry = _drifting(self.truth)
-        self._points = _building(rng)
+        self.truth, self.odometry, self._points, self._found, chunks = _world()
         self._done: list[loops.Command] = []
         self._undone: list[loops.Command] = []
-        self._found = _found(self.truth, rng)
-        chunks = tuple(self._chunk(index) for index in range(KEYFRAMES))
         frame = chunks[-1].frame
         self.publish(
             chunks=chunks,
@@ -118,7 +141,7 @@ class LoopEngine(FakeEngine):
         def laid(T: np.ndarray) -> np.ndarray:
             return np.asarray(self.level(older) @ T @ lie.inverse(self.level(newer)))
 
-        submaps = [self._near(index, 8.0) - self.truth[index][:3, 3] for index in (older, newer)]
+        submaps = [_near(self.truth[index], self._points, 8.0) - self.truth[index][:3, 3] for index in (older, newer)]
         contexts = [scan_context.describe(points.astype(np.float32)) for points in submaps]
         cells = [np.where(context.seen, context.cells, np.float32(np.nan)) for context in contexts]
         spread = 0.012 if edge.verdict is Verdict.ACCEPTED else 0.06
@@ -135,25 +158,6 @@ class LoopEngine(FakeEngine):
         )
 
     # --- inside ------------------------------------------------------------------------------
-    def _near(self, index: int, reach: float, ahead: bool = False) -> np.ndarray:
-        away = self._points - self.truth[index][:3, 3]
-        near = np.linalg.norm(away, axis=1) < reach
-        if ahead:
-            near &= away @ (self.truth[index][:3, 0] * [1, 1, 0]) > 0
-        return self._points[near]
-
-    def _chunk(self, index: int) -> Chunk:
-        T_imu_map = lie.inverse(self.truth[index])
-        points = self._near(index, 7.0, ahead=True)
-        points = np.random.default_rng(index).permutation(points)[:700]
-        local = (points @ T_imu_map[:3, :3].T + T_imu_map[:3, 3]).astype(np.float32)
-        labels = (points[:, 2] < 0.03).astype(np.uint8)
-        n = len(local)
-        stamp = START_NS + 600_000_000 * index
-        return Chunk(
-            index, 6 * index, stamp, local, labels, np.full(n, 30, np.float32), np.zeros(n, np.uint16), np.eye(4)
-        )
-
     def _obey(self, command: Command) -> None:
         view = self.snapshot.loops
         match command:

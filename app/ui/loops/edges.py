@@ -113,7 +113,7 @@ class LoopEdges:
         )
         knobs = np.ascontiguousarray(lines[:, 1])
         self._nodes[f"{node}-knobs"] = self._scene.add_point_cloud(
-            f"{node}-knobs", knobs, colour, point_size=knob_m, point_shape="circle"
+            f"{node}-knobs", knobs, colour, point_size=knob_m, point_shape="circle", precision="float32"
         )
 
     def _differs(self, node: str, lines: F32) -> bool:

@@ -92,7 +92,12 @@ class Overlay:
                 old.remove()
             return
         self._nodes[name] = self._scene.add_point_cloud(
-            f"{self._root}/{name}", points[:_MOST_POINTS], colour, point_size=point_size, point_shape="circle"
+            f"{self._root}/{name}",
+            points[:_MOST_POINTS],
+            colour,
+            point_size=point_size,
+            point_shape="circle",
+            precision="float32",  # a fit is judged by centimetres, and half a float has two of them at 20 m
         )
 
 

@@ -155,9 +155,10 @@ class LoopsPanel:
                 self._shown = self._shown ^ {Kind(kind)}
             case ["sort", column] if column in ledger.COLUMNS:
                 self._order = self._order.clicked(column)
-            case ["choose", pair]:
-                older, newer = (int(index) for index in pair.split())
-                self.choose(None if (older, newer) == self._chosen else (older, newer))
+            case ["choose", text]:
+                named = {f"{edge.older} {edge.newer}": edge.pair for edge in self._snapshot().loops.edges}
+                if text in named:
+                    self.choose(None if named[text] == self._chosen else named[text])
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         """A click in the scene."""

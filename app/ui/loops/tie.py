@@ -181,7 +181,12 @@ class TiePanel:
         colours = np.tile(np.array(_DOT, np.uint8), (len(positions), 1))
         colours[list(marked)] = OLDER if len(marked) < 2 else NEWER
         self._dots = self._scene.add_point_cloud(
-            f"{self._root}/keyframes", positions.astype(np.float32), colours, point_size=0.15, point_shape="circle"
+            f"{self._root}/keyframes",
+            positions.astype(np.float32),
+            colours,
+            point_size=0.15,
+            point_shape="circle",
+            precision="float32",
         )
 
 
