@@ -188,7 +188,7 @@ watch(); draw();
 
 STYLE: Final = """<style>
 .hs-tl{position:relative;padding:0 0 4px;user-select:none}.hs-tl canvas{display:block;width:100%;touch-action:none}
-.hs-tl.wide{background:rgba(20,25,32,.88);border:1px solid rgba(127,140,160,.25);border-radius:6px;padding:2px 0}
+.hs-tl.wide{background:rgba(20,25,32,.95);border:1px solid rgba(127,140,160,.25);border-radius:6px;padding:2px 0}
 .hs-tl button{position:absolute;right:6px;top:2px;border:0;background:none;color:#8b97a8;cursor:pointer;font-size:13px;
 line-height:16px;padding:0 3px}.hs-tl button:hover{color:#fff}
 </style>"""

@@ -28,6 +28,7 @@ from app.ui.notices import NoticePanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.readouts import ReadoutPanel
 from app.ui.scene import ROOT, Scene
+from app.ui.study import StudyPanel
 from app.ui.timeline import TimelinePanel
 from app.ui.transport import TransportPanel
 from app.ui.view import View
@@ -95,6 +96,8 @@ class Workbench:
             add_yaml_buttons(gui, lambda: engine.snapshot.params, engine.send)
         with tabs.add_tab("View", viser.Icon.EYE):
             self._appearance = AppearancePanel(gui)
+        with tabs.add_tab("Study", viser.Icon.MICROSCOPE):
+            self._study = StudyPanel(server, ROOT, lambda: engine.snapshot, lambda: self._scene.offset, now)
         with tabs.add_tab("Files", viser.Icon.FOLDER):
             self._files = FilesPanel(gui, folders, results, engine.send, lambda: engine.snapshot)
         with tabs.add_tab("Help", viser.Icon.HELP):
@@ -151,7 +154,8 @@ class Workbench:
 
     def draw(self, current: Snapshot) -> None:
         """Bring the page up to `current`: at once what a user waits for, the rest no faster than one can see."""
-        now, view, drawn = self._now(), self._loops.seen(self._appearance.view), self._drawn
+        now, drawn = self._now(), self._drawn
+        view = self._study.seen(self._loops.seen(self._appearance.view))
         self._transport.tick(current)
         self._timeline.draw(current)
         self._breakpoints.tick(current)
@@ -159,6 +163,7 @@ class Workbench:
         self._notices.draw(current)
         self._header.draw(current)
         self._loops.tick(current, view)
+        self._study.tick(current, view)
         news = drawn is None or drawn.revision != current.revision
         awaited = drawn is not None and _changed_by_user(drawn, current)
         due = now - self._scene_drawn_at >= _SCENE_PERIOD_S

@@ -1,0 +1,126 @@
+"""One frame under the glass: each point's numbers, a point's neighbours and their plane, files of all of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.slam.lie import quaternion
+from app.slam.types import F32, F64, I64, StepResult
+
+VERTEX = np.dtype(
+    [
+        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("offset", "<i4"),
+        ("label", "u1"), ("distance", "<f4"), ("angle", "<f4"),
+    ]
+)  # fmt: skip
+"""x y z: m, LiDAR frame at the scan's end. offset: ns after the first point. label: 0 not ground, 1 ground,
+2 seed. distance: m, signed, above the ground plane; nan without one. angle: degrees to "down"."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointNumbers:
+    """Of n points.
+
+    Attributes:
+        range: (n,) m. angle: (n,) rad between the point and "down".
+        distance: (n,) m above (+) or below (-) the ground plane; nan where no plane was fitted.
+    """
+
+    range: F64
+    angle: F64
+    distance: F64
+
+
+def point_numbers(points: F32, result: StepResult) -> PointNumbers:
+    """Numbers of (n, 3) points in the LiDAR frame of a result, by its ground plane, accepted or not."""
+    exact, ground = points.astype(np.float64), result.ground
+    reach = np.linalg.norm(exact, axis=1)
+    cosine = exact @ ground.down / np.maximum(reach, 1e-9)
+    return PointNumbers(
+        range=reach,
+        angle=np.arccos(np.clip(cosine, -1.0, 1.0)),
+        distance=(exact - ground.centroid) @ ground.normal,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A plane through some points.
+
+    Attributes:
+        indices: (k,) of the points, nearest first. center: (3,) m. normal: (3,) unit, towards the sensor.
+        variances: (3,) m², of the points along the patch's axes, greatest first; the last is across the plane.
+        radius: m to the farthest of the points from the first.
+    """
+
+    indices: I64
+    center: F64
+    normal: F64
+    variances: F64
+    radius: float
+
+
+def neighbourhood(points: F32, index: int, count: int) -> Patch:
+    """The `count` points nearest to one of (n, 3), itself first, and the plane through them by their principal axes."""
+    offsets = points.astype(np.float64) - points[index]
+    squared = np.einsum("ij,ij->i", offsets, offsets)
+    count = min(count, len(points))
+    nearest = np.argpartition(squared, count - 1)[:count]
+    nearest = nearest[np.argsort(squared[nearest], kind="stable")]
+    near = points[nearest].astype(np.float64)
+    center = near.mean(axis=0)
+    values, vectors = np.linalg.eigh((near - center).T @ (near - center) / count)
+    normal = vectors[:, 0] * -(np.sign(vectors[:, 0] @ center) or 1.0)
+    return Patch(
+        indices=nearest.astype(np.int64),
+        center=center,
+        normal=normal,
+        variances=np.maximum(values[::-1], 0.0),
+        radius=float(np.sqrt(squared[nearest[-1]])),
+    )
+
+
+# --- files ---------------------------------------------------------------------------------------
+def vertices(result: StepResult) -> np.ndarray:
+    """All points of a frame with all they carry, as `VERTEX`."""
+    cloud = result.cloud
+    numbers = point_numbers(cloud.points, result)
+    table = np.empty(len(cloud), dtype=VERTEX)
+    table["x"], table["y"], table["z"] = cloud.points.T
+    table["intensity"], table["ring"], table["offset"] = cloud.intensity, cloud.ring, cloud.offsets_ns
+    table["label"], table["distance"], table["angle"] = cloud.labels, numbers.distance, np.degrees(numbers.angle)
+    return table
+
+
+_PLY = {"<f4": "float", "<u2": "ushort", "<i4": "int", "|u1": "uchar"}
+_UNITS = "x y z distance in m, offset in ns, angle in degrees; label 0 not ground, 1 ground, 2 seed"
+
+
+def ply(result: StepResult) -> bytes:
+    """A frame as a binary PLY file, in the LiDAR frame; a comment tells its pose in the map."""
+    table = vertices(result)
+    properties = "".join(f"property {_PLY[table.dtype[name].str]} {name}\n" for name in table.dtype.names or ())
+    pose = " ".join(f"{value:.9g}" for value in (result.T_map_imu @ result.state.T_imu_lidar)[:3].ravel())
+    header = (
+        f"ply\nformat binary_little_endian 1.0\ncomment hemislam frame {result.index}, {result.stamp_ns} ns\n"
+        f"comment {_UNITS}\ncomment T_map_lidar, rows: {pose}\n"
+        f"element vertex {len(table)}\n{properties}end_header\n"
+    )
+    return header.encode("ascii") + table.tobytes()
+
+
+def pcd(result: StepResult) -> bytes:
+    """The same as a binary PCD file; its viewpoint is the pose of the LiDAR in the map."""
+    table = vertices(result)
+    kinds = [table.dtype[name] for name in table.dtype.names or ()]
+    T = result.T_map_imu @ result.state.T_imu_lidar
+    x, y, z, w = quaternion(T[:3, :3])
+    viewpoint = " ".join(f"{value:.9g}" for value in (*T[:3, 3], w, x, y, z))
+    header = (
+        f"# hemislam frame {result.index}, {result.stamp_ns} ns; {_UNITS}\n"
+        f"VERSION 0.7\nFIELDS {' '.join(table.dtype.names or ())}\n"
+        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}\n"
+        f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}\nCOUNT {' '.join('1' for _ in kinds)}\n"
+        f"WIDTH {len(table)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {len(table)}\nDATA binary\n"
+    )
+    return header.encode("ascii") + table.tobytes()
