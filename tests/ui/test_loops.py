@@ -384,7 +384,7 @@ def test_edits_are_saved_and_given_again(page: Page) -> None:
     for command in commands:
         page.engine.send(OverruleLoop(command))
     files: dict[str, bytes] = {}
-    browser: Any = SimpleNamespace(send_file_download=lambda name, content: files.update({name: content}))
+    browser: Any = SimpleNamespace(send_file_download=lambda name, content, **_: files.update({name: content}))
     page.loops._edits._download(browser)
     assert edits.read(files["edits.yaml"].decode()) == commands
     page.engine.sent.clear()

@@ -179,7 +179,8 @@ class EditsPanel:
         self._save.disabled = not count
 
     def _download(self, client: viser.ClientHandle) -> None:
-        client.send_file_download("edits.yaml", edits.write(self._snapshot().loops.undo).encode())
+        text = edits.write(self._snapshot().loops.undo)
+        client.send_file_download("edits.yaml", text.encode(), save_immediately=True)
 
     def _load(self, content: bytes, client: viser.ClientHandle | None) -> None:
         try:

@@ -1,0 +1,142 @@
+"""Loops in a real Chromium: clicks on HTML that reach the server, clicks in the scene, and the keys."""
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import viser
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from app.server.folders import Folders
+from app.server.protocol import InspectLoop, OverruleLoop, RedoLoop, TryLoop, UndoLoop
+from app.slam.loops.types import Reject
+from app.ui.workbench import Workbench
+from tests.browser.test_page import _ARGS, _SLOW_MS
+from tests.ui.fake_loops import LoopEngine
+
+GOOD = (12, 89)
+UP = np.array([12.0, 6.9, 38.0])
+"""Where the camera is: high above the middle of the building."""
+
+
+@dataclass
+class Bench:
+    workbench: Workbench
+    engine: LoopEngine
+    page: Page
+
+    def eventually(self, holds: Callable[[], bool], seconds: float = 60.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not holds():
+            assert time.monotonic() < deadline, "it did not come about in time"
+            self.page.wait_for_timeout(50)
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None and "CI" in os.environ:
+        pytest.fail("CI must have chromium")
+    if path is None:
+        pytest.skip("needs chromium")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=list(_ARGS))
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def bench(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    engine = LoopEngine()
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    workbench = Workbench(server, engine, Folders([tmp_path_factory.mktemp("recordings")]))
+    server.initial_camera.position, server.initial_camera.look_at = tuple(UP), (12.0, 7.0, 0.0)
+    workbench.start()
+    page = chromium.new_page(viewport={"width": 1280, "height": 900})
+    page.set_default_timeout(_SLOW_MS)
+    page.goto(f"http://127.0.0.1:{server.get_port()}/")
+    page.get_by_role("tab", name="Loops").click()
+    expect(page.get_by_text("accepted 6")).to_be_visible(timeout=_SLOW_MS)
+    yield Bench(workbench, engine, page)
+    workbench.close()
+    engine.close()
+    server.stop()
+
+
+def test_chips_rows_and_heads_of_the_ledger_can_be_clicked(bench: Bench) -> None:
+    page = bench.page
+    expect(page.locator("tr[aria-selected]")).to_have_count(9)
+    page.get_by_role("button", name="rejected 20").click()
+    expect(page.locator("tr[aria-selected]")).to_have_count(29)
+    page.get_by_text("over %").click()
+    expect(page.get_by_text("over %▴")).to_be_visible()
+    page.get_by_role("button", name="rejected 20").click()
+    expect(page.locator("tr[aria-selected]")).to_have_count(9)
+    page.locator("tr[aria-selected]", has_text="12–89").click()
+    expect(page.get_by_text("keyframes 12–89")).to_be_visible()
+    expect(page.get_by_text("Points over their distance")).to_be_visible()
+    assert bench.engine.sent == [InspectLoop(GOOD)]
+    page.locator("tr[aria-selected]", has_text="12–89").press("Enter")
+    expect(page.get_by_text("keyframes 12–89")).to_have_count(0)
+
+
+def test_an_arch_can_be_clicked_in_the_scene(bench: Bench) -> None:
+    page, poses = bench.page, bench.engine.snapshot.keyframe_poses
+    assert poses is not None
+    # the knob above the middle, through a camera that looks straight down at the middle of the canvas
+    middle = poses[list(GOOD), :3, 3].mean(axis=0)
+    knob = middle + np.array([0.0, 0.0, 0.7 + 0.12 * np.linalg.norm(np.diff(poses[list(GOOD), :3, 3], axis=0))])
+    box = page.evaluate(
+        "() => { const size = (c) => c.width * c.height; const all = [...document.querySelectorAll('canvas')];"
+        " const b = all.sort((a, c) => size(c) - size(a))[0].getBoundingClientRect();"
+        " return [b.x, b.y, b.width, b.height]; }"
+    )
+    focal = box[3] / 2 / np.tan(np.radians(30.0))
+    depth = UP[2] - knob[2]
+    x = box[0] + box[2] / 2 + focal * (knob[0] - 12.0) / depth
+    y = box[1] + box[3] / 2 - focal * (knob[1] - 7.0) / depth
+    page.mouse.click(x, y)
+    bench.eventually(lambda: bench.workbench._loops.chosen == GOOD)
+    expect(page.get_by_text("keyframes 12–89")).to_be_visible()
+
+
+def test_a_loop_is_rejected_undone_and_rejected_again(bench: Bench) -> None:
+    page = bench.page
+    bench.engine.sent.clear()
+    page.get_by_role("button", name="Reject it").click()
+    expect(page.get_by_text("Keyframes would move by up to")).to_be_visible()
+    page.get_by_role("button", name="Commit").click()
+    expect(page.get_by_role("button", name="Undo: reject 12–89")).to_be_visible()
+    bench.eventually(lambda: OverruleLoop(Reject(*GOOD)) in bench.engine.sent)
+    assert bench.engine.sent[0] == TryLoop(Reject(*GOOD))
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("Control+z")
+    expect(page.get_by_role("button", name="Redo: reject 12–89")).to_be_visible()
+    page.keyboard.press("Control+Shift+Z")
+    expect(page.get_by_role("button", name="Undo: reject 12–89")).to_be_visible()
+    assert bench.engine.sent.count(UndoLoop()) == bench.engine.sent.count(RedoLoop()) == 1
+
+
+def test_edits_are_downloaded_as_the_command_line_takes_them(bench: Bench) -> None:
+    with bench.page.expect_download() as download:
+        bench.page.get_by_role("button", name="Save edits (1)").click()
+    assert download.value.suggested_filename == "edits.yaml"
+    assert "- reject: [12, 89]" in download.value.path().read_text()
+
+
+def test_flying_to_a_loop_brings_its_submaps_before_the_camera(bench: Bench) -> None:
+    page = bench.page
+    (client,) = bench.workbench._server.get_clients().values()
+    page.get_by_role("button", name="fly there").click()
+    poses = bench.engine.snapshot.keyframe_poses
+    assert poses is not None
+    middle = poses[list(GOOD), :3, 3].mean(axis=0)
+    bench.eventually(lambda: bool(np.linalg.norm(client.camera.look_at - middle) < 0.3))
+    bench.eventually(lambda: bool(np.linalg.norm(client.camera.position - middle) < 12.0))
+    if folder := os.environ.get("HEMISLAM_SCREENSHOTS"):
+        page.wait_for_timeout(1500)
+        page.screenshot(path=f"{folder}/loops.png")
