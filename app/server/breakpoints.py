@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, fields
 
 from app.slam.errors import HemislamError
-from app.slam.loops.types import LoopEdge, Pair, Verdict
+from app.slam.loops.types import Origin, Verdict
 from app.slam.types import StepResult
 
 
@@ -51,11 +51,10 @@ LIMITS = ("planarity", "residual", "frame_ms", "error")
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """A frame as the breakpoints see it: its result, its error to the truth (m; nan), all loops known then."""
+    """A frame as the breakpoints see it: its result, and its error to the truth (m; nan)."""
 
     result: StepResult
     error: float = math.nan
-    loops: tuple[LoopEdge, ...] = ()
 
 
 def reasons(breakpoints: Breakpoints, before: Moment | None, now: Moment) -> tuple[str, ...]:
@@ -66,7 +65,7 @@ def reasons(breakpoints: Breakpoints, before: Moment | None, now: Moment) -> tup
     """
     held = _states(breakpoints, before) if before is not None else {}
     begun = (text for name, text in _states(breakpoints, now).items() if name not in held)
-    return (*begun, *_events(breakpoints, before, now))
+    return (*begun, *_events(breakpoints, now.result))
 
 
 def _states(limits: Breakpoints, moment: Moment) -> dict[str, str]:
@@ -89,14 +88,13 @@ def _states(limits: Breakpoints, moment: Moment) -> dict[str, str]:
     return held
 
 
-def _events(wanted: Breakpoints, before: Moment | None, now: Moment) -> list[str]:
+def _events(wanted: Breakpoints, result: StepResult) -> list[str]:
     texts = []
-    if wanted.dropped and now.result.dropped:
-        scans = "1 scan was" if now.result.dropped == 1 else f"{now.result.dropped} scans were"
+    if wanted.dropped and result.dropped:
+        scans = "1 scan was" if result.dropped == 1 else f"{result.dropped} scans were"
         texts.append(f"{scans} left out just before this frame.")
-    known: dict[Pair, Verdict] = {edge.pair: edge.verdict for edge in before.loops} if before is not None else {}
-    for edge in now.loops:
-        if known.get(edge.pair) is edge.verdict:
+    for edge in result.loops:
+        if edge.overruled or edge.origin is Origin.USER:  # that is no news to the user
             continue
         between = f"between keyframes {edge.older} and {edge.newer}"
         if wanted.loop_found and edge.verdict is Verdict.ACCEPTED:

@@ -14,7 +14,7 @@ from app.server.protocol import Pause, Play, Seek, SetBreakpoints, SetSpeed, Sna
 from app.server.run import Run
 from app.server.session import Session
 from app.slam.errors import HemislamError
-from app.slam.loops.types import Evidence, LoopEdge, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.params import Params
 from app.slam.types import ImuSamples, Scan, StepResult
 
@@ -82,20 +82,24 @@ def test_scans_left_out_pause_every_time() -> None:
     assert reasons(Breakpoints(dropped=True), now, Moment(GOOD)) == ()
 
 
-def test_a_loop_pauses_once_with_its_verdict() -> None:
-    accepted, rejected = edge(Verdict.ACCEPTED), edge(Verdict.REJECTED, 11)
-    before, now = Moment(GOOD, loops=(rejected,)), Moment(GOOD, loops=(rejected, accepted))
+def test_a_loop_pauses_at_the_frame_at_which_it_takes_effect_and_says_why() -> None:
+    result = frame(loops=(edge(Verdict.REJECTED, 11), edge(Verdict.ACCEPTED), edge(Verdict.CANDIDATE, 12)))
     found, turned_down = Breakpoints(loop_found=True), Breakpoints(loop_rejected=True)
-    assert [text[:39] for text in reasons(found, before, now)] == ["Loop found between keyframes 2 and 9: o"]
-    assert reasons(turned_down, before, now) == () == reasons(found, now, now)
-    assert len(reasons(turned_down, Moment(GOOD), now)) == 1
+    before = Moment(GOOD)
+    assert reasons(found, before, Moment(result)) == (
+        "Loop found between keyframes 2 and 9: overlap 0.2 is below 0.5.",
+    )
+    assert reasons(turned_down, before, Moment(result)) == (
+        "Loop rejected between keyframes 2 and 11: overlap 0.2 is below 0.5.",
+    )
+    assert reasons(found, Moment(result), Moment(GOOD)) == ()
 
 
-def test_a_loop_that_waited_pauses_when_it_is_decided() -> None:
-    waiting, decided = edge(Verdict.CANDIDATE), edge(Verdict.ACCEPTED)
-    both = Breakpoints(loop_found=True, loop_rejected=True)
-    assert reasons(both, Moment(GOOD), Moment(GOOD, loops=(waiting,))) == ()
-    assert len(reasons(both, Moment(GOOD, loops=(waiting,)), Moment(GOOD, loops=(decided,)))) == 1
+def test_the_users_own_word_on_a_loop_pauses_nothing() -> None:
+    overruled = replace(edge(Verdict.ACCEPTED), overruled=True)
+    added = replace(edge(Verdict.ACCEPTED), origin=Origin.USER)
+    result = frame(loops=(overruled, added))
+    assert reasons(Breakpoints(loop_found=True), Moment(GOOD), Moment(result)) == ()
 
 
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
