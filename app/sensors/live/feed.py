@@ -2,6 +2,7 @@
 
 import heapq
 import math
+import queue
 import socket
 import threading
 import time
@@ -65,13 +66,13 @@ def packets_of(
     calibration = angles or fit_angles(first, model, rate)
     difop = Difop(rpm=60 * rate, serial="68656d690001", calibration=calibration)
     writer = PacketWriter(model)
-    queue: list[Sent] = []
+    waiting: list[Sent] = []
     number = samples = 0
     device_ns = 0
 
     def push(time_ns: int, stream: int, data: bytes) -> None:
         nonlocal number
-        heapq.heappush(queue, Sent(time_ns, number, stream, data))
+        heapq.heappush(waiting, Sent(time_ns, number, stream, data))
         number += 1
 
     for entry in recording.entries():
@@ -87,16 +88,16 @@ def packets_of(
                 device_ns = entry.scan.stamp_ns
                 push(device_ns, DEVICE, write_difop(difop, device_ns))
             until = entry.scan.end_ns
-            while queue and queue[0].time_ns <= until:
-                yield heapq.heappop(queue)
+            while waiting and waiting[0].time_ns <= until:
+                yield heapq.heappop(waiting)
         elif entry.stamp_ns < stop_ns + 2e8:
             sample = ImuSample(samples, entry.stamp_ns, entry.gyro, entry.accel)
             samples += 1
             push(entry.stamp_ns, IMU, write_imu(sample))
     for time_ns, packet in writer.flush():
         push(time_ns, LIDAR, packet)
-    while queue:
-        yield heapq.heappop(queue)
+    while waiting:
+        yield heapq.heappop(waiting)
 
 
 def feed(
@@ -137,7 +138,7 @@ def _feed_packets(recording: Recording, to: Address, imu_to: Address, pace: Pace
     angles = read_angles(Path(to.options["angles"])) if "angles" in to.options else None
     count = 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for sent in _paced(packets_of(recording, duration_s, angles=angles), pace):
+        for sent in _paced(_ahead(packets_of(recording, duration_s, angles=angles), pace.stop), pace):
             try:
                 sender.sendto(sent.data, peers[sent.stream])
             except ConnectionRefusedError:  # nobody receives there yet
@@ -174,6 +175,47 @@ def _messages_of(source: Source, topics: tuple[str, str], duration_s: float | No
     for number, (topic, log_ns, message) in enumerate(source.messages(topics, None, stop_ns)):
         channel, kind = kinds[topic]
         yield Sent(log_ns, number, channel, messages.serialised(message, kind))
+
+
+def _ahead(items: Iterator[Sent], stop: threading.Event) -> Iterator[Sent]:
+    """The same, made ahead on another thread: making one scan's packets must not delay another's."""
+    made: queue.Queue[Sent | BaseException | None] = queue.Queue(4_000)
+    done = threading.Event()
+
+    def put(item: Sent | BaseException | None) -> None:
+        while not (done.is_set() or stop.is_set()):
+            try:
+                return made.put(item, timeout=0.2)
+            except queue.Full:
+                continue
+        return None
+
+    def make() -> None:
+        try:
+            for item in items:
+                put(item)
+                if done.is_set() or stop.is_set():
+                    return
+            put(None)
+        except BaseException as error:  # raised again where the items are used
+            put(error)
+
+    thread = threading.Thread(target=make, daemon=True, name="feed")
+    thread.start()
+    try:
+        while not stop.is_set():
+            try:
+                item = made.get(timeout=0.2)
+            except queue.Empty:
+                continue
+            if item is None:
+                return
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        done.set()
+        thread.join()
 
 
 def _paced(items: Iterator[Sent], pace: Pace) -> Iterator[Sent]:

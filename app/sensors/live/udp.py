@@ -18,8 +18,8 @@ from app.slam.types import Scan
 BUFFER_BYTES = 16 << 20
 """Asked of the kernel, so that nothing is lost while this process is busy; it may grant less."""
 _DRAIN = 128
-_REST_NS = 60_000_000
-"""Packets wait so long for the rest of their revolution."""
+_REST_NS = 300_000_000
+"""Packets wait so long for the rest of their revolution: only the last one before a silence ever does."""
 _DEVICE_WAIT_NS = 1_500_000_000
 """The device tells its angles once a second; scans wait for them at the start."""
 

@@ -1,0 +1,122 @@
+"""A recording played out over real sockets arrives as the file has it."""
+
+import contextlib
+import math
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.sensors.live.feed import Pace, feed, packets_of
+from app.sensors.live.source import Event
+from app.sensors.live.urls import open_live, parse_address
+from app.sensors.presets import resolve_params
+from app.sensors.recording import open_recording
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import Measurement
+from tests.sensors.live import ports
+
+MUSEUM = Path(__file__).resolve().parents[3] / "sample_data" / "museum.mcap"
+SECONDS = 2.5
+
+
+@pytest.fixture(scope="module")
+def params() -> Params:
+    return resolve_params(MUSEUM, None, None, [])
+
+
+@pytest.fixture(scope="module")
+def filed(params: Params) -> list[Measurement]:
+    with open_recording(MUSEUM, params) as recording:
+        return [m for m in recording.measurements(0, SECONDS) if isinstance(m, Measurement)]
+
+
+@contextlib.contextmanager
+def feeding(params: Params, to: str, imu_to: str | None = None, speed: float = 1.0) -> Iterator[None]:
+    stop = threading.Event()
+    thread = threading.Thread(
+        target=feed,
+        args=(MUSEUM, params, parse_address(to), parse_address(imu_to) if imu_to else None),
+        kwargs={"pace": Pace(speed, stop), "duration_s": SECONDS, "wait_s": 20.0},
+    )
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+def pairs(events: list[Event], filed: list[Measurement]) -> list[tuple[Measurement, Measurement]]:
+    """Each with the file's, by time; all but the last few that were still to come."""
+    got = ports.measurements(events)
+    assert len(got) >= len(filed) - 2
+    by_time = {round(m.scan.end_ns / 1e7): m for m in filed}
+    return [(m, by_time[round(m.scan.end_ns / 1e7)]) for m in got]
+
+
+def test_as_packets_the_same_but_for_the_packets_steps(
+    params: Params, filed: list[Measurement], tmp_path: Path
+) -> None:
+    msop, difop, imu = ports.free(3)
+    url, beside = f"rsbpearl://127.0.0.1:{msop},{difop}", f"imu-udp://127.0.0.1:{imu}"
+    record = tmp_path / "session.mcap"
+    with open_live(url, params, beside, record) as source, feeding(params, url, beside):
+        events = ports.collect(source, lambda e: len(ports.measurements(e)) >= len(filed) - 1)
+        state = source.state()
+    for live, file in pairs(events, filed):
+        assert len(live.scan) == len(file.scan)
+        distance = np.linalg.norm(live.scan.points - file.scan.points, axis=1)
+        assert (
+            np.median(distance) < 0.0025 and distance.max() < 0.010
+        )  # half a step, and what rounding to 1/256 m hides
+        times = [m.scan.stamp_ns + m.scan.offsets_ns.astype(np.int64) for m in (live, file)]
+        assert np.abs(times[0] - times[1]).max() < 12_000
+        np.testing.assert_array_equal(live.scan.ring, file.scan.ring)
+        np.testing.assert_array_equal(live.scan.intensity, file.scan.intensity)
+        np.testing.assert_array_equal(live.imu.stamps_ns, file.imu.stamps_ns)
+        np.testing.assert_array_equal(live.imu.gyro, file.imu.gyro)
+        np.testing.assert_array_equal(live.imu.accel, file.imu.accel)
+    counters = state.counters
+    assert (counters.lost, counters.late, counters.dropped, counters.imu_lost) == (0, 0, 0, 0)
+    assert state.lidar_hz == pytest.approx(10.0, rel=0.3) and state.imu_hz == pytest.approx(200.0, rel=0.3)
+    assert state.offset_s == pytest.approx(0.0, abs=0.1) and state.clock == "sensor"
+    with open_recording(record, params) as recording:
+        recorded = [m for m in recording.measurements() if isinstance(m, Measurement)]
+    assert len(recorded) >= len(ports.measurements(events))
+    for live, again in zip(ports.measurements(events), recorded, strict=False):
+        np.testing.assert_array_equal(again.scan.points, live.scan.points)
+        assert abs(again.scan.stamp_ns - live.scan.stamp_ns) < 300  # f64 seconds, as drivers have it
+        np.testing.assert_array_equal(again.imu.accel, live.imu.accel)
+        np.testing.assert_array_equal(again.imu.stamps_ns, live.imu.stamps_ns)
+
+
+def test_through_foxglove_the_same_to_the_bit(params: Params, filed: list[Measurement]) -> None:
+    (port,) = ports.free(1)
+    url = f"foxglove://127.0.0.1:{port}"
+    with feeding(params, url, speed=2.0), open_live(url, params) as source:
+        events = ports.collect(source, lambda e: len(ports.measurements(e)) >= len(filed) - 2)
+    for live, file in pairs(events, filed):
+        assert live.scan.stamp_ns == file.scan.stamp_ns
+        for name in ("points", "offsets_ns", "intensity", "ring", "truth_ground"):
+            np.testing.assert_array_equal(getattr(live.scan, name), getattr(file.scan, name))
+        for name in ("stamps_ns", "gyro", "accel"):
+            np.testing.assert_array_equal(getattr(live.imu, name), getattr(file.imu, name))
+
+
+def test_another_lidars_recording_is_no_rsbpearls(shared_data: Path) -> None:
+    path = shared_data / "garage_hdl32e.mcap"
+    with open_recording(path, Params()) as recording, pytest.raises(HemislamError, match="not those of an RS-Bpearl"):
+        list(packets_of(recording))
+
+
+def test_nobody_comes_or_nothing_says_where_the_imu_goes(params: Params) -> None:
+    (port,) = ports.free(1)
+    with pytest.raises(HemislamError, match="Nobody came"):
+        feed(MUSEUM, params, parse_address(f"foxglove://127.0.0.1:{port}"), wait_s=0.1)
+    with pytest.raises(HemislamError, match="--imu-to"):
+        feed(MUSEUM, params, parse_address("rsbpearl://127.0.0.1:1,2"), pace=Pace(math.inf))
