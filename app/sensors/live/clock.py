@@ -77,23 +77,30 @@ class ClockMap:
 
 @dataclass(slots=True)
 class OffsetEstimate:
-    """How far one sensor's stamps lag behind their arrival: the least and the median of the last ones.
+    """By how much the IMU's stamps lag behind the LiDAR's, judged by what came at the same moment.
 
-    The difference of two sensors' is the offset of their clocks, up to their drivers' delays.
+    So it holds whatever the speed at which a recording is played out. Good to the drivers' delays.
     """
 
-    _delays: deque[int] = field(default_factory=lambda: deque(maxlen=400))
+    _imu: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=2_000))
+    _lags: deque[int] = field(default_factory=lambda: deque(maxlen=50))
 
-    def add(self, stamp_ns: int, arrival_ns: int) -> None:
-        self._delays.append(arrival_ns - stamp_ns)
+    def add_imu(self, stamp_ns: int, arrival_ns: int) -> None:
+        self._imu.append((arrival_ns, stamp_ns))
 
-    def __len__(self) -> int:
-        return len(self._delays)
+    def add_scan(self, end_ns: int, arrival_ns: int) -> None:
+        for arrived, stamp in reversed(self._imu):
+            if arrived <= arrival_ns:
+                if arrival_ns - arrived < JUMP_NS:
+                    self._lags.append(end_ns - stamp)
+                return
 
     def clear(self) -> None:
-        self._delays.clear()
+        self._imu.clear()
+        self._lags.clear()
 
-    def delay_s(self) -> float:
-        """Median; the offset of clocks is judged by it as for recordings."""
-        ordered = sorted(self._delays)
-        return ordered[len(ordered) // 2] / 1e9
+    def seconds(self) -> float | None:
+        """Median over the last scans; None while there are not three."""
+        if len(self._lags) < 3:
+            return None
+        return sorted(self._lags)[len(self._lags) // 2] / 1e9

@@ -21,8 +21,8 @@ from app.sensors.live.status import Kind, LiveState, Status
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan
 
-MAX_BACKLOG = 10
-"""Scans that may wait for the engine: a second of them."""
+MAX_BACKLOG = 20
+"""Scans that may wait for the engine: two seconds of them at 10 Hz, and more than are held back at the start."""
 MAX_WAITING = 600_000
 """IMU samples and news that may wait: twenty minutes at 500 Hz. If there are more, nobody reads any longer."""
 _SETTLE_NS = 1_000_000_000
@@ -81,7 +81,7 @@ class Intake:
         self._held: deque[LiveScan | LiveImu] | None = deque()
         self._suspect: LiveImu | None = None
         self._maps = {"LiDAR": ClockMap(), "IMU": ClockMap()}
-        self._offsets = {"LiDAR": OffsetEstimate(), "IMU": OffsetEstimate()}
+        self._offset = OffsetEstimate()
         self._arrivals: dict[str, deque[int]] = {"LiDAR": deque(maxlen=50), "IMU": deque(maxlen=1000)}
         self._accel_scale = 1.0
 
@@ -90,13 +90,15 @@ class Intake:
     def put_scan(self, scan: Scan | DroppedScan, arrival_ns: int) -> None:
         with self._changed:
             if isinstance(scan, Scan):
-                self._seen("LiDAR", scan.end_ns, arrival_ns)
+                self._offset.add_scan(scan.end_ns, arrival_ns)
+                self._arrivals["LiDAR"].append(arrival_ns)
             self._put(LiveScan(scan, arrival_ns))
 
     def put_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, arrival_ns: int) -> None:
         with self._changed:
             stamp_ns += round(self._params.recording.imu_time_offset * 1e9)
-            self._seen("IMU", stamp_ns, arrival_ns)
+            self._offset.add_imu(stamp_ns, arrival_ns)
+            self._arrivals["IMU"].append(arrival_ns)
             self._put(LiveImu(stamp_ns, gyro, accel, arrival_ns))
 
     def put_status(self, kind: Kind, sensor: Literal["LiDAR", "IMU", "source"], text: str) -> None:
@@ -125,7 +127,6 @@ class Intake:
         now = time.time_ns()
         with self._changed:
             ages = {name: (now - times[-1]) / 1e9 if times else None for name, times in self._arrivals.items()}
-            both = all(len(offset) > 2 for offset in self._offsets.values())
             return LiveState(
                 counters=replace(self.counters),
                 lidar_hz=_rate(self._arrivals["LiDAR"], now),
@@ -134,15 +135,11 @@ class Intake:
                 imu_age_s=ages["IMU"],
                 backlog=len(self._scans),
                 clock="" if self._held is not None else self._clock,
-                offset_s=self._offset_s() if both else None,
+                offset_s=self._offset.seconds(),
                 sensor=self.sensor,
             )
 
     # --- under the lock --------------------------------------------------------------------------
-
-    def _seen(self, name: str, stamp_ns: int, arrival_ns: int) -> None:
-        self._offsets[name].add(stamp_ns, arrival_ns)
-        self._arrivals[name].append(arrival_ns)
 
     def _put(self, entry: LiveScan | LiveImu) -> None:
         if self._held is None:
@@ -184,11 +181,8 @@ class Intake:
         self._settle_clock()
         return True
 
-    def _offset_s(self) -> float:
-        return self._offsets["IMU"].delay_s() - self._offsets["LiDAR"].delay_s()
-
     def _settle_clock(self) -> None:
-        offset = self._offset_s()
+        offset = self._offset.seconds() or 0.0
         apart = abs(offset) > TOLERANCE_S
         wrong = f"the IMU's stamps are {abs(offset):.3f} s {'behind' if offset > 0 else 'ahead of'} the LiDAR's"
         if self._clock == "auto":
@@ -242,7 +236,7 @@ class Intake:
         mapped = clock_map.map(stamp_ns, arrival_ns, other)
         if clock_map.jumped_at_ns != before:
             self.counters.jumps += 1
-            self._offsets[name].clear()
+            self._offset.clear()
             self._tell(
                 "jump", name, f"the {name}'s clock was set by {clock_map.jump_ns / 1e9:+.3f} s; its time goes on"
             )
