@@ -88,8 +88,8 @@ class Recorder:
                     self._file.flush()
                     os.fsync(self._file.fileno())
                     self.bytes_written = self._file.tell()
-        except OSError as error:
-            self.failure = f"{self.path} can not be written any more ({error.strerror})"
+        except (OSError, ValueError) as error:
+            self.failure = f"{self.path} can not be written any more ({getattr(error, 'strerror', None) or error})"
             self._waiting.clear()
 
     def _channel(self, topic: str, msgtype: str) -> int:

@@ -1,0 +1,130 @@
+"""A live session on disk: read again as it was, and nearly all of it after a crash."""
+
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from app.sensors.live.recorder import Recorder
+from app.sensors.recording import open_recording
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import Measurement, Scan
+from tests.sensors.live import sensor
+
+TURN_NS = 100_000_000
+
+
+def scan(turn: int) -> Scan:
+    rng = np.random.default_rng(turn)
+    angle = np.linspace(0, 2 * np.pi, 900, endpoint=False)
+    ring = np.arange(900, dtype=np.uint16) % 8
+    height = np.tan(np.radians(5 + 10 * ring))
+    points = np.column_stack([np.cos(angle), -np.sin(angle), height]) * (3 + rng.random((900, 1)))
+    offsets = np.linspace(0, 99_000_000, 900).astype(np.int32)
+    begin = sensor.START_NS + turn * TURN_NS
+    return Scan(begin, points.astype(np.float32), offsets, rng.integers(0, 256, 900).astype(np.float32), ring)
+
+
+def record(recorder: Recorder, turns: range) -> None:
+    for turn in turns:
+        for k in range(20):
+            stamp = sensor.START_NS + turn * TURN_NS + k * 5_000_000
+            recorder.add_imu(stamp, (0.1, 0.2, 0.001 * k), (0.0, 0.0, 9.81), stamp + 1_000_000)
+        recorder.add_scan(scan(turn), sensor.START_NS + (turn + 1) * TURN_NS + 3_000_000)
+
+
+def scans(path: Path) -> list[Scan]:
+    with open_recording(path, Params()) as recording:
+        return [m.scan for m in recording.measurements() if isinstance(m, Measurement)]
+
+
+def test_a_session_reads_again_as_it_was(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "folder" / "session.mcap")
+    record(recorder, range(12))
+    recorder.close()
+    assert recorder.bytes_written == recorder.path.stat().st_size
+    found = scans(recorder.path)
+    assert len(found) == 11  # no sample comes after the last one
+    for turn, again in enumerate(found):
+        truth = scan(turn)
+        np.testing.assert_array_equal(again.points, truth.points)
+        np.testing.assert_array_equal(again.intensity, truth.intensity)
+        np.testing.assert_array_equal(again.ring, truth.ring)
+        assert again.truth_ground is None
+        assert abs(again.stamp_ns - truth.stamp_ns) < 300
+    # What `ros2 bag` needs: profile, message types with their definitions, an index.
+    with AnyReader([recorder.path], default_typestore=get_typestore(Stores.EMPTY)) as reader:
+        types = {connection.topic: connection.msgtype for connection in reader.connections}
+        assert types == {"/rslidar_points": "sensor_msgs/msg/PointCloud2", "/imu/data": "sensor_msgs/msg/Imu"}
+        assert reader.message_count == 12 * 21
+
+
+def test_a_killed_process_loses_less_than_its_last_second(tmp_path: Path) -> None:
+    path = tmp_path / "session.mcap"
+    script = f"""
+        import sys, time
+        from pathlib import Path
+        from app.sensors.live.recorder import Recorder
+        from tests.sensors.live.test_recorder import record
+        recorder = Recorder(Path({str(path)!r}))
+        for turn in range(1000):
+            record(recorder, range(turn, turn + 1))
+            print(turn, flush=True)
+            time.sleep(0.1)
+    """
+    root = Path(__file__).resolve().parents[3]
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(script)], cwd=root, stdout=subprocess.PIPE, text=True
+    )
+    turn = 0
+    try:
+        assert process.stdout is not None
+        deadline = time.monotonic() + 30.0
+        while turn < 25 and time.monotonic() < deadline:
+            turn = int(process.stdout.readline())
+    finally:
+        process.kill()
+        process.wait(5.0)
+        process.stdout.close()
+    found = scans_before_the_end(path)
+    assert turn - 11 <= len(found) <= turn + 1
+    np.testing.assert_array_equal(found[-1].points, scan(len(found) - 1).points)
+
+
+def scans_before_the_end(path: Path) -> list[Scan]:
+    found = []
+    with open_recording(path, Params()) as recording:
+        assert any("cut off" in finding.text for finding in recording.findings)
+        try:
+            found += [m.scan for m in recording.measurements() if isinstance(m, Measurement)]
+        except HemislamError:
+            reading = recording.measurements()
+            while len(found) < 10_000:
+                try:
+                    entry = next(reading)
+                except (HemislamError, StopIteration):
+                    break
+                if isinstance(entry, Measurement):
+                    found.append(entry.scan)
+    return found
+
+
+def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "session.mcap")
+    recorder._file.close()  # what comes next can not be written
+    record(recorder, range(3))
+    recorder.close()
+    assert "can not be written any more" in recorder.failure
+
+
+def test_no_place_to_write_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(HemislamError, match=r"can not be written|is there already"):
+        Recorder(tmp_path / "file" / "session.mcap")
