@@ -18,6 +18,19 @@ HELP: Final = (
         "or is paused: the frame you see is labelled anew at once, the engine uses the values from the next frame on. "
         "<b>Read</b> on the left how well ground and motion are found."
     )
+    + heading("Why did it drift")
+    + box(
+        "The strips show every frame of the recording: hover to read, click or drag to go there. Red is beyond what is "
+        "good; what you went back over stays, paler. The white line is the present frame. "
+        "<b>Pause when</b> stops playing where a condition begins to hold; Play goes on from there."
+    )
+    + heading("One frame under study")
+    + box(
+        "Pause, and under <b>Study</b> colour the scan by ring, angle to down, distance to the ground plane, or by how "
+        "far its points lie from the map's planes. Click a point to see its numbers, its neighbours and their plane "
+        "(pink) and the map's plane nearby (blue); click beside it to end that. <b>PLY</b> and <b>PCD</b> hold the "
+        "frame with all its points carry."
+    )
     + heading("Loops")
     + box(
         "Where the walk comes back, a <b>loop</b> ties two keyframes together and straightens the map. Arches show "
@@ -31,6 +44,8 @@ HELP: Final = (
     + box(
         f"{key('space')} play or pause<br>{key('←')} {key('→')} one frame back or on<br>"
         f"{key('F')} follow the sensor or look freely<br>{key('C')} next colouring<br>"
+        f"{key('N')} {key('B')} next trouble on the strips, or the one before<br>"
+        f"{key('V')} next colouring of the frame under study<br>"
         f"{key('J')} {key('K')} next or previous loop<br>"
         f"{key('Ctrl')} {key('Z')} undo your word on a loop, with {key('Shift')} redo<br>"
         f"{key('Ctrl')} {key('K')} all commands"

@@ -1,0 +1,139 @@
+"""The timeline, the breakpoints and the study of a frame in a real Chromium."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Locator, expect
+
+from app.server.breakpoints import Breakpoints
+from app.server.protocol import Seek, SetBreakpoints, StepFrame
+from tests.browser import test_page
+from tests.browser.test_page import Bench
+
+chromium, bench = test_page.chromium, test_page.bench
+
+LEFT = RIGHT = 72
+"""Pixels of the timeline beside its strips: names and values."""
+
+
+@pytest.fixture(autouse=True)
+def _fresh(bench: Bench) -> None:
+    bench.engine.sent.clear()
+
+
+def timeline(bench: Bench) -> Locator:
+    return bench.page.locator("canvas[aria-label=timeline]")
+
+
+def place_of(bench: Bench, frame: int) -> tuple[float, float]:
+    """Where on the page a frame's first strip is."""
+    box = timeline(bench).bounding_box()
+    assert box is not None
+    share = (frame + 0.5) / bench.engine.frames
+    return box["x"] + LEFT + share * (box["width"] - LEFT - RIGHT), box["y"] + 28
+
+
+def seeks(bench: Bench) -> list[int]:
+    return [command.frame for command in bench.engine.sent if isinstance(command, Seek)]
+
+
+def click_goes_to(bench: Bench, frame: int) -> None:
+    bench.page.mouse.move(*place_of(bench, frame))
+    bench.page.mouse.down()
+    bench.page.mouse.up()
+    bench.eventually(lambda: bool(seeks(bench)))
+    assert abs(seeks(bench)[-1] - frame) <= 2  # less than a pixel
+
+
+def drawn(bench: Bench) -> int:
+    """Pixels of the timeline's canvas that are painted."""
+    script = (
+        "(c) => {const p = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0;"
+        "for (let i = 3; i < p.length; i += 4) n += p[i] > 150; return n}"
+    )
+    return int(timeline(bench).evaluate(script))
+
+
+def test_a_click_on_the_timeline_goes_there_and_what_is_passed_is_drawn(bench: Bench) -> None:
+    bench.eventually(lambda: timeline(bench).count() == 1)
+    before = drawn(bench)
+    bench.engine.send(StepFrame(120))
+    bench.engine.sent.clear()
+    bench.eventually(lambda: drawn(bench) > before + 300)
+    click_goes_to(bench, 60)
+    bench.eventually(lambda: bench.engine.snapshot.transport.frame == seeks(bench)[-1])
+    assert bench.page.evaluate("document.querySelectorAll('[data-hs-to] canvas').length") == 1
+
+
+def test_along_the_scene_it_is_as_wide_as_that_and_works_the_same_also_after_a_reload(bench: Bench) -> None:
+    panel = timeline(bench).bounding_box()
+    assert panel is not None
+
+    def x() -> float:
+        box = timeline(bench).bounding_box() if timeline(bench).count() == 1 else None
+        return box["x"] if box is not None else np.nan
+
+    bench.page.get_by_role("button", name="timeline place").click()
+    bench.eventually(lambda: x() < panel["x"] - 100)
+    click_goes_to(bench, 30)
+    bench.page.reload()
+    bench.eventually(lambda: x() < panel["x"] - 100)
+    bench.engine.sent.clear()
+    bench.eventually(lambda: drawn(bench) > 300)
+    click_goes_to(bench, 20)
+    bench.page.get_by_role("button", name="timeline place").click()
+    bench.eventually(lambda: x() == panel["x"])
+
+
+def test_a_breakpoint_is_switched_on(bench: Bench) -> None:
+    bench.page.get_by_text("Pause when").click()
+    bench.page.get_by_role("checkbox", name="no ground plane").click()
+    bench.eventually(lambda: SetBreakpoints(Breakpoints(no_ground=True)) in bench.engine.sent)
+    bench.page.get_by_role("checkbox", name="no ground plane").click()
+    bench.eventually(lambda: bench.engine.sent[-1] == SetBreakpoints(Breakpoints()))
+    bench.page.get_by_text("Pause when").click()
+
+
+def pixel_of(bench: Bench, index: int) -> tuple[float, float]:
+    """Where on the page a point of the newest scan is drawn."""
+    (client,) = bench.server.get_clients().values()
+    result, camera = bench.engine.snapshot.result, client.camera
+    assert result is not None
+    T = result.T_map_imu @ result.state.T_imu_lidar
+    root = bench.server.scene._handle_from_node_name["/map"].position
+    towards = T[:3, :3] @ result.cloud.points[index] + T[:3, 3] + root - camera.position
+    forward = (camera.look_at - camera.position) / np.linalg.norm(camera.look_at - camera.position)
+    right = np.cross(forward, camera.up_direction)
+    right /= np.linalg.norm(right)
+    scene = bench.page.locator("canvas[data-engine]").bounding_box()
+    assert scene is not None
+    scale = scene["height"] / 2 / np.tan(camera.fov / 2) / (towards @ forward)
+    x = scene["x"] + scene["width"] / 2 + scale * (towards @ right)
+    y = scene["y"] + scene["height"] / 2 - scale * (towards @ np.cross(right, forward))
+    return float(x), float(y)
+
+
+def test_a_clicked_point_tells_its_numbers_until_another_frame_comes(bench: Bench) -> None:
+    bench.page.get_by_role("tab", name="Study").click()
+    asks = bench.page.get_by_text("Pause and click a point")
+    expect(asks).to_be_visible()
+    bench.page.wait_for_timeout(1000)  # the view still glides to the sensor
+    result = bench.engine.snapshot.result
+    assert result is not None
+    seeds = np.flatnonzero(result.cloud.labels == 2)
+    bench.page.mouse.click(*pixel_of(bench, int(seeds[len(seeds) // 2])))
+    told = bench.page.get_by_text("plane of its neighbours")
+    expect(told).to_be_visible()
+    expect(bench.page.get_by_text("seed", exact=True)).to_be_visible()
+    bench.engine.send(StepFrame(1))
+    expect(asks).to_be_visible()
+
+
+def test_a_frame_is_downloaded(bench: Bench, tmp_path: Path) -> None:
+    with bench.page.expect_download() as download:
+        bench.page.get_by_role("button", name="PLY").click()
+    download.value.save_as(tmp_path / "frame.ply")
+    frame = bench.engine.snapshot.transport.frame
+    assert download.value.suggested_filename == f"hall_bpearl-frame-{frame:06d}.ply"
+    assert (tmp_path / "frame.ply").read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")
