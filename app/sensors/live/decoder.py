@@ -5,8 +5,8 @@ import numpy as np
 from app.sensors.live.difop import NOMINAL, Calibration, Difop
 from app.sensors.live.frames import Frame
 from app.sensors.live.kernels import decode_blocks
-from app.sensors.live.msop import BLOCK_BYTES, BLOCKS, HEADER_BYTES, TURN
-from app.sensors.rsbpearl import CHANNELS
+from app.sensors.live.msop import BLOCK_BYTES, BLOCKS, HEADER_BYTES, PACKET_BYTES, TURN
+from app.sensors.rsbpearl import BPEARL, CHANNELS
 from app.slam.types import F64, U16, DroppedScan, Scan
 
 MIN_RANGE_M, MAX_RANGE_M = 0.1, 150.0
@@ -42,6 +42,13 @@ class Decoder:
             np.sin(horizontal),
         )
         self._rings: U16 = self.calibration.rings
+
+    def warm_up(self) -> None:
+        """Compile the kernel, or load it, before there is something to decode."""
+        packets = np.zeros((1, PACKET_BYTES), np.uint8)
+        packets.setflags(write=False)
+        self.decode(Frame(BPEARL, packets, np.zeros(1, np.int64), 0, BLOCKS, 0))
+        self.bad_blocks = 0
 
     def decode(self, frame: Frame) -> Scan | DroppedScan:
         """The scan in firing order: block by block, in each by channel."""

@@ -23,6 +23,8 @@ from app.slam.types import DroppedScan, Scan
 
 MAX_BACKLOG = 20
 """Scans that may wait for the engine: two seconds of them at 10 Hz, and more than are held back at the start."""
+MAX_BACKLOG_ABSENT = 100
+"""The same while there is no engine, which is being started again and will then be faster than the sensor."""
 MAX_WAITING = 600_000
 """IMU samples and news that may wait: twenty minutes at 500 Hz. If there are more, nobody reads any longer."""
 _SETTLE_NS = 1_000_000_000
@@ -80,6 +82,8 @@ class Intake:
         self._rest: deque[LiveImu | DroppedScan | Status] = deque()
         self._held: deque[LiveScan | LiveImu] | None = deque()
         self._suspect: LiveImu | None = None
+        self._absent = False
+        self._limit = MAX_BACKLOG
         self._maps = {"LiDAR": ClockMap(), "IMU": ClockMap()}
         self._offset = OffsetEstimate()
         self._arrivals: dict[str, deque[int]] = {"LiDAR": deque(maxlen=50), "IMU": deque(maxlen=1000)}
@@ -122,6 +126,11 @@ class Intake:
             found = self._scans.popleft().scan if scan and self._scans else None
             assert not isinstance(found, DroppedScan)
             return rest, found
+
+    def set_absent(self, absent: bool) -> None:
+        """Whether there is no reader at present. What waited for one is not let go when it is back."""
+        with self._changed:
+            self._absent = absent
 
     def state(self) -> LiveState:
         now = time.time_ns()
@@ -246,7 +255,8 @@ class Intake:
         self._rest.append(Status(kind, sensor, text, time.time_ns()))
 
     def _bound(self) -> None:
-        while len(self._scans) > MAX_BACKLOG:
+        self._limit = MAX_BACKLOG_ABSENT if self._absent else max(MAX_BACKLOG, min(self._limit, len(self._scans)))
+        while len(self._scans) > self._limit:
             oldest = self._scans.popleft()
             times = self._arrivals["IMU"]
             silent = not times or time.time_ns() - times[-1] > 500_000_000

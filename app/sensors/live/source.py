@@ -37,6 +37,7 @@ class LiveSource:
         self._pairing = False
         self._silent: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": None, "IMU": None}
         self._watched_at = 0.0
+        self._told_failure = False
         self._threads = [
             threading.Thread(target=receive, args=(intake, self._stop), daemon=True, name=f"receive-{number}")
             for number, receive in enumerate(receivers)
@@ -67,6 +68,10 @@ class LiveSource:
         """How it is doing, now."""
         recorded = None if self._recorder is None else self._recorder.bytes_written
         return replace(self._intake.state(), recorded=recorded)
+
+    def set_absent(self, absent: bool) -> None:
+        """Whether nobody polls at present, and will come back: then more scans may wait."""
+        self._intake.set_absent(absent)
 
     @property
     def pairing(self) -> Counts:
@@ -107,6 +112,9 @@ class LiveSource:
             return
         self._watched_at = now
         state = self._intake.state()
+        if self._recorder is not None and self._recorder.failure and not self._told_failure:
+            self._told_failure = True
+            self._events.append(Status("recording", "source", self._recorder.failure, time.time_ns()))
         ages: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": state.lidar_age_s, "IMU": state.imu_age_s}
         for sensor, age in ages.items():
             since = self._silent[sensor]

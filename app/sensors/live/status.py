@@ -5,7 +5,7 @@ from typing import Literal
 
 from app.sensors.live.counters import Counters
 
-Kind = Literal["connected", "disconnected", "silent", "back", "jump", "configuration", "clocks", "units", "late"]
+Kind = Literal["connected", "disconnected", "silent", "back", "jump", "configuration", "clocks", "units", "recording"]
 
 
 @dataclass(frozen=True, slots=True)

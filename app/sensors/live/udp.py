@@ -3,6 +3,8 @@
 import contextlib
 import select
 import socket
+import struct
+import sys
 import threading
 import time
 from collections import deque
@@ -18,6 +20,9 @@ from app.slam.types import Scan
 BUFFER_BYTES = 16 << 20
 """Asked of the kernel, so that nothing is lost while this process is busy; it may grant less."""
 _DRAIN = 128
+_TIMESTAMP = 35
+"""SO_TIMESTAMPNS: Linux notes when a datagram came, so that it matters little when it is read."""
+_TIMESPEC = struct.Struct("@ll")
 _REST_NS = 300_000_000
 """Packets wait so long for the rest of their revolution: only the last one before a silence ever does."""
 _DEVICE_WAIT_NS = 1_500_000_000
@@ -45,18 +50,27 @@ def open_socket(host: str, port: int) -> socket.socket:
     except OSError:  # only root may go beyond the system's limit
         with contextlib.suppress(OSError):
             made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            made.setsockopt(socket.SOL_SOCKET, _TIMESTAMP, 1)
     made.setblocking(False)
     return made
 
 
-def _drain(ready: socket.socket) -> list[bytes]:
-    """The datagrams that wait there, some at a time."""
-    found: list[bytes] = []
+def _drain(ready: socket.socket) -> list[tuple[bytes, int]]:
+    """The datagrams that wait there, some at a time, and when each came by the host's clock."""
+    found: list[tuple[bytes, int]] = []
     while len(found) < _DRAIN:
         try:
-            found.append(ready.recv(65_536))
+            data, extra, _, _ = ready.recvmsg(65_536, 64)
         except (BlockingIOError, ConnectionError):
             break
+        arrival_ns = time.time_ns()
+        for level, kind, value in extra:
+            if level == socket.SOL_SOCKET and kind == _TIMESTAMP and len(value) == _TIMESPEC.size:
+                seconds, nanoseconds = _TIMESPEC.unpack(value)
+                arrival_ns = seconds * 1_000_000_000 + nanoseconds
+        found.append((data, arrival_ns))
     return found
 
 
@@ -77,6 +91,7 @@ class RsbpearlReceiver:
                 raise
         self.ports = [int(made.getsockname()[1]) for made in self._sockets]
         self._decoder = Decoder(angles)
+        self._decoder.warm_up()
         self._assembler = Assembler()
         self._wait_until_ns: int | None = None
         self._device: Difop | None = None
@@ -92,8 +107,8 @@ class RsbpearlReceiver:
                 ready, _, _ = select.select(self._sockets, [], [], 0.05)
                 now = time.time_ns()
                 for readable in ready:
-                    for packet in _drain(readable):
-                        self._take(packet, now, intake)
+                    for packet, arrival_ns in _drain(readable):
+                        self._take(packet, arrival_ns, intake)
                 since = self._assembler.pending_since()
                 if since is not None and now - since > _REST_NS:
                     self._frames += self._assembler.flush()
@@ -157,7 +172,7 @@ class ImuReceiver:
         with self._socket:
             while not stop.is_set():
                 ready, _, _ = select.select([self._socket], [], [], 0.05)
-                now = time.time_ns()
-                samples = [s for datagram in _drain(self._socket) for s in self._order.add(datagram)] if ready else []
-                for sample in samples or ([] if ready else self._order.flush()):
-                    intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, now)
+                samples = [(s, at) for datagram, at in _drain(self._socket) for s in self._order.add(datagram)]
+                samples = samples or [(s, time.time_ns()) for s in ([] if ready else self._order.flush())]
+                for sample, arrival_ns in samples:
+                    intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, arrival_ns)

@@ -1,0 +1,84 @@
+"""Receiving goes on in its own process whatever becomes of the engine that polls it."""
+
+import os
+import signal
+import threading
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.sensors.live.process import LiveClient, LiveProcess
+from app.sensors.recording import open_recording
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import DroppedScan, Measurement
+from tests.sensors.live import sensor
+from tests.sensors.live.test_live import Wire
+
+
+def take(client: LiveClient, count: int) -> list[Measurement]:
+    found: list[Measurement] = []
+    deadline = time.monotonic() + 20.0
+    while len(found) < count:
+        assert time.monotonic() < deadline
+        event = client.poll(0.1)
+        assert not isinstance(event, DroppedScan)
+        if isinstance(event, Measurement):
+            found.append(event)
+    return found
+
+
+def test_an_engine_that_dies_is_followed_by_one_that_misses_nothing(tmp_path: Path) -> None:
+    wire, record = Wire(), tmp_path / "session.mcap"
+    packets = sensor.turns(60)
+    with LiveProcess(wire.url, Params(), wire.imu_url, record) as process:
+        with pytest.raises(HemislamError, match="can not be opened"):
+            LiveProcess(wire.url, Params(), wire.imu_url)
+        wire.send(wire.device, sensor.difop())
+        feeder = threading.Thread(target=wire.turns, args=(0, packets))
+        feeder.start()
+        first = LiveClient(process.address)
+        before = take(first, 20)
+        first._connection.send(("poll", 5.0))  # and dies before the answer
+        first.close()
+        feeder.join(20.0)
+        time.sleep(0.3)  # nearly forty scans have come meanwhile
+        second = LiveClient(process.address)
+        checkpoint = before[11].scan.end_ns
+        assert second.rewind(checkpoint)
+        after = take(second, 58 - 12)
+        onlooker = LiveClient(process.address, engine=False)
+        counters = onlooker.state().counters
+        assert (counters.lost, counters.dropped) == (0, 0)
+        onlooker.close()
+        second.close()
+    whole = [*before[:12], *after]
+    turns = [round((m.scan.stamp_ns - sensor.START_NS) / (1801 * 55_520)) for m in whole]
+    assert turns == list(range(58))
+    for one, following in pairwise(whole):
+        assert following.imu.stamps_ns[0] <= one.scan.end_ns <= following.imu.stamps_ns[1]
+    with open_recording(record, Params()) as recording:
+        recorded = [m for m in recording.measurements() if isinstance(m, Measurement)]
+    assert len(recorded) >= 58
+    np.testing.assert_array_equal(recorded[30].scan.points, whole[30].scan.points)
+    with pytest.raises(HemislamError, match="has ended"):
+        LiveClient(process.address)
+
+
+def test_it_ends_cleanly_with_sigterm_and_says_that_it_did(tmp_path: Path) -> None:
+    wire, record = Wire(), tmp_path / "session.mcap"
+    with LiveProcess(wire.url, Params(), wire.imu_url, record) as process:
+        client = LiveClient(process.address)
+        pid = process._process.pid
+        assert pid is not None and process.alive
+        os.kill(pid, signal.SIGTERM)
+        with pytest.raises(HemislamError, match="has ended"):
+            for _ in range(100):
+                client.poll(0.1)
+        client.close()
+        process._process.join(5.0)
+        assert not process.alive
+    assert record.read_bytes().endswith(b"\x89MCAP0\r\n")
