@@ -16,28 +16,16 @@ from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops import inspection
 from app.slam.loops.detection import Detector, Head
-from app.slam.loops.drift import Drift, expect
-from app.slam.loops.judgement import by_hand, judge
+from app.slam.loops.drift import Drift
+from app.slam.loops.judgement import by_hand
 from app.slam.loops.odometry import odometry_factor
 from app.slam.loops.overruling import Entry, Overrulings, check, in_words
 from app.slam.loops.pose_graph import Factor, Step, g2o_text, optimise
-from app.slam.loops.scan_context import ScanContext
+from app.slam.loops.search import Found, search
 from app.slam.loops.solution import Solution, loop_factor
-from app.slam.loops.support import settle
 from app.slam.loops.types import Add, Command, FactorResidual, LoopDetail, LoopEdge, Pair, Preview, Verdict, rows
 from app.slam.params import Loops
 from app.slam.types import F64, Keyframe
-
-SURE_M = 0.3
-"""Where odometry is surer than this of its position, one place that fits is enough."""
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """What looking found: contexts of the next keyframes that had none; candidates, new or changed."""
-
-    contexts: tuple[ScanContext, ...] = ()
-    updates: tuple[LoopEdge, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,23 +175,8 @@ class LoopBackend:
 
     def _look(self, first: int, end: int, params: Loops) -> Found:
         """Look for loops of the keyframes from `first` to before `end`; the graph stays as it is."""
-        described, updates = self._detector.described, dict[Pair, LoopEdge]()
-        while self._detector.described < end:
-            self._detector.learn([self._detector.describe(self._detector.described)])
-        for newer in range(first, end):
-            edges = self._edges({**self._found, **updates})
-            expectation = expect(newer, self.poses, self._accepted(edges.values()), _drift(params))
-            seen = []
-            for sighting in self._detector.look(newer, expectation, params):
-                seen.append(judge(sighting, self._detector, expectation, params))
-                if seen[-1].verdict is Verdict.CANDIDATE and seen[-1].evidence.gate_m < SURE_M:
-                    break
-            known = {*self._found, *updates}
-            fresh = {edge.pair: edge for edge in seen if edge.pair not in known}
-            laid = self._edges({**self._found, **updates, **fresh})
-            settled = settle(fresh, laid, self._detector.poses, _drift(params), params, len(self) - 1)
-            updates.update((edge.pair, edge) for edge in settled)
-        return Found(tuple(self._detector.context(i) for i in range(described, end)), tuple(updates.values()))
+        keyframes = range(first, max(end, 0))
+        return search(self._detector, keyframes, self._found, self._edges, self.poses, _drift(params), params)
 
     # --- what there is ---------------------------------------------------------------------------
     @property

@@ -1,0 +1,60 @@
+"""Looking for loops of keyframes: what is recognised is judged, and settled with what was found before."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from app.slam.loops.detection import Detector
+from app.slam.loops.drift import Drift, expect
+from app.slam.loops.judgement import judge
+from app.slam.loops.scan_context import ScanContext
+from app.slam.loops.support import settle
+from app.slam.loops.types import LoopEdge, Pair, Verdict
+from app.slam.params import Loops
+from app.slam.types import F64
+
+SURE_M = 0.3
+"""Where odometry is surer than this of its position, one place that fits is enough."""
+
+Edges = dict[Pair, LoopEdge]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What looking found: contexts of the next keyframes that had none; candidates, new or changed."""
+
+    contexts: tuple[ScanContext, ...] = ()
+    updates: tuple[LoopEdge, ...] = ()
+
+
+def search(
+    detector: Detector,
+    keyframes: range,
+    found: Edges,
+    counting: Callable[[Edges], Edges],
+    poses: F64,
+    drift: Drift,
+    params: Loops,
+) -> Found:
+    """Look for loops of some keyframes; all before the last of them are described on the way.
+
+    Args:
+        found: before. counting: how such edges count with the user's commands.
+        poses: (k, 4, 4) T_map_imu.
+    """
+    described, updates, now = detector.described, Edges(), len(detector) - 1
+    while detector.described < keyframes.stop:
+        detector.learn([detector.describe(detector.described)])
+    for newer in keyframes:
+        known = {**found, **updates}
+        accepted = [edge for edge in counting(known).values() if edge.verdict is Verdict.ACCEPTED]
+        expectation = expect(newer, poses, accepted, drift)
+        seen = []
+        for sighting in detector.look(newer, expectation, params):
+            seen.append(judge(sighting, detector, expectation, params))
+            if seen[-1].verdict is Verdict.CANDIDATE and seen[-1].evidence.gate_m < SURE_M:
+                break
+        fresh = {edge.pair: edge for edge in seen if edge.pair not in known}
+        settled = settle(fresh, counting({**known, **fresh}), detector.poses, drift, params, now)
+        updates.update((edge.pair, edge) for edge in settled)
+    contexts = tuple(detector.context(index) for index in range(described, keyframes.stop))
+    return Found(contexts, tuple(updates.values()))
