@@ -10,6 +10,7 @@ from app import __version__
 from app.cli import options
 from app.cli.evaluate import evaluate
 from app.cli.feed import feed
+from app.cli.replay import replay
 from app.cli.run import run
 from app.cli.serve import serve
 from app.slam.errors import HemislamError
@@ -65,6 +66,7 @@ def hemislam(
 
 cli.command()(serve)
 cli.command()(run)
+cli.command()(replay)
 cli.command()(evaluate)
 cli.command()(feed)
 

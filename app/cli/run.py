@@ -23,8 +23,12 @@ from app.cli.options import (
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from app.server.run import Run
     from app.slam.loops.types import Command as Overruling
+    from app.slam.params import Params
+    from app.slam.results import RunInfo
     from app.slam.trajectory import Trajectory
 
 
@@ -66,12 +70,12 @@ def run(
       hemislam run walk.mcap --loops edits.yaml
     """
     from app.server.run import open_run
-    from app.slam.results import RunInfo, prepare_folder, save_results, summarise
+    from app.slam.results import RunInfo, prepare_folder
     from app.slam.trajectory import read_tum
 
     params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
     overrulings = _read_overrulings(loops) if loops else ()
-    folder = out or _free_folder(recording)
+    folder = out or free_folder(recording)
     work = open_run(recording, truth, params, start, duration)
     try:
         truth_path = work.opened.truth
@@ -89,7 +93,7 @@ def run(
             work.engine.loops.wait_ready()
         if overrulings:
             work.overrule(overrulings)
-        stop = _process(work)
+        stop = process(work)
         if not len(work.log):
             with contextlib.suppress(OSError):
                 folder.rmdir()  # only if it is empty
@@ -103,10 +107,21 @@ def run(
             truth_path=truth_path,
             stopped="" if stop is None else str(stop) or type(stop).__name__,
         )
-        found = work.engine.loops.results() if work.engine.loops else None
-        report = save_results(folder, work.log, work.engine.keyframes, info, found, replace=force)
+        save(work, folder, info, stop, replace=force)
     finally:
         work.close()
+
+
+def save(work: "Run", folder: Path, info: "RunInfo", stop: BaseException | None, *, replace: bool) -> None:
+    """Write the results and sum them up.
+
+    Raises:
+        BaseException: `stop`, what ended the run early, once the frames so far are saved.
+    """
+    from app.slam.results import save_results, summarise
+
+    found = work.engine.loops.results() if work.engine.loops else None
+    report = save_results(folder, work.log, work.engine.keyframes, info, found, replace=replace)
     typer.echo(summarise(report, folder))
     if isinstance(stop, HemislamError):
         raise HemislamError(f"{stop} The frames before that were processed and saved in {folder}.")
@@ -126,7 +141,7 @@ def _read_overrulings(path: Path) -> "tuple[Overruling, ...]":
         raise HemislamError(f"{path} can not be read: {error.strerror}.") from None
 
 
-def _free_folder(recording: Path) -> Path:
+def free_folder(recording: Path) -> Path:
     """The first of runs/NAME-1, runs/NAME-2, ... that does not exist yet."""
     name = recording.resolve().stem
     return next(folder for n in itertools.count(1) if not (folder := Path("runs") / f"{name}-{n}").exists())
@@ -158,17 +173,27 @@ def compile_behind_bar() -> None:
         compile_kernels(show)
 
 
-def _process(work: "Run") -> BaseException | None:
-    """Run to the end of the recording. What stopped it before, an interruption say, is returned, not raised."""
+def process(
+    work: "Run", *, until: int | None = None, params_of: "Callable[[int], Params | None] | None" = None
+) -> BaseException | None:
+    """Run to the end of the recording. What stopped it before, an interruption say, is returned, not raised.
+
+    Args:
+        until: the last frame to process. params_of: those for a frame; None: as they are.
+    """
     from tqdm import tqdm
 
     from app.slam.types import Measurement
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with tqdm(total=work.opened.frames, unit=" frames", disable=None) as bar:
+    frames = work.opened.frames if until is None else until + 1
+    with tqdm(total=frames, unit=" frames", disable=None) as bar:
         try:
-            while (entry := work.peek()) is not None:
+            while (until is None or work.frame < until) and (entry := work.peek()) is not None:
                 if isinstance(entry, Measurement):
+                    params = params_of(work.frame + 1) if params_of else None
+                    if params is not None and params != work.params:
+                        work.choose(params)
                     work.step()
                 bar.update()
         except (Exception, KeyboardInterrupt) as error:  # whatever it was, the frames so far must be saved

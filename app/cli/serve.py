@@ -12,7 +12,9 @@ from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic,
 def serve(
     recording: Annotated[
         Path | None,
-        typer.Argument(metavar="RECORDING", help="What to open first; another one can be chosen in the page."),
+        typer.Argument(
+            metavar="RECORDING", help="What to open first, a session file too; another one can be chosen in the page."
+        ),
     ] = None,
     host: Annotated[str, typer.Option("--host", metavar="ADDRESS", help="0.0.0.0: all, by a link with a token.")] = (
         "127.0.0.1"
@@ -59,11 +61,13 @@ def serve(
     Examples:
       hemislam serve walk.mcap
       hemislam serve indoor1.bag --preset h2lid --paused
+      hemislam serve runs/sessions/walk-20261121-101500.hemislam     goes on where that session ended
       hemislam serve --folder ~/recordings --port 8081
       hemislam serve walk.mcap --host 0.0.0.0            from other computers, by the printed link
     """
     from app.sensors.recording import open_recording
     from app.server.folders import Folders
+    from app.server.journal import SUFFIX, read_session
     from app.server.setup import Setup
     from app.server.web import run_server
     from app.slam.trajectory import read_tum
@@ -77,9 +81,11 @@ def serve(
         lidar_topic=lidar_topic,
         imu_topic=imu_topic,
     )
-    params = resolve_for(recording)
+    session = read_session(recording) if recording is not None and recording.suffix == SUFFIX else None
+    params = session.state.params if session else resolve_for(recording)
     if recording is not None:
-        open_recording(recording, params).close()  # so that a mistake is told here and not in the page
+        opened = session.opened.recording if session else recording
+        open_recording(opened, params).close()  # so that a mistake is told here and not in the page
     if truth is not None:
         read_tum(truth)
     run_server(
@@ -92,6 +98,7 @@ def serve(
             resolve=resolve_for,
             play=not paused,
             checkpoint_bytes=checkpoint_memory << 20,
+            journals=Path("runs") / "sessions",
         ),
         folders=Folders(folder or [recording.resolve().parent if recording else Path.cwd()]),
         build_page=partial(Workbench, point_budget=point_budget, results=Path("runs")),

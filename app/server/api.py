@@ -105,7 +105,7 @@ def make_router(engine: EngineProcess, folders: Folders) -> APIRouter:
     def open_recording(body: OpenBody) -> None:
         """Open one. Whether that worked, the notices in the state tell."""
         truth = folders.inside(body.truth) if body.truth else None
-        _send(engine, OpenRecording(folders.inside(body.path), truth))
+        _send(engine, OpenRecording(folders.openable(body.path), truth))
 
     @router.get("/export/{name}", response_class=FileResponse)
     def export(name: Export, background: BackgroundTasks) -> FileResponse:

@@ -99,8 +99,10 @@ class Link:
 def main(commands: Pipe, updates: Pipe, setup: Setup) -> None:
     """Compile, open the recording, and work until told to end or the parent has gone."""
 
-    def opener(path: Path, truth: Path | None, params: Params, /) -> Run:
-        part = (setup.start_s, setup.duration_s) if path == setup.recording else (0.0, None)
+    def opener(
+        path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /
+    ) -> Run:
+        part = part or ((setup.start_s, setup.duration_s) if path == setup.recording else (0.0, None))
         return open_run(path, truth, params, *part, checkpoint_bytes=setup.checkpoint_bytes)
 
     run_loop(commands, updates, setup, opener, compile_kernels)
@@ -117,7 +119,14 @@ def run_loop(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     outbox = Outbox(setup.params, session=setup.session, notices=setup.notices)
     link = Link(commands, updates, outbox)
-    session = Session(outbox, setup.params, opener, resolve=setup.resolve, chunk_voxel=setup.chunk_voxel)
+    session = Session(
+        outbox,
+        setup.params,
+        opener,
+        resolve=setup.resolve,
+        chunk_voxel=setup.chunk_voxel,
+        journals=setup.journals,
+    )
     session.handle(SetSpeed(setup.speed))
     session.handle(SetBreakpoints(setup.breakpoints))
     if prepare is not None:

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from app.sensors.source import SUFFIXES
+from app.server.journal import SUFFIX, read_session
 from app.slam.errors import HemislamError
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A line of the file browser: a recording that can be opened, or a folder to look into."""
+    """A line of the file browser: a recording or a session that can be opened, or a folder to look into."""
 
     path: Path
     is_recording: bool
@@ -46,6 +47,13 @@ class Folders:
             raise HemislamError(
                 f"There is no {path} in the folders that hemislam was started for; start it with the folder given."
             )
+        return real
+
+    def openable(self, path: Path | str) -> Path:
+        """As `inside`, and if it is a session file, its recording must be inside as well. Raises as `inside`."""
+        real = self.inside(path)
+        if real.suffix == SUFFIX:
+            self.inside(read_session(real).opened.recording)
         return real
 
     def listing(self, folder: Path | str) -> list[Entry]:
@@ -85,6 +93,6 @@ def _entry(path: Path) -> Entry | None:
         is_recording = (path / "metadata.yaml").is_file()
         size = sum(file.stat().st_size for file in path.iterdir() if file.is_file()) if is_recording else 0
         return Entry(path, is_recording, size)
-    if path.suffix in SUFFIXES and path.is_file():
+    if path.suffix in (*SUFFIXES, SUFFIX) and path.is_file():
         return Entry(path, True, path.stat().st_size)
     return None

@@ -279,6 +279,7 @@ class Snapshot:
         progress: what takes long just now, or None. notices: the newest 50.
         saved: the newest 10 `Save`s that ended.
         engine_alive: False when the engine's process has died.
+        journal: file in which this session is kept; opening it goes on from there.
     """
 
     session: int = 0
@@ -299,3 +300,4 @@ class Snapshot:
     notices: tuple[Notice, ...] = ()
     saved: tuple[Saved, ...] = ()
     engine_alive: bool = True
+    journal: Path | None = None

@@ -1,12 +1,13 @@
 """One pass through a recording: the open file, the engine at work on it, and what came of it so far."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from app.sensors.recording import Place, Recording, open_recording
 from app.server.checkpoints import DEFAULT_BYTES, Checkpoints
+from app.server.journal import SUFFIX, SavedSession, write_session
 from app.server.loop_process import LoopProcess
 from app.server.protocol import OpenedRecording
 from app.server.readouts import Readouts, ReadoutsState
@@ -15,10 +16,12 @@ from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.messages import LoadCommands
 from app.slam.loops.types import Command as Overruling
-from app.slam.params import Params
+from app.slam.params import Params, leaves
 from app.slam.results import LogState, RunInfo, RunLog, prepare_folder, save_results
 from app.slam.trajectory import Trajectory, read_tum, truth_beside, write_tum
 from app.slam.types import DroppedScan, Keyframe, Measurement, StepResult
+
+EFFECT = {leaf.path: leaf.effect for leaf in leaves()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +45,7 @@ class Run:
         opened: what the page is told of the recording. finished: whether all of it was processed.
         frame: index of the newest frame, -1 before the first. known: of the last one that there is a way back to.
         params: for frames not yet processed; set them with `choose`.
+        history: from which frame on which were in force, ascending.
         checkpoints: to go back to; filled by `remember`. readouts, log: filled frame by frame.
     """
 
@@ -72,7 +76,7 @@ class Run:
         self.frame = self.known = -1
         self.params = engine.params
         self.checkpoints = Checkpoints(checkpoint_bytes)
-        self._params_from: list[tuple[int, Params]] = []  # journal: from which frame on which were in force
+        self.history: tuple[tuple[int, Params], ...] = ()
         self.readouts = Readouts(recording.start_ns, truth)
         self.log = RunLog()
         self._recording = recording
@@ -114,7 +118,7 @@ class Run:
         frame = self.frame + 1
         if not again and self.params_of(frame) != self.params:
             self.forget_after(self.frame)
-            self._params_from.append((frame, self.params))
+            self.history = (*self.history, (frame, self.params))
         self.engine.params = (self.params_of(frame) if again else None) or self.params
         try:
             result = self.engine.step(measurement.scan, measurement.imu)
@@ -126,24 +130,34 @@ class Run:
         self.log.add(result)
         return result
 
-    def overrule(self, commands: tuple[Overruling, ...]) -> None:
-        """Put these commands over the loops that are found, now and later.
+    @property
+    def part(self) -> tuple[float, float | None]:
+        """Start and duration (s) of what is processed of the recording."""
+        return self._part
+
+    def overrule(self, commands: tuple[Overruling, ...], undone: tuple[Overruling, ...] = ()) -> None:
+        """Put these commands over the loops that are found, now and later; the undone ones can be done again.
 
         Raises:
             HemislamError: loops are not looked for.
         """
         if self.engine.loops is None:
             raise HemislamError("Loops are not looked for, so none can be overruled; set loops.enabled.")
-        self.engine.loops.command(LoadCommands(commands))
+        self.engine.loops.command(LoadCommands(commands, undone))
 
     # --- going back ------------------------------------------------------------------------------
     def choose(self, params: Params) -> None:
         """Take these parameters for all frames not yet processed."""
         self.params = self.engine.params = params
 
+    def usable(self, params: Params) -> Params:
+        """These, but for those that the engine can not change on the way."""
+        waiting = [path for path in self.params.changed(params) if EFFECT[path] == "restart"]
+        return params.with_values({path: self.params.value(path) for path in waiting})
+
     def params_of(self, frame: int) -> Params | None:
         """Those in force at a frame that is known; of a later one, those of the last."""
-        return next((params for first, params in reversed(self._params_from) if first <= frame), None)
+        return in_force(self.history, frame)
 
     def forget_after(self, frame: int) -> None:
         """What comes after a frame will be another walk."""
@@ -151,7 +165,7 @@ class Run:
         if self.engine.loops:
             self.engine.loops.forget_after(frame)
         self.checkpoints.forget_after(frame)
-        self._params_from = [entry for entry in self._params_from if entry[0] <= frame]
+        self.history = tuple(entry for entry in self.history if entry[0] <= frame)
 
     def remember(self, *, near: bool = False) -> None:
         """Take a checkpoint, if one is wanted here. Call it between two steps, with nothing peeked at."""
@@ -183,8 +197,10 @@ class Run:
         self._incoming = self._recording.measurements(*self._part, after=state.place)
         self._waiting, self._dropped, self.finished = None, 0, False
 
-    def saver(self, folder: Path, *, trajectory_only: bool) -> Callable[[], None]:
-        """A function that writes the results of the frames so far; may be called in another thread.
+    def saver(
+        self, folder: Path, session: SavedSession | None = None, *, trajectory_only: bool = False
+    ) -> Callable[[], None]:
+        """A function that writes the results of the frames so far, and the session; may be called in another thread.
 
         It raises HemislamError if the folder can not be written to.
         """
@@ -206,6 +222,8 @@ class Run:
 
         def save() -> None:
             save_results(folder, log, keyframes, info, loops, replace=True)
+            if session is not None:
+                _save_session(folder / f"session{SUFFIX}", session)
 
         return save
 
@@ -213,6 +231,18 @@ class Run:
         self._recording.close()
         self.engine.close()
         self.checkpoints.close()
+
+
+def in_force(history: Sequence[tuple[int, Params]], frame: int) -> Params | None:
+    """The parameters of a frame by a history as in `Run.history`; None before its first."""
+    return next((params for first, params in reversed(history) if first <= frame), None)
+
+
+def _save_session(path: Path, session: SavedSession) -> None:
+    try:
+        write_session(path, session)
+    except OSError as error:
+        raise HemislamError(f"The session can not be written to {path}: {error.strerror}.") from error
 
 
 class _Present:

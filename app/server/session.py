@@ -11,6 +11,7 @@ from typing import Protocol, assert_never
 from app.server.breakpoints import Breakpoints, Moment, reasons
 from app.server.checkpoints import NEAR
 from app.server.delta import Outbox
+from app.server.journal import SUFFIX, Journal, Opened, SavedSession, State, new_path, read_session, size_of
 from app.server.loop_desk import LoopDesk
 from app.server.pacing import Pacer
 from app.server.protocol import (
@@ -35,11 +36,11 @@ from app.server.protocol import (
     UndoLoop,
 )
 from app.server.publisher import Publisher
-from app.server.run import Run
+from app.server.run import EFFECT, Run, in_force
 from app.server.saver import Saver
 from app.slam.errors import HemislamError
 from app.slam.loops.line import LoopLine
-from app.slam.params import Params, leaves
+from app.slam.params import Params
 from app.slam.types import DroppedScan, StepResult
 
 log = logging.getLogger(__name__)
@@ -49,8 +50,6 @@ LONG_SEEK = 20
 """Frames to process on the way to a frame, from which on progress is shown."""
 POLL_S = 0.02
 """How often to look for what others are at work on."""
-
-_EFFECT = {leaf.path: leaf.effect for leaf in leaves()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +71,11 @@ class Journey:
 
 
 class OpenRun(Protocol):
-    """Opens a recording with a new engine; raises HemislamError."""
+    """Opens a recording, or the part of it from start for a duration (s), with a new engine; raises HemislamError."""
 
-    def __call__(self, path: Path, truth: Path | None, params: Params, /) -> Run: ...
+    def __call__(
+        self, path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /
+    ) -> Run: ...
 
 
 class Session:
@@ -88,6 +89,7 @@ class Session:
         open_run: opens a recording.
         resolve: parameters that a recording is opened with, before changes by hand; None: the present ones.
         chunk_voxel: edge of the voxels (m) in which keyframe clouds are thinned for the page.
+        journals: folder in which sessions are kept while they go on; None: nowhere.
         clock: monotonic seconds.
     """
 
@@ -99,6 +101,7 @@ class Session:
         *,
         resolve: Callable[[Path], Params] | None = None,
         chunk_voxel: float = 0.05,
+        journals: Path | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._outbox = outbox
@@ -110,6 +113,9 @@ class Session:
         self._resolve = resolve
         self._params = self._base = params
         self._run: Run | None = None
+        self._journals = journals
+        self._journal: Journal | None = None
+        self._resuming: SavedSession | None = None
         # What is wanted but not done yet:
         self._opening: Callable[[], None] | None = None
         self._after_opening: list[Command] = []
@@ -121,10 +127,13 @@ class Session:
         self._moment: Moment | None = None  # the frame that the page shows
 
     def open(self, path: Path, truth: Path | None, *, play: bool = False) -> None:
-        """Open a recording with exactly the parameters given so far."""
+        """Open a recording with exactly the parameters given so far, or a session file with its own."""
 
         def opening() -> None:
-            self._take(self._open_run(path, truth, self._params))
+            if path.suffix == SUFFIX:
+                self._resume(path)
+            else:
+                self._take(self._open_run(path, truth, self._params))
             self._page.show(playing=play)
 
         self._open_soon(path, opening)
@@ -137,6 +146,8 @@ class Session:
             return
         try:
             self._handle(command)
+            if self._journal is not None and self._run is not None:
+                self._journal.did(self._run.frame, command)
         except HemislamError as error:
             self._outbox.notice("error", str(error))
 
@@ -171,7 +182,9 @@ class Session:
                 path = self._need_run().opened.path
                 self._open_soon(path, self._reopen)
             case Save(folder, trajectory_only):
-                self._saver.start(folder, self._need_run().saver(folder, trajectory_only=trajectory_only))
+                run = self._need_run()
+                session = SavedSession(opened_of(run), self._state(run), run.frame)
+                self._saver.start(folder, run.saver(folder, session, trajectory_only=trajectory_only))
             case OverruleLoop() | UndoLoop() | RedoLoop() | TryLoop() | InspectLoop():
                 self._desk.handle(command, self._need_loops())
             case _:
@@ -216,19 +229,19 @@ class Session:
         changed = self._params.changed(params)
         self._params = params
         if self._run is not None:
-            run, waiting = self._run, self._pending_restart()
-            usable = params.with_values({path: run.params.value(path) for path in waiting})
+            run = self._run
+            usable = run.usable(self._params)
             if usable != run.params:
                 run.forget_after(run.frame if self._journey is None else max(run.frame, self._journey.again_to))
                 run.choose(usable)
-            self._relabelling |= any(_EFFECT[path] == "now" for path in changed)
+            self._relabelling |= any(EFFECT[path] == "now" for path in changed)
         self._page.params(params, self._pending_restart())
 
     def _pending_restart(self) -> tuple[str, ...]:
         """Names of parameters that the engine still has another value of, since it can not change them."""
         if self._run is None:
             return ()
-        return tuple(path for path in self._run.params.changed(self._params) if _EFFECT[path] == "restart")
+        return tuple(path for path in self._run.params.changed(self._params) if EFFECT[path] == "restart")
 
     def _need_run(self) -> Run:
         if self._run is None:
@@ -249,6 +262,11 @@ class Session:
             Seconds until there may be more: 0 if there is more already; None if nothing will be due
             before the next command.
         """
+        wait = self._work()
+        self._note(settled=wait is None)
+        return wait
+
+    def _work(self) -> float | None:
         while (saved := self._saver.ended()) is not None:
             self._page.saved(saved)
         if self._opening is not None:
@@ -310,6 +328,8 @@ class Session:
             return 0.0
         if journey is None and (wait := self._pacer.wait(entry.scan.stamp_ns)) > 0:
             return wait
+        if self._resuming is not None and not again:
+            self._follow(run, self._resuming)
         try:
             result = run.step(again=again)
         except Exception as error:
@@ -328,6 +348,8 @@ class Session:
             self._page.show(frames_per_second=self._pacer.tick(), urgent=False)
             run.remember()
             self._passed(run, result, played=journey is None)
+        if self._resuming is not None and run.frame >= self._resuming.frame:
+            self._resumed(run)
         self._approach(run.frame)
         return 0.0
 
@@ -347,7 +369,7 @@ class Session:
             self._moment = Moment(result, run.readouts.error) if result is not None else None
             then = run.params_of(run.frame)
             changed = then.changed(run.params) if then is not None else {}
-            self._relabelling = any(_EFFECT[path] == "now" for path in changed)
+            self._relabelling = any(EFFECT[path] == "now" for path in changed)
 
     def _approach(self, frame: int) -> None:
         """At a frame of the journey, if there is one: end it there or say how far it is."""
@@ -406,6 +428,9 @@ class Session:
 
         What was changed by hand about the device stays with the recording it was meant for.
         """
+        if path.suffix == SUFFIX:
+            self._resume(path)
+            return
         base = self._resolve(path) if self._resolve else self._params
         by_hand = {
             name: value
@@ -419,8 +444,8 @@ class Session:
         self._take(run)
 
     def _reopen(self) -> None:
-        opened = self._need_run().opened
-        self._take(self._open_run(opened.path, opened.truth, self._params))
+        run = self._need_run()
+        self._take(self._open_run(run.opened.path, run.opened.truth, self._params, run.part))
 
     def _take(self, run: Run) -> None:
         """Let go of the present run and show the first frame of this one."""
@@ -428,6 +453,8 @@ class Session:
             self._saver.wait()
             self._run.close()
         self._run = run
+        self._resuming = None
+        self._begin_journal(run)
         self._relabelling = self._page_behind = False
         self._moment = None
         self._unseen = None
@@ -438,9 +465,66 @@ class Session:
         self._pacer.release()
         self._go_to(0, -1)
 
+    # --- the session as a file -------------------------------------------------------------------
+    def _begin_journal(self, run: Run) -> None:
+        if self._journal is not None:
+            self._journal.close()
+            self._journal = None
+        if self._journals is not None:
+            path = new_path(self._journals, run.opened.path)
+            self._journal = Journal(path, opened_of(run))
+            self._outbox.put(journal=path)
+            if self._journal.error:
+                self._outbox.notice("warning", self._journal.error)
+
+    def _note(self, *, settled: bool) -> None:
+        if self._journal is not None and self._run is not None and self._resuming is None:
+            self._journal.note(self._run.frame, self._state(self._run), settled=settled)
+
+    def _state(self, run: Run) -> State:
+        loops = run.engine.loops.state if run.engine.loops is not None else None
+        overrulings, undone = (loops.undo, loops.redo) if loops is not None else ((), ())
+        return State(self._params, run.history, overrulings, undone)
+
+    def _resume(self, path: Path) -> None:
+        """Open what a session file opened and go, as it went, to the frame that it was at."""
+        saved = read_session(path)
+        opened, state = saved.opened, saved.state
+        first = state.history[0][1] if state.history else state.params
+        run = self._open_run(opened.recording, opened.truth, first, (opened.start_s, opened.duration_s))
+        self._base = self._params = state.params
+        self._halt()
+        self._take(run)
+        if state.overrulings or state.undone:
+            run.overrule(state.overrulings, state.undone)
+        self._resuming = saved
+        if self._journal is not None:
+            self._journal.note(saved.frame, state)
+        self._go_to(max(saved.frame, 0), -1)
+
+    def _follow(self, run: Run, saved: SavedSession) -> None:
+        """Choose for the next frame what was in force at it then."""
+        params = in_force(saved.state.history, run.frame + 1)
+        if params is not None and params != run.params:
+            run.choose(params)
+
+    def _resumed(self, run: Run) -> None:
+        """The frame that the session was at is reached: from here on what is chosen now is in force."""
+        self._resuming = None
+        run.choose(run.usable(self._params))
+
     def close(self) -> None:
         """Finish the saves under way and close the recording."""
         self._saver.close()
+        self._note(settled=True)
+        if self._journal is not None:
+            self._journal.close()
         self._page.close()
         if self._run is not None:
             self._run.close()
+
+
+def opened_of(run: Run) -> Opened:
+    """What a session file says of where a run comes from."""
+    opened = run.opened
+    return Opened(opened.path.resolve(), opened.truth and opened.truth.resolve(), *run.part, size_of(opened.path))

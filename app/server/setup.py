@@ -18,6 +18,7 @@ class Setup:
         resolve: parameters for recordings opened later; None keeps the present ones.
         play: begin at once. speed: to play at. breakpoints: where to pause.
         chunk_voxel: m, see `Session`. checkpoint_bytes: see `app.server.checkpoints`.
+        journals: folder for session files, see `Session`.
         session, notices: how many there were before, for a process that takes over from another.
     """
 
@@ -32,5 +33,6 @@ class Setup:
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     chunk_voxel: float = 0.05
     checkpoint_bytes: int = 1 << 30
+    journals: Path | None = None
     session: int = 0
     notices: int = 0

@@ -21,6 +21,9 @@ from app.server.protocol import Command, Notice, OpenRecording, Restart, Shutdow
 from app.server.setup import Setup
 from app.server.wire import Pipe
 
+MOST_REVIVALS = 25
+"""Deaths of the engine's process after which it is not started again by itself."""
+
 Main = Callable[[Pipe, Pipe, Setup], None]
 
 
@@ -45,6 +48,7 @@ class EngineProcess:
         self._sending = threading.Lock()
         self._commands: Pipe | None = None
         self._process: multiprocessing.process.BaseProcess | None = None
+        self._revivals = 0
         self._start(setup)
 
     # --- for its users ---------------------------------------------------------------------------
@@ -139,6 +143,25 @@ class EngineProcess:
             number = last.notices[-1].number + 1 if last.notices else 1
             code = process.exitcode or 0
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            if last.journal is not None and self._revivals < MOST_REVIVALS:
+                self._revivals += 1
+                text = (
+                    f"The engine's process has ended unexpectedly ({how}); it is started again and goes where it was."
+                )
+                self._edit(notices=(Notice(number, "error", text),))
+                self._start(
+                    replace(
+                        self._setup,
+                        recording=last.journal,
+                        params=last.params,
+                        play=last.transport.playing,
+                        speed=last.transport.speed,
+                        breakpoints=last.breakpoints,
+                        session=last.session,
+                        notices=number,
+                    )
+                )
+                return
             text = f"The engine's process has ended unexpectedly ({how}); restart it to begin again at the first frame."
             self._edit(
                 engine_alive=False,

@@ -78,8 +78,9 @@ class FilesPanel:
         with gui.add_modal("Save results") as modal:
             gui.add_html(
                 box(
-                    "Writes <b>trajectory.tum</b>, <b>timings.csv</b>, <b>map.ply</b> and <b>report.json</b> "
-                    "of what was processed so far, below ",
+                    "Writes <b>trajectory.tum</b>, <b>timings.csv</b>, <b>map.ply</b>, <b>report.json</b>, of loops "
+                    "<b>loops.csv</b>, <b>graph.g2o</b> and <b>trajectory_odometry.tum</b>, and the session itself, "
+                    "<b>session.hemislam</b>, which can be opened again; all of what was processed so far, below ",
                     code(str(self._results)),
                 )
             )
@@ -145,7 +146,9 @@ class FileBrowser:
             for entry in entries[:_MOST_ENTRIES]:
                 self._entry(entry)
             if not entries:
-                self._shown.append(self._gui.add_html(box("No recordings (.bag, .mcap, .db3, ROS 2 folders) here.")))
+                self._shown.append(
+                    self._gui.add_html(box("No recordings (.bag, .mcap, .db3, .pcap, ROS 2 folders) or sessions here."))
+                )
             if len(entries) > _MOST_ENTRIES:
                 more = f"{len(entries) - _MOST_ENTRIES} more are not shown; name the file on the command line."
                 self._shown.append(self._gui.add_html(box(more)))
@@ -163,5 +166,10 @@ class FileBrowser:
         self._shown.append(button)
 
     def _choose(self, path: Path) -> None:
+        try:
+            path = self._folders.openable(path)
+        except HemislamError as error:
+            self._here.content = box(code(str(error)))
+            return
         self._send(OpenRecording(path, truth_beside(path) if self._with_truth.value else None))
         self._modal.close()

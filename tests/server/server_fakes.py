@@ -178,7 +178,7 @@ class FakeEngine:
         return GroundResult(cloud.labels, True, "", up, np.zeros(3), -up, 0.01, 10, share)
 
 
-def open_fake(path: Path, truth: Path | None, params: Params, /) -> Run:
+def open_fake(path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /) -> Run:
     """Opens names like `walk-50.mcap` (50 frames), `broken-50-20.mcap`, `failing-50-20.mcap`, `dropped-50-20.mcap`."""
     kind, *numbers = path.stem.split("-")
     if kind not in ("walk", "broken", "failing", "dropped"):

@@ -117,7 +117,7 @@ class Desk:
         self.session.open(Path(name), None)
         self.settle()
 
-    def _open(self, path: Path, truth: Path | None, params: Params, /) -> Run:
+    def _open(self, path: Path, truth: Path | None, params: Params, part: object = None, /) -> Run:
         run = fakes.open_fake(path, truth, params)
         run.engine = MoodyEngine(params)  # type: ignore[assignment]
         return run

@@ -30,16 +30,19 @@ class Desk:
     """A session that works whenever it is told something, and the page's view of it."""
 
     def __init__(self, params: Params, opener: Callable[..., Run], path: Path) -> None:
-        self.outbox, self.fold = Outbox(params), Fold()
+        self.params, self.outbox, self.fold = params, Outbox(params), Fold()
         self.runs: list[Run] = []
 
-        def opening(path: Path, truth: Path | None, params: Params) -> Run:
+        def opening(path: Path, truth: Path | None, params: Params, part: object = None) -> Run:
             self.runs.append(opener(path, truth, params))
             return self.runs[-1]
 
-        self.session = Session(self.outbox, params, opening, clock=lambda: 0.0)
+        self.session = self._session(opening)
         self.session.open(path, None)
         self.settle()
+
+    def _session(self, opener: Callable[..., Run]) -> Session:
+        return Session(self.outbox, self.params, opener, clock=lambda: 0.0)
 
     @property
     def run(self) -> Run:

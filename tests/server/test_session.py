@@ -42,7 +42,7 @@ class Desk:
             self.session.open(Path(recording), truth)
             self.settle()
 
-    def _open(self, path: Path, truth: Path | None, params: Params, /) -> Run:
+    def _open(self, path: Path, truth: Path | None, params: Params, part: object = None, /) -> Run:
         self.runs.append(fakes.open_fake(path, truth, params))
         return self.runs[-1]
 
@@ -386,7 +386,7 @@ def test_results_are_written_while_replay_goes_on(tmp_path: Path) -> None:
         snapshot = desk.do(StepFrame())
     assert [saved.error for saved in snapshot.saved] == ["", ""]
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
-        "trajectory.tum", "timings.csv", "map.ply", "report.json",
+        "trajectory.tum", "timings.csv", "map.ply", "report.json", "session.hemislam",
     }  # fmt: skip
     assert {file.name for file in (tmp_path / "short").iterdir()} == {"trajectory.tum"}
     assert len((tmp_path / "out/trajectory.tum").read_text().splitlines()) == 31

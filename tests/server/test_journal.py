@@ -1,0 +1,226 @@
+"""A session is a file: reopened it is where it was, repeated headless it gives the same, killed it loses a moment."""
+
+import json
+import math
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_rewind import SAMPLE, Desk, page
+from typer.testing import CliRunner
+
+from app.__main__ import cli
+from app.sensors.presets import resolve_params
+from app.server.journal import (
+    EVERY_S,
+    SUFFIX,
+    Journal,
+    Opened,
+    SavedSession,
+    State,
+    new_path,
+    read_session,
+    size_of,
+    write_session,
+)
+from app.server.protocol import OpenRecording, Play, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.run import Run, open_run
+from app.server.session import Session
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
+from app.slam.errors import HemislamError
+from app.slam.loops.types import Accept, Add, Reject
+from app.slam.params import Params
+
+LENGTH_S = 8.0
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> SavedSession:
+    recording = tmp_path / "walk.mcap"
+    recording.write_bytes(b"12345")
+    coarse = Params().with_values({"ground.alpha": 30.0})
+    state = State(
+        coarse, ((0, Params()), (12, coarse)), (Accept(1, 20, 21), Add(2, 30, None, False, 31)), (Reject(3, 9),)
+    )
+    return SavedSession(Opened(recording, None, 2.0, 30.0, 5), state, 41)
+
+
+def test_what_is_written_is_read(saved: SavedSession, tmp_path: Path) -> None:
+    write_session(tmp_path / "a.hemislam", saved)
+    assert read_session(tmp_path / "a.hemislam") == saved
+
+
+def test_a_journal_cut_anywhere_tells_the_session_up_to_there(saved: SavedSession, tmp_path: Path) -> None:
+    now = 0.0
+    journal = Journal(tmp_path / "b.hemislam", saved.opened, clock=lambda: now)
+    journal.note(0, State(Params()))
+    for frame in range(1, 40):
+        now += EVERY_S / 4
+        journal.did(frame, SetParams({"ground.alpha": 30.0}))
+        journal.note(frame, State(Params()) if frame < 20 else saved.state)
+    journal.close()
+    whole = (tmp_path / "b.hemislam").read_bytes()
+    frames = []
+    for length in range(whole.index(b"state"), len(whole), 97):
+        (tmp_path / "cut.hemislam").write_bytes(whole[:length])
+        try:
+            session = read_session(tmp_path / "cut.hemislam")
+        except HemislamError:
+            continue
+        assert session.state == (saved.state if session.frame >= 20 else State(Params()))
+        frames.append(session.frame)
+    assert frames == sorted(frames) and frames[-1] >= 36
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "no session"),
+        (b"PNG\x00\n", "no session"),
+        (b'{"hemislam": "9.0", "format": 99}\n', "written by hemislam 9.0"),
+        (b'{"hemislam": "0.1", "format": 1}\n', "damaged"),
+    ],
+)
+def test_a_file_that_is_no_session_is_refused_in_a_sentence(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / "bad.hemislam"
+    path.write_bytes(content)
+    with pytest.raises(HemislamError, match=says):
+        read_session(path)
+
+
+def test_a_recording_that_is_gone_or_another_is_said(saved: SavedSession, tmp_path: Path) -> None:
+    write_session(tmp_path / "a.hemislam", saved)
+    saved.opened.recording.write_bytes(b"123456")
+    with pytest.raises(HemislamError, match="another file now"):
+        read_session(tmp_path / "a.hemislam")
+    saved.opened.recording.unlink()
+    with pytest.raises(HemislamError, match="not there any more"):
+        read_session(tmp_path / "a.hemislam")
+
+
+def test_a_folder_that_can_not_be_written_ends_the_journal_not_the_session(saved: SavedSession, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    journal = Journal(tmp_path / "file" / "a.hemislam", saved.opened)
+    assert "not recorded" in journal.error
+    journal.note(0, saved.state)
+    journal.close()
+
+
+def test_two_sessions_at_one_time_have_two_names(tmp_path: Path) -> None:
+    first = new_path(tmp_path, Path("walk.mcap"))
+    first.write_text("")
+    assert new_path(tmp_path, Path("walk.mcap")) != first
+
+
+# --- with the real engine ------------------------------------------------------------------------
+class Kept(Desk):
+    """A session on the sample that is kept in a folder."""
+
+    def __init__(self, folder: Path, path: Path = SAMPLE) -> None:
+        self.folder = folder
+        super().__init__(resolve_params(SAMPLE, None, None, []), open_run, path)
+
+    def _session(self, opener: Callable[..., Run]) -> Session:
+        return Session(self.outbox, self.params, opener, journals=self.folder, clock=lambda: 0.0)
+
+    @property
+    def journal(self) -> Path:
+        path = self.see().journal
+        assert path is not None
+        return path
+
+
+def walk_about(desk: Kept) -> Snapshot:
+    """On, back, other parameters, on, and one last wish that no frame has seen yet."""
+    desk.do(Seek(30), SetParams({"ground.sigma": 0.02}), Seek(60), Seek(45), SetParams({"scan.voxel_size": 0.6}))
+    return desk.do(Seek(80), Seek(70), StepFrame(2), SetParams({"ground.alpha": 35.0}))
+
+
+def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path) -> None:
+    first = Kept(tmp_path)
+    there = walk_about(first)
+    second = Kept(tmp_path, first.journal)
+    again = second.see()
+    assert again.params == there.params and again.transport.frame == there.transport.frame == 72
+    assert again.trajectory is not None and there.trajectory is not None
+    np.testing.assert_array_equal(again.trajectory, there.trajectory)
+    third = Kept(tmp_path, second.journal)  # the one reopened is kept as well
+    assert page(first.do(StepFrame(10))) == page(second.do(StepFrame(10))) == page(third.do(StepFrame(10)))
+    for desk in (first, second, third):
+        desk.session.close()
+
+
+def test_a_saved_session_repeats_headless_to_the_same_files(tmp_path: Path) -> None:
+    desk = Kept(tmp_path)
+    walk_about(desk)
+    desk.session.handle(Save(tmp_path / "page"))
+    while not desk.see().saved:
+        desk.session.work()
+        time.sleep(0.01)
+    desk.session.close()
+    file = tmp_path / "page" / f"session{SUFFIX}"
+    result = CliRunner().invoke(cli, ["replay", str(file), "--out", str(tmp_path / "again")])
+    assert result.exit_code == 0, result.output
+    for name in ("trajectory.tum", "trajectory_odometry.tum", "map.ply", "graph.g2o"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "page" / name).read_bytes(), name
+    ours, theirs = (json.loads((tmp_path / place / "report.json").read_text()) for place in ("page", "again"))
+    assert ours["parameters"] == theirs["parameters"]
+
+
+def test_an_engine_killed_at_any_moment_goes_on_to_the_same_end(tmp_path: Path) -> None:
+    setup = Setup(
+        SAMPLE,
+        params=resolve_params(SAMPLE, None, None, []),
+        duration_s=LENGTH_S,
+        speed=math.inf,
+        play=True,
+        journals=tmp_path / "kept",
+    )
+    ends = []
+    rng = np.random.default_rng(3)
+    for kills in (0, 3):
+        engine = EngineProcess(setup)
+        try:
+            for _ in range(kills):
+                _until(engine, lambda s: s.transport.frame >= 0 and s.progress is None)
+                time.sleep(rng.uniform(0.0, 0.6))
+                if engine.pid is not None and not engine.snapshot.transport.finished:
+                    os.kill(engine.pid, signal.SIGKILL)
+                    time.sleep(0.5)
+            ends.append(_until(engine, lambda s: s.transport.finished))
+        finally:
+            engine.close()
+    assert any("goes where it was" in notice.text for notice in ends[1].notices)
+    assert ends[0].trajectory is not None and ends[1].trajectory is not None
+    np.testing.assert_array_equal(ends[0].trajectory, ends[1].trajectory)
+
+
+def _until(engine: EngineProcess, wanted: Callable[[Snapshot], bool]) -> Snapshot:
+    deadline = time.monotonic() + 60
+    snapshot = engine.snapshot
+    while not wanted(snapshot):
+        assert time.monotonic() < deadline, snapshot.transport
+        snapshot = engine.wait(snapshot.revision, timeout=1.0)
+    return snapshot
+
+
+def test_a_session_file_opens_in_the_page_too(tmp_path: Path) -> None:
+    desk = Kept(tmp_path)
+    desk.do(SetSpeed(math.inf), Seek(20), SetParams({"ground.sigma": 0.02}), StepFrame(3))
+    other = Kept(tmp_path)
+    there = other.do(OpenRecording(desk.journal))
+    assert there.transport.frame == 23 and there.params.ground.sigma == 0.02
+    assert other.do(Play()).transport.playing
+    desk.session.close()
+    other.session.close()
+
+
+def test_size_is_that_of_all_files(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"123")
+    (tmp_path / "b").write_bytes(b"4567")
+    assert size_of(tmp_path) == 7 and size_of(tmp_path / "a") == 3 and size_of(tmp_path / "none") == 0
