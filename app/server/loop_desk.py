@@ -53,8 +53,8 @@ class LoopDesk:
                 loops.command(Inspect(*pair))
             case InspectLoop():
                 view = replace(view, inspected=None)
-        if not isinstance(command, TryLoop):
-            loops.command(AskResiduals())
+        if command != TryLoop(None):
+            loops.command(AskResiduals())  # for a trial those of the present too, to compare with
         self._show(view)
 
     def update(self, loops: LoopLine) -> bool:

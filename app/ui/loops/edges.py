@@ -19,7 +19,7 @@ _RISE: Final = (0.7, 0.12)
 """Height of a knob above the edge's middle: m, and its share of the edge's length."""
 _WIDTH: Final = {Kind.ACCEPTED: 3.0, Kind.CANDIDATE: 2.0, Kind.REJECTED: 1.0, Kind.USER: 3.5}
 _OUT_WIDTH: Final = 1.0
-_KNOB_M: Final = {Kind.ACCEPTED: 0.16, Kind.CANDIDATE: 0.14, Kind.REJECTED: 0.09, Kind.USER: 0.17}
+_KNOB_M: Final = {Kind.ACCEPTED: 0.1, Kind.CANDIDATE: 0.1, Kind.REJECTED: 0.07, Kind.USER: 0.12}
 _CHOSEN: Final[Rgb] = (255, 255, 255)
 _CHOSEN_WIDTH: Final = 5.0
 _PICK_RAD: Final = np.radians(1.5)

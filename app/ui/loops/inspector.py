@@ -16,6 +16,8 @@ from app.ui.loops.words import evidence, submap_legend
 from app.ui.widgets import by_user
 
 FLY, SEEK, CLOSE = "fly there", "frame", "close"
+_LEAST_POINT_M: Final = 0.035
+"""Submaps are thinner than the map."""
 _NO_CONTEXTS: Final = np.zeros((1, 1, 4), np.uint8)
 
 
@@ -93,7 +95,8 @@ class Inspector:
             return
         T_map_older = poses[chosen[0]] @ detail.T_imu_level
         self._pairing = Pairing(detail.older, detail.newer, T_map_older)
-        self._overlay.draw(self._pairing, placed(detail, T_map_older, self._laid.value), point_size)
+        size = max(point_size, _LEAST_POINT_M)
+        self._overlay.draw(self._pairing, placed(detail, T_map_older, self._laid.value), size)
 
 
 def placed(detail: LoopDetail, T_map_older: F64, share: float) -> F64:

@@ -61,7 +61,7 @@ def submap_legend(pair: Pair) -> str:
 def worst_factors(residuals: tuple[FactorResidual, ...], most: int = _WORST) -> str:
     """The factors that the graph meets least, worst first; a loop can be clicked."""
     if not residuals:
-        return box('<span class="hs-quiet">The graph has no factors yet.</span>')
+        return box('<span class="hs-quiet">Worked out whenever a loop is chosen, tried or overruled.</span>')
     worst = sorted(residuals, key=lambda factor: -factor.sigmas)[:most]
     top = max(worst[0].sigmas, 1e-9)
     rows = "".join(
@@ -74,8 +74,8 @@ def worst_factors(residuals: tuple[FactorResidual, ...], most: int = _WORST) -> 
     loops = sum(factor.loop for factor in residuals)
     return (
         box(
-            f'<span class="hs-note">{len(residuals) - loops} odometry and {loops} loop factors, '
-            f"Σσ² = {number(_total(residuals), 1)}; the worst:</span>"
+            f'<span class="hs-note">{len(residuals) - loops} odometry and {loops} loop factors, Σσ² = '
+            f"{_total(residuals):.3g}, as of the loop chosen or overruled last; the worst:</span>"
         )
         + '<div class="hs-scroll" style="max-height:none"><table class="hs-table"><thead><tr><th>factor</th>'
         f"<th>°</th><th>cm</th><th>σ</th><th></th></tr></thead><tbody>{rows}</tbody></table></div>"
@@ -125,7 +125,7 @@ def _comparison(before: tuple[FactorResidual, ...], after: tuple[FactorResidual,
             for side in pairs
         ]
         rows += f"<tr>{''.join(cells)}</tr>"
-    sums = f"<tr><td>all, Σσ²</td><td>{number(_total(before), 1)}</td><td></td><td>{number(_total(after), 1)}</td></tr>"
+    sums = f"<tr><td>all, Σσ²</td><td>{_total(before):.3g}</td><td></td><td>{_total(after):.3g}</td></tr>"
     return f'<table class="hs-table" style="margin-top:4px"><thead>{heads}</thead><tbody>{rows}{sums}</tbody></table>'
 
 
@@ -134,7 +134,9 @@ def _total(residuals: tuple[FactorResidual, ...]) -> float:
 
 
 def _length(metres: float) -> str:
-    return f"{metres:.2f} m" if metres >= 1.0 else f"{100 * metres:.1f} cm"
+    if metres >= 1.0:
+        return f"{metres:.2f} m"
+    return f"{100 * metres:.1f} cm" if metres >= 0.01 else f"{1000 * metres:.1f} mm"
 
 
 def _what(factor: FactorResidual) -> str:
