@@ -33,6 +33,7 @@ class StudyPanel:
     Args:
         root: scene node of the map, whose position below the scene's origin is `offset`.
         snapshot: the newest one. now: monotonic seconds.
+        taken: whether a click's ray in the map, its origin and direction, was meant for something else.
     """
 
     def __init__(
@@ -42,9 +43,10 @@ class StudyPanel:
         snapshot: Callable[[], Snapshot],
         offset: Callable[[], F64],
         now: Callable[[], float] = time.monotonic,
+        taken: Callable[[F64, F64], bool] = lambda origin, direction: False,
     ) -> None:
         gui = server.gui
-        self._snapshot, self._offset, self._now = snapshot, offset, now
+        self._snapshot, self._offset, self._now, self._taken = snapshot, offset, now, taken
         self._scene = StudyScene(server.scene, root)
         self._clicked: tuple[F64, F64] | None = None  # in the scene: origin and direction of the newest click's ray
         self._picked: Picked | None = None
@@ -129,7 +131,9 @@ class StudyPanel:
             )
 
     def _click(self, event: viser.SceneClickEvent) -> None:
-        self._clicked = np.array(event.ray_origin) - self._offset(), np.array(event.ray_direction)
+        ray = np.array(event.ray_origin) - self._offset(), np.array(event.ray_direction)
+        if not self._taken(*ray):
+            self._clicked = ray
 
     def _next(self) -> None:
         order = list(StudyBy)

@@ -97,7 +97,14 @@ class Workbench:
         with tabs.add_tab("View", viser.Icon.EYE):
             self._appearance = AppearancePanel(gui)
         with tabs.add_tab("Study", viser.Icon.MICROSCOPE):
-            self._study = StudyPanel(server, ROOT, lambda: engine.snapshot, lambda: self._scene.offset, now)
+            self._study = StudyPanel(
+                server,
+                ROOT,
+                lambda: engine.snapshot,
+                lambda: self._scene.offset,
+                now,
+                taken=lambda origin, direction: self._loops.points_at(origin, direction),
+            )
         with tabs.add_tab("Files", viser.Icon.FOLDER):
             self._files = FilesPanel(gui, folders, results, engine.send, lambda: engine.snapshot)
         with tabs.add_tab("Help", viser.Icon.HELP):

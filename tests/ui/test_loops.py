@@ -127,6 +127,20 @@ def test_a_click_in_the_scene_chooses_the_loop_it_points_at(page: Page) -> None:
     assert page.engine.sent == [InspectLoop(GOOD)]
 
 
+def test_a_click_at_an_arch_is_not_taken_for_a_point_of_the_scan(page: Page) -> None:
+    poses = page.engine.snapshot.keyframe_poses
+    assert poses is not None
+    middle = poses[list(GOOD), :3, 3].mean(axis=0) + np.array([0.0, 0.0, 1.1])
+    for eye, target, meant in (
+        (middle + np.array([2.0, -6.0, 9.0]), middle, False),
+        (np.array([12.0, 7.0, 50.0]), np.array([12.0, 7.0, 0.0]), True),
+    ):
+        page.workbench._study._clicked = None
+        event: Any = SimpleNamespace(ray_origin=tuple(eye), ray_direction=tuple(target - eye))
+        page.workbench._study._click(event)
+        assert (page.workbench._study._clicked is not None) is meant
+
+
 def test_a_click_beside_all_loops_and_one_on_what_is_hidden_choose_nothing(page: Page) -> None:
     poses = page.engine.snapshot.keyframe_poses
     assert poses is not None

@@ -27,9 +27,6 @@ _LABEL: Final = np.array([0.0, 0.0, 0.5])
 _STILL_M: Final = 1e-3
 _SAMPLES: Final = np.linspace(0.0, 1.0, 12)
 
-Style = tuple[Kind, bool]
-"""How an edge is drawn: its kind, and whether it is in the graph."""
-
 
 def arches(edges: list[LoopEdge], poses: F64) -> F32:
     """(n, 3, 3) older keyframe, knob and newer keyframe of each edge in the map, from poses (k, 4, 4)."""
@@ -58,7 +55,7 @@ def nearest(lines: npt.NDArray[np.floating], origin: F64, direction: F64, within
 
 
 class LoopEdges:
-    """Arches and knobs of the loops shown: one node of lines and one of points for each style."""
+    """Arches and knobs of the loops shown: one node of lines and one of points for each kind, in the graph or not."""
 
     def __init__(self, scene: viser.SceneApi, root: str) -> None:
         self._scene = scene

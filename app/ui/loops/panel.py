@@ -86,6 +86,10 @@ class LoopsPanel:
         alone = self._inspector.alone or self._tie.nudging
         return replace(view, map=False, scan=False, wedge=False, plane=False) if alone else view
 
+    def points_at(self, origin: F64, direction: F64) -> bool:
+        """Whether a click's ray in the map is for the loops: at an arch, or while keyframes are picked."""
+        return self._tie.picking or self._edges.pick(origin, direction) is not None
+
     def choose(self, pair: Pair | None) -> None:
         """Show everything there is on a loop; None: on none."""
         if pair != self._chosen:
