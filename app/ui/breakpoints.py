@@ -13,9 +13,9 @@ from app.ui.widgets import by_user, show
 _SWITCHES: Final = (
     ("loop_found", "loop found", "A loop was accepted."),
     ("loop_rejected", "loop rejected", "A loop was looked at and turned down."),
-    ("no_ground", "no ground plane", "The seeds gave no plane; the notice says why."),
-    ("degenerate", "degenerate direction", "One direction is not held by the scan."),
-    ("dropped", "dropped frame", "A scan was left out."),
+    ("no_ground", "no ground", "The seeds gave no plane; the notice says why."),
+    ("degenerate", "degenerate", "One direction is not held by the scan."),
+    ("dropped", "scan dropped", "A scan was left out."),
 )
 
 
@@ -29,13 +29,14 @@ class _Limit:
     scale: float
     default: float
     step: float
+    hint: str
 
 
 _LIMITS: Final = (
-    _Limit("planarity", "λ3/λ2 over", "", 1.0, 0.3, 0.01),
-    _Limit("residual", "residual over", "mm", 1000.0, 50.0, 1.0),
-    _Limit("frame_ms", "frame over", "ms", 1.0, 100.0, 1.0),
-    _Limit("error", "error to truth over", "cm", 100.0, 50.0, 1.0),
+    _Limit("planarity", "λ3/λ2 over", "", 1.0, 0.3, 0.01, "The seeds are less flat than this."),
+    _Limit("residual", "residual over", "mm", 1000.0, 50.0, 1.0, "RMS distance of the points to the map's planes."),
+    _Limit("frame_ms", "frame over", "ms", 1.0, 100.0, 1.0, "Time that the engine took for the frame."),
+    _Limit("error", "error over", "cm", 100.0, 50.0, 1.0, "Distance to the truth, where there is one."),
 )
 
 
@@ -48,8 +49,7 @@ class BreakpointPanel:
         self._switches = {name: gui.add_checkbox(text, False, hint=hint) for name, text, hint in _SWITCHES}
         self._limits = {}
         for limit in _LIMITS:
-            text = f"{limit.text} ({limit.unit})" if limit.unit else limit.text
-            switch = gui.add_checkbox(text, False, hint="Pauses where it begins to hold; Play goes on.")
+            switch = gui.add_checkbox(limit.text, False, hint=limit.hint)
             number = gui.add_number(limit.unit or "limit", limit.default, min=0.0, step=limit.step)
             number.visible = False
             self._limits[limit.name] = switch, number

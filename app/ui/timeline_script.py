@@ -48,7 +48,7 @@ const say = (text, x, y, colour, align = 'left') => {
   pen.fillStyle = colour; pen.textAlign = align; pen.fillText(text, x, y);
 };
 function draw() {
-  const ratio = window.devicePixelRatio || 1, W = shell.clientWidth, rows = d ? d.strips.length + 1 : 0;
+  const ratio = window.devicePixelRatio || 1, W = canvas.clientWidth, rows = d ? d.strips.length + 1 : 0;
   ROW = shell.classList.contains('wide') ? 19 : 17;
   const H = HEAD + ROW * rows + 2;
   if (!W) return;
@@ -187,7 +187,7 @@ watch(); draw();
 """
 
 STYLE: Final = """<style>
-.hs-tl{position:relative;padding:0 0 4px;user-select:none}.hs-tl canvas{display:block;width:100%;touch-action:none}
+.hs-tl{position:relative;padding:0 6px 4px 0;user-select:none}.hs-tl canvas{display:block;width:100%;touch-action:none}
 .hs-tl.wide{background:rgba(20,25,32,.95);border:1px solid rgba(127,140,160,.25);border-radius:6px;padding:2px 0}
 .hs-tl button{position:absolute;right:6px;top:2px;border:0;background:none;color:#8b97a8;cursor:pointer;font-size:13px;
 line-height:16px;padding:0 3px}.hs-tl button:hover{color:#fff}

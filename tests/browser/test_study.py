@@ -88,9 +88,9 @@ def test_along_the_scene_it_is_as_wide_as_that_and_works_the_same_also_after_a_r
 
 def test_a_breakpoint_is_switched_on(bench: Bench) -> None:
     bench.page.get_by_text("Pause when").click()
-    bench.page.get_by_role("checkbox", name="no ground plane").click()
+    bench.page.get_by_role("checkbox", name="no ground").click()
     bench.eventually(lambda: SetBreakpoints(Breakpoints(no_ground=True)) in bench.engine.sent)
-    bench.page.get_by_role("checkbox", name="no ground plane").click()
+    bench.page.get_by_role("checkbox", name="no ground").click()
     bench.eventually(lambda: bench.engine.sent[-1] == SetBreakpoints(Breakpoints()))
     bench.page.get_by_text("Pause when").click()
 
