@@ -1,6 +1,10 @@
 """Where playing pauses by itself: the conditions on their own, and in a session."""
 
 import math
+import os
+import signal
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +14,11 @@ import server_fakes as fakes
 
 from app.server.breakpoints import Breakpoints, Moment, reasons
 from app.server.delta import Fold, Outbox
-from app.server.protocol import Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot, StepFrame
+from app.server.protocol import Pause, Play, Restart, Seek, SetBreakpoints, SetSpeed, Snapshot, StepFrame
 from app.server.run import Run
 from app.server.session import Session
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.params import Params
@@ -178,3 +184,29 @@ def test_breakpoints_taken_off_pause_nothing() -> None:
     desk.do(NO_GROUND, SetBreakpoints(Breakpoints()), FAST)
     assert desk.do(Play(), Pause()).transport.frame >= 0
     assert desk.do(Play()).transport.frame == FRAMES - 1
+
+
+def test_an_engine_that_was_killed_still_pauses_there() -> None:
+    engine = EngineProcess(Setup(recording=Path("dropped-30-12.mcap")), main=fakes.fake_main)
+    try:
+        engine.send(SetBreakpoints(Breakpoints(dropped=True)))
+        first = until(engine, lambda s: s.breakpoints.dropped and s.transport.frame == 0)
+        assert engine.pid is not None
+        os.kill(engine.pid, signal.SIGKILL)
+        until(engine, lambda s: not s.engine_alive)
+        engine.send(Restart())
+        until(engine, lambda s: s.engine_alive and s.session > first.session and s.transport.frame == 0)
+        engine.send(FAST)
+        engine.send(Play())
+        assert until(engine, lambda s: s.transport.frame > 0 and not s.transport.playing).transport.frame == 12
+    finally:
+        engine.close()
+
+
+def until(engine: EngineProcess, wanted: Callable[[Snapshot], bool]) -> Snapshot:
+    deadline = time.monotonic() + 60.0
+    snapshot = engine.snapshot
+    while not wanted(snapshot):
+        assert time.monotonic() < deadline, snapshot.transport
+        snapshot = engine.wait(snapshot.revision, timeout=1.0)
+    return snapshot
