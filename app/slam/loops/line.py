@@ -36,6 +36,7 @@ from app.slam.types import Keyframe
 
 MOST_DEATHS = 3
 """So often the work is begun again when it dies; after that, loops stay as they are."""
+STATES_KEPT = 64
 MOST_PENDING = 4
 """Keyframes handed over again that wait at the worker's."""
 
@@ -81,6 +82,7 @@ class LoopLine:
         self._in_effect = 0
         self._asked: deque[_Asked] = deque()
         self._arrived: deque[tuple[int, LoopState]] = deque()
+        self._states: dict[int, LoopState] = {}  # the last, by keyframes, so that a step back waits for nobody
         self._news: list[LoopEdge] = []
         self._again: int | None = None  # the next keyframe to hand over again, after the work has died
         self._deaths = 0
@@ -113,7 +115,12 @@ class LoopLine:
             self._stamps.append(keyframe.stamp_ns)
         self._count += 1
         self._params = params
-        if self._again is None:
+        if not known:
+            self._states = {count: state for count, state in self._states.items() if count <= index}
+        if self._again is None and known and index + 1 in self._states and not self._asked_for_state:
+            self._arrived.append((index + 1, self._states[index + 1]))
+            self._ask(GoTo(index + 1), index + 1, void=True)
+        elif self._again is None:
             self._ask(GoTo(index + 1) if known else AddKeyframe(keyframe, params), index + 1)
 
     def go_to(self, frame: int) -> None:
@@ -123,20 +130,30 @@ class LoopLine:
         """
         for asked in self._asked:
             asked.void = True
+            if asked.keyframes is None:
+                self._states.clear()  # the user's command changes them all
         self._arrived.clear()
         self._count = len(self._keyframes)
         if self._again is not None or self._count > len(self._frames):  # or another engine's walk goes on here
             self._begin_again()
             return
         due = bisect_right(self._frames, frame - self._latency, hi=self._count)
+        wanted = range(due, self._count + 1)
+        if all(count in self._states for count in wanted):
+            self._in_effect = due
+            self._take(self._states[due])
+            self._arrived.extend((count, self._states[count]) for count in wanted[1:])
+            self._ask(GoTo(self._count), self._count, void=True)
+            return
         self._in_effect = -1
-        for index in range(due, self._count + 1):
-            self._ask(GoTo(index), index)
+        for count in wanted:
+            self._ask(GoTo(count), count)
 
     def forget_after(self, frame: int) -> None:
         """Keyframes after this frame will be others."""
         keep = max(bisect_right(self._frames, frame), self._count)
         del self._frames[keep:], self._stamps[keep:]
+        self._states = {count: state for count, state in self._states.items() if count <= keep}
 
     def finish(self) -> None:
         """The walk has ended: look for loops of the last keyframes too, and let all take effect that comes."""
@@ -201,9 +218,14 @@ class LoopLine:
         self._client.close()
 
     # --- the work --------------------------------------------------------------------------------
-    def _ask(self, request: Request, keyframes: int | None) -> None:
+    @property
+    def _asked_for_state(self) -> bool:
+        """Whether the state of a keyframe is still outstanding."""
+        return any(asked.keyframes is not None and not asked.void for asked in self._asked)
+
+    def _ask(self, request: Request, keyframes: int | None, *, void: bool = False) -> None:
         if self._deaths <= MOST_DEATHS:
-            self._asked.append(_Asked(keyframes))
+            self._asked.append(_Asked(keyframes, void))
             self._client.send(request)
         elif keyframes is None:
             self._answers.append(Failure("Loops are no longer worked on; restart to try again."))
@@ -225,10 +247,14 @@ class LoopLine:
             elif asked.keyframes is None:
                 self._news += [edge for _, state in self._arrived for edge in state.changed]
                 self._arrived.clear()
+                self._states.clear()  # they are of other commands
                 self._in_effect = reply.count
                 self._take(reply)
             else:
                 self._arrived.append((asked.keyframes, reply))
+                self._states[asked.keyframes] = reply
+                while len(self._states) > STATES_KEPT:
+                    del self._states[next(iter(self._states))]
         elif asked.keyframes is None:
             self._answers.append(reply)
         elif isinstance(reply, Failure):
@@ -261,6 +287,7 @@ class LoopLine:
     def _begin_again(self) -> None:
         """Hand all keyframes over from the first on, while frames go on with the state that there is."""
         self._again = 0
+        self._states.clear()
         self._asked.append(_Asked(0, void=True))
         commands = (self.state.undo, self.state.redo) if self.state is not None else ((), ())
         self._client.send(LoadCommands(*commands))
