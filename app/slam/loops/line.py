@@ -137,7 +137,7 @@ class LoopLine:
         if self._again is not None or self._count > len(self._frames):  # or another engine's walk goes on here
             self._begin_again()
             return
-        due = bisect_right(self._frames, frame - self._latency, hi=self._count)
+        due = bisect_right(self._frames, frame - 1 - self._latency, hi=self._count)
         wanted = range(due, self._count + 1)
         if all(count in self._states for count in wanted):
             self._in_effect = due

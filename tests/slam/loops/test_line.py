@@ -170,6 +170,28 @@ def test_gone_back_and_on_again_every_frame_is_as_it_was(walk: Walk, frame: int)
     assert len(walk.client.added) == sent, "what is known is not handed over twice"
 
 
+def test_a_step_back_waits_for_nobody(walk: Walk) -> None:
+    walk.client.answered = 100
+    shifts = [walk.step()[1] for _ in range(30)]
+    walk.line.poll()
+    waits = walk.client.waits
+    for frame in range(28, 15, -1):
+        walk.go_to(frame)
+        assert walk.line.frame.newest[0, 3] == shift_at(frame - 1)
+        assert walk.step()[1] == shifts[frame]
+    assert walk.client.waits == waits
+
+
+def test_a_command_given_just_before_going_back_is_not_lost(walk: Walk) -> None:
+    for _ in range(30):
+        walk.step()
+    walk.line.command(Overrule(Accept(0, 2)))
+    walk.go_to(20)
+    walk.step()
+    assert walk.line.state is not None and walk.line.state.undo == (Accept(0, 2),)
+    assert walk.line.frame.newest[0, 3] == shift_at(20)
+
+
 def test_a_walk_that_goes_on_differently_hands_its_keyframes_over_anew(walk: Walk) -> None:
     for _ in range(30):
         walk.step()
