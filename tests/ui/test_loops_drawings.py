@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -17,6 +17,7 @@ angles = st.tuples(*(st.floats(-1.5, 1.5) for _ in range(3)))
 places = st.tuples(*(st.floats(-50, 50) for _ in range(3)))
 
 
+@settings(deadline=None)
 @given(angles, places, angles, places, st.floats(0, 1))
 def test_on_the_way_positions_go_straight_and_rotations_as_slerp_has_it(
     turn_a: tuple[float, ...], at_a: tuple[float, ...], turn_b: tuple[float, ...], at_b: tuple[float, ...], share: float
@@ -92,6 +93,7 @@ def test_the_plot_of_shifts_runs_from_half_a_turn_to_half_a_turn_and_marks_the_b
     assert lowest == pytest.approx(26 + 0.75 * (300 - 6 - 26), abs=0.5)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 30), st.floats(0.0, 0.9))
 def test_of_many_edges_the_eye_s_ray_means_the_one_it_touches(which: int, share: float) -> None:
     rng = np.random.default_rng(which)
@@ -117,6 +119,7 @@ def test_what_is_behind_or_far_beside_is_not_meant() -> None:
     assert nearest(np.empty((0, 3, 3)), np.zeros(3), np.ones(3)) is None
 
 
+@settings(deadline=None)
 @given(places, places, places, st.floats(3, 40))
 def test_the_camera_stands_at_its_distance_above_what_it_looks_at(
     position: tuple[float, ...], look_at: tuple[float, ...], target: tuple[float, ...], distance: float

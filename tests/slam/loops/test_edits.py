@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -35,6 +35,7 @@ def _commands(draw: st.DrawFn) -> Command:
     )
 
 
+@settings(deadline=None)
 @given(st.lists(_commands(), max_size=6))
 def test_what_is_written_is_read_again_to_the_last_digit(commands: list[Command]) -> None:
     again = read(write(commands))
