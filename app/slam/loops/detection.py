@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import KDTree
 
 from app.slam import lie
 from app.slam.loops import scan_context, verification
@@ -132,9 +133,9 @@ class Detector:
             return []
         context = self._contexts[newer]
         keys = np.array([self._contexts[i].ring_key for i in candidates])
-        alike = np.linalg.norm(keys - context.ring_key, axis=1)
-        nearest = candidates[np.argsort(alike, kind="stable")[: p.candidates]]
-        sightings = [self._compare(int(older), newer, expectation, p) for older in nearest]
+        ranks = np.arange(1, min(p.candidates, len(keys)) + 1)
+        _, nearest = KDTree(keys).query(context.ring_key, k=ranks)  # type: ignore[no-untyped-call]  # no types
+        sightings = [self._compare(int(older), newer, expectation, p) for older in candidates[nearest]]
         chosen: list[Sighting] = []
         for sighting in sorted(sightings, key=lambda s: s.distance):
             where = self._heads[sighting.older].T_odom_imu[:3, 3]
