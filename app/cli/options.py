@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from app.slam.params import Params
 
 RecordingPath = Annotated[
-    Path, typer.Argument(metavar="RECORDING", help="A .mcap, .db3 or .bag file, or the folder of a ROS 2 recording.")
+    Path, typer.Argument(metavar="RECORDING", help="A .mcap, .db3, .bag or .pcap file, or a ROS 2 folder.")
 ]
 Preset = Annotated[
     str | None, typer.Option("--preset", metavar="NAME", help="Settings of a known device, e.g. h2lid or rslidar.")

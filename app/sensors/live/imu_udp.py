@@ -40,6 +40,8 @@ IMU_PORT = 6700
 IMU_MAGIC = b"HIMU"
 _SAMPLE = struct.Struct("<4sIq6d")
 SAMPLE_BYTES = _SAMPLE.size
+_FAR_NS = 1 << 62
+"""The year 2116: no time that anything here could reckon with."""
 
 Vector = tuple[float, float, float]
 
@@ -66,7 +68,7 @@ def read_imu(datagram: bytes) -> list[ImuSample]:
         return []
     samples = []
     for magic, number, stamp, gx, gy, gz, ax, ay, az in _SAMPLE.iter_unpack(datagram):
-        if magic != IMU_MAGIC:
+        if magic != IMU_MAGIC or abs(stamp) >= _FAR_NS:
             return []
         samples.append(ImuSample(number, stamp, (gx, gy, gz), (ax, ay, az)))
     return samples

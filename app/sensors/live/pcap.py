@@ -12,6 +12,7 @@ from typing import BinaryIO
 CLASSIC_MAGIC = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
 NEXT_MAGIC = b"\x0a\x0d\x0d\x0a"
 MAX_RECORD = 1 << 22
+_FAR_NS = 1 << 62
 _FRAGMENTS_KEPT = 64
 """Datagrams of which parts wait for the rest; older ones are given up."""
 
@@ -70,6 +71,8 @@ class Capture:
         """UDP datagrams from a record's position on, or all."""
         fragments: dict[bytes, _Fragments] = {}
         for record in self.records(position):
+            if not 0 <= record.time_ns < _FAR_NS:
+                continue
             network = _network_layer(record)
             if network:
                 found = _udp(record, network, fragments)

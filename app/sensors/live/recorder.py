@@ -6,6 +6,7 @@ the disk: a crash costs less than the last second, and a missing end is no obsta
 """
 
 import os
+import struct
 import threading
 from collections import deque
 from pathlib import Path
@@ -80,7 +81,10 @@ class Recorder:
                     self._wake.wait(FLUSH_S)
                     closing = self._closing
                     while self._waiting:
-                        self._write(self._waiting.popleft())
+                        try:
+                            self._write(self._waiting.popleft())
+                        except (struct.error, OverflowError):  # a time that ROS can not express
+                            self.left_out += 1
                     if closing:
                         self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
                     else:

@@ -39,7 +39,7 @@ class LiveSource:
         self._watched_at = 0.0
         self._told_failure = False
         self._threads = [
-            threading.Thread(target=receive, args=(intake, self._stop), daemon=True, name=f"receive-{number}")
+            threading.Thread(target=_run, args=(receive, intake, self._stop), daemon=True, name=f"receive-{number}")
             for number, receive in enumerate(receivers)
         ]
         for thread in self._threads:
@@ -128,3 +128,11 @@ class LiveSource:
                 self._silent[sensor] = None
                 text = f"the {sensor} is back after {now - since:.1f} s"
                 self._events.append(Status("back", sensor, text, time.time_ns()))
+
+
+def _run(receive: Receive, intake: Intake, stop: threading.Event) -> None:
+    try:
+        receive(intake, stop)
+    except Exception as error:  # the other threads go on; the user must know that this one does not
+        intake.put_status("disconnected", "source", f"receiving has ended: {type(error).__name__}: {error}")
+        raise

@@ -1,5 +1,6 @@
 """A capture of the sensor's packets is a recording like any other."""
 
+import random
 import struct
 from pathlib import Path
 
@@ -167,3 +168,20 @@ def test_angles_beside_the_capture_win(tmp_path: Path) -> None:
     lowest = scan.points[scan.ring == 0]
     tilt = np.degrees(np.arctan2(lowest[:, 2] - 0.09427, np.hypot(lowest[:, 0], lowest[:, 1]) - 0.01473))
     assert np.median(tilt) == pytest.approx(2.3125 - 0.5, abs=0.01)
+
+
+def test_a_damaged_capture_is_read_or_refused_but_never_crashes(tmp_path: Path) -> None:
+    rng = random.Random(0)
+    entries = walk()[::3]
+    wholes = [captures.pcap(entries, "fragments"), captures.pcapng(entries, "vlan")]
+    for number in range(60):
+        data = bytearray(wholes[number % 2])
+        for _ in range(rng.randrange(1, 60)):
+            data[rng.randrange(len(data) if number % 3 else 2_000)] = rng.randrange(256)
+        path = tmp_path / ("x.pcap" if number % 2 == 0 else "x.pcapng")
+        path.write_bytes(bytes(data[: rng.randrange(1_000, len(data))]))
+        try:
+            found = measurements(path)
+        except HemislamError:
+            continue
+        assert all(np.isfinite(m.scan.points).all() for m in found)

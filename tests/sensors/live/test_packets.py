@@ -174,3 +174,19 @@ def test_packets_run_on_over_the_end_of_a_revolution_but_not_over_a_pause() -> N
 def test_nominal_angles_are_the_data_sheets() -> None:
     np.testing.assert_allclose(NOMINAL.elevations_deg, sensor.ELEVATIONS)
     assert isinstance(NOMINAL, Calibration)
+
+
+def test_no_bytes_of_a_device_packet_stop_the_decoder() -> None:
+    rng = np.random.default_rng(3)
+    packets = sensor.turns(1)
+    for number in range(300):
+        broken = bytearray(sensor.difop(angles=ANGLES))
+        for at in rng.integers(8, 1248, 1 + number):
+            broken[at] = rng.integers(256)
+        said = read_difop(bytes(broken))
+        assert said is not None
+        decoder = Decoder()
+        decoder.configure(said)
+        (scan,) = scans(packets[:20], decoder)
+        assert np.isfinite(scan.points).all()
+        assert sorted(set(scan.ring.tolist())) == list(range(32))

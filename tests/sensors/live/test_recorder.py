@@ -128,3 +128,12 @@ def test_no_place_to_write_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(HemislamError, match=r"can not be written|is there already"):
         Recorder(tmp_path / "file" / "session.mcap")
+
+
+def test_a_time_that_ros_has_no_number_for_is_left_out(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "session.mcap")
+    record(recorder, range(3))
+    recorder.add_imu(1 << 61, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), sensor.START_NS)
+    recorder.close()
+    assert (recorder.failure, recorder.left_out) == ("", 1)
+    assert len(scans(recorder.path)) == 2

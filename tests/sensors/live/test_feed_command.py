@@ -1,0 +1,35 @@
+"""`hemislam feed` explains itself, and refuses what can not be in one sentence."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from app.__main__ import cli
+from tests.sensors.live import ports
+
+MUSEUM = str(Path(__file__).resolve().parents[3] / "sample_data" / "museum.mcap")
+
+
+def test_it_plays_packets_to_whoever_listens_or_nobody() -> None:
+    one, two, three = ports.free(3)
+    to, beside = f"rsbpearl://127.0.0.1:{one},{two}", f"imu-udp://127.0.0.1:{three}"
+    done = CliRunner().invoke(
+        cli, ["feed", MUSEUM, "--to", to, "--imu-to", beside, "--speed", "0", "--duration", "0.5"]
+    )
+    assert done.exit_code == 0, done.output
+    assert "packets sent" in done.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--to", "http://x"], "is no live source"),
+        (["--to", "imu-udp://127.0.0.1:1"], "Play it out to rsbpearl:// or foxglove://"),
+        (["--to", "foxglove://127.0.0.1:1", "--speed", "-1"], "less than nothing"),
+    ],
+)
+def test_what_can_not_be_is_refused(arguments: list[str], words: str) -> None:
+    done = CliRunner().invoke(cli, ["feed", MUSEUM, *arguments])
+    assert done.exit_code == 2
+    assert words in done.output
