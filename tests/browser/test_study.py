@@ -39,11 +39,17 @@ def seeks(bench: Bench) -> list[int]:
 
 
 def click_goes_to(bench: Bench, frame: int) -> None:
-    bench.page.mouse.move(*place_of(bench, frame))
-    bench.page.mouse.down()
-    bench.page.mouse.up()
-    bench.eventually(lambda: bool(seeks(bench)))
-    assert abs(seeks(bench)[-1] - frame) <= 2  # less than a pixel
+    """Click where a frame is, again if need be: a page that is still busy may move the strips meanwhile."""
+
+    def clicked() -> bool:
+        bench.engine.sent.clear()
+        bench.page.mouse.move(*place_of(bench, frame))
+        bench.page.mouse.down()
+        bench.page.mouse.up()
+        bench.page.wait_for_timeout(700)
+        return bool(seeks(bench)) and abs(seeks(bench)[-1] - frame) <= 2  # that is less than a pixel
+
+    bench.eventually(clicked)
 
 
 def drawn(bench: Bench) -> int:
@@ -79,11 +85,10 @@ def test_along_the_scene_it_is_as_wide_as_that_and_works_the_same_also_after_a_r
     click_goes_to(bench, 30)
     bench.page.reload()
     bench.eventually(lambda: x() < panel["x"] - 100)
-    bench.engine.sent.clear()
     bench.eventually(lambda: drawn(bench) > 300)
     click_goes_to(bench, 20)
     bench.page.get_by_role("button", name="timeline place").click()
-    bench.eventually(lambda: x() == panel["x"])
+    bench.eventually(lambda: abs(x() - panel["x"]) < 2)
 
 
 def test_a_breakpoint_is_switched_on(bench: Bench) -> None:
