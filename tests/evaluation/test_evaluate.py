@@ -127,10 +127,12 @@ def test_killed_at_any_moment_and_started_again_it_gives_the_same_tables(
             command(*arguments), cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         while not moment() and process.poll() is None:
-            time.sleep(0.02)
+            time.sleep(0.001)
         process.send_signal(signal.SIGKILL)
-        process.wait()
+        assert process.wait() == -signal.SIGKILL  # it was still at work
 
+    begin = time.monotonic()
+    kill_when(lambda: time.monotonic() > begin + 2.0)  # before the first results
     kill_when(lambda: any(runs.glob("*.part-*")))  # in the middle of writing results
     kill_when(lambda: any(runs.glob("*/run.json")))  # some are finished, some are not
     survived = {path: path.stat().st_mtime_ns for path in runs.glob("*/run.json")}
