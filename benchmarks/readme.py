@@ -1,0 +1,73 @@
+"""Puts what `hemislam evaluate --suite paper` found beside the paper's own figures, into README.md.
+
+hemislam evaluate --suite paper --short --out runs/suite
+python -m benchmarks.readme runs/suite
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from app.evaluation import paper
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+BEGIN, END = "<!-- suite: written by benchmarks/readme.py -->", "<!-- /suite -->"
+SYSTEMS = ("FAST-LIO", "FAST-LIO-GD", "FAST-LIO-L", "Ours")
+
+
+def main() -> None:
+    (folder,) = sys.argv[1:]
+    results = json.loads((Path(folder) / "results.json").read_text(encoding="utf-8"))
+    README.write_text(with_section(README.read_text(encoding="utf-8"), section(results)), encoding="utf-8")
+
+
+def with_section(readme: str, text: str) -> str:
+    """The README with what is between the marks replaced by `text`."""
+    before, mark, rest = readme.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (mark and end):
+        raise SystemExit(f"README.md has no `{BEGIN}` ... `{END}` to write between.")
+    return f"{before}{BEGIN}\n{text}\n{END}{after}"
+
+
+def section(results: dict[str, Any]) -> str:
+    """Rows of each sequence, here and in the paper; then what may be compared, and what the table says."""
+    machine = results["machine"]
+    lines = [
+        f"| sequence | | {' | '.join(SYSTEMS)} |",
+        f"| --- | --- |{' ---: |' * len(SYSTEMS)}",
+    ]
+    for recording in results["recordings"]:
+        sequence = paper.SEQUENCES.get(recording["name"].partition("-")[0])
+        if sequence is None:
+            continue
+        found = {variant["variant"]: variant for variant in recording["variants"]}
+        ours = [found.get(name) or {} for name in SYSTEMS]
+        rows = (
+            ("ATE here, m", [_at(o, "accuracy", "ate_m", "rmse") for o in ours], ".4f"),
+            ("ATE in the paper, m", [sequence.ate_m.get(name) for name in SYSTEMS], ".2f"),
+            ("ms a frame here", [_at(o, "runtime_ms", "total", "median") for o in ours], ".1f"),
+            ("ms a frame in the paper", [sequence.runtime_ms.get(name) for name in SYSTEMS], ".1f"),
+        )
+        name = f"{sequence.name} ({recording['name']})"
+        for label, values, form in rows:
+            if any(value is not None for value in values):
+                cells = " | ".join("–" if value is None else format(value, form) for value in values)
+                lines.append(f"| {name} | {label} | {cells} |")
+                name = ""
+    lines += ["", paper.NOT_COMPARABLE, "", "What the table says:", ""]
+    lines += [f"- {finding}" for finding in results["findings"]]
+    return "\n".join(
+        [*lines, "", f"Measured on {machine['processor']}, {machine['cores']} cores, one of them a variant."]
+    )
+
+
+def _at(tree: Any, *path: str) -> float | None:
+    for name in path:
+        tree = tree.get(name) if tree else None
+    return None if tree is None else float(tree)
+
+
+if __name__ == "__main__":
+    main()
