@@ -1,5 +1,6 @@
 """`hemislam serve`: the workbench in the browser."""
 
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -7,6 +8,7 @@ from typing import Annotated
 import typer
 
 from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic, Preset, Start, Truth, resolve
+from app.slam.errors import HemislamError
 
 
 def serve(
@@ -42,6 +44,21 @@ def serve(
             help="For going back to any frame; what is beyond it goes to temporary files, up to four times as much.",
         ),
     ] = 1024,
+    live: Annotated[
+        str | None,
+        typer.Option(
+            "--live",
+            metavar="URL",
+            help="Map what a sensor sends: rsbpearl://0.0.0.0:6699,7788 or foxglove://HOST:8765.",
+        ),
+    ] = None,
+    imu: Annotated[
+        str | None,
+        typer.Option("--imu", metavar="URL", help="Where IMU samples come from: imu-udp://:6700, foxglove://..."),
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", metavar="FILE", help="Write what comes live into this .mcap.")
+    ] = None,
     preset: Preset = None,
     config: Config = None,
     assignments: Assignments = None,
@@ -63,11 +80,15 @@ def serve(
       hemislam serve indoor1.bag --preset h2lid --paused
       hemislam serve runs/sessions/walk-20261121-101500.hemislam     goes on where that session ended
       hemislam serve --folder ~/recordings --port 8081
+      hemislam serve --live rsbpearl://0.0.0.0:6699,7788 --imu imu-udp://:6700 --record walk.mcap
+      hemislam serve --live foxglove://robot:8765 --preset rslidar
       hemislam serve walk.mcap --host 0.0.0.0            from other computers, by the printed link
     """
+    from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording
     from app.server.folders import Folders
     from app.server.journal import SUFFIX, read_session
+    from app.server.protocol import LIVE
     from app.server.setup import Setup
     from app.server.web import run_server
     from app.slam.trajectory import read_tum
@@ -81,6 +102,10 @@ def serve(
         lidar_topic=lidar_topic,
         imu_topic=imu_topic,
     )
+    if live is not None and recording is not None:
+        raise HemislamError("Give a recording or --live, not both.")
+    if live is None and (imu or record):
+        raise HemislamError("--imu and --record belong to --live; say with it where scans come from.")
     session = read_session(recording) if recording is not None and recording.suffix == SUFFIX else None
     params = session.state.params if session else resolve_for(recording)
     if recording is not None:
@@ -88,21 +113,23 @@ def serve(
         open_recording(opened, params).close()  # so that a mistake is told here and not in the page
     if truth is not None:
         read_tum(truth)
-    run_server(
-        Setup(
-            recording=recording,
-            truth=truth,
-            params=params,
-            start_s=start,
-            duration_s=duration,
-            resolve=resolve_for,
-            play=not paused,
-            checkpoint_bytes=checkpoint_memory << 20,
-            journals=Path("runs") / "sessions",
-        ),
-        folders=Folders(folder or [recording.resolve().parent if recording else Path.cwd()]),
-        build_page=partial(Workbench, point_budget=point_budget, results=Path("runs")),
-        host=host,
-        port=port,
-        open_browser=not no_browser,
-    )
+    with LiveProcess(live, params, imu, record) if live else nullcontext() as source:
+        run_server(
+            Setup(
+                recording=recording or (LIVE if live else None),
+                truth=truth,
+                params=params,
+                start_s=start,
+                duration_s=duration,
+                resolve=resolve_for,
+                play=not paused or live is not None,
+                checkpoint_bytes=checkpoint_memory << 20,
+                journals=Path("runs") / "sessions",
+                live=source.address if source else None,
+            ),
+            folders=Folders(folder or [recording.resolve().parent if recording else Path.cwd()]),
+            build_page=partial(Workbench, point_budget=point_budget, results=Path("runs")),
+            host=host,
+            port=port,
+            open_browser=not no_browser,
+        )

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from app.server import wire
 from app.server.delta import Delta, Outbox
-from app.server.protocol import Command, Progress, SetBreakpoints, SetSpeed, Shutdown
+from app.server.live import open_live_run
+from app.server.protocol import LIVE, Command, Progress, SetBreakpoints, SetSpeed, Shutdown
 from app.server.run import Run, open_run
 from app.server.session import OpenRun, Session
 from app.server.setup import Setup
@@ -102,6 +103,8 @@ def main(commands: Pipe, updates: Pipe, setup: Setup) -> None:
     def opener(
         path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /
     ) -> Run:
+        if path == LIVE and setup.live is not None:
+            return open_live_run(setup.live, params)
         part = part or ((setup.start_s, setup.duration_s) if path == setup.recording else (0.0, None))
         return open_run(path, truth, params, *part, checkpoint_bytes=setup.checkpoint_bytes)
 

@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from app.sensors.findings import Finding
+from app.sensors.live.status import LiveState
 from app.server.breakpoints import Breakpoints
 from app.slam.loops import types as loops
 from app.slam.params import Params
 from app.slam.types import F32, F64, I64, U8, U16, StepResult
+
+LIVE = Path("live")
+"""Stands for the live source wherever a recording is named."""
 
 
 # --- commands ------------------------------------------------------------------------------------
@@ -249,12 +253,13 @@ SERIES = (
     "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "loops_ms",
     "total_ms",
     "iterations", "used", "inliers", "residual_rms", "degeneracy", "imu_gap_s", "dropped",
-    "speed", "gyro_bias", "accel_bias", "distance", "error_m",
+    "speed", "gyro_bias", "accel_bias", "distance", "error_m", "turn_x", "turn_y", "turn_z",
 )  # fmt: skip
 """Per-frame readouts, one float64 array each, nan where there is none. `stamp_s` counts from the
 start of the recording; `used` points were looked up in the map; `degeneracy` is the smallest
 eigenvalue of the pose information; `imu_gap_s` and `dropped` as in `StepResult`; `speed` m/s; the
-biases are norms; `distance` m walked; `error_m` to the truth, aligned to the walk so far."""
+biases are norms; `distance` m walked; `error_m` to the truth, aligned to the walk so far; `turn_*` is the
+rotation vector (rad) of R_odom_imu."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,6 +284,7 @@ class Snapshot:
         progress: what takes long just now, or None. notices: the newest 50.
         saved: the newest 10 `Save`s that ended.
         engine_alive: False when the engine's process has died.
+        live: how the live source is doing; None for a recording.
         journal: file in which this session is kept; opening it goes on from there.
     """
 
@@ -301,3 +307,4 @@ class Snapshot:
     saved: tuple[Saved, ...] = ()
     engine_alive: bool = True
     journal: Path | None = None
+    live: LiveState | None = None

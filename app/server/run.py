@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from app.sensors.live.status import Status
 from app.sensors.recording import Place, Recording, open_recording
 from app.server.checkpoints import DEFAULT_BYTES, Checkpoints
 from app.server.journal import SUFFIX, SavedSession, write_session
@@ -35,6 +36,13 @@ class RunState:
     readouts: ReadoutsState
 
 
+@dataclass(frozen=True, slots=True)
+class Quiet:
+    """There is no scan just now; of a live source. status: what it has to tell instead, if anything."""
+
+    status: Status | None = None
+
+
 class Run:
     """A recording being processed.
 
@@ -46,8 +54,11 @@ class Run:
         frame: index of the newest frame, -1 before the first. known: of the last one that there is a way back to.
         params: for frames not yet processed; set them with `choose`.
         history: from which frame on which were in force, ascending.
+        live: whether it goes on as it happens, and there is no going back.
         checkpoints: to go back to; filled by `remember`. readouts, log: filled frame by frame.
     """
+
+    live = False
 
     def __init__(
         self,
@@ -87,7 +98,7 @@ class Run:
         self._dropped = 0  # scans since the newest frame
         self.finished = False
 
-    def peek(self) -> Measurement | DroppedScan | None:
+    def peek(self) -> Measurement | DroppedScan | Quiet | None:
         """What `step` will process; None at the end. A dropped scan is returned once and skipped.
 
         Raises:
@@ -101,11 +112,14 @@ class Run:
                 self.engine.loops.finish()
             if not isinstance(entry, Measurement):
                 if entry is not None:
-                    self.log.drop(entry)
-                    self._dropped += 1
+                    self._drop(entry)
                 return entry
             self._waiting = entry
         return self._waiting
+
+    def _drop(self, scan: DroppedScan) -> None:
+        self.log.drop(scan)
+        self._dropped += 1
 
     def step(self, *, again: bool = False) -> StepResult:
         """Process the measurement last peeked at. It is used up even if the engine fails on it.

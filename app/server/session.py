@@ -6,12 +6,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, assert_never
+from typing import Literal, Protocol, assert_never
 
 from app.server.breakpoints import Breakpoints, Moment, reasons
 from app.server.checkpoints import NEAR
 from app.server.delta import Outbox
 from app.server.journal import SUFFIX, Journal, Opened, SavedSession, State, new_path, read_session, size_of
+from app.server.live import LiveRun, tells
 from app.server.loop_desk import LoopDesk
 from app.server.pacing import Pacer
 from app.server.protocol import (
@@ -36,7 +37,7 @@ from app.server.protocol import (
     UndoLoop,
 )
 from app.server.publisher import Publisher
-from app.server.run import EFFECT, Run, in_force
+from app.server.run import EFFECT, Quiet, Run, in_force
 from app.server.saver import Saver
 from app.slam.errors import HemislamError
 from app.slam.loops.line import LoopLine
@@ -48,6 +49,7 @@ log = logging.getLogger(__name__)
 SLOWEST = 0.1
 LONG_SEEK = 20
 """Frames to process on the way to a frame, from which on progress is shown."""
+SOURCE_PERIOD_S = 0.5
 POLL_S = 0.02
 """How often to look for what others are at work on."""
 
@@ -108,6 +110,7 @@ class Session:
         self._page = Publisher(outbox, chunk_voxel)
         self._desk = LoopDesk(outbox)
         self._pacer = Pacer(clock)
+        self._clock, self._looked_at_source = clock, -1e9
         self._saver = Saver()
         self._open_run = open_run
         self._resolve = resolve
@@ -201,6 +204,8 @@ class Session:
     def _step(self, frames: int) -> None:
         """Steps asked for while the last one is not done yet add up."""
         run, journey = self._need_run(), self._journey
+        if run.live and frames < 0:
+            raise HemislamError("A live source can only go on; record it, and open the recording to go back in it.")
         if journey is not None and journey.stepping:
             self._page.show(playing=False, frames_per_second=0.0)
             start, again_to = journey.target, journey.again_to
@@ -212,6 +217,8 @@ class Session:
 
     def _seek(self, frame: int) -> None:
         run = self._need_run()
+        if run.live:
+            raise HemislamError("A live source can only go on; record it, and open the recording to go back in it.")
         frame = max(0, min(frame, run.opened.frames - 1))
         self._go_to(frame, min(frame, run.known))
 
@@ -280,8 +287,18 @@ class Session:
             return 0.0
         moving = self._page.transport.playing or self._journey is not None
         wait = self._advance(self._run) if self._run is not None and moving else None
+        if isinstance(self._run, LiveRun):
+            self._look_at_source(self._run)
         waits = [wait, POLL_S if self._saver.busy else None, self._look_at_loops()]
         return min((seconds for seconds in waits if seconds is not None), default=None)
+
+    def _look_at_source(self, run: LiveRun) -> None:
+        """Show now and then how a live source is doing."""
+        now = self._clock()
+        if now - self._looked_at_source >= SOURCE_PERIOD_S:
+            self._looked_at_source = now
+            run.grown()
+            self._outbox.put(live=run.state(), recording=run.opened)
 
     def _look_at_loops(self) -> float | None:
         """Take in what came of them. Returns when (s) to look again if something is awaited."""
@@ -320,13 +337,18 @@ class Session:
             self._halt()
             self._page.show(finished=True)
             return None
+        if isinstance(entry, Quiet):
+            if entry.status is not None:
+                level: Literal["warning", "info"] = "warning" if tells(entry.status) else "info"
+                self._outbox.notice(level, f"Live: {entry.status.text}.")
+            return 0.0
         if isinstance(entry, DroppedScan):
             if again:
                 return 0.0
             self._page.show(dropped=run.log.dropped.total(), urgent=False)
             self._page.notice_once(f"A scan was left out: {entry.reason}.", entry.stamp_ns)
             return 0.0
-        if journey is None and (wait := self._pacer.wait(entry.scan.stamp_ns)) > 0:
+        if journey is None and not run.live and (wait := self._pacer.wait(entry.scan.stamp_ns)) > 0:
             return wait
         if self._resuming is not None and not again:
             self._follow(run, self._resuming)
@@ -470,7 +492,8 @@ class Session:
         if self._journal is not None:
             self._journal.close()
             self._journal = None
-        if self._journals is not None:
+        self._outbox.put(journal=None)
+        if self._journals is not None and not run.live:
             path = new_path(self._journals, run.opened.path)
             self._journal = Journal(path, opened_of(run))
             self._outbox.put(journal=path)

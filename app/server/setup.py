@@ -3,9 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from app.server.breakpoints import Breakpoints
 from app.slam.params import Params
+
+if TYPE_CHECKING:
+    from app.sensors.live.process import LiveAddress
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +22,7 @@ class Setup:
         resolve: parameters for recordings opened later; None keeps the present ones.
         play: begin at once. speed: to play at. breakpoints: where to pause.
         chunk_voxel: m, see `Session`. checkpoint_bytes: see `app.server.checkpoints`.
+        live: where to take scans from while `recording` is `app.server.protocol.LIVE`.
         journals: folder for session files, see `Session`.
         session, notices: how many there were before, for a process that takes over from another.
     """
@@ -33,6 +38,7 @@ class Setup:
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     chunk_voxel: float = 0.05
     checkpoint_bytes: int = 1 << 30
+    live: "LiveAddress | None" = None
     journals: Path | None = None
     session: int = 0
     notices: int = 0

@@ -17,7 +17,7 @@ from typing import Any
 
 from app.server import wire
 from app.server.delta import Delta, Fold
-from app.server.protocol import Command, Notice, OpenRecording, Restart, Shutdown, Snapshot
+from app.server.protocol import LIVE, Command, Notice, OpenRecording, Restart, Shutdown, Snapshot
 from app.server.setup import Setup
 from app.server.wire import Pipe
 
@@ -143,7 +143,8 @@ class EngineProcess:
             number = last.notices[-1].number + 1 if last.notices else 1
             code = process.exitcode or 0
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
-            if last.journal is not None and self._revivals < MOST_REVIVALS:
+            place = last.journal or (LIVE if last.live is not None else None)
+            if place is not None and self._revivals < MOST_REVIVALS:
                 self._revivals += 1
                 text = (
                     f"The engine's process has ended unexpectedly ({how}); it is started again and goes where it was."
@@ -152,7 +153,7 @@ class EngineProcess:
                 self._start(
                     replace(
                         self._setup,
-                        recording=last.journal,
+                        recording=place,
                         params=last.params,
                         play=last.transport.playing,
                         speed=last.transport.speed,
