@@ -164,13 +164,11 @@ class Workbench:
         now, drawn = self._now(), self._drawn
         view = self._study.seen(self._loops.seen(self._appearance.view))
         self._transport.tick(current)
-        self._timeline.draw(current)
         self._breakpoints.tick(current)
         self._parameters.tick(current)
         self._notices.draw(current)
         self._header.draw(current)
         self._loops.tick(current, view)
-        self._study.tick(current, view)
         news = drawn is None or drawn.revision != current.revision
         awaited = drawn is not None and _changed_by_user(drawn, current)
         due = now - self._scene_drawn_at >= _SCENE_PERIOD_S
@@ -184,6 +182,8 @@ class Workbench:
             if awaited:  # the page is to be quick with this before anything else
                 self._server.flush()
                 self._panels_drawn_at = now
+        self._study.tick(current, view)
+        self._timeline.draw(current)
         if self._panels_due and now - self._panels_drawn_at >= _PANEL_PERIOD_S:
             self._panels_due = False
             self._panels_drawn_at = now

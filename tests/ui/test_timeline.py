@@ -3,15 +3,18 @@
 import html
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import viser
 
 from app.server.breakpoints import Breakpoints
-from app.server.protocol import Command, Seek, SetBreakpoints, Snapshot, StepFrame
+from app.server.folders import Folders
+from app.server.protocol import Command, Seek, SetBreakpoints, SetParams, Snapshot, StepFrame
 from app.ui.breakpoints import BreakpointPanel
 from app.ui.timeline import TimelinePanel
+from app.ui.workbench import Workbench
 from tests.ui.conftest import Clock, Wire, user_sets
 from tests.ui.fake_engine import FakeEngine
 
@@ -97,6 +100,23 @@ def test_keys_go_to_the_next_trouble_and_to_the_one_before(bench: Bench) -> None
     bench.panel._jump(1)
     bench.panel._jump(-1)
     assert bench.sent == [Seek(30), Seek(10)]
+
+
+def test_a_moved_slider_reaches_the_scene_before_the_strips_and_the_curve(
+    server: viser.ViserServer, wire: Wire, engine: FakeEngine, tmp_path: Path
+) -> None:
+    clock = Clock()
+    workbench = Workbench(server, engine, Folders([tmp_path]), now=clock)
+    engine.send(StepFrame(3))
+    workbench.draw(engine.snapshot)
+    wire.clear()
+    clock.now += 5.0
+    engine.send(SetParams({"ground.sigma": 0.2}))
+    workbench.draw(engine.snapshot)
+    order = [getattr(message, "name", "") or getattr(message, "uuid", "") for message in wire.messages]
+    scan, strips = order.index("/map/sensor/lidar/scan"), order.index(workbench._timeline._data._impl.uuid)
+    curve = order.index(workbench._study._plot._impl.uuid)
+    assert scan < min(strips, curve)
 
 
 # --- breakpoints ---------------------------------------------------------------------------------
