@@ -8,11 +8,12 @@ import viser
 
 from app.server.protocol import Snapshot
 from app.slam.loops.types import LoopDetail, LoopEdge, Pair
-from app.slam.types import F64
+from app.slam.types import F32, F64
 from app.ui.html import box, heading
 from app.ui.loops.charts import best_yaw, contexts_image, histogram, shift_plot
-from app.ui.loops.overlay import Overlay, Pairing, on_the_way
+from app.ui.loops.overlay import Overlay, Pairing, on_the_way, without_ceiling
 from app.ui.loops.words import evidence, submap_legend
+from app.ui.view import View
 from app.ui.widgets import by_user
 
 FLY, SEEK, CLOSE = "fly there", "frame", "close"
@@ -33,6 +34,7 @@ class Inspector:
         self._overlay = Overlay(server.scene, root)
         self._pairing: Pairing | None = None
         self._detail: LoopDetail | None = None
+        self._clouds: tuple[LoopDetail, bool, F32, F32] | None = None
         self._told: tuple[object, ...] = ()
         self._evidence = gui.add_html("")
         self._go = gui.add_button_group(
@@ -86,16 +88,20 @@ class Inspector:
             )
         self._detail = detail
 
-    def draw_scene(self, snapshot: Snapshot, chosen: Pair | None, point_size: float) -> None:
+    def draw_scene(self, snapshot: Snapshot, chosen: Pair | None, view: View) -> None:
         """Lay the submaps into the scene, as far between the two poses as the slider says."""
         detail, poses = _detail(snapshot, chosen), snapshot.keyframe_poses
         if detail is None or chosen is None or poses is None or chosen[1] >= len(poses):
             self._pairing = None
-            self._overlay.draw(None, None, point_size)
+            self._overlay.draw(None, None, view.point_size)
             return
         T_map_older = poses[chosen[0]] @ detail.T_imu_level
-        self._pairing = Pairing(detail.older, detail.newer, T_map_older)
-        size = max(point_size, _LEAST_POINT_M)
+        if self._clouds is None or self._clouds[0] is not detail or self._clouds[1] != view.ceilings:
+            both = detail.older, detail.newer
+            older, newer = both if view.ceilings else map(without_ceiling, both)
+            self._clouds = detail, view.ceilings, older, newer
+        self._pairing = Pairing(*self._clouds[2:], T_map_older)
+        size = max(view.point_size, _LEAST_POINT_M)
         self._overlay.draw(self._pairing, placed(detail, T_map_older, self._laid.value), size)
 
 

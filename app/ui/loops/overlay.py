@@ -8,7 +8,9 @@ import viser
 
 from app.server.protocol import Chunk
 from app.slam import lie
-from app.slam.types import F32, F64
+from app.slam.types import F32, F64, NON_GROUND
+from app.ui.ceiling import below_ceiling
+from app.ui.chunks import shown_points
 from app.ui.geometry import wxyz
 from app.ui.loops.kinds import GHOST, NEWER, OLDER
 from app.ui.paths import segments
@@ -31,14 +33,21 @@ def upright(T_map_imu: F64) -> F64:
     return lie.transform(np.eye(3), T_map_imu[:3, 3])
 
 
-def surroundings(chunks: tuple[Chunk, ...], poses: F64, index: int) -> F32:
+def without_ceiling(points: F32) -> F32:
+    """(n, 3) points of a submap, z up and its keyframe at the origin, without the ceiling above that."""
+    mask = below_ceiling(points, np.full(len(points), NON_GROUND, np.uint8), np.array([0.0, 0.0, 1.0]))
+    return points if mask is None else points[mask]
+
+
+def surroundings(chunks: tuple[Chunk, ...], poses: F64, index: int, ceilings: bool) -> F32:
     """(n, 3) points around a keyframe in its upright frame, from the keyframes before and after it."""
     near = [chunk for chunk in chunks if abs(chunk.index - index) <= _REACH and chunk.index < len(poses)]
     share = _MOST_POINTS // max(len(near), 1)
     parts = [np.empty((0, 3))]
     for chunk in near:
         T = poses[chunk.index] @ chunk.T_imu_lidar
-        parts.append(chunk.points[:share] @ T[:3, :3].T + T[:3, 3] - poses[index][:3, 3])
+        points = chunk.points[shown_points(chunk, T, 0, ceilings)[:share]]
+        parts.append(points @ T[:3, :3].T + T[:3, 3] - poses[index][:3, 3])
     return np.concatenate(parts).astype(np.float32)
 
 

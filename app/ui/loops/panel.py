@@ -112,8 +112,8 @@ class LoopsPanel:
         command = self._proposal.command
         self._verdict.draw(edge, command.weight if isinstance(command, SetWeight) else None)
         self._edges.draw(snapshot.loops.edges, poses, self._shown, self._chosen)
-        self._tie.draw_scene(snapshot, view.point_size)
-        self._inspector.draw_scene(snapshot, None if self._tie.nudging else self._chosen, view.point_size)
+        self._tie.draw_scene(snapshot, view)
+        self._inspector.draw_scene(snapshot, None if self._tie.nudging else self._chosen, view)
         self._inspector.draw(snapshot, edge)
         self._proposal.draw(snapshot)
         self._edits.draw(snapshot)

@@ -15,6 +15,7 @@ from app.ui.html import box
 from app.ui.loops.edges import nearest
 from app.ui.loops.kinds import NEWER, OLDER
 from app.ui.loops.overlay import Gizmo, Overlay, Pairing, surroundings, upright
+from app.ui.view import View
 from app.ui.widgets import by_user, show
 
 _REST_S: Final = 0.4
@@ -112,7 +113,7 @@ class TiePanel:
             self.suggest_pair((min(picked), max(picked)))
             self._picked = None
 
-    def draw_scene(self, snapshot: Snapshot, point_size: float) -> None:
+    def draw_scene(self, snapshot: Snapshot, view: View) -> None:
         """Called by the drawing thread, often: dots to pick from, the two clouds, and a guess that has come to rest."""
         self._draw_picking(snapshot)
         poses = _poses(snapshot)
@@ -120,20 +121,20 @@ class TiePanel:
         wanted = self._nudge.value and 0 <= older < newer < len(poses)
         if self._start is not None and (not wanted or self._start[0] != pair):
             self._gizmo.hide()
-            self._overlay.draw(None, None, point_size)
+            self._overlay.draw(None, None, view.point_size)
             self._start = self._moved = None
         if not wanted:
             return
         if self._start is None:
             pairing = Pairing(
-                surroundings(snapshot.chunks, poses, older),
-                surroundings(snapshot.chunks, poses, newer),
+                surroundings(snapshot.chunks, poses, older, view.ceilings),
+                surroundings(snapshot.chunks, poses, newer, view.ceilings),
                 upright(poses[older]),
             )
             self._start = (pair, pairing, poses[older], poses[newer])
             self._gizmo.show(upright(poses[newer]))
         T = self._gizmo.pose
-        self._overlay.draw(self._start[1], T, point_size)
+        self._overlay.draw(self._start[1], T, view.point_size)
         if T is None:
             return
         now = self._now()
