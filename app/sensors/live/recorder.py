@@ -18,8 +18,8 @@ from app.slam.errors import HemislamError
 from app.slam.types import Scan
 
 FLUSH_S = 0.5
-MAX_WAITING = 50_000
-"""Messages that may wait for the disk; if there are more, it has stopped, and the newest are left out."""
+MAX_SCANS, MAX_SAMPLES = 200, 100_000
+"""What may wait for the disk, 20 s of scans: if there is more it is too slow, and the newest are left out."""
 
 Vector = tuple[float, float, float]
 _Scan = tuple[Scan, int]
@@ -50,13 +50,18 @@ class Recorder:
         self._lidar = self._channel(messages.LIDAR_TOPIC, messages.CLOUD)
         self._imu = self._channel(messages.IMU_TOPIC, messages.IMU)
         self._waiting: deque[_Scan | _Imu] = deque()
+        self._scans_waiting = 0
         self._wake = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._run, daemon=True, name="recorder")
         self._thread.start()
 
     def add_scan(self, scan: Scan, arrival_ns: int) -> None:
-        self._add((scan, arrival_ns))
+        if self._scans_waiting < MAX_SCANS:
+            self._scans_waiting += 1
+            self._add((scan, arrival_ns))
+        else:
+            self.left_out += 1
 
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, arrival_ns: int) -> None:
         self._add((stamp_ns, gyro, accel, arrival_ns))
@@ -68,7 +73,7 @@ class Recorder:
         self._thread.join(30.0)
 
     def _add(self, message: _Scan | _Imu) -> None:
-        if len(self._waiting) >= MAX_WAITING or self.failure:
+        if len(self._waiting) >= MAX_SAMPLES or self.failure:
             self.left_out += 1
             return
         self._waiting.append(message)
@@ -106,5 +111,6 @@ class Recorder:
             channel, data = self._imu, messages.serialised(messages.imu_message(stamp_ns, gyro, accel), messages.IMU)
         else:
             scan, arrival_ns = message
+            self._scans_waiting -= 1
             channel, data = self._lidar, messages.serialised(messages.cloud_message(scan), messages.CLOUD)
         self._mcap.add_message(channel, arrival_ns, data, publish_time=arrival_ns)

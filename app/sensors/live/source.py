@@ -112,9 +112,12 @@ class LiveSource:
             return
         self._watched_at = now
         state = self._intake.state()
-        if self._recorder is not None and self._recorder.failure and not self._told_failure:
-            self._told_failure = True
-            self._events.append(Status("recording", "source", self._recorder.failure, time.time_ns()))
+        if self._recorder is not None and not self._told_failure:
+            slow = "the disk is too slow to record everything; some scans are missing in the recording"
+            trouble = self._recorder.failure or (slow if self._recorder.left_out else "")
+            if trouble:
+                self._told_failure = True
+                self._events.append(Status("recording", "source", trouble, time.time_ns()))
         ages: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": state.lidar_age_s, "IMU": state.imu_age_s}
         for sensor, age in ages.items():
             since = self._silent[sensor]

@@ -110,7 +110,7 @@ class RsbpearlReceiver:
                     for packet, arrival_ns in _drain(readable):
                         self._take(packet, arrival_ns, intake)
                 since = self._assembler.pending_since()
-                if since is not None and now - since > _REST_NS:
+                if not ready and since is not None and now - since > _REST_NS:
                     self._frames += self._assembler.flush()
                 self._give(now, intake)
 

@@ -11,7 +11,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from app.sensors.live.recorder import Recorder
+from app.sensors.live.recorder import MAX_SCANS, Recorder
 from app.sensors.recording import open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -71,7 +71,7 @@ def test_a_killed_process_loses_less_than_its_last_second(tmp_path: Path) -> Non
     script = f"""
         import sys, time
         from pathlib import Path
-        from app.sensors.live.recorder import Recorder
+        from app.sensors.live.recorder import MAX_SCANS, Recorder
         from tests.sensors.live.test_recorder import record
         recorder = Recorder(Path({str(path)!r}))
         for turn in range(1000):
@@ -137,3 +137,15 @@ def test_a_time_that_ros_has_no_number_for_is_left_out(tmp_path: Path) -> None:
     recorder.close()
     assert (recorder.failure, recorder.left_out) == ("", 1)
     assert len(scans(recorder.path)) == 2
+
+
+def test_a_disk_that_is_too_slow_costs_scans_of_the_recording_and_no_memory(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "session.mcap")
+    recorder._write = lambda message: time.sleep(0.01)  # type: ignore[method-assign]
+    one = scan(0)
+    for number in range(MAX_SCANS + 50):
+        recorder.add_scan(one, sensor.START_NS + number)
+    assert recorder.left_out >= 1
+    assert len(recorder._waiting) <= MAX_SCANS
+    recorder._write = lambda message: None  # type: ignore[method-assign]
+    recorder.close()
