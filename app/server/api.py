@@ -12,6 +12,7 @@ from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import BaseModel, Field
 
 from app.server.folders import Folders
+from app.server.fork import Engine
 from app.server.protocol import (
     Command,
     OpenRecording,
@@ -25,7 +26,6 @@ from app.server.protocol import (
     StepFrame,
 )
 from app.server.views import Speed, StateView, state_view
-from app.server.worker import EngineProcess
 from app.slam.params import Params
 
 EXPORT_PATIENCE_S = 600.0
@@ -61,7 +61,7 @@ class OpenBody(BaseModel):
 Export = Literal["trajectory.tum", "timings.csv", "map.ply", "report.json"]
 
 
-def make_router(engine: EngineProcess, folders: Folders) -> APIRouter:
+def make_router(engine: Engine, folders: Folders) -> APIRouter:
     """All routes below /api. HemislamError raised here becomes status 422."""
     router = APIRouter(prefix="/api")
 
@@ -122,7 +122,7 @@ def make_router(engine: EngineProcess, folders: Folders) -> APIRouter:
     return router
 
 
-def _send(engine: EngineProcess, command: Command) -> None:
+def _send(engine: Engine, command: Command) -> None:
     if not engine.snapshot.engine_alive and not isinstance(command, Restart | OpenRecording):
         raise HTTPException(503, "The engine's process has ended; the action `restart` starts it again.")
     engine.send(command)
@@ -144,7 +144,7 @@ def _command(action: Simple | StepBody | SeekBody | SpeedBody) -> Command:
             return Restart()
 
 
-def _save(engine: EngineProcess, folder: Path, *, trajectory_only: bool) -> None:
+def _save(engine: Engine, folder: Path, *, trajectory_only: bool) -> None:
     """Let the engine save into a folder and wait for it."""
     snapshot = engine.snapshot
     if snapshot.transport.frame < 0:

@@ -6,6 +6,7 @@ import numpy as np
 
 from app.server.delta import Rows
 from app.server.protocol import SERIES
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.metrics import MAX_TRUTH_GAP_S, umeyama
 from app.slam.trajectory import Trajectory
@@ -79,6 +80,7 @@ class Readouts:
             "accel_bias": np.linalg.norm(state.b_accel),
             "distance": self._walked,
             "error_m": self.error,
+            **dict(zip(("turn_x", "turn_y", "turn_z"), lie.log(state.R_odom_imu), strict=True)),
         } | {f"{stage}_ms": ms for stage, ms in result.timings_ms.items()}
         return [float(values.get(name, np.nan)) for name in SERIES]
 

@@ -24,6 +24,7 @@ from app import __version__
 from app.server.access import Access, Guard
 from app.server.api import make_router
 from app.server.folders import Folders
+from app.server.fork import Engine, Workspace
 from app.server.setup import Setup
 from app.server.viser_page import BUFFER_BYTES, Viser, bridge, page_html, start_viser
 from app.server.worker import EngineProcess
@@ -37,10 +38,10 @@ class Page(Protocol):
     def close(self) -> None: ...
 
 
-BuildPage = Callable[[viser.ViserServer, EngineProcess, Folders], Page]
+BuildPage = Callable[[viser.ViserServer, Workspace, Folders], Page]
 
 
-def make_app(engine: EngineProcess, folders: Folders, target: Viser, access: Access) -> FastAPI:
+def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) -> FastAPI:
     """Everything that is reachable from outside."""
     app = FastAPI(
         title="hemislam",
@@ -101,13 +102,14 @@ def run_server(
     with contextlib.ExitStack() as cleanup:
         cleanup.callback(listener.close)
         engine = start_engine(setup)
-        cleanup.callback(engine.close)
+        workspace = Workspace(engine, setup, start_engine)
+        cleanup.callback(workspace.close)
         target = start_viser()
         cleanup.callback(target.stop)
-        page = build_page(target.server, engine, folders)
+        page = build_page(target.server, workspace, folders)
         page.start()
         cleanup.callback(page.close)
-        server = make_server(make_app(engine, folders, target, access))
+        server = make_server(make_app(workspace, folders, target, access))
         address, *others = links(host, access)
         print(f"hemislam is at {address} (Ctrl-C ends it)", flush=True)
         for other in others:

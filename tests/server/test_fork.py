@@ -1,0 +1,305 @@
+"""Two settings side by side: B is what A would be with other parameters, goes where A goes, and costs A nothing."""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import server_fakes as fakes
+
+from app.sensors.presets import resolve_params
+from app.server.fork import STUCK_S, Follower, Workspace, forked
+from app.server.journal import Journal, Opened, State, read_session
+from app.server.protocol import (
+    SERIES,
+    OpenRecording,
+    Pause,
+    Play,
+    Progress,
+    Seek,
+    SetBreakpoints,
+    SetParams,
+    SetSpeed,
+    Snapshot,
+    StepFrame,
+    Transport,
+)
+from app.server.run import open_run
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import Measurement
+
+PATIENCE_S = 60.0
+SAMPLE = next((Path(__file__).resolve().parents[2] / "sample_data").glob("*.mcap"))
+COARSE = {"filter.plane_tilt": 6.0, "ground.sigma": 0.02}
+
+
+def until(read: Callable[[], Snapshot | None], wanted: Callable[[Snapshot], bool]) -> Snapshot:
+    deadline = time.monotonic() + PATIENCE_S
+    while (snapshot := read()) is None or not wanted(snapshot):
+        assert time.monotonic() < deadline, (snapshot and snapshot.transport, snapshot and snapshot.notices[-2:])
+        time.sleep(0.01)
+    return snapshot
+
+
+def both_at(workspace: Workspace, frame: int) -> tuple[Snapshot, Snapshot]:
+    def there(snapshot: Snapshot) -> bool:
+        return snapshot.transport.frame == frame and snapshot.result is not None
+
+    return until(lambda: workspace.snapshot, there), until(lambda: workspace.other, there)
+
+
+# --- what B is told ------------------------------------------------------------------------------
+def at(frame: int, revision: int = 1, *, frames: int = 100, name: str = "walk", busy: bool = False) -> Snapshot:
+    run = fakes.open_fake(Path(f"walk-{frames}.mcap"), None, Params())
+    opened = replace(run.opened, path=Path(f"{name}.mcap"))
+    return Snapshot(
+        revision=revision,
+        recording=opened,
+        transport=Transport(frame=frame),
+        progress=Progress("Going to frame 50", 0.5) if busy else None,
+    )
+
+
+def test_b_is_led_from_place_to_place_not_pushed_on_the_way() -> None:
+    follower = Follower(10)
+    assert follower.next(at(10), at(4), 0.0) is None, "it comes to the frame of the fork by itself"
+    assert follower.next(at(12), at(7, 2), 0.1) is None
+    assert follower.next(at(14), at(10, 3), 0.2) == Seek(14)
+    assert follower.next(at(17), at(12, 4), 0.3) is None, "on its way"
+    assert follower.next(at(20), at(14, 5), 0.4) == Seek(20), "however far A has come meanwhile"
+    assert follower.next(at(20), at(20, 6), 0.5) is None
+
+
+def test_b_goes_back_at_once_with_a() -> None:
+    follower = Follower(50)
+    assert follower.next(at(8), at(20), 0.0) == Seek(8)
+    assert follower.next(at(8), at(21, 2), 0.1) is None
+    assert follower.next(at(8), at(8, 3), 0.2) is None
+
+
+def test_a_journey_that_comes_to_nothing_is_begun_again_but_not_one_that_takes_long() -> None:
+    follower = Follower(0)
+    assert follower.next(at(5), at(0), 0.0) == Seek(5)
+    assert follower.next(at(5), at(2, 2), 0.1) is None
+    assert follower.next(at(5), at(2, 3, busy=True), 9.0) is None
+    assert follower.next(at(5), at(2, 3, busy=True), 20.0) is None
+    assert follower.next(at(5), at(2, 4), 20.1) is None
+    assert follower.next(at(5), at(2, 4), 20.1 + STUCK_S) == Seek(5)
+
+
+def test_beyond_the_number_of_frames_that_was_expected_b_steps() -> None:
+    follower = Follower(90)
+    assert follower.next(at(101, frames=100), at(90, frames=100), 0.0) == Seek(99)
+    assert follower.next(at(101, frames=100), at(99, 2, frames=100), 0.1) == StepFrame(2)
+    assert follower.next(at(101, frames=100), at(101, 3, frames=100), 0.2) is None
+
+
+def test_another_recording_is_nothing_to_follow() -> None:
+    assert Follower(3).next(at(50, name="other"), at(3), 0.0) is None
+
+
+def test_a_fork_knows_only_what_came_before_it(tmp_path: Path) -> None:
+    first, later, latest = (Params().with_values({"ground.alpha": alpha}) for alpha in (30.0, 40.0, 50.0))
+    journal = Journal(tmp_path / "a.hemislam", Opened(tmp_path / "none.mcap"))
+    journal.note(80, State(latest, ((0, first), (20, later), (60, latest))))
+    journal.close()
+    a = Snapshot(params=latest, transport=Transport(frame=40), journal=tmp_path / "a.hemislam")
+    session = forked(a, {"ground.sigma": 0.2})
+    assert session.frame == 40 and session.state.history == ((0, first), (20, later))
+    assert session.state.params == latest.with_values({"ground.sigma": 0.2})
+    with pytest.raises(HemislamError, match="play or step first"):
+        forked(replace(a, transport=Transport()), {})
+    with pytest.raises(HemislamError, match="not kept in a file"):
+        forked(replace(a, journal=None), {})
+
+
+# --- two processes with an engine that knows the answer ------------------------------------------
+@pytest.fixture
+def pair(tmp_path: Path) -> Iterator[Workspace]:
+    """A at frame 20 of 300."""
+    start = partial(EngineProcess, main=fakes.fake_main)
+    setup = Setup(Path("walk-300.mcap"), journals=tmp_path)
+    workspace = Workspace(start(setup), setup, start)
+    workspace.send(Seek(20))
+    until(lambda: workspace.snapshot, lambda s: s.transport.frame == 20)
+    yield workspace
+    workspace.close()
+
+
+def speeds(snapshot: Snapshot) -> np.ndarray:
+    """The fake engine's memory of the parameters that were in force so far, frame by frame."""
+    return snapshot.series["speed"]
+
+
+def test_a_fork_is_led_swapped_and_discarded(pair: Workspace, tmp_path: Path) -> None:
+    pair.fork("wide", {"ground.sigma": 0.2})
+    with pytest.raises(HemislamError, match="already"):
+        pair.fork("another")
+    pair.send(Seek(30))
+    a, b = both_at(pair, 30)
+    np.testing.assert_array_equal(speeds(a)[:21], speeds(b)[:21])
+    assert (speeds(a)[21:] < speeds(b)[21:]).all() and pair.names == ("main", "wide") and pair.forked_at == 20
+    pair.send(Seek(5))
+    both_at(pair, 5)
+
+    pair.send(SetSpeed(5.0))
+    pair.send(Seek(30))
+    both_at(pair, 30)
+    pair.send(Play())
+    pair.swap()
+    assert pair.names == ("wide", "main")
+    playing = until(lambda: pair.snapshot, lambda s: s.transport.frame >= 33)
+    assert playing.params.ground.sigma == 0.2 and playing.session != a.session and playing.transport.speed == 5.0
+    follows = until(lambda: pair.other, lambda s: s.transport.frame >= 33)
+    assert not follows.transport.playing and follows.params == Params()
+    np.testing.assert_array_equal(speeds(follows)[:31], speeds(a)[:31])
+    pair.send(Pause())
+
+    kept = pair.snapshot.journal
+    pair.discard()
+    assert pair.other is None and kept is not None and kept.exists(), "what A is now is not thrown away with the other"
+    assert list(tmp_path.glob("*.hemislam")), "nor is the first session"
+    with pytest.raises(HemislamError, match="no fork"):
+        pair.swap()
+
+
+def test_a_discarded_fork_leaves_nothing_and_there_can_be_another(pair: Workspace, tmp_path: Path) -> None:
+    pair.fork("", {"ground.sigma": 0.2})
+    both_at(pair, 20)
+    pair.discard()
+    assert not list((tmp_path / "forks").iterdir())
+    pair.fork("again", {"ground.sigma": 0.15})
+    assert both_at(pair, 20)[1].params.ground.sigma == 0.15
+
+
+def test_a_kept_fork_is_a_file_of_its_name_that_replaces_none(pair: Workspace, tmp_path: Path) -> None:
+    paths = []
+    for frame in (22, 24):
+        pair.fork("finer σ / 2", {"ground.sigma": 0.05})
+        pair.send(StepFrame(2))
+        both_at(pair, frame)
+        paths.append(pair.keep())
+    assert [path.name for path in paths] == ["walk-300-finer-σ---2.hemislam", "walk-300-finer-σ---2-2.hemislam"]
+    assert [read_session(path).frame for path in paths] == [22, 24]
+    pair.send(OpenRecording(paths[0]))
+    opened = until(lambda: pair.snapshot, lambda s: s.params.ground.sigma == 0.05 and s.transport.frame == 22)
+    assert speeds(opened)[20] < speeds(opened)[22]
+
+
+def test_what_can_not_be_is_said(pair: Workspace) -> None:
+    for act in (pair.swap, pair.discard, pair.keep):
+        with pytest.raises(HemislamError, match="no fork"):
+            act()
+    with pytest.raises(HemislamError):
+        pair.fork("x", {"ground.sigma": -1})
+    assert pair.other is None
+
+
+# --- the real engine -----------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workspace]:
+    folder = tmp_path_factory.mktemp("sessions")
+    setup = Setup(SAMPLE, params=resolve_params(SAMPLE, None, None, []), duration_s=6.0, journals=folder)
+    workspace = Workspace(EngineProcess(setup), setup, EngineProcess)
+    yield workspace
+    workspace.close()
+
+
+def same(a: Snapshot, b: Snapshot) -> None:
+    """To the last bit, but for how long it took."""
+    assert a.trajectory is not None and b.trajectory is not None and a.result is not None and b.result is not None
+    np.testing.assert_array_equal(a.trajectory, b.trajectory)
+    for name in SERIES:
+        if not name.endswith("_ms"):
+            np.testing.assert_array_equal(a.series[name], b.series[name], name)
+    assert a.result.index == b.result.index
+    for name in ("points", "labels", "intensity", "ring"):
+        np.testing.assert_array_equal(getattr(a.result.cloud, name), getattr(b.result.cloud, name), name)
+    np.testing.assert_array_equal(a.result.state.b_gyro, b.result.state.b_gyro)
+    assert len(a.chunks) == len(b.chunks)
+
+
+def test_a_fork_with_the_same_parameters_is_the_same_and_with_others_what_a_fresh_run_gives(real: Workspace) -> None:
+    real.send(Seek(12))
+    until(lambda: real.snapshot, lambda s: s.transport.frame == 12)
+    real.fork("twin")
+    for frame in (12, 13, 20):
+        real.send(Seek(frame))
+        same(*both_at(real, frame))
+    real.send_other(SetParams(COARSE))
+    until(lambda: real.other, lambda s: s.params.ground.sigma == 0.02)
+    real.send(Seek(32))
+    a, b = both_at(real, 32)
+
+    run = open_run(SAMPLE, None, a.params, 0.0, 6.0)
+    positions, turns = [], []
+    while run.frame < 32 and (entry := run.peek()) is not None:
+        if isinstance(entry, Measurement):
+            if run.frame == 20:
+                run.choose(a.params.with_values(COARSE))
+            result = run.step()
+            positions.append(result.T_map_imu[:3, 3])
+            turns.append(result.state.R_odom_imu)
+    run.close()
+    assert b.trajectory is not None and a.trajectory is not None
+    np.testing.assert_array_equal(b.trajectory, positions)
+    assert np.abs(a.trajectory - b.trajectory)[21:].max() > 1e-6, "the parameters were meant to change something"
+    np.testing.assert_array_equal(a.trajectory[:21], b.trajectory[:21])
+    from scipy.spatial.transform import Rotation
+
+    told = np.column_stack([b.series[f"turn_{axis}"] for axis in "xyz"])
+    np.testing.assert_allclose(Rotation.from_rotvec(told).as_matrix(), turns, atol=1e-9)
+
+
+def test_a_killed_b_leaves_a_going_and_comes_back(real: Workspace) -> None:
+    before, b = both_at(real, real.snapshot.transport.frame)
+    pid = real._sides[1].engine.pid  # type: ignore[union-attr]
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+    real.send(StepFrame(4))
+    frame = before.transport.frame + 4
+    a = until(lambda: real.snapshot, lambda s: s.transport.frame == frame)
+    assert a.session == before.session and len(a.notices) == len(before.notices)
+    _, again = both_at(real, frame)
+    assert any("started again" in notice.text for notice in again.notices)
+    assert again.params == b.params and again.trajectory is not None and b.trajectory is not None
+    np.testing.assert_array_equal(again.trajectory[: len(b.trajectory)], b.trajectory)
+
+
+def test_a_kept_fork_opens_where_it_was(real: Workspace) -> None:
+    _, b = both_at(real, real.snapshot.transport.frame)
+    path = real.keep("coarse")
+    assert path.name == f"{SAMPLE.stem}-coarse.hemislam" and real.other is None
+    engine = EngineProcess(Setup(path, params=b.params))
+    try:
+        opened = until(lambda: engine.snapshot, lambda s: s.transport.frame == b.transport.frame and s.progress is None)
+        same(opened, b)
+        assert opened.params == b.params
+    finally:
+        engine.close()
+
+
+def test_breakpoints_stay_with_what_is_shown() -> None:
+    class Told:
+        def __init__(self, snapshot: Snapshot) -> None:
+            self.snapshot, self.sent = snapshot, []
+
+        def send(self, command: object) -> None:
+            self.sent.append(command)
+
+    from app.server.breakpoints import Breakpoints
+    from app.server.fork import Side
+
+    a, b = Told(replace(at(7), breakpoints=Breakpoints(no_ground=True))), Told(at(5))
+    workspace = Workspace(a, Setup(), lambda _: b)  # type: ignore[arg-type, return-value]
+    workspace._sides = (Side(a, "main"), Side(b, "b"))  # type: ignore[arg-type]
+    workspace.swap()
+    assert b.sent == [SetSpeed(1.0), SetBreakpoints(Breakpoints(no_ground=True)), Seek(7)] and a.sent == [Pause()]
