@@ -53,6 +53,7 @@ class LoopBackend:
         self._solution = Solution()
         self._found: dict[Pair, LoopEdge] = {}
         self._finished = False
+        self._idle: set[str] = set()  # commands of which was said that they found nothing
         self._notices: list[str] = []
 
     def __len__(self) -> int:
@@ -110,9 +111,8 @@ class LoopBackend:
             self._ends[count] = self._look(self._detector.described, count, params) if params.enabled else Found()
         self._finished = True
         self._stand(count)
-        self._reach(self.known + (count == self.known))
-        for command in self._idle():
-            self._notices.append(f"{in_words(command)} has no effect: there is no such loop; loops.csv lists all.")
+        self._reach(max(self.known + 1, self._overrulings.latest) if count == self.known else 0)
+        self._tell_idle()
 
     def go_to(self, count: int) -> None:
         """Be where it was after `count` keyframes of the history. Raises HemislamError if there are not so many."""
@@ -301,9 +301,13 @@ class LoopBackend:
         if self._overrulings.resolve(count, complete, self._made):
             self._solve()
 
-    def _idle(self) -> list[Command]:
+    def _tell_idle(self) -> None:
+        """At the end: which commands found nothing to act on; each is said once."""
         there = self._edges(self._found)
-        return [entry.command for entry in self._overrulings if entry.pair not in there]
+        idle = [in_words(entry.command) for entry in self._overrulings if entry.pair not in there]
+        new = [words for words in idle if words not in self._idle]
+        self._notices += [f"{words} has no effect: there is no such loop; loops.csv lists all." for words in new]
+        self._idle = set(idle)
 
     def _check_there(self, older: int, newer: int) -> None:
         if not 0 <= older < newer < len(self):

@@ -50,6 +50,11 @@ class Overrulings:
         """Those that `redo` would give again, the next one last."""
         return tuple(entry.command for entry in self._undone)
 
+    @property
+    def latest(self) -> int:
+        """The greatest `since`; of a list from a walk that had more keyframes it may lie beyond the end."""
+        return max((entry.command.since for entry in [*self._done, *self._undone]), default=0)
+
     def give(self, entry: Entry) -> None:
         self._done.append(entry)
         self._undone.clear()

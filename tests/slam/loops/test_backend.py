@@ -272,6 +272,23 @@ def test_a_list_written_by_hand_waits_for_its_keyframes(walked: Walked, backend:
     early.close()
 
 
+def test_commands_from_a_walk_with_more_keyframes_act_at_the_end(walked: Walked) -> None:
+    backend = LoopBackend()
+    backend.load((Add(3, 25, rows(np.eye(4)), register=False, since=141), Accept(1, 2, since=500)))
+    for keyframe in walked.keyframes[:30]:
+        backend.add(keyframe, PARAMS)
+    assert backend.edges == ()
+    backend.finish()
+    assert [edge.pair for edge in backend.edges] == [(3, 25)]
+    assert backend.take_notices() == ("Accept 1-2 has no effect: there is no such loop; loops.csv lists all.",)
+    backend.go_to(28)
+    assert [edge.pair for edge in backend.edges] == [(3, 25)], "given once, it belongs to the present"
+    backend.go_to(30)
+    backend.finish()
+    assert backend.take_notices() == (), "it is said once"
+    backend.close()
+
+
 def test_a_command_of_the_present_counts_for_what_is_found_from_then_on(walked: Walked, backend: LoopBackend) -> None:
     """A false loop that was let in rules out the true ones; rejected, it stands in their way no more."""
     start = next(k for k, edges in enumerate(walked.edges) if edges) - 2
