@@ -11,7 +11,7 @@ from app.slam.loops.scan_context import RINGS, SECTORS, YAWS
 from app.ui.loops.charts import UNSEEN, contexts_image, disc, histogram, shift_plot
 from app.ui.loops.edges import nearest
 from app.ui.loops.fly import stand
-from app.ui.loops.overlay import on_the_way
+from app.ui.loops.overlay import on_the_way, without_ceiling
 
 angles = st.tuples(*(st.floats(-1.5, 1.5) for _ in range(3)))
 places = st.tuples(*(st.floats(-50, 50) for _ in range(3)))
@@ -127,3 +127,13 @@ def test_the_camera_stands_at_its_distance_above_what_it_looks_at(
     stood = stand(np.array(position), np.array(look_at), np.array(target), distance)
     assert np.linalg.norm(stood - target) == pytest.approx(distance)
     assert stood[2] - target[2] > 0.6 * distance
+
+
+def test_a_submap_is_drawn_without_its_ceiling_and_one_under_the_sky_as_it_is() -> None:
+    rng = np.random.default_rng(0)
+    floor = np.column_stack((rng.uniform(-5, 5, (2000, 2)), np.full(2000, -1.3)))
+    wall = np.column_stack((np.full(1000, 5.0), rng.uniform(-5, 5, 1000), rng.uniform(-1.3, 1.0, 1000)))
+    ceiling = np.column_stack((rng.uniform(-5, 5, (2000, 2)), np.full(2000, 1.5)))
+    outdoors = np.concatenate((floor, wall)).astype(np.float32)
+    assert np.array_equal(without_ceiling(np.concatenate((outdoors, ceiling.astype(np.float32)))), outdoors)
+    assert np.array_equal(without_ceiling(outdoors), outdoors)
