@@ -1,6 +1,7 @@
 """An RS-Bpearl built with `struct` and `math` alone from the vendor's facts, by none of the code under test."""
 
 import datetime
+import functools
 import math
 import struct
 
@@ -76,6 +77,7 @@ def point(
     )
 
 
+@functools.lru_cache
 def turns(
     count: int, *, rate: int = 10, v4: bool = False, start_ns: int = START_NS, fov: tuple[int, int] = (0, 36000),
     dual: bool = False, distance: int = 1000,

@@ -1,5 +1,6 @@
 """A capture of the sensor's packets is a recording like any other."""
 
+import functools
 import random
 import struct
 from pathlib import Path
@@ -23,6 +24,7 @@ def imu(number: int, stamp_ns: int) -> bytes:
     return struct.pack("<4sIq6d", b"HIMU", number, stamp_ns, 0.01 * number, 0, 0, 0, 0, 9.81)
 
 
+@functools.lru_cache
 def walk(*, host_ns: int = 0, imu_ns: int = 0) -> list[captures.Entry]:
     """What a network card sees of eight turns. host_ns: its clock is ahead of the LiDAR's; imu_ns: the IMU's is."""
     entries = [(sensor.START_NS - 1_000, 7788, sensor.difop())]
