@@ -154,6 +154,7 @@ def test_a_fork_is_led_swapped_and_discarded(pair: Workspace, tmp_path: Path) ->
     pair.send(Seek(30))
     both_at(pair, 30)
     pair.send(Play())
+    until(lambda: pair.snapshot, lambda s: s.transport.playing)
     pair.swap()
     assert pair.names == ("wide", "main")
     playing = until(lambda: pair.snapshot, lambda s: s.transport.frame >= 33)
