@@ -69,12 +69,12 @@ def test_two_frames_of_a_static_sensor_show_no_motion(frames: list[Frame], pair:
 
 
 @pytest.mark.parametrize("pair", PAIRS, ids=str)
-def test_with_default_parameters_they_agree_within_two_centimetres(frames: list[Frame], pair: tuple[int, int]) -> None:
+def test_with_default_parameters_they_agree_almost_as_well(frames: list[Frame], pair: tuple[int, int]) -> None:
     """Voxels made for halls and campuses leave 730 points of 48,000 here, and few patches wide enough for a plane."""
     one, other = pair
     metres, degrees, registration = registered(frames[one], frames[other], DEFAULT, seed=10 * one + other)
-    assert metres < 0.02
-    assert degrees < 0.15
+    assert metres < 0.0125
+    assert degrees < 0.1
     assert registration.inliers > iekf.MIN_INLIERS
 
 
