@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from app.sensors.live.decoder import Decoder
 from app.sensors.live.difop import NOMINAL, Calibration, Difop, read_angles, read_difop, write_difop
-from app.sensors.live.frames import Assembler
+from app.sensors.live.frames import Assembler, Frame
 from app.sensors.live.msop import PacketWriter, stamp_of, write_packet
 from app.sensors.rsbpearl import BPEARL, BPV4
 from app.slam.errors import HemislamError
@@ -190,3 +191,31 @@ def test_no_bytes_of_a_device_packet_stop_the_decoder() -> None:
         (scan,) = scans(packets[:20], decoder)
         assert np.isfinite(scan.points).all()
         assert sorted(set(scan.ring.tolist())) == list(range(32))
+
+
+def test_a_real_frame_comes_out_where_another_driver_put_its_points(shared_data: Path) -> None:
+    """A real BPv4, decoded by another driver: its azimuths and ranges as packets give the points it computed."""
+    raw = (shared_data / "bpearl" / "frame_0.pcd").read_bytes()
+    fields = [(name, "<f4") for name in ("x", "y", "z", "intensity")] + [("ring", "<u2")]
+    fields += [(name, "<f4") for name in ("azimuth", "elevation", "range")]
+    truth = np.frombuffer(raw, np.dtype(fields), offset=raw.index(b"DATA binary\n") + 12)
+    angles = read_angles(shared_data / "bpearl" / "angles.csv")
+    channel = np.argsort(angles.rings)[truth["ring"]]
+    np.testing.assert_allclose(truth["elevation"], angles.elevations_deg[channel], atol=0.001)
+    within = 36_000 / 60 * 600 * 55.56e-6 * (channel * 1.668 / 55.56) / 100  # deg that the head turns on in the block
+    head = np.rint((truth["azimuth"] - angles.horizontal_deg[channel] - within) * 100).astype(int) % 36_000
+    packets, times = [], []
+    for number, azimuth in enumerate(np.unique(head)):
+        blocks: list[sensor.Block] = [(int(azimuth), [(0, 0)] * 32) for _ in range(12)]
+        for at in np.flatnonzero(head == azimuth):
+            blocks[0][1][channel[at]] = (round(truth["range"][at] / 0.0025), int(truth["intensity"][at]))
+        packets.append(np.frombuffer(sensor.msop(sensor.START_NS, blocks, v4=True), np.uint8))
+        times.append(sensor.START_NS + 10_000 * number)
+    frame = Frame(BPV4, np.array(packets), np.array(times), 0, 12, 0)
+    scan = Decoder(angles).decode(frame)
+    assert isinstance(scan, Scan)
+    assert len(scan) > 0.999 * len(truth)
+    theirs = np.column_stack([truth["x"], truth["y"], truth["z"]])
+    distance, nearest = cKDTree(theirs).query(scan.points)
+    assert np.all(distance < 1e-4 + 2e-4 * np.linalg.norm(scan.points, axis=1))  # 0.01 deg, as it rounded
+    np.testing.assert_array_equal(scan.ring, truth["ring"][nearest])
