@@ -3,6 +3,7 @@
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -113,7 +114,10 @@ def serve(
         open_recording(opened, params).close()  # so that a mistake is told here and not in the page
     if truth is not None:
         read_tum(truth)
-    with LiveProcess(live, params, imu, record) if live else nullcontext() as source:
+    with (
+        TemporaryDirectory(prefix="hemislam-") as folder_live,
+        LiveProcess(live, params, imu, record) if live else nullcontext() as source,
+    ):
         run_server(
             Setup(
                 recording=recording or (LIVE if live else None),
@@ -126,6 +130,7 @@ def serve(
                 checkpoint_bytes=checkpoint_memory << 20,
                 journals=Path("runs") / "sessions",
                 live=source.address if source else None,
+                live_folder=Path(folder_live),
             ),
             folders=Folders(folder or [recording.resolve().parent if recording else Path.cwd()]),
             build_page=partial(Workbench, point_budget=point_budget, results=Path("runs")),

@@ -45,12 +45,15 @@ class Delta:
 class Outbox:
     """Collects changes for the next `Delta`.
 
+    Args:
+        session, notices, frames, chunks: what the reader has already, of a process before this one.
+
     Attributes:
         urgent: asks for the next one at once, whatever the rate limit.
         frames, chunks: how many the reader has of this session once it has taken everything.
     """
 
-    def __init__(self, params: Params, *, session: int = 0, notices: int = 0) -> None:
+    def __init__(self, params: Params, *, session: int = 0, notices: int = 0, frames: int = 0, chunks: int = 0) -> None:
         self._session = session
         self._notices_given = notices
         self._replaced: dict[str, Any] = {"params": params}
@@ -59,8 +62,8 @@ class Outbox:
         self._chunks: list[Chunk] = []
         self._kept: tuple[int, int] | None = None
         self._moved: tuple[int, F64] | None = None
-        self.frames = 0
-        self.chunks = 0
+        self.frames = frames
+        self.chunks = chunks
         self._notices: list[Notice] = []
         self.urgent = True
 

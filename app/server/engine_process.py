@@ -99,12 +99,15 @@ class Link:
 
 def main(commands: Pipe, updates: Pipe, setup: Setup) -> None:
     """Compile, open the recording, and work until told to end or the parent has gone."""
+    opened_before: list[Path] = []
 
     def opener(
         path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /
     ) -> Run:
-        if path == LIVE and setup.live is not None:
-            return open_live_run(setup.live, params)
+        if path == LIVE and setup.live is not None and setup.live_folder is not None:
+            revive = setup.revive and not opened_before
+            opened_before.append(path)
+            return open_live_run(setup.live, params, setup.live_folder, revive=revive)
         part = part or ((setup.start_s, setup.duration_s) if path == setup.recording else (0.0, None))
         return open_run(path, truth, params, *part, checkpoint_bytes=setup.checkpoint_bytes)
 
@@ -120,7 +123,9 @@ def run_loop(
 ) -> None:
     """As `main`, with what opens a recording, and what must be prepared with progress (name, fraction) before."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    outbox = Outbox(setup.params, session=setup.session, notices=setup.notices)
+    outbox = Outbox(
+        setup.params, session=setup.session, notices=setup.notices, frames=setup.frames, chunks=setup.chunks
+    )
     link = Link(commands, updates, outbox)
     session = Session(
         outbox,

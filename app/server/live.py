@@ -1,5 +1,7 @@
 """A run on a live source: frames come when they come, and there is no going back."""
 
+import logging
+import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -7,16 +9,41 @@ from app.sensors.findings import Finding
 from app.sensors.live.process import LiveAddress, LiveClient
 from app.sensors.live.status import LiveState, Status
 from app.server.loop_process import LoopProcess
-from app.server.protocol import LIVE
+from app.server.protocol import LIVE, OpenedRecording
 from app.server.readouts import Readouts
 from app.server.run import Quiet, Run
-from app.slam.engine import Engine
+from app.slam.engine import Checkpoint, Engine
 from app.slam.errors import HemislamError
+from app.slam.keyframes import KeyframeStore
+from app.slam.loops.types import Command
 from app.slam.params import Params
+from app.slam.results import RunLog
 from app.slam.types import DroppedScan, Measurement
 
 POLL_S = 0.02
 """How long to wait for the next scan before looking for commands."""
+
+
+EVERY = 10
+"""Frames between two checkpoints; the receiving process can give six seconds of scans again."""
+KEYFRAMES, CHECKPOINT = "keyframes", "checkpoint"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """A live run as an engine that takes over needs it. end_ns: of its newest scan."""
+
+    frame: int
+    end_ns: int
+    engine: Checkpoint
+    params: Params
+    history: tuple[tuple[int, Params], ...]
+    opened: OpenedRecording
+    log: RunLog
+    readouts: Readouts
+    overrulings: tuple[tuple[Command, ...], tuple[Command, ...]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +64,19 @@ class _Endless:
 
 
 class LiveRun(Run):
-    """Takes scans from a `LiveProcess`."""
+    """Takes scans from a `LiveProcess`.
+
+    Attributes:
+        complete: whether no scan was missed between an engine that died and this one.
+    """
 
     live = True
+    complete = True
 
-    def __init__(self, client: LiveClient, engine: Engine) -> None:
+    def __init__(self, client: LiveClient, engine: Engine, folder: Path) -> None:
         super().__init__(_Endless(), engine)  # type: ignore[arg-type]
         self._client = client
+        self._folder = folder
 
     def peek(self) -> Measurement | DroppedScan | Quiet | None:
         """As of a recording; `Quiet` if there is no scan just now."""
@@ -74,7 +107,45 @@ class LiveRun(Run):
         return self._client.state()
 
     def remember(self, *, near: bool = False) -> None:
-        """Nothing: what has passed can not be had again."""
+        """Now and then put on disk what an engine that takes over needs. Going back is not possible."""
+        if self.frame < 0 or self.frame % EVERY:
+            return
+        loops = self.engine.loops.state if self.engine.loops else None
+        kept = _Kept(
+            frame=self.frame,
+            end_ns=int(self.log.stamps_ns[-1]),
+            engine=self.engine.checkpoint(),
+            params=self.params,
+            history=self.history,
+            opened=self.opened,
+            log=self.log,
+            readouts=self.readouts,
+            overrulings=(loops.undo, loops.redo) if loops else ((), ()),
+        )
+        part = self._folder / "checkpoint.part"
+        try:
+            part.write_bytes(pickle.dumps(kept, protocol=5))
+            part.replace(self._folder / CHECKPOINT)
+        except OSError as error:
+            log.warning("What a new engine would need can not be kept: %s", error)
+
+    def revive(self) -> bool:
+        """Go on where an engine that died was; whether there is anything to go on from."""
+        try:
+            kept = pickle.loads((self._folder / CHECKPOINT).read_bytes())
+        except (OSError, EOFError, pickle.UnpicklingError):
+            return False
+        assert isinstance(kept, _Kept)
+        if kept.engine.keyframes > len(self.engine.keyframes):
+            return False
+        self.engine.restore(kept.engine)
+        self.choose(kept.params)
+        self.frame = self.known = kept.frame
+        self.history, self.opened, self.log, self.readouts = kept.history, kept.opened, kept.log, kept.readouts
+        if any(kept.overrulings):
+            self.overrule(*kept.overrulings)
+        self.complete = self._client.rewind(kept.end_ns)
+        return True
 
     def go_before(self, frame: int) -> None:
         raise HemislamError("A live source has no past; open its recording to go back in it.")
@@ -84,9 +155,25 @@ class LiveRun(Run):
         super().close()
 
 
-def open_live_run(address: LiveAddress, params: Params) -> LiveRun:
-    """Begin to map what comes from now on. Raises HemislamError: the receiving process has ended."""
-    return LiveRun(LiveClient(address), Engine(params, LoopProcess if params.loops.enabled else None))
+def open_live_run(address: LiveAddress, params: Params, folder: Path, *, revive: bool = False) -> LiveRun:
+    """Map what comes from now on, or go on where an engine that died was.
+
+    Args:
+        folder: for what must outlive the process. revive: go on, if that is possible.
+
+    Raises:
+        HemislamError: the receiving process has ended.
+    """
+    client = LiveClient(address)
+    if not revive:
+        (folder / KEYFRAMES).unlink(missing_ok=True)
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+    engine = Engine(params, LoopProcess if params.loops.enabled else None, KeyframeStore(folder / KEYFRAMES))
+    run = LiveRun(client, engine, folder)
+    if revive and not run.revive():
+        run.close()
+        return open_live_run(address, params, folder)
+    return run
 
 
 def tells(status: Status) -> bool:

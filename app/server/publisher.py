@@ -44,7 +44,7 @@ class Publisher:
         """Of all frames that are known, also those that the page was taken back over."""
         self._rows, self._odometry = Rows(len(SERIES)), Rows(16)  # the latter: T_odom_imu of keyframes
         self._positions, self._frame = Rows(3), MapFrame()  # as the page has them
-        self._chunks: list[Slot | Chunk] = []  # on disk, while that has room
+        self._chunks: list[Slot | Chunk | None] = []  # on disk, while that has room; None: another process sent it
         self._spill = Spill()
 
     def close(self) -> None:
@@ -63,6 +63,18 @@ class Publisher:
         for finding in run.opened.findings:
             if finding.verdict == "needs you":
                 self.outbox.notice("warning", " ".join(filter(None, (finding.text, finding.option))))
+
+    def taken_over(self, run: Run) -> None:
+        """A run that another process began goes on; the page keeps what it has of it. There is no going back."""
+        frames, keyframes = run.frame + 1, run.engine.keyframes
+        self._rows.extend(np.full((frames, len(SERIES)), np.nan))
+        self._positions.extend(run.log.odometry.positions)
+        for keyframe in keyframes:
+            self._odometry.extend(keyframe.T_odom_imu.reshape(1, 16))
+            self._chunks.append(None)
+        self.outbox.rewind(frames, len(keyframes))
+        self.outbox.put(recording=run.opened)
+        self.show(frame=run.frame, finished=False, frames_per_second=0.0, dropped=run.log.dropped.total())
 
     def show(self, *, urgent: bool = True, **changes: Any) -> None:
         """Change fields of the transport."""
@@ -103,7 +115,8 @@ class Publisher:
             self.outbox.move(first, positions)
         run.readouts.moved(positions)
         for kept in self._chunks[self.outbox.chunks : chunks]:
-            self.outbox.chunk(kept if isinstance(kept, Chunk) else wire.unpack(self._spill.get(kept)))
+            if kept is not None:
+                self.outbox.chunk(kept if isinstance(kept, Chunk) else wire.unpack(self._spill.get(kept)))
         self._newest(run, result)
         self.show(
             frame=run.frame,

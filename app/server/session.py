@@ -482,10 +482,14 @@ class Session:
         self._unseen = None
         run.remember()
         self._desk.clear()
-        self._page.opened(run)
+        if run.frame >= 0:
+            self._page.taken_over(run)
+        else:
+            self._page.opened(run)
         self._page.params(self._params, self._pending_restart())
         self._pacer.release()
-        self._go_to(0, -1)
+        if run.frame < 0:
+            self._go_to(0, -1)
 
     # --- the session as a file -------------------------------------------------------------------
     def _begin_journal(self, run: Run) -> None:

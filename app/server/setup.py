@@ -22,9 +22,10 @@ class Setup:
         resolve: parameters for recordings opened later; None keeps the present ones.
         play: begin at once. speed: to play at. breakpoints: where to pause.
         chunk_voxel: m, see `Session`. checkpoint_bytes: see `app.server.checkpoints`.
+        live_folder: where a live run keeps what a process that takes over needs. revive: it is that process.
         live: where to take scans from while `recording` is `app.server.protocol.LIVE`.
         journals: folder for session files, see `Session`.
-        session, notices: how many there were before, for a process that takes over from another.
+        session, notices, frames, chunks: how many there were before, for a process that takes over from another.
     """
 
     recording: Path | None = None
@@ -39,6 +40,10 @@ class Setup:
     chunk_voxel: float = 0.05
     checkpoint_bytes: int = 1 << 30
     live: "LiveAddress | None" = None
+    live_folder: Path | None = None
+    revive: bool = False
     journals: Path | None = None
     session: int = 0
     notices: int = 0
+    frames: int = 0
+    chunks: int = 0

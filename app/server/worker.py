@@ -158,8 +158,11 @@ class EngineProcess:
                         play=last.transport.playing,
                         speed=last.transport.speed,
                         breakpoints=last.breakpoints,
+                        revive=True,
                         session=last.session,
                         notices=number,
+                        frames=0 if last.trajectory is None else len(last.trajectory),
+                        chunks=len(last.chunks),
                     )
                 )
                 return

@@ -41,6 +41,7 @@ class Engine:
 
     Args:
         loops: makes who looks for loops, for example `InlineLoops`; None: nobody, it is odometry alone.
+        keyframes: where to keep them; None: in a temporary file.
 
     Attributes:
         params: used from the next step on; those that act on restart are read only once, here.
@@ -48,9 +49,11 @@ class Engine:
         loops: what was found, and the way to overrule it; None for odometry alone.
     """
 
-    def __init__(self, params: Params, loops: Callable[[], LoopClient] | None = None) -> None:
+    def __init__(
+        self, params: Params, loops: Callable[[], LoopClient] | None = None, keyframes: KeyframeStore | None = None
+    ) -> None:
         self.params = params
-        self.keyframes = KeyframeStore()
+        self.keyframes = KeyframeStore() if keyframes is None else keyframes
         self.loops = LoopLine(loops, self.keyframes, params.loops) if loops else None
         self._map = LocalMap(params.map)
         self._grid = VoxelGrid()

@@ -8,6 +8,8 @@ import os
 import tempfile
 from array import array
 from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -42,15 +44,34 @@ def is_due(last: Keyframe | None, T_odom_imu: F64, params: Keyframes) -> bool:
 
 
 class KeyframeStore:
-    """All keyframes of a walk, in an unnamed temporary file.
+    """All keyframes of a walk, in an unnamed temporary file or in one that outlives the process.
 
     `store[i]` reads keyframe i, from any thread; iterating streams all of them in order.
+
+    Args:
+        path: of the file; whole keyframes that it holds already are there. None: a temporary one.
     """
 
-    def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile(prefix="hemislam-keyframes-")  # noqa: SIM115 - closed by close()
+    def __init__(self, path: Path | None = None) -> None:
         self._ends = array("q")  # file offset after each keyframe, also of those gone back over
-        self._count = 0
+        self._file: IO[bytes]
+        if path is None:
+            self._file = tempfile.TemporaryFile(prefix="hemislam-keyframes-")  # noqa: SIM115 - closed by close()
+        else:
+            path.touch()
+            self._file = path.open("r+b")
+            self._find(path.stat().st_size)
+        self._count = len(self._ends)
+
+    def _find(self, size: int) -> None:
+        """Find the keyframes of a file of `size` bytes; one that was torn at its end is not there."""
+        end = 0
+        while end + _HEAD.itemsize <= size:
+            raw = os.pread(self._file.fileno(), _HEAD.itemsize, end)
+            end += _HEAD.itemsize + int(np.frombuffer(raw, dtype=_HEAD)[0]["points"]) * _POINT.itemsize
+            if end > size:
+                return
+            self._ends.append(end)
 
     def __len__(self) -> int:
         return self._count
