@@ -78,6 +78,11 @@ def same_recording(a: Snapshot, b: Snapshot) -> bool:
     return a.recording.path.resolve() == b.recording.path.resolve() and a.recording.start_ns == b.recording.start_ns
 
 
+def engine_number(snapshot: Snapshot) -> int:
+    """Which engine a snapshot is of: 0 is the first one, each fork has a number of its own."""
+    return snapshot.session // APART
+
+
 class Follower:
     """Says what brings B to A's frame: one journey at a time, but back at once.
 

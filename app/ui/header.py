@@ -40,6 +40,14 @@ HELP: Final = (
         "become, then commit or cancel. Every word can be undone; <b>Save edits</b> keeps them for "
         "<code>hemislam run --loops</code>."
     )
+    + heading("Two settings side by side")
+    + box(
+        "<b>Fork here</b> under <b>Compare</b> on the left goes on from this frame twice: A (pink) as it is, and B "
+        "(blue) with what you then set under Tune, where <b>act on</b> says whose parameters you see. B goes where A "
+        "goes; the scan tells who calls a point ground. <b>Swap</b> shows B whole; <b>keep</b> leaves a session file "
+        "that can be opened again. B is a second engine: it doubles memory and work, and first has to come to this "
+        "frame by itself."
+    )
     + heading("Keys")
     + box(
         f"{key('space')} play or pause<br>{key('←')} {key('→')} one frame back or on<br>"
@@ -47,6 +55,7 @@ HELP: Final = (
         f"{key('N')} {key('B')} next trouble on the strips, or the one before<br>"
         f"{key('V')} next colouring of the frame under study<br>"
         f"{key('J')} {key('K')} next or previous loop<br>"
+        f"{key('X')} swap A and B {key('T')} tune A or B<br>"
         f"{key('Ctrl')} {key('Z')} undo your word on a loop, with {key('Shift')} redo<br>"
         f"{key('Ctrl')} {key('K')} all commands"
     )

@@ -34,14 +34,14 @@ class NoticePanel:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._log = server.gui.add_html(log_html(()))
-        self._told = 0
+        self._told: set[int] = set()
 
     def draw(self, snapshot: Snapshot) -> None:
         """Tell every browser the notices that are new since the call before."""
-        new = [notice for notice in snapshot.notices if notice.number > self._told]
+        new = [notice for notice in snapshot.notices if notice.number not in self._told]
         if not new:
             return
-        self._told = new[-1].number
+        self._told |= {notice.number for notice in new}
         self._log.content = log_html(snapshot.notices)
         for client in self._server.get_clients().values():
             for notice in new:

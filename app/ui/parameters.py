@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import viser
 
+from app.server.fork import engine_number
 from app.server.protocol import Command, LoadParams, Restart, SetParams, Snapshot
 from app.slam.params import Effect, Leaf, Params, leaves
 from app.ui.html import box
@@ -102,6 +103,7 @@ class ParameterPanel:
         self._send = send
         self._now = now
         self._edits: dict[str, _Edit] = {}
+        self._engine = 0
         self._controls: dict[str, Control] = {}
         self._resets: dict[str, viser.GuiButtonGroupHandle] = {}
         self._sections: dict[str, dict[str, Leaf]] = {}
@@ -124,6 +126,9 @@ class ParameterPanel:
     def tick(self, snapshot: Snapshot) -> None:
         """Called by the drawing thread, often: sends typed values that have rested, shows the snapshot's."""
         now = self._now()
+        if engine_number(snapshot) != self._engine:  # what was set was meant for the other one
+            self._engine = engine_number(snapshot)
+            self._edits.clear()
         for path, edit in list(self._edits.items()):
             if not edit.sent and now - edit.at >= _TYPING_S:
                 edit.sent = True

@@ -6,6 +6,7 @@ import numpy as np
 import viser
 
 from app.slam.types import F32, F64
+from app.ui.colours import Rgb
 from app.ui.geometry import wxyz
 
 PATH_COLOUR: Final = (255, 92, 141)
@@ -23,9 +24,10 @@ def segments(positions: F64) -> F32:
 class Trajectory:
     """The estimated path, in blocks of at most `BLOCK` segments below the node `root`."""
 
-    def __init__(self, scene: viser.SceneApi, root: str) -> None:
+    def __init__(self, scene: viser.SceneApi, root: str, colour: Rgb = PATH_COLOUR) -> None:
         self._scene = scene
         self._root = root
+        self._colour = colour
         self._blocks: list[viser.LineSegmentsHandle] = []
         self._drawn: F64 = np.empty((0, 3))
 
@@ -45,7 +47,7 @@ class Trajectory:
             if index == len(self._blocks):
                 self._blocks.append(
                     self._scene.add_line_segments(
-                        f"{self._root}/{index}", segments(part), PATH_COLOUR, thickness=3.0, thickness_units="screen"
+                        f"{self._root}/{index}", segments(part), self._colour, thickness=3.0, thickness_units="screen"
                     )
                 )
             elif not np.array_equal(part, self._drawn[first : first + BLOCK + 1]):

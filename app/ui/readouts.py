@@ -148,15 +148,15 @@ class ReadoutPanel:
         self._time = gui.add_html("")
         layers = [(css(STAGE_COLOURS[stage]), 0.0, css(STAGE_COLOURS[stage])) for stage in reversed(STAGES)]
         gui.add_html(heading("Frame time by stage, ms"))
-        self._stages = _plot(gui, stacked_stages({}), layers)
+        self._stages = plot(gui, stacked_stages({}), layers)
         gui.add_html(heading("λ3/λ2 of the seeds and its limit"))
-        self._planarity = _plot(
+        self._planarity = plot(
             gui, (*recent({}, "planarity"), np.zeros(1)), [("#3ecf9a", 1.5, ""), ("#ff6b6b", 1.0, "")]
         )
         gui.add_html(heading("Residual (RMS), mm"))
-        self._residual = _plot(gui, recent({}, "residual_rms"), [("#40b8f0", 1.5, "")])
+        self._residual = plot(gui, recent({}, "residual_rms"), [("#40b8f0", 1.5, "")])
         self._error_title = gui.add_html(heading("Position error to truth, cm"), visible=False)
-        self._error = _plot(gui, recent({}, "error_m"), [("#ff5c8d", 1.5, "")])
+        self._error = plot(gui, recent({}, "error_m"), [("#ff5c8d", 1.5, "")])
         self._error.visible = False
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -187,7 +187,7 @@ class ReadoutPanel:
         self._error.data = (stamps, 100 * error)
 
 
-def _plot(gui: viser.GuiApi, data: tuple[F64, ...], looks: list[tuple[str, float, str]]) -> viser.GuiUplotHandle:
+def plot(gui: viser.GuiApi, data: tuple[F64, ...], looks: list[tuple[str, float, str]]) -> viser.GuiUplotHandle:
     """A small chart over seconds; per line its colour, width and fill ("" for none)."""
     lines: list[Any] = [{"label": "s"}]
     for colour, width, fill in looks:

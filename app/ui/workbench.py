@@ -10,14 +10,17 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import viser
 
 from app.server.folders import Folders
-from app.server.protocol import Command, Snapshot
+from app.server.fork import Engine, Workspace
+from app.server.protocol import Snapshot
+from app.server.setup import Setup
 from app.ui.appearance import AppearancePanel
 from app.ui.breakpoints import BreakpointPanel
+from app.ui.compare import ComparePanel, Sides
 from app.ui.doctor import DoctorPanel
 from app.ui.files import FilesPanel
 from app.ui.header import HELP, HeaderPanel
@@ -41,22 +44,11 @@ _TICK_S: Final = 0.04
 """How long the drawing thread waits for a snapshot before it looks at the page's own controls."""
 
 
-class EngineClient(Protocol):
-    """The engine's process as the page knows it (`app.server.worker.EngineProcess`)."""
-
-    @property
-    def snapshot(self) -> Snapshot: ...
-    def send(self, command: Command) -> None: ...
-    def wait(self, after_revision: int, timeout: float) -> Snapshot:
-        """The newest snapshot, as soon as its revision is greater or the time (s) is up."""
-        ...
-
-
 class Workbench:
     """Builds the page on `server`; `start` begins to draw, `close` ends it.
 
     Args:
-        server: whose page this is. engine: where snapshots come from and commands go.
+        server: whose page this is. engine: where snapshots come from and commands go; a `Workspace` can be forked.
         folders: where recordings may be opened from. point_budget: most map points in the page.
         results: folder below which results are saved.
         now: monotonic seconds.
@@ -65,13 +57,14 @@ class Workbench:
     def __init__(
         self,
         server: viser.ViserServer,
-        engine: EngineClient,
+        engine: Engine | Workspace,
         folders: Folders,
         point_budget: int = 3_000_000,
         *,
         results: Path = Path("results"),
         now: Callable[[], float] = time.monotonic,
     ) -> None:
+        forks = engine if isinstance(engine, Workspace) else Workspace(engine, Setup(), lambda _: engine)
         self._server = server
         self._engine = engine
         self._budget = point_budget
@@ -92,8 +85,9 @@ class Workbench:
             self._breakpoints = BreakpointPanel(gui, engine.send)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Tune", viser.Icon.ADJUSTMENTS_HORIZONTAL):
-            self._parameters = ParameterPanel(gui, first.params, engine.send)
-            add_yaml_buttons(gui, lambda: engine.snapshot.params, engine.send)
+            self._sides = Sides(gui, forks)
+            self._parameters = ParameterPanel(gui, first.params, self._sides.send)
+            add_yaml_buttons(gui, lambda: self._sides.tuned(engine.snapshot).params, self._sides.send)
         with tabs.add_tab("View", viser.Icon.EYE):
             self._appearance = AppearancePanel(gui)
         with tabs.add_tab("Study", viser.Icon.MICROSCOPE):
@@ -128,6 +122,8 @@ class Workbench:
                 self._appearance.look_freely,
                 now,
             )
+        with left.add_tab("Compare", viser.Icon.GIT_COMPARE):
+            self._compare = ComparePanel(server, ROOT, forks, self._sides, now)
         left.dock_left()
         left.set_width(300)
 
@@ -163,13 +159,15 @@ class Workbench:
         """Bring the page up to `current`: at once what a user waits for, the rest no faster than one can see."""
         now, drawn = self._now(), self._drawn
         view = self._study.seen(self._loops.seen(self._appearance.view))
+        self._compare.tick(current, view)
+        view = self._compare.seen(view)
         self._transport.tick(current)
         self._breakpoints.tick(current)
-        self._parameters.tick(current)
+        self._parameters.tick(self._sides.tuned(current))
         self._notices.draw(current)
         self._header.draw(current)
         self._loops.tick(current, view)
-        news = drawn is None or drawn.revision != current.revision
+        news = drawn is not current
         awaited = drawn is not None and _changed_by_user(drawn, current)
         due = now - self._scene_drawn_at >= _SCENE_PERIOD_S
         if (news and (due or awaited)) or view != self._drawn_view:

@@ -32,6 +32,7 @@ from app.server.protocol import (
     StepFrame,
     Transport,
 )
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.params import Params, leaves
 from app.slam.types import (
@@ -320,6 +321,7 @@ class FakeEngine:
             "total_ms": result.timings_ms["total"],
             "distance": 0.08 * frame,
             "error_m": error,
+            **dict(zip(("turn_x", "turn_y", "turn_z"), lie.log(result.state.R_odom_imu), strict=True)),
             **{f"{stage}_ms": ms for stage, ms in result.timings_ms.items()},
         }
         self._rows.append([row.get(name, np.nan) for name in SERIES])
