@@ -13,9 +13,10 @@ from app.__main__ import cli
 from app.server.run import Run
 from app.slam.errors import HemislamError
 from app.slam.metrics import Trajectory, ate, read_tum, write_tum
+from app.slam.results import LOOP_FILES, RESULT_FILES
 
 Call = Callable[..., Any]
-RESULTS = ["map.ply", "report.json", "timings.csv", "trajectory.tum"]
+RESULTS = sorted((*RESULT_FILES, *LOOP_FILES))
 
 
 @pytest.fixture(scope="module")
