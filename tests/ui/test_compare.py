@@ -162,6 +162,7 @@ def test_a_value_typed_for_b_is_never_sent_to_a(page: Page) -> None:
     page.forks.fork("")
     page.both_at(20)
     user_sets(page.sides._choice, "B")
+    page.draw()
     user_sets(page.workbench._parameters._controls["map.spacing"], 0.33)
     page.forks.discard()
     page.workbench._parameters._now = lambda: time.monotonic() + 10
