@@ -9,7 +9,7 @@ from app.server.protocol import Snapshot
 from app.slam.types import I64
 from app.ui.colours import LABEL_COLOURS
 from app.ui.compare_maths import A_COLOUR, B_COLOUR, Difference, Ground
-from app.ui.html import BAD, WARN, box, dot, number, tile, tiles
+from app.ui.html import BAD, WARN, box, dot, heading, number, tile, tiles
 
 
 def status(a: Snapshot | None, b: Snapshot | None, names: tuple[str, str], forked_at: int) -> str:
@@ -64,17 +64,22 @@ def numbers(found: Difference, counts: I64 | None) -> str:
     worst = f"most {number(100 * float(found.position_m.max()), 1)} cm"
     turned = found.turn_deg[np.isfinite(found.turn_deg)]
     most = f"most {number(float(turned.max()) if len(turned) else np.nan)}°"
-    parts = [
-        tile("A to B", number(100 * float(found.position_m[-1]), 1), "cm", note=worst, width="half"),
-        tile("turned", number(float(found.turn_deg[-1])), "°", note=most, width="half"),
-    ]
+    apart = tiles(
+        (
+            tile("A to B", number(100 * float(found.position_m[-1]), 1), "cm", note=worst, width="half"),
+            tile("turned", number(float(found.turn_deg[-1])), "°", note=most, width="half"),
+        )
+    )
+    ground, parts = "", []
     if counts is not None:
         alone = f"{counts[Ground.ALONE]:,} points of A's scan are not in B's" if counts[Ground.ALONE] else ""
-        parts += [
-            tile("ground only in A", f"{counts[Ground.ONLY_A]:,}"),
-            tile("only in B", f"{counts[Ground.ONLY_B]:,}"),
-            tile("both", f"{counts[Ground.BOTH]:,}", note=alone),
-        ]
+        ground = heading("Points called ground") + tiles(
+            (
+                tile("only in A", f"{counts[Ground.ONLY_A]:,}"),
+                tile("only in B", f"{counts[Ground.ONLY_B]:,}"),
+                tile("in both", f"{counts[Ground.BOTH]:,}", note=alone),
+            )
+        )
     for title, (a, b), unit, scale in (
         ("frame, mean of A → B", found.total_ms, "ms", 1.0),
         ("error to truth, RMS of A → B", found.error_m, "cm", 100.0),
@@ -83,7 +88,7 @@ def numbers(found: Difference, counts: I64 | None) -> str:
         if known.any():
             mean = [_mean(column[known], scale, squared=unit == "cm") for column in (a, b)]
             parts.append(tile(title, f"{number(mean[0], 1)} → {number(mean[1], 1)}", unit, width="wide"))
-    return tiles(parts)
+    return apart + ground + heading("Time and error") + tiles(parts)
 
 
 def _mean(values: np.ndarray, scale: float, *, squared: bool) -> float:

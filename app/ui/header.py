@@ -42,11 +42,18 @@ HELP: Final = (
     )
     + heading("Two settings side by side")
     + box(
-        "<b>Fork here</b> under <b>Compare</b> on the left goes on from this frame twice: A (pink) as it is, and B "
+        "<b>Fork here</b> under <b>A/B</b> on the left goes on from this frame twice: A (pink) as it is, and B "
         "(blue) with what you then set under Tune, where <b>act on</b> says whose parameters you see. B goes where A "
         "goes; the scan tells who calls a point ground. <b>Swap</b> shows B whole; <b>keep</b> leaves a session file "
         "that can be opened again. B is a second engine: it doubles memory and work, and first has to come to this "
         "frame by itself."
+    )
+    + heading("Live")
+    + box(
+        "With <code>serve --live</code> the map is made of what a sensor sends. Scans are taken as they come, so there "
+        "is no slider and no speed; <b>Pause</b> lets them wait, and when too many do, the oldest are dropped, as the "
+        "strips show. <b>Recording</b> on the left tells rates, losses and clocks. To go back, open what "
+        "<code>--record</code> wrote."
     )
     + heading("Keys")
     + box(

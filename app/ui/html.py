@@ -31,7 +31,7 @@ white-space:nowrap;color:#10151c}
 .hs-keys{display:flex;flex-wrap:wrap;gap:3px 12px}
 .hs-item{border-left:3px solid;padding:1px 0 2px 8px;margin:5px 0}
 .hs-h{font-size:10.5px;font-weight:600;letter-spacing:.3px;color:#8b97a8;padding:4px 10px 3px}
-[data-dock-tab]{padding-inline:8px!important}
+[data-dock-tab]{padding-inline:6px!important}
 kbd.hs-kbd{font:11px ui-monospace,monospace;border:1px solid rgba(127,140,160,.5);border-bottom-width:2px;
 border-radius:4px;padding:0 5px}
 </style>"""

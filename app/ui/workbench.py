@@ -26,6 +26,7 @@ from app.ui.files import FilesPanel
 from app.ui.header import HELP, HeaderPanel
 from app.ui.html import ACCENT, STYLE, heading
 from app.ui.keys import KEYS
+from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
 from app.ui.notices import NoticePanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
@@ -108,6 +109,7 @@ class Workbench:
         with left.add_tab("Readouts", viser.Icon.CHART_LINE):
             self._readouts = ReadoutPanel(gui)
         with left.add_tab("Recording", viser.Icon.STETHOSCOPE):
+            self._live = LivePanel(gui)
             gui.add_html(heading("The recording doctor"))
             self._doctor = DoctorPanel(gui)
             gui.add_html(heading("Log"))
@@ -122,7 +124,7 @@ class Workbench:
                 self._appearance.look_freely,
                 now,
             )
-        with left.add_tab("Compare", viser.Icon.GIT_COMPARE):
+        with left.add_tab("A/B", viser.Icon.GIT_COMPARE):
             self._compare = ComparePanel(server, ROOT, forks, self._sides, now)
         left.dock_left()
         left.set_width(300)
@@ -187,6 +189,7 @@ class Workbench:
             self._panels_drawn_at = now
             self._readouts.draw(current)
             self._doctor.draw(current)
+            self._live.draw(current)
             self._files.draw(current)
             self._appearance.draw(view, self._scene.limits(view.colour_by), self._scene.points, self._budget)
 
