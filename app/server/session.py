@@ -497,6 +497,8 @@ class Session:
             self._journal.close()
             self._journal = None
         self._outbox.put(journal=None)
+        if not run.live:  # a live one shows how its source is doing when it knows
+            self._outbox.put(live=None)
         if self._journals is not None and not run.live:
             path = new_path(self._journals, run.opened.path)
             self._journal = Journal(path, opened_of(run))

@@ -86,7 +86,11 @@ class TransportPanel:
             self._slider.max = last
         if self._dragged is None and self._sought is None:
             show(self._slider, min(max(transport.frame, 0), last))
-        self._slider.disabled = self._play.disabled = snapshot.recording is None
+        live = snapshot.live is not None
+        self._play.disabled = snapshot.recording is None
+        # A live source has no past, and its own pace. viser can not disable a group of buttons.
+        self._slider.disabled = self._speed.disabled = live or snapshot.recording is None
+        self._frames.visible = not live
         playing = transport.playing
         if (self._play.label == "Pause") != playing:
             self._play.label = "Pause" if playing else "Play"
@@ -111,14 +115,34 @@ def where(snapshot: Snapshot) -> str:
     recording, transport = snapshot.recording, snapshot.transport
     if recording is None:
         return box('<span class="hs-quiet">No recording is open.</span>')
+    if snapshot.live is not None:
+        return _where_live(snapshot)
     if transport.frame < 0:
         return box(f'<span class="hs-quiet">{recording.frames:,} frames, {recording.duration_s:.1f} s</span>')
     seconds = (transport.stamp_ns - recording.start_ns) * 1e-9
-    clock = datetime.fromtimestamp(transport.stamp_ns // 1_000_000_000, UTC)
-    millis = transport.stamp_ns // 1_000_000 % 1000
     return box(
         f'<div class="hs-row"><span>frame <b>{transport.frame:,}</b> of {recording.frames:,}</span>'
         f"<span><b>{number(seconds)}</b> of {number(recording.duration_s, 1)} s</span></div>",
-        f'<div class="hs-row hs-note"><span>{clock:%Y-%m-%d %H:%M:%S}.{millis:03d} UTC</span>'
+        f'<div class="hs-row hs-note"><span>{_utc(transport.stamp_ns)}</span>'
         f"<span>{number(transport.frames_per_second, 1)} frames/s</span></div>",
     )
+
+
+def _where_live(snapshot: Snapshot) -> str:
+    """The same of a live source, and why there is no way back."""
+    transport = snapshot.transport
+    quiet = "Live goes on only. Record it (--record) and open the file to go back."
+    if transport.frame < 0:
+        return box(f'<span class="hs-quiet">Waiting for the first scan. {quiet}</span>')
+    dropped = f"{transport.dropped:,} scans dropped" if transport.dropped else "no scan dropped"
+    return box(
+        f'<div class="hs-row"><span>frame <b>{transport.frame:,}</b>, live</span><span>{dropped}</span></div>',
+        f'<div class="hs-row hs-note"><span>{_utc(transport.stamp_ns)}</span>'
+        f"<span>{number(transport.frames_per_second, 1)} frames/s</span></div>",
+        f'<div class="hs-note">{quiet}</div>',
+    )
+
+
+def _utc(stamp_ns: int) -> str:
+    clock = datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC)
+    return f"{clock:%Y-%m-%d %H:%M:%S}.{stamp_ns // 1_000_000 % 1000:03d} UTC"

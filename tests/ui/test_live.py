@@ -1,0 +1,107 @@
+"""The panel of a live source, and the transport while there is one."""
+
+import re
+from dataclasses import replace
+
+import pytest
+import viser
+
+from app.sensors.live.counters import Counters
+from app.sensors.live.status import LiveState
+from app.ui.html import BAD, GOOD, WARN
+from app.ui.live import LivePanel, live_html, verdict
+from app.ui.transport import TransportPanel
+from tests.ui.conftest import Clock, Wire
+from tests.ui.fake_engine import FakeEngine
+
+WELL = LiveState(
+    counters=Counters(packets=1000, frames=10),
+    lidar_hz=10.0,
+    imu_hz=199.96,
+    lidar_age_s=0.03,
+    imu_age_s=0.004,
+    clock="sensor",
+    offset_s=0.0021,
+    sensor="RS-Bpearl 10 Hz",
+    recorded=12_345_678,
+)
+
+
+def shown(state: LiveState) -> str:
+    return re.sub(r"\s+", " ", re.sub("<[^>]+>", " ", live_html(state)))
+
+
+def test_each_reading_has_its_unit() -> None:
+    text = shown(replace(WELL, counters=Counters(packets=990, lost=10, duplicates=3, dropped=2, foreign=4), backlog=1))
+    for words in ("LiDAR 10.0 Hz last 30 ms ago", "IMU 200.0 Hz last 4 ms ago", "packets lost 10 1.00 % of 1,000",
+                  "not usable 4 packets", "duplicates 3", "scans dropped 2", "waiting 1 scans",
+                  "IMU behind LiDAR +2.1 ms", "recorded 12 MB", "clock in use the sensors' own",
+                  "RS-Bpearl 10 Hz"):  # fmt: skip
+        assert words in text.replace("&#x27;", "'"), words
+
+
+def test_what_is_not_known_is_a_dash_and_not_zero() -> None:
+    text = shown(LiveState())
+    assert "IMU behind LiDAR – ms" in text and "nothing came yet" in text and "recorded – not asked for" in text
+
+
+@pytest.mark.parametrize(
+    ("state", "words", "colour"),
+    [
+        (WELL, "receiving", GOOD),
+        (LiveState(), "waiting for the LiDAR", WARN),
+        (replace(WELL, lidar_age_s=5.0), "LiDAR silent", BAD),
+        (replace(WELL, imu_age_s=5.0), "IMU silent", BAD),
+        (replace(WELL, backlog=12), "engine behind", WARN),
+        (replace(WELL, clock=""), "settling", WARN),
+    ],
+)
+def test_the_worst_is_said_in_a_word(state: LiveState, words: str, colour: str) -> None:
+    assert verdict(state) == (words, colour)
+
+
+def test_only_trouble_is_coloured_as_trouble() -> None:
+    assert BAD not in live_html(WELL) and WARN not in live_html(WELL)
+    for worse in (
+        replace(WELL, counters=Counters(packets=10, dropped=1)),
+        replace(WELL, counters=Counters(packets=10, lost=5)),
+        replace(WELL, lidar_age_s=3.0),
+    ):
+        assert BAD in live_html(worse)
+    for warned in (replace(WELL, offset_s=0.3), replace(WELL, counters=Counters(packets=10, truncated=1))):
+        assert WARN in live_html(warned)
+    assert WARN not in live_html(replace(WELL, offset_s=0.3, clock="host")), "then it does no harm"
+
+
+def test_what_a_sensor_says_is_no_html() -> None:
+    assert "<script>" not in live_html(replace(WELL, sensor="<script>alert(1)</script>"))
+
+
+def test_the_panel_takes_no_place_while_a_recording_is_open(server: viser.ViserServer, engine: FakeEngine) -> None:
+    panel = LivePanel(server.gui)
+    panel.draw(engine.snapshot)
+    assert not panel._html.visible
+    panel.draw(replace(engine.snapshot, live=WELL))
+    assert panel._html.visible and "receiving" in panel._html.content
+    panel.draw(engine.snapshot)
+    assert not panel._html.visible
+
+
+def test_nothing_is_sent_while_nothing_changes(server: viser.ViserServer, engine: FakeEngine, wire: Wire) -> None:
+    panel = LivePanel(server.gui)
+    live = replace(engine.snapshot, live=WELL)
+    panel.draw(live)
+    wire.clear()
+    panel.draw(replace(live, revision=live.revision + 1))
+    assert not wire.messages
+
+
+def test_live_there_is_no_way_back_and_the_page_says_why(server: viser.ViserServer, engine: FakeEngine) -> None:
+    panel = TransportPanel(server.gui, engine.send, lambda: engine.snapshot, Clock())
+    panel.tick(replace(engine.snapshot, live=WELL))
+    assert panel._slider.disabled and panel._speed.disabled and not panel._frames.visible
+    assert not panel._play.disabled
+    assert "--record" in panel._where.content
+    panel.tick(engine.snapshot)
+    assert not panel._slider.disabled and not panel._speed.disabled and panel._frames.visible
+    assert "--record" not in panel._where.content
