@@ -9,6 +9,11 @@ import pytest
 from app.slam.errors import HemislamError
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Not in pyproject.toml, since naming it imports numba, which must come after what `app` settles for it."""
+    config.addinivalue_line("filterwarnings", "error::numba.core.errors.NumbaWarning")
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The recordings beside the project. A checkout without them skips the test by name."""

@@ -216,7 +216,9 @@ class LoopBackend:
         self._check_there(older, newer)
         edge = self._edges(self._found).get((older, newer))
         measured = None if edge is None else edge.T_older_newer
-        return inspection.detail(self._detector, older, newer, self.poses, measured)
+        counts = edge is not None and edge.verdict is Verdict.ACCEPTED
+        poses = self._detector.poses if counts else self.poses  # the graph has obeyed it already
+        return inspection.detail(self._detector, older, newer, poses, measured)
 
     def g2o(self) -> str:
         """The graph as the text of a g2o file."""
@@ -242,7 +244,9 @@ class LoopBackend:
                 command = replace(command, guess=rows(self._present(command.older, command.newer)))
         elif (command.older, command.newer) not in self._edges(self._found):
             there = False
-        self._overrulings.give(self._entry(replace(command, since=self._overrulings.reached if there else 0)))
+        self._overrulings.give(
+            self._fitting(self._entry(replace(command, since=self._overrulings.reached if there else 0)))
+        )
         self._solve()
         if not there:
             self._notices.append(f"{in_words(command)} waits until there is such a loop.")
@@ -276,13 +280,23 @@ class LoopBackend:
         self._check_there(command.older, command.newer)
         if not isinstance(command, Add) and (command.older, command.newer) not in self._edges(self._found):
             raise HemislamError(f"There is no loop candidate of keyframes {command.older} and {command.newer}.")
-        edges = tuple(self._edges(self._found, self._entry(replace(command, since=0))).values())
+        edges = tuple(self._edges(self._found, self._fitting(self._entry(replace(command, since=0)))).values())
         poses = self._batch(edges)
         return Preview(poses, inspection.residuals(self._factors(edges), poses))
 
     def _entry(self, command: Command) -> Entry:
         there = isinstance(command, Add) and command.newer < len(self)
         return Entry(command, self._made(command) if isinstance(command, Add) and there else None)
+
+    def _fitting(self, entry: Entry) -> Entry:
+        """The same, unless it ties two places by a registration that found nothing in common."""
+        edge = entry.added
+        if edge is not None and isinstance(entry.command, Add) and entry.command.register and not edge.evidence.overlap:
+            raise HemislamError(
+                f"The surroundings of keyframes {edge.older} and {edge.newer} have nothing in common from there;"
+                " nudge one nearer to where it belongs, or tie them without registration."
+            )
+        return entry
 
     def _made(self, command: Add) -> LoopEdge:
         older, newer = command.older, command.newer

@@ -177,7 +177,8 @@ class LoopDetail:
     Attributes:
         older, newer: (n, 3) submap points, each in its own level frame.
         T_imu_level: (4, 4) the older keyframe's IMU frame from its level frame: a rotation.
-        T_guess: (4, 4) older's level frame from newer's, by the graph. T_registered: by the edge.
+        T_guess: (4, 4) older's level frame from newer's, by odometry if the loop counts, else by the graph.
+        T_registered: by the edge.
         older_context, newer_context: (rings, sectors), nan where never seen.
         shift_distances: (sectors,) distance over column shifts.
         residuals: (k,) m, point-to-plane, of the newer's points that have a partner.

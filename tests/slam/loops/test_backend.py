@@ -230,7 +230,13 @@ def edits(walked: Walked, backend: LoopBackend) -> list[Command]:
     """One of each kind, and one for a loop that is not there."""
     first, *_, last = (edge.pair for edge in accepted(backend))
     far = rows(lie.inverse(walked.walk.truth[3]) @ walked.walk.truth[60])
-    return [SetWeight(*first, 2.0), Reject(*last), Add(3, 60, far, register=False), Add(5, 62), Accept(0, 1)]
+    return [
+        SetWeight(*first, 2.0),
+        Reject(*last),
+        Add(3, 60, far, register=False),
+        Add(first[0] + 1, first[1] - 1),
+        Accept(0, 1),
+    ]
 
 
 def test_a_session_given_again_before_the_walk_goes_as_it_went(walked: Walked, backend: LoopBackend) -> None:
@@ -472,3 +478,13 @@ def test_an_empty_back_end_has_nothing_to_show(walked: Walked) -> None:
     np.testing.assert_array_equal(backend.T_map_odom, np.eye(4))
     backend.go_to(0)
     assert backend.edges == backend.factor_residuals() == ()
+
+
+def test_places_with_nothing_in_common_are_not_tied_by_registration(walked: Walked, backend: LoopBackend) -> None:
+    far = np.eye(4)
+    far[0, 3] = 200.0
+    before = backend.edges
+    for act in (backend.preview, backend.apply):
+        with pytest.raises(HemislamError, match="nothing in common"):
+            act(Add(5, 62, rows(far)))
+    assert same(backend.edges, before) and not backend.commands
