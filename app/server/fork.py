@@ -5,6 +5,7 @@ one more engine's process that opens it, comes to A's frame by itself, and then 
 frame that A is at. A never waits for B.
 """
 
+import json
 import shutil
 import threading
 import time
@@ -15,8 +16,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from app.server.breakpoints import Breakpoints
+from app.server.follower import Follower, same_recording
 from app.server.journal import SUFFIX, SavedSession, read_session, write_session
-from app.server.protocol import Command, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot, StepFrame
+from app.server.protocol import Command, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
 from app.server.setup import Setup
 from app.slam.errors import HemislamError
 
@@ -25,10 +27,10 @@ FOLDER = "forks"
 """Below the folder of session files: forks that are neither kept nor discarded."""
 PERIOD_S = 0.02
 """How often to look where A is."""
-STUCK_S = 1.0
-"""B is told again where to go if nothing came of it for so long: what is sent to a process that dies is lost."""
 APART = 1_000_000
 """Between the session and notice numbers of one engine and the next, so that the page never takes one for another."""
+_MOST_KEPT = 30
+_NOT_KEPT = "This session is not kept in a file, so it can not be forked; serve keeps one."
 
 
 class Engine(Protocol):
@@ -63,56 +65,19 @@ def forked(a: Snapshot, values: Mapping[str, Any]) -> SavedSession:
     frame = a.transport.frame
     if frame < 0:
         raise HemislamError("There is no frame to fork at yet; play or step first.")
+    if a.live is not None:
+        raise HemislamError("A live source can not be forked; record it, and open the recording.")
     if a.journal is None:
-        raise HemislamError("This session is not kept in a file, so it can not be forked; serve keeps one.")
+        raise HemislamError(_NOT_KEPT)
     saved = read_session(a.journal)
     history = tuple(entry for entry in saved.state.history if entry[0] <= frame)
     state = replace(saved.state, params=a.params.with_values(dict(values)), history=history)
     return SavedSession(saved.opened, state, frame)
 
 
-def same_recording(a: Snapshot, b: Snapshot) -> bool:
-    """Whether frames of one can be compared with those of the other."""
-    if a.recording is None or b.recording is None:
-        return False
-    return a.recording.path.resolve() == b.recording.path.resolve() and a.recording.start_ns == b.recording.start_ns
-
-
 def engine_number(snapshot: Snapshot) -> int:
     """Which engine a snapshot is of: 0 is the first one, each fork has a number of its own."""
     return snapshot.session // APART
-
-
-class Follower:
-    """Says what brings B to A's frame: one journey at a time, but back at once.
-
-    Args:
-        frame: that B goes to by itself at first.
-    """
-
-    def __init__(self, frame: int) -> None:
-        self._target = frame
-        self._revision, self._since = -1, 0.0
-
-    def next(self, a: Snapshot, b: Snapshot, now: float) -> Command | None:
-        """What to send B now (monotonic s), if anything."""
-        if b.revision != self._revision:
-            self._revision, self._since = b.revision, now
-        wanted, here = a.transport.frame, b.transport.frame
-        if wanted < 0 or not same_recording(a, b) or wanted == here == self._target:
-            return None
-        stuck = here != wanted and b.progress is None and now - self._since >= STUCK_S
-        arrived = here == self._target
-        back = wanted < max(here, self._target)
-        if not stuck and (wanted == self._target or not (arrived or back)):
-            return None
-        self._since = now
-        self._target = wanted
-        last = b.recording.frames - 1 if b.recording else wanted
-        if wanted > last:  # the number of frames is an estimate, which a seek keeps to
-            self._target = wanted if here >= last else last
-            return StepFrame(wanted - here) if here >= last else Seek(last)
-        return Seek(wanted)
 
 
 class Workspace:
@@ -179,38 +144,39 @@ class Workspace:
             HemislamError: there is a fork already, A can not be forked, or its file can not be written.
         """
         with self._lock:
-            a, b = self._sides
-            if b is not None:
-                raise HemislamError("There is a fork already; keep or discard it first.")
-            if self._setup.journals is None:
-                raise HemislamError("This session is not kept in a file, so it can not be forked; serve keeps one.")
+            a, folder = self._place(name)
             session = forked(a.engine.snapshot, values or {})
-            self._forks += 1
-            name = name.strip() or f"fork {self._forks}"
-            folder = _free(self._setup.journals / FOLDER / f"{datetime.now():%Y%m%d-%H%M%S}-{_plain(name)}", "")
             file = folder / f"start{SUFFIX}"
             try:
                 folder.mkdir(parents=True)
                 write_session(file, session)
             except OSError as error:
                 raise HemislamError(f"The fork can not be written to {folder}: {error.strerror}.") from None
-            engine = self._start(
-                replace(
-                    self._setup,
-                    recording=file.resolve(),
-                    truth=None,  # the file says which
-                    params=session.state.params,
-                    play=False,
-                    breakpoints=Breakpoints(),
-                    journals=folder.resolve(),
-                    session=APART * self._forks,
-                    notices=APART * self._forks,
-                )
-            )
-            self.forked_at, self._follower = session.frame, Follower(session.frame)
-            self._sides = (a, Side(engine, name, folder))
-            self._ended = threading.Event()
-            threading.Thread(target=self._follow, args=(self._ended,), name="fork", daemon=True).start()
+            self._begin(file, session, name, folder, session.frame)
+
+    def open(self, path: Path) -> None:
+        """Start B on a session file, a kept fork or any other of A's recording; it comes to where A is.
+
+        Raises:
+            HemislamError: there is a fork already, or the file is none of A's recording.
+        """
+        with self._lock:
+            a, folder = self._place(path.stem)
+            session, journal = read_session(path), a.engine.snapshot.journal
+            ours = read_session(journal).opened if journal is not None else None
+            theirs = session.opened
+            if ours is None or (ours.recording, ours.start_s) != (theirs.recording, theirs.start_s):
+                raise HemislamError(f"{path.name} is of {theirs.recording} from {theirs.start_s:g} s; open that first.")
+            self._begin(path, session, path.stem, folder, 0)
+
+    def kept(self) -> list[Path]:
+        """Session files of A's recording that B can be opened on, the newest first."""
+        a, folder = self._sides[0].engine.snapshot, self._setup.journals
+        if folder is None or a.recording is None:
+            return []
+        files = [file for file in folder.glob(f"*{SUFFIX}") if a.journal is None or file.name != a.journal.name]
+        newest = sorted(files, key=lambda file: file.stat().st_mtime, reverse=True)[:_MOST_KEPT]
+        return [file for file in newest if _recording_of(file) == a.recording.path.resolve()]
 
     def swap(self) -> None:
         """B becomes A: it goes on where A is, as A did, and A follows. Raises HemislamError without a fork."""
@@ -273,6 +239,38 @@ class Workspace:
                     side.engine.close()
 
     # --- inside ----------------------------------------------------------------------------------
+    def _place(self, name: str) -> tuple[Side, Path]:
+        """A, and a folder for a new B, which is not there yet."""
+        a, b = self._sides
+        if b is not None:
+            raise HemislamError("There is a fork already; keep or discard it first.")
+        if self._setup.journals is None:
+            raise HemislamError(_NOT_KEPT)
+        self._forks += 1
+        stamp = f"{datetime.now():%Y%m%d-%H%M%S}"
+        return a, _free(self._setup.journals / FOLDER / f"{stamp}-{_plain(name.strip())}", "")
+
+    def _begin(self, file: Path, session: SavedSession, name: str, folder: Path, forked_at: int) -> None:
+        engine = self._start(
+            replace(
+                self._setup,
+                recording=file.resolve(),
+                truth=None,  # the file says which
+                params=session.state.params,
+                play=False,
+                breakpoints=Breakpoints(),
+                journals=folder.resolve(),
+                session=APART * self._forks,
+                notices=APART * self._forks,
+                live=None,
+                live_folder=None,
+            )
+        )
+        self.forked_at, self._follower = forked_at, Follower(max(session.frame, 0))
+        self._sides = (self._sides[0], Side(engine, name.strip() or f"fork {self._forks}", folder))
+        self._ended = threading.Event()
+        threading.Thread(target=self._follow, args=(self._ended,), name="fork", daemon=True).start()
+
     def _need_fork(self) -> tuple[Side, Side]:
         a, b = self._sides
         if b is None:
@@ -295,6 +293,15 @@ class Workspace:
                 command = self._follower.next(a.engine.snapshot, b.engine.snapshot, time.monotonic())
                 if command is not None:
                     b.engine.send(command)
+
+
+def _recording_of(session: Path) -> Path | None:
+    """What a session file says that it opened; None if that can not be told."""
+    try:
+        with session.open(encoding="utf-8") as lines:
+            return Path(json.loads(lines.readline())["recording"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _plain(name: str) -> str:

@@ -6,19 +6,22 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import viser
 
-from app.server.fork import Workspace, same_recording
+from app.server.follower import same_recording
+from app.server.fork import Workspace
 from app.server.protocol import Command, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.types import U8, StepResult
 from app.ui.compare_maths import A_COLOUR, B_COLOUR, Difference, Ground, difference, ground_difference, thinned
 from app.ui.compare_scene import CompareScene
 from app.ui.compare_words import legend, numbers, status
-from app.ui.html import css, heading
+from app.ui.html import box, css, heading
 from app.ui.readouts import plot
 from app.ui.view import View
 from app.ui.widgets import by_user, show
@@ -102,6 +105,9 @@ class ComparePanel:
         self._fork = gui.add_button(
             "Fork here", icon=viser.Icon.GIT_BRANCH, hint="Go on from this frame with other parameters, side by side."
         )
+        self._open = gui.add_button(
+            "Open as B…", icon=viser.Icon.FOLDER_OPEN, color="gray", hint="A kept fork or an older session, beside A."
+        )
         self._what = gui.add_button_group(
             "fork", (_SWAP, _KEEP, _DISCARD), visible=False, hint="X swaps. Keep: as a file that can be opened again."
         )
@@ -124,6 +130,7 @@ class ComparePanel:
             chart.visible = False
             self._plots.append((named, chart))
         self._fork.on_click(by_user(lambda _, client: self._act("", client)))
+        self._open.on_click(by_user(lambda _, client: self._choose(client)))
         self._what.on_click(by_user(self._act))
         gui.add_command("Swap A and its fork B", hotkey="X").on_trigger(lambda _: self._swap_if_any())
 
@@ -192,7 +199,7 @@ class ComparePanel:
         self._sides.tick(b)
         forked = b is not None
         if self._what.visible != forked:
-            self._fork.visible = not forked
+            self._fork.visible = self._open.visible = not forked
             for control in (self._what, self._by_ground, self._legend, self._numbers):
                 control.visible = forked
 
@@ -207,11 +214,30 @@ class ComparePanel:
                     client.add_notification("Kept", f"The fork is {path}; hemislam serve opens it again.")
                 case "discard":
                     self._forks.discard()
+                case Path():
+                    self._forks.open(what)
                 case _:
                     self._forks.fork(self._name.value)
                     self._sides.choose("B")
         except HemislamError as error:
             client.add_notification("Error", str(error), color="red", auto_close_seconds=None)
+
+    def _choose(self, client: viser.ClientHandle) -> None:
+        """A dialog with the sessions that B can be opened on."""
+        kept = self._forks.kept()
+        with client.gui.add_modal("Open a session as B") as modal:
+            if not kept:
+                client.gui.add_html(box("There is no other session of this recording yet; fork, and keep it."))
+            buttons = [(path, client.gui.add_button(path.stem, color="gray")) for path in kept]
+            cancel = client.gui.add_button("Cancel", color="gray")
+        cancel.on_click(lambda _: modal.close())
+
+        def chosen(path: Path, _: object) -> None:
+            modal.close()
+            self._act(path, client)
+
+        for path, button in buttons:
+            button.on_click(partial(chosen, path))
 
     def _swap_if_any(self) -> None:
         if self._forks.other is not None:

@@ -4,7 +4,7 @@ from html import escape
 
 import numpy as np
 
-from app.server.fork import same_recording
+from app.server.follower import same_recording
 from app.server.protocol import Snapshot
 from app.slam.types import I64
 from app.ui.colours import LABEL_COLOURS

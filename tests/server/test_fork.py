@@ -13,7 +13,8 @@ import pytest
 import server_fakes as fakes
 
 from app.sensors.presets import resolve_params
-from app.server.fork import STUCK_S, Follower, Workspace, forked
+from app.server.follower import STUCK_S, Follower
+from app.server.fork import Workspace, forked
 from app.server.journal import Journal, Opened, State, read_session
 from app.server.protocol import (
     SERIES,
@@ -190,6 +191,12 @@ def test_a_kept_fork_is_a_file_of_its_name_that_replaces_none(pair: Workspace, t
         paths.append(pair.keep())
     assert [path.name for path in paths] == ["walk-300-finer-σ---2.hemislam", "walk-300-finer-σ---2-2.hemislam"]
     assert [read_session(path).frame for path in paths] == [22, 24]
+    assert pair.kept() == paths[::-1], "of this recording, but for A's own"
+    pair.open(paths[1])
+    opened = both_at(pair, 24)[1]
+    assert opened.params.ground.sigma == 0.05 and pair.names[1] == paths[1].stem
+    pair.discard()
+    assert paths[1].exists(), "what was kept is not thrown away"
     pair.send(OpenRecording(paths[0]))
     opened = until(lambda: pair.snapshot, lambda s: s.params.ground.sigma == 0.05 and s.transport.frame == 22)
     assert speeds(opened)[20] < speeds(opened)[22]
