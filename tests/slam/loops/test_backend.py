@@ -234,7 +234,7 @@ def edits(walked: Walked, backend: LoopBackend) -> list[Command]:
         SetWeight(*first, 2.0),
         Reject(*last),
         Add(3, 60, far, register=False),
-        Add(first[0] + 1, first[1] - 1),
+        Add(5, 62, register=False),
         Accept(0, 1),
     ]
 
