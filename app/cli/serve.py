@@ -60,6 +60,13 @@ def serve(
     record: Annotated[
         Path | None, typer.Option("--record", metavar="FILE", help="Write what comes live into this .mcap.")
     ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option("--certificate", metavar="PEM", help="Speak https by this certificate.")
+    ] = None,
+    key: Annotated[
+        Path | None, typer.Option("--key", metavar="PEM", help="Of the certificate, if it is not in its file.")
+    ] = None,
+    log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr, one JSON object a line.")] = False,
     preset: Preset = None,
     config: Config = None,
     assignments: Assignments = None,
@@ -89,9 +96,10 @@ def serve(
     from app.sensors.recording import open_recording
     from app.server.folders import Folders
     from app.server.journal import SUFFIX, read_session
+    from app.server.logs import start_logging
     from app.server.protocol import LIVE
     from app.server.setup import Setup
-    from app.server.web import run_server
+    from app.server.web import Tls, run_server
     from app.slam.trajectory import read_tum
     from app.ui.workbench import Workbench
 
@@ -103,6 +111,12 @@ def serve(
         lidar_topic=lidar_topic,
         imu_topic=imu_topic,
     )
+    if key is not None and certificate is None:
+        raise HemislamError("--key belongs to --certificate; give both.")
+    tls = Tls(certificate, key) if certificate else None
+    if tls is not None:
+        tls.check()
+    start_logging(json_lines=log_json)
     if live is not None and recording is not None:
         raise HemislamError("Give a recording or --live, not both.")
     if live is None and (imu or record):
@@ -137,4 +151,5 @@ def serve(
             host=host,
             port=port,
             open_browser=not no_browser,
+            tls=tls,
         )

@@ -3,15 +3,20 @@
 - A page of another site must not reach us through the user's browser: its Origin is refused.
 - On a loopback address there is no token, so the Host must be a loopback name (DNS rebinding).
 - On any other address a token is needed: in the link once, then in a cookie, or as a bearer token.
+- There is a second token for those who may look only. Their requests must be GET, and of what their page
+  sends the bridge lets through where their camera is (`viser_page.py`): everything else there is a command.
+- No request may be larger than what a sensible one is.
 """
 
 import hmac
 import ipaddress
+import logging
 import secrets
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
+from fastapi import HTTPException
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -32,6 +37,14 @@ CONTENT_SECURITY_POLICY = "; ".join(
     )
 )
 
+MOST_BYTES = 1 << 20
+"""Of a request's body, and of a file that is uploaded in the page: YAML of some kilobytes."""
+
+VIEWER = "hemislam.viewer"
+"""Set in the scope of requests by those who may look only."""
+
+log = logging.getLogger(__name__)
+
 OPEN_PATHS = ("/healthz",)
 """Answered without a token: they say nothing but that the server is there."""
 
@@ -47,20 +60,33 @@ def is_loopback(host: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """The rules for one server. `token` is None on a loopback address."""
+    """The rules for one server.
+
+    Attributes:
+        token: lets in; None on a loopback address. viewer_token: lets look only; None: there is no such link.
+        secure: whether it speaks TLS.
+    """
 
     port: int
     token: str | None = None
+    viewer_token: str | None = None
+    secure: bool = False
 
     @classmethod
-    def on(cls, host: str, port: int) -> "Access":
-        """For a server bound to this address; makes a new token where one is needed."""
-        return cls(port, None if is_loopback(host) else secrets.token_urlsafe(24))
+    def on(cls, host: str, port: int, *, secure: bool = False) -> "Access":
+        """For a server bound to this address; makes new tokens where they are needed."""
+        if is_loopback(host):
+            return cls(port, secure=secure)
+        return cls(port, secrets.token_urlsafe(24), secrets.token_urlsafe(24), secure)
 
     @property
     def cookie(self) -> str:
         """Cookies know no ports, so the name does."""
         return f"hemislam-{self.port}"
+
+    def known(self, token: str) -> bool:
+        """Whether it is one of ours."""
+        return _same(token, self.token) or _same(token, self.viewer_token)
 
 
 class Guard:
@@ -74,26 +100,44 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        headers = Headers(scope=scope)
-        if refusal := self._refusal(scope, headers):
+        if refusal := self._refusal(scope, Headers(scope=scope)):
+            client = scope.get("client") or ("?", 0)
+            log.warning("Refused %s from %s: %s", scope["path"], client[0], refusal[1], extra={"status": refusal[0]})
             await _refuse(scope, receive, send, *refusal)
-        elif scope["type"] == "http" and self._linked(scope):
-            await self._keep_token(scope)(scope, receive, _with_headers(send))
+        elif token := self._linked(scope):
+            await self._keep(scope, token)(scope, receive, _with_headers(send))
+        elif scope["type"] == "http":
+            await self._app(scope, _limited(receive), _with_headers(send))
         else:
-            await self._app(scope, receive, _with_headers(send))
+            await self._app(scope, receive, send)
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
-        """Status and reason, if the request must not go on."""
+        """Status and reason, if the request must not go on. Notes in its scope if it may look only."""
         host = headers.get("host", "")
         origin = headers.get("origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
             return 403, "This page belongs to another site and may not talk to hemislam."
-        token = self._access.token
-        if token is None:
+        if refusal := self._without_token(scope, headers, host):
+            return refusal
+        length = headers.get("content-length", "0")
+        if not length.isdecimal():
+            return 400, "The length of the request is not a number."
+        if int(length) > MOST_BYTES:
+            return 413, f"Nothing that is larger than {MOST_BYTES >> 10} kB is taken."
+        return None
+
+    def _without_token(self, scope: Scope, headers: Headers, host: str) -> tuple[int, str] | None:
+        if self._access.token is None:
             return None if is_loopback(_name(host)) else (403, "Open hemislam as http://127.0.0.1 or http://localhost.")
-        if scope["path"] in OPEN_PATHS or any(_same(given, token) for given in self._given(scope, headers)):
+        given = self._given(scope, headers)
+        if scope["path"] in OPEN_PATHS or any(_same(one, self._access.token) for one in given):
             return None
-        return 401, "Open hemislam by the link that it printed when it started; the token in it is needed once."
+        if not any(_same(one, self._access.viewer_token) for one in given):
+            return 401, "Open hemislam by the link that it printed when it started; the token in it is needed once."
+        scope[VIEWER] = True
+        if scope["type"] == "http" and scope["method"] not in ("GET", "HEAD"):
+            return 403, "This link is for looking only; the other one that hemislam printed lets you act."
+        return None
 
     def _given(self, scope: Scope, headers: Headers) -> list[str]:
         """All tokens that came with the request."""
@@ -107,16 +151,17 @@ class Guard:
             given.append(cookies[self._access.cookie].value)
         return given
 
-    def _linked(self, scope: Scope) -> bool:
-        """Whether the token is in the address: then it moves into a cookie and out of sight."""
-        token = self._access.token
-        return token is not None and scope["method"] == "GET" and any(name == "token" for name, _ in _query(scope))
+    def _linked(self, scope: Scope) -> str | None:
+        """The token in the address, if one of ours is: it moves into a cookie and out of sight."""
+        if self._access.token is None or scope["type"] != "http" or scope["method"] != "GET":
+            return None
+        return next((value for name, value in _query(scope) if name == "token" and self._access.known(value)), None)
 
-    def _keep_token(self, scope: Scope) -> RedirectResponse:
+    def _keep(self, scope: Scope, token: str) -> RedirectResponse:
         rest = urlencode([(name, value) for name, value in _query(scope) if name != "token"])
         # Only a path of ours: "//elsewhere" would leave for another host.
         response = RedirectResponse("/" + scope["path"].lstrip("/\\") + (f"?{rest}" if rest else ""), status_code=303)
-        response.set_cookie(self._access.cookie, self._access.token or "", httponly=True, samesite="lax")
+        response.set_cookie(self._access.cookie, token, httponly=True, samesite="lax", secure=self._access.secure)
         return response
 
 
@@ -129,8 +174,23 @@ def _name(host: str) -> str:
     return host[: host.rindex("]") + 1] if "]" in host else host.partition(":")[0]
 
 
-def _same(given: str, token: str) -> bool:
-    return hmac.compare_digest(given.encode(), token.encode())
+def _same(given: str, token: str | None) -> bool:
+    return token is not None and hmac.compare_digest(given.encode(), token.encode())
+
+
+def _limited(receive: Receive) -> Receive:
+    """The same for a body whose length was not told before."""
+    received = 0
+
+    async def receiver() -> Message:
+        nonlocal received
+        message = await receive()
+        received += len(message.get("body", b""))
+        if received > MOST_BYTES:
+            raise HTTPException(413, f"Nothing that is larger than {MOST_BYTES >> 10} kB is taken.")
+        return message
+
+    return receiver
 
 
 async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, reason: str) -> None:

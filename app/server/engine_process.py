@@ -123,6 +123,7 @@ def run_loop(
 ) -> None:
     """As `main`, with what opens a recording, and what must be prepared with progress (name, fraction) before."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to a whole group; our parent says when to end
     outbox = Outbox(
         setup.params, session=setup.session, notices=setup.notices, frames=setup.frames, chunks=setup.chunks
     )

@@ -1,11 +1,13 @@
 """The session's state as the REST interface sends it."""
 
 import math
+from dataclasses import asdict
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 from scipy.spatial.transform import Rotation
 
+from app.sensors.live.status import LiveState
 from app.server.protocol import OpenedRecording, Snapshot
 from app.slam.types import StepResult
 
@@ -70,6 +72,21 @@ class ProgressView(BaseModel):
     fraction: float | None
 
 
+class LiveView(BaseModel):
+    """How the live source is doing."""
+
+    lidar_hz: float
+    imu_hz: float
+    lidar_age_s: float | None = Field(description="Since the last arrival.")
+    imu_age_s: float | None
+    backlog: int = Field(description="Scans that wait for the engine.")
+    clock: str = Field(description='Whose time is used: "sensor", "host", or "" while that is not settled.')
+    imu_lag_s: float | None = Field(description="By how much the IMU's stamps lag behind the LiDAR's.")
+    sensor: str
+    recorded: int | None = Field(description="Bytes written; null if nothing is recorded.")
+    counters: dict[str, int]
+
+
 class StateView(BaseModel):
     session: int
     revision: int
@@ -81,6 +98,7 @@ class StateView(BaseModel):
     progress: ProgressView | None
     pending_restart: list[str]
     notices: list[NoticeView]
+    live: LiveView | None
 
 
 def state_view(snapshot: Snapshot) -> StateView:
@@ -104,6 +122,22 @@ def state_view(snapshot: Snapshot) -> StateView:
         progress=ProgressView(title=progress.title, fraction=_finite(progress.fraction)) if progress else None,
         pending_restart=list(snapshot.pending_restart),
         notices=[NoticeView(number=n.number, level=n.level, text=n.text) for n in snapshot.notices],
+        live=_live(snapshot.live) if snapshot.live else None,
+    )
+
+
+def _live(state: LiveState) -> LiveView:
+    return LiveView(
+        lidar_hz=state.lidar_hz,
+        imu_hz=state.imu_hz,
+        lidar_age_s=state.lidar_age_s,
+        imu_age_s=state.imu_age_s,
+        backlog=state.backlog,
+        clock=state.clock,
+        imu_lag_s=state.offset_s,
+        sensor=state.sensor,
+        recorded=state.recorded,
+        counters=asdict(state.counters),
     )
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import viser
 import viser._messages
 import websockets.asyncio.server
@@ -18,7 +19,15 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.typing import Subprotocol
 
+from app.server.access import MOST_BYTES
+
 KEY_HEADER = "X-Hemislam-Key"
+
+HARMLESS = frozenset({"ViewerCameraMessage"})
+"""What the page of somebody who may look only can say to viser: where its own camera is."""
+
+MOST_UPLOADS = 4
+"""That one browser may have under way."""
 
 BUFFER_BYTES = 1 << 20
 """Of each socket on the way to the browser. The system would let tens of megabytes of old frames queue there."""
@@ -84,8 +93,79 @@ def page_html() -> str:
     return page.read_text(encoding="utf-8").replace("<title>Viser</title>", "<title>hemislam</title>", 1)
 
 
-async def bridge(browser: WebSocket, target: Viser) -> None:
-    """Pass messages between a browser and viser until either leaves.
+BADGE = (
+    '<div style="position:fixed;left:50%;top:8px;transform:translateX(-50%);z-index:9999;pointer-events:none;'
+    'padding:2px 12px;border-radius:12px;background:#ffb020;color:#10151c;font:600 12px system-ui,sans-serif">'
+    "Looking only: what you press here does nothing</div>"
+)
+
+
+def viewer_html(page: str) -> str:
+    """The same page for somebody who may look only, and is told so."""
+    head, body, rest = page.rpartition("</body>")
+    return f"{head}{BADGE}{body}{rest}"
+
+
+class Refused(Exception):
+    """What a browser sent is not for us. code: to close the WebSocket with."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
+        self.code, self.reason = code, reason
+
+
+class Gate:
+    """What of a browser's messages may reach viser. viewer: whether it may look only."""
+
+    def __init__(self, *, viewer: bool) -> None:
+        self._viewer = viewer
+        self._uploads: dict[str, int] = {}
+
+    def let(self, raw: bytes) -> bytes | None:
+        """The message, or None if it is to be left out.
+
+        It is written anew, so that viser can not read anything else in it than was read here.
+
+        Raises:
+            Refused: it is no message, or an upload that is too large.
+        """
+        try:
+            message = msgspec.msgpack.decode(raw, type=dict[str, Any])
+        except msgspec.MsgspecError:
+            raise Refused(1007, "That is no message of the page.") from None
+        kind = message.get("type")
+        if self._viewer and kind not in HARMLESS:
+            return None
+        if kind == "FileTransferStartUpload":
+            self._begin(message)
+        elif kind == "FileTransferPart" and not self._take(message):
+            return None
+        return msgspec.msgpack.encode(message)
+
+    def _begin(self, message: dict[str, Any]) -> None:
+        size = message.get("size_bytes")
+        if not isinstance(size, int) or not 0 <= size <= MOST_BYTES:
+            raise Refused(1009, f"Files larger than {MOST_BYTES >> 10} kB are not taken.")
+        if len(self._uploads) >= MOST_UPLOADS:
+            raise Refused(1008, "Too many uploads at once.")
+        if size:
+            self._uploads[str(message.get("transfer_uuid"))] = size
+
+    def _take(self, message: dict[str, Any]) -> bool:
+        """Whether a part belongs to an upload, of which it must not be more than was told."""
+        name, content = str(message.get("transfer_uuid")), message.get("content")
+        if name not in self._uploads or not isinstance(content, bytes):
+            return False
+        self._uploads[name] -= len(content)
+        if self._uploads[name] < 0:
+            raise Refused(1009, "The file is larger than was told.")
+        if self._uploads[name] == 0:
+            del self._uploads[name]
+        return True
+
+
+async def bridge(browser: WebSocket, target: Viser, *, viewer: bool = False) -> None:
+    """Pass messages between a browser and viser until either leaves; of a viewer's only harmless ones.
 
     Each direction takes a message only when the one before was delivered, so a slow browser slows
     viser's sending, and viser then sends it fewer, newer updates.
@@ -112,7 +192,10 @@ async def bridge(browser: WebSocket, target: Viser) -> None:
         return
     async with upstream:
         await browser.accept(subprotocol=upstream.subprotocol)
-        ways = [asyncio.create_task(_up(browser, upstream)), asyncio.create_task(_down(browser, upstream))]
+        ways = [
+            asyncio.create_task(_up(browser, upstream, Gate(viewer=viewer))),
+            asyncio.create_task(_down(browser, upstream)),
+        ]
         try:
             await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -121,10 +204,17 @@ async def bridge(browser: WebSocket, target: Viser) -> None:
             await asyncio.gather(*ways, return_exceptions=True)
 
 
-async def _up(browser: WebSocket, upstream: ClientConnection) -> None:
+async def _up(browser: WebSocket, upstream: ClientConnection, gate: Gate) -> None:
     with contextlib.suppress(WebSocketDisconnect, ConnectionClosed):
-        while True:
-            await upstream.send(await browser.receive_bytes())
+        try:
+            while True:
+                received = await browser.receive()
+                if received["type"] == "websocket.disconnect":
+                    return
+                if (message := gate.let(received.get("bytes") or b"")) is not None:
+                    await upstream.send(message)
+        except Refused as refused:
+            await browser.close(refused.code, refused.reason)
 
 
 async def _down(browser: WebSocket, upstream: ClientConnection) -> None:

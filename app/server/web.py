@@ -2,33 +2,40 @@
 
 import contextlib
 import errno
+import logging
 import math
 import os
 import signal
 import socket
+import ssl
 import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
 import uvicorn
 import viser
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from starlette.websockets import WebSocket
 from tqdm import tqdm
 
 from app import __version__
-from app.server.access import Access, Guard
+from app.server.access import MOST_BYTES, VIEWER, Access, Guard
 from app.server.api import make_router
 from app.server.folders import Folders
 from app.server.fork import Engine, Workspace
+from app.server.logs import log_notices
 from app.server.setup import Setup
-from app.server.viser_page import BUFFER_BYTES, Viser, bridge, page_html, start_viser
+from app.server.viser_page import BUFFER_BYTES, Viser, bridge, page_html, start_viser, viewer_html
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
+
+log = logging.getLogger(__name__)
 
 
 class Page(Protocol):
@@ -52,19 +59,23 @@ def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) ->
     )
     app.add_middleware(Guard, access=access)
     page = page_html()
+    viewers_page = viewer_html(page)
 
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
-    def index() -> str:
-        return page
+    def index(request: Request) -> str:
+        return viewers_page if VIEWER in request.scope else page
 
     @app.websocket("/")
     async def messages(browser: WebSocket) -> None:
-        await bridge(browser, target)
+        await bridge(browser, target, viewer=VIEWER in browser.scope)
 
     @app.get("/healthz")
-    def health() -> dict[str, str]:
-        """Whether the server is there, and its engine with it."""
-        return {"status": "ok" if engine.snapshot.engine_alive else "engine down"}
+    def health(response: Response) -> dict[str, str]:
+        """Whether the server is there, and its engine with it: 200, or 503 if the engine has ended for good."""
+        if engine.snapshot.engine_alive:
+            return {"status": "ok"}
+        response.status_code = 503
+        return {"status": "engine down"}
 
     @app.exception_handler(HemislamError)
     def refused(request: Request, error: HemislamError) -> JSONResponse:
@@ -83,6 +94,7 @@ def run_server(
     port: int = 8080,
     open_browser: bool = True,
     start_engine: Callable[[Setup], EngineProcess] = EngineProcess,
+    tls: "Tls | None" = None,
 ) -> None:
     """Serve the workbench until Ctrl-C or SIGTERM; then end the engine's process and everything else.
 
@@ -92,13 +104,16 @@ def run_server(
         host, port: to bind to; beyond loopback a token is made and is part of the printed link. Port 0: a free one.
         open_browser: if there is a display to open one on.
         start_engine: another one only in tests.
+        tls: certificate and key to speak https by.
 
     Raises:
-        HemislamError: the address can not be bound to.
+        HemislamError: the address can not be bound to, or the certificate not be used.
     """
+    if tls is not None:
+        tls.check()
     listener = listen(host, port)
     port = listener.getsockname()[1]
-    access = Access.on(host, port)
+    access = Access.on(host, port, secure=tls is not None)
     with contextlib.ExitStack() as cleanup:
         cleanup.callback(listener.close)
         engine = start_engine(setup)
@@ -109,15 +124,20 @@ def run_server(
         page = build_page(target.server, workspace, folders)
         page.start()
         cleanup.callback(page.close)
-        server = make_server(make_app(workspace, folders, target, access))
+        server = make_server(make_app(workspace, folders, target, access), tls)
         address, *others = links(host, access)
         print(f"hemislam is at {address} (Ctrl-C ends it)", flush=True)
         for other in others:
             print(f"from other computers: {other}", flush=True)
+        if access.viewer_token:
+            print(f"to look only: {links(host, access, access.viewer_token)[-1]}", flush=True)
+        log.info("Serving on %s:%d", host, port)
+        threading.Thread(target=log_notices, args=(workspace,), name="log", daemon=True).start()
         threading.Thread(target=show_compilation, args=(engine,), name="progress", daemon=True).start()
         if open_browser and _has_display():
             webbrowser.open(address)  # the listener holds the request until the server is up
         server.run(sockets=[listener])
+        log.info("Ending")
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -147,13 +167,18 @@ def listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-def links(host: str, access: Access) -> list[str]:
-    """The addresses to open, with the token if there is one: first for this computer, then for others."""
+def links(host: str, access: Access, token: str | None = None) -> list[str]:
+    """The addresses to open, with the token if there is one: first for this computer, then for others.
+
+    token: another one than that which lets in.
+    """
     names = [host]
     if host in ("0.0.0.0", "::", ""):
         names = ["localhost", _own_address()]
-    token = f"?token={access.token}" if access.token else ""
-    return [f"http://{f'[{name}]' if ':' in name else name}:{access.port}/{token}" for name in names]
+    token = token or access.token
+    query = f"?token={token}" if token else ""
+    scheme = "https" if access.secure else "http"
+    return [f"{scheme}://{f'[{name}]' if ':' in name else name}:{access.port}/{query}" for name in names]
 
 
 def _own_address() -> str:
@@ -183,14 +208,36 @@ def _has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def make_server(app: FastAPI) -> uvicorn.Server:
+@dataclass(frozen=True, slots=True)
+class Tls:
+    """Files in PEM: the certificate with what it is signed by, and its key, which may be in the same file."""
+
+    certificate: Path
+    key: Path | None = None
+
+    def check(self) -> None:
+        """Raises HemislamError: they can not be used."""
+        try:
+            ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(self.certificate, self.key)
+        except OSError as error:  # an SSLError is one
+            raise HemislamError(
+                f"The certificate {self.certificate}{f' with the key {self.key}' if self.key else ''} can not be used"
+                f" ({error.strerror or error}); give both as PEM by --certificate and --key."
+            ) from None
+
+
+def make_server(app: FastAPI, tls: Tls | None = None) -> uvicorn.Server:
     """What runs the app. Nothing is compressed: it would cost more than it saves on this machine."""
     config = uvicorn.Config(
         app,
         log_level="warning",
+        log_config=None,
         lifespan="off",
         ws="websockets-sansio",
         ws_per_message_deflate=False,
+        ws_max_size=2 * MOST_BYTES,
+        ssl_certfile=tls.certificate if tls else None,
+        ssl_keyfile=tls.key if tls else None,
         timeout_graceful_shutdown=1,
         server_header=False,
     )

@@ -1,0 +1,333 @@
+"""Who is refused what, over real sockets: those who may look only, and whatever is too large; https; the logs."""
+
+import json
+import os
+import signal
+import ssl
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import msgspec
+import pytest
+import server_fakes as fakes
+import zstandard
+from test_web import PATIENCE_S, PROTOCOL, Site
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
+
+from app.server.access import MOST_BYTES, Access
+from app.server.folders import Folders
+from app.server.logs import JsonLines
+from app.server.setup import Setup
+from app.server.viser_page import Gate, Refused, Viser, start_viser
+from app.server.web import Tls, links, listen, make_app, make_server
+from app.server.worker import EngineProcess
+from app.slam.errors import HemislamError
+
+VIEWER = {"Authorization": "Bearer for-viewers"}
+OWNER = {"Authorization": "Bearer for-owners"}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """A server as on a public address, with both tokens."""
+    recording = tmp_path_factory.mktemp("recordings") / "walk-60.mcap"
+    recording.write_bytes(b"x")
+    engine = EngineProcess(Setup(recording=recording), main=fakes.fake_main)
+    target = start_viser()
+    listener = listen("127.0.0.1", 0)
+    access = Access(listener.getsockname()[1], "for-owners", "for-viewers")
+    server = make_server(make_app(engine, Folders([recording.parent]), target, access))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    until(lambda: engine.snapshot.recording is not None)
+    yield Site(access.port, engine, target, recording.parent, access)
+    server.should_exit = True
+    thread.join()
+    listener.close()
+    target.stop()
+    engine.close()
+
+
+def until(true: Any) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def page(site: Site, headers: dict[str, str]) -> ClientConnection:
+    return site.socket(additional_headers=headers)
+
+
+def shown(browser: ClientConnection, label: str) -> dict[str, Any]:
+    """The message by which viser shows the control with this label."""
+    while True:
+        raw = browser.recv(timeout=PATIENCE_S)
+        assert isinstance(raw, bytes)
+        size = int.from_bytes(raw[8:16], "little")
+        unpacked = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size])
+        for message in msgspec.msgpack.decode(unpacked)["messages"]:
+            if message.get("props", {}).get("label") == label:
+                found: dict[str, Any] = message
+                return found
+
+
+# --- looking only --------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("method", "path", "body"),
+    [
+        ("POST", "/api/transport", {"action": "play"}),
+        ("PATCH", "/api/params", {"ground": {"alpha": 31}}),
+        ("POST", "/api/recordings", {"path": "walk-60.mcap"}),
+        ("PUT", "/", None),
+        ("DELETE", "/api/state", None),
+    ],
+)
+def test_who_may_look_only_changes_nothing_by_rest(site: Site, method: str, path: str, body: Any) -> None:
+    before = site.engine.snapshot.params
+    answer = httpx.request(method, site.url(path), json=body, headers=VIEWER)
+    assert answer.status_code == 403 and "looking only" in answer.text
+    assert site.engine.snapshot.params == before
+
+
+def test_who_may_look_only_sees_the_state_and_the_page(site: Site) -> None:
+    for path in ("/api/state", "/api/params", "/api/openapi.json"):
+        assert httpx.get(site.url(path), headers=VIEWER).status_code == 200
+    seen, owned = (httpx.get(site.url(), headers=headers).text for headers in (VIEWER, OWNER))
+    assert "Looking only" in seen and "Looking only" not in owned
+
+
+def test_in_the_page_a_viewers_controls_do_nothing_while_an_owners_do(site: Site) -> None:
+    gui = site.viser.server.gui
+    pressed: list[str] = []
+    slider = gui.add_slider("a slider here", min=0, max=10, step=1, initial_value=3)
+    button = gui.add_button("a button here")
+    button.on_click(lambda _: pressed.append("button"))
+    command = gui.add_command("a command here")
+    command.on_trigger(lambda _: pressed.append("command"))
+    with page(site, VIEWER) as viewer, page(site, OWNER) as owner:
+        uuid = shown(viewer, "a slider here")["uuid"]
+        button_uuid = shown(owner, "a button here")["uuid"]
+
+        def act(browser: ClientConnection, value: int) -> None:
+            browser.send(packed(type="GuiUpdateMessage", uuid=button_uuid, updates={"value": True}))
+            browser.send(packed(type="CommandTriggerMessage", uuid=command._impl.uuid))
+            browser.send(packed(type="GuiUpdateMessage", uuid=uuid, updates={"value": value}))
+
+        act(viewer, 9)
+        viewer.send(packed(**CAMERA))  # comes after, and is let through: so what came before was read
+        until(lambda: len(site.viser.server.get_clients()) >= 1)
+        assert slider.value == 3 and pressed == []
+        owner.send(packed(**CAMERA))
+        until(lambda: len(site.viser.server.get_clients()) >= 2)
+        act(owner, 7)
+        until(lambda: slider.value == 7 and sorted(pressed) == ["button", "command"])
+    slider.remove()
+    button.remove()
+
+
+CAMERA: dict[str, Any] = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1.0, 0.0, 0.0, 0.0),
+    "position": (0.0, 0.0, 0.0),
+    "fov": 1.0,
+    "near": 0.1,
+    "far": 100.0,
+    "image_height": 100,
+    "image_width": 100,
+    "look_at": (1.0, 0.0, 0.0),
+    "up_direction": (0.0, 0.0, 1.0),
+}
+
+
+def packed(**message: Any) -> bytes:
+    return msgspec.msgpack.encode(message)
+
+
+def test_a_message_that_could_be_read_in_two_ways_reaches_viser_in_one() -> None:
+    """A map with the same key twice: harmless as one of them, a command as the other."""
+    entries = [("type", "ViewerCameraMessage"), ("uuid", "x"), ("type", "GuiUpdateMessage")]
+    two = bytes([0x80 | len(entries)]) + b"".join(msgspec.msgpack.encode(part) for entry in entries for part in entry)
+    for order in (two, two.replace(b"ViewerCameraMessage", b"GuiUpdateMessage___"[:19])):
+        let = Gate(viewer=True).let(order)
+        assert let is None or (let.count(b"type") == 1 and b"GuiUpdate" not in let)
+
+
+@pytest.mark.parametrize("raw", [b"", b"\xc1", b"no message", b"\x93\x01\x02\x03", os.urandom(200)])
+def test_what_is_no_message_ends_the_connection_and_nothing_else(site: Site, raw: bytes) -> None:
+    with page(site, OWNER) as browser:
+        browser.send(raw)
+        with pytest.raises(ConnectionClosed):
+            while True:
+                browser.recv(timeout=PATIENCE_S)
+    assert httpx.get(site.url("/healthz")).status_code == 200
+
+
+def test_a_viewers_link_makes_nobody_an_owner(site: Site) -> None:
+    with httpx.Client() as browser:
+        answer = browser.get(site.url("/?token=for-viewers"))
+        assert answer.status_code == 303 and "for-viewers" in answer.headers["set-cookie"]
+        for query in ("?token=wrong", "?token=", "?token=for-owner", "?token=for-viewers&token=wrong"):
+            browser.get(site.url(f"/{query}"))
+            assert "for-owners" not in str(browser.cookies)
+        assert browser.post(site.url("/api/transport"), json={"action": "play"}).status_code == 403
+        assert browser.get(site.url("/?token=for-owners")).status_code == 303
+        assert browser.post(site.url("/api/transport"), json={"action": "pause"}).status_code == 202
+
+
+def test_a_viewers_token_does_not_open_the_door_to_another_site(site: Site) -> None:
+    evil = "http://evil.example"
+    assert httpx.get(site.url("/api/state"), headers=VIEWER | {"Origin": evil}).status_code == 403
+    with pytest.raises(InvalidStatus):
+        site.socket(additional_headers=VIEWER, origin=Origin(evil))
+    with pytest.raises(InvalidStatus):
+        site.socket(additional_headers={"Authorization": "Bearer wrong"})
+
+
+def test_the_two_tokens_are_two_and_only_where_others_could_reach_us() -> None:
+    public = Access.on("0.0.0.0", 1)
+    assert public.token and public.viewer_token and public.token != public.viewer_token
+    assert Access.on("127.0.0.1", 1).viewer_token is None
+    assert all(public.token not in link for link in links("0.0.0.0", public, public.viewer_token))
+
+
+# --- too large -----------------------------------------------------------------------------------
+def test_a_body_that_is_too_large_is_refused_whether_its_length_is_told_or_not(site: Site) -> None:
+    large = b" " * (MOST_BYTES + 1)
+    told = httpx.post(site.url("/api/transport"), content=large, headers=OWNER)
+    assert told.status_code == 413
+
+    def parts() -> Iterator[bytes]:
+        for _ in range(4):
+            yield large[: MOST_BYTES // 2]
+
+    untold = httpx.post(
+        site.url("/api/transport"), content=parts(), headers=OWNER | {"Content-Type": "application/json"}
+    )
+    assert untold.status_code == 413
+
+
+def upload(size: int, parts: list[bytes]) -> Iterator[bytes]:
+    common = {"source_component_uuid": "some-button", "transfer_uuid": "one"}
+    about = {"filename": "a.yaml", "mime_type": "text/yaml", "part_count": len(parts), "size_bytes": size}
+    yield packed(type="FileTransferStartUpload", **common, **about)
+    for index, content in enumerate(parts):
+        yield packed(type="FileTransferPart", **common, part_index=index, content=content)
+
+
+@pytest.mark.parametrize(
+    ("size", "parts"),
+    [(MOST_BYTES + 1, []), (-1, []), (10, [b"x" * 8, b"x" * 8]), (1000, [b"x" * (3 * MOST_BYTES)])],
+    ids=["too large", "negative", "more than was told", "too large a message"],
+)
+def test_a_file_that_is_too_large_ends_the_connection(site: Site, size: int, parts: list[bytes]) -> None:
+    with page(site, OWNER) as browser:
+        with pytest.raises(ConnectionClosed):
+            for message in upload(size, parts):
+                browser.send(message)
+            while True:
+                browser.recv(timeout=PATIENCE_S)
+        assert browser.close_code == 1009
+
+
+def test_a_file_of_a_sensible_size_arrives(site: Site) -> None:
+    button = site.viser.server.gui.add_upload_button("an upload here")
+    with page(site, OWNER) as browser:
+        browser.send(packed(**CAMERA))
+        uuid = shown(browser, "an upload here")["uuid"]
+        content = os.urandom(100_000)
+        for message in upload(len(content), [content[:60_000], content[60_000:]]):
+            browser.send(msgspec.msgpack.encode(msgspec.msgpack.decode(message) | {"source_component_uuid": uuid}))
+        until(lambda: button.value.content == content)
+    button.remove()
+
+
+def test_uploads_that_never_end_do_not_pile_up() -> None:
+    gate = Gate(viewer=False)
+    with pytest.raises(Refused):
+        for n in range(20):
+            gate.let(packed(type="FileTransferStartUpload", transfer_uuid=str(n), size_bytes=MOST_BYTES))
+    assert gate.let(packed(type="FileTransferPart", transfer_uuid="of nobody", content=b"x")) is None
+
+
+# --- https ---------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Tls:
+    folder = tmp_path_factory.mktemp("tls")
+    tls = Tls(folder / "cert.pem", folder / "key.pem")
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "1",
+         "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1",
+         "-keyout", str(tls.key), "-out", str(tls.certificate)],
+        check=True, capture_output=True, timeout=PATIENCE_S,
+    )  # fmt: skip
+    return tls
+
+
+def test_page_rest_and_websocket_by_https(site: Site, certificate: Tls) -> None:
+    listener = listen("127.0.0.1", 0)
+    access = Access(listener.getsockname()[1], "for-owners", "for-viewers", secure=True)
+    server = make_server(make_app(site.engine, Folders([site.folder]), site.viser, access), certificate)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        trust = ssl.create_default_context(cafile=str(certificate.certificate))
+        (link,) = links("localhost", access)
+        assert link.startswith("https://localhost:")
+        with httpx.Client(verify=trust) as browser:
+            cookie = browser.get(link.replace("localhost", "127.0.0.1")).headers["set-cookie"]
+            assert "Secure" in cookie and "HttpOnly" in cookie
+            assert browser.get(f"https://127.0.0.1:{access.port}/api/state", headers=OWNER).status_code == 200
+        address = f"wss://127.0.0.1:{access.port}/"
+        with connect(address, ssl=trust, subprotocols=[PROTOCOL], additional_headers=OWNER, proxy=None) as socket:
+            assert socket.subprotocol == PROTOCOL
+        with pytest.raises(httpx.HTTPError):
+            httpx.get(f"http://127.0.0.1:{access.port}/healthz")
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()
+
+
+def test_a_certificate_that_can_not_be_used_is_told_at_once(certificate: Tls, tmp_path: Path) -> None:
+    (tmp_path / "no.pem").write_text("nothing")
+    for bad in (Tls(tmp_path / "missing.pem"), Tls(tmp_path / "no.pem"), Tls(certificate.certificate)):
+        with pytest.raises(HemislamError, match="--certificate and --key"):
+            bad.check()
+
+
+# --- logs ----------------------------------------------------------------------------------------
+def test_a_refusal_is_logged_as_one_line_of_json_without_the_token(site: Site, caplog: Any) -> None:
+    httpx.get(site.url("/api/state?token=my-guess"))
+    (record,) = [record for record in caplog.records if record.name == "app.server.access"]
+    (line,) = JsonLines().format(record).splitlines()
+    entry = json.loads(line)
+    assert entry["level"] == "warning" and entry["status"] == 401 and "127.0.0.1" in entry["message"]
+    assert "my-guess" not in line
+
+
+def test_health_tells_by_its_status_when_the_engine_has_ended_for_good() -> None:
+    listener = listen("127.0.0.1", 0)
+    engine, target = EngineProcess(Setup(), main=fakes.fake_main), Viser(None, "")  # type: ignore[arg-type]
+    server = make_server(make_app(engine, Folders([]), target, Access(listener.getsockname()[1])))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        health = f"http://127.0.0.1:{listener.getsockname()[1]}/healthz"
+        assert httpx.get(health).status_code == 200
+        assert engine.pid is not None
+        os.kill(engine.pid, signal.SIGKILL)
+        until(lambda: httpx.get(health).status_code == 503)
+        assert httpx.get(health).json() == {"status": "engine down"}
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()
+        engine.close()
