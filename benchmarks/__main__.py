@@ -3,11 +3,12 @@
 import os
 import sys
 
-from benchmarks import frame, loops, packets, page, replay, seek, walk
+from benchmarks import frame, live, loops, packets, page, replay, seek, walk
 from benchmarks.record import show
 
 BENCHMARKS = {
     "frame": frame.run,
+    "live": live.run,
     "loops": loops.run,
     "packets": packets.run,
     "replay": replay.run,

@@ -289,7 +289,8 @@ class Session:
         wait = self._advance(self._run) if self._run is not None and moving else None
         if isinstance(self._run, LiveRun):
             self._look_at_source(self._run)
-        waits = [wait, POLL_S if self._saver.busy else None, self._look_at_loops()]
+        looking = SOURCE_PERIOD_S if isinstance(self._run, LiveRun) and not self._page.transport.finished else None
+        waits = [wait, POLL_S if self._saver.busy else None, self._look_at_loops(), looking]
         return min((seconds for seconds in waits if seconds is not None), default=None)
 
     def _look_at_source(self, run: LiveRun) -> None:
@@ -298,7 +299,12 @@ class Session:
         if now - self._looked_at_source >= SOURCE_PERIOD_S:
             self._looked_at_source = now
             run.grown()
-            self._outbox.put(live=run.state(), recording=run.opened)
+            try:
+                self._outbox.put(live=run.state(), recording=run.opened)
+            except HemislamError as error:
+                if not self._page.transport.finished:
+                    self._fail("Nothing more comes live", error)
+                    self._page.show(finished=True)
 
     def _look_at_loops(self) -> float | None:
         """Take in what came of them. Returns when (s) to look again if something is awaited."""

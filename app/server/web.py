@@ -1,5 +1,6 @@
 """The one public port: viser's page, the bridge to it, and the REST interface."""
 
+import asyncio
 import contextlib
 import errno
 import logging
@@ -67,7 +68,8 @@ def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) ->
 
     @app.websocket("/")
     async def messages(browser: WebSocket) -> None:
-        await bridge(browser, target, viewer=VIEWER in browser.scope)
+        with contextlib.suppress(asyncio.CancelledError):  # the server ends, and a stalled browser does not
+            await bridge(browser, target, viewer=VIEWER in browser.scope)
 
     @app.get("/healthz")
     def health(response: Response) -> dict[str, str]:

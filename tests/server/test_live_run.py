@@ -55,6 +55,7 @@ class Live:
     packets: str
     imu: str
     params: Params
+    source: LiveProcess
     errors: list[BaseException] = field(default_factory=list)
 
     def play(self, speed: float) -> threading.Thread:
@@ -95,7 +96,7 @@ def live(params: Params, tmp_path: Path) -> Iterator[Live]:
     with LiveProcess(packets, params, imu) as source:
         setup = Setup(LIVE, params=params, play=True, speed=math.inf, live=source.address, live_folder=tmp_path)
         engine = EngineProcess(setup)
-        live = Live(engine, packets, imu, params)
+        live = Live(engine, packets, imu, params, source)
         live.until(lambda s: s.recording is not None)
         yield live
         engine.close()
@@ -150,3 +151,19 @@ def test_there_is_no_going_back_live_and_it_is_said(live: Live) -> None:
     live.engine.send(Pause())
     live.until(lambda s: not s.transport.playing)
     thread.join(PATIENCE_S)
+
+
+def test_paused_the_source_is_still_watched_and_its_end_is_said_and_survived(live: Live) -> None:
+    thread = live.play(4.0)
+    live.until(lambda s: s.transport.frame >= 10)
+    live.engine.send(Pause())
+    thread.join(PATIENCE_S)
+    paused = live.until(lambda s: not s.transport.playing and s.live is not None)
+    assert paused.live is not None
+    live.until(lambda s: s.live is not None and s.live.imu_age_s is not None and s.live.imu_age_s > 1.0)
+    pid = live.engine.pid
+    live.source.close()
+    ended = live.until(lambda s: s.transport.finished)
+    assert "Nothing more comes live" in ended.notices[-1].text
+    assert live.engine.pid == pid and ended.engine_alive
+    assert ended.transport.frame == paused.transport.frame, "what was mapped stays"

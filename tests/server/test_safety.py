@@ -5,6 +5,7 @@ import os
 import signal
 import ssl
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -16,11 +17,17 @@ import msgspec
 import pytest
 import server_fakes as fakes
 import zstandard
+from mcap.reader import make_reader
+from test_live_run import free_ports
+from test_rewind import SAMPLE
 from test_web import PATIENCE_S, PROTOCOL, Site
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
+from app.sensors.live.feed import Pace, feed
+from app.sensors.live.urls import parse_address
+from app.sensors.presets import resolve_params
 from app.server.access import MOST_BYTES, Access
 from app.server.folders import Folders
 from app.server.logs import JsonLines
@@ -331,3 +338,35 @@ def test_health_tells_by_its_status_when_the_engine_has_ended_for_good() -> None
         thread.join()
         listener.close()
         engine.close()
+
+
+# --- the end -------------------------------------------------------------------------------------
+def test_a_sigterm_to_the_whole_group_costs_nothing_that_was_received(tmp_path: Path) -> None:
+    """As a service manager sends it: to the server, the engine and the receiver at once."""
+    msop, difop, imu_port = free_ports(3)
+    packets, imu = f"rsbpearl://127.0.0.1:{msop},{difop}", f"imu-udp://127.0.0.1:{imu_port}"
+    record = tmp_path / "live.mcap"
+    command = [sys.executable, "-m", "app", "serve", "--live", packets, "--imu", imu, "--record", str(record)]
+    command += ["--port", "0", "--no-browser", "--log-json"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        assert process.stdout is not None
+        address = process.stdout.readline().split()[3]
+        params = resolve_params(SAMPLE, None, None, [])
+        feed(SAMPLE, params, parse_address(packets), parse_address(imu), pace=Pace(2.0), duration_s=4.0)
+        until(lambda: (live := httpx.get(f"{address}api/state").json()["live"]) and live["imu_age_s"] > 1.0)
+        counted = httpx.get(f"{address}api/state").json()["live"]["counters"]
+        os.killpg(process.pid, signal.SIGTERM)
+        _, err = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    assert "Traceback" not in err and [json.loads(line)["message"] for line in err.splitlines()][-1] == "Ending"
+    with record.open("rb") as file:
+        found = make_reader(file).get_summary()
+    assert found is not None and found.statistics is not None, "the file has its end"
+    topics = {channel.topic: found.statistics.channel_message_counts[n] for n, channel in found.channels.items()}
+    assert counted["frames"] > 30 and counted["imu"] > 700
+    assert sorted(topics.values()) == [counted["frames"], counted["imu"]]

@@ -1,0 +1,180 @@
+"""Live for minutes on end: laps round a building, fed as packets, with three pages open, one of them stalled.
+
+Prints memory and drops each half minute. The pages are WebSocket clients that take everything that a browser
+would be sent; the stalled one reads nothing at all. `HEMISLAM_LIVE_MINUTES` (4) and `HEMISLAM_LIVE_SPEED` (2).
+"""
+
+import os
+import re
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import httpx
+import viser
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from app.sensors.live.feed import Pace, feed
+from app.sensors.live.urls import parse_address
+from app.sensors.presets import resolve_params
+from benchmarks.record import Line
+from benchmarks.scenes import walk_in_laps
+
+MINUTES = float(os.environ.get("HEMISLAM_LIVE_MINUTES", "4"))
+SPEED = float(os.environ.get("HEMISLAM_LIVE_SPEED", "2"))
+"""Times real time: at 2, twenty scans a second."""
+REPORT_S = 30.0
+
+
+def run() -> list[Line]:
+    walk = walk_in_laps()
+    with TemporaryDirectory() as folder, _served(walk, Path(folder) / "live.mcap") as (url, server, packets, imu):
+        ended = threading.Event()
+        feeder = threading.Thread(target=_feed, args=(walk, packets, imu, ended), daemon=True)
+        feeder.start()
+        _wait_for_frames(url)
+        received = [0, 0]
+        for number in range(2):
+            threading.Thread(target=_page, args=(url, ended, received, number), daemon=True).start()
+        stalled = _stalled_page(url)
+        memory: list[dict[str, float]] = []
+        begin = time.monotonic()
+        while (passed := time.monotonic() - begin) < 60 * MINUTES:
+            memory.append(_memory(server))
+            _tell(passed, _state(url), memory[-1])
+            time.sleep(min(REPORT_S, 60 * MINUTES - passed))
+        memory.append(_memory(server))
+        state = _state(url)
+        _tell(time.monotonic() - begin, state, memory[-1])
+        ended.set()
+        stalled.close()
+        feeder.join(30.0)
+        live = state["live"]
+        on = f"laps, {MINUTES:g} min at {SPEED:g}x, 3 pages"
+        print(f"pages took {received[0] / 1e6:.0f} and {received[1] / 1e6:.0f} MB; {live['counters']}")
+        lines = [
+            Line.of("frames", on, "", [state["transport"]["frame"] + 1]),
+            Line.of("scans dropped", on, "", [live["counters"]["dropped"]]),
+            Line.of("packets lost", on, "", [live["counters"]["lost"]]),
+        ]
+        for name in memory[0]:
+            lines.append(Line.of(f"{name}, start", on, "MB", [memory[0][name]]))
+            lines.append(Line.of(f"{name}, half way", on, "MB", [memory[len(memory) // 2][name]]))
+            lines.append(Line.of(f"{name}, end", on, "MB", [memory[-1][name]]))
+        return lines
+
+
+def _feed(walk: Path, packets: str, imu: str, ended: threading.Event) -> None:
+    """Until the time is over; should the walk end before, it begins anew, with a clock that was set back."""
+    params = resolve_params(walk, None, None, [])
+    while not ended.is_set():
+        feed(walk, params, parse_address(packets), parse_address(imu), pace=Pace(SPEED, stop=ended))
+
+
+def _page(url: str, ended: threading.Event, received: list[int], number: int) -> None:
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    with connect(url.replace("http", "ws", 1), subprotocols=[protocol], max_size=None, proxy=None) as page:
+        while not ended.is_set():
+            try:
+                received[number] += len(page.recv(timeout=1.0))
+            except TimeoutError:
+                continue
+            except ConnectionClosed:
+                return
+
+
+def _stalled_page(url: str) -> socket.socket:
+    """Asks for the page's WebSocket and then reads nothing."""
+    host, port = url.removeprefix("http://").rstrip("/").split(":")
+    page = socket.socket()
+    page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 18)
+    page.connect((host, int(port)))
+    page.sendall(
+        f"GET / HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        f"Sec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Version: 13\r\n"
+        f"Sec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n".encode()
+    )
+    return page
+
+
+def _memory(server: "subprocess.Popen[str]") -> dict[str, float]:
+    """MB that belong to each process alone: the server, and those that it started. Linux only."""
+    found = {"server": _private_mb(server.pid)}
+    names = ["receiver", "engine"]  # in the order in which they are started
+    for pid in _children(server.pid):
+        command = Path(f"/proc/{pid}/cmdline").read_bytes()
+        if b"spawn_main" in command and names:
+            found[names.pop(0)] = _private_mb(pid)
+        elif b"loop_process" in command:
+            found["loops"] = _private_mb(pid)
+    return found
+
+
+def _children(pid: int) -> list[int]:
+    direct = [
+        int(one) for task in Path(f"/proc/{pid}/task").iterdir() for one in (task / "children").read_text().split()
+    ]
+    return [one for child in sorted(direct) for one in (child, *_children(child))]
+
+
+def _private_mb(pid: int) -> float:
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Private_")) / 1e3
+
+
+def _tell(seconds: float, state: Any, memory: dict[str, float]) -> None:
+    live = state["live"]
+    sizes = ", ".join(f"{name} {size:.0f}" for name, size in memory.items())
+    print(
+        f"{seconds:6.0f} s: frame {state['transport']['frame']:,}, {live['lidar_hz']:.1f} Hz, keyframes"
+        f" {state['keyframes']}, dropped {live['counters']['dropped']}, waiting {live['backlog']}; MB: {sizes}",
+        flush=True,
+    )
+
+
+def _state(url: str) -> Any:
+    """As JSON."""
+    return httpx.get(f"{url}api/state", timeout=30.0).raise_for_status().json()
+
+
+def _wait_for_frames(url: str) -> None:
+    deadline = time.monotonic() + 120
+    while (state := _state(url))["transport"]["frame"] < 20 or not state["live"]:
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"no frames come: {state['notices']}")
+        time.sleep(0.2)
+
+
+@contextmanager
+def _served(walk: Path, record: Path) -> Iterator[tuple[str, "subprocess.Popen[str]", str, str]]:
+    ports = [_free_port() for _ in range(3)]
+    packets, imu = f"rsbpearl://127.0.0.1:{ports[0]},{ports[1]}", f"imu-udp://127.0.0.1:{ports[2]}"
+    params = walk.with_suffix(".params.yaml")
+    command = [sys.executable, "-m", "app", "serve", "--live", packets, "--imu", imu, "--record", str(record)]
+    command += ["--no-browser", "--port", "0", *(["--config", str(params)] if params.exists() else [])]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout is not None
+        found = re.search(r"http://\S+", server.stdout.readline())
+        if found is None:
+            raise RuntimeError("the server did not start")
+        yield found.group(), server, packets, imu
+    finally:
+        server.terminate()
+        server.wait(30.0)
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
