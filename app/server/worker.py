@@ -108,6 +108,7 @@ class EngineProcess:
 
     # --- the process -----------------------------------------------------------------------------
     def _start(self, setup: Setup) -> None:
+        self._running = setup
         context = multiprocessing.get_context("spawn")
         commands_in, commands_out = context.Pipe(duplex=False)
         updates_in, updates_out = context.Pipe(duplex=False)
@@ -150,12 +151,13 @@ class EngineProcess:
                     f"The engine's process has ended unexpectedly ({how}); it is started again and goes where it was."
                 )
                 self._edit(notices=(Notice(number, "error", text),))
+                on_the_way = last.progress is not None or last.transport.frame < 0  # to where the one before was
                 self._start(
                     replace(
                         self._setup,
                         recording=place,
                         params=last.params,
-                        play=last.transport.playing,
+                        play=self._running.play if on_the_way else last.transport.playing,
                         speed=last.transport.speed,
                         breakpoints=last.breakpoints,
                         revive=True,
