@@ -17,7 +17,7 @@ from app.slam.errors import HemislamError
 from app.slam.loops import inspection
 from app.slam.loops.detection import Detector, Head
 from app.slam.loops.drift import Drift
-from app.slam.loops.judgement import by_hand
+from app.slam.loops.judgement import by_hand, worth_correcting
 from app.slam.loops.odometry import odometry_factor
 from app.slam.loops.overruling import Entry, Overrulings, check, in_words
 from app.slam.loops.pose_graph import Factor, Step, g2o_text, optimise
@@ -187,7 +187,14 @@ class LoopBackend:
     @property
     def T_map_odom(self) -> F64:
         """(4, 4) the correction at the newest keyframe."""
-        return np.asarray(self.corrections_of(self.poses)[-1]) if len(self) else np.eye(4)
+        return np.asarray(self.corrections[-1]) if len(self) else np.eye(4)
+
+    @property
+    def corrections(self) -> F64:
+        """(k, 4, 4) T_map_odom at each keyframe; identity while odometry meets the loops as well as they are known."""
+        if worth_correcting(self.edges, self._detector.poses):
+            return self.corrections_of(self.poses)
+        return np.tile(np.eye(4), (len(self), 1, 1))
 
     def corrections_of(self, poses: F64) -> F64:
         """(k, 4, 4) T_map_odom at each keyframe, by these T_map_imu."""

@@ -1,5 +1,6 @@
 """What speaks for and against one candidate, and the verdict on it alone. No two candidates meet here."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -121,3 +122,25 @@ def _rival(older: int, newer: int, detector: Detector, expectation: Expectation,
 def _imu(detector: Detector, older: int, newer: int, T_level: F64) -> F64:
     """T_older_newer of the IMU frames from that of the level frames."""
     return np.asarray(lie.inverse(detector.T_level_imu(older)) @ T_level @ detector.T_level_imu(newer))
+
+
+def worth_correcting(edges: Iterable[LoopEdge], poses: F64) -> bool:
+    """Whether the loops that count tell something that odometry does not know already.
+
+    Registrations are no better than about half of `FLOOR_M` and `FLOOR_RAD`: where odometry meets all of
+    them as well as that, following them would only add their noise. The user's word always counts.
+
+    Args:
+        poses: (k, 4, 4) T_odom_imu of all keyframes.
+    """
+    loops = [edge for edge in edges if edge.verdict is Verdict.ACCEPTED]
+    if any(edge.overruled or edge.origin is Origin.USER or edge.weight != 1.0 for edge in loops):
+        return True
+    if not loops:
+        return False
+    pairs = np.array([edge.pair for edge in loops])
+    measured = np.array([edge.T_older_newer for edge in loops])
+    missed = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]
+    moved = float(np.sqrt(np.mean(np.sum(missed[:, :3, 3] ** 2, axis=1))))
+    turned = float(np.sqrt(np.mean(np.sum(lie.log(missed[:, :3, :3]) ** 2, axis=1))))
+    return bool(moved > FLOOR_M / 2 or turned > FLOOR_RAD / 2)

@@ -85,7 +85,7 @@ class LoopService:
         edges = {edge.pair: edge for edge in backend.edges}
         changed = tuple(edge for pair, edge in edges.items() if _differs(edge, self._told.get(pair)))
         self._told = edges
-        corrections = backend.corrections_of(backend.poses)
+        corrections = backend.corrections
         corrections.setflags(write=False)
         return LoopState(
             count=len(backend),
