@@ -253,6 +253,7 @@ def test_a_file_of_a_sensible_size_arrives(site: Site) -> None:
         for message in upload(len(content), [content[:60_000], content[60_000:]]):
             browser.send(msgspec.msgpack.encode(msgspec.msgpack.decode(message) | {"source_component_uuid": uuid}))
         until(lambda: button.value.content == content)
+        assert button.value.content == content
     button.remove()
 
 
