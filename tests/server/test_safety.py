@@ -230,18 +230,26 @@ def upload(size: int, parts: list[bytes]) -> Iterator[bytes]:
 
 
 @pytest.mark.parametrize(
-    ("size", "parts"),
-    [(MOST_BYTES + 1, []), (-1, []), (10, [b"x" * 8, b"x" * 8]), (1000, [b"x" * (3 * MOST_BYTES)])],
+    ("size", "parts", "codes"),
+    [
+        (MOST_BYTES + 1, [], {1009}),
+        (-1, [], {1009}),
+        (10, [b"x" * 8, b"x" * 8], {1009}),
+        # Closed while most of the message is still under way, so the reset may overtake the close frame.
+        (1000, [b"x" * (3 * MOST_BYTES)], {1009, 1006}),
+    ],
     ids=["too large", "negative", "more than was told", "too large a message"],
 )
-def test_a_file_that_is_too_large_ends_the_connection(site: Site, size: int, parts: list[bytes]) -> None:
+def test_a_file_that_is_too_large_ends_the_connection(
+    site: Site, size: int, parts: list[bytes], codes: set[int]
+) -> None:
     with page(site, OWNER) as browser:
         with pytest.raises(ConnectionClosed):
             for message in upload(size, parts):
                 browser.send(message)
             while True:
                 browser.recv(timeout=PATIENCE_S)
-        assert browser.close_code == 1009
+        assert browser.close_code in codes
 
 
 def test_a_file_of_a_sensible_size_arrives(site: Site) -> None:
