@@ -33,7 +33,7 @@ def replay(
     """
     from app.cli.run import compile_behind_bar, free_folder, process, save
     from app.server.journal import read_session
-    from app.server.run import in_force, open_run
+    from app.server.run import open_run
     from app.slam.results import RunInfo, prepare_folder
     from app.slam.trajectory import read_tum
 
@@ -47,16 +47,8 @@ def replay(
         compile_behind_bar()
         if work.engine.loops:
             work.engine.loops.wait_ready()
-        if state.overrulings or state.undone:
-            work.overrule(state.overrulings, state.undone)
-        stop = process(
-            work,
-            until=None if to_end else saved.frame,
-            params_of=lambda frame: (
-                in_force(state.history, frame) if frame <= saved.frame else work.usable(state.params)
-            ),
-        )
-        work.choose(work.usable(state.params))
+        work.resume(saved)
+        stop = process(work, until=None if to_end else saved.frame)
         if not len(work.log):
             raise stop or HemislamError(
                 f"The session {session} ended before its first frame; there is nothing to repeat."

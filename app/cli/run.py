@@ -23,11 +23,8 @@ from app.cli.options import (
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from app.server.run import Run
     from app.slam.loops.types import Command as Overruling
-    from app.slam.params import Params
     from app.slam.results import RunInfo
     from app.slam.trajectory import Trajectory
 
@@ -173,13 +170,11 @@ def compile_behind_bar() -> None:
         compile_kernels(show)
 
 
-def process(
-    work: "Run", *, until: int | None = None, params_of: "Callable[[int], Params | None] | None" = None
-) -> BaseException | None:
+def process(work: "Run", *, until: int | None = None) -> BaseException | None:
     """Run to the end of the recording. What stopped it before, an interruption say, is returned, not raised.
 
     Args:
-        until: the last frame to process. params_of: those for a frame; None: as they are.
+        until: the last frame to process.
     """
     from tqdm import tqdm
 
@@ -191,9 +186,6 @@ def process(
         try:
             while (until is None or work.frame < until) and (entry := work.peek()) is not None:
                 if isinstance(entry, Measurement):
-                    params = params_of(work.frame + 1) if params_of else None
-                    if params is not None and params != work.params:
-                        work.choose(params)
                     work.step()
                 bar.update()
         except (Exception, KeyboardInterrupt) as error:  # whatever it was, the frames so far must be saved

@@ -96,7 +96,7 @@ class Journal:
     def did(self, frame: int, command: Command) -> None:
         """Note what the user did."""
         values = {name: _plain(value) for name, value in asdict(command).items()}
-        self._line({"frame": frame, "did": type(command).__name__, **values})
+        self._line({"frame": frame, "did": type(command).__name__, **values}, now=True)
 
     def note(self, frame: int, state: State, *, settled: bool = False) -> None:
         """Note where the session stands, if that is news; the frame alone, unless it stays there, every `EVERY_S`."""

@@ -96,6 +96,7 @@ class Run:
         self._incoming = recording.measurements(start_s, duration_s)
         self._waiting: Measurement | None = None
         self._dropped = 0  # scans since the newest frame
+        self._followed: SavedSession | None = None  # whose way is being repeated
         self.finished = False
 
     def peek(self) -> Measurement | DroppedScan | Quiet | None:
@@ -130,10 +131,11 @@ class Run:
         measurement, self._waiting = self._waiting, None
         assert measurement is not None
         frame = self.frame + 1
-        if not again and self.params_of(frame) != self.params:
+        params = self._params_for(frame, again=again)
+        if self.params_of(frame) != params:
             self.forget_after(self.frame)
-            self.history = (*self.history, (frame, self.params))
-        self.engine.params = (self.params_of(frame) if again else None) or self.params
+            self.history = (*self.history, (frame, params))
+        self.engine.params = params
         try:
             result = self.engine.step(measurement.scan, measurement.imu)
         finally:
@@ -143,6 +145,14 @@ class Run:
         self.known = max(self.known, frame)
         self.log.add(result)
         return result
+
+    def _params_for(self, frame: int, *, again: bool) -> Params:
+        if again:
+            return self.params_of(frame) or self.params
+        followed = self._followed
+        if followed is not None and frame > followed.frame:
+            followed = self._followed = None
+        return (in_force(followed.state.history, frame) if followed is not None else None) or self.params
 
     @property
     def part(self) -> tuple[float, float | None]:
@@ -158,6 +168,18 @@ class Run:
         if self.engine.loops is None:
             raise HemislamError("Loops are not looked for, so none can be overruled; set loops.enabled.")
         self.engine.loops.command(LoadCommands(commands, undone))
+
+    def resume(self, saved: SavedSession) -> None:
+        """Repeat a session of this recording: up to its frame as it went, from there on with what it chose last.
+
+        Raises:
+            HemislamError: it overrules loops, and none are looked for.
+        """
+        state = saved.state
+        self.choose(self.usable(state.params))
+        if state.overrulings or state.undone:
+            self.overrule(state.overrulings, state.undone)
+        self._followed = saved
 
     # --- going back ------------------------------------------------------------------------------
     def choose(self, params: Params) -> None:
