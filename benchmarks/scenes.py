@@ -26,6 +26,11 @@ def walk_in_laps() -> Path:
     return _simulated("laps.mcap", "building", 480.0, seed=3, every_block=6)
 
 
+def half_hour() -> Path:
+    """Half an hour outdoors, with one azimuth of 6: 870 m of new ground, then along the same way again."""
+    return _simulated("half-hour.mcap", "outdoor_3", 1830.0, seed=7, every_block=6)
+
+
 def _simulated(name: str, scene: str, duration_s: float, *, seed: int, every_block: int = 1) -> Path:
     path = FOLDER / name
     if not path.exists():

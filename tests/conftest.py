@@ -5,8 +5,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from app.slam.errors import HemislamError
+
+# The same examples on every run, and no verdict by the clock.
+settings.register_profile("hemislam", deadline=None, derandomize=True, max_examples=50)
+settings.load_profile("hemislam")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -141,6 +141,7 @@ def serve(
                 duration_s=duration,
                 resolve=resolve_for,
                 play=not paused or live is not None,
+                point_budget=point_budget,
                 checkpoint_bytes=checkpoint_memory << 20,
                 journals=Path("runs") / "sessions",
                 live=source.address if source else None,

@@ -1,9 +1,24 @@
-"""Keyframe clouds thinned for display."""
+"""Keyframe clouds thinned for display, and the whole map to what a page may show.
+
+Every chunk has a level: 0 is as it was made, each further one leaves one point per voxel, with edges that
+double. Levels rise where they are missed least and never fall, and what was thinned away is kept nowhere:
+however long the walk, its map takes no more memory than a page's budget of points.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
 from app.server.protocol import Chunk
-from app.slam.types import F32, I64, Keyframe
+from app.slam.types import F32, F64, I64, Keyframe
+
+FINEST_VOXEL_M: Final = 0.08
+COARSEST_LEVEL: Final = 8
+"""At 0.08 m · 2^7 = 10 m a keyframe is down to a handful of points; there is nothing left to thin."""
+_SLACK: Final = 0.97
+"""Over budget, the map is thinned to this share of it, so that not every new keyframe thins again."""
 
 
 def thinned(keyframe: Keyframe, voxel_size: float) -> Chunk:
@@ -24,6 +39,67 @@ def thinned(keyframe: Keyframe, voxel_size: float) -> Chunk:
 
 def one_per_voxel(points: F32, voxel_size: float, seed: int = 0) -> I64:
     """Indices, shuffled by `seed`, of one point of `points` (n, 3) in every occupied voxel."""
+    return np.random.default_rng(seed).permutation(_first_per_voxel(points, voxel_size))
+
+
+def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: int) -> tuple[Chunk, ...]:
+    """The same chunks if they have no more points than `budget`; else some of them at higher levels.
+
+    Depends on nothing but its arguments, so that two readers of one session hold the same.
+
+    Args:
+        poses: (k, 4, 4) T_map_imu of at least the keyframes of these chunks. sensor: (3,) m, in the map.
+    """
+    total = sum(len(chunk.points) for chunk in chunks)
+    if total <= budget:
+        return chunks
+    kept = list(chunks)
+    levels = [chunk.level for chunk in kept]
+    positions = poses[[chunk.index for chunk in kept], :3, 3]
+    while total > budget * _SLACK and (index := next_to_thin(levels, positions, sensor)) is not None:
+        before, kept[index] = kept[index], coarser(kept[index])
+        total -= len(before.points) - len(kept[index].points)
+        levels[index] += 1
+    return tuple(kept)
+
+
+def coarser(chunk: Chunk) -> Chunk:
+    """A chunk at the next level."""
+    level = chunk.level + 1
+    chosen = np.sort(_first_per_voxel(chunk.points, voxel_of_level(level)))  # of random points in their order
+    return replace(
+        chunk,
+        points=chunk.points[chosen],
+        labels=chunk.labels[chosen],
+        intensity=chunk.intensity[chosen],
+        ring=chunk.ring[chosen],
+        level=level,
+    )
+
+
+def voxel_of_level(level: int) -> float:
+    """Voxel edge in metres of a level >= 1."""
+    return float(FINEST_VOXEL_M * 2 ** (level - 1))
+
+
+def next_to_thin(levels: Sequence[int], positions: F64, sensor: F64) -> int | None:
+    """The keyframe that is thinned next, or None when all are at the coarsest level.
+
+    Of those drawn finest it is the one farthest from the sensor, and of equally far ones the oldest.
+
+    Args:
+        levels: of each keyframe. positions: (k, 3) m. sensor: (3,) m, in the same frame.
+    """
+    finest = min(levels, default=COARSEST_LEVEL)
+    if finest >= COARSEST_LEVEL:
+        return None
+    candidates = np.flatnonzero(np.asarray(levels) == finest)
+    distances = np.linalg.norm(positions[candidates] - sensor, axis=1)
+    return int(candidates[np.argmax(distances)])
+
+
+def _first_per_voxel(points: F32, voxel_size: float) -> I64:
+    """Indices, in the order of the voxels, of the first point of `points` (n, 3) in every occupied voxel."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     cells = np.floor(points * np.float32(1 / voxel_size)).astype(np.int64)
@@ -33,4 +109,4 @@ def one_per_voxel(points: F32, voxel_size: float, seed: int = 0) -> I64:
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
     first = np.concatenate(([True], ordered[1:] != ordered[:-1]))
-    return np.random.default_rng(seed).permutation(order[first])
+    return np.asarray(order[first])

@@ -11,7 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from app.server.chunks import within_budget
 from app.server.protocol import SERIES, Chunk, LoopsView, Notice, Snapshot
+from app.server.setup import POINT_BUDGET
 from app.slam.params import Params
 from app.slam.types import F64
 
@@ -183,10 +185,15 @@ class Rows:
 
 
 class Fold:
-    """Lays deltas over a snapshot, in their order. One thread writes; anybody may read `snapshot`."""
+    """Lays deltas over a snapshot, in their order. One thread writes; anybody may read `snapshot`.
 
-    def __init__(self, snapshot: Snapshot | None = None) -> None:
+    Args:
+        point_budget: most points that all chunks together may have.
+    """
+
+    def __init__(self, snapshot: Snapshot | None = None, point_budget: int = POINT_BUDGET) -> None:
         self.snapshot = snapshot or Snapshot()
+        self._point_budget = point_budget
         self._positions, self._series = Rows(3), Rows(len(SERIES))
 
     def apply(self, delta: Delta) -> Snapshot:
@@ -207,12 +214,22 @@ class Fold:
         series = self._series.view()
         return self.edit(
             session=delta.session,
-            chunks=chunks + delta.chunks,
+            chunks=self._thinned(chunks, delta) if delta.chunks else chunks,
             trajectory=self._positions.view(),
             series={name: series[:, column] for column, name in enumerate(SERIES)},
             notices=delta.notices,
             **delta.replaced,
         )
+
+    def _thinned(self, chunks: tuple[Chunk, ...], delta: Delta) -> tuple[Chunk, ...]:
+        """These and those of the delta, within the budget."""
+        poses = delta.replaced.get("keyframe_poses", self.snapshot.keyframe_poses)
+        result = delta.replaced.get("result", self.snapshot.result)
+        chunks += delta.chunks
+        if poses is None or len(poses) < len(chunks):
+            return chunks
+        sensor = result.T_map_imu[:3, 3] if result is not None else poses[-1, :3, 3]
+        return within_budget(chunks, poses, sensor, self._point_budget)
 
     def edit(self, *, notices: Iterable[Notice] = (), **values: Any) -> Snapshot:
         """Replace fields and add notices: the next revision."""

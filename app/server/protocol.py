@@ -159,13 +159,14 @@ Command = (
 class Chunk:
     """One keyframe's points, thinned for display, in the LiDAR frame of that keyframe.
 
-    Sent once. T_imu_lidar is fixed per chunk; the keyframe's pose is in `Snapshot.keyframe_poses`.
+    Sent once; a reader thins it further (`app.server.chunks`) when the whole map has too many points.
+    T_imu_lidar is fixed per chunk; the keyframe's pose is in `Snapshot.keyframe_poses`.
     Points are in random order: the first k are a fair sample, for a page that must show fewer.
 
     Attributes:
         index: of the keyframe. frame: that it was. stamp_ns: its time.
         points: (n, 3) float32 m. labels: (n,) uint8. intensity: (n,) float32. ring: (n,) uint16.
-        T_imu_lidar: (4, 4).
+        T_imu_lidar: (4, 4). level: how often it was thinned.
     """
 
     index: int
@@ -176,6 +177,7 @@ class Chunk:
     intensity: F32
     ring: U16
     T_imu_lidar: F64
+    level: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,7 +275,7 @@ class Snapshot:
         pending_restart: names of parameters that were changed and act on restart only.
         result: newest frame, already relabelled with the present ground parameters. Its `keyframe`
             is left out, since that is sent as a chunk.
-        chunks: within a session only appended, and taken away at the end when going back.
+        chunks: within a session appended, thinned, and taken away at the end when going back.
         keyframe_poses: (k, 4, 4) T_map_imu of each keyframe.
         trajectory: (n, 3) positions of the IMU in the map, every processed frame.
         loops: candidates, their verdicts and what was asked about them.

@@ -44,7 +44,8 @@ class Publisher:
         """Of all frames that are known, also those that the page was taken back over."""
         self._rows, self._odometry = Rows(len(SERIES)), Rows(16)  # the latter: T_odom_imu of keyframes
         self._positions, self._frame = Rows(3), MapFrame()  # as the page has them
-        self._chunks: list[Slot | Chunk | None] = []  # on disk, while that has room; None: another process sent it
+        self._poses_changed = True
+        self._chunks: list[Slot | Chunk] = []  # on disk, while that has room; none of a live run
         self._spill = Spill()
 
     def close(self) -> None:
@@ -67,11 +68,9 @@ class Publisher:
     def taken_over(self, run: Run) -> None:
         """A run that another process began goes on; the page keeps what it has of it. There is no going back."""
         frames, keyframes = run.frame + 1, run.engine.keyframes
-        self._rows.extend(np.full((frames, len(SERIES)), np.nan))
         self._positions.extend(run.log.odometry.positions)
         for keyframe in keyframes:
             self._odometry.extend(keyframe.T_odom_imu.reshape(1, 16))
-            self._chunks.append(None)
         self.outbox.rewind(frames, len(keyframes))
         self.outbox.put(recording=run.opened)
         self.show(frame=run.frame, finished=False, frames_per_second=0.0, dropped=run.log.dropped.total())
@@ -84,12 +83,13 @@ class Publisher:
     def frame(self, run: Run, result: StepResult) -> None:
         """A frame was processed, the one after that which the page shows."""
         frame, position, row = run.frame, result.T_map_imu[:3, 3].copy(), run.readouts.row(result)
-        self._rows.go_to(frame)
-        self._rows.extend(np.array([row]))
+        if not run.live:  # nobody goes back there
+            self._rows.go_to(frame)
+            self._rows.extend(np.array([row]))
         self._positions.extend(position[None])
         self.outbox.frame(position, row)
         if result.keyframe is not None:
-            self._keyframe(len(run.engine.keyframes) - 1, result.keyframe)
+            self._keyframe(len(run.engine.keyframes) - 1, result.keyframe, keep=not run.live)
         self._lay_anew(run)
         self._newest(run, result)
         self.show(frame=frame, stamp_ns=result.stamp_ns, urgent=False)
@@ -102,7 +102,7 @@ class Publisher:
         self.outbox.rewind(frames, chunks)
         self._rows.go_to(frames)
         self._odometry.go_to(chunks)
-        self._frame = run.engine.map_frame
+        self._frame, self._poses_changed = run.engine.map_frame, True
         positions, rows = self._frame.trajectory(run.log.odometry).positions, self._rows.view()
         sent = self.outbox.frames
         apart = np.abs(positions[:sent] - self._positions.view()[:sent]).max(axis=1, initial=0.0)
@@ -115,8 +115,7 @@ class Publisher:
             self.outbox.move(first, positions)
         run.readouts.moved(positions)
         for kept in self._chunks[self.outbox.chunks : chunks]:
-            if kept is not None:
-                self.outbox.chunk(kept if isinstance(kept, Chunk) else wire.unpack(self._spill.get(kept)))
+            self.outbox.chunk(kept if isinstance(kept, Chunk) else wire.unpack(self._spill.get(kept)))
         self._newest(run, result)
         self.show(
             frame=run.frame,
@@ -127,12 +126,11 @@ class Publisher:
 
     def _newest(self, run: Run, result: StepResult | None) -> None:
         self.result = result and replace(result, keyframe=None)
-        poses = self._frame.poses(self._odometry.view().reshape(-1, 4, 4))
-        self.outbox.put(
-            result=self.result,
-            T_map_truth=run.readouts.T_map_truth,
-            keyframe_poses=poses if len(poses) else None,
-        )
+        self.outbox.put(result=self.result, T_map_truth=run.readouts.T_map_truth)
+        if self._poses_changed:
+            self._poses_changed = False
+            poses = self._frame.poses(self._odometry.view().reshape(-1, 4, 4))
+            self.outbox.put(keyframe_poses=poses if len(poses) else None)
 
     def map_moved(self, run: Run) -> None:
         """Loops have moved keyframes: show them, the walk and the sensor where they are now."""
@@ -144,7 +142,7 @@ class Publisher:
         before, frame = self._frame, run.engine.map_frame
         if frame is before:
             return
-        self._frame = frame
+        self._frame, self._poses_changed = frame, True
         first = _first_stamp(before, frame)
         if first is None:
             return
@@ -157,11 +155,15 @@ class Publisher:
         self._positions.extend(positions[begin:])
         self.outbox.move(begin, positions)
 
-    def _keyframe(self, index: int, keyframe: Keyframe) -> None:
+    def _keyframe(self, index: int, keyframe: Keyframe, *, keep: bool) -> None:
+        """keep: whether it may have to be sent again."""
         chunk = thinned(keyframe, self._chunk_voxel)
         self.outbox.chunk(chunk)
+        self._poses_changed = True
         self._odometry.go_to(index)
         self._odometry.extend(keyframe.T_odom_imu.reshape(1, 16))
+        if not keep:
+            return
         for replaced in self._chunks[index : index + 1]:
             if isinstance(replaced, Slot):
                 self._spill.release(replaced)

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from app.sensors.live.process import LiveAddress
 
 
+POINT_BUDGET = 3_000_000
+
+
 @dataclass(frozen=True, slots=True)
 class Setup:
     """What an engine's process starts with. Must be picklable.
@@ -21,7 +24,8 @@ class Setup:
         start_s, duration_s: the part of that recording to process.
         resolve: parameters for recordings opened later; None keeps the present ones.
         play: begin at once. speed: to play at. breakpoints: where to pause.
-        chunk_voxel: m, see `Session`. checkpoint_bytes: see `app.server.checkpoints`.
+        chunk_voxel: m, see `Session`. point_budget: most points of the map that are held for pages.
+        checkpoint_bytes: see `app.server.checkpoints`.
         live_folder: where a live run keeps what a process that takes over needs. revive: it is that process.
         live: where to take scans from while `recording` is `app.server.protocol.LIVE`.
         journals: folder for session files, see `Session`.
@@ -38,6 +42,7 @@ class Setup:
     speed: float = 1.0
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     chunk_voxel: float = 0.05
+    point_budget: int = POINT_BUDGET
     checkpoint_bytes: int = 1 << 30
     live: "LiveAddress | None" = None
     live_folder: Path | None = None

@@ -43,7 +43,7 @@ class EngineProcess:
     def __init__(self, setup: Setup, *, main: Main = _run_engine) -> None:
         self._setup = setup
         self._main = main
-        self._fold = Fold(Snapshot(params=setup.params))
+        self._fold = Fold(Snapshot(params=setup.params), setup.point_budget)
         self._changed = threading.Condition()
         self._sending = threading.Lock()
         self._commands: Pipe | None = None

@@ -1,25 +1,25 @@
 """The growing map: one scene node per keyframe.
 
 A keyframe's points are sent once, in its own LiDAR frame; a pose that moves later sends 7 numbers.
-When the map outgrows the point budget, keyframes are sent again with fewer points.
+When the map outgrows the point budget, snapshots hold some keyframes with fewer points: those are sent again.
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import viser
 
 from app.server.protocol import Chunk
-from app.slam.types import F64, I64, U8
+from app.slam.types import F64, U8
 from app.ui.ceiling import below_ceiling
 from app.ui.colours import MAP_OF, TABLES, ColourBy, Limits, grown, label_colours, value_colours
 from app.ui.geometry import wxyz
-from app.ui.thinning import next_to_thin, thinned, voxel_of_level
 from app.ui.view import View
 
-_SLACK: Final = 0.97
-"""Over budget, the map is thinned to this share of it, so that not every new keyframe thins again."""
+Chosen: TypeAlias = npt.NDArray[np.bool_] | slice
+"""Which points of a chunk."""
 
 MEASURED: Final = (ColourBy.HEIGHT, ColourBy.INTENSITY, ColourBy.RING)
 """Colourings whose limits grow with the map; time's are the recording's duration."""
@@ -29,16 +29,13 @@ MEASURED: Final = (ColourBy.HEIGHT, ColourBy.INTENSITY, ColourBy.RING)
 class _Drawn:
     chunk: Chunk
     T_map_lidar: F64
-    shown: I64
-    level: int
+    shown: Chosen
+    count: int
+    """Points that are shown."""
     handle: viser.PointCloudHandle | None
     """None while no point of it is shown."""
     limits: dict[ColourBy, Limits]
     """Ends of the colour maps with this keyframe and those before it."""
-
-    @property
-    def count(self) -> int:
-        return len(self.shown)
 
 
 def chunk_values(chunk: Chunk, T_map_lidar: F64, by: ColourBy, start_ns: int) -> F64:
@@ -52,11 +49,19 @@ def chunk_values(chunk: Chunk, T_map_lidar: F64, by: ColourBy, start_ns: int) ->
     return np.full(len(chunk.points), (chunk.stamp_ns - start_ns) * 1e-9)
 
 
-def shown_points(chunk: Chunk, T_map_lidar: F64, level: int, ceilings: bool) -> I64:
-    """Indices (ascending) of the points that are drawn at a level, with or without the ceiling above them."""
+def shown_points(chunk: Chunk, T_map_lidar: F64, ceilings: bool) -> Chosen:
+    """The points that are drawn, with or without the ceiling above them."""
     mask = None if ceilings else below_ceiling(chunk.points, chunk.labels, T_map_lidar[2, :3])
-    kept = np.arange(len(chunk.points)) if mask is None else np.flatnonzero(mask)
-    return kept if level == 0 else kept[thinned(chunk.points[kept], voxel_of_level(level))]
+    return slice(None) if mask is None else mask
+
+
+def _same(drawn: Chunk, chunk: Chunk) -> bool:
+    """Whether one is the other or, thinned, what it has become."""
+    if drawn is chunk:
+        return True
+    return (drawn.index, drawn.frame, drawn.stamp_ns) == (chunk.index, chunk.frame, chunk.stamp_ns) and (
+        drawn.level < chunk.level
+    )
 
 
 def _pose(T: F64) -> tuple[F64, F64]:
@@ -64,12 +69,11 @@ def _pose(T: F64) -> tuple[F64, F64]:
 
 
 class MapChunks:
-    """Draws keyframes below the scene node `root`, within a budget of points."""
+    """Draws keyframes below the scene node `root`."""
 
-    def __init__(self, scene: viser.SceneApi, root: str, budget: int) -> None:
+    def __init__(self, scene: viser.SceneApi, root: str) -> None:
         self._scene = scene
         self._root = root
-        self._budget = budget
         self._drawn: list[_Drawn] = []
         self._view = View()
         self._limits: dict[ColourBy, Limits] = {}
@@ -97,8 +101,8 @@ class MapChunks:
         self._limits = {ColourBy.TIME: Limits(0.0, max(duration_s, 1.0))}
 
     def _take_back(self, chunks: tuple[Chunk, ...]) -> None:
-        """Take away the keyframes from the first on that is not among `chunks` any more."""
-        same = (drawn.chunk is chunk for drawn, chunk in zip(self._drawn, chunks, strict=False))
+        """Take away the keyframes from the first on that is not among `chunks` any more, be it thinned or not."""
+        same = (_same(drawn.chunk, chunk) for drawn, chunk in zip(self._drawn, chunks, strict=False))
         kept = next((index for index, is_same in enumerate(same) if not is_same), min(len(chunks), len(self._drawn)))
         if kept == len(self._drawn):
             return
@@ -110,11 +114,11 @@ class MapChunks:
         before = self._drawn[-1].limits if self._drawn else {}
         self._limits = {ColourBy.TIME: self._limits[ColourBy.TIME], **before}
 
-    def draw(self, chunks: tuple[Chunk, ...], poses: F64, sensor: F64, view: View) -> None:
-        """Add chunks that are new, take away those that are gone, move and colour anew where needed.
+    def draw(self, chunks: tuple[Chunk, ...], poses: F64, view: View) -> None:
+        """Add chunks that are new, take away those that are gone, thin, move and colour anew where needed.
 
         Args:
-            poses: (k, 4, 4) T_map_imu by keyframe index. sensor: (3,) m in the map.
+            poses: (k, 4, 4) T_map_imu by keyframe index.
         """
         before, seen = self._limits.get(view.colour_by), self._view
         self._view = view
@@ -123,16 +127,17 @@ class MapChunks:
         for chunk in chunks[len(self._drawn) :]:
             T = poses[chunk.index] @ chunk.T_imu_lidar
             self._widen(chunk, T)
-            new.append(_Drawn(chunk, T, np.empty(0, np.int64), 0, None, self._limits.copy()))
+            new.append(_Drawn(chunk, T, slice(None), 0, None, self._limits.copy()))
         recolour = view.colour_by is not seen.colour_by or self._limits.get(view.colour_by) != before
         restyle = (view.point_size, view.map) != (seen.point_size, seen.map)
         now = poses[[drawn.chunk.index for drawn in self._drawn]]
         moved = np.abs(now - self._poses).max(axis=(1, 2), initial=0.0) > 1e-5
-        for drawn, has_moved in zip(self._drawn, moved, strict=True):
+        for drawn, chunk, has_moved in zip(self._drawn, chunks, moved, strict=False):
             if has_moved:
                 drawn.T_map_lidar = poses[drawn.chunk.index] @ drawn.chunk.T_imu_lidar
-            if view.ceilings != seen.ceilings:
-                self._send(drawn, self._show(drawn))
+            if view.ceilings != seen.ceilings or chunk is not drawn.chunk:
+                drawn.chunk = chunk
+                self._send(drawn)
             elif drawn.handle is not None:
                 if has_moved:
                     drawn.handle.wxyz, drawn.handle.position = _pose(drawn.T_map_lidar)
@@ -142,10 +147,8 @@ class MapChunks:
                     drawn.handle.colors = self._colours(drawn)
         for drawn in new:
             self._drawn.append(drawn)
-            self._send(drawn, self._show(drawn))
+            self._send(drawn)
         self._poses = poses[[drawn.chunk.index for drawn in self._drawn]]
-        if self.points > self._budget:
-            self._thin(sensor)
 
     def _widen(self, chunk: Chunk, T_map_lidar: F64) -> None:
         for by in MEASURED:
@@ -153,17 +156,16 @@ class MapChunks:
             if limits is not None:
                 self._limits[by] = limits
 
-    def _show(self, drawn: _Drawn) -> I64:
-        return shown_points(drawn.chunk, drawn.T_map_lidar, drawn.level, self._view.ceilings)
-
-    def _send(self, drawn: _Drawn, shown: I64) -> None:
-        """Send these points of a keyframe in place of those sent before.
+    def _send(self, drawn: _Drawn) -> None:
+        """Send the points of a keyframe that are shown now in place of those sent before.
 
         Under the same name instead of through the handle's properties: a page that connects later is
         then not sent what was thinned away.
         """
-        drawn.shown = shown
-        if not len(shown):  # the page can not draw a cloud of no points
+        drawn.shown = shown_points(drawn.chunk, drawn.T_map_lidar, self._view.ceilings)
+        points = drawn.chunk.points[drawn.shown]
+        drawn.count = len(points)
+        if not len(points):  # the page can not draw a cloud of no points
             if drawn.handle is not None:
                 drawn.handle.remove()
                 drawn.handle = None
@@ -171,7 +173,7 @@ class MapChunks:
         orientation, position = _pose(drawn.T_map_lidar)
         drawn.handle = self._scene.add_point_cloud(
             f"{self._root}/{drawn.chunk.index}",
-            drawn.chunk.points[drawn.shown],
+            points,
             self._colours(drawn),
             point_size=self._view.point_size,
             point_shape="circle",
@@ -187,15 +189,3 @@ class MapChunks:
             return label_colours(chunk.labels[drawn.shown])
         values = chunk_values(chunk, drawn.T_map_lidar, by, self._start_ns)[drawn.shown]
         return value_colours(values, self._limits.get(by, Limits(0.0, 1.0)), TABLES[MAP_OF[by]])
-
-    def _thin(self, sensor: F64) -> None:
-        positions = np.array([drawn.T_map_lidar[:3, 3] for drawn in self._drawn])
-        levels = [drawn.level for drawn in self._drawn]
-        total = self.points
-        while total > self._budget * _SLACK and (index := next_to_thin(levels, positions, sensor)) is not None:
-            drawn = self._drawn[index]
-            levels[index] = drawn.level = drawn.level + 1
-            shown = self._show(drawn)
-            if len(shown) < drawn.count:
-                total -= drawn.count - len(shown)
-                self._send(drawn, shown)

@@ -27,7 +27,7 @@ _GROUND_BEFORE_SEEN_M: Final = -1.2
 class Scene:
     """Draws snapshots on a viser server, sending differences only."""
 
-    def __init__(self, server: viser.ViserServer, point_budget: int) -> None:
+    def __init__(self, server: viser.ViserServer) -> None:
         scene = server.scene
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
@@ -46,7 +46,7 @@ class Scene:
             shadow_opacity=0.0,
             position=(0.0, 0.0, _GROUND_BEFORE_SEEN_M),
         )
-        self._chunks = MapChunks(scene, f"{ROOT}/keyframes", point_budget)
+        self._chunks = MapChunks(scene, f"{ROOT}/keyframes")
         self._sensor = Sensor(scene, f"{ROOT}/sensor")
         self._trajectory = Trajectory(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
@@ -82,7 +82,7 @@ class Scene:
             result = current.result
             position = result.T_map_imu[:3, 3] if result is not None else np.zeros(3)
             limits_before = self.limits(view.colour_by)
-            self._chunks.draw(current.chunks[: len(poses)], poses, position, view)
+            self._chunks.draw(current.chunks[: len(poses)], poses, view)
             if current.trajectory is not None:
                 self._trajectory.draw(current.trajectory, view.path)
             self._truth.draw(current.T_map_truth, view.path)

@@ -17,7 +17,7 @@ import viser
 from app.server.folders import Folders
 from app.server.fork import Engine, Workspace
 from app.server.protocol import Snapshot
-from app.server.setup import Setup
+from app.server.setup import POINT_BUDGET, Setup
 from app.ui.appearance import AppearancePanel
 from app.ui.breakpoints import BreakpointPanel
 from app.ui.compare import ComparePanel, Sides
@@ -50,7 +50,7 @@ class Workbench:
 
     Args:
         server: whose page this is. engine: where snapshots come from and commands go; a `Workspace` can be forked.
-        folders: where recordings may be opened from. point_budget: most map points in the page.
+        folders: where recordings may be opened from. point_budget: of the engine's reader, to be told.
         results: folder below which results are saved.
         now: monotonic seconds.
     """
@@ -60,7 +60,7 @@ class Workbench:
         server: viser.ViserServer,
         engine: Engine | Workspace,
         folders: Folders,
-        point_budget: int = 3_000_000,
+        point_budget: int = POINT_BUDGET,
         *,
         results: Path = Path("results"),
         now: Callable[[], float] = time.monotonic,
@@ -76,7 +76,7 @@ class Workbench:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(340)
         first = engine.snapshot
-        self._scene = Scene(server, point_budget)
+        self._scene = Scene(server)
 
         gui.add_html(STYLE + KEYS)
         self._header = HeaderPanel(gui)

@@ -11,7 +11,7 @@ from app.ui.ceiling import below_ceiling
 from app.ui.colours import TABLES, ColourBy, Limits, grown, label_colours, value_colours
 from app.ui.geometry import field_of_view, foot, ring_elevations, rotation_to, seed_wedge, wxyz
 from app.ui.paths import BLOCK, segments
-from app.ui.thinning import COARSEST_LEVEL, next_to_thin, strided, thinned
+from app.ui.thinning import strided
 
 clouds = hnp.arrays(np.float32, st.tuples(st.integers(1, 200), st.just(3)), elements=st.floats(-50, 50, width=32))
 units = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.1)
@@ -74,40 +74,11 @@ def test_limits_of_nothing_are_unknown() -> None:
     assert grown(None, ColourBy.HEIGHT, [np.nan]) is None
 
 
-@given(clouds, st.floats(0.05, 5))
-def test_thinning_leaves_one_point_in_every_occupied_voxel(points: np.ndarray, voxel: float) -> None:
-    kept = thinned(points, voxel)
-    cells = np.floor(points / np.float32(voxel)).astype(int)
-    assert len({tuple(c) for c in cells}) == len(kept)
-    assert {tuple(c) for c in cells[kept]} == {tuple(c) for c in cells}
-    assert (np.diff(kept) > 0).all()
-
-
-def test_thinning_an_empty_cloud_leaves_nothing() -> None:
-    assert len(thinned(np.empty((0, 3), np.float32), 0.1)) == 0
-
-
 @given(st.integers(0, 200_000), st.integers(1, 40_000))
 def test_a_stride_keeps_the_limit_and_wastes_less_than_half(count: int, most: int) -> None:
     left = len(range(count)[strided(count, most)])
     assert left <= most
     assert left >= min(count, most // 2)
-
-
-def test_the_farthest_of_the_finest_keyframes_is_thinned_first() -> None:
-    positions = np.array([[0.0, 0, 0], [5.0, 0, 0], [9.0, 0, 0]])
-    assert next_to_thin([0, 0, 0], positions, np.zeros(3)) == 2
-    assert next_to_thin([0, 0, 1], positions, np.zeros(3)) == 1
-    assert next_to_thin([0, 0, 0], positions, positions[2]) == 0
-
-
-def test_of_equally_far_keyframes_the_oldest_is_thinned_first() -> None:
-    assert next_to_thin([0, 0], np.array([[3.0, 0, 0], [-3.0, 0, 0]]), np.zeros(3)) == 0
-
-
-def test_thinning_ends_where_nothing_is_left_to_thin() -> None:
-    assert next_to_thin([COARSEST_LEVEL] * 2, np.zeros((2, 3)), np.zeros(3)) is None
-    assert next_to_thin([], np.empty((0, 3)), np.zeros(3)) is None
 
 
 def room(height: float, rng: np.random.Generator) -> np.ndarray:

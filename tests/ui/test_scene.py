@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import viser
 
+from app.server.chunks import within_budget
 from app.server.protocol import Seek, SetParams, Snapshot, StepFrame
 from app.ui.colours import LABEL_COLOURS, ColourBy
 from app.ui.scene import Scene
@@ -17,10 +18,11 @@ SCAN = "/map/sensor/lidar/scan"
 
 
 class Drawn:
-    """A scene that remembers what it shows, as the workbench does."""
+    """A scene that remembers what it shows, as the workbench does; `budget`: most points of the map."""
 
-    def __init__(self, server: viser.ViserServer, engine: FakeEngine, budget: int = 1_000_000) -> None:
-        self.scene = Scene(server, budget)
+    def __init__(self, server: viser.ViserServer, engine: FakeEngine, budget: int | None = None) -> None:
+        self.scene = Scene(server)
+        self.budget = budget
         self.engine = engine
         self.snapshot: Snapshot | None = None
         self.view: View | None = None
@@ -28,6 +30,12 @@ class Drawn:
     def draw(self, view: View | None = None, **changes: object) -> None:
         view = view or self.view or View()
         snapshot = replace(self.engine.snapshot, **changes)  # type: ignore[arg-type]
+        if self.budget is not None:
+            known = self.snapshot.chunks if self.snapshot else ()
+            chunks, result = known + snapshot.chunks[len(known) :], snapshot.result
+            assert snapshot.keyframe_poses is not None and result is not None
+            chunks = within_budget(chunks, snapshot.keyframe_poses, result.T_map_imu[:3, 3], self.budget)
+            snapshot = replace(snapshot, chunks=chunks)
         self.scene.draw(self.snapshot, snapshot, view, self.view)
         self.snapshot, self.view = snapshot, view
 

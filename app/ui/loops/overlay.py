@@ -46,7 +46,7 @@ def surroundings(chunks: tuple[Chunk, ...], poses: F64, index: int, ceilings: bo
     parts = [np.empty((0, 3))]
     for chunk in near:
         T = poses[chunk.index] @ chunk.T_imu_lidar
-        points = chunk.points[shown_points(chunk, T, 0, ceilings)[:share]]
+        points = chunk.points[shown_points(chunk, T, ceilings)][:share]
         parts.append(points @ T[:3, :3].T + T[:3, 3] - poses[index][:3, 3])
     return np.concatenate(parts).astype(np.float32)
 

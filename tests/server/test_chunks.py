@@ -1,0 +1,85 @@
+"""Of a map that outgrows its budget of points, what is far is thinned, and what is thinned away is held nowhere."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.server.chunks import COARSEST_LEVEL, coarser, next_to_thin, voxel_of_level, within_budget
+from app.server.delta import Fold, Outbox
+from app.server.protocol import Chunk
+from app.slam.params import Params
+
+ALONG_M = 2.0
+
+
+def chunk(index: int, points: int = 2000) -> Chunk:
+    rng = np.random.default_rng(index)
+    return Chunk(
+        index=index,
+        frame=5 * index,
+        stamp_ns=index,
+        points=rng.uniform(-6, 6, (points, 3)).astype(np.float32),
+        labels=rng.integers(0, 3, points).astype(np.uint8),
+        intensity=np.arange(points, dtype=np.float32),
+        ring=np.zeros(points, np.uint16),
+        T_imu_lidar=np.eye(4),
+    )
+
+
+def walk(keyframes: int) -> np.ndarray:
+    """Poses (k, 4, 4) along x."""
+    poses = np.tile(np.eye(4), (keyframes, 1, 1))
+    poses[:, 0, 3] = ALONG_M * np.arange(keyframes)
+    return poses
+
+
+@given(st.integers(0, 1000), st.integers(1, 4))
+def test_a_level_leaves_one_point_with_all_that_belongs_to_it_in_every_occupied_voxel(seed: int, levels: int) -> None:
+    full = thin = chunk(seed, 400)
+    for _ in range(levels):
+        thin = coarser(thin)
+    assert thin.level == levels
+    size = np.float32(1 / voxel_of_level(levels))
+    cells = [tuple(cell) for cell in np.floor(thin.points * size).astype(int)]
+    # levels nest: voxels of one are eight of the one before, so what is left of these fills all of those
+    assert len(cells) == len(set(cells)) and set(cells) == {tuple(c) for c in np.floor(full.points * size).astype(int)}
+    kept = thin.intensity.astype(int)
+    assert np.array_equal(thin.points, full.points[kept]) and np.array_equal(thin.labels, full.labels[kept])
+    assert (np.diff(kept) > 0).all()  # still in the random order
+
+
+def test_a_map_within_its_budget_is_left_as_it_is() -> None:
+    chunks = tuple(map(chunk, range(4)))
+    assert within_budget(chunks, walk(4), np.zeros(3), 8000) is chunks
+
+
+def test_the_farthest_of_the_finest_keyframes_is_thinned_first() -> None:
+    positions = np.array([[0.0, 0, 0], [5.0, 0, 0], [9.0, 0, 0]])
+    assert next_to_thin([0, 0, 0], positions, np.zeros(3)) == 2
+    assert next_to_thin([0, 0, 1], positions, np.zeros(3)) == 1
+    assert next_to_thin([0, 0, 0], positions, positions[2]) == 0
+
+
+def test_of_equally_far_keyframes_the_oldest_is_thinned_first() -> None:
+    assert next_to_thin([0, 0], np.array([[3.0, 0, 0], [-3.0, 0, 0]]), np.zeros(3)) == 0
+
+
+def test_thinning_ends_where_nothing_is_left_to_thin() -> None:
+    assert next_to_thin([COARSEST_LEVEL] * 2, np.zeros((2, 3)), np.zeros(3)) is None
+    assert next_to_thin([], np.empty((0, 3)), np.zeros(3)) is None
+
+
+def test_a_reader_never_holds_more_points_than_its_budget() -> None:
+    budget, outbox = 50_000, Outbox(Params())
+    fold = Fold(point_budget=budget)
+    for index in range(300):
+        outbox.chunk(chunk(index))
+        outbox.put(keyframe_poses=walk(index + 1))
+        snapshot = fold.apply(outbox.take())
+        assert len(snapshot.chunks) == index + 1
+        assert sum(len(one.points) for one in snapshot.chunks) <= budget
+    levels = [one.level for one in snapshot.chunks]
+    assert levels[0] > 0
+    assert levels == sorted(levels, reverse=True)  # the walk went straight: the farther, the coarser
+    for one in snapshot.chunks[:5]:  # a thinned chunk does not hold on to the whole one
+        assert one.points.base is None or one.points.base.nbytes == one.points.nbytes
