@@ -15,7 +15,7 @@ from app.slam.loops.line import LoopLine
 from app.slam.loops.messages import LoopClient
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
-from app.slam.types import STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
+from app.slam.types import F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
 from app.slam.voxel import VoxelGrid
 
 
@@ -30,7 +30,7 @@ class Checkpoint:
     status: FrameStatus
     map: MapState
     keyframes: int
-    last_keyframe: Keyframe | None
+    T_odom_keyframe: F64 | None
 
 
 class Engine:
@@ -61,7 +61,7 @@ class Engine:
         self._still: ImuSamples | None = None
         self._status = FrameStatus.INITIALISING
         self._frame = 0
-        self._last_keyframe: Keyframe | None = None
+        self._T_odom_keyframe: F64 | None = None  # the last one's T_odom_imu
 
     def step(self, scan: Scan, samples: ImuSamples) -> StepResult:
         """Process one scan with the samples that cover the time from the previous scan's end to its own."""
@@ -168,7 +168,7 @@ class Engine:
             status=self._status,
             map=self._map.checkpoint(),
             keyframes=len(self.keyframes),
-            last_keyframe=self._last_keyframe,
+            T_odom_keyframe=self._T_odom_keyframe,
         )
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -180,7 +180,7 @@ class Engine:
         self._status = checkpoint.status
         self._map.restore(checkpoint.map)
         self.keyframes.truncate(checkpoint.keyframes)
-        self._last_keyframe = checkpoint.last_keyframe
+        self._T_odom_keyframe = checkpoint.T_odom_keyframe
         if self.loops:
             self.loops.go_to(self._frame)
 
@@ -196,7 +196,7 @@ class Engine:
 
     def _keyframe(self, belief: Belief, cloud: Cloud) -> Keyframe | None:
         state = belief.state
-        if not keyframes.is_due(self._last_keyframe, state.T_odom_imu, self.params.keyframe):
+        if not keyframes.is_due(self._T_odom_keyframe, state.T_odom_imu, self.params.keyframe):
             return None
         keyframe = Keyframe(
             index=len(self.keyframes),
@@ -208,7 +208,7 @@ class Engine:
             cloud=cloud,
         )
         self.keyframes.append(keyframe)
-        self._last_keyframe = keyframe
+        self._T_odom_keyframe = keyframe.T_odom_imu
         return keyframe
 
 

@@ -33,11 +33,11 @@ _POINT = np.dtype(
 """One point of a `Cloud`; the names are its attributes."""
 
 
-def is_due(last: Keyframe | None, T_odom_imu: F64, params: Keyframes) -> bool:
-    """Whether the pose is far or turned enough from the last keyframe's."""
-    if last is None:
+def is_due(T_odom_last: F64 | None, T_odom_imu: F64, params: Keyframes) -> bool:
+    """Whether the pose is far or turned enough from the last keyframe's, if there is one."""
+    if T_odom_last is None:
         return True
-    delta = lie.inverse(last.T_odom_imu) @ T_odom_imu
+    delta = lie.inverse(T_odom_last) @ T_odom_imu
     far = np.linalg.norm(delta[:3, 3]) > params.distance
     turned = np.degrees(np.linalg.norm(lie.log(delta[:3, :3]))) > params.angle
     return bool(far or turned)

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from app.slam.kernels import map as kernels
 from app.slam.params import Filter
@@ -13,12 +14,16 @@ from app.slam.types import F32, F64, I32, U8
 
 @dataclass(frozen=True, slots=True)
 class MapState:
-    """A copy of everything in the map; restoring it restores every later result exactly."""
+    """A copy of everything in the map; restoring it restores every later result exactly.
+
+    Attributes:
+        cells: (v, 3) indices of the voxels, in the order in which they came. counts: (v,) points in each.
+        points: (sum of counts, 3) m, voxel by voxel. center: (3,) m, from where far voxels were last dropped.
+    """
 
     cells: I32
     counts: U8
-    store: F32
-    table: I32
+    points: F32
     center: F64
 
 
@@ -94,16 +99,16 @@ class LocalMap:
 
     def checkpoint(self) -> MapState:
         n = self._used
-        return MapState(
-            self._cells[:n].copy(),
-            self._counts[:n].copy(),
-            self._store[:n].copy(),
-            self._table.copy(),
-            self._center.copy(),
-        )
+        points = self._store[:n][self._taken(n)]
+        return MapState(self._cells[:n].copy(), self._counts[:n].copy(), points, self._center.copy())
 
     def restore(self, state: MapState) -> None:
-        n = self._used = len(state.cells)
-        self._cells[:n], self._counts[:n], self._store[:n] = state.cells, state.counts, state.store
-        self._table[:] = state.table
-        self._center = state.center.copy()
+        n = len(state.cells)
+        self._cells[:n], self._counts[:n] = state.cells, state.counts
+        self._store[:n][self._taken(n)] = state.points
+        self._used = n
+        self._evict(np.array(state.center), math.inf)  # drops nothing, and makes the table as it was
+
+    def _taken(self, n: int) -> npt.NDArray[np.bool_]:
+        """(n, points_per_voxel): which places of the first n voxels hold a point."""
+        return np.arange(self._store.shape[1]) < self._counts[:n, None]

@@ -120,7 +120,7 @@ def test_a_keyframe_is_due_after_walking_or_turning_far_enough(metres: float, de
     moved = np.eye(4)
     moved[:3, 3] = metres * np.array([0.6, 0.0, -0.8])
     moved[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * np.array([0.0, 0.6, 0.8])).as_matrix()
-    assert is_due(last, last.T_odom_imu @ moved, Keyframes(distance=0.5, angle=15)) is due
+    assert is_due(last.T_odom_imu, last.T_odom_imu @ moved, Keyframes(distance=0.5, angle=15)) is due
 
 
 def test_the_first_frame_is_a_keyframe() -> None:

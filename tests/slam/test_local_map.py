@@ -20,8 +20,7 @@ HERE = np.zeros(3)
 
 def stored(local_map: LocalMap) -> np.ndarray:
     """All points of the map, (n, 3) float64."""
-    state = local_map.checkpoint()
-    return np.concatenate([np.empty((0, 3)), *(state.store[k, :n] for k, n in enumerate(state.counts))]).astype(float)
+    return local_map.checkpoint().points.astype(float)
 
 
 def filled(points: np.ndarray, params: MapParams = SMALL) -> LocalMap:
@@ -75,8 +74,9 @@ def test_what_is_stored_is_what_a_dictionary_stores(seed: int, voxel: float, spa
     state = filled(points, params).checkpoint()
     expected = by_dictionary(points, params)
     assert {tuple(cell) for cell in state.cells.tolist()} == set(expected)
-    for cell, count, store in zip(state.cells.tolist(), state.counts, state.store, strict=True):
-        np.testing.assert_array_equal(store[:count], np.array(expected[tuple(cell)]))
+    voxels = np.split(state.points, np.cumsum(state.counts)[:-1])
+    for cell, stored_there in zip(state.cells.tolist(), voxels, strict=True):
+        np.testing.assert_array_equal(stored_there, np.array(expected[tuple(cell)]))
 
 
 def test_standing_still_piles_up_nothing() -> None:
