@@ -9,6 +9,8 @@ from app.evaluation.measured import START_S, Column, Evaluated
 
 LIKE = 0.02
 """Closer than this share of one another, two values are the same."""
+CHANCE = 2.0
+"""A mean difference of fewer standard errors than this, over the recordings, may be chance."""
 
 _CLAIMS = (
     ("FAST-LIO-GD", "FAST-LIO", "thinning the ground"),
@@ -73,8 +75,9 @@ class _Metric:
 
 
 _METRICS = (
-    _Metric("error (ATE)", _ate, "m", ".4f"),
-    _Metric(f"error (ATE) without the first {START_S:g} s", _later, "m", ".4f"),
+    _Metric("error (ATE)", _ate, "m", ".3g"),
+    _Metric("error (ATE) outdoors", _ate, "m", ".3g", where="outdoor"),
+    _Metric(f"error (ATE) without the first {START_S:g} s", _later, "m", ".3g"),
     _Metric("CPU time a frame", _time, "ms", ".2f", promised=False),
     # Table 3: outdoors, where much is ground, thinning it should make up for most of what it costs
     _Metric("CPU time a frame outdoors", _time, "ms", ".2f", where="outdoor", promised=False),
@@ -98,8 +101,20 @@ def _claim(recordings: Sequence[Evaluated], name: str, base: str, what: str, met
     sentence += f" {theirs:{metric.digits}} to {ours:{metric.digits}} {metric.unit}"
     worse = [pair[0] for pair in pairs if _compare(pair[1], pair[2])[1]]
     if len(pairs) > 1:
-        sentence += f" over {len(pairs)} recordings" + (f"; it rises on {', '.join(worse)}" if worse else "")
+        sentence += f" over {len(pairs)} recordings{_certainty(pairs)}"
+        sentence += f"; it rises on {', '.join(worse)}" if worse else ""
     return sentence + ("; this goes against what the paper found." if against and metric.promised else ".")
+
+
+def _certainty(pairs: Sequence[tuple[str, float, float]]) -> str:
+    """How well the recordings tell the mean difference, in words."""
+    if len(pairs) < 3:
+        return ""
+    differences = np.array([ours - theirs for _, ours, theirs in pairs])
+    error = float(differences.std(ddof=1) / np.sqrt(len(pairs)))
+    base, mean = float(np.mean([theirs for _, _, theirs in pairs])), abs(float(differences.mean()))
+    chance = ": may be chance" if LIKE * base < mean < CHANCE * error else ""
+    return f" (± {100 * error / base:.1f} %, one standard error{chance})"
 
 
 def _compare(ours: float, theirs: float) -> tuple[str, bool]:

@@ -1,0 +1,85 @@
+"""The sentences of the report follow the figures, whichever way these go."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.evaluation.findings import findings
+from app.evaluation.measured import Accuracy, Column, Evaluated
+from app.slam.results import TIMINGS
+
+
+def column(name: str, ate_m: float, cpu_ms: float) -> Column:
+    none = np.zeros(0)
+    accuracy = Accuracy(
+        {"rmse": ate_m, "mean": ate_m, "max": ate_m}, None, {}, 10, 10.0, none, none, np.zeros((0, 3)), ate_m
+    )
+    run = {"peak_memory_mb": 100.0, "threads": 1, "load": 0.5}
+    times = np.full((10, len(TIMINGS)), cpu_ms)
+    return Column(name, run=run, timings_ms=times, cpu_ms=times[:, 0], accuracy=accuracy)
+
+
+def said(where: str, ours: list[float], theirs: list[float], cpu: tuple[float, float] = (3.0, 3.0)) -> list[str]:
+    """What is said of Ours against FAST-LIO, by errors in millimetres, a recording each."""
+    recordings = [
+        Evaluated(
+            f"{where}_{number}",
+            Path("x"),
+            "",
+            (column("FAST-LIO", 1e-3 * b, cpu[1]), column("Ours", 1e-3 * a, cpu[0])),
+        )
+        for number, (a, b) in enumerate(zip(ours, theirs, strict=True))
+    ]
+    return [text for text in findings(recordings) if text.startswith("Ours ")]
+
+
+def about(texts: list[str], what: str) -> str:
+    (text,) = [text for text in texts if re.search(rf"the mean {re.escape(what)} (falls|rises|stays)", text)]
+    return text
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "verdict", "against"),
+    [
+        (1.0, 2.0, "falls by 50 %, 0.002 to 0.001 m", False),
+        (3.0, 2.0, "rises by 50 %, 0.002 to 0.003 m", True),
+        (2.01, 2.0, "stays the same", False),
+    ],
+)
+def test_an_error_that_falls_and_one_that_rises_are_told_apart(
+    ours: float, theirs: float, verdict: str, against: bool
+) -> None:
+    text = about(said("indoor", [ours], [theirs]), "error (ATE)")
+    assert verdict in text
+    assert ("goes against what the paper found" in text) is against
+
+
+@pytest.mark.parametrize(("ours", "theirs", "verdict"), [(2.0, 4.0, "falls by 50 %"), (6.0, 4.0, "rises by 50 %")])
+def test_time_outdoors_is_told_either_way_and_the_paper_promised_nothing(
+    ours: float, theirs: float, verdict: str
+) -> None:
+    text = about(said("outdoor", [1.0], [1.0], (ours, theirs)), "CPU time a frame outdoors")
+    assert verdict in text and "against what the paper" not in text
+
+
+def test_outdoors_is_only_told_of_recordings_outdoors() -> None:
+    assert not any("outdoors" in text for text in said("indoor", [1.0], [1.0]))
+
+
+def test_recordings_that_go_the_other_way_are_named_though_the_mean_falls() -> None:
+    text = about(said("outdoor", [1.0, 3.0], [3.0, 2.0]), "error (ATE)")
+    assert "falls by" in text and "it rises on outdoor_1" in text and "outdoor_0" not in text
+
+
+def test_a_difference_that_recordings_do_not_share_may_be_chance() -> None:
+    """By hand: differences of +2, -1, +2 have the mean 1 and the standard error sqrt(3) / sqrt(3) = 1 mm."""
+    text = about(said("indoor", [12.0, 9.0, 12.0], [10.0, 10.0, 10.0]), "error (ATE)")
+    assert "rises by 10 %" in text and "goes against what the paper found" in text
+    assert "over 3 recordings (± 10.0 %, one standard error: may be chance)" in text
+
+
+def test_a_difference_that_all_recordings_share_is_none_of_chance() -> None:
+    text = about(said("indoor", [11.0, 11.1, 10.9], [10.0, 10.0, 10.0]), "error (ATE)")
+    assert "(± 0.6 %, one standard error)" in text
