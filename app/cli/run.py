@@ -120,6 +120,9 @@ def save(work: "Run", folder: Path, info: "RunInfo", stop: BaseException | None,
     found = work.engine.loops.results() if work.engine.loops else None
     report = save_results(folder, work.log, work.engine.keyframes, info, found, replace=replace)
     typer.echo(summarise(report, folder))
+    if work.engine.loops:
+        for notice in (*work.engine.loops.take_notices(), *work.engine.loops.take_alarms()):
+            typer.echo(notice)
     if isinstance(stop, HemislamError):
         raise HemislamError(f"{stop} The frames before that were processed and saved in {folder}.")
     if stop is not None:

@@ -71,7 +71,7 @@ class LoopDesk:
                     view = replace(view, residuals=residuals)
                 case Failure(text):
                     self._outbox.notice("error", text)
-        for notice in loops.take_notices():
+        for notice in (*loops.take_notices(), *loops.take_alarms()):
             self._outbox.notice("warning", notice)
         state, moved = loops.state, loops.state is not self._state
         self._state = state

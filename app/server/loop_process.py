@@ -101,7 +101,7 @@ class LoopProcess:
     def _death(self) -> LoopWorkerDied:
         code = self._process.wait()
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        return LoopWorkerDied(f"The process that looks for loops has ended unexpectedly ({how}); it must start again.")
+        return LoopWorkerDied(f"The process that looks for loops has ended unexpectedly ({how}).")
 
     def _write(self) -> None:
         with self._requests:

@@ -1,6 +1,8 @@
 """Loops of the recording that ships, through a session: found beside the frames, overruled, taken back, replayed."""
 
 import math
+import os
+import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +14,7 @@ from typer.testing import CliRunner
 
 from app.__main__ import cli
 from app.sensors.presets import resolve_params
+from app.server.loop_process import LoopProcess
 from app.server.protocol import (
     InspectLoop,
     OverruleLoop,
@@ -124,11 +127,12 @@ def test_the_file_of_what_was_done_in_the_page_repeats_it_headless(walk: Walk, t
         UndoLoop(),
     )
     path = tmp_path / "edits.yaml"
-    path.write_text(edits.write(snapshot.loops.undo))
+    path.write_text(edits.write(snapshot.loops.undo) + "- accept: [1, 2]\n")
     ours = walk.saved(tmp_path / "page")
     walk.do(UndoLoop(), UndoLoop())
     result = CliRunner().invoke(cli, ["run", str(SAMPLE), "--loops", str(path), "--out", str(tmp_path / "headless")])
     assert result.exit_code == 0, result.output
+    assert "Accept 1-2 has no effect" in result.output
     assert {name: (tmp_path / "headless" / name).read_bytes() for name in FILES} == ours
 
 
@@ -149,3 +153,41 @@ def test_what_can_not_be_done_is_said_and_changes_nothing(walk: Walk) -> None:
     after = walk.do(OverruleLoop(SetWeight(*accepted(before)[0].pair, -1.0)))
     assert after.notices[-1].level == "error" and "weight" in after.notices[-1].text
     assert after.loops.edges == before.loops.edges
+
+
+# --- what goes wrong -----------------------------------------------------------------------------
+def test_a_factor_that_the_solver_fails_with_is_left_out_the_page_says_so_and_the_walk_goes_on(
+    walk: Walk, files: dict[str, bytes], tmp_path: Path
+) -> None:
+    """gtsam raises IndeterminantLinearSystemException with so large a weight."""
+    pair = accepted(walk.end())[0].pair
+    broken = walk.do(OverruleLoop(SetWeight(*pair, 1e306)))
+    assert f"The solver failed with the loop {pair[0]}-{pair[1]}" in broken.notices[-1].text
+    (edge,) = (edge for edge in broken.loops.edges if edge.pair == pair)
+    assert edge.verdict is Verdict.REJECTED and "solver" in edge.reason
+    assert broken.engine_alive and np.isfinite(broken.trajectory).all()  # type: ignore[arg-type]  # None would fail
+    assert walk.end().transport.frame == broken.transport.frame
+    walk.do(UndoLoop())
+    assert walk.saved(tmp_path) == files
+
+
+def test_the_loops_process_killed_twice_is_revived_and_leaves_the_same_files(
+    walk: Walk, files: dict[str, bytes], tmp_path: Path
+) -> None:
+    def kill() -> None:
+        assert walk.run.engine.loops is not None
+        process = walk.run.engine.loops._client  # nobody outside has a reason to know it
+        assert isinstance(process, LoopProcess)
+        os.kill(process.pid, signal.SIGKILL)
+
+    walk.do(Seek(300))
+    kill()
+    ended = walk.end()
+    assert any("started again" in notice.text for notice in ended.notices)
+    pair = accepted(ended)[0].pair
+    walk.session.handle(OverruleLoop(Reject(*pair)))
+    kill()  # before it has answered
+    walk.settle()
+    assert walk.see().loops.undo == (Reject(*pair),)
+    walk.do(UndoLoop())
+    assert walk.saved(tmp_path) == files

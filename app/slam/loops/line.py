@@ -6,7 +6,6 @@ poses shown never depend on the speed of the machine, and a frame waits only if 
 What the user commands takes effect as soon as it is answered.
 """
 
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import numpy as np
 
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.files import LoopResults
+from app.slam.loops.known import KnownKeyframes
 from app.slam.loops.messages import (
     AddKeyframe,
     AskG2o,
@@ -36,7 +36,7 @@ from app.slam.types import Keyframe
 
 MOST_DEATHS = 3
 """So often the work is begun again when it dies; after that, loops stay as they are."""
-STATES_KEPT = 64
+GIVEN_UP = "Loops are no longer worked on; restart to try again."
 MOST_PENDING = 4
 """Keyframes handed over again that wait at the worker's."""
 
@@ -47,9 +47,10 @@ class _Asked:
 
     Attributes:
         keyframes: it is the state after so many of them, and takes effect when they are due; None:
-            it answers the user. void: the walk went elsewhere since; only failures are told.
+            it answers the user. void: it is not waited for, or no longer; only failures are told.
     """
 
+    request: Request
     keyframes: int | None
     void: bool = False
 
@@ -71,20 +72,22 @@ class LoopLine:
         self.frame = MapFrame()
         self._answers: list[Reply] = []
         self._notices: list[str] = []
+        self._alarms: list[str] = []
         self._make_client = client
         self._client = client()
         self._keyframes = keyframes
         self._params = params
         self._latency = params.latency
-        self._frames: list[int] = []  # of all keyframes known, those gone back over included
-        self._stamps: list[int] = []
+        self._known = KnownKeyframes()
         self._count = 0
-        self._in_effect = 0
+        self._due = 0  # keyframes whose loops count at the newest frame
+        self._in_effect = 0  # keyframes whose loops do; fewer only while the work is begun again
+        self._finished = False
         self._asked: deque[_Asked] = deque()
         self._arrived: deque[tuple[int, LoopState]] = deque()
-        self._states: dict[int, LoopState] = {}  # the last, by keyframes, so that a step back waits for nobody
         self._news: list[LoopEdge] = []
         self._again: int | None = None  # the next keyframe to hand over again, after the work has died
+        self._held: list[Request] = []  # the user's, until it has caught up
         self._deaths = 0
 
     # --- the walk --------------------------------------------------------------------------------
@@ -94,13 +97,10 @@ class LoopLine:
         Returns:
             Candidates that are new by it or have another verdict.
         """
-        due = bisect_right(self._frames, frame - self._latency, hi=min(self._count, len(self._frames)))
-        while self._again is None and self._in_effect < due:
-            if self._arrived:
-                self._in_effect, state = self._arrived.popleft()
-                self._take(state)
-            elif not self._receive(None):
-                break
+        self._due = min(self._known.until(frame - self._latency), self._count)
+        self._take_due()
+        while self._again is None and self._in_effect < self._due and self._receive(None):
+            self._take_due()
         self.poll()
         news, self._news = tuple(self._news), []
         return news
@@ -108,17 +108,13 @@ class LoopLine:
     def add(self, keyframe: Keyframe, params: Loops) -> None:
         """The walk has a new keyframe, or comes by a known one again."""
         index = self._count
-        known = index < len(self._frames) and self._frames[index] == keyframe.frame
-        if not known:
-            del self._frames[index:], self._stamps[index:]
-            self._frames.append(keyframe.frame)
-            self._stamps.append(keyframe.stamp_ns)
-        self._count += 1
+        known = self._known.holds(index, keyframe.frame)
+        self._count, self._finished = index + 1, False
         self._params = params
         if not known:
-            self._states = {count: state for count, state in self._states.items() if count <= index}
-        if self._again is None and known and index + 1 in self._states and not self._asked_for_state:
-            self._arrived.append((index + 1, self._states[index + 1]))
+            self._known.put(keyframe, params)
+        if self._again is None and known and index + 1 in self._known.states and not self._asked_for_state:
+            self._arrived.append((index + 1, self._known.states[index + 1]))
             self._ask(GoTo(index + 1), index + 1, void=True)
         elif self._again is None:
             self._ask(GoTo(index + 1) if known else AddKeyframe(keyframe, params), index + 1)
@@ -128,21 +124,23 @@ class LoopLine:
 
         Nothing waits here; the state follows with the next frame or `poll`.
         """
+        self._finished = False
         for asked in self._asked:
             asked.void = True
             if asked.keyframes is None:
-                self._states.clear()  # the user's command changes them all
+                self._known.states.clear()  # the user's command changes them all
         self._arrived.clear()
         self._count = len(self._keyframes)
-        if self._again is not None or self._count > len(self._frames):  # or another engine's walk goes on here
+        self._due = min(self._known.until(frame - 1 - self._latency), self._count)
+        if self._again is not None or self._count > len(self._known):  # or another engine's walk goes on here
+            self._in_effect = -1
             self._begin_again()
             return
-        due = bisect_right(self._frames, frame - 1 - self._latency, hi=self._count)
-        wanted = range(due, self._count + 1)
-        if all(count in self._states for count in wanted):
-            self._in_effect = due
-            self._take(self._states[due])
-            self._arrived.extend((count, self._states[count]) for count in wanted[1:])
+        wanted, states = range(self._due, self._count + 1), self._known.states
+        if all(count in states for count in wanted):
+            self._in_effect = self._due
+            self._take(states[self._due])
+            self._arrived.extend((count, states[count]) for count in wanted[1:])
             self._ask(GoTo(self._count), self._count, void=True)
             return
         self._in_effect = -1
@@ -151,39 +149,36 @@ class LoopLine:
 
     def forget_after(self, frame: int) -> None:
         """Keyframes after this frame will be others."""
-        keep = max(bisect_right(self._frames, frame), self._count)
-        del self._frames[keep:], self._stamps[keep:]
-        self._states = {count: state for count, state in self._states.items() if count <= keep}
+        self._known.forget(max(self._known.until(frame), self._count))
 
     def finish(self) -> None:
         """The walk has ended: look for loops of the last keyframes too, and let all take effect that comes."""
-        self._ask(Finish(), None)
+        self._finished = True
+        if not self._given_up:
+            self._ask(Finish(), None)
 
     def wait_ready(self) -> None:
         """Wait until the work can begin, so that no frame has to: a process of its own takes a second to start."""
-        self._asked.append(_Asked(0, void=True))
-        self._client.send(GoTo(0))
-        while self._asked and self._receive(None):
-            pass
+        self._ask(GoTo(0), 0, void=True)
+        self._settle()
 
     # --- the user --------------------------------------------------------------------------------
     def command(self, request: Request) -> None:
         """Ask on behalf of the user; `poll` until it is `idle` brings the answer."""
         self._ask(request, None)
 
-    def poll(self) -> bool:
-        """Take in what has been answered, without waiting. Returns whether anything was."""
-        came = False
+    def poll(self) -> None:
+        """Take in what has been answered, without waiting."""
         while self._asked and self._receive(0.0):
-            came = True
-        if self._again is not None:
-            self._hand_over_again()
-        return came
+            pass
+        self._hand_over_again()
+        self._take_due()
 
     @property
     def idle(self) -> bool:
         """Whether every question of the user was answered and the state is that of this frame."""
-        return self._in_effect >= 0 and all(asked.keyframes is not None for asked in self._asked)
+        settled = self._again is None and all(asked.keyframes is not None for asked in self._asked)
+        return settled and (self._in_effect >= 0 or self._given_up)
 
     # --- what there is ---------------------------------------------------------------------------
     @property
@@ -197,6 +192,11 @@ class LoopLine:
         taken, self._notices = self._notices, []
         return taken
 
+    def take_alarms(self) -> list[str]:
+        """The same of whoever does the work: what happened to it is no part of the walk."""
+        taken, self._alarms = self._alarms, []
+        return taken
+
     def take_answers(self) -> list[Reply]:
         """Replies to the user's questions since the last call."""
         taken, self._answers = self._answers, []
@@ -205,14 +205,13 @@ class LoopLine:
     def results(self) -> LoopResults:
         """All that is written of loops, by all keyframes so far, whether in effect or not; waits for it."""
         self._ask(AskG2o(), None)
-        while self._asked and self._receive(None):
-            pass
+        self._settle()
         state = self._arrived[-1][1] if self._arrived else self.state
         texts = [answer.text for answer in self._answers if isinstance(answer, G2o)]
         self._answers = [answer for answer in self._answers if not isinstance(answer, G2o)]
         g2o = texts[-1] if texts else ""
         frame, edges = (MapFrame(), ()) if state is None else (self._lay(state), state.edges)
-        return LoopResults(frame, np.array(self._stamps[: self._count], dtype=np.int64), edges, g2o)
+        return LoopResults(frame, self._known.stamps_ns(self._count), edges, g2o)
 
     def close(self) -> None:
         self._client.close()
@@ -223,12 +222,25 @@ class LoopLine:
         """Whether the state of a keyframe is still outstanding."""
         return any(asked.keyframes is not None and not asked.void for asked in self._asked)
 
+    @property
+    def _given_up(self) -> bool:
+        return self._deaths > MOST_DEATHS
+
     def _ask(self, request: Request, keyframes: int | None, *, void: bool = False) -> None:
-        if self._deaths <= MOST_DEATHS:
-            self._asked.append(_Asked(keyframes, void))
+        if self._given_up:
+            if keyframes is None:
+                self._answers.append(Failure(GIVEN_UP))
+        elif self._again is not None and keyframes is None:
+            self._held.append(request)
+        else:
+            self._asked.append(_Asked(request, keyframes, void))
             self._client.send(request)
-        elif keyframes is None:
-            self._answers.append(Failure("Loops are no longer worked on; restart to try again."))
+
+    def _settle(self) -> None:
+        """Wait until all that was asked is answered, begun again as often as it takes."""
+        while self._asked or self._again is not None:
+            self._receive(None)
+            self._hand_over_again()
 
     def _receive(self, timeout: float | None) -> bool:
         """Take in one answer; whether there was one."""
@@ -247,19 +259,23 @@ class LoopLine:
             elif asked.keyframes is None:
                 self._news += [edge for _, state in self._arrived for edge in state.changed]
                 self._arrived.clear()
-                self._states.clear()  # they are of other commands
+                self._known.states.clear()  # they are of other commands
                 self._in_effect = reply.count
                 self._take(reply)
             else:
                 self._arrived.append((asked.keyframes, reply))
-                self._states[asked.keyframes] = reply
-                while len(self._states) > STATES_KEPT:
-                    del self._states[next(iter(self._states))]
+                self._known.remember(asked.keyframes, reply)
         elif asked.keyframes is None:
             self._answers.append(reply)
         elif isinstance(reply, Failure):
             self._notices.append(reply.text)
         return True
+
+    def _take_due(self) -> None:
+        """Let take effect, one after the other, what has come and is due."""
+        while self._arrived and self._in_effect < self._due:
+            self._in_effect, state = self._arrived.popleft()
+            self._take(state)
 
     def _take(self, state: LoopState) -> None:
         self.state = state
@@ -269,42 +285,51 @@ class LoopLine:
     def _lay(self, state: LoopState) -> MapFrame:
         if (state.corrections == np.eye(4)).all():
             return self.frame if not len(self.frame.T_map_odom) else MapFrame()
-        return MapFrame(np.array(self._stamps[: state.count], dtype=np.int64), state.corrections)
+        return MapFrame(self._known.stamps_ns(state.count), state.corrections)
 
+    # --- when the work has died ------------------------------------------------------------------
     def _died(self, error: LoopWorkerDied) -> None:
         self._deaths += 1
+        self._held[:0] = [asked.request for asked in self._asked if asked.keyframes is None]
+        if self._finished and Finish() not in self._held:
+            self._held.insert(0, Finish())  # it was done already
         self._asked.clear()
         self._arrived.clear()
         self._client.close()
-        if self._deaths > MOST_DEATHS:
-            self._notices.append(f"{error} Loops stay as they are from here on; restart to look for them again.")
-            self._again = None
+        if self._given_up:
+            self._alarms.append(f"{error} Loops stay as they are from here on; restart to look for them again.")
+            lost = len(self._held) - self._held.count(Finish())
+            self._answers += [Failure(GIVEN_UP)] * lost
+            self._again, self._held = None, []
             return
-        self._notices.append(f"{error} It is started again; loops follow once it has caught up.")
+        self._alarms.append(f"{error} It is started again; loops follow once it has caught up.")
         self._client = self._make_client()
         self._begin_again()
 
     def _begin_again(self) -> None:
         """Hand all keyframes over from the first on, while frames go on with the state that there is."""
         self._again = 0
-        self._states.clear()
-        self._asked.append(_Asked(0, void=True))
+        self._known.forget(self._count)  # those gone back over come again as new ones
+        self._known.states.clear()
         commands = (self.state.undo, self.state.redo) if self.state is not None else ((), ())
-        self._client.send(LoadCommands(*commands))
+        self._ask(GoTo(0), 0, void=True)
+        self._ask(LoadCommands(*commands), 0, void=self._in_effect >= 0 or self._due > 0)
         self._hand_over_again()
 
     def _hand_over_again(self) -> None:
-        """A few at a time, so that they do not pile up in memory. The last of them brings the state."""
+        """A few at a time, so that they do not pile up in memory. Those that count already change nothing."""
         while self._again is not None and self._client.pending < MOST_PENDING:
             if self._again >= min(self._count, len(self._keyframes)):
                 self._again = None
-                self._in_effect = -1
-                self._ask(GoTo(self._count), self._count)
+                held, self._held = self._held, []
+                for request in held:
+                    if self._finished or not isinstance(request, Finish):  # the walk may have gone on since
+                        self._ask(request, None)
                 return
             keyframe = self._keyframes[self._again]
-            if self._again == len(self._frames):  # another engine had it
-                self._frames.append(keyframe.frame)
-                self._stamps.append(keyframe.stamp_ns)
-            self._asked.append(_Asked(0, void=True))
-            self._client.send(AddKeyframe(keyframe, self._params))
+            if self._again == len(self._known):  # another engine had it
+                self._known.put(keyframe, self._params)
+            params = self._known.params(self._again)
             self._again += 1
+            passed = self._again <= self._in_effect if self._in_effect >= 0 else self._again < self._due
+            self._ask(AddKeyframe(keyframe, params), self._again, void=passed)
