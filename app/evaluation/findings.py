@@ -102,7 +102,8 @@ def _claim(recordings: Sequence[Evaluated], name: str, base: str, what: str, met
     worse = [pair[0] for pair in pairs if _compare(pair[1], pair[2])[1]]
     if len(pairs) > 1:
         sentence += f" over {len(pairs)} recordings{_certainty(pairs)}"
-        sentence += f"; it rises on {', '.join(worse)}" if worse else ""
+        where = "all" if len(worse) == len(pairs) else ", ".join(worse)
+        sentence += f"; it rises on {where}" if worse else ""
     return sentence + ("; this goes against what the paper found." if against and metric.promised else ".")
 
 

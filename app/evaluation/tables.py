@@ -182,7 +182,7 @@ def beside_paper(recordings: Sequence[Evaluated]) -> Table | None:
         errors = [c.accuracy if c else None for c in found]
         times = [c.runtime if c else None for c in found]
         lines: list[tuple[str, list[float | None], str]] = [
-            ("ATE (m), here", [e.ate_m["rmse"] if e else None for e in errors], ".3f"),
+            ("ATE (m), here", [e.ate_m["rmse"] if e else None for e in errors], ".4f"),
             ("ATE (m), paper", [sequence.ate_m.get(name) for name in systems], ".2f"),
             ("RPE (m), here, per frame", [_rpe(e, RPE_OVER[0]) if e else None for e in errors], ".4f"),
             ("RPE (m), paper", [sequence.rpe_m.get(name) for name in systems], ".2f"),

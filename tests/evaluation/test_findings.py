@@ -71,6 +71,7 @@ def test_outdoors_is_only_told_of_recordings_outdoors() -> None:
 def test_recordings_that_go_the_other_way_are_named_though_the_mean_falls() -> None:
     text = about(said("outdoor", [1.0, 3.0], [3.0, 2.0]), "error (ATE)")
     assert "falls by" in text and "it rises on outdoor_1" in text and "outdoor_0" not in text
+    assert "it rises on all" in about(said("outdoor", [3.0, 3.0], [2.0, 2.0]), "error (ATE)")
 
 
 def test_a_difference_that_recordings_do_not_share_may_be_chance() -> None:
