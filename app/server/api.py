@@ -1,31 +1,39 @@
-"""The REST interface for scripts: state, parameters, transport, recordings, exports."""
+"""The REST interface for scripts: state, parameters, transport, breakpoints, loops, notes, recordings, exports."""
 
 import math
 import shutil
 import tempfile
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, BackgroundTasks, HTTPException
 from fastapi.responses import FileResponse, PlainTextResponse
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
+from app.server.breakpoints import Breakpoints
 from app.server.folders import Folders
 from app.server.fork import Engine
 from app.server.protocol import (
+    AddNote,
     Command,
     OpenRecording,
+    OverruleLoop,
     Pause,
     Play,
+    RedoLoop,
     Restart,
     Save,
     Seek,
+    SetBreakpoints,
     SetParams,
     SetSpeed,
     StepFrame,
+    UndoLoop,
 )
-from app.server.views import Speed, StateView, state_view
+from app.server.views import LoopsState, Speed, StateView, loops_state, state_view
+from app.slam.loops.types import Accept, Add, Reject, SetWeight
 from app.slam.params import Params
 
 EXPORT_PATIENCE_S = 600.0
@@ -53,12 +61,49 @@ class SpeedBody(BaseModel):
 Action = Annotated[Simple | StepBody | SeekBody | SpeedBody, Field(discriminator="action")]
 
 
+class BreakpointsBody(BaseModel):
+    """Where playing pauses. A limit pauses where it is exceeded; left out or null it does not."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    loop_found: bool = Field(False, description="A loop was accepted.")
+    loop_rejected: bool = Field(False, description="A loop candidate was rejected.")
+    no_ground: bool = Field(False, description="A frame without a ground plane.")
+    degenerate: bool = Field(False, description="A scan leaves a direction open.")
+    dropped: bool = Field(False, description="A scan was left out.")
+    planarity: float | None = Field(None, ge=0, description="λ3/λ2 of the ground's seeds.")
+    residual: float | None = Field(None, ge=0, description="RMS of the filter's update, m.")
+    frame_ms: float | None = Field(None, ge=0, description="Time that the engine took for the frame, ms.")
+    error: float | None = Field(None, ge=0, description="To the truth, m.")
+
+
+class OverruleBody(BaseModel):
+    """The user's word on the loop of two keyframes."""
+
+    action: Literal["accept", "reject", "weigh", "add"]
+    older: int = Field(ge=0)
+    newer: int = Field(ge=0)
+    weight: float = Field(1.0, gt=0, description="Of `weigh`: divides the loop's covariance.")
+    register_: bool = Field(True, alias="register", description="Of `add`: register the two, or tie them as they are.")
+
+
+class UndoBody(BaseModel):
+    action: Literal["undo", "redo"]
+
+
+LoopAction = Annotated[OverruleBody | UndoBody, Field(discriminator="action")]
+
+
+class NoteBody(BaseModel):
+    text: str = Field(min_length=1, max_length=1000)
+
+
 class OpenBody(BaseModel):
     path: str = Field(description="Of a recording in the folders given at the start.")
     truth: str | None = None
 
 
-Export = Literal["trajectory.tum", "timings.csv", "map.ply", "report.json"]
+Export = Literal["trajectory.tum", "timings.csv", "map.ply", "report.json", "session.hemislam"]
 
 
 def make_router(engine: Engine, folders: Folders) -> APIRouter:
@@ -95,6 +140,32 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
     def transport(action: Action) -> None:
         """Play, pause, step, seek, set the speed ("max": as fast as it can), start again."""
         _send(engine, _command(action))
+
+    @router.get("/breakpoints")
+    def breakpoints() -> BreakpointsBody:
+        """Where playing pauses."""
+        return BreakpointsBody(**asdict(engine.snapshot.breakpoints))
+
+    @router.put("/breakpoints")
+    def set_breakpoints(body: BreakpointsBody) -> BreakpointsBody:
+        """Pause where one of these holds, in place of those before. Why it paused, the notices in the state tell."""
+        _send(engine, SetBreakpoints(Breakpoints(**body.model_dump())))
+        return body
+
+    @router.get("/loops")
+    def loops() -> LoopsState:
+        """Loop candidates with their verdicts, and the user's word on them."""
+        return loops_state(engine.snapshot.loops)
+
+    @router.post("/loops", status_code=202)
+    def overrule(body: LoopAction) -> None:
+        """Accept, reject, weigh or add a loop; undo or redo that."""
+        _send(engine, _loop_command(body))
+
+    @router.post("/notes", status_code=202)
+    def add_note(body: NoteBody) -> None:
+        """Keep a remark on the present frame in the session; the state lists them."""
+        _send(engine, AddNote(body.text))
 
     @router.get("/recordings")
     def recordings() -> list[str]:
@@ -142,6 +213,22 @@ def _command(action: Simple | StepBody | SeekBody | SpeedBody) -> Command:
             return Pause()
         case _:
             return Restart()
+
+
+def _loop_command(body: OverruleBody | UndoBody) -> Command:
+    match body:
+        case OverruleBody(action="accept", older=older, newer=newer):
+            return OverruleLoop(Accept(older, newer))
+        case OverruleBody(action="reject", older=older, newer=newer):
+            return OverruleLoop(Reject(older, newer))
+        case OverruleBody(action="weigh", older=older, newer=newer):
+            return OverruleLoop(SetWeight(older, newer, body.weight))
+        case OverruleBody(older=older, newer=newer):
+            return OverruleLoop(Add(older, newer, register=body.register_))
+        case UndoBody(action="undo"):
+            return UndoLoop()
+        case _:
+            return RedoLoop()
 
 
 def _save(engine: Engine, folder: Path, *, trajectory_only: bool) -> None:

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from app.server.breakpoints import Breakpoints
 from app.server.follower import Follower, same_recording
 from app.server.journal import SUFFIX, SavedSession, read_session, write_session
-from app.server.protocol import Command, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
+from app.server.protocol import AddNote, Command, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
 from app.server.setup import Setup
 from app.slam.errors import HemislamError
 
@@ -71,7 +71,8 @@ def forked(a: Snapshot, values: Mapping[str, Any]) -> SavedSession:
         raise HemislamError(_NOT_KEPT)
     saved = read_session(a.journal)
     history = tuple(entry for entry in saved.state.history if entry[0] <= frame)
-    state = replace(saved.state, params=a.params.with_values(dict(values)), history=history)
+    notes = tuple(note for note in saved.state.notes if note.frame <= frame)
+    state = replace(saved.state, params=a.params.with_values(dict(values)), history=history, notes=notes)
     return SavedSession(saved.opened, state, frame)
 
 
@@ -153,6 +154,8 @@ class Workspace:
             except OSError as error:
                 raise HemislamError(f"The fork can not be written to {folder}: {error.strerror}.") from None
             self._begin(file, session, name, folder, session.frame)
+            changed = ", ".join(f"{path} = {value}" for path, value in (values or {}).items())
+            a.engine.send(AddNote(f"Forked as {self.names[1]}{f' with {changed}' if changed else ''}."))
 
     def open(self, path: Path) -> None:
         """Start B on a session file, a kept fork or any other of A's recording; it comes to where A is.
@@ -168,6 +171,7 @@ class Workspace:
             if ours is None or (ours.recording, ours.start_s) != (theirs.recording, theirs.start_s):
                 raise HemislamError(f"{path.name} is of {theirs.recording} from {theirs.start_s:g} s; open that first.")
             self._begin(path, session, path.stem, folder, 0)
+            a.engine.send(AddNote(f"Opened {path.name} beside this session."))
 
     def kept(self) -> list[Path]:
         """Session files of A's recording that B can be opened on, the newest first."""
@@ -194,6 +198,7 @@ class Workspace:
                 b.engine.send(Play())
             self._follower = Follower(before.transport.frame)
             self._sides = (b, a)
+            b.engine.send(AddNote(f"Swapped: goes on in place of {a.name}."))
 
     def discard(self) -> None:
         """End B; what it came to is gone. Raises HemislamError without a fork."""
@@ -201,6 +206,7 @@ class Workspace:
             b = self._end()
             if b.folder is not None:
                 shutil.rmtree(b.folder, ignore_errors=True)
+            self.send(AddNote(f"Discarded {b.name}."))
 
     def keep(self, name: str = "") -> Path:
         """End B and keep its session as a file, which can be opened again.
@@ -228,6 +234,7 @@ class Workspace:
                 ) from None
             if b.folder is not None:
                 shutil.rmtree(b.folder, ignore_errors=True)
+            self.send(AddNote(f"Kept {b.name} as {path.name}."))
             return path
 
     def close(self) -> None:

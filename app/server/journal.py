@@ -22,7 +22,7 @@ from typing import Any
 import yaml
 
 from app import __version__
-from app.server.protocol import Command
+from app.server.protocol import Command, Note
 from app.slam.errors import HemislamError
 from app.slam.loops import edits
 from app.slam.loops.types import Command as Overruling
@@ -54,12 +54,14 @@ class State:
     """Attributes:
     params: as chosen now. history: from which frame on which were in force, ascending.
     overrulings: of loops, in force. undone: that can be done again, the next one last.
+    notes: in the order in which they were made.
     """
 
     params: Params
     history: tuple[tuple[int, Params], ...] = ()
     overrulings: tuple[Overruling, ...] = ()
     undone: tuple[Overruling, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +209,7 @@ def _state_tree(state: State) -> dict[str, Any]:
         "history": [[frame, Params().changed(params)] for frame, params in state.history],
         "overrulings": yaml.safe_load(edits.write(state.overrulings)),
         "undone": yaml.safe_load(edits.write(state.undone)),
+        "notes": [[note.frame, note.text] for note in state.notes],
     }
 
 
@@ -216,6 +219,7 @@ def _state(tree: Mapping[str, Any]) -> State:
         history=tuple((int(frame), Params().with_values(values)) for frame, values in tree["history"]),
         overrulings=edits.read(yaml.safe_dump(tree["overrulings"])),
         undone=edits.read(yaml.safe_dump(tree["undone"])),
+        notes=tuple(Note(int(frame), str(text)) for frame, text in tree.get("notes", ())),
     )
 
 

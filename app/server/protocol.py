@@ -62,6 +62,13 @@ class SetBreakpoints:
 
 
 @dataclass(frozen=True, slots=True)
+class AddNote:
+    """Keep a remark on the present frame in the session."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class SetParams:
     """Change parameters by dotted name, for example {"ground.alpha": 30}."""
 
@@ -144,6 +151,7 @@ Command = (
     | SetSpeed
     | Seek
     | SetBreakpoints
+    | AddNote
     | SetParams
     | LoadParams
     | OpenRecording
@@ -233,6 +241,14 @@ class Notice:
 
 
 @dataclass(frozen=True, slots=True)
+class Note:
+    """A remark of the user, or what was done with forks."""
+
+    frame: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class LoopsView:
     """Loops as they count at the newest frame.
 
@@ -283,6 +299,7 @@ class Snapshot:
         T_map_truth: (4, 4) that lays the truth's positions over the map, None until the walk
             determines it.
         breakpoints: where playing pauses.
+        notes: of this session, in the order in which they were made.
         progress: what takes long just now, or None. notices: the newest 50.
         saved: the newest 10 `Save`s that ended.
         engine_alive: False when the engine's process has died.
@@ -304,6 +321,7 @@ class Snapshot:
     series: dict[str, F64] = field(default_factory=dict)
     T_map_truth: F64 | None = None
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
+    notes: tuple[Note, ...] = ()
     progress: Progress | None = None
     notices: tuple[Notice, ...] = ()
     saved: tuple[Saved, ...] = ()

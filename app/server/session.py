@@ -13,9 +13,11 @@ from app.server.live import LiveRun
 from app.server.loop_desk import LoopDesk
 from app.server.player import Player
 from app.server.protocol import (
+    AddNote,
     Command,
     InspectLoop,
     LoadParams,
+    Note,
     OpenRecording,
     OverruleLoop,
     Pause,
@@ -89,6 +91,7 @@ class Session:
         self._open_run = open_run
         self._resolve = resolve
         self._params = self._base = params
+        self._notes: tuple[Note, ...] = ()
         self._resuming: int | None = None  # the frame that a reopened session was at, until it is there
         # What is wanted but not done yet:
         self._opening: Callable[[], None] | None = None
@@ -136,6 +139,9 @@ class Session:
             case SetBreakpoints(breakpoints):
                 self._player.breakpoints = breakpoints
                 self._outbox.put(breakpoints=breakpoints, urgent=True)
+            case AddNote(text):
+                if text.strip():
+                    self._show_notes((*self._notes, Note(self._need_run().frame, text.strip())))
             case SetParams(values):
                 self._set_params(self._params.with_values(values))
             case LoadParams(text):
@@ -147,7 +153,7 @@ class Session:
                 self._open_soon(path, self._reopen)
             case Save(folder, trajectory_only):
                 run = self._need_run()
-                session = session_of(run, self._params)
+                session = session_of(run, self._params, self._notes)
                 self._saver.start(folder, run.saver(folder, session, trajectory_only=trajectory_only))
             case OverruleLoop() | UndoLoop() | RedoLoop() | TryLoop() | InspectLoop():
                 self._desk.handle(command, self._need_loops())
@@ -165,6 +171,10 @@ class Session:
                 run.choose(usable)
             self._player.relabelling |= any(EFFECT[path] == "now" for path in changed)
         self._page.params(params, self._pending_restart())
+
+    def _show_notes(self, notes: tuple[Note, ...]) -> None:
+        self._notes = notes
+        self._outbox.put(notes=notes, urgent=True)
 
     def _pending_restart(self) -> tuple[str, ...]:
         """Names of parameters that the engine still has another value of, since it can not change them."""
@@ -239,7 +249,7 @@ class Session:
     def _note(self, *, settled: bool) -> None:
         run = self._player.run
         if run is not None and self._resuming is None and self._keeper.keeping:
-            self._keeper.note(run.frame, state_of(run, self._params), settled=settled)
+            self._keeper.note(run.frame, state_of(run, self._params, self._notes), settled=settled)
 
     # --- opening ---------------------------------------------------------------------------------
     def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
@@ -303,6 +313,7 @@ class Session:
         self._keeper.begin(run)
         self._desk.clear()
         self._player.take(run)
+        self._show_notes(saved.state.notes if saved is not None else ())
         self._resuming = None
         if saved is not None:
             run.resume(saved)

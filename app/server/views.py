@@ -2,13 +2,15 @@
 
 import math
 from dataclasses import asdict
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import yaml
 from pydantic import BaseModel, Field
 from scipy.spatial.transform import Rotation
 
 from app.sensors.live.status import LiveState
-from app.server.protocol import OpenedRecording, Snapshot
+from app.server.protocol import LoopsView, OpenedRecording, Snapshot
+from app.slam.loops import edits
 from app.slam.types import StepResult
 
 Speed = Annotated[float, Field(ge=0.1)] | Literal["max"]
@@ -87,6 +89,29 @@ class LiveView(BaseModel):
     counters: dict[str, int]
 
 
+class NoteView(BaseModel):
+    frame: int
+    text: str
+
+
+class LoopView(BaseModel):
+    """A loop candidate, by keyframes."""
+
+    older: int
+    newer: int
+    verdict: str
+    reason: str
+    origin: str
+    overruled: bool = Field(description="Whether the verdict is the user's.")
+    weight: float
+
+
+class LoopsState(BaseModel):
+    loops: list[LoopView]
+    overrulings: list[dict[str, Any]] = Field(description="The user's word on loops, in order, as in a file of edits.")
+    undone: list[dict[str, Any]] = Field(description="That can be done again, the next one last.")
+
+
 class StateView(BaseModel):
     session: int
     revision: int
@@ -99,6 +124,27 @@ class StateView(BaseModel):
     pending_restart: list[str]
     notices: list[NoticeView]
     live: LiveView | None
+    journal: str | None = Field(description="File in which the session is kept; opening it goes on from there.")
+    notes: list[NoteView]
+
+
+def loops_state(view: LoopsView) -> LoopsState:
+    return LoopsState(
+        loops=[
+            LoopView(
+                older=edge.older,
+                newer=edge.newer,
+                verdict=edge.verdict,
+                reason=edge.reason,
+                origin=edge.origin,
+                overruled=edge.overruled,
+                weight=edge.weight,
+            )
+            for edge in view.edges
+        ],
+        overrulings=yaml.safe_load(edits.write(view.undo)),
+        undone=yaml.safe_load(edits.write(view.redo)),
+    )
 
 
 def state_view(snapshot: Snapshot) -> StateView:
@@ -123,6 +169,8 @@ def state_view(snapshot: Snapshot) -> StateView:
         pending_restart=list(snapshot.pending_restart),
         notices=[NoticeView(number=n.number, level=n.level, text=n.text) for n in snapshot.notices],
         live=_live(snapshot.live) if snapshot.live else None,
+        journal=str(snapshot.journal) if snapshot.journal else None,
+        notes=[NoteView(frame=note.frame, text=note.text) for note in snapshot.notes],
     )
 
 

@@ -14,6 +14,8 @@ COLUMNS: Final = 480
 """Most columns that a recording is thinned to, however long."""
 DEGENERATE_CM: Final = 5.0
 """A direction more uncertain than this is called degenerate (`app.slam.iekf.DEGENERATE_SIGMA`)."""
+_NOTES: Final = 50
+_NOTE_LETTERS: Final = 120
 _UNKNOWN: Final = 65535
 _STEPS: Final = 65534
 
@@ -196,6 +198,7 @@ def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
         "stamps": packed(columns.stamps, duration),
         "strips": strips,
         "loops": {name: counts for name, counts in columns.loops.items() if any(counts)},
+        "notes": [[note.frame, note.text[:_NOTE_LETTERS]] for note in snapshot.notes[-_NOTES:]],
     }
 
 

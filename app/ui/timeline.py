@@ -77,6 +77,7 @@ def _differs(drawn: Snapshot, current: Snapshot) -> bool:
     return (
         drawn.result is not current.result
         or drawn.loops.edges is not current.loops.edges
+        or drawn.notes != current.notes
         or drawn.recording is not current.recording
         or drawn.params.imu != current.params.imu
     )

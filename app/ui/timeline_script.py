@@ -112,6 +112,8 @@ function draw() {
   say('loops', 8, mid, QUIET);
   say(counts.join('  ') || '–', W - 8, mid, '#e6ebf2', 'right');
   const bottom = H - 3;
+  pen.fillStyle = '#ffd166';
+  for (const [frame] of d.notes) pen.fillRect(X(frame + 0.5) - 1, HEAD - 5, 2, 5);
   if (d.present >= 0) {
     pen.fillStyle = '#ffffff';
     pen.fillRect(X(d.present + 0.5) - 0.75, HEAD - 3, 1.5, bottom - HEAD + 3);
@@ -138,6 +140,9 @@ canvas.onpointermove = (event) => {
   const row = Math.floor((y - HEAD) / ROW), over = x >= NAME && x <= box.width - VALUE;
   const loops = 'Loops by verdict: ✓ accepted, × rejected, ? waiting for others that agree.';
   canvas.title = over || row < 0 ? '' : d.strips[row] ? d.strips[row].hint : loops;
+  const place = (frame) => NAME + (frame + 0.5) / d.frames * (box.width - NAME - VALUE);
+  const near = d.notes.filter(([frame]) => over && Math.abs(place(frame) - x) < 4);
+  if (near.length) canvas.title = near.map(([f, text]) => `${f.toLocaleString('en')}: ${text}`).join('\\n');
   canvas.style.cursor = over || scrubbing ? 'col-resize' : 'default';
   hover = over || scrubbing ? frameAt(event) : null;
   if (scrubbing) ask(hover, false);

@@ -28,6 +28,7 @@ from app.ui.html import ACCENT, STYLE, heading
 from app.ui.keys import KEYS
 from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
+from app.ui.notes import NotesPanel
 from app.ui.notices import NoticePanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.readouts import ReadoutPanel
@@ -84,6 +85,8 @@ class Workbench:
         self._timeline = TimelinePanel(gui, engine.send, lambda: engine.snapshot, now)
         with gui.add_folder("Pause when", expand_by_default=False):
             self._breakpoints = BreakpointPanel(gui, engine.send)
+        with gui.add_folder("Notes", expand_by_default=False):
+            self._notes = NotesPanel(gui, engine.send)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Tune", viser.Icon.ADJUSTMENTS_HORIZONTAL):
             self._sides = Sides(gui, forks)
@@ -165,6 +168,7 @@ class Workbench:
         view = self._compare.seen(view)
         self._transport.tick(current)
         self._breakpoints.tick(current)
+        self._notes.draw(current)
         self._parameters.tick(self._sides.tuned(current))
         self._notices.draw(current)
         self._header.draw(current)

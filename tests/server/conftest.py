@@ -1,6 +1,46 @@
 """The engine's process is spawned anew and must find `server_fakes`, so its folder goes on the path."""
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).parent))
+
+import server_fakes as fakes
+from server_site import Site, engine_recording, serving
+
+from app.server.setup import Setup
+from app.server.viser_page import Viser, start_viser
+from app.server.worker import EngineProcess
+
+
+@pytest.fixture(scope="module")
+def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EngineProcess]:
+    recording = tmp_path_factory.mktemp("recordings") / "walk-60.mcap"
+    recording.write_bytes(b"x")
+    (recording.parent / "walk-30.mcap").write_bytes(b"x")
+    process = EngineProcess(Setup(recording=recording), main=fakes.fake_main)
+    yield process
+    process.close()
+
+
+@pytest.fixture(scope="module")
+def target() -> Iterator[Viser]:
+    running = start_viser()
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="module")
+def site(engine: EngineProcess, target: Viser) -> Iterator[Site]:
+    recording = engine_recording(engine)
+    with serving(engine, target, recording.parent, None) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def locked_site(engine: EngineProcess, target: Viser) -> Iterator[Site]:
+    with serving(engine, target, engine_recording(engine).parent, "the-token") as running:
+        yield running

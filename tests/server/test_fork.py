@@ -18,6 +18,8 @@ from app.server.fork import Workspace, forked
 from app.server.journal import Journal, Opened, State, read_session
 from app.server.protocol import (
     SERIES,
+    AddNote,
+    Note,
     OpenRecording,
     Pause,
     Play,
@@ -169,6 +171,12 @@ def test_a_fork_is_led_swapped_and_discarded(pair: Workspace, tmp_path: Path) ->
     pair.discard()
     assert pair.other is None and kept is not None and kept.exists(), "what A is now is not thrown away with the other"
     assert list(tmp_path.glob("*.hemislam")), "nor is the first session"
+    until(lambda: pair.snapshot, lambda s: len(s.notes) == 2)
+    assert [(note.frame, note.text.split()[0]) for note in pair.snapshot.notes][1:] == [
+        (pair.snapshot.transport.frame, "Discarded")
+    ]
+    first = read_session(a.journal)  # type: ignore[arg-type]  # None would fail
+    assert first.state.notes == (Note(20, "Forked as wide with ground.sigma = 0.2."),)
     with pytest.raises(HemislamError, match="no fork"):
         pair.swap()
 
@@ -310,4 +318,6 @@ def test_breakpoints_stay_with_what_is_shown() -> None:
     workspace = Workspace(a, Setup(), lambda _: b)  # type: ignore[arg-type, return-value]
     workspace._sides = (Side(a, "main"), Side(b, "b"))  # type: ignore[arg-type]
     workspace.swap()
-    assert b.sent == [SetSpeed(1.0), SetBreakpoints(Breakpoints(no_ground=True)), Seek(7)] and a.sent == [Pause()]
+    *led, noted = b.sent
+    assert led == [SetSpeed(1.0), SetBreakpoints(Breakpoints(no_ground=True)), Seek(7)] and a.sent == [Pause()]
+    assert noted == AddNote("Swapped: goes on in place of main.")

@@ -27,7 +27,7 @@ from app.server.journal import (
     size_of,
     write_session,
 )
-from app.server.protocol import OpenRecording, Play, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.protocol import AddNote, Note, OpenRecording, Play, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
 from app.server.run import Run, open_run
 from app.server.session import Session
 from app.server.setup import Setup
@@ -45,7 +45,11 @@ def saved(tmp_path: Path) -> SavedSession:
     recording.write_bytes(b"12345")
     coarse = Params().with_values({"ground.alpha": 30.0})
     state = State(
-        coarse, ((0, Params()), (12, coarse)), (Accept(1, 20, 21), Add(2, 30, None, False, 31)), (Reject(3, 9),)
+        coarse,
+        ((0, Params()), (12, coarse)),
+        (Accept(1, 20, 21), Add(2, 30, None, False, 31)),
+        (Reject(3, 9),),
+        (Note(12, 'the "door" opens\nand closes'),),
     )
     return SavedSession(Opened(recording, None, 2.0, 30.0, 5), state, 41)
 
@@ -138,7 +142,8 @@ class Kept(Desk):
 def walk_about(desk: Kept) -> Snapshot:
     """On, back, other parameters, on, and one last wish that no frame has seen yet."""
     desk.do(Seek(30), SetParams({"ground.sigma": 0.02}), Seek(60), Seek(45), SetParams({"scan.voxel_size": 0.6}))
-    return desk.do(Seek(80), Seek(70), StepFrame(2), SetParams({"ground.alpha": 35.0}))
+    desk.do(Seek(80), Seek(70), AddNote("a turn"))
+    return desk.do(StepFrame(2), SetParams({"ground.alpha": 35.0}))
 
 
 def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path) -> None:
@@ -149,6 +154,9 @@ def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path)
     assert again.params == there.params and again.transport.frame == there.transport.frame == 72
     assert again.trajectory is not None and there.trajectory is not None
     np.testing.assert_array_equal(again.trajectory, there.trajectory)
+    assert again.notes == there.notes == (Note(70, "a turn"),)
+    assert again.result is not None and there.result is not None
+    np.testing.assert_array_equal(again.result.cloud.labels, there.result.cloud.labels, "relabelled by the last wish")
     third = Kept(tmp_path, second.journal)  # the one reopened is kept as well
     assert page(first.do(StepFrame(10))) == page(second.do(StepFrame(10))) == page(third.do(StepFrame(10)))
     for desk in (first, second, third):

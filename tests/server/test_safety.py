@@ -18,9 +18,9 @@ import pytest
 import server_fakes as fakes
 import zstandard
 from mcap.reader import make_reader
+from server_site import PATIENCE_S, PROTOCOL, Site
 from test_live_run import free_ports
 from test_rewind import SAMPLE
-from test_web import PATIENCE_S, PROTOCOL, Site
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin

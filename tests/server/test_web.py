@@ -6,11 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,103 +14,15 @@ import httpx
 import msgspec
 import numpy as np
 import pytest
-import server_fakes as fakes
-import viser
 import zstandard
+from server_site import PATIENCE_S, PROTOCOL, Site
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
 from app.server.access import Access
-from app.server.folders import Folders
-from app.server.setup import Setup
-from app.server.viser_page import Viser, start_viser
-from app.server.web import links, listen, make_app, make_server
-from app.server.worker import EngineProcess
+from app.server.web import links, listen
 from app.slam.errors import HemislamError
-
-PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
-PATIENCE_S = 20.0
-
-
-@dataclass
-class Site:
-    port: int
-    engine: EngineProcess
-    viser: Viser
-    folder: Path
-    access: Access
-
-    def url(self, path: str = "/") -> str:
-        return f"http://127.0.0.1:{self.port}{path}"
-
-    def socket(self, **kwargs: object) -> ClientConnection:
-        url = f"ws://127.0.0.1:{self.port}/"
-        return connect(url, subprotocols=[PROTOCOL], max_size=None, proxy=None, **kwargs)  # type: ignore[arg-type]
-
-
-@contextmanager
-def serving(engine: EngineProcess, target: Viser, folder: Path, token: str | None) -> Iterator[Site]:
-    listener = listen("127.0.0.1", 0)
-    access = Access(listener.getsockname()[1], token)
-    server = make_server(make_app(engine, Folders([folder]), target, access))
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
-    try:
-        yield Site(access.port, engine, target, folder, access)
-    finally:
-        server.should_exit = True
-        thread.join()
-        listener.close()
-
-
-@pytest.fixture(scope="module")
-def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EngineProcess]:
-    recording = tmp_path_factory.mktemp("recordings") / "walk-60.mcap"
-    recording.write_bytes(b"x")
-    (recording.parent / "walk-30.mcap").write_bytes(b"x")
-    process = EngineProcess(Setup(recording=recording), main=fakes.fake_main)
-    yield process
-    process.close()
-
-
-@pytest.fixture(scope="module")
-def target() -> Iterator[Viser]:
-    running = start_viser()
-    yield running
-    running.stop()
-
-
-@pytest.fixture(scope="module")
-def site(engine: EngineProcess, target: Viser) -> Iterator[Site]:
-    recording = engine_recording(engine)
-    with serving(engine, target, recording.parent, None) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def locked_site(engine: EngineProcess, target: Viser) -> Iterator[Site]:
-    with serving(engine, target, engine_recording(engine).parent, "the-token") as running:
-        yield running
-
-
-def engine_recording(engine: EngineProcess) -> Path:
-    deadline = time.monotonic() + PATIENCE_S
-    while (recording := engine.snapshot.recording) is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    return recording.path
-
-
-def eventually(site: Site, **wanted: object) -> dict[str, object]:
-    """The transport, once it is as wanted."""
-    deadline = time.monotonic() + PATIENCE_S
-    while True:
-        transport: dict[str, object] = httpx.get(site.url("/api/state")).json()["transport"]
-        if wanted.items() <= transport.items():
-            return transport
-        assert time.monotonic() < deadline, transport
-        time.sleep(0.02)
 
 
 # --- page and bridge -----------------------------------------------------------------------------
@@ -281,77 +189,6 @@ def test_a_token_is_made_wherever_others_could_reach_us(host: str, needed: bool)
     access = Access.on(host, 8080)
     assert (access.token is not None) == needed
     assert all((f":8080/?token={access.token}" in address) == needed for address in links(host, access))
-
-
-# --- REST ----------------------------------------------------------------------------------------
-def test_transport_by_rest(site: Site) -> None:
-    def post(**body: object) -> int:
-        return httpx.post(site.url("/api/transport"), json=body).status_code
-
-    assert post(action="seek", frame=7) == 202
-    eventually(site, frame=7, playing=False)
-    assert post(action="step") == 202
-    eventually(site, frame=8)
-    assert post(action="speed", factor="max") == 202
-    assert post(action="play") == 202
-    eventually(site, finished=True, frame=59, speed="max")
-    assert post(action="restart") == 202
-    assert post(action="pause") == 202
-    eventually(site, finished=False, playing=False)
-    for bad in (
-        {"action": "fly"},
-        {"action": "seek"},
-        {"action": "speed", "factor": 0},
-        {"action": "step", "frames": -1},
-    ):
-        assert post(**bad) == 422
-
-
-def test_parameters_by_rest(site: Site) -> None:
-    answer = httpx.patch(site.url("/api/params"), json={"ground": {"alpha": 31}})
-    assert answer.json()["ground"]["alpha"] == 31
-    deadline = time.monotonic() + PATIENCE_S
-    while httpx.get(site.url("/api/params")).json()["ground"]["alpha"] != 31:
-        assert time.monotonic() < deadline
-    refused = httpx.patch(site.url("/api/params"), json={"ground": {"alpha": 900}})
-    assert refused.status_code == 422 and "`ground.alpha` can not be 900" in refused.json()["detail"]
-    schema = httpx.get(site.url("/api/openapi.json")).json()["components"]["schemas"]["Ground"]["properties"]["alpha"]
-    assert schema["minimum"] == 1 and schema["maximum"] == 90 and schema["unit"] == "deg"
-
-
-def test_exports_by_rest(site: Site) -> None:
-    httpx.post(site.url("/api/transport"), json={"action": "seek", "frame": 20})
-    eventually(site, frame=20)
-    trajectory = httpx.get(site.url("/api/export/trajectory.tum"), timeout=PATIENCE_S).text.splitlines()
-    assert len(trajectory) == 21 and all(len(line.split()) == 8 for line in trajectory)
-    cloud = httpx.get(site.url("/api/export/map.ply"), timeout=PATIENCE_S).content
-    assert f"element vertex {5 * fakes.POINTS:012d}".encode() in cloud
-    assert httpx.get(site.url("/api/export/passwd")).status_code == 422
-
-
-@pytest.mark.parametrize("path", ["/etc/passwd", "../../../../etc/passwd", "missing.mcap"])
-def test_recordings_outside_the_folders_are_not_opened(site: Site, path: str) -> None:
-    answer = httpx.post(site.url("/api/recordings"), json={"path": path})
-    assert answer.status_code == 422 and "There is no" in answer.json()["detail"]
-
-
-@pytest.mark.parametrize(
-    "path", ["/../pyproject.toml", "/%2e%2e/pyproject.toml", "/..%2fpyproject.toml", "/index.html"]
-)
-def test_no_file_but_the_page_is_served(site: Site, path: str) -> None:
-    with socket.create_connection(("127.0.0.1", site.port)) as raw:
-        raw.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n".encode())
-        assert raw.recv(100).split()[1] == b"404"
-
-
-def test_recordings_inside_are_listed_and_opened(site: Site) -> None:
-    names = httpx.get(site.url("/api/recordings")).json()
-    assert [Path(name).name for name in names] == ["walk-30.mcap", "walk-60.mcap"]
-    for name in names:
-        assert httpx.post(site.url("/api/recordings"), json={"path": name}).status_code == 202
-        deadline = time.monotonic() + PATIENCE_S
-        while httpx.get(site.url("/api/state")).json()["recording"]["path"] != name:
-            assert time.monotonic() < deadline
 
 
 # --- the whole server ----------------------------------------------------------------------------

@@ -1,0 +1,72 @@
+"""The server's public port on a real socket, for tests of what goes over it."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import viser
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+from app.server.access import Access
+from app.server.folders import Folders
+from app.server.viser_page import Viser
+from app.server.web import listen, make_app, make_server
+from app.server.worker import EngineProcess
+
+PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
+PATIENCE_S = 20.0
+
+
+@dataclass
+class Site:
+    port: int
+    engine: EngineProcess
+    viser: Viser
+    folder: Path
+    access: Access
+
+    def url(self, path: str = "/") -> str:
+        return f"http://127.0.0.1:{self.port}{path}"
+
+    def socket(self, **kwargs: object) -> ClientConnection:
+        url = f"ws://127.0.0.1:{self.port}/"
+        return connect(url, subprotocols=[PROTOCOL], max_size=None, proxy=None, **kwargs)  # type: ignore[arg-type]
+
+
+@contextmanager
+def serving(engine: EngineProcess, target: Viser, folder: Path, token: str | None) -> Iterator[Site]:
+    listener = listen("127.0.0.1", 0)
+    access = Access(listener.getsockname()[1], token)
+    server = make_server(make_app(engine, Folders([folder]), target, access))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        yield Site(access.port, engine, target, folder, access)
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()
+
+
+def engine_recording(engine: EngineProcess) -> Path:
+    deadline = time.monotonic() + PATIENCE_S
+    while (recording := engine.snapshot.recording) is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return recording.path
+
+
+def eventually(site: Site, **wanted: object) -> dict[str, object]:
+    """The transport, once it is as wanted."""
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        transport: dict[str, object] = httpx.get(site.url("/api/state")).json()["transport"]
+        if wanted.items() <= transport.items():
+            return transport
+        assert time.monotonic() < deadline, transport
+        time.sleep(0.02)

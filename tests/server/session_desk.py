@@ -1,0 +1,58 @@
+"""A session on a recording that exists only in memory, as the page sees it: through snapshots."""
+
+from pathlib import Path
+
+import server_fakes as fakes
+
+from app.server.delta import Fold, Outbox
+from app.server.protocol import Command, Snapshot
+from app.server.run import Run
+from app.server.session import Session
+from app.slam.params import Params
+
+
+class Desk:
+    """A session, its clock, and the page's view of it."""
+
+    def __init__(self, recording: str | None = "walk-60.mcap", truth: Path | None = None, **kwargs: object) -> None:
+        self.now = 0.0
+        self.runs: list[Run] = []
+        self.outbox = Outbox(Params())
+        self.fold = Fold()
+        self.session = Session(self.outbox, Params(), self._open, clock=lambda: self.now, **kwargs)  # type: ignore[arg-type]
+        if recording:
+            self.session.open(Path(recording), truth)
+            self.settle()
+
+    def _open(self, path: Path, truth: Path | None, params: Params, part: object = None, /) -> Run:
+        self.runs.append(fakes.open_fake(path, truth, params))
+        return self.runs[-1]
+
+    def settle(self, limit: int = 1000) -> Snapshot:
+        """Work until nothing is due at this moment."""
+        for _ in range(limit):
+            if self.session.work() != 0:
+                break
+        else:
+            raise AssertionError("still busy")
+        return self.see()
+
+    def see(self) -> Snapshot:
+        if self.outbox.filled:
+            self.fold.apply(self.outbox.take())
+        return self.fold.snapshot
+
+    def do(self, *commands: Command) -> Snapshot:
+        for command in commands:
+            self.session.handle(command)
+        return self.settle()
+
+    def pass_time(self, seconds: float, step: float = 0.01) -> Snapshot:
+        for _ in range(round(seconds / step)):
+            self.now += step
+            self.settle()
+        return self.see()
+
+
+def last_notice(snapshot: Snapshot) -> str:
+    return snapshot.notices[-1].text

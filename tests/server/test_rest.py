@@ -1,0 +1,135 @@
+"""The REST interface over a real socket: what scripts ask for and do."""
+
+import socket
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import httpx
+import pytest
+import server_fakes as fakes
+from server_site import PATIENCE_S, Site, eventually
+
+from app.server.api import BreakpointsBody
+from app.server.breakpoints import Breakpoints
+
+
+def test_transport_by_rest(site: Site) -> None:
+    def post(**body: object) -> int:
+        return httpx.post(site.url("/api/transport"), json=body).status_code
+
+    assert post(action="seek", frame=7) == 202
+    eventually(site, frame=7, playing=False)
+    assert post(action="step") == 202
+    eventually(site, frame=8)
+    assert post(action="speed", factor="max") == 202
+    assert post(action="play") == 202
+    eventually(site, finished=True, frame=59, speed="max")
+    assert post(action="restart") == 202
+    assert post(action="pause") == 202
+    eventually(site, finished=False, playing=False)
+    for bad in (
+        {"action": "fly"},
+        {"action": "seek"},
+        {"action": "speed", "factor": 0},
+        {"action": "step", "frames": -1},
+    ):
+        assert post(**bad) == 422
+
+
+def test_parameters_by_rest(site: Site) -> None:
+    answer = httpx.patch(site.url("/api/params"), json={"ground": {"alpha": 31}})
+    assert answer.json()["ground"]["alpha"] == 31
+    deadline = time.monotonic() + PATIENCE_S
+    while httpx.get(site.url("/api/params")).json()["ground"]["alpha"] != 31:
+        assert time.monotonic() < deadline
+    refused = httpx.patch(site.url("/api/params"), json={"ground": {"alpha": 900}})
+    assert refused.status_code == 422 and "`ground.alpha` can not be 900" in refused.json()["detail"]
+    schema = httpx.get(site.url("/api/openapi.json")).json()["components"]["schemas"]["Ground"]["properties"]["alpha"]
+    assert schema["minimum"] == 1 and schema["maximum"] == 90 and schema["unit"] == "deg"
+
+
+def test_exports_by_rest(site: Site) -> None:
+    httpx.post(site.url("/api/transport"), json={"action": "seek", "frame": 20})
+    eventually(site, frame=20)
+    trajectory = httpx.get(site.url("/api/export/trajectory.tum"), timeout=PATIENCE_S).text.splitlines()
+    assert len(trajectory) == 21 and all(len(line.split()) == 8 for line in trajectory)
+    cloud = httpx.get(site.url("/api/export/map.ply"), timeout=PATIENCE_S).content
+    assert f"element vertex {5 * fakes.POINTS:012d}".encode() in cloud
+    assert httpx.get(site.url("/api/export/passwd")).status_code == 422
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "../../../../etc/passwd", "missing.mcap"])
+def test_recordings_outside_the_folders_are_not_opened(site: Site, path: str) -> None:
+    answer = httpx.post(site.url("/api/recordings"), json={"path": path})
+    assert answer.status_code == 422 and "There is no" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    "path", ["/../pyproject.toml", "/%2e%2e/pyproject.toml", "/..%2fpyproject.toml", "/index.html"]
+)
+def test_no_file_but_the_page_is_served(site: Site, path: str) -> None:
+    with socket.create_connection(("127.0.0.1", site.port)) as raw:
+        raw.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n".encode())
+        assert raw.recv(100).split()[1] == b"404"
+
+
+def test_recordings_inside_are_listed_and_opened(site: Site) -> None:
+    names = httpx.get(site.url("/api/recordings")).json()
+    assert [Path(name).name for name in names] == ["walk-30.mcap", "walk-60.mcap"]
+    for name in names:
+        assert httpx.post(site.url("/api/recordings"), json={"path": name}).status_code == 202
+        deadline = time.monotonic() + PATIENCE_S
+        while httpx.get(site.url("/api/state")).json()["recording"]["path"] != name:
+            assert time.monotonic() < deadline
+
+
+# --- breakpoints, notes, loops -------------------------------------------------------------------
+def told(site: Site) -> list[str]:
+    return [notice["text"] for notice in httpx.get(site.url("/api/state")).json()["notices"]]
+
+
+def test_breakpoints_by_rest_reach_the_engine_all_at_once(site: Site) -> None:
+    for body in ({"no_ground": True, "residual": 0.5}, {"frame_ms": 80}, {}):
+        answer = httpx.put(site.url("/api/breakpoints"), json=body)
+        assert answer.status_code == 200 and answer.json() == BreakpointsBody(**body).model_dump()
+        deadline = time.monotonic() + PATIENCE_S
+        while site.engine.snapshot.breakpoints != Breakpoints(**body):
+            assert time.monotonic() < deadline
+        assert httpx.get(site.url("/api/breakpoints")).json() == answer.json()
+
+
+@pytest.mark.parametrize("body", [{"frame_ms": -1}, {"frame_ms": "slow"}, {"flying": True}])
+def test_a_breakpoint_that_is_none_is_refused(site: Site, body: dict[str, object]) -> None:
+    before = httpx.get(site.url("/api/breakpoints")).json()
+    assert httpx.put(site.url("/api/breakpoints"), json=body).status_code == 422
+    assert httpx.get(site.url("/api/breakpoints")).json() == before
+
+
+def test_breakpoints_are_described(site: Site) -> None:
+    schemas = httpx.get(site.url("/api/openapi.json")).json()["components"]["schemas"]
+    described = schemas["BreakpointsBody"]["properties"]
+    assert set(described) == {field.name for field in fields(Breakpoints)}
+    assert all(entry["description"] for entry in described.values())
+
+
+def test_a_note_stays_with_its_frame(site: Site) -> None:
+    httpx.post(site.url("/api/transport"), json={"action": "seek", "frame": 9})
+    eventually(site, frame=9)
+    assert httpx.post(site.url("/api/notes"), json={"text": "  the door opens "}).status_code == 202
+    deadline = time.monotonic() + PATIENCE_S
+    while not (notes := httpx.get(site.url("/api/state")).json()["notes"]):
+        assert time.monotonic() < deadline
+    assert notes[-1] == {"frame": 9, "text": "the door opens"}
+    assert httpx.post(site.url("/api/notes"), json={"text": ""}).status_code == 422
+
+
+def test_a_loop_that_can_not_be_overruled_is_told(site: Site) -> None:
+    assert httpx.get(site.url("/api/loops")).json() == {"loops": [], "overrulings": [], "undone": []}
+    before = len(told(site))
+    assert httpx.post(site.url("/api/loops"), json={"action": "reject", "older": 1, "newer": 5}).status_code == 202
+    deadline = time.monotonic() + PATIENCE_S
+    while not any("Loops are not looked for" in text for text in told(site)[before:]):
+        assert time.monotonic() < deadline
+    for bad in ({"action": "reject", "older": 1}, {"action": "weigh", "older": 1, "newer": 5, "weight": 0}):
+        assert httpx.post(site.url("/api/loops"), json=bad).status_code == 422

@@ -1,0 +1,128 @@
+"""What a session reads and writes: recordings, truth, results; and what becomes of it if they can not be used."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import server_fakes as fakes
+from session_desk import Desk, last_notice
+
+from app.server.protocol import Command, OpenRecording, Play, Restart, Save, Seek, SetParams, SetSpeed, StepFrame
+from app.slam.params import Params
+from app.slam.trajectory import Trajectory, write_tum
+
+
+# --- recordings ----------------------------------------------------------------------------------
+def test_opening_another_recording_empties_the_scene_and_pauses() -> None:
+    desk = Desk()
+    desk.do(Play())
+    desk.pass_time(1.0)
+    snapshot = desk.do(OpenRecording(Path("walk-30.mcap")))
+    assert snapshot.recording is not None and snapshot.recording.path == Path("walk-30.mcap")
+    assert snapshot.transport.frame == 0 and not snapshot.transport.playing
+    assert snapshot.trajectory is not None and len(snapshot.trajectory) == 1 and len(snapshot.chunks) == 1
+
+
+def test_a_file_that_can_not_be_opened_leaves_the_session_as_it_is() -> None:
+    desk = Desk()
+    desk.do(Play())
+    desk.pass_time(1.0)
+    snapshot = desk.do(OpenRecording(Path("notes.txt")))
+    assert last_notice(snapshot) == "notes.txt is not a recording; choose another file."
+    assert snapshot.session == 1 and snapshot.progress is None and snapshot.transport.playing
+    before = snapshot.transport.frame
+    assert desk.pass_time(1.0).transport.frame > before
+
+
+def test_another_recording_brings_its_own_device_but_keeps_what_was_tuned() -> None:
+    def resolve(path: Path) -> Params:
+        return Params().with_values({"sensor.translation": (1.0, 0.0, 0.0)} if path.stem == "walk-30" else {})
+
+    desk = Desk(resolve=resolve)
+    desk.do(SetParams({"ground.alpha": 33, "sensor.translation": (0.0, 0.0, 5.0)}))
+    snapshot = desk.do(OpenRecording(Path("walk-30.mcap")))
+    assert snapshot.params.sensor.translation == (1.0, 0.0, 0.0)
+    assert snapshot.params.ground.alpha == 33
+    assert snapshot.pending_restart == ()
+
+
+def test_a_recording_damaged_in_the_middle_keeps_what_was_read() -> None:
+    snapshot = Desk("broken-60-20.mcap").do(SetSpeed(math.inf), Play())
+    assert "damaged at frame 20" in last_notice(snapshot)
+    assert snapshot.transport.frame == 19 and not snapshot.transport.playing and snapshot.transport.finished
+    assert snapshot.trajectory is not None and len(snapshot.trajectory) == 20
+
+
+def test_an_engine_that_fails_on_a_frame_pauses_and_can_go_on() -> None:
+    desk = Desk("failing-60-20.mcap")
+    snapshot = desk.do(SetSpeed(math.inf), Play())
+    assert "FloatingPointError: the covariance is not positive" in last_notice(snapshot)
+    assert snapshot.transport.frame == 19 and not snapshot.transport.playing
+    assert desk.do(Play()).transport.frame == 58, "one of 60 was left out"
+
+
+def test_a_dropped_scan_is_counted_and_explained() -> None:
+    snapshot = Desk("dropped-60-20.mcap").do(SetSpeed(math.inf), Play())
+    assert snapshot.transport.dropped == 1 and snapshot.transport.frame == 58
+    assert any("no IMU samples cover it" in notice.text for notice in snapshot.notices)
+
+
+@pytest.mark.parametrize("command", [Play(), StepFrame(), Seek(3), Restart(), Save(Path("x"))])
+def test_without_a_recording_a_command_asks_for_one(command: Command) -> None:
+    assert "No recording is open" in last_notice(Desk(recording=None).do(command))
+
+
+# --- truth and results ---------------------------------------------------------------------------
+def truth_file(folder: Path, frames: int, wobble: float = 0.0) -> Path:
+    """The fake walk's own poses, seen from another frame, with an error of `wobble` m up and down."""
+    T_truth_map = np.eye(4)
+    T_truth_map[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    T_truth_map[:3, 3] = [100, 200, 300]
+    poses = [T_truth_map @ fakes.pose(index) for index in range(frames)]
+    for index, T in enumerate(poses):
+        T[2, 3] += wobble * (-1) ** index
+    path = folder / "truth.tum"
+    write_tum(path, Trajectory.from_poses(fakes.START_NS + np.arange(frames) * fakes.FRAME_NS, poses))
+    return path
+
+
+def test_the_error_to_truth_is_what_remains_after_alignment(tmp_path: Path) -> None:
+    snapshot = Desk(truth=truth_file(tmp_path, 60)).do(Seek(59))
+    assert np.isnan(snapshot.series["error_m"][:3]).all(), "nothing to align before the walk has begun"
+    assert snapshot.series["error_m"][-1] == pytest.approx(0.0, abs=1e-6)
+    assert snapshot.T_map_truth is not None
+    np.testing.assert_allclose(
+        snapshot.T_map_truth[:3, :3] @ [100, 200, 300] + snapshot.T_map_truth[:3, 3], 0, atol=1e-6
+    )
+
+
+def test_an_error_of_a_centimetre_is_reported_as_such(tmp_path: Path) -> None:
+    snapshot = Desk(truth=truth_file(tmp_path, 60, wobble=0.01)).do(Seek(59))
+    assert snapshot.series["error_m"][-1] == pytest.approx(0.01, rel=0.1)
+
+
+def test_results_are_written_while_replay_goes_on(tmp_path: Path) -> None:
+    recording = tmp_path / "walk-60.mcap"
+    recording.write_bytes(b"something to hash")
+    desk = Desk(str(recording))
+    desk.do(Seek(30))
+    snapshot = desk.do(Save(tmp_path / "out"), Save(tmp_path / "short", trajectory_only=True))
+    while len(snapshot.saved) < 2:
+        snapshot = desk.do(StepFrame())
+    assert [saved.error for saved in snapshot.saved] == ["", ""]
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+        "trajectory.tum", "timings.csv", "map.ply", "report.json", "session.hemislam",
+    }  # fmt: skip
+    assert {file.name for file in (tmp_path / "short").iterdir()} == {"trajectory.tum"}
+    assert len((tmp_path / "out/trajectory.tum").read_text().splitlines()) == 31
+
+
+def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    desk = Desk()
+    desk.session.handle(Save(tmp_path / "file"))
+    while not desk.see().saved:
+        desk.session.work()
+    assert str(tmp_path / "file") in desk.see().saved[0].error
+    assert str(tmp_path / "file") in last_notice(desk.see())
