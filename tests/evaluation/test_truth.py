@@ -1,6 +1,8 @@
 """Truth of every format gives the same poses; truth that can not be used is refused in one sentence."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,23 +103,39 @@ def write_topic(path: Path, kind: str, messages: list[tuple[int, dict[str, objec
     return path
 
 
-def test_poses_of_a_topic_are_truth(tmp_path: Path) -> None:
+def _stamped(types: Any, pose: Any) -> dict[str, Any]:
+    return {"pose": pose}
+
+
+def _with_covariance(types: Any, pose: Any) -> dict[str, Any]:
+    return {"pose": types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36))}
+
+
+def _odometry(types: Any, pose: Any) -> dict[str, Any]:
+    none = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+    twist = types["geometry_msgs/msg/Twist"](linear=none, angular=none)
+    still = types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36))
+    return _with_covariance(types, pose) | {"child_frame_id": "body", "twist": still}
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("geometry_msgs/msg/PoseStamped", _stamped),
+        ("geometry_msgs/msg/PoseWithCovarianceStamped", _with_covariance),
+        ("nav_msgs/msg/Odometry", _odometry),
+    ],
+)
+def test_poses_of_a_topic_are_truth(tmp_path: Path, kind: str, values: Callable[[Any, Any], dict[str, Any]]) -> None:
     types = get_typestore(Stores.ROS2_HUMBLE).types
     walk = walks.wandering(np.arange(0.0, 80.0, 0.05))
     body = (walk.rotations * walks.R_BODY_IMU.inv()).as_quat()
-    messages = [
-        (
-            int(stamp),
-            {
-                "pose": types["geometry_msgs/msg/Pose"](
-                    position=types["geometry_msgs/msg/Point"](*map(float, p)),
-                    orientation=types["geometry_msgs/msg/Quaternion"](*map(float, q)),
-                )
-            },
-        )
-        for stamp, p, q in zip(walk.stamps_ns, walk.positions, body, strict=True)
-    ]
-    recording = write_topic(tmp_path / "rec", "geometry_msgs/msg/PoseStamped", messages)
+    messages = []
+    for stamp, p, q in zip(walk.stamps_ns, walk.positions, body, strict=True):
+        position = types["geometry_msgs/msg/Point"](*map(float, p))
+        pose = types["geometry_msgs/msg/Pose"](position, types["geometry_msgs/msg/Quaternion"](*map(float, q)))
+        messages.append((int(stamp), values(types, pose)))
+    recording = write_topic(tmp_path / "rec", kind, messages)
     matched = match(read_truth("topic:/truth", recording), ESTIMATE)
     error = ate(ESTIMATE, matched.trajectory)
     assert error.position.max < 0.01 and error.rotation.max < 0.2
