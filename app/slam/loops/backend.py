@@ -23,7 +23,19 @@ from app.slam.loops.overruling import Entry, Overrulings, check, in_words
 from app.slam.loops.pose_graph import Factor, Step, g2o_text, optimise
 from app.slam.loops.search import Found, search
 from app.slam.loops.solution import Solution, loop_factor
-from app.slam.loops.types import Add, Command, FactorResidual, LoopDetail, LoopEdge, Pair, Preview, Verdict, rows
+from app.slam.loops.types import (
+    Add,
+    Command,
+    FactorResidual,
+    LoopDetail,
+    LoopEdge,
+    Pair,
+    Preview,
+    Solve,
+    Verdict,
+    pair_of,
+    rows,
+)
 from app.slam.params import Loops
 from app.slam.types import F64, Keyframe
 
@@ -55,6 +67,7 @@ class LoopBackend:
         self._finished = False
         self._idle: set[str] = set()  # commands of which was said that they found nothing
         self._notices: list[str] = []
+        self._said: set[str] = set()  # failures of the solver
 
     def __len__(self) -> int:
         return len(self._detector)
@@ -176,13 +189,21 @@ class LoopBackend:
     def _look(self, first: int, end: int, params: Loops) -> Found:
         """Look for loops of the keyframes from `first` to before `end`; the graph stays as it is."""
         keyframes = range(first, max(end, 0))
-        return search(self._detector, keyframes, self._found, self._edges, self.poses, _drift(params), params)
+        return search(self._detector, keyframes, self._found, self._edges, self._solution.poses, _drift(params), params)
 
     # --- what there is ---------------------------------------------------------------------------
     @property
     def poses(self) -> F64:
         """(k, 4, 4) T_map_imu of all keyframes."""
-        return self._solution.poses
+        if not self._overrulings.solving:
+            return self._solution.poses
+        try:
+            return self._optimum(self.edges)
+        except HemislamError as error:
+            if str(error) not in self._said:
+                self._said.add(str(error))
+                self._notices.append(str(error))
+            return self._solution.poses
 
     @property
     def T_map_odom(self) -> F64:
@@ -192,7 +213,7 @@ class LoopBackend:
     @property
     def corrections(self) -> F64:
         """(k, 4, 4) T_map_odom at each keyframe; identity while odometry meets the loops as well as they are known."""
-        if worth_correcting(self.edges, self._detector.poses):
+        if self._overrulings.solving or worth_correcting(self.edges, self._detector.poses):
             return self.corrections_of(self.poses)
         return np.tile(np.eye(4), (len(self), 1, 1))
 
@@ -213,10 +234,6 @@ class LoopBackend:
     def factor_residuals(self) -> tuple[FactorResidual, ...]:
         """Of every factor of the graph, odometry first."""
         return inspection.residuals(self._factors(self.edges), self.poses)
-
-    def optimised(self) -> F64:
-        """(k, 4, 4) T_map_imu by Levenberg-Marquardt over all factors at once, from the present poses."""
-        return self._batch(self.edges)
 
     def detail(self, older: int, newer: int) -> LoopDetail:
         """What the inspector shows of two keyframes. Raises HemislamError if there are none such."""
@@ -245,12 +262,13 @@ class LoopBackend:
     def apply(self, command: Command) -> None:
         """Overrule. What was undone before can no longer be redone. Raises HemislamError if it makes no sense."""
         check(command)
-        there = command.newer < len(self)
+        pair = pair_of(command)
         if isinstance(command, Add):
+            there = command.newer < len(self)
             if there and command.guess is None:  # as it is now, so that it is the same when given again
                 command = replace(command, guess=rows(self._present(command.older, command.newer)))
-        elif (command.older, command.newer) not in self._edges(self._found):
-            there = False
+        else:
+            there = pair is None or pair in self._edges(self._found)
         self._overrulings.give(
             self._fitting(self._entry(replace(command, since=self._overrulings.reached if there else 0)))
         )
@@ -284,11 +302,12 @@ class LoopBackend:
             HemislamError: it makes no sense, or there is no such loop or keyframe yet.
         """
         check(command)
-        self._check_there(command.older, command.newer)
-        if not isinstance(command, Add) and (command.older, command.newer) not in self._edges(self._found):
-            raise HemislamError(f"There is no loop candidate of keyframes {command.older} and {command.newer}.")
+        if not isinstance(command, Solve):
+            self._check_there(command.older, command.newer)
+            if not isinstance(command, Add) and pair_of(command) not in self._edges(self._found):
+                raise HemislamError(f"There is no loop candidate of keyframes {command.older} and {command.newer}.")
         edges = tuple(self._edges(self._found, self._fitting(self._entry(replace(command, since=0)))).values())
-        poses = self._batch(edges)
+        poses = self._optimum(edges)
         return Preview(poses, inspection.residuals(self._factors(edges), poses))
 
     def _entry(self, command: Command) -> Entry:
@@ -325,7 +344,7 @@ class LoopBackend:
     def _tell_idle(self) -> None:
         """At the end: which commands found nothing to act on; each is said once."""
         there = self._edges(self._found)
-        idle = [in_words(entry.command) for entry in self._overrulings if entry.pair not in there]
+        idle = [in_words(entry.command) for entry in self._overrulings if entry.pair and entry.pair not in there]
         new = [words for words in idle if words not in self._idle]
         self._notices += [f"{words} has no effect: there is no such loop; loops.csv lists all." for words in new]
         self._idle = set(idle)
@@ -368,8 +387,9 @@ class LoopBackend:
         odometry = [record.odometry for record in self._history[: len(self)] if record.odometry is not None]
         return odometry + [loop_factor(edge) for edge in self._accepted(edges)]
 
-    def _batch(self, edges: tuple[LoopEdge, ...]) -> F64:
-        poses = self.poses
+    def _optimum(self, edges: tuple[LoopEdge, ...]) -> F64:
+        """(k, 4, 4) T_map_imu by all factors at once. Raises HemislamError if the solver fails."""
+        poses = self._solution.poses
         if len(poses) < 2:
             return poses
         try:

@@ -7,9 +7,11 @@
     - add: [5, 300]
       register: false
       guess: [[1.0, 0.0, 0.0, 0.2], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    - solve: at once
 
 A loop is named by its older and its newer keyframe. `guess` is T_older_newer of the IMU frames,
-left out: where the graph has them; `register` is true if left out. `since`, of any entry, is how
+left out: where the graph has them; `register` is true if left out. `solve: at once` takes the poses
+from all factors at once (Levenberg-Marquardt) instead of one after the other. `since`, of any entry, is how
 many keyframes the walk had when it was given; it acts from there on, left out: from the start.
 """
 
@@ -21,15 +23,18 @@ import numpy as np
 import yaml
 
 from app.slam.errors import HemislamError
-from app.slam.loops.types import Accept, Add, Command, Pair, Reject, SetWeight, rows
+from app.slam.loops.types import Accept, Add, Command, Pair, Reject, SetWeight, Solve, rows
 
 _FIELDS: Final[dict[str, frozenset[str]]] = {
     "accept": frozenset(),
     "reject": frozenset(),
     "weigh": frozenset({"weight"}),
     "add": frozenset({"guess", "register"}),
+    "solve": frozenset(),
 }
 """What an entry may hold beside its verb, keyframes and `since`."""
+
+_AT_ONCE: Final = "at once"
 
 _HEAD: Final = "# Overrulings of loops, in their order: hemislam run RECORDING --loops THIS_FILE\n"
 
@@ -66,16 +71,18 @@ def read(text: str, source: str = "the list of overrulings") -> tuple[Command, .
 
 
 def _entry(command: Command) -> dict[str, Any]:
-    pair = [command.older, command.newer]
+    entry: dict[str, Any]
     match command:
-        case Accept():
-            entry: dict[str, Any] = {"accept": pair}
-        case Reject():
-            entry = {"reject": pair}
-        case SetWeight(weight=weight):
-            entry = {"weigh": pair, "weight": float(weight)}
-        case Add(guess=guess, register=register):
-            entry = {"add": pair, "register": register}
+        case Accept(older, newer):
+            entry = {"accept": [older, newer]}
+        case Reject(older, newer):
+            entry = {"reject": [older, newer]}
+        case SetWeight(older, newer, weight):
+            entry = {"weigh": [older, newer], "weight": float(weight)}
+        case Solve():
+            entry = {"solve": _AT_ONCE}
+        case Add(older, newer, guess, register):
+            entry = {"add": [older, newer], "register": register}
             if guess is not None:
                 entry["guess"] = [list(row) for row in guess]
     return {**entry, "since": command.since} if command.since else entry
@@ -84,14 +91,21 @@ def _entry(command: Command) -> dict[str, Any]:
 def _command(entry: object) -> Command:
     verbs = [verb for verb in _FIELDS if verb in entry] if isinstance(entry, dict) else []
     if not isinstance(entry, dict) or len(verbs) != 1:
-        raise HemislamError("it must hold one of accept, reject, weigh or add, with two keyframes: accept: [12, 340].")
+        raise HemislamError(
+            "it must hold one of accept, reject, weigh or add, with two keyframes: accept: [12, 340]; or `solve:"
+            f" {_AT_ONCE}`."
+        )
     verb = verbs[0]
     unknown = sorted(str(name) for name in entry.keys() - {verb, "since"} - _FIELDS[verb])
     if unknown:
         allowed = " and ".join(sorted(_FIELDS[verb])) or "nothing else"
         raise HemislamError(f"{unknown[0]} means nothing to {verb}; it takes {allowed}.")
-    older, newer = _pair(verb, entry[verb])
     since = _since(entry.get("since", 0))
+    if verb == "solve":
+        if entry[verb] != _AT_ONCE:
+            raise HemislamError(f"solve is {entry[verb]!r}; it can only be `{_AT_ONCE}`.")
+        return Solve(since)
+    older, newer = _pair(verb, entry[verb])
     match verb:
         case "accept":
             return Accept(older, newer, since)

@@ -96,29 +96,11 @@ class AskResiduals:
 
 
 @dataclass(frozen=True, slots=True)
-class Optimise:
-    """What do all factors at once make of the poses (Levenberg-Marquardt)? Answered by `Optimum`."""
-
-
-@dataclass(frozen=True, slots=True)
 class AskG2o:
     """The graph as the text of a g2o file. Answered by `G2o`."""
 
 
-Request = (
-    AddKeyframe
-    | GoTo
-    | Finish
-    | Overrule
-    | Undo
-    | Redo
-    | LoadCommands
-    | TryOut
-    | Inspect
-    | AskResiduals
-    | Optimise
-    | AskG2o
-)
+Request = AddKeyframe | GoTo | Finish | Overrule | Undo | Redo | LoadCommands | TryOut | Inspect | AskResiduals | AskG2o
 
 
 # --- replies -------------------------------------------------------------------------------------
@@ -174,13 +156,6 @@ class Residuals:
 
 
 @dataclass(frozen=True, slots=True)
-class Optimum:
-    """(count, 4, 4) `corrections` as in `LoopState`."""
-
-    corrections: F64
-
-
-@dataclass(frozen=True, slots=True)
 class G2o:
     text: str
 
@@ -192,7 +167,7 @@ class Failure:
     text: str
 
 
-Reply = LoopState | Tried | Inspected | Residuals | Optimum | G2o | Failure
+Reply = LoopState | Tried | Inspected | Residuals | G2o | Failure
 
 
 # --- who answers ---------------------------------------------------------------------------------

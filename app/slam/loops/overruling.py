@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam.errors import HemislamError
-from app.slam.loops.types import Accept, Add, Command, LoopEdge, Pair, SetWeight, Verdict
+from app.slam.loops.types import Accept, Add, Command, LoopEdge, Pair, SetWeight, Solve, Verdict, pair_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,8 +21,8 @@ class Entry:
     added: LoopEdge | None = None
 
     @property
-    def pair(self) -> Pair:
-        return self.command.older, self.command.newer
+    def pair(self) -> Pair | None:
+        return pair_of(self.command)
 
 
 class Overrulings:
@@ -49,6 +49,11 @@ class Overrulings:
     def undone(self) -> tuple[Command, ...]:
         """Those that `redo` would give again, the next one last."""
         return tuple(entry.command for entry in self._undone)
+
+    @property
+    def solving(self) -> bool:
+        """Whether poses are those of all factors solved at once."""
+        return any(isinstance(entry.command, Solve) and entry.command.since <= self.reached for entry in self._done)
 
     @property
     def latest(self) -> int:
@@ -107,7 +112,7 @@ class Overrulings:
         self.reached = reached
 
         def kept(entry: Entry) -> Entry:
-            if lost(entry.pair):
+            if entry.pair is not None and lost(entry.pair):
                 return Entry(replace(entry.command, since=0))
             return replace(entry, command=replace(entry.command, since=min(entry.command.since, reached)))
 
@@ -121,18 +126,21 @@ class Overrulings:
         """
         edges = dict(found)
         for entry in [*self._done, *([extra] if extra else [])]:
-            if entry.command.since > self.reached:
+            pair = entry.pair
+            if pair is None or entry.command.since > self.reached:
                 continue
             if entry.added is not None:
                 if entry.added.newer < count:
-                    edges[entry.pair] = entry.added
-            elif entry.pair in edges:
-                edges[entry.pair] = _overruled(edges[entry.pair], entry.command)
+                    edges[pair] = entry.added
+            elif pair in edges:
+                edges[pair] = _overruled(edges[pair], entry.command)
         return {pair: edges[pair] for pair in sorted(edges)}
 
 
 def check(command: Command) -> None:
     """Raises HemislamError if the command can never make sense, whatever is found."""
+    if isinstance(command, Solve):
+        return
     older, newer = command.older, command.newer
     if not 0 <= older < newer:
         raise HemislamError(f"Keyframes {older} and {newer} can not be tied together; name an older and a newer one.")
@@ -146,13 +154,13 @@ def check(command: Command) -> None:
 
 def in_words(command: Command) -> str:
     """A command's name and pair, to begin a sentence with."""
-    return f"{type(command).__name__} {command.older}-{command.newer}"
+    return " ".join([type(command).__name__, *("-".join(map(str, pair)) for pair in [pair_of(command)] if pair)])
 
 
 def _overruled(edge: LoopEdge, command: Command) -> LoopEdge:
     if isinstance(command, SetWeight):
         return replace(edge, weight=command.weight)
-    if isinstance(command, Add):  # one that waits
+    if isinstance(command, Add | Solve):  # one that waits; one that is for no loop
         return edge
     verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
     if verdict is edge.verdict:

@@ -16,10 +16,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from app.slam.loops.types import HUBER
 from app.slam.types import F64
 
-HUBER = 1.345
-"""Whitened error from which a loop pulls with constant force (95 % efficient for a Gaussian)."""
 RELINEARISE = 0.05
 """Change of a pose (rad, m) from which its factors are linearised again."""
 MOST_UPDATES = 5

@@ -18,8 +18,6 @@ from app.slam.loops.messages import (
     Inspected,
     LoadCommands,
     LoopState,
-    Optimise,
-    Optimum,
     Overrule,
     Redo,
     Reply,
@@ -74,8 +72,6 @@ class LoopService:
                 return Inspected((older, newer), backend.detail(older, newer))
             case AskResiduals():
                 return Residuals(backend.factor_residuals())
-            case Optimise():
-                return Optimum(backend.corrections_of(backend.optimised()))
             case AskG2o():
                 return G2o(backend.g2o())
         return self._state()

@@ -11,6 +11,9 @@ import numpy as np
 
 from app.slam.types import F32, F64
 
+HUBER = 1.345
+"""Whitened error from which a loop pulls with constant force (95 % efficient for a Gaussian)."""
+
 Pair = tuple[int, int]
 """(older, newer) keyframe."""
 
@@ -142,7 +145,17 @@ class Add:
     since: int = field(default=0, compare=False)
 
 
-Command = Accept | Reject | SetWeight | Add
+@dataclass(frozen=True, slots=True)
+class Solve:
+    """Take the poses from all factors solved at once (Levenberg-Marquardt), from here on.
+
+    They differ from the incremental ones where these only came near the optimum, and with a window.
+    """
+
+    since: int = field(default=0, compare=False)
+
+
+Command = Accept | Reject | SetWeight | Add | Solve
 
 
 # --- what the inspector and the files show -------------------------------------------------------
@@ -160,6 +173,13 @@ class FactorResidual:
     rotation: float
     translation: float
     sigmas: float
+
+    @property
+    def cost(self) -> float:
+        """What it adds to that which the solver minimises: the square of `sigmas`, of a loop by Huber's loss."""
+        if not self.loop or self.sigmas <= HUBER:
+            return self.sigmas**2
+        return 2 * HUBER * self.sigmas - HUBER**2
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +213,11 @@ class LoopDetail:
     newer_context: F32
     shift_distances: F64
     residuals: F64
+
+
+def pair_of(command: Command) -> Pair | None:
+    """What a command is for; None: the graph as a whole."""
+    return None if isinstance(command, Solve) else (command.older, command.newer)
 
 
 def rows(T: F64) -> tuple[tuple[float, ...], ...]:

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Final
 
-from app.slam.loops.types import Accept, Add, Command, LoopEdge, Origin, Pair, SetWeight, Verdict
+from app.slam.loops.types import Accept, Add, Command, LoopEdge, Origin, Pair, SetWeight, Solve, Verdict
 from app.ui.colours import Rgb
 
 
@@ -45,6 +45,8 @@ def name(pair: Pair) -> str:
 
 def say(command: Command) -> str:
     """A command in a few words."""
+    if isinstance(command, Solve):
+        return "solve all at once"
     pair = name((command.older, command.newer))
     match command:
         case Accept():

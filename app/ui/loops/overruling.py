@@ -10,9 +10,9 @@ import viser
 from app.server.protocol import Command, OverruleLoop, RedoLoop, Snapshot, TryLoop, UndoLoop
 from app.slam.errors import HemislamError
 from app.slam.loops import edits
-from app.slam.loops.types import Accept, LoopEdge, Pair, Preview, Reject, SetWeight, Verdict
+from app.slam.loops.types import Accept, LoopEdge, Pair, Preview, Reject, SetWeight, Solve, Verdict
 from app.slam.loops.types import Command as Overrule
-from app.ui.loops.kinds import say
+from app.ui.loops.kinds import in_graph, say
 from app.ui.loops.overlay import Ghost
 from app.ui.loops.words import forecast, headline
 from app.ui.widgets import by_user, show
@@ -136,6 +136,25 @@ class VerdictPanel:
     def _say(self, verb: type[Accept] | type[Reject]) -> None:
         if self._pair is not None:
             self._propose(verb(*self._pair))
+
+
+class SolvePanel:
+    """All factors solved at once, on request."""
+
+    def __init__(self, gui: viser.GuiApi, propose: Callable[[Overrule], None]) -> None:
+        self._button = gui.add_button(
+            "Solve all at once …",
+            icon=viser.Icon.MATH_FUNCTION,
+            color="gray",
+            hint="Levenberg-Marquardt over all factors, instead of one keyframe after the other; first see what it"
+            " would change.",
+        )
+        self._button.on_click(by_user(lambda _, __: propose(Solve())))
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Nothing to ask for where it is so already, or where there is no loop."""
+        loops = snapshot.loops
+        self._button.disabled = Solve() in loops.undo or not any(in_graph(edge) for edge in loops.edges)
 
 
 class EditsPanel:

@@ -10,7 +10,7 @@ import viser
 
 from app.server.protocol import Command, InspectLoop, Seek, Snapshot
 from app.slam.loops.types import Command as Overrule
-from app.slam.loops.types import LoopEdge, Pair, SetWeight
+from app.slam.loops.types import LoopEdge, Pair, SetWeight, pair_of
 from app.slam.types import F64
 from app.ui.html import box
 from app.ui.loops import ledger
@@ -19,7 +19,7 @@ from app.ui.loops.edges import LoopEdges
 from app.ui.loops.fly import fly
 from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
 from app.ui.loops.kinds import Kind
-from app.ui.loops.overruling import EditsPanel, Proposal, VerdictPanel
+from app.ui.loops.overruling import EditsPanel, Proposal, SolvePanel, VerdictPanel
 from app.ui.loops.tie import TiePanel
 from app.ui.loops.words import worst_factors
 from app.ui.view import View
@@ -72,6 +72,7 @@ class LoopsPanel:
         with gui.add_folder("Overrulings"):
             self._edits = EditsPanel(gui, send, snapshot)
         with gui.add_folder("How well the graph is met", expand_by_default=False):
+            self._solve = SolvePanel(gui, self._proposal.propose)
             self._factors = gui.add_html("")
         gui.add_command("Next loop of the ledger", hotkey="J").on_trigger(lambda _: self._step(1))
         gui.add_command("Previous loop of the ledger", hotkey="K").on_trigger(lambda _: self._step(-1))
@@ -117,6 +118,7 @@ class LoopsPanel:
         self._inspector.draw(snapshot, edge)
         self._proposal.draw(snapshot)
         self._edits.draw(snapshot)
+        self._solve.draw(snapshot)
         self._folder.visible = edge is not None
         self._draw_tables(snapshot)
 
@@ -200,4 +202,5 @@ class LoopsPanel:
 
     def _committed(self, command: Overrule) -> None:
         self._tie.done()
-        self._chosen = self._coming = command.older, command.newer  # a loop by hand has yet to arrive
+        if (pair := pair_of(command)) is not None:
+            self._chosen = self._coming = pair  # a loop by hand has yet to arrive

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops.types import Command, FactorResidual, LoopEdge, Pair, Preview
+from app.slam.loops.types import Command, FactorResidual, LoopEdge, Pair, Preview, Solve
 from app.slam.params import Loops
 from app.slam.types import F64
 from app.ui.html import BAD, GOOD, box, css, number, tile, tiles
@@ -74,8 +74,8 @@ def worst_factors(residuals: tuple[FactorResidual, ...], most: int = _WORST) -> 
     loops = sum(factor.loop for factor in residuals)
     return (
         box(
-            f'<span class="hs-note">{len(residuals) - loops} odometry and {loops} loop factors, Σσ² = '
-            f"{_total(residuals):.3g}, as of the loop chosen or overruled last; the worst:</span>"
+            f'<span class="hs-note">{len(residuals) - loops} odometry and {loops} loop factors, cost '
+            f"{_cost(residuals):.4g}, as of the loop chosen or overruled last; the worst:</span>"
         )
         + '<div class="hs-scroll" style="max-height:none"><table class="hs-table"><thead><tr><th>factor</th>'
         f"<th>°</th><th>cm</th><th>σ</th><th></th></tr></thead><tbody>{rows}</tbody></table></div>"
@@ -94,7 +94,8 @@ def forecast(
     if preview is None:
         return box(title, f'<span class="hs-quiet">{escape(working or "The engine works out what it would change …")}'
                    "</span>")  # fmt: skip
-    return box(title, _moves(preview.poses, poses), _comparison(residuals, preview.residuals))
+    costs = _costs(residuals, preview.residuals) if isinstance(command, Solve) else ""
+    return box(title, _moves(preview.poses, poses), costs, _comparison(residuals, preview.residuals))
 
 
 def _moves(after: F64, before: F64) -> str:
@@ -113,6 +114,17 @@ def _moves(after: F64, before: F64) -> str:
     )
 
 
+def _costs(before: tuple[FactorResidual, ...], after: tuple[FactorResidual, ...]) -> str:
+    """What all factors at once make of the cost, which is of the same factors then as before."""
+    if not before:  # they come a moment later
+        return ""
+    now, then = _cost(before), _cost(after)
+    if abs(now - then) < 1e-4 * max(now, then):
+        return f"<div>The cost stays at <b>{then:.4g}</b>: the poses are those of the optimum already.</div>"
+    way = f"{100 * (1 - then / now):.2g} % less" if then < now else f"{100 * (then / now - 1):.2g} % more"
+    return f"<div>The cost goes from <b>{now:.4g}</b> to <b>{then:.4g}</b>, {way}.</div>"
+
+
 def _comparison(before: tuple[FactorResidual, ...], after: tuple[FactorResidual, ...]) -> str:
     heads = "<tr><th>worst now</th><th>σ</th><th>worst then</th><th>σ</th></tr>"
     pairs = [sorted(side, key=lambda factor: -factor.sigmas)[:_COMPARED] for side in (before, after)]
@@ -125,12 +137,13 @@ def _comparison(before: tuple[FactorResidual, ...], after: tuple[FactorResidual,
             for side in pairs
         ]
         rows += f"<tr>{''.join(cells)}</tr>"
-    sums = f"<tr><td>all, Σσ²</td><td>{_total(before):.3g}</td><td></td><td>{_total(after):.3g}</td></tr>"
+    sums = f"<tr><td>all, cost</td><td>{_cost(before):.4g}</td><td></td><td>{_cost(after):.4g}</td></tr>"
     return f'<table class="hs-table" style="margin-top:4px"><thead>{heads}</thead><tbody>{rows}{sums}</tbody></table>'
 
 
-def _total(residuals: tuple[FactorResidual, ...]) -> float:
-    return float(sum(factor.sigmas**2 for factor in residuals))
+def _cost(residuals: tuple[FactorResidual, ...]) -> float:
+    """What the solver minimises."""
+    return float(sum(factor.cost for factor in residuals))
 
 
 def _length(metres: float) -> str:

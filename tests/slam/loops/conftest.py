@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.slam.loops.backend import LoopBackend
-from app.slam.loops.types import LoopEdge
+from app.slam.loops.types import Command, LoopEdge, Verdict
 from app.slam.params import Loops
 from app.slam.types import F64, Keyframe
 from tests.slam.loops.walks import Walk, drive, take
@@ -18,6 +18,15 @@ PARAMS = Loops(submap_keyframes=5)
 def same(ours: tuple[LoopEdge, ...], theirs: tuple[LoopEdge, ...]) -> bool:
     """To the last bit."""
     return [_values(edge) for edge in ours] == [_values(edge) for edge in theirs]
+
+
+def accepted(backend: LoopBackend) -> list[LoopEdge]:
+    return [edge for edge in backend.edges if edge.verdict is Verdict.ACCEPTED]
+
+
+def applied(backend: LoopBackend, command: Command) -> LoopEdge:
+    backend.apply(command)
+    return next(edge for edge in backend.edges if edge.pair == (command.older, command.newer))
 
 
 def _values(edge: LoopEdge) -> list[object]:

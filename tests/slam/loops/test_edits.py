@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import read, write
-from app.slam.loops.types import Accept, Add, Command, Reject, SetWeight, rows
+from app.slam.loops.types import Accept, Add, Command, Reject, SetWeight, Solve, rows
 
 
 @st.composite
@@ -30,6 +30,7 @@ def _commands(draw: st.DrawFn) -> Command:
                 SetWeight(older, newer, weight, since),
                 Add(older, newer, None, register, since),
                 Add(older, newer, rows(guess), register, since),
+                Solve(since),
             )
         )
     )
@@ -44,8 +45,10 @@ def test_what_is_written_is_read_again_to_the_last_digit(commands: list[Command]
 
 
 def test_a_list_written_by_hand_is_understood() -> None:
-    text = "- accept: [12, 340]\n- reject: [3, 40]\n- {weigh: [12, 340], weight: 2}\n- add: [5, 300]\n"
-    assert read(text) == (Accept(12, 340), Reject(3, 40), SetWeight(12, 340, 2.0), Add(5, 300))
+    text = (
+        "- accept: [12, 340]\n- reject: [3, 40]\n- {weigh: [12, 340], weight: 2}\n- add: [5, 300]\n- solve: at once\n"
+    )
+    assert read(text) == (Accept(12, 340), Reject(3, 40), SetWeight(12, 340, 2.0), Add(5, 300), Solve())
 
 
 def test_an_empty_file_overrules_nothing() -> None:
@@ -69,6 +72,8 @@ def test_an_empty_file_overrules_nothing() -> None:
         ("{add: [1, 2], register: perhaps}", "true or false"),
         ("{add: [1, 2], guess: [[1, 0], [0, 1]]}", "4x4"),
         ("{add: [1, 2], guess: [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}", "no rigid transform"),
+        ("solve: twice", "at once"),
+        ("{solve: at once, accept: [1, 2]}", "solve: at once"),
         ("12", "accept, reject, weigh or add"),
     ],
 )

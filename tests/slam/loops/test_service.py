@@ -13,8 +13,6 @@ from app.slam.loops.messages import (
     Inspected,
     LoadCommands,
     LoopState,
-    Optimise,
-    Optimum,
     Overrule,
     Redo,
     Request,
@@ -24,7 +22,7 @@ from app.slam.loops.messages import (
     Undo,
 )
 from app.slam.loops.service import InlineLoops, LoopService
-from app.slam.loops.types import Accept, Add, Reject, Verdict
+from app.slam.loops.types import Accept, Add, Reject, Solve, Verdict
 from tests.slam.loops.conftest import PARAMS, Walked
 
 
@@ -68,10 +66,10 @@ def test_questions_change_nothing(walked: Walked, service: LoopService) -> None:
     edge = next(edge for edge in before.edges if edge.verdict is Verdict.ACCEPTED)
     replies = [
         service.handle(request)
-        for request in (TryOut(Reject(*edge.pair)), Inspect(*edge.pair), AskResiduals(), Optimise(), AskG2o())
+        for request in (TryOut(Reject(*edge.pair)), Inspect(*edge.pair), AskResiduals(), TryOut(Solve()), AskG2o())
     ]
-    assert [type(reply) for reply in replies] == [Tried, Inspected, Residuals, Optimum, G2o]
-    tried, inspected, residuals, optimum, g2o = replies
+    assert [type(reply) for reply in replies] == [Tried, Inspected, Residuals, Tried, G2o]
+    tried, inspected, residuals, solved, g2o = replies
     assert isinstance(tried, Tried)
     assert tried.command == Reject(*edge.pair)
     assert isinstance(inspected, Inspected)
@@ -79,8 +77,8 @@ def test_questions_change_nothing(walked: Walked, service: LoopService) -> None:
     assert isinstance(residuals, Residuals)
     loops = sum(edge.verdict is Verdict.ACCEPTED for edge in before.edges)
     assert len(residuals.residuals) == before.count - 1 + loops
-    assert isinstance(optimum, Optimum)
-    assert optimum.corrections.shape == (before.count, 4, 4)
+    assert isinstance(solved, Tried)
+    assert solved.preview.poses.shape == (before.count, 4, 4)
     assert isinstance(g2o, G2o)
     assert g2o.text.count("\nEDGE_SE3:QUAT") == before.count - 1 + loops
     after = state(service, Finish())

@@ -1,0 +1,130 @@
+"""The user's word on a loop: proposed, seen as a ghost, committed, undone, saved and given again."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from app.server.protocol import OverruleLoop, RedoLoop, TryLoop, UndoLoop
+from app.slam.loops import edits
+from app.slam.loops.types import Accept, Add, Reject, SetWeight, Verdict
+from tests.ui.conftest import user_clicks, user_sets
+from tests.ui.loops.conftest import GOOD, WAITING, Page, rejected
+
+
+def test_a_rejected_loop_is_accepted_in_two_steps_with_a_ghost_between(page: Page) -> None:
+    pair = rejected(page)
+    page.choose(pair)
+    page.engine.sent.clear()
+    user_clicks(page.loops._verdict._accept)
+    page.draw()
+    assert page.engine.sent == [TryLoop(Accept(*pair))]
+    tried = page.engine.snapshot.loops.tried
+    assert tried is not None
+    assert np.allclose(page.node("/map/ghost/path").points[:, 0], tried[1].poses[:-1, :3, 3], atol=1e-5)
+    assert page.edge(pair).verdict is Verdict.REJECTED
+    user_clicks(page.loops._proposal._commit)
+    page.draw()
+    assert page.engine.sent[1:3] == [OverruleLoop(Accept(*pair)), TryLoop(None)]
+    assert page.edge(pair).verdict is Verdict.ACCEPTED
+    assert page.node("/map/ghost/path") is None
+    assert page.node("/map/loops/by-hand-in") is None  # it is the chosen one, drawn in white
+    page.choose(None)
+    assert page.node("/map/loops/by-hand-in").points.shape == (2, 2, 3)
+
+
+def test_cancelling_leaves_all_as_it_was(page: Page) -> None:
+    page.choose(GOOD)
+    user_clicks(page.loops._verdict._reject)
+    page.draw()
+    page.loops._proposal.cancel()
+    page.draw()
+    assert not any(isinstance(command, OverruleLoop) for command in page.engine.sent)
+    assert page.engine.sent[-1] == TryLoop(None)
+    assert not page.loops._proposal._folder.visible and page.node("/map/ghost/path") is None
+
+
+def test_before_a_decision_the_page_says_how_far_keyframes_move_and_which_factors_are_met_worst(page: Page) -> None:
+    page.choose(GOOD)
+    user_clicks(page.loops._verdict._reject)
+    page.draw()
+    now, tried = page.engine.snapshot, page.engine.snapshot.loops.tried
+    assert tried is not None and now.keyframe_poses is not None
+    moved = np.linalg.norm(tried[1].poses[:, :3, 3] - now.keyframe_poses[:, :3, 3], axis=1)
+    words = page.loops._proposal._words.content
+    assert f"{100 * moved.max():.1f} cm</b> (keyframe {moved.argmax()})" in words
+    for residuals in (now.loops.residuals, tried[1].residuals):
+        worst = max(residuals, key=lambda factor: factor.sigmas)
+        assert f"loop {worst.pair[0]}–{worst.pair[1]}</td><td>{worst.sigmas:.2f}" in words
+
+
+def test_nothing_can_be_committed_before_its_effect_is_known(page: Page) -> None:
+    page.choose(GOOD)
+    page.loops._proposal.command = Reject(*GOOD)  # asked, and the engine is still at it
+    page.draw()
+    assert page.loops._proposal._commit.disabled and "works out" in page.loops._proposal._words.content
+
+
+def test_what_the_engine_refuses_is_told_where_it_was_asked(page: Page) -> None:
+    page.loops._proposal.propose(Accept(0, 3))
+    page.draw()
+    assert "There is no loop candidate of keyframes 0 and 3" in page.loops._proposal._words.content
+    assert page.loops._proposal._commit.disabled
+
+
+def test_the_weight_is_tried_when_the_hand_rests(page: Page) -> None:
+    page.choose(GOOD)
+    page.engine.sent.clear()
+    for weight in (2.0, 3.0, 4.0):
+        user_sets(page.loops._verdict._weight, weight)
+        page.draw(0.1)
+    assert page.engine.sent == []
+    page.draw(0.5)
+    assert page.engine.sent == [TryLoop(SetWeight(*GOOD, 4.0))]
+    user_clicks(page.loops._proposal._commit)
+    page.draw()
+    assert page.edge(GOOD).weight == 4.0 and page.loops._verdict._weight.value == 4.0
+
+
+def test_choosing_another_loop_drops_what_was_being_considered(page: Page) -> None:
+    page.choose(GOOD)
+    user_clicks(page.loops._verdict._reject)
+    page.draw()
+    page.choose(WAITING)
+    assert page.loops._proposal.command is None and TryLoop(None) in page.engine.sent
+
+
+def test_undo_and_redo_say_what_they_would_do(page: Page) -> None:
+    panel = page.loops._edits
+    assert panel._undo.disabled and panel._redo.disabled and panel._save.disabled
+    page.engine.send(OverruleLoop(Reject(*GOOD)))
+    page.engine.send(OverruleLoop(Accept(*WAITING)))
+    page.draw()
+    assert panel._undo.label == "Undo: accept 34–112" and panel._redo.disabled
+    user_clicks(panel._undo)
+    page.draw()
+    assert page.engine.sent[-1] == UndoLoop()
+    assert panel._undo.label == "Undo: reject 12–89" and panel._redo.label == "Redo: accept 34–112"
+    user_clicks(panel._redo)
+    page.draw()
+    assert page.engine.sent[-1] == RedoLoop() and panel._redo.disabled
+
+
+def test_edits_are_saved_and_given_again(page: Page) -> None:
+    commands = (Reject(*GOOD), Accept(*WAITING), Add(20, 97), SetWeight(20, 97, 0.5))
+    for command in commands:
+        page.engine.send(OverruleLoop(command))
+    files: dict[str, bytes] = {}
+    browser: Any = SimpleNamespace(send_file_download=lambda name, content, **_: files.update({name: content}))
+    page.loops._edits._download(browser)
+    assert edits.read(files["edits.yaml"].decode()) == commands
+    page.engine.sent.clear()
+    page.loops._edits._load(files["edits.yaml"], None)
+    assert page.engine.sent == [OverruleLoop(command) for command in commands]
+
+
+def test_a_file_that_can_not_be_used_changes_nothing_and_says_why(page: Page) -> None:
+    told: list[str] = []
+    browser: Any = SimpleNamespace(add_notification=lambda title, text, **_: told.append(text))
+    page.loops._edits._load(b"- accept: [1, 2]\n- acept: [3, 4]\n", browser)
+    assert page.engine.sent == [] and "entry 2" in told[0]
