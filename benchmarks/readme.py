@@ -1,6 +1,6 @@
 """Puts what `hemislam evaluate --suite paper` found beside the paper's own figures, into README.md.
 
-hemislam evaluate --suite paper --short --out runs/suite
+hemislam evaluate --suite paper --short --seed 0 --seed 1 --seed 2 --out runs/suite
 python -m benchmarks.readme runs/suite
 """
 
@@ -38,19 +38,23 @@ def section(results: dict[str, Any]) -> str:
         f"| sequence | | {' | '.join(SYSTEMS)} |",
         f"| --- | --- |{' ---: |' * len(SYSTEMS)}",
     ]
+    twins: dict[str, list[dict[str, Any]]] = {}
     for recording in results["recordings"]:
-        sequence = paper.SEQUENCES.get(recording["name"].partition("-")[0])
+        twins.setdefault(recording["name"].partition("-")[0], []).append(recording)
+    for scene, recordings in twins.items():
+        sequence = paper.SEQUENCES.get(scene)
         if sequence is None:
             continue
-        found = {variant["variant"]: variant for variant in recording["variants"]}
-        ours = [found.get(name) or {} for name in SYSTEMS]
+        found = [{variant["variant"]: variant for variant in recording["variants"]} for recording in recordings]
+        ours = [[variants.get(name) for variants in found] for name in SYSTEMS]
         rows = (
-            ("ATE here, m", [_at(o, "accuracy", "ate_m", "rmse") for o in ours], ".4f"),
+            ("ATE here, m", [_mean(seeds, "accuracy", "ate_m", "rmse") for seeds in ours], ".4f"),
             ("ATE in the paper, m", [sequence.ate_m.get(name) for name in SYSTEMS], ".2f"),
-            ("ms a frame here", [_at(o, "runtime_ms", "total", "median") for o in ours], ".1f"),
+            ("ms a frame here", [_mean(seeds, "runtime_ms", "cpu", "median") for seeds in ours], ".1f"),
             ("ms a frame in the paper", [sequence.runtime_ms.get(name) for name in SYSTEMS], ".1f"),
         )
-        name = f"{sequence.name} ({recording['name']})"
+        seeds = f", mean of {len(recordings)} seeds" if len(recordings) > 1 else ""
+        name = f"{sequence.name} ({recordings[0]['name']}{seeds})"
         for label, values, form in rows:
             if any(value is not None for value in values):
                 cells = " | ".join("–" if value is None else format(value, form) for value in values)
@@ -59,8 +63,20 @@ def section(results: dict[str, Any]) -> str:
     lines += ["", paper.NOT_COMPARABLE, "", "What it says of the whole method (`report.md` tells of its parts):", ""]
     lines += [f"- {finding}" for finding in results["findings"] if finding.startswith("Ours ")]
     return "\n".join(
-        [*lines, "", f"Measured on {machine['processor']}, {machine['cores']} cores, one of them a variant."]
+        [
+            *lines,
+            "",
+            f"Measured on {machine['processor']}, {machine['cores']} cores, one of them a variant; times are CPU time,"
+            " the median over all frames.",
+        ]
     )
+
+
+def _mean(trees: list[Any], *path: str) -> float | None:
+    """Over all seeds; None if one of them has no value."""
+    values = [_at(tree, *path) for tree in trees]
+    there = [value for value in values if value is not None]
+    return sum(there) / len(there) if there and len(there) == len(values) else None
 
 
 def _at(tree: Any, *path: str) -> float | None:

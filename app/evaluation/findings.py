@@ -9,6 +9,8 @@ from app.evaluation.measured import START_S, Column, Evaluated
 
 LIKE = 0.02
 """Closer than this share of one another, two values are the same."""
+MOST_NAMED = 4
+"""Recordings that go the other way; of more, the number is told and the tables show which."""
 CHANCE = 2.0
 """A mean difference of fewer standard errors than this, over the recordings, may be chance."""
 
@@ -102,7 +104,8 @@ def _claim(recordings: Sequence[Evaluated], name: str, base: str, what: str, met
     worse = [pair[0] for pair in pairs if _compare(pair[1], pair[2])[1]]
     if len(pairs) > 1:
         sentence += f" over {len(pairs)} recordings{_certainty(pairs)}"
-        where = "all" if len(worse) == len(pairs) else ", ".join(worse)
+        where = ", ".join(worse) if len(worse) <= MOST_NAMED else f"{len(worse)} of them"
+        where = "all" if len(worse) == len(pairs) else where
         sentence += f"; it rises on {where}" if worse else ""
     return sentence + ("; this goes against what the paper found." if against and metric.promised else ".")
 

@@ -71,6 +71,8 @@ def test_outdoors_is_only_told_of_recordings_outdoors() -> None:
 def test_recordings_that_go_the_other_way_are_named_though_the_mean_falls() -> None:
     text = about(said("outdoor", [1.0, 3.0], [3.0, 2.0]), "error (ATE)")
     assert "falls by" in text and "it rises on outdoor_1" in text and "outdoor_0" not in text
+    most = about(said("outdoor", [3.0] * 5 + [1.0], [2.0] * 6), "error (ATE)")
+    assert "it rises on 5 of them" in most
     assert "it rises on all" in about(said("outdoor", [3.0, 3.0], [2.0, 2.0]), "error (ATE)")
 
 
