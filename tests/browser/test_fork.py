@@ -6,19 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import viser
 from playwright.sync_api import Browser, expect
 
-from app.server.folders import Folders
 from app.server.fork import Workspace
 from app.server.protocol import Seek, SetParams
-from app.ui.workbench import Workbench
-from tests.browser import test_page
-from tests.browser.test_page import Bench
+from tests.browser.conftest import Bench, opened
 from tests.ui.fake_engine import FakeEngine
 from tests.ui.fake_forks import workspace
-
-chromium = test_page.chromium
 
 
 @pytest.fixture(scope="module")
@@ -32,18 +26,8 @@ def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workspace]:
 
 @pytest.fixture(scope="module")
 def bench(chromium: Browser, forks: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    workbench = Workbench(server, forks, Folders([tmp_path_factory.mktemp("recordings")]))
-    workbench.start()
-    page = chromium.new_page(viewport={"width": 1280, "height": 900})
-    page.set_default_timeout(60_000)
-    url = f"http://127.0.0.1:{server.get_port()}/"
-    page.goto(url)
-    expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
-    yield Bench(server, forks, page, url)  # type: ignore[arg-type]
-    workbench.close()
-    page.close()
-    server.stop()
+    with opened(chromium, forks, tmp_path_factory.mktemp("recordings"), 1280, 900) as bench:
+        yield bench
 
 
 def blue(bench: Bench) -> int:

@@ -1,21 +1,15 @@
 """Loops in a real Chromium: clicks on HTML that reach the server, clicks in the scene, and the keys."""
 
 import os
-import shutil
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
-import viser
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, expect
 
-from app.server.folders import Folders
 from app.server.protocol import InspectLoop, OverruleLoop, RedoLoop, TryLoop, UndoLoop
 from app.slam.loops.types import Reject
-from app.ui.workbench import Workbench
-from tests.browser.test_page import _ARGS, _SLOW_MS
+from tests.browser.conftest import Bench, opened
 from tests.ui.fake_loops import LoopEngine
 
 GOOD = (12, 89)
@@ -23,48 +17,15 @@ UP = np.array([12.0, 6.9, 38.0])
 """Where the camera is: high above the middle of the building."""
 
 
-@dataclass
-class Bench:
-    workbench: Workbench
-    engine: LoopEngine
-    page: Page
-
-    def eventually(self, holds: Callable[[], bool], seconds: float = 60.0) -> None:
-        deadline = time.monotonic() + seconds
-        while not holds():
-            assert time.monotonic() < deadline, "it did not come about in time"
-            self.page.wait_for_timeout(50)
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    path = shutil.which("chromium") or shutil.which("google-chrome")
-    if path is None and "CI" in os.environ:
-        pytest.fail("CI must have chromium")
-    if path is None:
-        pytest.skip("needs chromium")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=list(_ARGS))
-        yield browser
-        browser.close()
-
-
 @pytest.fixture(scope="module")
 def bench(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     engine = LoopEngine()
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    workbench = Workbench(server, engine, Folders([tmp_path_factory.mktemp("recordings")]))
-    server.initial_camera.position, server.initial_camera.look_at = tuple(UP), (12.0, 7.0, 0.0)
-    workbench.start()
-    page = chromium.new_page(viewport={"width": 1280, "height": 900})
-    page.set_default_timeout(_SLOW_MS)
-    page.goto(f"http://127.0.0.1:{server.get_port()}/")
-    page.get_by_role("tab", name="Loops").click()
-    expect(page.get_by_text("accepted 6")).to_be_visible(timeout=_SLOW_MS)
-    yield Bench(workbench, engine, page)
-    workbench.close()
+    above = (tuple(UP), (12.0, 7.0, 0.0))
+    with opened(chromium, engine, tmp_path_factory.mktemp("recordings"), 1280, 900, above) as bench:
+        bench.page.get_by_role("tab", name="Loops").click()
+        expect(bench.page.get_by_text("accepted 6")).to_be_visible()
+        yield bench
     engine.close()
-    server.stop()
 
 
 def test_chips_rows_and_heads_of_the_ledger_can_be_clicked(bench: Bench) -> None:

@@ -1,118 +1,25 @@
-"""The page in a real Chromium, drawn in software. One browser for all tests: starting it takes longest."""
+"""The page in a real Chromium."""
 
-import io
-import os
-import shutil
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-import viser
-from PIL import Image
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, expect
 
-from app.server.folders import Folders
 from app.server.protocol import OpenRecording, Seek, SetParams, StepFrame
-from app.ui.workbench import Workbench
-from tests.ui.fake_engine import FakeEngine
-
-_ARGS = (
-    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
-)  # fmt: skip
-_SLOW_MS = 60_000
-"""Software rendering on a busy machine; what is expected comes as soon as it comes."""
-expect.set_options(timeout=_SLOW_MS)
-
-
-@dataclass
-class Bench:
-    """A served workbench and a page that shows it."""
-
-    server: viser.ViserServer
-    engine: FakeEngine
-    page: Page
-    url: str
-
-    def eventually(self, holds: Callable[[], bool], seconds: float = 60.0) -> None:
-        deadline = time.monotonic() + seconds
-        while not holds():
-            assert time.monotonic() < deadline, "it did not come about in time"
-            self.page.wait_for_timeout(50)
-
-    def press(self, key: str, holds: Callable[[], bool], page: Page | None = None) -> None:
-        """Press a key, again if need be: a page that is still busy may drop it."""
-
-        def pressed() -> bool:
-            (page or self.page).keyboard.press(key)
-            self.page.wait_for_timeout(1500)
-            return holds()
-
-        self.eventually(pressed)
-
-    def resting_camera(self, client: viser.ClientHandle) -> np.ndarray:
-        """(3,) where the page's camera is, once it has said so and stays there."""
-        seen = [client.camera.position]
-
-        def rests() -> bool:
-            self.page.wait_for_timeout(400)
-            seen.append(client.camera.position)
-            return bool(np.allclose(seen[-1], seen[-2], atol=1e-6))
-
-        self.eventually(rests)
-        return np.asarray(seen[-1])
-
-    def pixels(self) -> np.ndarray:
-        """(h, w, 3) of the scene between the panels."""
-        shot = self.page.screenshot(clip={"x": 310, "y": 150, "width": 340, "height": 460})
-        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
-
-    def seed_pixels(self) -> int:
-        """How much of the scene is amber, as seeds and their wedge are."""
-        r, g, b = np.moveaxis(self.pixels(), 2, 0)
-        return int(((r > 180) & (g > 110) & (g < 210) & (b < 90)).sum())
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    path = shutil.which("chromium") or shutil.which("google-chrome")
-    if path is None and "CI" in os.environ:
-        pytest.fail("CI must have chromium")
-    if path is None:
-        pytest.skip("needs chromium")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=list(_ARGS))
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def bench(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    folder = tmp_path_factory.mktemp("recordings")
-    (folder / "garage.mcap").write_bytes(b"x" * 2_000)
-    (folder / "older").mkdir()
-    engine = FakeEngine(columns=30)
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    workbench = Workbench(server, engine, Folders([folder]))
-    workbench.start()
-    page = chromium.new_page(viewport={"width": 1000, "height": 620})
-    page.set_default_timeout(_SLOW_MS)
-    url = f"http://127.0.0.1:{server.get_port()}/"
-    page.goto(url)
-    expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
-    yield Bench(server, engine, page, url)
-    workbench.close()
-    engine.close()
-    server.stop()
+from tests.browser.conftest import Bench
 
 
 @pytest.fixture(autouse=True)
 def _fresh(bench: Bench) -> None:
     """Each test starts paused and with nothing sent."""
     bench.engine.sent.clear()
+
+
+def seed_pixels(bench: Bench) -> int:
+    """How much of the scene is amber, as seeds and their wedge are."""
+    r, g, b = np.moveaxis(bench.pixels(), 2, 0)
+    return int(((r > 180) & (g > 110) & (g < 210) & (b < 90)).sum())
 
 
 ALPHA = 2
@@ -176,13 +83,13 @@ def test_a_focused_slider_takes_the_arrow_for_itself_and_the_scene_is_relabelled
     bench.engine.sent.clear()
     slider = bench.page.locator("[role=slider]").nth(ALPHA)
     expect(slider).to_have_attribute("aria-valuenow", "60")
-    bench.eventually(lambda: bench.seed_pixels() > 80)
-    many = bench.seed_pixels()
+    bench.eventually(lambda: seed_pixels(bench) > 80)
+    many = seed_pixels(bench)
     slider.focus()
     bench.press("ArrowLeft", lambda: 50.0 < bench.engine.snapshot.params.ground.alpha < 60.0)
     bench.press("Home", lambda: bench.engine.snapshot.params.ground.alpha == 1.0)
     assert not [command for command in bench.engine.sent if isinstance(command, StepFrame)]
-    bench.eventually(lambda: bench.seed_pixels() < many / 2)
+    bench.eventually(lambda: seed_pixels(bench) < many / 2)
     bench.engine.send(SetParams({"ground.alpha": 40.0, "ground.scan_lines": 8}))
     expect(slider).to_have_attribute("aria-valuenow", "40")
 

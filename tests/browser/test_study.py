@@ -8,10 +8,7 @@ from playwright.sync_api import Locator, expect
 
 from app.server.breakpoints import Breakpoints
 from app.server.protocol import Seek, SetBreakpoints, StepFrame
-from tests.browser import test_page
-from tests.browser.test_page import Bench
-
-chromium, bench = test_page.chromium, test_page.bench
+from tests.browser.conftest import Bench
 
 LEFT = RIGHT = 72
 """Pixels of the timeline beside its strips: names and values."""

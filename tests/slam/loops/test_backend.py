@@ -24,7 +24,7 @@ def misplaced(poses: F64, truth: F64) -> float:
     return float(np.sqrt(np.mean(np.sum((poses[:, :3, 3] @ T[:3, :3].T + T[:3, 3] - truth[:, :3, 3]) ** 2, axis=1))))
 
 
-# --- finding --------------------------------------------------------------------------------------
+# --- finding -------------------------------------------------------------------------------------
 def test_revisits_are_found_where_they_are_and_nothing_else_is(walked: Walked) -> None:
     loops = accepted(walked.backend)
     errors = np.array([error(edge, walked.walk.truth) for edge in loops])
@@ -70,7 +70,7 @@ def test_corridors_and_rooms_that_repeat_make_no_false_loop() -> None:
     assert errors[:, 1].max() < 2.0
 
 
-# --- history --------------------------------------------------------------------------------------
+# --- history -------------------------------------------------------------------------------------
 def test_the_same_walk_gives_the_same_loops_and_poses_to_the_last_bit(walked: Walked) -> None:
     again = drive(walked.keyframes, PARAMS)
     assert again.poses.tobytes() == walked.poses[-1].tobytes()
@@ -165,7 +165,7 @@ def test_a_window_keeps_what_is_older_than_it_in_place(walked: Walked) -> None:
         np.testing.assert_array_equal(after[:left], before[:left])
 
 
-# --- what is shown and written --------------------------------------------------------------------
+# --- what is shown and written -------------------------------------------------------------------
 def test_the_detail_of_a_loop_shows_both_places_and_how_they_fit(backend: LoopBackend) -> None:
     edge = accepted(backend)[-1]
     detail = backend.detail(*edge.pair)

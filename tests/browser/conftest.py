@@ -1,0 +1,123 @@
+"""The workbench in a real Chromium, drawn in software. One browser for all tests: starting it takes longest."""
+
+import io
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import viser
+from PIL import Image
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from app.server.folders import Folders
+from app.ui.workbench import Workbench
+from tests.ui.fake_engine import FakeEngine
+
+ARGS = (
+    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
+)  # fmt: skip
+SLOW_MS = 60_000
+"""Software rendering on a busy machine; what is expected comes as soon as it comes."""
+expect.set_options(timeout=SLOW_MS)
+
+
+@dataclass
+class Bench:
+    """A served workbench and a page that shows it."""
+
+    server: viser.ViserServer
+    workbench: Workbench
+    engine: Any
+    page: Page
+    url: str
+
+    def eventually(self, holds: Callable[[], bool], seconds: float = 60.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not holds():
+            assert time.monotonic() < deadline, "it did not come about in time"
+            self.page.wait_for_timeout(50)
+
+    def press(self, key: str, holds: Callable[[], bool], page: Page | None = None) -> None:
+        """Press a key, again if need be: a page that is still busy may drop it."""
+
+        def pressed() -> bool:
+            (page or self.page).keyboard.press(key)
+            self.page.wait_for_timeout(1500)
+            return holds()
+
+        self.eventually(pressed)
+
+    def resting_camera(self, client: viser.ClientHandle) -> np.ndarray:
+        """(3,) where the page's camera is, once it has said so and stays there."""
+        seen = [client.camera.position]
+
+        def rests() -> bool:
+            self.page.wait_for_timeout(400)
+            seen.append(client.camera.position)
+            return bool(np.allclose(seen[-1], seen[-2], atol=1e-6))
+
+        self.eventually(rests)
+        return np.asarray(seen[-1])
+
+    def pixels(self) -> np.ndarray:
+        """(h, w, 3) of the scene between the panels."""
+        shot = self.page.screenshot(clip={"x": 310, "y": 150, "width": 340, "height": 460})
+        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Browser]:
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None and "CI" in os.environ:
+        pytest.fail("CI must have chromium")
+    if path is None:
+        pytest.skip("needs chromium")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=list(ARGS))
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def opened(
+    chromium: Browser, engine: Any, folder: Path, width: int, height: int, camera: tuple[Any, Any] | None = None
+) -> Iterator[Bench]:
+    """A workbench on an engine, which stays the caller's, and its page, ready to be clicked.
+
+    Args:
+        camera: where it is at first, and what it looks at.
+    """
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    workbench = Workbench(server, engine, Folders([folder]))
+    if camera is not None:
+        server.initial_camera.position, server.initial_camera.look_at = camera
+    workbench.start()
+    page = chromium.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(SLOW_MS)
+    url = f"http://127.0.0.1:{server.get_port()}/"
+    page.goto(url)
+    expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+    yield Bench(server, workbench, engine, page, url)
+    workbench.close()
+    page.close()
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def bench(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """On a recording of thirty columns of building, in a small window."""
+    folder = tmp_path_factory.mktemp("recordings")
+    (folder / "garage.mcap").write_bytes(b"x" * 2_000)
+    (folder / "older").mkdir()
+    engine = FakeEngine(columns=30)
+    with opened(chromium, engine, folder, 1000, 620) as bench:
+        yield bench
+    engine.close()

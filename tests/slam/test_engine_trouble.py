@@ -1,0 +1,168 @@
+"""What the engine does with bad scans, gaps and people in the way."""
+
+from collections.abc import Iterable
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from app.slam.engine import Engine
+from app.slam.types import FrameStatus, ImuSamples, Measurement, Scan
+from tests.slam.engine_runs import FRAMES, REAL, errors, room_walk, run, worst
+from tests.slam.scenes import (
+    PERIOD_S,
+    START_NS,
+    Scene,
+    Walk,
+    box,
+    furnished_room,
+    measurements,
+    params_for,
+    pattern,
+)
+
+
+def only(scan: Scan, keep: np.ndarray) -> Scan:
+    truth = None if scan.truth_ground is None else scan.truth_ground[keep]
+    return Scan(scan.stamp_ns, scan.points[keep], scan.offsets_ns[keep], scan.intensity[keep], scan.ring[keep], truth)
+
+
+def first_points(scan: Scan, count: int) -> Scan:
+    return only(scan, np.arange(len(scan)) < count)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_lost_without_points_and_found_again(count: int) -> None:
+    """A second with a hand over the sensor."""
+    engine, walk = Engine(params_for(REAL)), room_walk(80)
+    results = []
+    for k, m in enumerate(walk):
+        scan = first_points(m.scan, count) if 40 <= k < 50 else m.scan
+        results.append(engine.step(scan, m.imu))
+    assert [r.index for r in results if r.status is FrameStatus.LOST] == list(range(40, 50))
+    assert any("Lost" in n for n in results[40].notices)
+    assert any("again" in n for n in results[50].notices)
+    assert not any("Lost" in n or "again" in n for r in [*results[:40], *results[51:]] for n in r.notices)
+    metres, degrees = worst(results, Walk(), since=52)
+    assert metres < 0.03
+    assert degrees < 0.5
+    during = errors(results, Walk())[40:50, 0].max()
+    assert during < 0.3  # carried by the IMU alone
+
+
+def test_scans_out_of_range_are_as_scans_without_points() -> None:
+    engine = Engine(params_for(REAL))
+    run(engine, room_walk()[:20])
+    m = room_walk()[20]
+    for factor in (1e-3, 1e4):
+        far = replace(m.scan, points=m.scan.points * np.float32(factor))
+        probe = Engine(params_for(REAL))
+        probe.restore(engine.checkpoint())
+        r = probe.step(far, m.imu)
+        assert r.status is FrameStatus.LOST
+        assert r.points_in == len(r.cloud) == 0
+        assert r.stamp_ns == m.scan.end_ns
+        assert not r.ground.found
+
+
+def test_points_that_are_no_numbers_are_left_out() -> None:
+    engine = Engine(params_for(REAL))
+    run(engine, room_walk()[:20])
+    m = room_walk()[20]
+    bad = m.scan.points.copy()
+    bad[::7] = np.nan
+    bad[3::50, 1] = np.inf
+    r = engine.step(replace(m.scan, points=bad), m.imu)
+    assert np.isfinite(r.cloud.points).all()
+    assert len(r.cloud) == np.isfinite(bad).all(axis=1).sum()
+    assert np.isfinite(r.state.T_odom_imu).all()
+    assert r.status is FrameStatus.TRACKING
+
+
+def test_an_empty_first_scan_does_not_end_the_walk() -> None:
+    engine = Engine(params_for(REAL))
+    results = [engine.step(first_points(m.scan, 0) if k < 15 else m.scan, m.imu) for k, m in enumerate(room_walk())]
+    assert results[-1].status is FrameStatus.TRACKING
+    assert results[-1].registration.inliers > 100
+    metres, _ = worst(results[20:], Walk())
+    assert metres < 0.1
+
+
+def without_imu(walk: Iterable[Measurement], begin_s: float, end_s: float) -> list[Measurement]:
+    """The walk with no IMU sample in between, paired as the sequencer pairs: samples around each scan."""
+    entries = list(walk)
+    stamps, gyro, accel = (np.concatenate([getattr(m.imu, f.name) for m in entries]) for f in fields(ImuSamples))
+    stamps, first = np.unique(stamps, return_index=True)
+    at = (stamps - START_NS) * 1e-9
+    keep = (at <= begin_s) | (at >= end_s)
+    stamps, gyro, accel = stamps[keep], gyro[first][keep], accel[first][keep]
+    paired, last_ns = [], stamps[0]
+    for m in entries:
+        a = max(np.searchsorted(stamps, last_ns, side="right") - 1, 0)
+        b = np.searchsorted(stamps, m.scan.end_ns)
+        paired.append(Measurement(m.scan, ImuSamples(stamps[a : b + 1], gyro[a : b + 1], accel[a : b + 1])))
+        last_ns = m.scan.end_ns
+    return paired
+
+
+@pytest.mark.parametrize("seconds", [0.15, 0.5])
+def test_a_gap_in_the_imu_is_bridged_by_the_scans(seconds: float) -> None:
+    results = run(Engine(params_for(REAL)), without_imu(room_walk(80), 4.02, 4.02 + seconds))
+    metres, degrees = worst(results, Walk(), since=55)
+    assert metres < 0.05
+    assert degrees < 0.7
+    assert results[-1].status is FrameStatus.TRACKING
+
+
+def test_scans_that_are_missing_are_bridged_by_the_imu() -> None:
+    """A second without a scan; the next one brings the samples of all that time."""
+    walk, rig = room_walk(80), REAL
+    gap = [m for k, m in enumerate(walk) if not 40 <= k < 50]
+    stamps = np.concatenate([m.imu.stamps_ns for m in walk[40:51]])
+    stamps, first = np.unique(stamps, return_index=True)
+    joined = ImuSamples(
+        stamps,
+        np.concatenate([m.imu.gyro for m in walk[40:51]])[first],
+        np.concatenate([m.imu.accel for m in walk[40:51]])[first],
+    )
+    gap[40] = Measurement(gap[40].scan, joined)
+    results = run(Engine(params_for(rig)), gap)
+    metres, degrees = worst(results, Walk(), since=41)
+    assert metres < 0.03
+    assert degrees < 0.5
+
+
+def test_a_scan_from_the_past_breaks_nothing() -> None:
+    """The sequencer does not let one through; if a caller does, the engine goes on afterwards."""
+    engine = Engine(params_for(REAL))
+    results = run(engine, room_walk()[:30])
+    engine.step(room_walk()[25].scan, room_walk()[25].imu)
+    engine.step(room_walk()[29].scan, room_walk()[29].imu)
+    results = run(engine, room_walk()[30:])
+    metres, degrees = worst(results, Walk(), since=5)
+    assert metres < 0.05
+    assert degrees < 1.0
+
+
+def test_a_full_revolution_of_57632_points_is_taken() -> None:
+    rig = replace(REAL, columns=1801)
+    engine = Engine(params_for(rig))
+    results = run(engine, measurements(furnished_room(), Walk(), rig, 14))
+    assert results[-1].points_in == 57_632
+    metres, _ = worst(results, Walk())
+    assert metres < 0.01
+    assert results[-1].registration.used <= engine.params.filter.max_points
+    assert len(pattern(1801)[0]) == 57_632
+
+
+def test_a_person_walking_by_does_not_take_the_map_along() -> None:
+    """A moving box within arm's reach, a sixth of the view."""
+    engine, walk = Engine(params_for(REAL)), Walk()
+    results = []
+    for k, m in enumerate(measurements(furnished_room(), walk, REAL, FRAMES)):
+        x = 1.2 + 0.02 * k
+        scene = Scene(furnished_room().room, (*furnished_room().boxes, box(x, -0.4, -1.3, x + 0.4, 0.4, 0.5)))
+        seen = next(iter(measurements(scene, walk, REAL, 1, begin_s=0.05 + k * PERIOD_S)))
+        results.append(engine.step(seen.scan, m.imu))
+    metres, _ = worst(results, walk)
+    assert metres < 0.03
