@@ -8,7 +8,7 @@ import viser
 
 from app.server.breakpoints import Breakpoints
 from app.server.protocol import Command, SetBreakpoints, Snapshot
-from app.ui.widgets import by_user, show
+from app.ui.widgets import as_set, show
 
 _SWITCHES: Final = (
     ("loop_found", "loop found", "A loop was accepted."),
@@ -54,7 +54,7 @@ class BreakpointPanel:
             number.visible = False
             self._limits[limit.name] = switch, number
         for control in (*self._switches.values(), *(part for pair in self._limits.values() for part in pair)):
-            control.on_update(by_user(lambda _value, _client: self._changed()))
+            control.on_update(as_set(lambda _value, _client: self._changed()))
 
     def tick(self, snapshot: Snapshot) -> None:
         """Called by the drawing thread, often."""

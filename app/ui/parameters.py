@@ -16,7 +16,7 @@ from app.server.fork import engine_number
 from app.server.protocol import Command, LoadParams, Restart, SetParams, Snapshot
 from app.slam.params import Effect, Leaf, Params, leaves
 from app.ui.html import box
-from app.ui.widgets import by_user, show
+from app.ui.widgets import as_set, by_user, show
 
 PRIMARY: Final = ("ground.scan_lines", "ground.alpha", "ground.sigma", "ground.voxel_size")
 """The paper's sliders, above all others."""
@@ -158,7 +158,7 @@ class ParameterPanel:
             if not typed:
                 self._send(SetParams({leaf.path: value}))
 
-        control.on_update(by_user(changed))
+        control.on_update(as_set(changed))
 
     def _add_reset(self, group: str) -> None:
         """A button for every parameter of the group that is not at its default, and one for all."""

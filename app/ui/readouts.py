@@ -160,8 +160,8 @@ class ReadoutPanel:
         self._error.visible = False
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the snapshot. Called a few times a second at most: a page of numbers is not read faster."""
-        result, series = snapshot.result, snapshot.series
+        """Show the snapshot's numbers. Called a few times a second at most: they are not read faster."""
+        result = snapshot.result
         if result is None:
             self._tiles.content = '<div class="hs hs-quiet">Numbers appear with the first frame.</div>'
             self._time.content = ""
@@ -177,6 +177,10 @@ class ReadoutPanel:
                 + heading("Time")
             )
             self._time.content = time_tiles(snapshot, result)
+
+    def draw_plots(self, snapshot: Snapshot) -> None:
+        """Show the snapshot's plots, of which a browser draws each point anew."""
+        series = snapshot.series
         self._stages.data = stacked_stages(series)
         stamps, planarity = recent(series, "planarity")
         self._planarity.data = (stamps, planarity, np.full(len(stamps), snapshot.params.ground.planarity))

@@ -14,7 +14,9 @@ _WIDE_FROM_PX: Final = 700
 
 _SCRIPT: Final = """
 const shell = this.parentElement, mover = shell.closest('[data-hs-to]'), home = mover.parentElement;
-const canvas = shell.querySelector('canvas'), button = shell.querySelector('button'), pen = canvas.getContext('2d');
+const canvas = shell.querySelector('canvas'), button = shell.querySelector('button');
+// Thousands of rectangles: without the hint they go to the process that draws the scene as well, which waits for them.
+const pen = canvas.getContext('2d', {willReadFrequently: true});
 for (const old of document.querySelectorAll('body > [data-hs-to]')) if (old.querySelector('.hs-tl')) old.remove();
 const HEAD = 20, NAME = 72, VALUE = 72;
 let ROW = 17;

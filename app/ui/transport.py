@@ -10,7 +10,7 @@ import viser
 
 from app.server.protocol import Command, Pause, Play, Restart, Seek, SetSpeed, Snapshot, StepFrame
 from app.ui.html import box, number
-from app.ui.widgets import by_user, show
+from app.ui.widgets import as_set, by_user, show
 
 SPEEDS: Final = {
     "0.1×": 0.1,
@@ -27,6 +27,8 @@ _FRAME_COMMANDS: Final[dict[str, Command]] = {_BACK: StepFrame(-1), _STEP: StepF
 _DRAG_REST_S: Final = 0.2
 """The slider seeks when the hand has rested for so long: some frames on the way may have to be processed."""
 _SEEK_HOLD_S: Final = 1.0
+_PLAYING_PERIOD_S: Final = 1 / 4
+"""How often the slider and the numbers follow what plays: a browser lays the page out anew for each of them."""
 
 
 class TransportPanel:
@@ -48,6 +50,7 @@ class TransportPanel:
         self._now = now
         self._dragged: tuple[int, float] | None = None
         self._sought: tuple[int, float] | None = None
+        self._followed_at = -1e9
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY_FILLED, hint="space")
         self._frames = gui.add_button_group("frame", (_BACK, _STEP, _RESTART), hint="← and → step one frame.")
         self._slider = gui.add_slider("time (frame)", 0, 1, 1, 0, hint="Drag to go to a frame, back or on.")
@@ -57,8 +60,8 @@ class TransportPanel:
         )
         self._play.on_click(lambda _: self.toggle())
         self._frames.on_click(by_user(lambda chosen, _: send(_FRAME_COMMANDS[chosen])))
-        self._speed.on_update(by_user(lambda chosen, _: send(SetSpeed(SPEEDS[chosen]))))
-        self._slider.on_update(by_user(self._drag))
+        self._speed.on_update(as_set(lambda chosen, _: send(SetSpeed(SPEEDS[chosen]))))
+        self._slider.on_update(as_set(self._drag))
         gui.add_command("Play or pause", hotkey="space").on_trigger(lambda _: self.toggle())
         gui.add_command("Step one frame", hotkey="arrowright").on_trigger(lambda _: send(StepFrame()))
         gui.add_command("Step one frame back", hotkey="arrowleft").on_trigger(lambda _: send(StepFrame(-1)))
@@ -84,8 +87,11 @@ class TransportPanel:
         last = max(snapshot.recording.frames - 1, 1) if snapshot.recording else 1
         if self._slider.max != last:
             self._slider.max = last
-        if self._dragged is None and self._sought is None:
-            show(self._slider, min(max(transport.frame, 0), last))
+        if not transport.playing or now - self._followed_at >= _PLAYING_PERIOD_S:
+            self._followed_at = now
+            if self._dragged is None and self._sought is None:
+                show(self._slider, min(max(transport.frame, 0), last))
+            self._where.content = where(snapshot)
         live = snapshot.live is not None
         self._play.disabled = snapshot.recording is None
         # A live source has no past, and its own pace. viser can not disable a group of buttons.
@@ -96,7 +102,6 @@ class TransportPanel:
             self._play.label = "Pause" if playing else "Play"
             self._play.icon = viser.Icon.PLAYER_PAUSE_FILLED if playing else viser.Icon.PLAYER_PLAY_FILLED
         show(self._speed, speed_name(transport.speed))
-        self._where.content = where(snapshot)
 
     def _drag(self, frame: int, _: Any) -> None:
         self._dragged = (frame, self._now())

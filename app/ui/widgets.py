@@ -1,6 +1,6 @@
 """The little that every panel needs from viser's widgets."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import viser
@@ -20,6 +20,22 @@ def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callable[[viser.G
     """
 
     def callback(event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:
+            act(event.target.value, event.client)
+
+    return callback
+
+
+def as_set(
+    act: Callable[[Any, viser.ClientHandle], None],
+) -> Callable[[viser.GuiEvent[Any]], Coroutine[Any, Any, None]]:
+    """As `by_user`, for controls that code sets as well; `act` holds up the page's server, so it only notes or enqueues.
+
+    viser calls this back the moment it has taken the new value in, and not by way of its threads. On that
+    way a snapshot's older value may be shown over the new one, and it is the older that would be read.
+    """
+
+    async def callback(event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:
             act(event.target.value, event.client)
 

@@ -42,6 +42,9 @@ log = logging.getLogger(__name__)
 
 _SCENE_PERIOD_S: Final = 1 / 15
 _PANEL_PERIOD_S: Final = 1 / 4
+_PLAYING_PERIOD_S: Final = 1 / 2
+_PLAYING_PLOTS_PERIOD_S: Final = 1.0
+"""Laying out and painting panels costs a browser without a graphics card more than the scene does, which then waits."""
 _TICK_S: Final = 0.04
 """How long the drawing thread waits for a snapshot before it looks at the page's own controls."""
 
@@ -134,8 +137,8 @@ class Workbench:
 
         self._drawn: Snapshot | None = None
         self._drawn_view: View | None = None
-        self._scene_drawn_at = self._panels_drawn_at = -1e9
-        self._panels_due = True
+        self._scene_drawn_at = self._panels_drawn_at = self._plots_drawn_at = -1e9
+        self._panels_due = self._plots_due = True
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="workbench", daemon=True)
 
@@ -182,13 +185,14 @@ class Workbench:
             self._scene.draw(drawn, current, view, self._drawn_view)
             self._drawn, self._drawn_view = current, view
             self._scene_drawn_at = now
-            self._panels_due = True
+            self._panels_due = self._plots_due = True
             if awaited:  # the page is to be quick with this before anything else
                 self._server.flush()
-                self._panels_drawn_at = now
+                self._panels_drawn_at = self._plots_drawn_at = now
         self._study.tick(current, view)
         self._timeline.draw(current)
-        if self._panels_due and now - self._panels_drawn_at >= _PANEL_PERIOD_S:
+        playing = current.transport.playing
+        if self._panels_due and now - self._panels_drawn_at >= (_PLAYING_PERIOD_S if playing else _PANEL_PERIOD_S):
             self._panels_due = False
             self._panels_drawn_at = now
             self._readouts.draw(current)
@@ -196,6 +200,9 @@ class Workbench:
             self._live.draw(current)
             self._files.draw(current)
             self._appearance.draw(view, self._scene.limits(view.colour_by), self._scene.points, self._budget)
+        if self._plots_due and now - self._plots_drawn_at >= (_PLAYING_PLOTS_PERIOD_S if playing else _PANEL_PERIOD_S):
+            self._plots_due, self._plots_drawn_at = False, now
+            self._readouts.draw_plots(current)
 
 
 def _changed_by_user(drawn: Snapshot, current: Snapshot) -> bool:

@@ -1,10 +1,13 @@
 """A viser server whose messages to the browsers are written down."""
 
-from collections.abc import Iterator
+import asyncio
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import Future
 from typing import Any
 
 import pytest
 import viser
+from viser._messages import GuiUpdateMessage
 
 from tests.ui.fake_engine import FakeEngine
 
@@ -88,8 +91,40 @@ def user_sets(handle: Any, value: Any) -> None:
     """As if somebody set a control in a browser."""
     handle._impl.value = value
     for callback in handle._impl.update_cb:
-        callback(viser.GuiEvent(client=SOMEONE, client_id=0, target=handle))  # type: ignore[arg-type]
+        called = callback(viser.GuiEvent(client=SOMEONE, client_id=0, target=handle))  # type: ignore[arg-type]
+        if isinstance(called, Coroutine):
+            asyncio.run(called)
 
 
 def user_clicks(handle: Any) -> None:
     user_sets(handle, True)
+
+
+class BusyThreads:
+    """Runs what it is given when told to, as threads do that are late."""
+
+    def __init__(self) -> None:
+        self._late: list[Callable[[], object]] = []
+
+    def submit(self, call: Callable[..., object], *args: Any) -> Future[object]:
+        self._late.append(lambda: call(*args))
+        return Future()
+
+    def catch_up(self) -> None:
+        for call in self._late:
+            call()
+
+
+@pytest.fixture
+def busy(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> BusyThreads:
+    """viser's threads, all of them busy."""
+    threads = BusyThreads()
+    monkeypatch.setattr(server.gui, "_thread_executor", threads)
+    monkeypatch.setattr(server.gui, "_resolve_client", lambda _: SOMEONE)
+    return threads
+
+
+def browser_sends(server: viser.ViserServer, handle: Any, value: Any) -> None:
+    """As if a control's new value came in from a browser."""
+    message = GuiUpdateMessage(handle._impl.uuid, {"value": value})
+    asyncio.run(server.gui._handle_gui_updates(0, message))  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from app.server.protocol import (
 )
 from app.slam.params import Params, leaves
 from app.ui.parameters import PRIMARY, ParameterPanel
-from tests.ui.conftest import Clock, user_clicks, user_sets
+from tests.ui.conftest import BusyThreads, Clock, browser_sends, user_clicks, user_sets
 
 
 class Parameters:
@@ -130,3 +130,13 @@ def test_what_waits_for_a_restart_is_named_and_can_be_had_now(parameters: Parame
 def test_the_slider_of_m_ends_at_the_lines_there_are(parameters: Parameters) -> None:
     parameters.panel.fit_lines(32)
     assert parameters.control("ground.scan_lines").max == 32
+
+
+def test_what_a_browser_set_is_sent_though_an_older_snapshot_is_drawn_just_then(
+    parameters: Parameters, server: viser.ViserServer, busy: BusyThreads
+) -> None:
+    browser_sends(server, parameters.control("ground.alpha"), 33.0)
+    parameters.tick()
+    busy.catch_up()
+    assert parameters.sent == [SetParams({"ground.alpha": 33.0})]
+    assert parameters.control("ground.alpha").value == 33.0

@@ -14,7 +14,7 @@ from app.server.protocol import (
     StepFrame,
 )
 from app.ui.transport import SPEEDS, TransportPanel, speed_name, where
-from tests.ui.conftest import Clock, user_clicks, user_sets
+from tests.ui.conftest import BusyThreads, Clock, browser_sends, user_clicks, user_sets
 from tests.ui.fake_engine import FakeEngine
 
 
@@ -102,3 +102,30 @@ def test_the_stamp_is_exact_to_the_millisecond(engine: FakeEngine) -> None:
     text = where(engine.snapshot)
     assert "frame <b>11</b> of 400" in text and "<b>1.10</b> of 40.0 s" in text
     assert "2023-11-14 22:13:21.100 UTC" in text
+
+
+def test_a_dragged_slider_seeks_though_the_present_frame_is_shown_just_then(
+    transport: Transporting, server: viser.ViserServer, busy: BusyThreads
+) -> None:
+    transport.engine.send(StepFrame(4))
+    transport.tick()
+    browser_sends(server, transport.panel._slider, 2)
+    transport.tick()
+    busy.catch_up()
+    transport.tick(1.0)
+    assert transport.engine.sent[-1] == Seek(2)
+
+
+def test_numbers_follow_what_plays_four_times_a_second_and_end_at_the_frame_it_stops_at(
+    transport: Transporting,
+) -> None:
+    shown = set()
+    for _ in range(100):
+        transport.engine.send(StepFrame(1))
+        transport.engine.publish(transport=replace(transport.engine.snapshot.transport, playing=True))
+        transport.tick(0.01)
+        shown.add(transport.panel._slider.value)
+    assert 4 <= len(shown) <= 5
+    transport.engine.publish(transport=replace(transport.engine.snapshot.transport, playing=False))
+    transport.tick(0.01)
+    assert transport.panel._slider.value == transport.engine.snapshot.transport.frame == 99

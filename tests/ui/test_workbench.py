@@ -1,10 +1,13 @@
 """The whole page, drawn at the pace of eyes."""
 
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import viser
+from viser._messages import GuiUpdateMessage
 
 from app.server.folders import Folders
 from app.server.protocol import (
@@ -66,6 +69,22 @@ def test_numbers_come_at_most_four_times_a_second_and_end_at_the_newest(page: Pa
     assert 1 <= len(sent) <= 5
     page.draw(0.5)
     assert f"{page.engine.snapshot.result.ground.seeds:,}" in page.workbench._readouts._tiles.content  # type: ignore[union-attr]
+
+
+def test_what_plays_asks_a_browser_to_lay_its_panels_out_anew_but_a_few_times_a_second(page: Page, wire: Wire) -> None:
+    """Ten seconds at ten frames a second: each panel's update is more work for a page than a drawing of the scene."""
+    for step in range(270):  # the first 20 for what is sent but once
+        if step == 20:
+            wire.clear()
+        if step % 5 in (0, 2):
+            page.engine.send(StepFrame(1))
+            page.engine.publish(transport=replace(page.engine.snapshot.transport, playing=True))
+        page.draw(0.04)
+    counts = Counter((m.uuid, *m.updates) for m in wire.messages if isinstance(m, GuiUpdateMessage))
+    assert max(counts.values()) <= 40
+    assert counts.total() <= 300
+    scene = Counter(type(m).__name__ for m in wire.messages if not isinstance(m, GuiUpdateMessage))
+    assert scene.total() <= 1200
 
 
 def test_a_page_at_rest_sends_nothing(page: Page, wire: Wire) -> None:
