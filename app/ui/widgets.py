@@ -29,7 +29,7 @@ def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callable[[viser.G
 def as_set(
     act: Callable[[Any, viser.ClientHandle], None],
 ) -> Callable[[viser.GuiEvent[Any]], Coroutine[Any, Any, None]]:
-    """As `by_user`, for controls that code sets as well; `act` holds up the page's server, so it only notes or enqueues.
+    """As `by_user`, for controls that code sets as well. `act` must only note or enqueue: the page's server waits.
 
     viser calls this back the moment it has taken the new value in, and not by way of its threads. On that
     way a snapshot's older value may be shown over the new one, and it is the older that would be read.

@@ -81,8 +81,8 @@ def test_what_plays_asks_a_browser_to_lay_its_panels_out_anew_but_a_few_times_a_
             page.engine.publish(transport=replace(page.engine.snapshot.transport, playing=True))
         page.draw(0.04)
     counts = Counter((m.uuid, *m.updates) for m in wire.messages if isinstance(m, GuiUpdateMessage))
-    assert max(counts.values()) <= 40
-    assert counts.total() <= 300
+    assert max(counts.values()) <= 25
+    assert counts.total() <= 200
     scene = Counter(type(m).__name__ for m in wire.messages if not isinstance(m, GuiUpdateMessage))
     assert scene.total() <= 1200
 
