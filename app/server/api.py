@@ -33,7 +33,7 @@ from app.server.protocol import (
     UndoLoop,
 )
 from app.server.views import LoopsState, Speed, StateView, loops_state, state_view
-from app.slam.loops.types import Accept, Add, Reject, SetWeight
+from app.slam.loops.types import Accept, Add, Reject, SetWeight, Solve
 from app.slam.params import Params
 
 EXPORT_PATIENCE_S = 600.0
@@ -87,11 +87,11 @@ class OverruleBody(BaseModel):
     register_: bool = Field(True, alias="register", description="Of `add`: register the two, or tie them as they are.")
 
 
-class UndoBody(BaseModel):
-    action: Literal["undo", "redo"]
+class GraphBody(BaseModel):
+    action: Literal["undo", "redo", "solve"]
 
 
-LoopAction = Annotated[OverruleBody | UndoBody, Field(discriminator="action")]
+LoopAction = Annotated[OverruleBody | GraphBody, Field(discriminator="action")]
 
 
 class NoteBody(BaseModel):
@@ -159,7 +159,7 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
 
     @router.post("/loops", status_code=202)
     def overrule(body: LoopAction) -> None:
-        """Accept, reject, weigh or add a loop; undo or redo that."""
+        """Accept, reject, weigh or add a loop; solve all factors at once (Levenberg-Marquardt); undo or redo that."""
         _send(engine, _loop_command(body))
 
     @router.post("/notes", status_code=202)
@@ -215,7 +215,7 @@ def _command(action: Simple | StepBody | SeekBody | SpeedBody) -> Command:
             return Restart()
 
 
-def _loop_command(body: OverruleBody | UndoBody) -> Command:
+def _loop_command(body: OverruleBody | GraphBody) -> Command:
     match body:
         case OverruleBody(action="accept", older=older, newer=newer):
             return OverruleLoop(Accept(older, newer))
@@ -225,7 +225,9 @@ def _loop_command(body: OverruleBody | UndoBody) -> Command:
             return OverruleLoop(SetWeight(older, newer, body.weight))
         case OverruleBody(older=older, newer=newer):
             return OverruleLoop(Add(older, newer, register=body.register_))
-        case UndoBody(action="undo"):
+        case GraphBody(action="solve"):
+            return OverruleLoop(Solve())
+        case GraphBody(action="undo"):
             return UndoLoop()
         case _:
             return RedoLoop()
