@@ -1,8 +1,9 @@
 """Keyframe clouds thinned for display, and the whole map to what a page may show.
 
 Every chunk has a level: 0 is as it was made, each further one leaves one point per voxel, with edges that
-double. Levels rise where they are missed least and never fall, and what was thinned away is kept nowhere:
-however long the walk, its map takes no more memory than a page's budget of points.
+double, and the last one leaves none. Levels rise where they are missed least and never fall, and what was thinned
+away is kept nowhere: however long the walk, its map takes no more memory than a page's budget of points, and the
+page draws no more clouds than it can at once.
 """
 
 from collections.abc import Sequence
@@ -17,6 +18,9 @@ from app.slam.types import F32, F64, I64, Keyframe
 FINEST_VOXEL_M: Final = 0.08
 COARSEST_LEVEL: Final = 8
 """At 0.08 m · 2^7 = 10 m a keyframe is down to a handful of points; there is nothing left to thin."""
+EMPTY_LEVEL: Final = COARSEST_LEVEL + 1
+MOST_SHOWN: Final = 2000
+"""Keyframes that have points: each costs the page a drawing of its own, and the server some kilobytes."""
 _SLACK: Final = 0.97
 """Over budget, the map is thinned to this share of it, so that not every new keyframe thins again."""
 
@@ -50,6 +54,7 @@ def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: in
     Args:
         poses: (k, 4, 4) T_map_imu of at least the keyframes of these chunks. sensor: (3,) m, in the map.
     """
+    chunks = _spread(chunks, poses)
     total = sum(len(chunk.points) for chunk in chunks)
     if total <= budget:
         return chunks
@@ -63,10 +68,28 @@ def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: in
     return tuple(kept)
 
 
+def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
+    """The same with at most `MOST_SHOWN` that have points: those between two close neighbours lose theirs first."""
+    shown = [index for index, chunk in enumerate(chunks) if chunk.level < EMPTY_LEVEL]
+    if len(shown) <= MOST_SHOWN:
+        return chunks
+    kept = list(chunks)
+    while len(shown) > MOST_SHOWN:
+        positions = poses[[chunks[index].index for index in shown], :3, 3]
+        around = np.linalg.norm(positions[2:] - positions[:-2], axis=1)
+        index = shown.pop(1 + int(np.argmin(around)))
+        kept[index] = _taken(kept[index], np.zeros(0, dtype=np.int64), EMPTY_LEVEL)
+    return tuple(kept)
+
+
 def coarser(chunk: Chunk) -> Chunk:
     """A chunk at the next level."""
     level = chunk.level + 1
     chosen = np.sort(_first_per_voxel(chunk.points, voxel_of_level(level)))  # of random points in their order
+    return _taken(chunk, chosen, level)
+
+
+def _taken(chunk: Chunk, chosen: I64, level: int) -> Chunk:
     return replace(
         chunk,
         points=chunk.points[chosen],

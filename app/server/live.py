@@ -1,5 +1,6 @@
 """A run on a live source: frames come when they come, and there is no going back."""
 
+import contextlib
 import logging
 import pickle
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.types import Command
 from app.slam.params import Params
-from app.slam.results import RunLog
+from app.slam.results import LogState
 from app.slam.types import DroppedScan, Measurement
 
 POLL_S = 0.02
@@ -26,14 +27,16 @@ POLL_S = 0.02
 
 EVERY = 10
 """Frames between two checkpoints; the receiving process can give six seconds of scans again."""
-KEYFRAMES, CHECKPOINT = "keyframes", "checkpoint"
+KEYFRAMES, CHECKPOINT, ROWS = "keyframes", "checkpoint", "rows"
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """A live run as an engine that takes over needs it. end_ns: of its newest scan."""
+    """A live run as an engine that takes over needs it, but for keyframes and the log's rows, which are appended
+    to files of their own: what is written each time must not grow with the walk. end_ns: of its newest scan.
+    """
 
     frame: int
     end_ns: int
@@ -41,7 +44,7 @@ class _Kept:
     params: Params
     history: tuple[tuple[int, Params], ...]
     opened: OpenedRecording
-    log: RunLog
+    log: LogState
     readouts: Readouts
     overrulings: tuple[tuple[Command, ...], tuple[Command, ...]]
 
@@ -77,6 +80,9 @@ class LiveRun(Run):
         super().__init__(_Endless(), engine)  # type: ignore[arg-type]
         self._client = client
         self._folder = folder
+        self._rows_kept = 0
+        if engine.loops is not None:
+            engine.loops.never_go_back()
 
     def peek(self) -> Measurement | DroppedScan | Quiet | None:
         """As of a recording; `Quiet` if there is no scan just now."""
@@ -98,8 +104,7 @@ class LiveRun(Run):
 
     def grown(self) -> None:
         """What was opened has become longer."""
-        last = self.log.stamps_ns[-1] if len(self.log) else self.opened.start_ns
-        seconds = (int(last) - self.opened.start_ns) * 1e-9
+        seconds = (self._end_ns - self.opened.start_ns) * 1e-9 if len(self.log) else 0.0
         self.opened = replace(self.opened, frames=self.frame + 1, duration_s=seconds)
 
     def state(self) -> LiveState:
@@ -113,21 +118,43 @@ class LiveRun(Run):
         loops = self.engine.loops.state if self.engine.loops else None
         kept = _Kept(
             frame=self.frame,
-            end_ns=int(self.log.stamps_ns[-1]),
+            end_ns=self._end_ns,
             engine=self.engine.checkpoint(),
             params=self.params,
             history=self.history,
             opened=self.opened,
-            log=self.log,
+            log=self.log.checkpoint(),
             readouts=self.readouts,
             overrulings=(loops.undo, loops.redo) if loops else ((), ()),
         )
         part = self._folder / "checkpoint.part"
         try:
+            self._keep_rows()
             part.write_bytes(pickle.dumps(kept, protocol=5))
             part.replace(self._folder / CHECKPOINT)
         except OSError as error:
+            self._rows_kept = 0
             log.warning("What a new engine would need can not be kept: %s", error)
+
+    @property
+    def _end_ns(self) -> int:
+        return self.log.rows(len(self.log) - 1)[0][0]
+
+    def _keep_rows(self) -> None:
+        """Append what is new to the file of rows, which is written anew by a process that did not write it."""
+        path, part = self._folder / ROWS, self._folder / "rows.part"
+        with (path if self._rows_kept else part).open("ab" if self._rows_kept else "wb") as file:
+            pickle.dump(self.log.rows(self._rows_kept), file, protocol=5)
+        if not self._rows_kept:
+            part.replace(path)
+        self._rows_kept = len(self.log)
+
+    def _read_rows(self) -> None:
+        """Take in the file of rows; at its end may be more than belongs to the checkpoint, or half of an entry."""
+        ended = EOFError, pickle.UnpicklingError, OSError
+        with contextlib.suppress(*ended), (self._folder / ROWS).open("rb") as file:
+            while True:
+                self.log.extend(pickle.load(file))
 
     def revive(self) -> bool:
         """Go on where an engine that died was; whether there is anything to go on from."""
@@ -138,10 +165,14 @@ class LiveRun(Run):
         assert isinstance(kept, _Kept)
         if kept.engine.keyframes > len(self.engine.keyframes):
             return False
+        self._read_rows()
+        if len(self.log) < kept.log.frames:
+            return False
+        self.log.restore(kept.log)
         self.engine.restore(kept.engine)
         self.choose(kept.params)
         self.frame = self.known = kept.frame
-        self.history, self.opened, self.log, self.readouts = kept.history, kept.opened, kept.log, kept.readouts
+        self.history, self.opened, self.readouts = kept.history, kept.opened, kept.readouts
         if any(kept.overrulings):
             self.overrule(*kept.overrulings)
         self.complete = self._client.rewind(kept.end_ns)
@@ -168,6 +199,7 @@ def open_live_run(address: LiveAddress, params: Params, folder: Path, *, revive:
     if not revive:
         (folder / KEYFRAMES).unlink(missing_ok=True)
         (folder / CHECKPOINT).unlink(missing_ok=True)
+        (folder / ROWS).unlink(missing_ok=True)
     engine = Engine(params, LoopProcess if params.loops.enabled else None, KeyframeStore(folder / KEYFRAMES))
     run = LiveRun(client, engine, folder)
     if revive and not run.revive():

@@ -58,6 +58,10 @@ class RunInfo:
     stopped: str = ""
 
 
+LogRows = tuple["array[int]", "array[float]", "array[float]"]
+"""Rows of a `RunLog`: stamps, poses, timings."""
+
+
 @dataclass(frozen=True, slots=True)
 class LogState:
     """What `RunLog.restore` needs beside the rows, which the log keeps."""
@@ -116,6 +120,17 @@ class RunLog:
         self._frames = state.frames
         for name, value in state.sums.items():
             setattr(self, name, copy.copy(value))
+
+    def rows(self, first: int) -> LogRows:
+        """The rows of the frames from `first` on."""
+        return self._stamps[first:], self._poses[7 * first :], self._timings[len(TIMINGS) * first :]
+
+    def extend(self, rows: LogRows) -> None:
+        """Put rows of another log behind those of this one; `restore` says what they amount to."""
+        self._stamps += rows[0]
+        self._poses += rows[1]
+        self._timings += rows[2]
+        self._frames = len(self._stamps)
 
     def _count(self, notices: tuple[str, ...]) -> None:
         for notice in notices:

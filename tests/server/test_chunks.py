@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.server.chunks import COARSEST_LEVEL, coarser, next_to_thin, voxel_of_level, within_budget
+from app.server.chunks import COARSEST_LEVEL, MOST_SHOWN, coarser, next_to_thin, voxel_of_level, within_budget
 from app.server.delta import Fold, Outbox
 from app.server.protocol import Chunk
 from app.slam.params import Params
@@ -83,3 +83,19 @@ def test_a_reader_never_holds_more_points_than_its_budget() -> None:
     assert levels == sorted(levels, reverse=True)  # the walk went straight: the farther, the coarser
     for one in snapshot.chunks[:5]:  # a thinned chunk does not hold on to the whole one
         assert one.points.base is None or one.points.base.nbytes == one.points.nbytes
+
+
+def test_of_more_keyframes_than_a_page_can_draw_those_left_are_spread_over_the_whole_walk() -> None:
+    """Walked slowly at first, so that keyframes are denser there."""
+    count = MOST_SHOWN + 500
+    poses = walk(count)
+    poses[:, 0, 3] = np.cumsum(np.where(np.arange(count) < 1000, 0.1, 0.4))
+    chunks: tuple[Chunk, ...] = ()
+    for index in range(count):
+        chunks = within_budget((*chunks, chunk(index, 3)), poses, poses[index, :3, 3], 10**9)
+    shown = [one.index for one in chunks if len(one.points)]
+    assert len(chunks) == count and len(shown) == MOST_SHOWN
+    assert shown[0] == 0 and shown[-1] == count - 1
+    gaps = np.diff(poses[shown, 0, 3])
+    assert gaps.max() < 0.85
+    assert sum(index < 1000 for index in shown) < 600, "the dense part is thinned first"

@@ -16,10 +16,12 @@ class KnownKeyframes:
 
     Attributes:
         states: the last ones, by number of keyframes, so that a step back waits for nobody.
+        states_kept: most of them; each holds a pose for every keyframe.
     """
 
     def __init__(self) -> None:
         self.states: dict[int, LoopState] = {}
+        self.states_kept = STATES_KEPT
         self._frames: list[int] = []
         self._stamps: list[int] = []
         self._params: list[Loops] = []
@@ -57,5 +59,5 @@ class KnownKeyframes:
     def remember(self, count: int, state: LoopState) -> None:
         """The state after so many of them."""
         self.states[count] = state
-        while len(self.states) > STATES_KEPT:
+        while len(self.states) > self.states_kept:
             del self.states[next(iter(self.states))]

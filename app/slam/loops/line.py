@@ -151,6 +151,10 @@ class LoopLine:
         """Keyframes after this frame will be others."""
         self._known.forget(max(self._known.until(frame), self._count))
 
+    def never_go_back(self) -> None:
+        """The walk only goes on: what would have to be known to go back is not kept."""
+        self._known.states_kept = 0
+
     def finish(self) -> None:
         """The walk has ended: look for loops of the last keyframes too, and let all take effect that comes."""
         self._finished = True
