@@ -92,11 +92,11 @@ def serve(
       hemislam serve --live foxglove://robot:8765 --preset rslidar
       hemislam serve walk.mcap --host 0.0.0.0            from other computers, by the printed link
     """
+    from app.logs import start_logging
     from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording
     from app.server.folders import Folders
     from app.server.journal import SUFFIX, read_session
-    from app.server.logs import start_logging
     from app.server.protocol import LIVE
     from app.server.setup import Setup
     from app.server.web import Tls, run_server

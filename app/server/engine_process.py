@@ -1,12 +1,12 @@
 """The main loop of the engine's process."""
 
+import logging
 import os
 import queue
 import signal
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,6 +26,9 @@ FRAME_PERIOD_S = 0.04
 
 LAST_BREATH_S = 5.0
 """After the parent has gone, so long may the work under way take."""
+
+
+log = logging.getLogger(__name__)
 
 
 class Link:
@@ -93,7 +96,7 @@ class Link:
         except OSError:
             pass  # the parent has gone; _receive sees it too
         except BaseException:
-            traceback.print_exc()
+            log.critical("What changed can not be sent", exc_info=True)
             os._exit(1)
 
 

@@ -15,6 +15,7 @@ from dataclasses import replace
 from multiprocessing.connection import Connection, Pipe
 from typing import Final
 
+from app.logs import process_logs
 from app.server import wire
 from app.slam.loops.messages import LoopState, LoopWorkerDied, Reply, Request
 from app.slam.loops.types import LoopEdge, Pair
@@ -154,4 +155,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with process_logs("loops"):
+        main()

@@ -6,6 +6,7 @@ process dies, however, the pipe for commands ends and the engine's process ends 
 """
 
 import contextlib
+import math
 import multiprocessing
 import os
 import signal
@@ -15,9 +16,10 @@ from dataclasses import replace
 from multiprocessing import resource_tracker
 from typing import Any
 
+from app.logs import process_logs
 from app.server import wire
 from app.server.delta import Delta, Fold
-from app.server.protocol import LIVE, Command, Notice, OpenRecording, Restart, Shutdown, Snapshot
+from app.server.protocol import LIVE, Command, Notice, OpenRecording, Progress, Restart, Shutdown, Snapshot
 from app.server.setup import Setup
 from app.server.wire import Pipe
 
@@ -31,6 +33,11 @@ def _run_engine(commands: Pipe, updates: Pipe, setup: Setup) -> None:
     from app.server.engine_process import main  # the parent has no need of the engine and its compiler
 
     main(commands, updates, setup)
+
+
+def _logged(main: Main, commands: Pipe, updates: Pipe, setup: Setup) -> None:
+    with process_logs("engine"):
+        main(commands, updates, setup)
 
 
 class EngineProcess:
@@ -114,7 +121,7 @@ class EngineProcess:
         updates_in, updates_out = context.Pipe(duplex=False)
         wire.widen(updates_out)
         process = context.Process(
-            target=self._main, args=(commands_in, updates_out, setup), name="hemislam engine", daemon=True
+            target=_logged, args=(self._main, commands_in, updates_out, setup), name="hemislam engine", daemon=True
         )
         with _sigint_blocked():
             process.start()
@@ -150,7 +157,9 @@ class EngineProcess:
                 text = (
                     f"The engine's process has ended unexpectedly ({how}); it is started again and goes where it was."
                 )
-                self._edit(notices=(Notice(number, "error", text),))
+                self._edit(
+                    notices=(Notice(number, "error", text),), progress=Progress("Starting the engine again", math.nan)
+                )
                 on_the_way = last.progress is not None or last.transport.frame < 0  # to where the one before was
                 self._start(
                     replace(

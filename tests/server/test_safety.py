@@ -25,12 +25,12 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
+from app.logs import JsonLines
 from app.sensors.live.feed import Pace, feed
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
 from app.server.access import MOST_BYTES, Access
 from app.server.folders import Folders
-from app.server.logs import JsonLines
 from app.server.setup import Setup
 from app.server.viser_page import Gate, Refused, Viser, start_viser
 from app.server.web import Tls, links, listen, make_app, make_server
@@ -323,7 +323,7 @@ def test_a_certificate_that_can_not_be_used_is_told_at_once(certificate: Tls, tm
 def test_a_refusal_is_logged_as_one_line_of_json_without_the_token(site: Site, caplog: Any) -> None:
     httpx.get(site.url("/api/state?token=my-guess"))
     (record,) = [record for record in caplog.records if record.name == "app.server.access"]
-    (line,) = JsonLines().format(record).splitlines()
+    (line,) = JsonLines("server").format(record).splitlines()
     entry = json.loads(line)
     assert entry["level"] == "warning" and entry["status"] == 401 and "127.0.0.1" in entry["message"]
     assert "my-guess" not in line
@@ -372,7 +372,9 @@ def test_a_sigterm_to_the_whole_group_costs_nothing_that_was_received(tmp_path: 
     finally:
         process.kill()
     assert process.returncode == 0
-    assert "Traceback" not in err and [json.loads(line)["message"] for line in err.splitlines()][-1] == "Ending"
+    entries = [json.loads(line) for line in err.splitlines()]
+    assert "Traceback" not in err and entries[-1]["message"] == "Ending"
+    assert {entry["process"] for entry in entries} >= {"server", "live"}
     with record.open("rb") as file:
         found = make_reader(file).get_summary()
     assert found is not None and found.statistics is not None, "the file has its end"

@@ -6,6 +6,7 @@ goes on where its checkpoint was (`rewind`).
 """
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import secrets
@@ -21,12 +22,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from app.logs import process_logs
 from app.sensors.live.source import Event, LiveSource
 from app.sensors.live.status import LiveState
 from app.sensors.live.urls import open_live
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import Measurement
+
+log = logging.getLogger(__name__)
 
 HISTORY = 60
 """Measurements that can be had again: six seconds, and an engine's checkpoints are two apart."""
@@ -59,7 +63,7 @@ class LiveProcess:
         ours, theirs = context.Pipe()
         self._control = ours
         self._process = context.Process(
-            target=_serve, args=(theirs, self.address, lidar, params, imu, record), name="hemislam-live", daemon=True
+            target=_logged, args=(theirs, self.address, lidar, params, imu, record), name="hemislam-live", daemon=True
         )
         self._process.start()
         theirs.close()
@@ -181,6 +185,11 @@ class _Desk:
         return None
 
 
+def _logged(*arguments: Any) -> None:
+    with process_logs("live"):
+        _serve(*arguments)
+
+
 def _serve(
     control: "Connection[Any, Any]", address: LiveAddress, lidar: str, params: Params, imu: str | None,
     record: Path | None,
@@ -195,6 +204,7 @@ def _serve(
     except HemislamError as error:
         control.send(str(error))
         return
+    log.info("Receiving from %s", ", ".join(filter(None, (lidar, imu))))
     desk = _Desk(source)
     source.set_absent(True)
     with source, Listener(address.path, authkey=address.key) as listener:

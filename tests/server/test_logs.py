@@ -1,0 +1,73 @@
+"""One format for the log lines of all processes."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import warnings
+from typing import Any
+
+import pytest
+
+from app.server.setup import Setup
+from app.server.wire import Pipe
+from app.server.worker import EngineProcess
+
+
+def failing_main(commands: Pipe, updates: Pipe, setup: Setup) -> None:
+    warnings.warn("somewhat odd", stacklevel=1)
+    thread = threading.Thread(target=lambda: [][1], name="side work")
+    thread.start()
+    thread.join()
+    raise ValueError("an engine\nthat fails")
+
+
+def entries(err: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in err.splitlines()]
+
+
+@pytest.fixture
+def as_json(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For processes that are started."""
+    monkeypatch.setenv("HEMISLAM_LOG_JSON", "1")
+
+
+def test_what_ends_the_engine_is_one_line_of_json(as_json: None, capfd: pytest.CaptureFixture[str]) -> None:
+    engine = EngineProcess(Setup(), main=failing_main)
+    snapshot = engine.wait(0, timeout=60.0)
+    assert not snapshot.engine_alive
+    engine.close()
+    warned, thread, ended = entries(capfd.readouterr().err)
+    assert warned["level"] == "warning" and "somewhat odd" in warned["message"]
+    assert thread["level"] == "error" and "side work" in thread["message"] and "IndexError" in thread["traceback"]
+    assert ended["level"] == "critical" and "an engine\nthat fails" in ended["message"]
+    assert {entry["process"] for entry in (warned, thread, ended)} == {"engine"}
+
+
+def test_so_it_is_of_the_process_that_looks_for_loops(as_json: None) -> None:
+    requests, writer = os.pipe()
+    os.write(writer, (8).to_bytes(4, "big") + bytes(4) + b"junk")  # no arrays, and no pickle
+    command = [sys.executable, "-m", "app.server.loop_process", str(requests), str(writer)]
+    done = subprocess.run(command, pass_fds=(requests, writer), capture_output=True, text=True, timeout=120)
+    os.close(requests)
+    os.close(writer)
+    (ended,) = entries(done.stderr)
+    assert done.returncode == 1
+    assert (ended["level"], ended["process"]) == ("critical", "loops") and "Traceback" in ended["traceback"]
+
+
+def test_processes_follow_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    command = [
+        sys.executable,
+        "-c",
+        "from app.logs import process_logs\nwith process_logs('one'): raise OSError('gone')",
+    ]
+    monkeypatch.setenv("HEMISLAM_LOG_JSON", "")
+    code = f"import subprocess, app.logs; app.logs.start_logging(json_lines=%s); subprocess.run({command})"
+    for json_lines in (True, False):
+        done = subprocess.run([sys.executable, "-c", code % json_lines], capture_output=True, text=True, timeout=60)
+        if json_lines:
+            assert [entry["process"] for entry in entries(done.stderr)] == ["one"]
+        else:
+            assert done.stderr.startswith("hemislam: The process ends: OSError: gone")
