@@ -3,11 +3,12 @@
 import os
 import sys
 
-from benchmarks import frame, live, loops, packets, page, replay, seek, walk
+from benchmarks import frame, latency, live, loops, packets, page, replay, seek, walk
 from benchmarks.record import show
 
 BENCHMARKS = {
     "frame": frame.run,
+    "latency": latency.run,
     "live": live.run,
     "loops": loops.run,
     "packets": packets.run,

@@ -23,8 +23,8 @@ _DRAIN = 128
 _TIMESTAMP = 35
 """SO_TIMESTAMPNS: Linux notes when a datagram came, so that it matters little when it is read."""
 _TIMESPEC = struct.Struct("@ll")
-_REST_NS = 300_000_000
-"""Packets wait so long for the rest of their revolution: only the last one before a silence ever does."""
+_REST_NS = 1_000_000_000
+"""Packets wait so long for the rest of their revolution: only the last ones before a silence ever do."""
 _DEVICE_WAIT_NS = 1_500_000_000
 """The device tells its angles once a second; scans wait for them at the start."""
 

@@ -1,0 +1,235 @@
+"""From the last packet of a scan to its pose, and to the page; and how soon a killed engine maps again.
+
+A walk at the sensor's full resolution is sent as packets at real time by a process of its own. The pose is
+there when the server's process has it; the page has it when a WebSocket client of the real program was sent
+where the sensor is, with its points.
+"""
+
+import math
+import multiprocessing
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgspec.msgpack
+import numpy as np
+import viser
+import zstandard
+from mcap.reader import make_reader
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from app.sensors.live.feed import LIDAR, packets_of
+from app.sensors.live.process import LiveProcess
+from app.sensors.live.urls import parse_address
+from app.sensors.presets import resolve_params
+from app.sensors.recording import open_recording
+from app.server.protocol import LIVE, Snapshot
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
+from app.slam.types import F64
+from benchmarks.live import free_port, served, wait_until
+from benchmarks.record import Line
+from benchmarks.scenes import recording
+
+SCENE = "corridor"
+KILLS = 5
+SAME_M = 1e-4
+"""The two runs give the same poses, but for 32-bit numbers on the wire."""
+
+
+def run() -> list[Line]:
+    walk = recording(SCENE)
+    on = f"{SCENE}, 57,632 firings a scan, as packets at real time"
+    poses, positions = _to_poses(walk)
+    pages = _to_page(walk, positions)
+    kills = [_after_a_kill(walk) for _ in range(KILLS)]
+    return [
+        Line.of("last packet to pose", on, "ms", 1e3 * np.array(poses)),
+        Line.of("last packet to page", on, "ms", 1e3 * np.array(pages)),
+        Line.of("kill -9 of the engine to the next frame", on, "s", [seconds for seconds, _ in kills]),
+        Line.of("scans and samples that came and are not recorded", on, "", [missing for _, missing in kills]),
+    ]
+
+
+def _to_poses(walk: Path) -> tuple[list[float], dict[int, F64]]:
+    """Seconds for each scan until the server's process has its pose, and positions by the scan's end."""
+    came: dict[int, float] = {}
+    with _received(walk) as (engine, sending):
+        while not sending.ended or time.monotonic() - sending.last < 1.0:
+            snapshot = engine.wait(engine.snapshot.revision, timeout=0.1)
+            if snapshot.result is not None:
+                came.setdefault(snapshot.result.stamp_ns, time.monotonic())
+        assert snapshot.trajectory is not None and snapshot.recording is not None
+        stamps = snapshot.recording.start_ns + np.round(snapshot.series["stamp_s"] * 1e9).astype(np.int64)
+        positions = dict(zip(stamps.tolist(), snapshot.trajectory, strict=True))
+    return sending.delays(came), positions
+
+
+def _to_page(walk: Path, positions: dict[int, F64]) -> list[float]:
+    """Seconds for each scan until a page that is open was sent it. positions: of all scans, by their ends."""
+    stamps, places = np.array(list(positions)), np.array(list(positions.values()))
+    came: dict[int, float] = {}
+    heard: list[tuple[float, bytes]] = []
+    with TemporaryDirectory() as folder, served(walk, Path(folder) / "live.mcap") as (url, _, packets, imu):
+        wait_until(url, lambda state: state["recording"] is not None)
+        ended = threading.Event()
+        page = threading.Thread(target=_listen, args=(url, heard, ended))
+        page.start()
+        with _sent(walk, packets, imu) as sending:
+            while not sending.ended or time.monotonic() - sending.last < 1.0:
+                time.sleep(0.1)
+        ended.set()
+        page.join()
+    for at, raw in heard:
+        for message in _messages(raw):
+            if message["type"] == "SetPositionMessage" and message["name"] == "/map/sensor":
+                apart = np.linalg.norm(places - np.array(message["position"]), axis=1)
+                if apart.min() < SAME_M:
+                    came.setdefault(int(stamps[apart.argmin()]), at)
+    return sending.delays(came)
+
+
+def _after_a_kill(walk: Path) -> tuple[float, int]:
+    """Seconds from the kill of the engine to the next frame, and how much of all that came is not recorded."""
+    with TemporaryDirectory() as folder:
+        record = Path(folder) / "live.mcap"
+        with _received(walk, record) as (engine, sending):
+            before = _until(engine, lambda s: s.transport.frame >= 50)
+            assert engine.pid is not None
+            os.kill(engine.pid, signal.SIGKILL)
+            begin = time.monotonic()
+            _until(engine, lambda s: s.transport.frame > before.transport.frame)
+            seconds = time.monotonic() - begin
+            while not sending.ended or time.monotonic() - sending.last < 2.0:
+                time.sleep(0.1)
+            end = engine.wait(engine.snapshot.revision, timeout=2.0)
+        assert end.live is not None
+        with record.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None and summary.statistics is not None
+        recorded = sum(summary.statistics.channel_message_counts.values())
+        return seconds, end.live.counters.frames + end.live.counters.imu - recorded
+
+
+def _until(engine: EngineProcess, wanted: Any) -> Snapshot:
+    deadline = time.monotonic() + 60.0
+    snapshot = engine.snapshot
+    while not wanted(snapshot):
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"nothing comes: {snapshot.notices}")
+        snapshot = engine.wait(snapshot.revision, timeout=0.1)
+    return snapshot
+
+
+# --- the page ------------------------------------------------------------------------------------
+def _listen(url: str, heard: list[tuple[float, bytes]], ended: threading.Event) -> None:
+    """As a browser would, but only noting what comes when; it is read later."""
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    with connect(url.replace("http", "ws", 1), subprotocols=[protocol], max_size=None, proxy=None) as page:
+        while not ended.is_set():
+            try:
+                raw = page.recv(timeout=0.2)
+            except TimeoutError:
+                continue
+            except ConnectionClosed:
+                return
+            assert isinstance(raw, bytes)
+            heard.append((time.monotonic(), raw))
+
+
+def _messages(raw: bytes) -> list[dict[str, Any]]:
+    """What viser packs into one WebSocket message."""
+    size = int.from_bytes(raw[8:16], "little")
+    unpacked = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size])
+    entries: list[dict[str, Any]] = msgspec.msgpack.decode(unpacked)["messages"]
+    return entries
+
+
+# --- the sensor ----------------------------------------------------------------------------------
+class _Sending:
+    """Sends a walk in a process of its own, which tells when each packet of the LiDAR was sent."""
+
+    def __init__(self, walk: Path, packets: str, imu: str) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._told, theirs = context.Pipe(duplex=False)
+        self._go = context.Event()
+        self._process = context.Process(target=_send, args=(walk, packets, imu, theirs, self._go), daemon=True)
+        self._process.start()
+        theirs.close()
+        self._told.recv()  # all is made and waits
+        self._sent: list[tuple[int, float]] = []
+        self.last = time.monotonic()
+        self.ended = False
+        self._go.set()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        self._sent = self._told.recv()
+        self.last = self._sent[-1][1]
+        self.ended = True
+
+    def delays(self, came: dict[int, float]) -> list[float]:
+        """Seconds from the last packet of each scan to when it came. came: monotonic s, by the ends of scans."""
+        stamps = np.array([stamp for stamp, _ in self._sent])
+        last = np.searchsorted(stamps, np.array(list(came)), side="right") - 1
+        return [at - self._sent[index][1] for index, at in zip(last, came.values(), strict=True)]
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.join()
+
+
+def _send(walk: Path, packets: str, imu: str, told: Any, go: Event) -> None:
+    """The process: makes all packets first, so that nothing delays them."""
+    with open_recording(walk, resolve_params(walk, None, None, [])) as opened:
+        made = list(packets_of(opened))
+    ports = (*parse_address(packets).ports, *parse_address(imu).ports)
+    sent: list[tuple[int, float]] = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        told.send(None)
+        go.wait()
+        begin = time.monotonic() - made[0].time_ns * 1e-9
+        for one in made:
+            if (ahead := begin + one.time_ns * 1e-9 - time.monotonic()) > 0.0002:
+                time.sleep(ahead)
+            sender.sendto(one.data, ("127.0.0.1", ports[one.stream]))
+            if one.stream == LIDAR:
+                sent.append((one.time_ns, time.monotonic()))
+    told.send(sent)
+
+
+@contextmanager
+def _sent(walk: Path, packets: str, imu: str) -> Iterator[_Sending]:
+    sending = _Sending(walk, packets, imu)
+    try:
+        yield sending
+    finally:
+        sending.close()
+
+
+@contextmanager
+def _received(walk: Path, record: Path | None = None) -> Iterator[tuple[EngineProcess, _Sending]]:
+    """An engine's process that maps what is sent, without a page."""
+    ports = [free_port() for _ in range(3)]
+    packets, imu = f"rsbpearl://127.0.0.1:{ports[0]},{ports[1]}", f"imu-udp://127.0.0.1:{ports[2]}"
+    params = resolve_params(walk, None, None, [])
+    with TemporaryDirectory() as folder, LiveProcess(packets, params, imu, record) as source:
+        setup = Setup(LIVE, params=params, play=True, speed=math.inf, live=source.address, live_folder=Path(folder))
+        engine = EngineProcess(setup)
+        try:
+            _until(engine, lambda s: s.recording is not None)
+            with _sent(walk, packets, imu) as sending:
+                yield engine, sending
+        finally:
+            engine.close()
