@@ -18,7 +18,7 @@ const canvas = shell.querySelector('canvas'), button = shell.querySelector('butt
 // Thousands of rectangles: without the hint they go to the process that draws the scene as well, which waits for them.
 const pen = canvas.getContext('2d', {willReadFrequently: true});
 for (const old of document.querySelectorAll('body > [data-hs-to]')) if (old.querySelector('.hs-tl')) old.remove();
-const HEAD = 20, NAME = 72, VALUE = 72;
+const HEAD = 20, NAME = 78, VALUE = 72;
 let ROW = 17;
 const BAD = '%BAD%', GOOD = '%GOOD%', QUIET = '%QUIET%';
 let d = null, text = '', hover = null, scrubbing = false, said = 0;
