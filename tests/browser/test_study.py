@@ -10,7 +10,7 @@ from app.server.breakpoints import Breakpoints
 from app.server.protocol import Seek, SetBreakpoints, StepFrame
 from tests.browser.conftest import Bench
 
-LEFT = RIGHT = 72
+LEFT, RIGHT = 78, 72
 """Pixels of the timeline beside its strips: names and values."""
 
 
