@@ -12,6 +12,11 @@ def show(control: Any, value: Any) -> None:
         control.value = value
 
 
+def unchanged(before: tuple[object, ...], now: tuple[object, ...]) -> bool:
+    """Whether all parts are the same objects still: what has not changed is not made anew from snapshot to snapshot."""
+    return len(before) == len(now) and all(a is b for a, b in zip(before, now, strict=True))
+
+
 def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callable[[viser.GuiEvent[Any]], None]:
     """A callback that is called with the new value and the browser, and only when a person changed it.
 

@@ -206,11 +206,6 @@ class LoopBackend:
             return self._solution.poses
 
     @property
-    def T_map_odom(self) -> F64:
-        """(4, 4) the correction at the newest keyframe."""
-        return np.asarray(self.corrections[-1]) if len(self) else np.eye(4)
-
-    @property
     def corrections(self) -> F64:
         """(k, 4, 4) T_map_odom at each keyframe; identity while odometry meets the loops as well as they are known."""
         if self._overrulings.solving or worth_correcting(self.edges, self._detector.poses):

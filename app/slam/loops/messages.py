@@ -7,8 +7,6 @@ One request, one reply, in order. Most are answered by a `LoopState`; what can n
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from app.slam.errors import HemislamError
 from app.slam.loops.types import Command, FactorResidual, LoopDetail, LoopEdge, Pair, Preview
 from app.slam.params import Loops
@@ -127,11 +125,6 @@ class LoopState:
     undo: tuple[Command, ...]
     redo: tuple[Command, ...]
     notices: tuple[str, ...]
-
-    @property
-    def T_map_odom(self) -> F64:
-        """(4, 4) at the newest keyframe."""
-        return self.corrections[-1] if self.count else np.eye(4)
 
 
 @dataclass(frozen=True, slots=True)

@@ -154,7 +154,8 @@ def check(command: Command) -> None:
 
 def in_words(command: Command) -> str:
     """A command's name and pair, to begin a sentence with."""
-    return " ".join([type(command).__name__, *("-".join(map(str, pair)) for pair in [pair_of(command)] if pair)])
+    pair = pair_of(command)
+    return f"{type(command).__name__} {pair[0]}-{pair[1]}" if pair else type(command).__name__
 
 
 def _overruled(edge: LoopEdge, command: Command) -> LoopEdge:

@@ -71,11 +71,6 @@ class PoseGraph:
         return self._solver.poses()
 
     @property
-    def newest(self) -> F64:
-        """(4, 4) the last pose."""
-        return self._solver.newest
-
-    @property
     def steps(self) -> tuple[Step, ...]:
         return tuple(self._steps)
 

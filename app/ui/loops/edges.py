@@ -14,6 +14,7 @@ from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.loops.kinds import COLOURS, Kind, in_graph, kind_of, name
+from app.ui.widgets import unchanged
 
 _RISE: Final = (0.7, 0.12)
 """Height of a knob above the edge's middle: m, and its share of the edge's length."""
@@ -71,9 +72,10 @@ class LoopEdges:
         Args:
             poses: (k, 4, 4) T_map_imu of the keyframes; edges of later ones are left out.
         """
-        if self._asked and all(a is b for a, b in zip(self._asked, (edges, poses, shown, chosen), strict=True)):
+        asked = (edges, poses, shown, chosen)
+        if unchanged(self._asked, asked):
             return
-        self._asked = (edges, poses, shown, chosen)
+        self._asked = asked
         there = [edge for edge in edges if edge.newer < len(poses)]
         seen = [edge for edge in there if kind_of(edge) in shown or edge.pair == chosen]
         lines = arches(seen, poses)

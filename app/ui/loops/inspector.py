@@ -14,7 +14,7 @@ from app.ui.loops.charts import best_yaw, contexts_image, histogram, shift_plot
 from app.ui.loops.overlay import Overlay, Pairing, on_the_way, without_ceiling
 from app.ui.loops.words import evidence, submap_legend
 from app.ui.view import View
-from app.ui.widgets import by_user
+from app.ui.widgets import by_user, unchanged
 
 FLY, SEEK, CLOSE = "fly there", "frame", "close"
 _LEAST_POINT_M: Final = 0.035
@@ -64,7 +64,7 @@ class Inspector:
         asked = edge.pair if edge is not None else None
         detail = _detail(snapshot, asked)
         news = (detail, edge, snapshot.params.loops)
-        if len(news) == len(self._told) and all(a is b for a, b in zip(self._told, news, strict=True)):
+        if unchanged(self._told, news):
             return
         self._told = news
         for handle in (self._laid, self._alone, self._legend, self._contexts_title, self._contexts, self._charts):

@@ -15,7 +15,7 @@ from app.slam.loops.types import Command as Overrule
 from app.ui.loops.kinds import in_graph, say
 from app.ui.loops.overlay import Ghost
 from app.ui.loops.words import forecast, headline
-from app.ui.widgets import by_user, show
+from app.ui.widgets import by_user, show, unchanged
 
 _REST_S: Final = 0.3
 
@@ -74,7 +74,7 @@ class Proposal:
         self._ghost.draw(preview.poses if command is not None and preview is not None else None, poses)
         problem = self._problem(snapshot) if preview is None else ""
         told = (command, preview, snapshot.loops.residuals, problem)
-        if len(told) == len(self._told) and all(a is b or a == "" == b for a, b in zip(told, self._told, strict=True)):
+        if unchanged(self._told, told):
             return
         self._told = told
         self._folder.visible = command is not None

@@ -23,6 +23,7 @@ from app.ui.loops.overruling import EditsPanel, Proposal, SolvePanel, VerdictPan
 from app.ui.loops.tie import TiePanel
 from app.ui.loops.words import worst_factors
 from app.ui.view import View
+from app.ui.widgets import unchanged
 
 _NONE_YET: Final = box(
     '<span class="hs-quiet">No loops yet. They are looked for where the walk comes back to a place it left at least '
@@ -125,7 +126,7 @@ class LoopsPanel:
     def _draw_tables(self, snapshot: Snapshot) -> None:
         loops = snapshot.loops
         told = (loops.edges, loops.residuals, self._shown, self._order, self._chosen)
-        if len(told) == len(self._told) and all(a is b for a, b in zip(told, self._told, strict=True)):
+        if unchanged(self._told, told):
             return
         self._told = told
         if not loops.edges:
