@@ -36,16 +36,16 @@ Step = Callable[[Measurement], F64]
 """Process one measurement and return the pose of the LiDAR, T_world_lidar."""
 
 
-def run(paths: list[Path], preset: str | None = None) -> list[Line]:
+def run(paths: list[Path], preset: str | None = None, duration_s: float | None = None) -> list[Line]:
     compile_kernels()
     lines = []
     for path in paths:
         params = resolve_params(path, preset, None, [])
-        lines += _odometry(path, params) + _ground(path, params)
+        lines += _odometry(path, params, duration_s) + _ground(path, params, duration_s)
     return lines
 
 
-def _odometry(path: Path, params: Params) -> list[Line]:
+def _odometry(path: Path, params: Params, duration_s: float | None) -> list[Line]:
     """Time a frame of each, on the clock and on all cores together, and both and the error over ours."""
     T_imu_lidar = _mounting(params)
     truth_path = truth_beside(path)
@@ -53,7 +53,7 @@ def _odometry(path: Path, params: Params) -> list[Line]:
     on, lines = path.stem, []
     ours: tuple[float, float, float] | None = None
     for name, make in (("hemislam", _hemislam), ("rko_lio", _rko_lio), ("kiss-icp", _kiss_icp)):
-        times, cpu_times, poses, dates = _play(path, params, name, make(params, T_imu_lidar))
+        times, cpu_times, poses, dates = _play(path, params, duration_s, name, make(params, T_imu_lidar))
         lines.append(Line.of(f"{name}, time a frame", on, "ms", times))
         lines.append(Line.of(f"{name}, CPU time a frame", on, "ms", cpu_times))
         error = float("nan")
@@ -68,11 +68,13 @@ def _odometry(path: Path, params: Params) -> list[Line]:
     return lines
 
 
-def _play(path: Path, params: Params, name: str, step: Step) -> tuple[list[float], list[float], F64, list[Any]]:
+def _play(
+    path: Path, params: Params, duration_s: float | None, name: str, step: Step
+) -> tuple[list[float], list[float], F64, list[Any]]:
     """Milliseconds, those of all cores, and poses of all scans, and their stamps at start, middle and end."""
     times, cpu_times, poses, dates = [], [], [], []
     with open_recording(path, params) as source, tqdm(desc=name, unit=" frames", leave=False, disable=None) as bar:
-        for entry in source.measurements():
+        for entry in source.measurements(0.0, duration_s):
             if not isinstance(entry, Measurement):
                 continue
             begin, cpu_begin = time.perf_counter(), time.process_time()
@@ -150,7 +152,7 @@ def _kiss_icp(params: Params, T_imu_lidar: F64) -> Step:
     return step
 
 
-def _ground(path: Path, params: Params) -> list[Line]:
+def _ground(path: Path, params: Params, duration_s: float | None) -> list[Line]:
     """Patchwork++ and ours on the same deskewed, levelled clouds, against the labels in the recording."""
     import pypatchworkpp
 
@@ -163,7 +165,7 @@ def _ground(path: Path, params: Params) -> list[Line]:
     ours_ms, theirs_ms = [], []
     ours, theirs = GroundScore(), GroundScore()
     with open_recording(path, params) as source:
-        for entry in source.measurements():
+        for entry in source.measurements(0.0, duration_s):
             if not isinstance(entry, Measurement):
                 continue
             result = engine.step(entry.scan, entry.imu)
@@ -195,10 +197,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Peers from PyPI on the same recording.")
     parser.add_argument("recordings", nargs="*", type=Path, help="else the simulated scenes of the benchmarks")
     parser.add_argument("--preset", help="as of hemislam itself")
+    parser.add_argument("--duration", type=float, help="seconds of each recording; else all of it")
     given = parser.parse_args()
     sys.path.append(str(PEERS))  # last, so that hemislam's own versions of shared packages win
     try:
-        show(run(given.recordings or [recording(scene) for scene in SCENES], given.preset))
+        show(run(given.recordings or [recording(scene) for scene in SCENES], given.preset, given.duration))
     except ImportError as error:
         sys.exit(f"The peers are not installed ({error}); `make bench-peers` does that.")
 
