@@ -1,33 +1,39 @@
-"""Run the benchmarks by name, or all: `python -m benchmarks frame`."""
+"""Run the benchmarks by name, or all: `python -m benchmarks frame`; some on a recording: `... seek walk.mcap`."""
 
 import os
 import sys
+from pathlib import Path
 
-from benchmarks import frame, latency, live, loops, packets, page, replay, seek, walk
+from benchmarks import frame, kill, latency, live, loops, packets, page, replay, rewind, seek, walk
 from benchmarks.record import show
 
 BENCHMARKS = {
     "frame": frame.run,
+    "kill": kill.run,
     "latency": latency.run,
     "live": live.run,
     "loops": loops.run,
     "packets": packets.run,
     "replay": replay.run,
+    "rewind": rewind.run,
     "seek": seek.run,
     "page": page.run,
     "walk": walk.run,
 }
+ON_A_RECORDING = {"kill": kill.run, "rewind": rewind.run, "seek": seek.run}
 
 
 def main() -> None:
-    names = sys.argv[1:] or list(BENCHMARKS)
+    *names, last = sys.argv[1:] or list(BENCHMARKS)
+    recording = Path(last) if last not in BENCHMARKS and Path(last).exists() else None
+    names += [last] if recording is None else []
     if unknown := [name for name in names if name not in BENCHMARKS]:
         sys.exit(f"There is no benchmark {unknown[0]}; choose from {', '.join(BENCHMARKS)}.")
     busy = os.getloadavg()[0]
     if busy > 0.5:
         print(f"Other programs keep this machine busy (load {busy:.1f} on {os.cpu_count()} cores); times mislead.")
     for name in names:
-        show(BENCHMARKS[name]())
+        show(ON_A_RECORDING[name](recording) if name in ON_A_RECORDING else BENCHMARKS[name]())
 
 
 if __name__ == "__main__":

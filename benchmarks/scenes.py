@@ -17,8 +17,8 @@ def recording(scene: str) -> Path:
 
 
 def long_recording() -> Path:
-    """Ten minutes outdoors, with one azimuth of 24, so that the file stays small."""
-    return _simulated("long.mcap", "outdoor", 600.0, seed=5, every_block=24)
+    """Ten minutes round and round a building, with one azimuth of 6, so that the file stays small."""
+    return _simulated("long.mcap", "building", 600.0, seed=3, every_block=6)
 
 
 def walk_in_laps() -> Path:

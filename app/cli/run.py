@@ -189,7 +189,7 @@ def process(work: "Run", *, until: int | None = None) -> BaseException | None:
         try:
             while (until is None or work.frame < until) and (entry := work.peek()) is not None:
                 if isinstance(entry, Measurement):
-                    work.step()
+                    work.step(sought=True)
                 bar.update()
         except (Exception, KeyboardInterrupt) as error:  # whatever it was, the frames so far must be saved
             return error

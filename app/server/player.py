@@ -140,7 +140,9 @@ class Player:
 
     def last_known(self, run: Run) -> int:
         """The last frame that stays as it is if what comes after is to be different."""
-        return run.frame if self._journey is None else max(run.frame, self._journey.again_to)
+        if self._journey is None:
+            return run.frame
+        return max(run.frame, self._journey.again_to, min(self._journey.target, run.followed_to))
 
     # --- work ------------------------------------------------------------------------------------
     def work(self) -> float | None:
@@ -208,7 +210,7 @@ class Player:
         if journey is None and not run.live and (wait := self._pacer.wait(entry.scan.stamp_ns)) > 0:
             return wait
         try:
-            result = run.step(again=again)
+            result = run.step(again=again, sought=journey is not None and not journey.stepping)
         except Exception as error:
             if again:  # as it did then
                 return 0.0

@@ -96,7 +96,7 @@ class Run:
         self._incoming = recording.measurements(start_s, duration_s)
         self._waiting: Measurement | None = None
         self._dropped = 0  # scans since the newest frame
-        self._followed: SavedSession | None = None  # whose way is being repeated
+        self._followed: SavedSession | None = None  # see `resume`
         self.finished = False
 
     def peek(self) -> Measurement | DroppedScan | Quiet | None:
@@ -122,18 +122,21 @@ class Run:
         self.log.drop(scan)
         self._dropped += 1
 
-    def step(self, *, again: bool = False) -> StepResult:
+    def step(self, *, again: bool = False, sought: bool = False) -> StepResult:
         """Process the measurement last peeked at. It is used up even if the engine fails on it.
 
         Args:
             again: with the parameters of then, for a frame that is known; else with the present ones.
+            sought: only on the way to another frame, so that a session that is repeated goes on as it went.
         """
         measurement, self._waiting = self._waiting, None
         assert measurement is not None
         frame = self.frame + 1
+        if not (again or sought):
+            self._followed = None
         params = self._params_for(frame, again=again)
         if self.params_of(frame) != params:
-            self.forget_after(self.frame)
+            self._forget_after(self.frame)
             self.history = (*self.history, (frame, params))
         self.engine.params = params
         try:
@@ -143,16 +146,21 @@ class Run:
         result = replace(result, notices=(*measurement.notices, *result.notices), dropped=self._dropped)
         self.frame, self._dropped = frame, 0
         self.known = max(self.known, frame)
+        if frame >= self.followed_to:
+            self._followed = None
         self.log.add(result)
         return result
 
     def _params_for(self, frame: int, *, again: bool) -> Params:
         if again:
             return self.params_of(frame) or self.params
-        followed = self._followed
-        if followed is not None and frame > followed.frame:
-            followed = self._followed = None
-        return (in_force(followed.state.history, frame) if followed is not None else None) or self.params
+        history = self._followed.state.history if self._followed is not None else ()
+        return in_force(history, frame) or self.params
+
+    @property
+    def followed_to(self) -> int:
+        """The frame up to which the way of a session is still to be repeated; -1: there is none."""
+        return -1 if self._followed is None else self._followed.frame
 
     @property
     def part(self) -> tuple[float, float | None]:
@@ -172,6 +180,8 @@ class Run:
     def resume(self, saved: SavedSession) -> None:
         """Repeat a session of this recording: up to its frame as it went, from there on with what it chose last.
 
+        Seeking does so; a frame that is played, or a change of parameters before, makes another walk of it.
+
         Raises:
             HemislamError: it overrules loops, and none are looked for.
         """
@@ -179,7 +189,7 @@ class Run:
         self.choose(self.usable(state.params))
         if state.overrulings or state.undone:
             self.overrule(state.overrulings, state.undone)
-        self._followed = saved
+        self._followed = saved if saved.frame > self.frame else None
 
     # --- going back ------------------------------------------------------------------------------
     def choose(self, params: Params) -> None:
@@ -197,6 +207,11 @@ class Run:
 
     def forget_after(self, frame: int) -> None:
         """What comes after a frame will be another walk."""
+        if frame < self.followed_to:
+            self._followed = None
+        self._forget_after(frame)
+
+    def _forget_after(self, frame: int) -> None:
         self.known = min(self.known, frame)
         if self.engine.loops:
             self.engine.loops.forget_after(frame)

@@ -47,6 +47,11 @@ POLL_S = 0.02
 """How often to look for what others are at work on."""
 
 
+_AT_ONCE = OpenRecording | Restart | SetSpeed | SetBreakpoints | Shutdown
+"""Commands that do not wait until what is being opened is open."""
+_FOR_THE_FRAME = OverruleLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop | AddNote | Save
+
+
 class OpenRun(Protocol):
     """Opens a recording, or the part of it from start for a duration (s), with a new engine; raises HemislamError."""
 
@@ -92,10 +97,11 @@ class Session:
         self._resolve = resolve
         self._params = self._base = params
         self._notes: tuple[Note, ...] = ()
-        self._resuming: int | None = None  # the frame that a reopened session was at, until it is there
+        self._resuming = False  # whether a session that was reopened is not yet where it was
         # What is wanted but not done yet:
         self._opening: Callable[[], None] | None = None
         self._after_opening: list[Command] = []
+        self._after_resuming: list[Command] = []
 
     def open(self, path: Path, truth: Path | None, *, play: bool = False) -> None:
         """Open a recording with exactly the parameters given so far, or a session file with its own."""
@@ -112,8 +118,11 @@ class Session:
     # --- commands --------------------------------------------------------------------------------
     def handle(self, command: Command) -> None:
         """Take in a command. What can not be done becomes a notice; nothing is raised."""
-        if self._opening is not None and isinstance(command, Play | Pause | StepFrame | Seek | Save):
+        if self._opening is not None and not isinstance(command, _AT_ONCE):
             self._after_opening.append(command)  # it is meant for what will be open then
+            return
+        if self._resuming and isinstance(command, _FOR_THE_FRAME):
+            self._after_resuming.append(command)  # it is meant for the frame that is gone to
             return
         try:
             self._handle(command)
@@ -215,9 +224,8 @@ class Session:
         wait, run = self._player.work(), self._player.run
         if run is None:
             return POLL_S if self._saver.busy else wait
-        if self._resuming is not None and run.frame >= self._resuming:
-            self._resuming = None
-            self._player.settle_labels(run)
+        if self._resuming and (run.followed_to < 0 or run.finished):
+            self._resumed(run)
         if isinstance(run, LiveRun):
             self._look_at_source(run)
         looking = SOURCE_PERIOD_S if isinstance(run, LiveRun) and not self._page.transport.finished else None
@@ -248,7 +256,7 @@ class Session:
 
     def _note(self, *, settled: bool) -> None:
         run = self._player.run
-        if run is not None and self._resuming is None and self._keeper.keeping:
+        if run is not None and not self._resuming and self._keeper.keeping:
             self._keeper.note(run.frame, state_of(run, self._params, self._notes), settled=settled)
 
     # --- opening ---------------------------------------------------------------------------------
@@ -311,16 +319,24 @@ class Session:
             self._saver.wait()
             self._player.run.close()
         self._keeper.begin(run)
+        if saved is not None:
+            self._keeper.note(saved.frame, saved.state)  # at once: it may be killed on the way there
         self._desk.clear()
         self._player.take(run)
         self._show_notes(saved.state.notes if saved is not None else ())
-        self._resuming = None
+        self._resuming, self._after_resuming = saved is not None, []
         if saved is not None:
             run.resume(saved)
-            self._resuming = max(saved.frame, 0)
-            self._keeper.note(saved.frame, saved.state)
-            self._player.go_to(self._resuming, -1)
+            self._player.go_to(max(saved.frame, 0), -1)
         self._page.params(self._params, self._pending_restart())
+
+    def _resumed(self, run: Run) -> None:
+        """A reopened session is where it was, or the user has left its way."""
+        self._resuming = False
+        self._player.settle_labels(run)
+        waiting, self._after_resuming = self._after_resuming, []
+        for command in waiting:
+            self.handle(command)
 
     def close(self) -> None:
         """Finish the saves under way and close the recording."""

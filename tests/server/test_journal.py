@@ -27,7 +27,19 @@ from app.server.journal import (
     size_of,
     write_session,
 )
-from app.server.protocol import AddNote, Note, OpenRecording, Play, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.protocol import (
+    AddNote,
+    Note,
+    OpenRecording,
+    Pause,
+    Play,
+    Save,
+    Seek,
+    SetParams,
+    SetSpeed,
+    Snapshot,
+    StepFrame,
+)
 from app.server.run import Run, open_run
 from app.server.session import Session
 from app.server.setup import Setup
@@ -161,6 +173,36 @@ def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path)
     assert page(first.do(StepFrame(10))) == page(second.do(StepFrame(10))) == page(third.do(StepFrame(10)))
     for desk in (first, second, third):
         desk.session.close()
+
+
+def test_a_session_stopped_on_its_way_back_goes_on_as_it_went_unless_it_is_changed_there(tmp_path: Path) -> None:
+    first = Kept(tmp_path)
+    there = walk_about(first)
+    file = first.journal
+    for change, same in (({}, True), ({"ground.alpha": 50.0}, False)):
+        desk = Desk(first.params, open_run, file, settle=False)
+        while desk.see().transport.frame < 20:
+            desk.session.work()
+        stopped = desk.do(Pause())
+        assert stopped.transport.frame < 45
+        again = desk.do(SetParams(change), Seek(72))
+        assert again.transport.frame == 72 and again.trajectory is not None and there.trajectory is not None
+        assert np.array_equal(again.trajectory, there.trajectory) is same
+        desk.session.close()
+    first.session.close()
+
+
+def test_what_is_wanted_while_a_session_opens_is_not_lost(tmp_path: Path) -> None:
+    first = Kept(tmp_path)
+    walk_about(first)
+    desk = Desk(first.params, open_run, first.journal, settle=False)
+    for command in (SetParams({"ground.sigma": 0.07}), AddNote("here")):
+        desk.session.handle(command)
+    desk.settle()
+    opened = desk.see()
+    assert opened.params.ground.sigma == 0.07 and opened.notes[-1] == Note(72, "here")
+    for each in (first, desk):
+        each.session.close()
 
 
 def test_a_saved_session_repeats_headless_to_the_same_files(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ FREE = tuple(name for name in SERIES if name.endswith("_ms"))
 class Desk:
     """A session that works whenever it is told something, and the page's view of it."""
 
-    def __init__(self, params: Params, opener: Callable[..., Run], path: Path) -> None:
+    def __init__(self, params: Params, opener: Callable[..., Run], path: Path, *, settle: bool = True) -> None:
         self.params, self.outbox, self.fold = params, Outbox(params), Fold()
         self.runs: list[Run] = []
 
@@ -39,7 +39,8 @@ class Desk:
 
         self.session = self._session(opening)
         self.session.open(path, None)
-        self.settle()
+        if settle:
+            self.settle()
 
     def _session(self, opener: Callable[..., Run]) -> Session:
         return Session(self.outbox, self.params, opener, clock=lambda: 0.0)
@@ -219,8 +220,8 @@ LENGTH_S = 6.0
 CHANGES = {12: {"ground.sigma": 0.02}, 25: {"filter.max_iterations": 2}, 40: {"scan.voxel_size": 0.6}}
 
 
-def open_sample(path: Path, truth: Path | None, params: Params, /, *, megabytes: int = 1024) -> Run:
-    return open_run(path, truth, params, 0.0, LENGTH_S, checkpoint_bytes=megabytes << 20)
+def open_sample(path: Path, truth: Path | None, params: Params, /, *, kilobytes: int = 1 << 20) -> Run:
+    return open_run(path, truth, params, 0.0, LENGTH_S, checkpoint_bytes=kilobytes << 10)
 
 
 @pytest.fixture(scope="module")
@@ -245,23 +246,23 @@ def walk_on(desk: Desk, end: int) -> None:
             break
 
 
-@pytest.mark.parametrize("megabytes", [1024, 4])
+@pytest.mark.parametrize("kilobytes", [1 << 20, 100])
 def test_restored_and_continued_equals_never_stopped(
-    sample_params: Params, never_stopped: Snapshot, megabytes: int
+    sample_params: Params, never_stopped: Snapshot, kilobytes: int
 ) -> None:
     def opener(path: Path, truth: Path | None, params: Params, /) -> Run:
-        return open_sample(path, truth, params, megabytes=megabytes)
+        return open_sample(path, truth, params, kilobytes=kilobytes)
 
     desk = Desk(sample_params, opener, SAMPLE)
     walk_on(desk, FRAMES)
-    rng = np.random.default_rng(megabytes)
+    rng = np.random.default_rng(kilobytes)
     last = never_stopped.transport.frame
     for frame in rng.integers(0, last, 8).tolist():
         snapshot = desk.do(Seek(frame))
         assert snapshot.trajectory is not None and never_stopped.trajectory is not None
         assert snapshot.trajectory.tobytes() == never_stopped.trajectory[: frame + 1].tobytes()
-        assert desk.run.checkpoints.memory <= megabytes << 20
-    assert (desk.run.checkpoints.disk > 0) is (megabytes == 4)
+        assert desk.run.checkpoints.memory <= kilobytes << 10
+    assert (desk.run.checkpoints.disk > 0) is (kilobytes == 100)
     # From an early frame on, all of it anew, with the parameters chosen anew:
     first = {name: sample_params.value(name) for change in CHANGES.values() for name in change}
     desk.do(Seek(5), SetParams(first))

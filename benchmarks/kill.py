@@ -1,0 +1,307 @@
+"""kill -9 at 20 random moments, of the server, its engine or both: what is reopened comes to the same end.
+
+A user works over REST with the real program, on a recording with loops: seeks to and fro, changes
+parameters, writes notes, overrules loops. After a kill he looks where the session is; what he did over a
+second before it must be there, what he did last he does again if it is not. In the end map and
+trajectory are those of a session that nobody killed, byte for byte.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import httpx
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.record import Line
+
+SAMPLE = next((Path(__file__).resolve().parents[1] / "sample_data").glob("*.mcap"))
+KILLS, KILLS_A_RUN = 20, 5
+LOSS_S = 1.0
+"""What was done longer before the kill must not be lost."""
+PATIENCE_S = 900.0
+FILES = ("trajectory.tum", "map.ply")
+KINDS: tuple[Literal["engine", "server", "both"], ...] = ("engine", "server", "engine", "both")
+
+State = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Deed:
+    """What the user does at a share of the recording, 1: at its end; `done`: by what the server says, it is so."""
+
+    at: float
+    act: Callable[["Workbench"], None]
+    done: Callable[["Workbench"], bool]
+
+
+class Lost(Exception):
+    """The server does not answer: it was killed."""
+
+
+class Workbench:
+    """`hemislam serve` and who uses it over REST."""
+
+    def __init__(self, folder: Path, recording: Path) -> None:
+        self.folder = folder
+        self.server: subprocess.Popen[str] | None = None
+        self.journal = ""
+        self._address = ""
+        self.start(recording)
+
+    def start(self, what: Path) -> None:
+        command = [sys.executable, "-m", "app", "serve", str(what), "--paused", "--no-browser", "--port", "0"]
+        self.server = subprocess.Popen(
+            command,
+            cwd=self.folder,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(SAMPLE.parents[1]), *filter(None, sys.path)])},
+            stdout=subprocess.PIPE,
+            stderr=(self.folder / "errors.txt").open("a"),
+            text=True,
+            start_new_session=True,
+        )
+        assert self.server.stdout is not None
+        line = ""
+        while "hemislam is at" not in line:
+            line = self.server.stdout.readline()
+            assert line, (self.folder / "errors.txt").read_text()
+        self._address = line.split()[3]
+
+    def reopen(self) -> None:
+        """As the user would: the newest session file, once the old engine has ended."""
+        assert self.server is not None
+        self.server.wait()
+        files = (self.folder / "runs" / "sessions").glob("*.hemislam")
+        self.start(max(files, key=lambda file: file.stat().st_mtime).resolve())
+
+    def ask(self, method: str, path: str, **kwargs: Any) -> Any:
+        try:
+            answer = httpx.request(method, f"{self._address}api/{path}", timeout=60.0, **kwargs)
+        except httpx.TransportError:
+            raise Lost from None
+        assert answer.status_code < 300 or answer.status_code == 503, answer.text
+        return answer
+
+    def state(self) -> State:
+        return dict(self.ask("GET", "state").json())
+
+    def until(self, wanted: Callable[[State], bool]) -> State:
+        deadline = time.monotonic() + PATIENCE_S
+        while not wanted(state := self.state()):
+            assert time.monotonic() < deadline, state
+            assert not self._refused(state), state["notices"]
+            time.sleep(0.05)
+        return state
+
+    @staticmethod
+    def _refused(state: State) -> bool:
+        return any("can not" in notice["text"] and notice["level"] == "error" for notice in state["notices"])
+
+    def ready(self) -> State:
+        """Where the session is, once it is anywhere."""
+        return self.until(
+            lambda s: s["recording"] is not None and s["progress"] is None and s["transport"]["frame"] >= 0
+        )
+
+    def go_to(self, frame: int) -> None:
+        """Ask again if an engine that died has not heard of it."""
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            self.ask("POST", "transport", json={"action": "seek", "frame": frame})
+            asked = time.monotonic()
+            while time.monotonic() < asked + 5.0:
+                state = self.ready()
+                if state["transport"]["frame"] == frame:
+                    return
+                time.sleep(0.05)
+            assert time.monotonic() < deadline, state
+
+    def finish(self, last: int, struck: threading.Event) -> None:
+        """To the end of the recording, where the last loops are found, unless something is struck meanwhile."""
+        if not self.state()["transport"]["finished"]:  # else Play would begin again
+            self.go_to(last)
+            self.ask("POST", "transport", json={"action": "speed", "factor": "max"})
+            self.ask("POST", "transport", json={"action": "play"})
+            self.until(lambda state: bool(state["transport"]["finished"]) or struck.is_set())
+
+    def engine(self) -> int | None:
+        """The engine's process; None if there is none just now."""
+        assert self.server is not None
+        found = subprocess.run(
+            ["pgrep", "-P", str(self.server.pid), "-f", "spawn_main"], capture_output=True, text=True, check=False
+        )
+        return int(found.stdout.split()[0]) if found.stdout.strip() else None
+
+    def kill(self, kind: Literal["engine", "server", "both"]) -> None:
+        """Returns when it has happened, and the server knows."""
+        assert self.server is not None
+        engine = self.engine()
+        if kind != "engine":
+            self.server.kill()
+        if kind != "server" and engine is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(engine, signal.SIGKILL)
+        if kind == "engine":
+            deadline = time.monotonic() + PATIENCE_S
+            while self.engine() in (None, engine) and time.monotonic() < deadline:
+                time.sleep(0.01)
+
+    def close(self) -> None:
+        if self.server is not None:
+            self.server.terminate()
+            self.server.wait(timeout=60)
+
+
+# --- what the user does --------------------------------------------------------------------------
+def _sets(at: float, **values: float) -> Deed:
+    """Parameters of one section and name, written section__name."""
+    tree: dict[str, dict[str, float]] = {}
+    for path, value in values.items():
+        section, name = path.split("__")
+        tree.setdefault(section, {})[name] = value
+
+    def act(bench: Workbench) -> None:
+        bench.ask("PATCH", "params", json=tree)
+
+    def done(bench: Workbench) -> bool:
+        now = bench.ask("GET", "params").json()
+        return all(now[section][name] == value for section, part in tree.items() for name, value in part.items())
+
+    return Deed(at, act, done)
+
+
+def _notes(at: float, text: str) -> Deed:
+    def act(bench: Workbench) -> None:
+        bench.ask("POST", "notes", json={"text": text})
+
+    def done(bench: Workbench) -> bool:
+        return any(note["text"] == text for note in bench.state()["notes"])
+
+    return Deed(at, act, done)
+
+
+def _overrules(at: float, number: int, word: str, **more: float) -> Deed:
+    """The accepted loop of this number, by keyframes."""
+
+    def pair(bench: Workbench) -> tuple[int, int]:
+        found, before, deadline = list[State](), list[State](), time.monotonic() + PATIENCE_S
+        while len(found) <= number or found != before:  # they may still be on their way
+            assert time.monotonic() < deadline, "there is no such loop to overrule; choose another recording"
+            time.sleep(1.0)
+            before, loops = found, bench.ask("GET", "loops").json()["loops"]
+            found = [loop for loop in loops if loop["verdict"] == "accepted" or loop["overruled"]]
+        return found[number]["older"], found[number]["newer"]
+
+    def act(bench: Workbench) -> None:
+        older, newer = pair(bench)
+        bench.ask("POST", "loops", json={"action": word, "older": older, "newer": newer, **more})
+
+    def done(bench: Workbench) -> bool:
+        return any(word in entry for entry in bench.ask("GET", "loops").json()["overrulings"])
+
+    return Deed(at, act, done)
+
+
+DEEDS = (
+    _sets(0.15, ground__sigma=0.02),
+    _notes(0.25, "the first turn"),
+    _sets(0.4, filter__max_points=1500, filter__plane_tilt=2.0),
+    _sets(0.3, ground__alpha=35.0),  # and what came after it is another walk
+    _sets(0.7, filter__max_iterations=3),
+    _notes(0.8, "on the way home"),
+    _overrules(1.0, 0, "reject"),
+    _overrules(1.0, 1, "weigh", weight=0.2),
+)
+
+
+def work_through(
+    bench: Workbench, moments: "list[tuple[float, Literal['engine', 'server', 'both']]]"
+) -> dict[str, bytes]:
+    """Do all, killed so many times, each a random time (s) after it was ready again. Returns what came of it."""
+    index, when = 0, [0.0] * len(DEEDS)
+    killed_at, struck, waiting = [0.0], threading.Event(), list(moments)
+    last = int(bench.ready()["recording"]["frames"]) - 1
+
+    def killer(delay: float, kind: Literal["engine", "server", "both"]) -> None:
+        time.sleep(delay)
+        killed_at[0] = time.monotonic()
+        bench.kill(kind)
+        struck.set()
+
+    thread: threading.Thread | None = None
+    while True:
+        if waiting and (thread is None or not thread.is_alive()) and not struck.is_set():
+            thread = threading.Thread(target=killer, args=waiting.pop(0), daemon=True)
+            thread.start()
+        try:
+            if struck.is_set():
+                struck.clear()
+                bench.ready()
+                index = _what_is_left(bench, index, when, killed_at[0])
+            if index < len(DEEDS):
+                deed = DEEDS[index]
+                bench.go_to(round(deed.at * last)) if deed.at < 1.0 else bench.finish(last, struck)
+                deed.act(bench)
+                when[index] = time.monotonic()
+                while not (done := deed.done(bench)) and not struck.is_set():
+                    time.sleep(0.05)
+                index += done
+                continue
+            bench.finish(last, struck)
+            if not waiting and (thread is None or not thread.is_alive()) and not struck.is_set():
+                return {name: bench.ask("GET", f"export/{name}").content for name in FILES}
+            time.sleep(0.05)
+        except Lost:
+            bench.reopen()
+
+
+def _what_is_left(bench: Workbench, index: int, when: list[float], killed_at: float) -> int:
+    """From which deed on to go on: the first that is not there. One that was done long before must be."""
+    for number, deed in enumerate(DEEDS[:index]):
+        deadline = time.monotonic() + 20.0  # loops are told a little after the frame
+        while not (done := deed.done(bench)) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        if not done:
+            assert killed_at - when[number] <= LOSS_S, f"deed {number} was done {killed_at - when[number]:.1f} s before"
+            return number
+    return index
+
+
+def run(recording: Path | None = None, kills: int = KILLS) -> list[Line]:
+    """Raises AssertionError: something was lost, or the end was another."""
+    path = (recording or SAMPLE).resolve()
+    rng = np.random.default_rng(0)
+    with tempfile.TemporaryDirectory(prefix="hemislam-kill-") as folder:
+        expected, took = _ended(Path(folder) / "never", path, [])
+        runs = -(-kills // KILLS_A_RUN)
+        for number in tqdm(range(runs), desc="Killed", disable=None):
+            delays = rng.uniform(0.0, took / KILLS_A_RUN, KILLS_A_RUN).tolist()
+            moments = [(delay, KINDS[k % len(KINDS)]) for k, delay in enumerate(delays)]
+            came, _ = _ended(Path(folder) / str(number), path, moments)
+            differ = [name for name in FILES if came[name] != expected[name]]
+            assert not differ, f"after the kills of run {number} these are others: {', '.join(differ)}"
+    on = f"{path.stem}: {len(DEEDS)} deeds, {runs * KILLS_A_RUN} kills of engine, server or both"
+    return [Line("reopened sessions that ended otherwise", on, "runs", 0.0, 0.0, 0.0, runs)]
+
+
+def _ended(
+    folder: Path, path: Path, moments: "list[tuple[float, Literal['engine', 'server', 'both']]]"
+) -> tuple[dict[str, bytes], float]:
+    folder.mkdir()
+    bench = Workbench(folder, path)
+    try:
+        bench.ready()
+        began = time.monotonic()
+        return work_through(bench, moments), time.monotonic() - began
+    finally:
+        bench.close()
