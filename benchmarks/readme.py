@@ -53,8 +53,9 @@ def section(results: dict[str, Any]) -> str:
             ("ms a frame here", [_mean(seeds, "runtime_ms", "cpu", "median") for seeds in ours], ".1f"),
             ("ms a frame in the paper", [sequence.runtime_ms.get(name) for name in SYSTEMS], ".1f"),
         )
-        seeds = f", mean of {len(recordings)} seeds" if len(recordings) > 1 else ""
-        name = f"{sequence.name} ({recordings[0]['name']}{seeds})"
+        one = len(recordings) == 1
+        which = recordings[0]["name"] if one else f"{scene}, mean of {len(recordings)} seeds"
+        name = f"{sequence.name} ({which})"
         for label, values, form in rows:
             if any(value is not None for value in values):
                 cells = " | ".join("–" if value is None else format(value, form) for value in values)

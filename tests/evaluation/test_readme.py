@@ -45,7 +45,7 @@ def test_seeds_of_one_sequence_are_averaged() -> None:
     other = {**ours, "accuracy": {"ate_m": {"rmse": 0.0333}}, "runtime_ms": {"cpu": {"median": 8.0}}}
     found["recordings"].append({"name": "outdoor_4-seed1-short", "variants": [other]})
     lines = section(found).splitlines()
-    assert "| Outdoor 4 (outdoor_4-short, mean of 2 seeds) | ATE here, m | – | – | – | 0.0222 |" in lines
+    assert "| Outdoor 4 (outdoor_4, mean of 2 seeds) | ATE here, m | – | – | – | 0.0222 |" in lines
     assert "|  | ms a frame here | – | – | – | 7.0 |" in lines  # FAST-LIO lacks a seed
 
 
