@@ -15,9 +15,11 @@ PRESETS: dict[str, dict[str, Any]] = {
         "sensor": _H2LID_MOUNT,
     },
     "h2lid-mount": {"sensor": _H2LID_MOUNT},
+    "close": {"scan": {"voxel_size": 0.3}, "map": {"spacing": 0.15}},
 }
 """`rslidar`: the vendor's ROS driver. `h2lid`: the authors' published recordings. `h2lid-mount`: their
-LiDAR-on-IMU extrinsics alone, for recordings of such a device under other topics."""
+LiDAR-on-IMU extrinsics alone, for recordings of such a device under other topics. `close`: most things
+are at arm's length (a desk, a cabin, a shaft)."""
 
 
 def sidecar(recording: Path) -> Path:

@@ -11,6 +11,9 @@ from app.slam.params import Filter
 from app.slam.params import LocalMap as MapParams
 from app.slam.types import F32, F64, I32, U8
 
+LEAST_SCATTER = 2.0
+"""Times a point's noise: a plane's points are not believed to scatter less, since a few lie flat by chance."""
+
 
 @dataclass(frozen=True, slots=True)
 class MapState:
@@ -91,8 +94,9 @@ class LocalMap:
         n = len(queries)
         out = Planes(np.empty((n, 3)), np.empty((n, 3)), np.empty(n))
         reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(relaxed * params.plane_tilt)
+        least = LEAST_SCATTER * params.point_noise
         kernels.planes(
-            queries, self._voxel, reach, params.neighbours, params.plane_threshold, tilt, params.point_noise,
+            queries, self._voxel, reach, params.neighbours, params.plane_threshold, tilt, least,
             self._table, self._cells, self._counts, self._store, out.normals, out.centers, out.variances,
         )  # fmt: skip
         return out

@@ -192,7 +192,12 @@ class Filter(Section):
     """The iterated Kalman filter's update (paper 2.3, eq. 5-7)."""
 
     point_noise: float = _param(
-        0.03, "Standard deviation of a point-to-plane distance.", unit="m", ge=0.001, le=1, step=0.005
+        0.015,
+        "Standard deviation of a point-to-plane distance on a flat surface.",
+        unit="m",
+        ge=0.001,
+        le=1,
+        step=0.005,
     )
     neighbours: int = _param(
         5, "Map points that make a plane; more are taken where these lie along one line.", ge=4, le=20, step=1

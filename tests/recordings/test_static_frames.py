@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pypcd4 import PointCloud
 
+from app.sensors.presets import PRESETS
 from app.slam import ground, iekf
 from app.slam.engine import Engine
 from app.slam.imu import DIM, POS, ROT, Belief
@@ -16,8 +17,8 @@ from app.slam.types import FrameStatus, ImuSamples, NavState, Registration, Scan
 from app.slam.voxel import VoxelGrid
 
 DEFAULT = Params()
-CLOSE = DEFAULT.with_values({"scan.voxel_size": 0.2, "map.spacing": 0.1, "filter.point_noise": 0.01})
-"""For a sensor on a desk, half of whose returns come from within 0.85 m: smaller voxels all round."""
+CLOSE = DEFAULT.merged(PRESETS["close"])
+"""For a sensor on a desk, half of whose returns come from within 0.85 m."""
 Frame = tuple[np.ndarray, np.ndarray]
 
 
@@ -59,23 +60,18 @@ PAIRS = list(permutations(range(4), 2))
 
 
 @pytest.mark.parametrize("pair", PAIRS, ids=str)
-def test_two_frames_of_a_static_sensor_show_no_motion(frames: list[Frame], pair: tuple[int, int]) -> None:
+@pytest.mark.parametrize(("params", "most_m"), [(CLOSE, 0.005), (DEFAULT, 0.0085)], ids=["close", "default"])
+def test_two_frames_of_a_static_sensor_show_no_motion(
+    frames: list[Frame], pair: tuple[int, int], params: Params, most_m: float
+) -> None:
+    """From several priors. Default voxels are made for halls: of 48,000 points they leave 730, few in wide patches."""
     one, other = pair
-    metres, degrees, registration = registered(frames[one], frames[other], CLOSE, seed=10 * one + other)
-    assert metres < 0.005
-    assert degrees < 0.1
-    assert registration.converged
-    assert not registration.degenerate
-
-
-@pytest.mark.parametrize("pair", PAIRS, ids=str)
-def test_with_default_parameters_they_agree_almost_as_well(frames: list[Frame], pair: tuple[int, int]) -> None:
-    """Voxels made for halls and campuses leave 730 points of 48,000 here, and few patches wide enough for a plane."""
-    one, other = pair
-    metres, degrees, registration = registered(frames[one], frames[other], DEFAULT, seed=10 * one + other)
-    assert metres < 0.0125
-    assert degrees < 0.1
-    assert registration.inliers > iekf.MIN_INLIERS
+    for seed in range(0, 700, 100):
+        metres, degrees, registration = registered(frames[one], frames[other], params, seed + 10 * one + other)
+        assert metres < most_m
+        assert degrees < 0.1
+        assert registration.converged
+        assert not registration.degenerate
 
 
 def test_a_real_sensor_at_rest_on_a_desk_is_not_lost(frames: list[Frame]) -> None:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from app.slam import iekf
 from app.slam.iekf import boxminus, boxplus
 from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
+from app.slam.kernels.registration import SHARED
 from app.slam.local_map import LocalMap
 from app.slam.params import Filter
 from app.slam.params import LocalMap as MapParams
@@ -241,7 +242,7 @@ class Problem:
         ranges = np.linalg.norm(self.points, axis=1)
         all_distances = self._all_distances(prior.state)
         self.used = (planes.variances >= 0) & (np.abs(all_distances) <= params.gate * np.sqrt(ranges))
-        self.sigma = np.sqrt(params.point_noise**2 + planes.variances[self.used])
+        self.sigma = np.sqrt(params.point_noise**2 + SHARED * planes.variances[self.used])
 
     def _world(self, x: NavState) -> np.ndarray:
         imu = self.points @ x.R_imu_lidar.T + x.p_imu_lidar

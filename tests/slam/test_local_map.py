@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from app.slam.kernels.map import BINS, MOST
-from app.slam.local_map import LocalMap, MapState, Planes
+from app.slam.local_map import LEAST_SCATTER, LocalMap, MapState, Planes
 from app.slam.params import Filter
 from app.slam.params import LocalMap as MapParams
 
@@ -108,7 +108,7 @@ def expected_plane(
             return "ambiguous"
         patch = near[:k]
         values, vectors = np.linalg.eigh(np.cov(patch.T, bias=True))
-        certain = max(values[0], p.point_noise**2) / (np.radians(p.plane_tilt) ** 2 * k * values[1])
+        certain = max(values[0], (LEAST_SCATTER * p.point_noise) ** 2) / (np.radians(p.plane_tilt) ** 2 * k * values[1])
         if abs(certain - 1) < 1e-3:
             return "ambiguous"
         if certain < 1:

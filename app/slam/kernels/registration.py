@@ -7,6 +7,10 @@ from numba import njit, prange
 
 from app.slam.kernels.small import CHUNKS
 
+SHARED = 4.0
+"""How much more than a point's own noise the scatter of a plane counts, as variance: points that meet the
+same patch share its error, so it does not average out between them."""
+
 
 @njit(cache=True, parallel=True)
 def to_world(points, R, p, R_il, p_il, out):
@@ -65,7 +69,7 @@ def normal_equations(
                 lz = R_il[0, 2] * ax + R_il[1, 2] * ay + R_il[2, 2] * az
                 row[6], row[7], row[8] = y * lz - z * ly, z * lx - x * lz, x * ly - y * lx
                 row[9], row[10], row[11] = ax, ay, az
-            w = 1.0 / (noise * noise + variances[j])
+            w = 1.0 / (noise * noise + SHARED * variances[j])
             residuals[j] = d
             s_part[chunk, 0] += 1.0
             s_part[chunk, 1] += d * d
