@@ -193,9 +193,11 @@ def _notes(at: float, text: str) -> Deed:
 def _overrules(at: float, number: int, word: str, **more: float) -> Deed:
     """The accepted loop of this number, by keyframes."""
 
-    def pair(bench: Workbench) -> tuple[int, int]:
+    def pair(bench: Workbench) -> tuple[int, int] | None:
         found, before, deadline = list[State](), list[State](), time.monotonic() + PATIENCE_S
         while len(found) <= number or found != before:  # they may still be on their way
+            if not bench.state()["transport"]["finished"]:
+                return None  # killed meanwhile: the last loops are gone until the end is reached again
             assert time.monotonic() < deadline, "there is no such loop to overrule; choose another recording"
             time.sleep(1.0)
             before, loops = found, bench.ask("GET", "loops").json()["loops"]
@@ -203,8 +205,8 @@ def _overrules(at: float, number: int, word: str, **more: float) -> Deed:
         return found[number]["older"], found[number]["newer"]
 
     def act(bench: Workbench) -> None:
-        older, newer = pair(bench)
-        bench.ask("POST", "loops", json={"action": word, "older": older, "newer": newer, **more})
+        if (found := pair(bench)) is not None:
+            bench.ask("POST", "loops", json={"action": word, "older": found[0], "newer": found[1], **more})
 
     def done(bench: Workbench) -> bool:
         return any(word in entry for entry in bench.ask("GET", "loops").json()["overrulings"])

@@ -23,14 +23,18 @@ class Follower:
     def __init__(self, frame: int) -> None:
         self._target = frame
         self._revision, self._since = -1, 0.0
+        self._ended = False
 
     def next(self, a: Snapshot, b: Snapshot, now: float) -> Command | None:
         """What to send B now (monotonic s), if anything."""
         if b.revision != self._revision:
             self._revision, self._since = b.revision, now
         wanted, here = a.transport.frame, b.transport.frame
-        if wanted < 0 or not same_recording(a, b) or wanted == here == self._target:
+        if wanted < 0 or not same_recording(a, b):
             return None
+        if wanted == here == self._target:
+            return self._end(a, b)
+        self._ended = False
         stuck = here != wanted and b.progress is None and now - self._since >= STUCK_S
         arrived = here == self._target
         back = wanted < max(here, self._target)
@@ -43,3 +47,10 @@ class Follower:
             self._target = wanted if here >= last else last
             return StepFrame(wanted - here) if here >= last else Seek(last)
         return Seek(wanted)
+
+    def _end(self, a: Snapshot, b: Snapshot) -> Command | None:
+        """At A's frame: to the end with it, beyond the last frame, where the last loops are found."""
+        if self._ended or not a.transport.finished or b.transport.finished:
+            return None
+        self._ended = True
+        return StepFrame()

@@ -105,6 +105,14 @@ def test_beyond_the_number_of_frames_that_was_expected_b_steps() -> None:
     assert follower.next(at(101, frames=100), at(101, 3, frames=100), 0.2) is None
 
 
+def test_at_the_end_b_is_told_once_that_it_is_the_end() -> None:
+    follower, b = Follower(99), at(99)
+    a = replace(b, transport=replace(b.transport, finished=True))
+    assert follower.next(b, b, 0.0) is None
+    assert [follower.next(a, b, 0.1), follower.next(a, b, 0.2)] == [StepFrame(1), None]
+    assert follower.next(a, a, 0.3) is None
+
+
 def test_another_recording_is_nothing_to_follow() -> None:
     assert Follower(3).next(at(50, name="other"), at(3), 0.0) is None
 
