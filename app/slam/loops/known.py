@@ -8,20 +8,23 @@ from app.slam.loops.messages import LoopState
 from app.slam.params import Loops
 from app.slam.types import I64, Keyframe
 
-STATES_KEPT = 64
+STATES_BYTES = 128 << 20
+"""Of corrections; a walk of a thousand keyframes has 64 MB of them."""
 
 
 class KnownKeyframes:
     """In their order: which frames they were, with which parameters loops were looked for, what was found.
 
     Attributes:
-        states: the last ones, by number of keyframes, so that a step back waits for nobody.
-        states_kept: most of them; each holds a pose for every keyframe.
+        states: by number of keyframes, so that going back waits for nobody: to solve the graph of a thousand
+            keyframes anew takes a second.
+        states_bytes: of corrections in them, at most; beyond it the first go.
     """
 
     def __init__(self) -> None:
         self.states: dict[int, LoopState] = {}
-        self.states_kept = STATES_KEPT
+        self.states_bytes = STATES_BYTES
+        self._nbytes = 0
         self._frames: list[int] = []
         self._stamps: list[int] = []
         self._params: list[Loops] = []
@@ -54,10 +57,20 @@ class KnownKeyframes:
     def forget(self, count: int) -> None:
         """All but the first `count`."""
         del self._frames[count:], self._stamps[count:], self._params[count:]
-        self.states = {known: state for known, state in self.states.items() if known <= count}
+        self._keep({known: state for known, state in self.states.items() if known <= count})
 
     def remember(self, count: int, state: LoopState) -> None:
         """The state after so many of them."""
+        if (before := self.states.pop(count, None)) is not None:
+            self._nbytes -= before.corrections.nbytes
         self.states[count] = state
-        while len(self.states) > self.states_kept:
-            del self.states[next(iter(self.states))]
+        self._nbytes += state.corrections.nbytes
+        while self._nbytes > self.states_bytes:
+            self._nbytes -= self.states.pop(next(iter(self.states))).corrections.nbytes
+
+    def forget_states(self) -> None:
+        """They are of other commands."""
+        self._keep({})
+
+    def _keep(self, states: dict[int, LoopState]) -> None:
+        self.states, self._nbytes = states, sum(state.corrections.nbytes for state in states.values())

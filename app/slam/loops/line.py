@@ -89,6 +89,7 @@ class LoopLine:
         self._again: int | None = None  # the next keyframe to hand over again, after the work has died
         self._held: list[Request] = []  # the user's, until it has caught up
         self._deaths = 0
+        self._elsewhere = False  # whoever does the work, in the walk: he is told where it is when he is needed
 
     # --- the walk --------------------------------------------------------------------------------
     def due(self, frame: int) -> tuple[LoopEdge, ...]:
@@ -115,7 +116,7 @@ class LoopLine:
             self._known.put(keyframe, params)
         if self._again is None and known and index + 1 in self._known.states and not self._asked_for_state:
             self._arrived.append((index + 1, self._known.states[index + 1]))
-            self._ask(GoTo(index + 1), index + 1, void=True)
+            self._elsewhere = True
         elif self._again is None:
             self._ask(GoTo(index + 1) if known else AddKeyframe(keyframe, params), index + 1)
 
@@ -127,8 +128,8 @@ class LoopLine:
         self._finished = False
         for asked in self._asked:
             asked.void = True
-            if asked.keyframes is None:
-                self._known.states.clear()  # the user's command changes them all
+            if asked.keyframes is None and not isinstance(asked.request, Finish):
+                self._known.forget_states()  # the user's command changes them all
         self._arrived.clear()
         self._count = len(self._keyframes)
         self._due = min(self._known.until(frame - 1 - self._latency), self._count)
@@ -141,7 +142,7 @@ class LoopLine:
             self._in_effect = self._due
             self._take(states[self._due])
             self._arrived.extend((count, states[count]) for count in wanted[1:])
-            self._ask(GoTo(self._count), self._count, void=True)
+            self._elsewhere = True
             return
         self._in_effect = -1
         for count in wanted:
@@ -153,7 +154,7 @@ class LoopLine:
 
     def never_go_back(self) -> None:
         """The walk only goes on: what would have to be known to go back is not kept."""
-        self._known.states_kept = 0
+        self._known.states_bytes = 0
 
     def finish(self) -> None:
         """The walk has ended: look for loops of the last keyframes too, and let all take effect that comes."""
@@ -237,8 +238,15 @@ class LoopLine:
         elif self._again is not None and keyframes is None:
             self._held.append(request)
         else:
-            self._asked.append(_Asked(request, keyframes, void))
-            self._client.send(request)
+            if self._elsewhere and not isinstance(request, GoTo):
+                count = request.keyframe.index if isinstance(request, AddKeyframe) else self._count
+                self._send(GoTo(count), count, void=True)
+            self._elsewhere = False
+            self._send(request, keyframes, void=void)
+
+    def _send(self, request: Request, keyframes: int | None, *, void: bool) -> None:
+        self._asked.append(_Asked(request, keyframes, void))
+        self._client.send(request)
 
     def _settle(self) -> None:
         """Wait until all that was asked is answered, begun again as often as it takes."""
@@ -263,11 +271,14 @@ class LoopLine:
             elif asked.keyframes is None:
                 self._news += [edge for _, state in self._arrived for edge in state.changed]
                 self._arrived.clear()
-                self._known.states.clear()  # they are of other commands
+                if reply.undo or not isinstance(asked.request, Finish):
+                    self._known.forget_states()
                 self._in_effect = reply.count
                 self._take(reply)
             else:
                 self._arrived.append((asked.keyframes, reply))
+                if isinstance(asked.request, AddKeyframe) and any(one.since == reply.known for one in reply.undo):
+                    self._known.forget_states()  # a command that is given again acts from here on, on all of them
                 self._known.remember(asked.keyframes, reply)
         elif asked.keyframes is None:
             self._answers.append(reply)
@@ -312,9 +323,9 @@ class LoopLine:
 
     def _begin_again(self) -> None:
         """Hand all keyframes over from the first on, while frames go on with the state that there is."""
-        self._again = 0
+        self._again, self._elsewhere = 0, False
         self._known.forget(self._count)  # those gone back over come again as new ones
-        self._known.states.clear()
+        self._known.forget_states()
         commands = (self.state.undo, self.state.redo) if self.state is not None else ((), ())
         self._ask(GoTo(0), 0, void=True)
         self._ask(LoadCommands(*commands), 0, void=self._in_effect >= 0 or self._due > 0)
