@@ -257,7 +257,8 @@ class Run:
         """
         log = copy.deepcopy(self.log)
         if trajectory_only:
-            frame = self.engine.map_frame
+            # by all that is found so far, as beside the map: what is on its way counts
+            frame = self.engine.loops.results().frame if self.engine.loops else self.engine.map_frame
             return lambda: _save_trajectory(folder, frame.trajectory(log.odometry))
         start_s, duration_s = self._part
         info = RunInfo(
