@@ -24,6 +24,8 @@ NICENESS: Final = 10
 """The frame loop comes first."""
 _ALONE: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "NUMBA", "OPENBLAS", "MKL")}
 """More threads would fight the frame loop's for the cores."""
+_LEAN: Final = {"MALLOC_MMAP_THRESHOLD_": "131072", "MALLOC_TRIM_THRESHOLD_": "131072"}
+"""What was large once is given back to the system; glibc would keep it, here a third of all that is taken."""
 
 
 class LoopProcess:
@@ -39,7 +41,7 @@ class LoopProcess:
             [sys.executable, "-m", __name__, *map(str, ends)],
             pass_fds=ends,
             stdin=subprocess.DEVNULL,
-            env={**os.environ, **_ALONE, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            env={**os.environ, **_ALONE, **_LEAN, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
             process_group=0,  # Ctrl-C goes to all of the terminal's group; this one is ended by its owner
         )
         requests_in.close()
