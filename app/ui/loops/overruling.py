@@ -12,6 +12,7 @@ from app.slam.errors import HemislamError
 from app.slam.loops import edits
 from app.slam.loops.types import Accept, LoopEdge, Pair, Preview, Reject, SetWeight, Solve, Verdict
 from app.slam.loops.types import Command as Overrule
+from app.ui.html import box
 from app.ui.loops.kinds import in_graph, say
 from app.ui.loops.overlay import Ghost
 from app.ui.loops.words import forecast, headline
@@ -149,11 +150,15 @@ class SolvePanel:
             hint="Levenberg-Marquardt over all factors, instead of one keyframe after the other; first see what it"
             " would change.",
         )
+        self._where = gui.add_html(
+            box("What it would change stands further up, under <b>Before you decide</b>."), visible=False
+        )
         self._button.on_click(by_user(lambda _, __: propose(Solve())))
 
-    def draw(self, snapshot: Snapshot) -> None:
-        """Nothing to ask for where it is so already, or where there is no loop."""
+    def draw(self, snapshot: Snapshot, considered: bool) -> None:
+        """Nothing to ask for where it is so already, or where there is no loop. considered: it is being decided."""
         loops = snapshot.loops
+        self._where.visible = considered
         self._button.disabled = Solve() in loops.undo or not any(in_graph(edge) for edge in loops.edges)
 
 

@@ -10,7 +10,7 @@ import viser
 
 from app.server.protocol import Command, InspectLoop, Seek, Snapshot
 from app.slam.loops.types import Command as Overrule
-from app.slam.loops.types import LoopEdge, Pair, SetWeight, pair_of
+from app.slam.loops.types import LoopEdge, Pair, SetWeight, Solve, pair_of
 from app.slam.types import F64
 from app.ui.html import box
 from app.ui.loops import ledger
@@ -119,7 +119,7 @@ class LoopsPanel:
         self._inspector.draw(snapshot, edge)
         self._proposal.draw(snapshot)
         self._edits.draw(snapshot)
-        self._solve.draw(snapshot)
+        self._solve.draw(snapshot, isinstance(command, Solve))
         self._folder.visible = edge is not None
         self._draw_tables(snapshot)
 

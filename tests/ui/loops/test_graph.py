@@ -30,6 +30,7 @@ def test_all_is_solved_at_once_in_two_steps_with_cost_and_change_said_between(pa
     assert preview is not None and before is not None
     moved = 100 * np.linalg.norm(preview[1].poses[:, :3, 3] - before[:, :3, 3], axis=1).max()
     costs = [sum(f.cost for f in side) for side in (page.engine.snapshot.loops.residuals, preview[1].residuals)]
+    assert solve._where.visible, "the panel is long"
     words = proposal._words.content
     assert "Solve all at once" in words
     assert f"move by up to <b>{moved:.1f} cm</b>" in words
