@@ -123,7 +123,8 @@ class RunLog:
 
     def rows(self, first: int) -> LogRows:
         """The rows of the frames from `first` on."""
-        return self._stamps[first:], self._poses[7 * first :], self._timings[len(TIMINGS) * first :]
+        n, width = self._frames, len(TIMINGS)
+        return self._stamps[first:n], self._poses[7 * first : 7 * n], self._timings[width * first : width * n]
 
     def extend(self, rows: LogRows) -> None:
         """Put rows of another log behind those of this one; `restore` says what they amount to."""

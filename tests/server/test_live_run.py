@@ -1,5 +1,6 @@
 """The workbench's engine on live data: the same map as from the file, and one that survives the engine."""
 
+import contextlib
 import math
 import os
 import signal
@@ -15,7 +16,8 @@ import pytest
 from test_rewind import SAMPLE
 
 from app.sensors.live.feed import Pace, feed
-from app.sensors.live.process import LiveProcess
+from app.sensors.live.intake import MAX_BACKLOG
+from app.sensors.live.process import LiveClient, LiveProcess
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
 from app.server.protocol import LIVE, Pause, Seek, Snapshot, StepFrame
@@ -49,26 +51,41 @@ def from_file(params: Params) -> dict[int, np.ndarray]:
 
 @dataclass
 class Live:
-    """An engine's process on packets that are sent to it."""
+    """An engine's process on what is sent to it, as packets with an IMU beside them or as a Foxglove server."""
 
     engine: EngineProcess
-    packets: str
-    imu: str
+    url: str
+    imu: str | None
     params: Params
     source: LiveProcess
     errors: list[BaseException] = field(default_factory=list)
 
-    def play(self, speed: float) -> threading.Thread:
+    def __post_init__(self) -> None:
+        self.onlooker = LiveClient(self.source.address, engine=False)
+
+    def play(self, speed: float, *, patiently: bool = True) -> threading.Thread:
+        """patiently: no faster than the engine takes it, so that nothing is dropped however busy the machine is."""
+        pace = Pace(speed, progress=self._wait_for_engine) if patiently else Pace(speed)
+
         def send() -> None:
             try:
-                to, imu_to = parse_address(self.packets), parse_address(self.imu)
-                feed(SAMPLE, self.params, to, imu_to, pace=Pace(speed), duration_s=LENGTH_S)
+                imu_to = parse_address(self.imu) if self.imu else None
+                feed(SAMPLE, self.params, parse_address(self.url), imu_to, pace=pace, duration_s=LENGTH_S)
             except BaseException as error:
                 self.errors.append(error)
 
         thread = threading.Thread(target=send, daemon=True)
         thread.start()
         return thread
+
+    def _wait_for_engine(self, played_s: float) -> None:
+        """Until fewer scans wait than may; those of the first second are held back until the clocks are compared."""
+        deadline = time.monotonic() + PATIENCE_S
+        while played_s > 1.4 and time.monotonic() < deadline:
+            transport = self.engine.snapshot.transport
+            if not transport.playing or transport.frame + transport.dropped > 10 * played_s - MAX_BACKLOG // 2:
+                return
+            time.sleep(0.02)
 
     def until(self, wanted: Callable[[Snapshot], bool]) -> Snapshot:
         deadline = time.monotonic() + PATIENCE_S
@@ -77,6 +94,15 @@ class Live:
             assert time.monotonic() < deadline, (snapshot.transport, snapshot.notices, self.errors)
             snapshot = self.engine.wait(snapshot.revision, timeout=0.2)
         return snapshot
+
+    def until_all_is_mapped(self) -> Snapshot:
+        """Once every scan that came was mapped or is counted as dropped; none is missing."""
+
+        def is_mapped(snapshot: Snapshot) -> bool:
+            done, state = snapshot.transport, self.onlooker.state()
+            return state.backlog == 0 and done.frame + 1 + done.dropped == state.counters.frames
+
+        return self.until(is_mapped)
 
 
 def free_ports(count: int) -> list[int]:
@@ -89,37 +115,71 @@ def free_ports(count: int) -> list[int]:
     return ports
 
 
+@contextlib.contextmanager
+def receiving(params: Params, folder: Path, url: str, imu: str | None = None) -> Iterator[Live]:
+    with LiveProcess(url, params, imu) as source:
+        setup = Setup(LIVE, params=params, play=True, speed=math.inf, live=source.address, live_folder=folder)
+        engine = EngineProcess(setup)
+        live = Live(engine, url, imu, params, source)
+        try:
+            live.until(lambda s: s.recording is not None)
+            yield live
+        finally:
+            engine.close()
+
+
 @pytest.fixture
 def live(params: Params, tmp_path: Path) -> Iterator[Live]:
-    msop, difop, imu_port = free_ports(3)
-    packets, imu = f"rsbpearl://127.0.0.1:{msop},{difop}", f"imu-udp://127.0.0.1:{imu_port}"
-    with LiveProcess(packets, params, imu) as source:
-        setup = Setup(LIVE, params=params, play=True, speed=math.inf, live=source.address, live_folder=tmp_path)
-        engine = EngineProcess(setup)
-        live = Live(engine, packets, imu, params, source)
-        live.until(lambda s: s.recording is not None)
+    """Of whole scans by TCP: however busy the machine is, all of them arrive."""
+    (port,) = free_ports(1)
+    with receiving(params, tmp_path, f"foxglove://127.0.0.1:{port}") as live:
         yield live
-        engine.close()
+
+
+def compared(snapshot: Snapshot, from_file: dict[int, np.ndarray]) -> tuple[float, float]:
+    """How far frames are from where the file has them, m, and from when, s; more may have come than was read of it."""
+    assert snapshot.trajectory is not None and snapshot.recording is not None
+    stamps = np.array(sorted(from_file))
+    found = np.round(snapshot.series["stamp_s"] * 1e9) + snapshot.recording.start_ns
+    known = np.flatnonzero(np.isfinite(found) & (found < stamps[-1] + 10_000_000))
+    nearest = stamps[np.abs(stamps[None, :] - found[known, None]).argmin(axis=1)]
+    there = np.array([from_file[int(stamp)] for stamp in nearest])
+    away = np.linalg.norm(snapshot.trajectory[known] - there, axis=1)
+    return float(away.max()), float(np.abs(nearest - found[known]).max() * 1e-9)
 
 
 def apart(snapshot: Snapshot, from_file: dict[int, np.ndarray]) -> float:
     """m, the farthest that a frame is from where the file has it."""
-    assert snapshot.trajectory is not None and snapshot.recording is not None
-    stamps = np.array(sorted(from_file))
-    found = np.round(snapshot.series["stamp_s"] * 1e9).astype(np.int64) + snapshot.recording.start_ns
-    known = np.flatnonzero(np.isfinite(snapshot.series["stamp_s"]))
-    nearest = stamps[np.abs(stamps[None, :] - found[known, None]).argmin(axis=1)]
-    there = np.array([from_file[int(stamp)] for stamp in nearest])
-    return float(np.linalg.norm(snapshot.trajectory[known] - there, axis=1).max())
+    away, late = compared(snapshot, from_file)
+    assert late < 0.001
+    return away
 
 
-def test_packets_give_the_same_walk_as_the_file(live: Live, from_file: dict[int, np.ndarray]) -> None:
-    live.play(2.0).join(PATIENCE_S)
+def test_packets_give_the_same_walk_as_the_file(
+    params: Params, from_file: dict[int, np.ndarray], tmp_path: Path
+) -> None:
+    """A machine that is too busy to send packets when it should, or to take them, is asked again, more slowly."""
+    for speed in (2.0, 0.5, 0.25):
+        msop, difop, imu_port = free_ports(3)
+        url, imu = f"rsbpearl://127.0.0.1:{msop},{difop}", f"imu-udp://127.0.0.1:{imu_port}"
+        with receiving(params, tmp_path, url, imu) as live:
+            live.play(speed, patiently=False).join(PATIENCE_S)
+            snapshot = live.until(lambda s: s.transport.frame + s.transport.dropped >= len(from_file) - 4)
+            assert not live.errors
+            assert snapshot.live is not None
+            away, cut = compared(snapshot, from_file)
+            if snapshot.live.counters.lost == snapshot.transport.dropped == 0 and cut < 0.001:  # no revolution was cut
+                assert away < 0.005  # the packets' steps
+                return
+    pytest.skip("needs a machine that has time for packets as they come")
+
+
+def test_what_a_robot_sends_gives_the_same_walk_as_the_file(live: Live, from_file: dict[int, np.ndarray]) -> None:
+    live.play(4.0).join(PATIENCE_S)
     snapshot = live.until(lambda s: s.transport.frame >= len(from_file) - 4)
     assert not live.errors
     assert snapshot.transport.dropped == 0
-    assert apart(snapshot, from_file) < 0.005  # the packets' steps
-    assert snapshot.live is not None
+    assert apart(snapshot, from_file) < 0.001
 
 
 def test_an_engine_that_is_killed_is_followed_by_one_that_goes_on_in_the_same_map(
@@ -134,20 +194,39 @@ def test_an_engine_that_is_killed_is_followed_by_one_that_goes_on_in_the_same_ma
     assert len(after.chunks) >= len(before.chunks)
     assert [chunk.index for chunk in after.chunks] == list(range(len(after.chunks)))
     thread.join(PATIENCE_S)
-    end = live.until(lambda s: s.transport.frame + s.transport.dropped >= len(from_file) - 4)
-    assert end.transport.dropped < 10, "a machine that is busy may drop some, and says so"
-    assert apart(end, from_file) < (0.005 if end.transport.dropped == 0 else 0.03)
+    end = live.until_all_is_mapped()
+    assert end.transport.dropped == 0
+    assert apart(end, from_file) < 0.001
     assert any("goes where it was" in notice.text for notice in end.notices)
+
+
+def test_scans_that_an_engine_is_too_slow_for_are_dropped_counted_and_told(live: Live) -> None:
+    """At four times real time, and held for a while."""
+    thread = live.play(4.0, patiently=False)
+    live.until(lambda s: s.transport.frame >= 5)
+    assert live.engine.pid is not None
+    os.kill(live.engine.pid, signal.SIGSTOP)
+    deadline = time.monotonic() + PATIENCE_S
+    while live.onlooker.state().counters.dropped < 5 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(live.engine.pid, signal.SIGCONT)
+    thread.join(PATIENCE_S)
+    assert not live.errors
+
+    end = live.until_all_is_mapped()
+    assert end.transport.dropped == live.onlooker.state().counters.dropped >= 5
+    assert live.onlooker.state().counters.imu_lost == 0
+    assert end.series["dropped"].sum() == end.transport.dropped, "the timeline draws them"
+    assert any("too busy" in notice.text for notice in end.notices)
 
 
 def test_there_is_no_going_back_live_and_it_is_said(live: Live) -> None:
     thread = live.play(4.0)
     live.until(lambda s: s.transport.frame >= 10)
     for command in (Seek(2), StepFrame(-1)):
-        told = len(live.engine.snapshot.notices)
+        told = sum("only go on" in notice.text for notice in live.engine.snapshot.notices)
         live.engine.send(command)
-        snapshot = live.until(lambda s, told=told: len(s.notices) > told)  # type: ignore[misc]
-        assert "only go on" in snapshot.notices[-1].text
+        live.until(lambda s, told=told: sum("only go on" in notice.text for notice in s.notices) > told)  # type: ignore[misc]
     live.engine.send(Pause())
     live.until(lambda s: not s.transport.playing)
     thread.join(PATIENCE_S)
