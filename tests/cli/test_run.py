@@ -163,10 +163,10 @@ def run_with_trouble(
     """Run in this process; `trouble` is raised when the frame number `after` is due."""
     step = Run.step
 
-    def trouble_comes(self: Run) -> Any:
+    def trouble_comes(self: Run, **way: bool) -> Any:
         if self.frame + 1 == after:
             raise trouble
-        return step(self)
+        return step(self, **way)
 
     monkeypatch.setattr(Run, "step", trouble_comes)
     return CliRunner().invoke(cli, ["run", str(walk), "--out", str(folder)])
