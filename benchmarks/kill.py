@@ -191,22 +191,25 @@ def _notes(at: float, text: str) -> Deed:
 
 
 def _overrules(at: float, number: int, word: str, **more: float) -> Deed:
-    """The accepted loop of this number, by keyframes."""
+    """The accepted loop of this number, by keyframes, as they are in the session that nobody kills."""
+    chosen = list[tuple[int, int]]()
 
-    def pair(bench: Workbench) -> tuple[int, int] | None:
+    def pair(bench: Workbench) -> tuple[int, int]:
         found, before, deadline = list[State](), list[State](), time.monotonic() + PATIENCE_S
-        while len(found) <= number or found != before:  # they may still be on their way
-            if not bench.state()["transport"]["finished"]:
-                return None  # killed meanwhile: the last loops are gone until the end is reached again
+        while not chosen and (len(found) <= number or found != before):  # they may still be on their way
             assert time.monotonic() < deadline, "there is no such loop to overrule; choose another recording"
             time.sleep(1.0)
             before, loops = found, bench.ask("GET", "loops").json()["loops"]
             found = [loop for loop in loops if loop["verdict"] == "accepted" or loop["overruled"]]
-        return found[number]["older"], found[number]["newer"]
+        if not chosen:
+            chosen.append((found[number]["older"], found[number]["newer"]))
+        return chosen[0]
 
     def act(bench: Workbench) -> None:
-        if (found := pair(bench)) is not None:
-            bench.ask("POST", "loops", json={"action": word, "older": found[0], "newer": found[1], **more})
+        if not bench.state()["transport"]["finished"]:
+            return  # killed meanwhile: the last loops are gone until the end is reached again
+        older, newer = pair(bench)
+        bench.ask("POST", "loops", json={"action": word, "older": older, "newer": newer, **more})
 
     def done(bench: Workbench) -> bool:
         return any(word in entry for entry in bench.ask("GET", "loops").json()["overrulings"])
