@@ -152,8 +152,9 @@ class ComparePanel:
         if not _same(self._in_scene, (a, b, look)) and (now - self._scene_at >= _SCENE_PERIOD_S or b is None):
             self._in_scene, self._scene_at = (a, b, look), now
             self._draw_scene(a, b, view)
-        if not _same(self._in_panel, (a, b, None)) and (now - self._panel_at >= _PANEL_PERIOD_S or b is None):
-            self._in_panel, self._panel_at = (a, b, None), now
+        told = (a, b, self._scene_at)  # the scene finds the frame that both have, maybe after the panel was drawn
+        if not _same(self._in_panel, told) and (now - self._panel_at >= _PANEL_PERIOD_S or b is None):
+            self._in_panel, self._panel_at = told, now
             self._draw_panel(a, b)
 
     # --- what is drawn ---------------------------------------------------------------------------

@@ -216,6 +216,16 @@ def test_the_scan_tells_who_calls_a_point_ground(page: Page, server: viser.Viser
     assert not nodes["/map/compare_lidar"].visible and nodes["/map/sensor/lidar/scan"].visible
 
 
+def test_whose_ground_it_is_is_told_though_the_scene_is_drawn_after_the_panel(page: Page) -> None:
+    page.forks.fork("", {"ground.sigma": 0.15})
+    eventually(lambda: (b := page.forks.other) is not None and b.transport.frame == 20)
+    page.panel._scene_at = page.clock.now + 1.0  # the scene was drawn just now, without B
+    page.draw()
+    assert page.panel._numbers.content and "only in A" not in page.panel._numbers.content
+    page.draw()
+    assert "only in A" in page.panel._numbers.content
+
+
 def test_while_b_lags_the_newest_frame_that_both_have_is_shown(page: Page, server: viser.ViserServer) -> None:
     page.forks.fork("")
     page.both_at(20)
