@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Coroutine, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -87,13 +87,19 @@ class Clock:
         return self.now
 
 
+def finish(work: Coroutine[Any, Any, Any]) -> None:
+    """Run it to its end, in a thread: in this one the browser tests may have left an event loop running."""
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(asyncio.run, work).result()
+
+
 def user_sets(handle: Any, value: Any) -> None:
     """As if somebody set a control in a browser."""
     handle._impl.value = value
     for callback in handle._impl.update_cb:
         called = callback(viser.GuiEvent(client=SOMEONE, client_id=0, target=handle))  # type: ignore[arg-type]
         if isinstance(called, Coroutine):
-            asyncio.run(called)
+            finish(called)
 
 
 def user_clicks(handle: Any) -> None:
@@ -127,4 +133,4 @@ def busy(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> BusyThre
 def browser_sends(server: viser.ViserServer, handle: Any, value: Any) -> None:
     """As if a control's new value came in from a browser."""
     message = GuiUpdateMessage(handle._impl.uuid, {"value": value})
-    asyncio.run(server.gui._handle_gui_updates(0, message))  # type: ignore[arg-type]
+    finish(server.gui._handle_gui_updates(0, message))  # type: ignore[arg-type]
