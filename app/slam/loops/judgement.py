@@ -127,8 +127,9 @@ def _imu(detector: Detector, older: int, newer: int, T_level: F64) -> F64:
 def worth_correcting(edges: Iterable[LoopEdge], poses: F64) -> bool:
     """Whether the loops that count tell something that odometry does not know already.
 
-    Registrations are no better than about half of `FLOOR_M` and `FLOOR_RAD`: where odometry meets all of
-    them as well as that, following them would only add their noise. The user's word always counts.
+    Where odometry meets all of them within half of what they are uncertain by (2 cm and 0.25 degrees at
+    best, in each direction by its own), following them would only add their noise. The user's word always
+    counts.
 
     Args:
         poses: (k, 4, 4) T_odom_imu of all keyframes.
@@ -141,6 +142,12 @@ def worth_correcting(edges: Iterable[LoopEdge], poses: F64) -> bool:
     pairs = np.array([edge.pair for edge in loops])
     measured = np.array([edge.T_older_newer for edge in loops])
     missed = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]
-    moved = float(np.sqrt(np.mean(np.sum(missed[:, :3, 3] ** 2, axis=1))))
-    turned = float(np.sqrt(np.mean(np.sum(lie.log(missed[:, :3, :3]) ** 2, axis=1))))
-    return bool(moved > FLOOR_M / 2 or turned > FLOOR_RAD / 2)
+    covariances = np.array([edge.covariance for edge in loops])
+    turned = _mean_square(lie.log(missed[:, :3, :3]), covariances[:, :3, :3])
+    moved = _mean_square(missed[:, :3, 3], covariances[:, 3:, 3:])
+    return max(moved, turned) > 0.5**2
+
+
+def _mean_square(errors: F64, covariances: F64) -> float:
+    """Mean over (n, 3) errors of their squared Mahalanobis length by (n, 3, 3)."""
+    return float(np.mean(np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)))
