@@ -24,7 +24,7 @@ ARGS = (
     "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
 )  # fmt: skip
-SLOW_MS = 60_000
+SLOW_MS = 120_000
 """Software rendering on a busy machine; what is expected comes as soon as it comes."""
 expect.set_options(timeout=SLOW_MS)
 
