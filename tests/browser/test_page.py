@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
-from app.server.protocol import OpenRecording, Seek, SetParams, StepFrame
+from app.server.protocol import OpenRecording, Pause, Play, Seek, SetParams, StepFrame
 from app.server.viser_page import PLAIN_EDGES
 from tests.browser.conftest import Bench
 
@@ -67,6 +67,7 @@ def test_space_plays_and_pauses(bench: Bench) -> None:
     bench.eventually(lambda: bench.engine.snapshot.transport.playing)
     bench.page.keyboard.press("Space")
     bench.eventually(lambda: not bench.engine.snapshot.transport.playing)
+    assert [type(command) for command in bench.engine.sent] == [Play, Pause]
 
 
 def test_space_after_a_click_on_a_button_does_not_click_it_again(bench: Bench) -> None:

@@ -228,7 +228,8 @@ def test_there_is_no_going_back_live_and_it_is_said(live: Live) -> None:
         live.engine.send(command)
         live.until(lambda s, told=told: sum("only go on" in notice.text for notice in s.notices) > told)  # type: ignore[misc]
     live.engine.send(Pause())
-    live.until(lambda s: not s.transport.playing)
+    paused = live.until(lambda s: not s.transport.playing)
+    assert paused.transport.frame >= 10, "it stayed where it was, or went on"
     thread.join(PATIENCE_S)
 
 
