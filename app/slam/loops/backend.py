@@ -7,7 +7,7 @@ came, so that undoing is the same as never having done. A command forgets nothin
 but keyframes that come after it are looked at with the loops as they count then.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,6 +64,7 @@ class LoopBackend:
         self._detector = Detector(self._start)
         self._solution = Solution()
         self._found: dict[Pair, LoopEdge] = {}
+        self._by_pair: dict[Pair, LoopEdge] | None = None  # as they count; None: to be laid over again
         self._finished = False
         self._idle: set[str] = set()  # commands of which was said that they found nothing
         self._notices: list[str] = []
@@ -175,6 +176,7 @@ class LoopBackend:
     def _step(self, head: Head, odometry: Factor | None) -> None:
         """One more keyframe in the graph."""
         self._detector.go_on(head)
+        self._by_pair = None
         if odometry is None:
             self._solution.begin(head.T_odom_imu, self._start.window)
         else:
@@ -183,8 +185,10 @@ class LoopBackend:
     def _learn(self, found: Found) -> None:
         """What was found with the newest keyframe takes effect."""
         self._found.update((edge.pair, edge) for edge in found.updates)
-        newest = len(self) - 1
-        self._solution.close([loop_factor(edge) for edge in self._accepted(self.edges) if edge.decided_at == newest])
+        updates, newest = {edge.pair: edge for edge in found.updates}, len(self) - 1
+        decided = [edge for edge in self._accepted(self._edges(updates).values()) if edge.decided_at == newest]
+        self._solution.close([loop_factor(edge) for edge in decided])
+        self._by_pair = None
 
     def _look(self, first: int, end: int, params: Loops) -> Found:
         """Look for loops of the keyframes from `first` to before `end`; the graph stays as it is."""
@@ -219,7 +223,14 @@ class LoopBackend:
     @property
     def edges(self) -> tuple[LoopEdge, ...]:
         """All candidates ever, as they count now, by keyframes."""
-        return tuple(self._edges(self._found).values())
+        return tuple(self.by_pair.values())
+
+    @property
+    def by_pair(self) -> Mapping[Pair, LoopEdge]:
+        """The same; stays as it is."""
+        if self._by_pair is None:
+            self._by_pair = self._edges(self._found)
+        return self._by_pair
 
     def take_notices(self) -> tuple[str, ...]:
         """What went wrong since this was last asked, in sentences."""
@@ -233,7 +244,7 @@ class LoopBackend:
     def detail(self, older: int, newer: int) -> LoopDetail:
         """What the inspector shows of two keyframes. Raises HemislamError if there are none such."""
         self._check_there(older, newer)
-        edge = self._edges(self._found).get((older, newer))
+        edge = self.by_pair.get((older, newer))
         measured = None if edge is None else edge.T_older_newer
         counts = edge is not None and edge.verdict is Verdict.ACCEPTED
         poses = self._detector.poses if counts else self.poses  # the graph has obeyed it already
@@ -263,7 +274,7 @@ class LoopBackend:
             if there and command.guess is None:  # as it is now, so that it is the same when given again
                 command = replace(command, guess=rows(self._present(command.older, command.newer)))
         else:
-            there = pair is None or pair in self._edges(self._found)
+            there = pair is None or pair in self.by_pair
         self._overrulings.give(
             self._fitting(self._entry(replace(command, since=self._overrulings.reached if there else 0)))
         )
@@ -299,7 +310,7 @@ class LoopBackend:
         check(command)
         if not isinstance(command, Solve):
             self._check_there(command.older, command.newer)
-            if not isinstance(command, Add) and pair_of(command) not in self._edges(self._found):
+            if not isinstance(command, Add) and pair_of(command) not in self.by_pair:
                 raise HemislamError(f"There is no loop candidate of keyframes {command.older} and {command.newer}.")
         edges = tuple(self._edges(self._found, self._fitting(self._entry(replace(command, since=0)))).values())
         poses = self._optimum(edges)
@@ -338,8 +349,7 @@ class LoopBackend:
 
     def _tell_idle(self) -> None:
         """At the end: which commands found nothing to act on; each is said once."""
-        there = self._edges(self._found)
-        idle = [in_words(entry.command) for entry in self._overrulings if entry.pair and entry.pair not in there]
+        idle = [in_words(entry.command) for entry in self._overrulings if entry.pair and entry.pair not in self.by_pair]
         new = [words for words in idle if words not in self._idle]
         self._notices += [f"{words} has no effect: there is no such loop; loops.csv lists all." for words in new]
         self._idle = set(idle)
@@ -360,6 +370,7 @@ class LoopBackend:
 
     def _solve(self) -> None:
         """Solve again, in the order in which keyframes and loops came."""
+        self._by_pair = None
         if not len(self):
             self._solution.clear()
             return

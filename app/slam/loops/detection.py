@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from app.slam import lie
 from app.slam.loops import scan_context, verification
 from app.slam.loops.drift import Expectation
+from app.slam.loops.rows import Rows
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.submap import Recent, Submap, Submaps
 from app.slam.loops.verification import Fit, Prepared
@@ -66,8 +67,7 @@ class Detector:
         self._prepared: Recent[tuple[int, int], Prepared] = Recent(
             KEPT_PREPARED, lambda key: verification.prepare(self._around[key])
         )
-        self._heads: list[Head] = []
-        self._contexts: list[ScanContext] = []
+        self.stand((), ())
 
     def __len__(self) -> int:
         return len(self._heads)
@@ -84,7 +84,7 @@ class Detector:
     @property
     def poses(self) -> F64:
         """(k, 4, 4) T_odom_imu."""
-        return np.array([head.T_odom_imu for head in self._heads]).reshape(-1, 4, 4)
+        return self._poses.array
 
     def take(self, keyframe: Keyframe) -> None:
         """Store the cloud of a keyframe that was never there before; `stand` goes to it."""
@@ -93,14 +93,21 @@ class Detector:
     def stand(self, heads: Iterable[Head], contexts: Iterable[ScanContext]) -> None:
         """Be where these keyframes and contexts, the first ones of those there ever were, are all there are."""
         self._heads, self._contexts = list(heads), list(contexts)
+        self._stamps = Rows((), np.int64, (head.stamp_ns for head in self._heads))
+        self._poses = Rows((4, 4), np.float64, (head.T_odom_imu for head in self._heads))
+        self._keys = Rows((scan_context.RINGS,), np.float32, (context.ring_key for context in self._contexts))
 
     def go_on(self, head: Head) -> None:
         """The next keyframe, whose cloud was taken."""
         self._heads.append(head)
+        self._stamps.append(head.stamp_ns)
+        self._poses.append(head.T_odom_imu)
 
     def learn(self, contexts: Iterable[ScanContext]) -> None:
         """The contexts of the next keyframes that have none, as they were described before."""
-        self._contexts.extend(contexts)
+        for context in contexts:
+            self._contexts.append(context)
+            self._keys.append(context.ring_key)
 
     def forget(self) -> None:
         """Forget the clouds beyond where it stands."""
@@ -132,7 +139,7 @@ class Detector:
         if not len(candidates):
             return []
         context = self._contexts[newer]
-        keys = np.array([self._contexts[i].ring_key for i in candidates])
+        keys = self._keys.array[candidates]
         ranks = np.arange(1, min(p.candidates, len(keys)) + 1)
         _, nearest = KDTree(keys).query(context.ring_key, k=ranks)  # type: ignore[no-untyped-call]  # no types
         sightings = [self._compare(int(older), newer, expectation, p) for older in candidates[nearest]]
@@ -162,8 +169,9 @@ class Detector:
 
     def _eligible(self, newer: int, expectation: Expectation, params: Loops) -> I64:
         """Keyframes left long enough ago, as near as drift may have brought them."""
-        stamps = np.array([head.stamp_ns for head in self._heads[: self.described]])
-        old = np.flatnonzero(stamps <= self._heads[newer].stamp_ns - round(params.min_time * 1e9))
+        old = np.flatnonzero(
+            self._stamps.array[: self.described] <= self._heads[newer].stamp_ns - round(params.min_time * 1e9)
+        )
         away = np.linalg.norm(expectation.poses[old, :3, 3] - expectation.poses[newer, :3, 3], axis=1)
         reach = params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M
         return np.asarray(old[away < reach])
@@ -185,8 +193,7 @@ class Detector:
 
     def _make(self, key: tuple[int, int]) -> Submap:
         index, last = key
-        poses = [head.T_odom_imu for head in self._heads]
-        return self._submaps.around(index, poses, max(0, index - self._half), last)
+        return self._submaps.around(index, self.poses, max(0, index - self._half), last)
 
 
 def _wrapped(angle: npt.NDArray[np.float64]) -> F64:

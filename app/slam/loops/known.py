@@ -56,6 +56,8 @@ class KnownKeyframes:
 
     def forget(self, count: int) -> None:
         """All but the first `count`."""
+        if count >= len(self):
+            return
         del self._frames[count:], self._stamps[count:], self._params[count:]
         self._keep({known: state for known, state in self.states.items() if known <= count})
 

@@ -16,6 +16,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from app.slam.loops.rows import Rows
 from app.slam.loops.types import HUBER
 from app.slam.types import F64
 
@@ -156,6 +157,9 @@ def g2o_text(poses: F64, factors: Sequence[Factor]) -> str:
 class _All:
     """Every pose is solved for.
 
+    Odometry alone adds a pose and moves none: it waits for the next loop, and a walk without loops costs
+    the same however long it has become.
+
     Attributes:
         count: of poses. newest: (4, 4), the last of them.
     """
@@ -164,18 +168,31 @@ class _All:
         self.count, self.newest = 1, first
         self._isam = gtsam.ISAM2(_params())
         self._isam.update(*_start(first))
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()  # not yet in the solver
+        self._poses: Rows[np.float64] | None = Rows((4, 4), np.float64, [first])  # None: loops have moved them since
+        self._ahead: list[F64] = []  # the poses after those
 
     def update(self, step: Step) -> None:
-        graph, values, self.newest = _additions(step, self.newest)
-        self.count += step.odometry is not None
+        """Raises what gtsam raises, ValueError and ArithmeticError; it is of no use then."""
+        if step.odometry is not None:
+            if not np.isfinite(np.linalg.cholesky(step.odometry.covariance)).all():
+                raise ArithmeticError("a covariance is not finite")  # or the next loop would fail, and be blamed
+            self.newest = _add(step.odometry, self.newest, self._graph, self._values)
+            self.count += 1
+            (self._ahead if self._poses is None else self._poses).append(self.newest)
+        if not step.loops:
+            return
         for loop in step.loops:
-            graph.add(_between(loop))
-        self._isam.update(graph, values)
-        if step.loops:  # odometry alone moves nothing before it
-            self.newest = _settled(self._isam, self._isam.update, self.count - 1, self.newest)
+            self._graph.add(_between(loop))
+        self._isam.update(self._graph, self._values)
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._poses, self._ahead = None, []
+        self.newest = _settled(self._isam, self._isam.update, self.count - 1, self.newest)
 
     def poses(self) -> F64:
-        return _matrices(self._isam.calculateEstimate())
+        if self._poses is None:
+            self._poses = Rows((4, 4), np.float64, [*_matrices(self._isam.calculateEstimate()), *self._ahead])
+        return self._poses.array
 
 
 class _Window:
@@ -189,9 +206,10 @@ class _Window:
         self._smoother.update(*_start(first), {0: 0.0})
 
     def update(self, step: Step) -> None:
-        graph, values, self.newest = _additions(step, self.newest)
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         stamps: dict[Any, Any] = {}
         if step.odometry is not None:
+            self.newest = _add(step.odometry, self.newest, graph, values)
             stamps[self.count] = float(self.count)
             if self.count - len(self._left) == self._size:
                 self._left.append(_estimate(self._smoother, len(self._left)))
@@ -232,14 +250,12 @@ def _start(first: F64) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     return graph, values
 
 
-def _additions(step: Step, newest: F64) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, F64]:
-    """The odometry factor of a step, where its pose begins, and the newest pose as it is then, before loops."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    if step.odometry is not None:
-        newest = newest @ step.odometry.T_first_second
-        values.insert(step.odometry.second, gtsam.Pose3(newest))
-        graph.add(_between(step.odometry))
-    return graph, values, newest
+def _add(odometry: Factor, newest: F64, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> F64:
+    """Put a step in the graph. Returns the pose after it, as it is before loops."""
+    after = newest @ odometry.T_first_second
+    values.insert(odometry.second, gtsam.Pose3(after))
+    graph.add(_between(odometry))
+    return after
 
 
 def _params() -> gtsam.ISAM2Params:

@@ -54,7 +54,9 @@ def search(
             if seen[-1].verdict is Verdict.CANDIDATE and seen[-1].evidence.gate_m < SURE_M:
                 break
         fresh = {edge.pair: edge for edge in seen if edge.pair not in known}
-        settled = settle(fresh, counting({**known, **fresh}), detector.poses, drift, params, now)
-        updates.update((edge.pair, edge) for edge in settled)
+        updates.update(fresh)
+        if any(edge.verdict is Verdict.CANDIDATE for edge in fresh.values()):
+            settled = settle(fresh, counting({**known, **fresh}), detector.poses, drift, params, now)
+            updates.update((edge.pair, edge) for edge in settled)
     contexts = tuple(detector.context(index) for index in range(described, keyframes.stop))
     return Found(contexts, tuple(updates.values()))

@@ -1,6 +1,7 @@
 """The loop back end behind one method, and the client that runs it in the caller's own process."""
 
 from collections import deque
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -35,7 +36,7 @@ class LoopService:
 
     def __init__(self) -> None:
         self._backend = LoopBackend()
-        self._told: dict[Pair, LoopEdge] = {}
+        self._told: Mapping[Pair, LoopEdge] = {}
 
     def handle(self, request: Request) -> Reply:
         """The answer. What can not be done gives a `Failure`, never an exception."""
@@ -78,7 +79,7 @@ class LoopService:
 
     def _state(self) -> LoopState:
         backend = self._backend
-        edges = {edge.pair: edge for edge in backend.edges}
+        edges = backend.by_pair
         changed = tuple(edge for pair, edge in edges.items() if _differs(edge, self._told.get(pair)))
         self._told = edges
         corrections = backend.corrections

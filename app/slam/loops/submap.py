@@ -10,7 +10,7 @@ import os
 import tempfile
 from array import array
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -117,16 +117,16 @@ class Submaps:
     def close(self) -> None:
         self._clouds.close()
 
-    def around(self, index: int, poses: Sequence[F64], first: int, last: int) -> Submap:
+    def around(self, index: int, poses: F64, first: int, last: int) -> Submap:
         """The submap about a keyframe, from the clouds of keyframes `first` to `last`, both included.
 
         Args:
-            poses: (4, 4) T_odom_imu of all keyframes.
+            poses: (k, 4, 4) T_odom_imu of all keyframes.
         """
-        centre = poses[index][:3, 3]
+        centre = poses[index, :3, 3]
         clouds, eyes = [], []
         for other in range(first, last + 1):
-            eye = (poses[other][:3, 3] - centre).astype(np.float32)
+            eye = (poses[other, :3, 3] - centre).astype(np.float32)
             points = self._clouds[other] + eye
             clouds.append(points[np.einsum("ni,ni->n", points, points) < self._radius**2])
             eyes.append(np.broadcast_to(eye, clouds[-1].shape))

@@ -32,8 +32,6 @@ def settle(
     Returns:
         All of `fresh`, and those before whose verdict changed, without the user's commands.
     """
-    if not any(edge.verdict is Verdict.CANDIDATE for edge in fresh.values()):
-        return list(fresh.values())
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
 
     def ways(a: LoopEdge, b: LoopEdge) -> tuple[float, float]:

@@ -88,6 +88,22 @@ def test_doing_it_again_gives_the_same_poses_to_the_last_bit() -> None:
     np.testing.assert_array_equal(graph.poses, again.poses)
 
 
+def test_odometry_alone_moves_no_pose_that_is_there() -> None:
+    odometry, loops = chain(40)
+    graph = graph_of(odometry[:20], [Factor(0, 15, odometry[0].T_first_second, np.eye(6) * 0.1)])
+    before = graph.poses
+    for factor in odometry[20:]:
+        graph.extend(factor)
+    np.testing.assert_array_equal(graph.poses[: len(before)], before)
+    T = before[-1]
+    for factor, pose in zip(odometry[20:], graph.poses[len(before) :], strict=True):
+        T = T @ factor.T_first_second
+        np.testing.assert_allclose(pose, T, atol=1e-12)
+    graph.close(loops)
+    assert np.abs(graph.poses[: len(before)] - before).max() > 0.01
+    assert len(before) == 21, "what was seen stays as it was"
+
+
 def straight(count: int, sigma: float) -> list[Factor]:
     step = lie.transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
     return [Factor(k - 1, k, step, np.eye(6) * sigma**2) for k in range(1, count)]
