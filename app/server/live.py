@@ -19,7 +19,7 @@ from app.slam.keyframes import KeyframeStore
 from app.slam.loops.types import Command
 from app.slam.params import Params
 from app.slam.results import LogState
-from app.slam.types import DroppedScan, Measurement
+from app.slam.types import DroppedScan, Measurement, StepResult
 
 POLL_S = 0.02
 """How long to wait for the next scan before looking for commands."""
@@ -34,12 +34,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """A live run as an engine that takes over needs it, but for keyframes and the log's rows, which are appended
-    to files of their own: what is written each time must not grow with the walk. end_ns: of its newest scan.
+    """A live run as an engine that takes over needs it, but for keyframes and rows, which are appended to files of
+    their own: what is written each time must not grow with the walk.
+
+    Attributes:
+        place: of the newest scan, see `LiveClient`. rows_end: bytes of the file of rows that belong to it.
     """
 
     frame: int
-    end_ns: int
+    place: int
+    rows_end: int
     engine: Checkpoint
     params: Params
     history: tuple[tuple[int, Params], ...]
@@ -67,20 +71,17 @@ class _Endless:
 
 
 class LiveRun(Run):
-    """Takes scans from a `LiveProcess`.
-
-    Attributes:
-        complete: whether no scan was missed between an engine that died and this one.
-    """
+    """Takes scans from a `LiveProcess`."""
 
     live = True
-    complete = True
 
     def __init__(self, client: LiveClient, engine: Engine, folder: Path) -> None:
         super().__init__(_Endless(), engine)  # type: ignore[arg-type]
         self._client = client
         self._folder = folder
+        self._rows_end = 0
         self._rows_kept = 0
+        self._readouts: list[list[float]] = []  # not yet kept
         if engine.loops is not None:
             engine.loops.never_go_back()
 
@@ -111,14 +112,32 @@ class LiveRun(Run):
         """How the source is doing. Raises HemislamError: it has ended."""
         return self._client.state()
 
+    def readout(self, result: StepResult) -> list[float]:
+        row = super().readout(result)
+        self._readouts.append(row)
+        return row
+
     def remember(self, *, near: bool = False) -> None:
         """Now and then put on disk what an engine that takes over needs. Going back is not possible."""
-        if self.frame < 0 or self.frame % EVERY:
+        if self.frame < 0 or self.frame % EVERY or self._waiting is not None:
             return
+        part = self._folder / "checkpoint.part"
+        try:
+            self._keep_rows()
+            part.write_bytes(pickle.dumps(self._state(), protocol=5))
+            part.replace(self._folder / CHECKPOINT)
+        except OSError as error:
+            log.warning("What a new engine would need can not be kept: %s", error)
+            return
+        with contextlib.suppress(HemislamError):  # it has ended, which is told when it is asked for the next scan
+            self._client.kept()
+
+    def _state(self) -> _Kept:
         loops = self.engine.loops.state if self.engine.loops else None
-        kept = _Kept(
+        return _Kept(
             frame=self.frame,
-            end_ns=self._end_ns,
+            place=self._client.place,
+            rows_end=self._rows_end,
             engine=self.engine.checkpoint(),
             params=self.params,
             history=self.history,
@@ -127,46 +146,46 @@ class LiveRun(Run):
             readouts=self.readouts,
             overrulings=(loops.undo, loops.redo) if loops else ((), ()),
         )
-        part = self._folder / "checkpoint.part"
-        try:
-            self._keep_rows()
-            part.write_bytes(pickle.dumps(kept, protocol=5))
-            part.replace(self._folder / CHECKPOINT)
-        except OSError as error:
-            self._rows_kept = 0
-            log.warning("What a new engine would need can not be kept: %s", error)
 
     @property
     def _end_ns(self) -> int:
         return self.log.rows(len(self.log) - 1)[0][0]
 
     def _keep_rows(self) -> None:
-        """Append what is new to the file of rows, which is written anew by a process that did not write it."""
-        path, part = self._folder / ROWS, self._folder / "rows.part"
-        with (path if self._rows_kept else part).open("ab" if self._rows_kept else "wb") as file:
-            pickle.dump(self.log.rows(self._rows_kept), file, protocol=5)
-        if not self._rows_kept:
-            part.replace(path)
-        self._rows_kept = len(self.log)
+        """Put what is new behind what is kept; a piece behind that may be there, of an engine that died meanwhile."""
+        with (self._folder / ROWS).open("r+b" if self._rows_end else "wb") as file:
+            file.seek(self._rows_end)
+            file.truncate()
+            pickle.dump((self.log.rows(self._rows_kept), self._readouts), file, protocol=5)
+            end = file.tell()
+        self._rows_end, self._rows_kept, self._readouts = end, len(self.log), []
 
-    def _read_rows(self) -> None:
-        """Take in the file of rows; at its end may be more than belongs to the checkpoint, or half of an entry."""
-        ended = EOFError, pickle.UnpicklingError, OSError
-        with contextlib.suppress(*ended), (self._folder / ROWS).open("rb") as file:
-            while True:
-                self.log.extend(pickle.load(file))
+    def _read_rows(self, end: int) -> None:
+        with (self._folder / ROWS).open("rb") as file:
+            while file.tell() < end:
+                rows, _ = pickle.load(file)
+                self.log.extend(rows)
+        self._rows_end, self._rows_kept = end, len(self.log)
+
+    def readouts_from(self, frame: int) -> list[list[float]]:
+        """The readouts from this frame on, of those that are kept."""
+        first, found = 0, []
+        with (self._folder / ROWS).open("rb") as file:
+            while file.tell() < self._rows_end:
+                _, rows = pickle.load(file)
+                found += rows[max(frame - first, 0) :]
+                first += len(rows)
+        return found
 
     def revive(self) -> bool:
         """Go on where an engine that died was; whether there is anything to go on from."""
         try:
             kept = pickle.loads((self._folder / CHECKPOINT).read_bytes())
+            assert isinstance(kept, _Kept)
+            if kept.engine.keyframes > len(self.engine.keyframes):
+                return False
+            self._read_rows(kept.rows_end)
         except (OSError, EOFError, pickle.UnpicklingError):
-            return False
-        assert isinstance(kept, _Kept)
-        if kept.engine.keyframes > len(self.engine.keyframes):
-            return False
-        self._read_rows()
-        if len(self.log) < kept.log.frames:
             return False
         self.log.restore(kept.log)
         self.engine.restore(kept.engine)
@@ -175,7 +194,7 @@ class LiveRun(Run):
         self.history, self.opened, self.readouts = kept.history, kept.opened, kept.readouts
         if any(kept.overrulings):
             self.overrule(*kept.overrulings)
-        self.complete = self._client.rewind(kept.end_ns)
+        self._client.place = kept.place
         return True
 
     def go_before(self, frame: int) -> None:
@@ -195,17 +214,28 @@ def open_live_run(address: LiveAddress, params: Params, folder: Path, *, revive:
     Raises:
         HemislamError: the receiving process has ended.
     """
-    client = LiveClient(address)
     if not revive:
-        (folder / KEYFRAMES).unlink(missing_ok=True)
-        (folder / CHECKPOINT).unlink(missing_ok=True)
-        (folder / ROWS).unlink(missing_ok=True)
-    engine = Engine(params, LoopProcess if params.loops.enabled else None, KeyframeStore(folder / KEYFRAMES))
-    run = LiveRun(client, engine, folder)
-    if revive and not run.revive():
+        _clear(folder)
+    run, client = _begun(address, params, folder)
+    if not revive:
+        client.kept()  # what an earlier walk was given is not of this one
+    elif not run.revive():
         run.close()
-        return open_live_run(address, params, folder)
+        _clear(folder)
+        run, client = _begun(address, params, folder)
+        client.place = 0  # all that was given to the engine that died before its first checkpoint
     return run
+
+
+def _begun(address: LiveAddress, params: Params, folder: Path) -> tuple[LiveRun, LiveClient]:
+    client = LiveClient(address)
+    engine = Engine(params, LoopProcess if params.loops.enabled else None, KeyframeStore(folder / KEYFRAMES))
+    return LiveRun(client, engine, folder), client
+
+
+def _clear(folder: Path) -> None:
+    for name in (KEYFRAMES, CHECKPOINT, ROWS):
+        (folder / name).unlink(missing_ok=True)
 
 
 def tells(status: Status) -> bool:

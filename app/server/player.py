@@ -9,7 +9,7 @@ from typing import Literal
 from app.server.breakpoints import Breakpoints, Moment, reasons
 from app.server.checkpoints import NEAR
 from app.server.delta import Outbox
-from app.server.live import tells
+from app.server.live import LiveRun, tells
 from app.server.pacing import Pacer
 from app.server.protocol import Progress
 from app.server.publisher import Publisher
@@ -79,7 +79,7 @@ class Player:
         self.relabelling = self.page_behind = False
         self._moment = self._unseen = None
         run.remember()
-        if run.frame >= 0:
+        if isinstance(run, LiveRun) and run.frame >= 0:
             self._page.taken_over(run)
         else:
             self._page.opened(run)

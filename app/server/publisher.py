@@ -10,6 +10,7 @@ import numpy as np
 from app.server import wire
 from app.server.chunks import thinned
 from app.server.delta import Outbox, Rows
+from app.server.live import LiveRun
 from app.server.protocol import SERIES, Chunk, Saved, Transport
 from app.server.run import Run
 from app.server.spill import Slot, Spill
@@ -65,13 +66,19 @@ class Publisher:
             if finding.verdict == "needs you":
                 self.outbox.notice("warning", " ".join(filter(None, (finding.text, finding.option))))
 
-    def taken_over(self, run: Run) -> None:
-        """A run that another process began goes on; the page keeps what it has of it. There is no going back."""
+    def taken_over(self, run: LiveRun) -> None:
+        """A run that another process began goes on; the page keeps what it has of it, and is sent what that process
+        had kept, but not told, when it died. There is no going back."""
         frames, keyframes = run.frame + 1, run.engine.keyframes
         self._positions.extend(run.log.odometry.positions)
         for keyframe in keyframes:
             self._odometry.extend(keyframe.T_odom_imu.reshape(1, 16))
         self.outbox.rewind(frames, len(keyframes))
+        told = self.outbox.frames
+        for position, row in zip(self._positions.view()[told:], run.readouts_from(told), strict=True):
+            self.outbox.frame(position, row)
+        for index in range(self.outbox.chunks, len(keyframes)):
+            self.outbox.chunk(thinned(keyframes[index], self._chunk_voxel))
         self.outbox.put(recording=run.opened)
         self.show(frame=run.frame, finished=False, frames_per_second=0.0, dropped=run.log.dropped.total())
 
@@ -82,7 +89,7 @@ class Publisher:
 
     def frame(self, run: Run, result: StepResult) -> None:
         """A frame was processed, the one after that which the page shows."""
-        frame, position, row = run.frame, result.T_map_imu[:3, 3].copy(), run.readouts.row(result)
+        frame, position, row = run.frame, result.T_map_imu[:3, 3].copy(), run.readout(result)
         if not run.live:  # nobody goes back there
             self._rows.go_to(frame)
             self._rows.extend(np.array([row]))

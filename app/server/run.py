@@ -118,6 +118,10 @@ class Run:
             self._waiting = entry
         return self._waiting
 
+    def readout(self, result: StepResult) -> list[float]:
+        """As `Readouts.row`, of the newest frame. Call it once."""
+        return self.readouts.row(result)
+
     def _drop(self, scan: DroppedScan) -> None:
         self.log.drop(scan)
         self._dropped += 1

@@ -61,7 +61,7 @@ class Live:
     errors: list[BaseException] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.onlooker = LiveClient(self.source.address, engine=False)
+        self.onlooker = LiveClient(self.source.address)
 
     def play(self, speed: float, *, patiently: bool = True) -> threading.Thread:
         """patiently: no faster than the engine takes it, so that nothing is dropped however busy the machine is."""

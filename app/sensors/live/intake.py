@@ -24,7 +24,8 @@ from app.slam.types import DroppedScan, Scan
 MAX_BACKLOG = 20
 """Scans that may wait for the engine: two seconds of them at 10 Hz, and more than are held back at the start."""
 MAX_BACKLOG_ABSENT = 100
-"""The same while there is no engine, which is being started again and will then be faster than the sensor."""
+"""The same while there is no engine, which is being started again and will then be faster than the sensor. As it
+catches up it may still fall behind by `MAX_BACKLOG`: its first frame takes a while."""
 MAX_WAITING = 600_000
 """IMU samples and news that may wait: twenty minutes at 500 Hz. If there are more, nobody reads any longer."""
 _SETTLE_NS = 1_000_000_000
@@ -255,7 +256,8 @@ class Intake:
         self._rest.append(Status(kind, sensor, text, time.time_ns()))
 
     def _bound(self) -> None:
-        self._limit = MAX_BACKLOG_ABSENT if self._absent else max(MAX_BACKLOG, min(self._limit, len(self._scans)))
+        behind = len(self._scans) + MAX_BACKLOG
+        self._limit = MAX_BACKLOG_ABSENT if self._absent else max(MAX_BACKLOG, min(self._limit, behind))
         while len(self._scans) > self._limit:
             oldest = self._scans.popleft()
             times = self._arrivals["IMU"]

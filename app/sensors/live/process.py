@@ -2,7 +2,7 @@
 
 A busy engine then loses no packet, and one that dies loses neither what is recorded nor its place:
 `LiveProcess` is owned by whoever supervises, `LiveClient` is what an engine polls, and a new engine
-goes on where its checkpoint was (`rewind`).
+goes on where its checkpoint was (`LiveClient.place`).
 """
 
 import contextlib
@@ -28,12 +28,15 @@ from app.sensors.live.status import LiveState
 from app.sensors.live.urls import open_live
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import Measurement
+from app.slam.types import DroppedScan, Measurement
 
 log = logging.getLogger(__name__)
 
 HISTORY = 60
-"""Measurements that can be had again: six seconds, and an engine's checkpoints are two apart."""
+"""Scans that can be had again: six seconds, and an engine's checkpoints are one apart."""
+MOST_GIVEN = 100_000
+"""The same with those that were let go, of which nothing is kept but their time."""
+LOST = "it was lost with the engine that had it"
 _START_S = 30.0
 _STOP_S = 10.0
 
@@ -99,90 +102,121 @@ class LiveProcess:
 class LiveClient:
     """Polls a `LiveProcess` as one would a `LiveSource`. One engine at a time; `state` from anywhere.
 
+    While there is nobody who polls, more scans may wait.
+
+    Attributes:
+        place: number of the scan given last, counted by the process whoever polls. Set it to that of an engine
+            that died, and `poll` goes on behind it; 0 is before the first.
+
     Raises:
         HemislamError: the process has ended.
     """
 
-    def __init__(self, address: LiveAddress, *, engine: bool = True) -> None:
-        """engine: whether it polls; while no such client is there, more scans may wait."""
+    def __init__(self, address: LiveAddress) -> None:
         try:
             self._connection: Connection[Any, Any] = Client(address.path, authkey=address.key)
         except OSError as error:
             raise HemislamError(f"The process that receives live data has ended ({error}).") from None
-        self._ask("engine" if engine else "onlooker")
+        self.place: int = self._ask("place")
 
     def poll(self, timeout_s: float = 0.1) -> Event | None:
         """As `LiveSource.poll`."""
-        event: Event | None = self._ask("poll", timeout_s)
+        event: Event | None
+        self.place, event = self._ask("poll", self.place, timeout_s)
         return event
 
     def state(self) -> LiveState:
         state: LiveState = self._ask("state")
         return state
 
-    def rewind(self, after_ns: int) -> bool:
-        """Give again what was given of scans that end later; whether that is all, without a gap."""
-        return bool(self._ask("rewind", after_ns))
+    def kept(self) -> None:
+        """Nobody will ask again for the scans up to this place."""
+        self._ask("kept", self.place)
 
     def close(self) -> None:
         self._connection.close()
 
-    def _ask(self, what: str, value: Any = None) -> Any:
+    def _ask(self, *request: Any) -> Any:
         try:
-            self._connection.send((what, value))
+            self._connection.send(request)
             return self._connection.recv()
         except (OSError, EOFError):
             raise HemislamError("The process that receives live data has ended.") from None
 
 
-class _Desk:
-    """What the clients ask for, in the receiving process."""
+class Desk:
+    """What the clients ask for, in the receiving process.
+
+    Scans, and those let go, are numbered as they are given, from 1 on, and who polls says which he had last: an
+    engine that dies, at whatever moment, has taken nothing from the one after it.
+    """
 
     def __init__(self, source: LiveSource) -> None:
         self._source = source
         self._lock = threading.Lock()
-        self._history: deque[Measurement] = deque(maxlen=HISTORY)
-        self._again: deque[Measurement] = deque()
-        self._engines = 0
+        self._given: dict[int, Measurement | DroppedScan] = {}  # without a gap
+        self._whole: deque[int] = deque()  # which of them are scans, not only the news of one
+        self._last = 0
+        self._polling = 0
 
     def serve(self, connection: "Connection[Any, Any]") -> None:
         """Until the client leaves, or dies."""
-        engine = False
+        polls = False
         try:
             with connection:
                 while True:
-                    what, value = connection.recv()
-                    if what == "engine":
-                        engine = True
+                    request = connection.recv()
+                    if request[0] == "poll" and not polls:
+                        polls = True
                         self._count(1)
-                    connection.send(self._answer(what, value))
+                    connection.send(self._answer(*request))
         except (OSError, EOFError):
             return
         finally:
-            if engine:
+            if polls:
                 self._count(-1)
 
     def _count(self, change: int) -> None:
         with self._lock:
-            self._engines += change
-            self._source.set_absent(self._engines == 0)
+            self._polling += change
+            self._source.set_absent(self._polling == 0)
 
-    def _answer(self, what: str, value: Any) -> Any:
+    def _answer(self, what: str, place: int = 0, timeout_s: float = 0.0) -> Any:
         if what == "state":
             return self._source.state()
-        if what == "poll":
-            with self._lock:
-                if self._again:
-                    return self._again.popleft()
-                event = self._source.poll(value)
-                if isinstance(event, Measurement):
-                    self._history.append(event)
-                return event
-        if what == "rewind":
-            with self._lock:
-                self._again = deque(m for m in self._history if m.scan.end_ns > value)
-                return len(self._again) < HISTORY
-        return None
+        with self._lock:
+            if what == "poll":
+                return self._next(place, timeout_s)
+            if what == "kept":
+                self._let_go(place)
+            return self._last
+
+    def _next(self, place: int, timeout_s: float) -> tuple[int, Event | None]:
+        """What comes behind that place, and its own."""
+        if self._given and place < self._last:
+            place = max(place + 1, next(iter(self._given)))
+            return place, self._given[place]
+        event = self._source.poll(timeout_s)
+        if isinstance(event, Measurement | DroppedScan):
+            self._last += 1
+            self._given[self._last] = event
+        if isinstance(event, Measurement):
+            self._whole.append(self._last)
+        if len(self._whole) > HISTORY:
+            oldest = self._whole.popleft()
+            self._given[oldest] = DroppedScan(_stamp(self._given[oldest]), LOST)
+        self._let_go(self._last - MOST_GIVEN)
+        return self._last, event
+
+    def _let_go(self, place: int) -> None:
+        while self._given and (first := next(iter(self._given))) <= place:
+            del self._given[first]
+        while self._whole and self._whole[0] <= place:
+            self._whole.popleft()
+
+
+def _stamp(event: Measurement | DroppedScan) -> int:
+    return event.scan.stamp_ns if isinstance(event, Measurement) else event.stamp_ns
 
 
 def _logged(*arguments: Any) -> None:
@@ -205,10 +239,10 @@ def _serve(
         control.send(str(error))
         return
     log.info("Receiving from %s", ", ".join(filter(None, (lidar, imu))))
-    desk = _Desk(source)
+    desk = Desk(source)
     source.set_absent(True)
     with source, Listener(address.path, authkey=address.key) as listener:
-        threading.Thread(target=_accept, args=(listener, desk), daemon=True).start()
+        threading.Thread(target=accept, args=(listener, desk), daemon=True).start()
         control.send("")
         while True:
             try:
@@ -217,7 +251,8 @@ def _serve(
                 return
 
 
-def _accept(listener: Listener, desk: _Desk) -> None:
+def accept(listener: Listener, desk: Desk) -> None:
+    """Serve all who come, each on a thread of its own, until the process ends."""
     while True:
         try:
             connection = listener.accept()

@@ -1,0 +1,176 @@
+"""Engines that die one after the other on live data, at every moment: nothing is missed, and nothing counted twice."""
+
+import random
+import secrets
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Listener
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_rewind import SAMPLE
+
+from app.sensors.live import process
+from app.sensors.live.process import Desk, LiveAddress
+from app.sensors.live.source import Event
+from app.sensors.live.status import LiveState
+from app.sensors.presets import resolve_params
+from app.sensors.recording import open_recording
+from app.server.delta import Fold, Outbox
+from app.server.live import LiveRun, open_live_run
+from app.server.protocol import LIVE, Snapshot
+from app.server.session import Session
+from app.slam.params import Params
+from app.slam.types import DroppedScan, Measurement
+
+LENGTH_S = 4.0
+BUSY = "the engine was too busy"
+
+
+class Script:
+    """A live source that gives these events, each once."""
+
+    def __init__(self, events: list[Event]) -> None:
+        self.left = events.copy()
+        self.absent = True
+
+    def poll(self, _timeout_s: float) -> Event | None:
+        return self.left.pop(0) if self.left else None
+
+    def set_absent(self, absent: bool) -> None:
+        self.absent = absent
+
+    def state(self) -> LiveState:
+        return LiveState()
+
+
+class Bench:
+    """Engines, each in its turn, and the page's side, which outlives them."""
+
+    def __init__(self, address: LiveAddress, params: Params, folder: Path) -> None:
+        self._address, self._params, self._folder = address, params, folder
+        self.fold = Fold(Snapshot(params=params))
+        self.run: LiveRun | None = None
+        self.begin(revive=False)
+
+    @property
+    def page(self) -> Snapshot:
+        return self.fold.snapshot
+
+    def begin(self, *, revive: bool = True) -> None:
+        page = self.page
+        self.outbox = Outbox(
+            self._params,
+            session=page.session,
+            frames=0 if page.trajectory is None else len(page.trajectory),
+            chunks=len(page.chunks),
+        )
+
+        def opened(*_: object) -> LiveRun:
+            self.run = open_live_run(self._address, self._params, self._folder, revive=revive)
+            return self.run
+
+        self.session = Session(self.outbox, self._params, opened, clock=lambda: 0.0)
+        self.session.open(LIVE, None, play=True)
+
+    def kill(self, *, asking: bool) -> None:
+        """asking: it has asked for a scan and dies before the answer."""
+        if self.run is not None:
+            if asking:
+                self.run._client._connection.send(("poll", self.run._client.place, 1.0))
+            self.run._client.close()
+            self.run.engine.close()
+
+    def tell(self) -> None:
+        """The page hears what there is to hear."""
+        if self.outbox.filled:
+            self.fold.apply(self.outbox.take())
+
+
+@pytest.fixture(scope="module")
+def params() -> Params:
+    return resolve_params(SAMPLE, None, None, []).with_values({"loops.enabled": False})
+
+
+@pytest.fixture(scope="module")
+def events(params: Params) -> list[Event]:
+    """Scans, and among them some that were let go, also several in a row."""
+    rng = random.Random(1)
+    found: list[Event] = []
+    with open_recording(SAMPLE, params) as recording:
+        for measurement in recording.measurements(0.0, LENGTH_S):
+            found.append(measurement)
+            found += [DroppedScan(measurement.scan.stamp_ns + k, BUSY) for k in range(rng.choice((0, 0, 0, 1, 5)))]
+    return found
+
+
+@contextmanager
+def given(events: list[Event], folder: Path) -> Iterator[LiveAddress]:
+    """Where these can be polled."""
+    address = LiveAddress(str(folder / "desk"), secrets.token_bytes(16))
+    desk = Desk(Script(events))  # type: ignore[arg-type]
+    with Listener(address.path, authkey=address.key) as listener:
+        threading.Thread(target=process.accept, args=(listener, desk), daemon=True).start()
+        yield address
+
+
+def walked(bench: Bench, events: list[Event]) -> Snapshot:
+    """To the end of the events."""
+    for _ in range(5 * len(events)):
+        bench.session.work()
+    bench.tell()
+    done = bench.page.transport
+    assert done.frame + 1 + done.dropped == len(events)
+    return bench.page
+
+
+@pytest.fixture(scope="module")
+def undisturbed(params: Params, events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Snapshot:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    with given(events, folder) as address:
+        return walked(Bench(address, params, folder), events)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_however_often_engines_die_every_scan_is_mapped_once_or_counted_as_dropped(
+    seed: int, params: Params, tmp_path: Path, events: list[Event], undisturbed: Snapshot
+) -> None:
+    rng = random.Random(seed)
+    with given(events, tmp_path) as address:
+        bench = Bench(address, params, tmp_path)
+        for _ in range(15):
+            for _ in range(rng.choice((1, 2, 4, 9, 25))):
+                bench.session.work()
+                if rng.random() < 0.3:
+                    bench.tell()
+            bench.kill(asking=rng.random() < 0.5)
+            bench.begin()
+        page = walked(bench, events)
+
+    assert page.transport.dropped == sum(isinstance(event, DroppedScan) for event in events)
+    assert bench.run is not None and bench.run.log.dropped == {BUSY: page.transport.dropped}
+    mapped = [event.scan.end_ns for event in events if isinstance(event, Measurement)]
+    assert bench.run.log.stamps_ns.tolist() == mapped
+    assert page.trajectory is not None and undisturbed.trajectory is not None
+    np.testing.assert_allclose(page.trajectory, undisturbed.trajectory, rtol=0, atol=1e-9)
+    for name in ("stamp_s", "dropped", "used", "distance"):
+        np.testing.assert_allclose(page.series[name], undisturbed.series[name], err_msg=name)
+    assert [chunk.index for chunk in page.chunks] == list(range(len(undisturbed.chunks)))
+
+
+def test_scans_that_are_too_many_to_be_had_again_are_counted_as_dropped(
+    params: Params, tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Should there be no checkpoint for long, the disk being full."""
+    monkeypatch.setattr(process, "HISTORY", 5)
+    with given(events, tmp_path) as address:
+        bench = Bench(address, params, tmp_path)
+        while bench.run is None or bench.run.frame < 9:  # one before the second checkpoint
+            bench.session.work()
+        bench.kill(asking=False)
+        bench.begin()
+        page = walked(bench, events)
+    assert bench.run.log.dropped[process.LOST] == 4
+    assert page.series["dropped"].sum() == page.transport.dropped
