@@ -8,7 +8,7 @@ but keyframes that come after it are looked at with the loops as they count then
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,10 +17,11 @@ from app.slam.errors import HemislamError
 from app.slam.loops import inspection
 from app.slam.loops.detection import Detector, Head
 from app.slam.loops.drift import Drift
+from app.slam.loops.history import History, Record
 from app.slam.loops.judgement import by_hand, worth_correcting
 from app.slam.loops.odometry import odometry_factor
 from app.slam.loops.overruling import Entry, Overrulings, check, in_words
-from app.slam.loops.pose_graph import Factor, Step, g2o_text, optimise
+from app.slam.loops.pose_graph import Factor, g2o_text, optimise
 from app.slam.loops.search import Found, search
 from app.slam.loops.solution import Solution, loop_factor
 from app.slam.loops.types import (
@@ -40,16 +41,6 @@ from app.slam.params import Loops
 from app.slam.types import F64, Keyframe
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
-    """One keyframe of the history: itself without its cloud, and what was found when it came."""
-
-    head: Head
-    odometry: Factor | None
-    params: Loops
-    found: Found
-
-
 class LoopBackend:
     """Finds loops among the keyframes of one walk and straightens their poses (paper 2.4).
 
@@ -57,8 +48,7 @@ class LoopBackend:
     """
 
     def __init__(self) -> None:
-        self._history: list[Record] = []
-        self._ends: dict[int, Found] = {}  # what `finish` found, by the number of keyframes
+        self._history = History()
         self._overrulings = Overrulings()
         self._start = Loops()  # for what acts on restart
         self._detector = Detector(self._start)
@@ -95,11 +85,9 @@ class LoopBackend:
             raise HemislamError(f"Keyframe {keyframe.index} can not follow on {len(self)} keyframes; one is missing.")
         self.go_to(len(self))
         head = Head(keyframe.stamp_ns, keyframe.T_odom_imu, keyframe.covariance)
-        if len(self) < self.known:
-            record = self._history[len(self)]
-            if record.params == params and _same(record.head, head):
-                self.go_to(len(self) + 1)
-                return
+        if self._history.holds(len(self), head, params):
+            self.go_to(len(self) + 1)
+            return
         self.forget()
         if not self.known:
             self._begin(params)
@@ -121,8 +109,10 @@ class LoopBackend:
         if self._finished or not len(self):
             return
         count, params = len(self), self._history[len(self) - 1].params
-        if count not in self._ends:
-            self._ends[count] = self._look(self._detector.described, count, params) if params.enabled else Found()
+        if count not in self._history.ends:
+            self._history.ends[count] = (
+                self._look(self._detector.described, count, params) if params.enabled else Found()
+            )
         self._finished = True
         self._stand(count)
         self._reach(max(self.known + 1, self._overrulings.latest) if count == self.known else 0)
@@ -148,8 +138,7 @@ class LoopBackend:
         if count == self.known:
             return
         half = self._start.submap_keyframes
-        del self._history[count:]
-        self._ends = {end: found for end, found in self._ends.items() if end <= count}
+        self._history.cut(count)
         self._detector.forget()
         self._overrulings.go_back(count, lambda pair: pair[1] + half >= count)
         self._stand(count)
@@ -166,10 +155,8 @@ class LoopBackend:
 
     def _stand(self, count: int) -> None:
         """Take from the history what was found with the first `count` keyframes, and solve."""
-        records = self._history[:count]
-        end = self._ends[count] if self._finished else Found()
-        parts = [*(record.found for record in records), end]
-        self._detector.stand((record.head for record in records), (c for part in parts for c in part.contexts))
+        parts = self._history.found(count, finished=self._finished)
+        self._detector.stand(self._history.heads(count), (c for part in parts for c in part.contexts))
         self._found = {edge.pair: edge for part in parts for edge in part.updates}
         self._solve()
 
@@ -377,12 +364,7 @@ class LoopBackend:
         arrivals: dict[int, list[Factor]] = {}
         for edge in self._accepted(self._overrulings.lay_over(self._found, len(self)).values()):
             arrivals.setdefault(edge.decided_at, []).append(loop_factor(edge))
-        steps = []
-        for index, record in enumerate(self._history[: len(self)]):
-            if record.odometry is not None:
-                steps.append(Step(record.odometry))
-            if index in arrivals:
-                steps.append(Step(None, tuple(arrivals[index])))
+        steps = self._history.steps(len(self), arrivals)
         self._solution.solve(self._history[0].head.T_odom_imu, self._start.window, steps)
 
     @staticmethod
@@ -390,8 +372,7 @@ class LoopBackend:
         return [edge for edge in edges if edge.verdict is Verdict.ACCEPTED]
 
     def _factors(self, edges: tuple[LoopEdge, ...]) -> list[Factor]:
-        odometry = [record.odometry for record in self._history[: len(self)] if record.odometry is not None]
-        return odometry + [loop_factor(edge) for edge in self._accepted(edges)]
+        return self._history.odometry(len(self)) + [loop_factor(edge) for edge in self._accepted(edges)]
 
     def _optimum(self, edges: tuple[LoopEdge, ...]) -> F64:
         """(k, 4, 4) T_map_imu by all factors at once. Raises HemislamError if the solver fails."""
@@ -406,11 +387,3 @@ class LoopBackend:
 
 def _drift(params: Loops) -> Drift:
     return Drift(params.drift_translation / 100, np.radians(params.drift_rotation))
-
-
-def _same(a: Head, b: Head) -> bool:
-    return (
-        a.stamp_ns == b.stamp_ns
-        and np.array_equal(a.T_odom_imu, b.T_odom_imu)
-        and np.array_equal(a.covariance, b.covariance, equal_nan=True)
-    )
