@@ -13,11 +13,11 @@ from app.server.wire import Parts
 log = logging.getLogger(__name__)
 
 DEFAULT_BYTES = 1 << 30
-EVERY = 20
+EVERY = 10
 """Frames between two checkpoints while a run goes on. One takes a tenth to a half of a frame's time."""
 NEAR = 24
 """Frames before a sought one after each of which there is a checkpoint, so that stepping back is at once."""
-SPACING = ((NEAR, 1), (2_000, EVERY), (25_600, 2 * EVERY))
+SPACING = ((NEAR, 1), (8_000, EVERY), (25_600, 2 * EVERY))
 """(distance from the present, frames between checkpoints up to there)."""
 FARTHEST = 4 * EVERY
 DISK_SHARE = 4

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from app.server.chunks import within_budget
+from app.server.edges import EdgesChange, EdgesReceiver, EdgesSender
 from app.server.protocol import SERIES, Chunk, LoopsView, Notice, Snapshot
 from app.server.setup import POINT_BUDGET
 from app.slam.params import Params
@@ -26,21 +27,27 @@ class Delta:
 
     Attributes:
         session: of all that follows; a new number empties the scene first.
-        kept: how many frames and how many chunks are left of what there was, before those that
-            follow; None: all.
+        kept: how many frames are left of those that there were, before those that follow; None: all.
         moved: frame and (m, 3) positions from it on, in place of those that there were.
-        replaced: new values of fields of `Snapshot`.
+        replaced: new values of fields of `Snapshot`; `loops` without its edges.
+        edges: what has changed of those.
         positions: (m, 3) and series: (m, len(SERIES)), rows of the frames since then.
-        chunks, notices: new since then.
+        chunks: new since then, in place of those that the reader has from number `first_chunk` on.
+        shown: how many of all these there are now; the reader keeps the others, since they come again
+            when one goes forth again.
+        notices: new since then.
     """
 
     session: int
-    kept: tuple[int, int] | None
+    kept: int | None
     moved: tuple[int, F64] | None
     replaced: dict[str, Any]
+    edges: EdgesChange | None
     positions: F64
     series: F64
+    first_chunk: int
     chunks: tuple[Chunk, ...]
+    shown: int
     notices: tuple[Notice, ...]
 
 
@@ -52,7 +59,7 @@ class Outbox:
 
     Attributes:
         urgent: asks for the next one at once, whatever the rate limit.
-        frames, chunks: how many the reader has of this session once it has taken everything.
+        frames, chunks: how many the reader shows of this session once it has taken everything.
     """
 
     def __init__(self, params: Params, *, session: int = 0, notices: int = 0, frames: int = 0, chunks: int = 0) -> None:
@@ -62,7 +69,9 @@ class Outbox:
         self._positions: list[F64] = []
         self._rows: list[list[float]] = []
         self._chunks: list[Chunk] = []
-        self._kept: tuple[int, int] | None = None
+        self._first_chunk = chunks
+        self._edges = EdgesSender()
+        self._kept: int | None = None
         self._moved: tuple[int, F64] | None = None
         self.frames = frames
         self.chunks = chunks
@@ -73,7 +82,7 @@ class Outbox:
         """Start a new session: what belonged to the old one and was not taken is dropped."""
         self._session += 1
         self.urgent = True
-        self._positions, self._rows, self._chunks = [], [], []
+        self._positions, self._rows, self._chunks, self._first_chunk = [], [], [], 0
         self._kept, self._moved, self.frames, self.chunks = None, None, 0, 0
         self._replaced |= {"result": None, "keyframe_poses": None, "T_map_truth": None, "loops": LoopsView()}
 
@@ -89,6 +98,9 @@ class Outbox:
         self.frames += 1
 
     def chunk(self, chunk: Chunk) -> None:
+        """Add a chunk, in place of those that were gone back over."""
+        self._first_chunk = min(self._first_chunk, self.chunks)
+        del self._chunks[self.chunks - self._first_chunk :]
         self._chunks.append(chunk)
         self.chunks += 1
 
@@ -104,18 +116,16 @@ class Outbox:
             self._moved = first, positions[first:taken]
         self._positions = list(positions[taken:])
 
-    def rewind(self, frames: int, chunks: int) -> None:
-        """Take frames and chunks back, the newest first, so that so many are left."""
-        frames, chunks = min(frames, self.frames), min(chunks, self.chunks)
-        taken_frames, taken_chunks = self.frames - len(self._rows), self.chunks - len(self._chunks)
-        if frames < taken_frames or chunks < taken_chunks:
-            self._kept = min(frames, taken_frames), min(chunks, taken_chunks)
+    def go_to(self, frames: int, chunks: int) -> None:
+        """Show so many: frames are taken back, the newest first; chunks also come again that there were."""
+        frames, taken_frames = min(frames, self.frames), self.frames - len(self._rows)
+        if frames < taken_frames:
+            self._kept = frames
         if self._moved:
             first, moved = self._moved
             self._moved = (first, moved[: frames - first]) if first < frames else None
         del self._positions[max(frames - taken_frames, 0) :], self._rows[max(frames - taken_frames, 0) :]
-        del self._chunks[max(chunks - taken_chunks, 0) :]
-        self.frames, self.chunks = frames, chunks
+        self.frames, self.chunks = frames, min(chunks, self._first_chunk + len(self._chunks))
 
     def notice(self, level: Literal["info", "warning", "error"], text: str) -> None:
         self._notices_given += 1
@@ -129,16 +139,25 @@ class Outbox:
 
     def take(self) -> Delta:
         """All changes since the last call."""
+        edges = None
+        if "loops" in self._replaced:
+            loops: LoopsView = self._replaced["loops"]
+            edges = self._edges.change(loops.edges)
+            self._replaced["loops"] = replace(loops, edges=())
         delta = Delta(
             session=self._session,
             kept=self._kept,
             moved=self._moved,
             replaced=self._replaced,
+            edges=edges,
             positions=np.array(self._positions, dtype=np.float64).reshape(-1, 3),
             series=np.array(self._rows, dtype=np.float64).reshape(-1, len(SERIES)),
+            first_chunk=self._first_chunk,
             chunks=tuple(self._chunks),
+            shown=self.chunks,
             notices=tuple(self._notices),
         )
+        self._first_chunk += len(self._chunks)
         self._replaced, self._positions, self._rows, self._chunks, self._notices = {}, [], [], [], []
         self._kept = self._moved = None
         self.urgent = False
@@ -195,16 +214,15 @@ class Fold:
         self.snapshot = snapshot or Snapshot()
         self._point_budget = point_budget
         self._positions, self._series = Rows(3), Rows(len(SERIES))
+        self._chunks: tuple[Chunk, ...] = ()  # also those that were gone back over
+        self._edges = EdgesReceiver()
 
     def apply(self, delta: Delta) -> Snapshot:
         before, delta = self.snapshot, read_only(delta)
-        chunks = before.chunks
         if delta.session != before.session:
-            self._positions, self._series, chunks = Rows(3), Rows(len(SERIES)), ()
+            self._positions, self._series, self._chunks = Rows(3), Rows(len(SERIES)), ()
         if delta.kept is not None:
-            frames, count = delta.kept
-            self._positions, self._series = self._positions.rewound(frames), self._series.rewound(frames)
-            chunks = chunks[:count]
+            self._positions, self._series = self._positions.rewound(delta.kept), self._series.rewound(delta.kept)
         if delta.moved is not None:
             first, positions = delta.moved
             self._positions = self._positions.rewound(first)
@@ -212,24 +230,35 @@ class Fold:
         self._positions.extend(delta.positions)
         self._series.extend(delta.series)
         series = self._series.view()
+        chunks = before.chunks
+        if delta.chunks or delta.shown != len(chunks) or delta.session != before.session:
+            chunks = self._shown(delta)
+        replaced = delta.replaced
+        if delta.edges is not None:
+            self._edges.take(delta.edges)
+            replaced = {**replaced, "loops": replace(replaced["loops"], edges=self._edges.edges)}
         return self.edit(
             session=delta.session,
-            chunks=self._thinned(chunks, delta) if delta.chunks else chunks,
+            chunks=chunks,
             trajectory=self._positions.view(),
             series={name: series[:, column] for column, name in enumerate(SERIES)},
             notices=delta.notices,
-            **delta.replaced,
+            **replaced,
         )
 
-    def _thinned(self, chunks: tuple[Chunk, ...], delta: Delta) -> tuple[Chunk, ...]:
-        """These and those of the delta, within the budget."""
+    def _shown(self, delta: Delta) -> tuple[Chunk, ...]:
+        """The chunks that there are with this delta, within the budget."""
         poses = delta.replaced.get("keyframe_poses", self.snapshot.keyframe_poses)
         result = delta.replaced.get("result", self.snapshot.result)
-        chunks += delta.chunks
-        if poses is None or len(poses) < len(chunks):
-            return chunks
+        if delta.chunks:
+            self._chunks = (*self._chunks[: delta.first_chunk], *delta.chunks)
+        shown, others = self._chunks[: delta.shown], self._chunks[delta.shown :]
+        if poses is None or len(poses) < len(shown):
+            return shown
         sensor = result.T_map_imu[:3, 3] if result is not None else poses[-1, :3, 3]
-        return within_budget(chunks, poses, sensor, self._point_budget)
+        shown = within_budget(shown, poses, sensor, self._point_budget)
+        self._chunks = (*shown, *others)
+        return shown
 
     def edit(self, *, notices: Iterable[Notice] = (), **values: Any) -> Snapshot:
         """Replace fields and add notices: the next revision."""

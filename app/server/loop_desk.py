@@ -57,8 +57,11 @@ class LoopDesk:
             loops.command(AskResiduals())  # for a trial those of the present too, to compare with
         self._show(view)
 
-    def update(self, loops: LoopLine) -> bool:
-        """Take in what was answered and what came into effect. Returns whether the map has moved by it."""
+    def update(self, loops: LoopLine, *, show: bool = True) -> bool:
+        """Take in what was answered and, if it is to be shown, what came into effect.
+
+        Returns whether the map has moved by it.
+        """
         loops.poll()
         view = self._view
         for answer in loops.take_answers():
@@ -73,8 +76,8 @@ class LoopDesk:
                     self._outbox.notice("error", text)
         for notice in (*loops.take_notices(), *loops.take_alarms()):
             self._outbox.notice("warning", notice)
-        state, moved = loops.state, loops.state is not self._state
-        self._state = state
+        state, moved = loops.state, show and loops.state is not self._state
+        self._state = state if show else self._state
         if state is not None and moved:
             if not _same(view.edges, state.edges):
                 view = replace(view, edges=state.edges)

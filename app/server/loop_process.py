@@ -17,8 +17,8 @@ from typing import Final
 
 from app.logs import process_logs
 from app.server import wire
+from app.server.edges import EdgesReceiver, EdgesSender
 from app.slam.loops.messages import LoopState, LoopWorkerDied, Reply, Request
-from app.slam.loops.types import LoopEdge, Pair
 
 NICENESS: Final = 10
 """The frame loop comes first."""
@@ -115,16 +115,14 @@ class LoopProcess:
                     return
 
     def _read(self, replies: "Connection[object, object]") -> None:
-        edges: dict[Pair, LoopEdge] = {}
+        edges = EdgesReceiver()
         with replies:
             try:
                 while True:
-                    reply, new, gone = wire.receive(replies)
+                    reply, change = wire.receive(replies)
                     if isinstance(reply, LoopState):
-                        edges.update((edge.pair, edge) for edge in new)
-                        for pair in gone:
-                            del edges[pair]
-                        reply = replace(reply, edges=tuple(edges[pair] for pair in sorted(edges)))
+                        edges.take(change)
+                        reply = replace(reply, edges=edges.edges)
                     self._answers.put(reply)
             except (EOFError, OSError):
                 self._answers.put(None)
@@ -140,18 +138,15 @@ def main() -> None:
 
     warm_up()
     service = LoopService()
-    sent: dict[Pair, LoopEdge] = {}
+    edges = EdgesSender()
     try:
         while True:
             reply = service.handle(wire.receive(requests))
-            new: list[LoopEdge] = []
-            gone: list[Pair] = []
-            if isinstance(reply, LoopState):  # of the edges only the difference: there are thousands
-                edges = {edge.pair: edge for edge in reply.edges}
-                new = [edge for pair, edge in edges.items() if sent.get(pair) is not edge]
-                gone = [pair for pair in sent if pair not in edges]
-                sent, reply = edges, replace(reply, edges=())
-            wire.send(replies, (reply, new, gone))
+            change = None
+            if isinstance(reply, LoopState):
+                change = edges.change(reply.edges)
+                reply = replace(reply, edges=())
+            wire.send(replies, (reply, change))
     except (EOFError, OSError):  # the owner has gone, or wants no more
         return
 

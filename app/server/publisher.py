@@ -1,19 +1,16 @@
 """What the page is told while frames are processed."""
 
-import contextlib
 import re
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from app.server import wire
 from app.server.chunks import thinned
 from app.server.delta import Outbox, Rows
 from app.server.live import LiveRun
-from app.server.protocol import SERIES, Chunk, Saved, Transport
+from app.server.protocol import SERIES, Saved, Transport
 from app.server.run import Run
-from app.server.spill import Slot, Spill
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import F64, Keyframe, StepResult
@@ -46,18 +43,11 @@ class Publisher:
         self._rows, self._odometry = Rows(len(SERIES)), Rows(16)  # the latter: T_odom_imu of keyframes
         self._positions, self._frame = Rows(3), MapFrame()  # as the page has them
         self._poses_changed = True
-        self._chunks: list[Slot | Chunk] = []  # on disk, while that has room; none of a live run
-        self._spill = Spill()
-
-    def close(self) -> None:
-        """Give the disk space of the chunks back."""
-        self._spill.close()
 
     def opened(self, run: Run) -> None:
         """A new session begins."""
         self.outbox.begin()
         self.result = None
-        self.close()
         self._begin_history()
         self._noticed = {}
         self.outbox.put(recording=run.opened)
@@ -73,7 +63,7 @@ class Publisher:
         self._positions.extend(run.log.odometry.positions)
         for keyframe in keyframes:
             self._odometry.extend(keyframe.T_odom_imu.reshape(1, 16))
-        self.outbox.rewind(frames, len(keyframes))
+        self.outbox.go_to(frames, len(keyframes))
         told = self.outbox.frames
         for position, row in zip(self._positions.view()[told:], run.readouts_from(told), strict=True):
             self.outbox.frame(position, row)
@@ -96,7 +86,7 @@ class Publisher:
         self._positions.extend(position[None])
         self.outbox.frame(position, row)
         if result.keyframe is not None:
-            self._keyframe(len(run.engine.keyframes) - 1, result.keyframe, keep=not run.live)
+            self._keyframe(len(run.engine.keyframes) - 1, result.keyframe)
         self._lay_anew(run)
         self._newest(run, result)
         self.show(frame=frame, stamp_ns=result.stamp_ns, urgent=False)
@@ -106,7 +96,7 @@ class Publisher:
     def arrived(self, run: Run, result: StepResult | None) -> None:
         """The run went to another frame, one that is known, with this result: show all as it was there."""
         frames, chunks = run.frame + 1, len(run.engine.keyframes)
-        self.outbox.rewind(frames, chunks)
+        self.outbox.go_to(frames, chunks)
         self._rows.go_to(frames)
         self._odometry.go_to(chunks)
         self._frame, self._poses_changed = run.engine.map_frame, True
@@ -121,8 +111,6 @@ class Publisher:
         if first < sent:
             self.outbox.move(first, positions)
         run.readouts.moved(positions)
-        for kept in self._chunks[self.outbox.chunks : chunks]:
-            self.outbox.chunk(kept if isinstance(kept, Chunk) else wire.unpack(self._spill.get(kept)))
         self._newest(run, result)
         self.show(
             frame=run.frame,
@@ -162,22 +150,11 @@ class Publisher:
         self._positions.extend(positions[begin:])
         self.outbox.move(begin, positions)
 
-    def _keyframe(self, index: int, keyframe: Keyframe, *, keep: bool) -> None:
-        """keep: whether it may have to be sent again."""
-        chunk = thinned(keyframe, self._chunk_voxel)
-        self.outbox.chunk(chunk)
+    def _keyframe(self, index: int, keyframe: Keyframe) -> None:
+        self.outbox.chunk(thinned(keyframe, self._chunk_voxel))
         self._poses_changed = True
         self._odometry.go_to(index)
         self._odometry.extend(keyframe.T_odom_imu.reshape(1, 16))
-        if not keep:
-            return
-        for replaced in self._chunks[index : index + 1]:
-            if isinstance(replaced, Slot):
-                self._spill.release(replaced)
-        kept: Slot | Chunk = chunk
-        with contextlib.suppress(OSError):
-            kept = self._spill.put(wire.pack(chunk))
-        self._chunks[index : index + 1] = [kept]
 
     def relabelled(self, result: StepResult) -> None:
         """The newest frame got other labels."""

@@ -250,7 +250,7 @@ class Session:
         loops = run.engine.loops
         if loops is None:
             return None
-        if self._desk.update(loops) and not self._player.page_behind:
+        if self._desk.update(loops, show=not self._player.page_behind):
             self._page.map_moved(run)
         return None if loops.idle else POLL_S
 
@@ -343,6 +343,5 @@ class Session:
         self._saver.close()
         self._note(settled=True)
         self._keeper.close()
-        self._page.close()
         if self._player.run is not None:
             self._player.run.close()

@@ -85,6 +85,25 @@ def test_a_reader_never_holds_more_points_than_its_budget() -> None:
         assert one.points.base is None or one.points.base.nbytes == one.points.nbytes
 
 
+def test_keyframes_that_come_again_are_as_they_were_thinned_and_within_the_budget() -> None:
+    budget, outbox = 50_000, Outbox(Params())
+    fold = Fold(point_budget=budget)
+    for index in range(300):
+        outbox.chunk(chunk(index))
+    outbox.go_to(0, 120)
+    outbox.put(keyframe_poses=walk(120))
+    some = fold.apply(outbox.take()).chunks
+    outbox.go_to(0, 300)
+    outbox.put(keyframe_poses=walk(300))
+    every = fold.apply(outbox.take()).chunks
+    assert (len(some), len(every)) == (120, 300)
+    for shown in (some, every):
+        assert sum(len(one.points) for one in shown) <= budget
+    outbox.go_to(0, 120)
+    outbox.put(keyframe_poses=walk(120))
+    assert fold.apply(outbox.take()).chunks == every[:120], "levels never fall"
+
+
 def test_of_more_keyframes_than_a_page_can_draw_those_left_are_spread_over_the_whole_walk() -> None:
     """Walked slowly at first, so that keyframes are denser there."""
     count = MOST_SHOWN + 500

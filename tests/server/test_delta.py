@@ -56,7 +56,7 @@ def content(snapshot: Snapshot) -> dict[str, Any]:
         "labels": None if result is None else (result.index, result.cloud.labels.tobytes()),
         "trajectory": None if snapshot.trajectory is None else snapshot.trajectory.tolist(),
         "poses": None if snapshot.keyframe_poses is None else snapshot.keyframe_poses.tolist(),
-        "chunks": [(chunk.index, chunk.points.tobytes()) for chunk in snapshot.chunks],
+        "chunks": [(chunk.index, chunk.points.tobytes(), chunk.labels.tobytes()) for chunk in snapshot.chunks],
         "series": {name: np.nan_to_num(column, nan=-1).tolist() for name, column in snapshot.series.items()},
         "progress": repr(snapshot.progress),
         "notices": snapshot.notices,

@@ -139,8 +139,20 @@ def test_going_back_sends_nothing_that_the_page_has() -> None:
     desk.session.handle(Seek(33))
     desk.settle()
     delta = desk.outbox.take()
-    assert delta.kept == (34, 7)
+    assert delta.kept == 34 and delta.shown == 7
     assert len(delta.positions) == 0 and delta.chunks == ()
+
+
+def test_going_forth_again_sends_no_keyframe_that_the_page_had() -> None:
+    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    had = desk.do(Seek(50)).chunks
+    assert len(desk.do(Seek(20)).chunks) == 5
+    desk.session.handle(Seek(43))
+    desk.settle()
+    delta = desk.outbox.take()
+    assert delta.chunks == () and delta.shown == 9
+    again = desk.fold.apply(delta).chunks
+    assert len(again) == 9 and all(one is other for one, other in zip(again, had, strict=False))
 
 
 def test_frames_on_the_way_back_are_not_shown() -> None:
