@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from app.slam.lie import quaternion
 from app.slam.types import F32, F64, I64, StepResult
@@ -10,11 +11,16 @@ from app.slam.types import F32, F64, I64, StepResult
 VERTEX = np.dtype(
     [
         ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("offset", "<i4"),
-        ("label", "u1"), ("distance", "<f4"), ("angle", "<f4"),
+        ("label", "u1"), ("distance", "<f4"), ("angle", "<f4"), ("residual", "<f4"), ("residual_away", "<f4"),
     ]
 )  # fmt: skip
 """x y z: m, LiDAR frame at the scan's end. offset: ns after the first point. label: 0 not ground, 1 ground,
-2 seed. distance: m, signed, above the ground plane; nan without one. angle: degrees to "down"."""
+2 seed. distance: m, signed, above the ground plane; nan without one. angle: degrees to "down". residual: m, signed, to
+the map's plane, of the nearest point that the filter looked up; nan where its plane was not accepted or there is no
+such point within `MATCH_M`. residual_away: m to that point, nan without one: the filter sees a thinned scan."""
+
+MATCH_M = 0.5
+"""A point that the filter looked up tells of the points of the scan within so far of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +86,20 @@ def neighbourhood(points: F32, index: int, count: int) -> Patch:
     )
 
 
+def nearest_match(points: F32, result: StepResult) -> tuple[I64, F64]:
+    """The point that the filter looked up nearest to each of (n, 3) points in the LiDAR frame.
+
+    Returns:
+        (n,) its index in the result's matches, -1 without one within `MATCH_M`; (n,) m to it, nan without one.
+    """
+    matches = result.registration.matches
+    if matches is None or not len(matches.points):
+        return np.full(len(points), -1), np.full(len(points), np.nan)
+    away, nearest = KDTree(matches.points).query(points)  # type: ignore[no-untyped-call]  # no types
+    near = away <= MATCH_M
+    return np.where(near, nearest, -1).astype(np.int64), np.where(near, away, np.nan)
+
+
 # --- files ---------------------------------------------------------------------------------------
 def vertices(result: StepResult) -> np.ndarray:
     """All points of a frame with all they carry, as `VERTEX`."""
@@ -89,11 +109,18 @@ def vertices(result: StepResult) -> np.ndarray:
     table["x"], table["y"], table["z"] = cloud.points.T
     table["intensity"], table["ring"], table["offset"] = cloud.intensity, cloud.ring, cloud.offsets_ns
     table["label"], table["distance"], table["angle"] = cloud.labels, numbers.distance, np.degrees(numbers.angle)
+    index, table["residual_away"] = nearest_match(cloud.points, result)
+    matches = result.registration.matches
+    table["residual"] = np.nan
+    if matches is not None:
+        table["residual"][index >= 0] = matches.residuals[index[index >= 0]]
     return table
 
 
 _PLY = {"<f4": "float", "<u2": "ushort", "<i4": "int", "|u1": "uchar"}
-_UNITS = "x y z distance in m, offset in ns, angle in degrees; label 0 not ground, 1 ground, 2 seed"
+_UNITS = (
+    "x y z distance residual residual_away in m, offset in ns, angle in degrees; label 0 not ground, 1 ground, 2 seed"
+)
 
 
 def ply(result: StepResult) -> bytes:

@@ -29,7 +29,7 @@ HELP: Final = (
         "Pause, and under <b>Study</b> colour the scan by ring, angle to down, distance to the ground plane, or by how "
         "far its points lie from the map's planes. Click a point to see its numbers, its neighbours and their plane "
         "(pink) and the map's plane nearby (blue); click beside it to end that. <b>PLY</b> and <b>PCD</b> hold the "
-        "frame with all its points carry."
+        "frame with all its points carry, and these numbers."
     )
     + heading("Loops")
     + box(

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from app.slam.study import Patch, neighbourhood, point_numbers
+from app.slam.study import MATCH_M, Patch, nearest_match, neighbourhood, point_numbers
 from app.slam.types import F32, F64, GROUND, SEED, StepResult
 from app.ui.html import BAD, GOOD, number, tile, tiles
 
@@ -13,8 +13,6 @@ _CLOSE: Final = np.radians(0.4)
 _REACH: Final = np.radians(1.0)
 """Of the points so close to the ray the nearest is meant; else the one closest to the ray, within reach of it."""
 _LABELS: Final = {GROUND: "ground", SEED: "seed"}
-_MATCH_M: Final = 0.5
-"""A point that the filter used farther away than this says nothing of the point clicked."""
 
 
 def nearest_to_ray(points: F32, origin: F64, direction: F64) -> int | None:
@@ -82,15 +80,12 @@ def pick(result: StepResult, index: int, sigma: float, neighbours: int) -> Picke
 
 def _match(result: StepResult, point: F32) -> Match | None:
     matches = result.registration.matches
-    if matches is None or len(matches.points) == 0:
-        return None
-    away = np.linalg.norm(matches.points - point, axis=1)
-    nearest = int(np.argmin(away))
-    if away[nearest] > _MATCH_M:
+    (nearest,), (away,) = nearest_match(point[None], result)
+    if matches is None or nearest < 0:
         return None
     found = bool(np.any(matches.normals[nearest]))
     return Match(
-        away=float(away[nearest]),
+        away=float(away),
         residual=float(matches.residuals[nearest]),
         center=matches.centers[nearest].astype(np.float64) if found else None,
         normal=matches.normals[nearest].astype(np.float64) if found else None,
@@ -130,7 +125,7 @@ def describe(result: StepResult, picked: Picked) -> str:
 def _match_tile(match: Match | None) -> str:
     name = "nearest point that the filter used"
     if match is None:
-        return tile(name, "none", f"within {100 * _MATCH_M:.0f} cm", width="wide")
+        return tile(name, "none", f"within {100 * MATCH_M:.0f} cm", width="wide")
     away = f"{100 * match.away:.1f} cm away"
     if match.normal is None:
         return tile(name, "no plane in the map", note=away, width="wide")

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from app.slam import study
 from app.slam.engine import Engine
-from app.slam.study import VERTEX, neighbourhood, pcd, ply, point_numbers
+from app.slam.study import MATCH_M, VERTEX, neighbourhood, pcd, ply, point_numbers
 from app.slam.types import StepResult
 
 from .scenes import Rig, Walk, furnished_room, measurements, params_for
@@ -132,15 +132,36 @@ def test_a_ply_holds_every_point_with_all_it_carries() -> None:
     np.testing.assert_allclose(table["angle"], np.degrees(numbers.angle), atol=1e-3)
 
 
+def test_a_file_s_residual_is_that_of_the_nearest_point_looked_up() -> None:
+    result = walked()[-1]
+    matches, points = result.registration.matches, result.cloud.points.astype(float)
+    assert matches is not None
+    apart = np.linalg.norm(points[:, None] - matches.points.astype(float), axis=2)
+    nearest, away = apart.argmin(axis=1), apart.min(axis=1)
+    near = away <= MATCH_M
+    assert np.count_nonzero(near) > 0, "else there is nothing to compare"
+    table = study.vertices(result)
+    np.testing.assert_allclose(table["residual_away"][near], away[near], rtol=1e-6)
+    np.testing.assert_array_equal(table["residual"][near], matches.residuals[nearest[near]])
+    assert np.isnan(table["residual"][~near]).all() and np.isnan(table["residual_away"][~near]).all()
+    used = np.isfinite(table["residual"])
+    assert used.mean() > 0.5 and np.sqrt(np.mean(table["residual"][used] ** 2)) < 0.02, "a room with a noise of 5 mm"
+
+
+def test_where_nothing_was_looked_up_a_file_has_no_residuals() -> None:
+    table = study.vertices(walked()[0])
+    assert len(table) and np.isnan(table["residual"]).all() and np.isnan(table["residual_away"]).all()
+
+
 def test_a_pcd_says_the_same_and_from_where_it_was_seen() -> None:
     result = walked()[-1]
     header, table = body(pcd(result), b"DATA binary\n")
     fields = dict(line.split(" ", 1) for line in header.splitlines() if not line.startswith("#"))
     assert fields["FIELDS"].split() == list(VERTEX.names or ())
     assert sum(map(int, fields["SIZE"].split())) == VERTEX.itemsize
-    assert fields["TYPE"].split() == ["F", "F", "F", "F", "U", "I", "U", "F", "F"]
+    assert fields["TYPE"].split() == ["F", "F", "F", "F", "U", "I", "U", "F", "F", "F", "F"]
     assert int(fields["POINTS"]) == int(fields["WIDTH"]) == len(table)
-    assert np.array_equal(table, study.vertices(result))
+    assert table.tobytes() == study.vertices(result).tobytes()
     x, y, z, qw, qx, qy, qz = map(float, fields["VIEWPOINT"].split())
     T = result.T_map_imu @ result.state.T_imu_lidar
     np.testing.assert_allclose([x, y, z], T[:3, 3], atol=1e-6)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from app.server.protocol import Seek, SetParams, StepFrame
 from app.slam.params import Params
+from app.slam.study import vertices
 from app.slam.types import Matches, StepResult
 from app.ui.study import StudyPanel
 from app.ui.study_colours import NOTHING, StudyBy, points_shown, study_colours, study_legend, study_values
@@ -124,6 +125,18 @@ def test_the_map_s_plane_is_that_of_the_nearest_point_looked_up() -> None:
     assert "no plane in the map" in describe(MATCHED, pick(MATCHED, 0, SIGMA, 8))
     assert "not used" in describe(MATCHED, pick(MATCHED, 60, SIGMA, 8))
     assert "-20.0" in describe(MATCHED, pick(MATCHED, 200, SIGMA, 8))
+
+
+def test_a_file_says_of_a_point_what_the_panel_does() -> None:
+    table = vertices(MATCHED)
+    for index in range(0, len(table), 37):
+        picked, row = pick(MATCHED, index, SIGMA, 8), table[index]
+        assert row["distance"] == pytest.approx(picked.distance, abs=1e-6, nan_ok=True)
+        assert row["angle"] == pytest.approx(np.degrees(picked.angle), abs=1e-4)
+        match = picked.match
+        assert row["residual"] == pytest.approx(match.residual if match else np.nan, nan_ok=True)
+        assert row["residual_away"] == pytest.approx(match.away if match else np.nan, nan_ok=True)
+    assert np.isfinite(table["residual"]).any() and np.isnan(table["residual"]).any()
 
 
 # --- the panel -----------------------------------------------------------------------------------
