@@ -1,0 +1,137 @@
+"""kill -9 of the real server: what is reopened lost no more than the last second, and comes to the same end."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from test_rewind import SAMPLE, Desk
+
+from app.sensors.presets import resolve_params
+from app.server.protocol import Save, Seek, SetParams
+from app.server.run import Run, open_run
+from app.slam.params import Params
+
+LENGTH_S = 7.0
+CHANGED_AT = 15
+CHANGE = {"ground.sigma": 0.02, "filter.max_iterations": 3}
+SETTINGS = ("loops.enabled=false",)
+FILES = ("trajectory.tum", "map.ply")
+LOSS_S = 1.0
+PATIENCE_S = 120.0
+
+State = dict[str, Any]
+
+
+class Server:
+    """`hemislam serve` in a session of its own, and who uses it over REST."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        errors = folder / "errors.txt"
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "app", "serve", *arguments, "--paused", "--no-browser", "--port", "0"],
+            cwd=folder,
+            env={**os.environ, "PYTHONPATH": str(SAMPLE.parents[1])},
+            stdout=subprocess.PIPE,
+            stderr=errors.open("a"),
+            text=True,
+            start_new_session=True,
+        )
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        assert "hemislam is at" in line, errors.read_text()
+        self._address = line.split()[3]
+
+    def ask(self, method: str, path: str, json: object = None) -> httpx.Response:
+        answer = httpx.request(method, f"{self._address}api/{path}", json=json, timeout=PATIENCE_S)
+        assert answer.status_code < 300, answer.text
+        return answer
+
+    def until(self, wanted: Callable[[State], bool]) -> State:
+        deadline = time.monotonic() + PATIENCE_S
+        while not wanted(state := self.ask("GET", "state").json()):
+            assert time.monotonic() < deadline, state
+            time.sleep(0.02)
+        return state
+
+    def ready(self) -> State:
+        """Where the session is, once it is anywhere."""
+        return self.until(
+            lambda s: s["recording"] is not None and s["progress"] is None and s["transport"]["frame"] >= 0
+        )
+
+    def go_to(self, frame: int) -> None:
+        self.ask("POST", "transport", {"action": "seek", "frame": frame})
+        self.until(lambda s: s["transport"]["frame"] == frame and s["progress"] is None)
+
+    def exports(self) -> dict[str, bytes]:
+        return {name: self.ask("GET", f"export/{name}").content for name in FILES}
+
+    def kill(self, *, engine_too: bool) -> None:
+        if engine_too:
+            os.killpg(self._process.pid, signal.SIGKILL)
+        else:
+            self._process.kill()
+        self._process.wait()
+        self._process.stdout.close()  # type: ignore[union-attr]  # it is a pipe
+
+
+@pytest.fixture(scope="module")
+def never_killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, dict[str, bytes]]:
+    """The last frame, and what a session that nobody kills ends with."""
+
+    def opener(path: Path, truth: Path | None, params: Params, /) -> Run:
+        return open_run(path, truth, params, 0.0, LENGTH_S)
+
+    desk, folder = (
+        Desk(resolve_params(SAMPLE, None, None, list(SETTINGS)), opener, SAMPLE),
+        tmp_path_factory.mktemp("e"),
+    )
+    last = desk.do(Seek(10_000)).transport.frame
+    desk.do(Seek(CHANGED_AT), SetParams(CHANGE), Seek(last))
+    desk.session.handle(Save(folder))
+    desk.session.close()
+    return last, {name: (folder / name).read_bytes() for name in FILES}
+
+
+@pytest.mark.parametrize("engine_too", [False, True], ids=["server", "server and engine"])
+def test_a_server_killed_while_it_plays_is_reopened_where_it_was_and_comes_to_the_same_end(
+    tmp_path: Path, never_killed: tuple[int, dict[str, bytes]], engine_too: bool
+) -> None:
+    last, expected = never_killed
+    server = Server(tmp_path, str(SAMPLE), "--duration", str(LENGTH_S), "--set", *SETTINGS)
+    try:
+        server.ready()
+        server.go_to(CHANGED_AT)
+        tree = {name.partition(".")[0]: {name.partition(".")[2]: value} for name, value in CHANGE.items()}
+        server.ask("PATCH", "params", tree)
+        server.ask("POST", "notes", {"text": "here it begins to drift"})
+        server.ask("POST", "transport", {"action": "play"})
+        seen: list[tuple[float, int]] = []
+        server.until(  # a real time of 2.5 s later
+            lambda s: seen.append((time.monotonic(), s["transport"]["frame"])) or seen[-1][1] >= CHANGED_AT + 25
+        )
+    finally:
+        server.kill(engine_too=engine_too)
+    killed = time.monotonic()
+    at_least = max(frame for at, frame in seen if at < killed - LOSS_S)
+    assert at_least > CHANGED_AT, "else nothing is asked of it"
+
+    (session,) = (tmp_path / "runs" / "sessions").glob("*.hemislam")
+    server = Server(tmp_path, str(session))
+    try:
+        state = server.ready()
+        assert at_least <= state["transport"]["frame"] < last
+        assert [(note["frame"], note["text"]) for note in state["notes"]] == [(CHANGED_AT, "here it begins to drift")]
+        params = server.ask("GET", "params").json()
+        assert {name: params[name.partition(".")[0]][name.partition(".")[2]] for name in CHANGE} == CHANGE
+        server.go_to(last)
+        assert server.exports() == expected
+    finally:
+        server.kill(engine_too=True)
