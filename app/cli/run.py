@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from app.server.run import Run
     from app.slam.loops.types import Command as Overruling
     from app.slam.results import RunInfo
-    from app.slam.trajectory import Trajectory
 
 
 def run(
@@ -68,17 +67,19 @@ def run(
     """
     from app.server.run import open_run
     from app.slam.results import RunInfo, prepare_folder
-    from app.slam.trajectory import read_tum
+    from app.slam.trajectory import read_tum, time_apart, truth_beside
 
     params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
     overrulings = _read_overrulings(loops) if loops else ()
     folder = out or free_folder(recording)
-    work = open_run(recording, truth, params, start, duration)
+    truth_path = truth or truth_beside(recording)
+    work = open_run(recording, truth_path, params, start, duration)
     try:
-        truth_path = work.opened.truth
         true_poses = read_tum(truth_path) if truth_path else None
+        opened = work.opened
         if truth and true_poses:
-            _check_truth(truth, true_poses, work)
+            if apart := time_apart(truth, true_poses.stamps_ns, opened.start_ns, opened.duration_s):
+                raise HemislamError(apart)
         elif truth_path:
             typer.echo(f"Using the truth that lies beside the recording: {truth_path}")
         prepare_folder(folder, replace=force)
@@ -145,16 +146,6 @@ def free_folder(recording: Path) -> Path:
     """The first of runs/NAME-1, runs/NAME-2, ... that does not exist yet."""
     name = recording.resolve().stem
     return next(folder for n in itertools.count(1) if not (folder := Path("runs") / f"{name}-{n}").exists())
-
-
-def _check_truth(path: Path, truth: "Trajectory", work: "Run") -> None:
-    """Better now than after a long run. Raises HemislamError if the truth is of another time."""
-    begin, end = work.opened.start_ns * 1e-9, work.opened.start_ns * 1e-9 + work.opened.duration_s
-    if truth.stamps_ns[-1] * 1e-9 < begin or truth.stamps_ns[0] * 1e-9 > end:
-        raise HemislamError(
-            f"The truth {path} covers {truth.stamps_ns[0] * 1e-9:.1f} s to {truth.stamps_ns[-1] * 1e-9:.1f} s, but the"
-            f" recording {begin:.1f} s to {end:.1f} s; both must be stamped by the same clock, in seconds."
-        )
 
 
 def compile_behind_bar() -> None:

@@ -100,7 +100,7 @@ def serve(
     from app.server.protocol import LIVE
     from app.server.setup import Setup
     from app.server.web import Tls, run_server
-    from app.slam.trajectory import read_tum
+    from app.slam.trajectory import read_tum, truth_beside
     from app.ui.workbench import Workbench
 
     resolve_for = partial(
@@ -128,6 +128,8 @@ def serve(
         open_recording(opened, params).close()  # so that a mistake is told here and not in the page
     if truth is not None:
         read_tum(truth)
+    elif recording is not None:
+        truth = truth_beside(recording)
     with (
         TemporaryDirectory(prefix="hemislam-") as folder_live,
         LiveProcess(live, params, imu, record) if live else nullcontext() as source,

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from app.evaluation import alignment
 from app.slam.errors import HemislamError
 from app.slam.metrics import interpolate, umeyama
-from app.slam.trajectory import Trajectory
+from app.slam.trajectory import Trajectory, time_apart
 from app.slam.types import F64, I64
 
 JUMP_M, JUMP_M_S, JUMP_TIMES = 1.0, 15.0, 5.0
@@ -159,13 +159,8 @@ def check_overlap(truth: Truth, begin_ns: int, duration_s: float) -> None:
     """Better now than after a long run. Raises HemislamError if truth and recording share no time."""
     if truth.stamps_ns is None or truth.own_clock:
         return
-    first, last = truth.stamps_ns[0] * 1e-9, truth.stamps_ns[-1] * 1e-9
-    begin, end = begin_ns * 1e-9, begin_ns * 1e-9 + duration_s
-    if last < begin or first > end:
-        raise HemislamError(
-            f"{truth.source} covers {first:.1f} s to {last:.1f} s, but the recording {begin:.1f} s to {end:.1f} s;"
-            " both must be stamped by the same clock, in seconds."
-        )
+    if apart := time_apart(truth.source, truth.stamps_ns, begin_ns, duration_s):
+        raise HemislamError(apart)
 
 
 def _borrow_rotation(there: Trajectory, estimate: Trajectory) -> Trajectory:

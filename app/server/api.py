@@ -18,6 +18,7 @@ from app.server.fork import Engine
 from app.server.protocol import (
     AddNote,
     Command,
+    CompareWith,
     OpenRecording,
     OverruleLoop,
     Pause,
@@ -35,6 +36,7 @@ from app.server.protocol import (
 from app.server.views import LoopsState, Speed, StateView, loops_state, state_view
 from app.slam.loops.types import Accept, Add, Reject, SetWeight, Solve
 from app.slam.params import Params
+from app.slam.trajectory import truth_beside
 
 EXPORT_PATIENCE_S = 600.0
 
@@ -100,7 +102,11 @@ class NoteBody(BaseModel):
 
 class OpenBody(BaseModel):
     path: str = Field(description="Of a recording in the folders given at the start.")
-    truth: str | None = None
+    truth: str | None = Field(None, description="A TUM file there; null: the one beside the recording, if any.")
+
+
+class CompareBody(BaseModel):
+    path: str | None = Field(None, description="A TUM file in the folders given at the start; null: against nothing.")
 
 
 Export = Literal["trajectory.tum", "timings.csv", "map.ply", "report.json", "session.hemislam"]
@@ -175,8 +181,13 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
     @router.post("/recordings", status_code=202)
     def open_recording(body: OpenBody) -> None:
         """Open one. Whether that worked, the notices in the state tell."""
-        truth = folders.inside(body.truth) if body.truth else None
-        _send(engine, OpenRecording(folders.openable(body.path), truth))
+        path = folders.openable(body.path)
+        _send(engine, OpenRecording(path, folders.inside(body.truth) if body.truth else truth_beside(path)))
+
+    @router.post("/truth", status_code=202)
+    def compare_with(body: CompareBody) -> None:
+        """Hold the walk against another trajectory, also what there is of it already."""
+        _send(engine, CompareWith(folders.inside(body.path) if body.path else None))
 
     @router.get("/export/{name}", response_class=FileResponse)
     def export(name: Export, background: BackgroundTasks) -> FileResponse:

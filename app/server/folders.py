@@ -8,15 +8,19 @@ from app.sensors.source import SUFFIXES
 from app.server.journal import SUFFIX, read_session
 from app.slam.errors import HemislamError
 
+RECORDINGS = (*SUFFIXES, SUFFIX)
+"""What can be opened, sessions among them; a ROS 2 folder can as well."""
+TRAJECTORIES = (".tum",)
+
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A line of the file browser: a recording or a session that can be opened, or a folder to look into."""
+    """A line of the file browser: something to choose, or a folder to look into."""
 
     path: Path
-    is_recording: bool
+    is_choice: bool
     size: int = 0
-    """Bytes, of a recording."""
+    """Bytes, of a choice."""
 
 
 class Folders:
@@ -56,8 +60,8 @@ class Folders:
             self.inside(read_session(real).opened.recording)
         return real
 
-    def listing(self, folder: Path | str) -> list[Entry]:
-        """What is in a folder inside: first its folders, then its recordings, each by name.
+    def listing(self, folder: Path | str, suffixes: tuple[str, ...] = RECORDINGS) -> list[Entry]:
+        """What is in a folder inside: first its folders, then the files that may be chosen, each by name.
 
         Raises:
             HemislamError: as `inside`, or it can not be read.
@@ -65,10 +69,10 @@ class Folders:
         place = self.inside(folder)
         try:
             seen = [path for path in place.iterdir() if not path.name.startswith(".") and self._holds(path.resolve())]
-            found = [entry for path in seen if (entry := _entry(path))]
+            found = [entry for path in seen if (entry := _entry(path, suffixes))]
         except OSError as error:
             raise HemislamError(f"The folder {place} can not be read: {error.strerror}.") from None
-        return sorted(found, key=lambda entry: (entry.is_recording, entry.path.name.casefold()))
+        return sorted(found, key=lambda entry: (entry.is_choice, entry.path.name.casefold()))
 
     def recordings(self) -> list[Path]:
         """All recordings in all folders and theirs, by path."""
@@ -77,7 +81,7 @@ class Folders:
         seen = set(waiting)
         while waiting:
             for entry in self.listing(waiting.pop()):
-                if entry.is_recording:
+                if entry.is_choice:
                     found.append(entry.path)
                 elif (real := entry.path.resolve()) not in seen:
                     seen.add(real)
@@ -88,11 +92,11 @@ class Folders:
         return any(real.is_relative_to(root) for root in self.roots)
 
 
-def _entry(path: Path) -> Entry | None:
+def _entry(path: Path, suffixes: tuple[str, ...]) -> Entry | None:
     if path.is_dir():
-        is_recording = (path / "metadata.yaml").is_file()
+        is_recording = suffixes == RECORDINGS and (path / "metadata.yaml").is_file()
         size = sum(file.stat().st_size for file in path.iterdir() if file.is_file()) if is_recording else 0
         return Entry(path, is_recording, size)
-    if path.suffix in (*SUFFIXES, SUFFIX) and path.is_file():
+    if path.suffix in suffixes and path.is_file():
         return Entry(path, True, path.stat().st_size)
     return None

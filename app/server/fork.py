@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from app.server.breakpoints import Breakpoints
 from app.server.follower import Follower, same_recording
 from app.server.journal import SUFFIX, SavedSession, read_session, write_session
-from app.server.protocol import AddNote, Command, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
+from app.server.protocol import AddNote, Command, CompareWith, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
 from app.server.setup import Setup
 from app.slam.errors import HemislamError
 
@@ -112,8 +112,10 @@ class Workspace:
         return self._sides[0].engine.pid
 
     def send(self, command: Command) -> None:
-        """Enqueue a command for A."""
+        """Enqueue a command for A; what both are compared with is B's affair too."""
         self._sides[0].engine.send(command)
+        if isinstance(command, CompareWith):
+            self.send_other(command)
 
     def wait(self, after_revision: int, timeout: float) -> Snapshot:
         """The newest snapshot of A, once it is newer than `after_revision` or the time (s) is over."""

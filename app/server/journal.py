@@ -14,7 +14,7 @@ import json
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from typing import Any
 import yaml
 
 from app import __version__
-from app.server.protocol import Command, Note
+from app.server.protocol import Command, CompareWith, Note
 from app.slam.errors import HemislamError
 from app.slam.loops import edits
 from app.slam.loops.types import Command as Overruling
@@ -172,6 +172,9 @@ def read_session(path: Path) -> SavedSession:
         )
     try:
         opened = _opened(head)
+        for entry in entries:
+            if entry.get("did") == CompareWith.__name__:
+                opened = replace(opened, truth=Path(entry["path"]) if entry["path"] else None)
         states = [entry for entry in entries if "state" in entry]
         state = _state(states[-1]["state"]) if states else State(Params())
         frame = int(

@@ -91,6 +91,15 @@ class OpenRecording:
 
 
 @dataclass(frozen=True, slots=True)
+class CompareWith:
+    """Hold the walk, also what there is of it already, against another trajectory (TUM): the truth, or what another
+    program or another run made of the same recording. None: against nothing.
+    """
+
+    path: Path | None
+
+
+@dataclass(frozen=True, slots=True)
 class Restart:
     """Start the present recording again with the present parameters."""
 
@@ -155,6 +164,7 @@ Command = (
     | SetParams
     | LoadParams
     | OpenRecording
+    | CompareWith
     | Restart
     | Save
     | LoopCommand

@@ -119,6 +119,20 @@ class Publisher:
             dropped=run.log.dropped.total(),
         )
 
+    def compared(self, run: Run, errors: F64) -> None:
+        """The walk is held against another trajectory: `errors` (n,) m, of all frames that are known."""
+        told = self.outbox.frames
+        self._rows.go_to(len(errors))
+        rows = self._rows.view().copy()
+        rows[:, SERIES.index("error_m")] = errors
+        self._rows.go_to(0)
+        self._rows.extend(rows)
+        self._rows.go_to(told)
+        self.outbox.go_to(0, self.outbox.chunks)
+        for position, row in zip(self._positions.view()[:told], rows[:told], strict=True):
+            self.outbox.frame(position, row.tolist())
+        self.outbox.put(recording=run.opened, T_map_truth=run.readouts.T_map_truth, urgent=True)
+
     def _newest(self, run: Run, result: StepResult | None) -> None:
         self.result = result and replace(result, keyframe=None)
         self.outbox.put(result=self.result, T_map_truth=run.readouts.T_map_truth)

@@ -10,7 +10,7 @@ from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.metrics import MAX_TRUTH_GAP_S, umeyama
 from app.slam.trajectory import Trajectory
-from app.slam.types import F64, StepResult
+from app.slam.types import F64, I64, StepResult
 
 LEAST_EXTENT_M = 0.5
 """Truth is aligned once the walk spans this much; before, any noise would fit."""
@@ -22,8 +22,6 @@ class ReadoutsState:
 
     walked: float
     last: F64 | None
-    compared: int
-    T_map_truth: F64 | None
 
 
 class Readouts:
@@ -44,13 +42,43 @@ class Readouts:
         self.error = float("nan")
 
     def checkpoint(self) -> ReadoutsState:
-        return ReadoutsState(self._walked, self._last, len(self._ours), self.T_map_truth)
+        return ReadoutsState(self._walked, self._last)
 
-    def restore(self, state: ReadoutsState) -> None:
-        """Go back to a checkpoint, or forth again to one whose frames were not replaced since."""
-        self._walked, self._last, self.T_map_truth = state.walked, state.last, state.T_map_truth
-        self._theirs.go_to(state.compared)
-        self._ours.go_to(state.compared)
+    def restore(self, state: ReadoutsState, frames: int) -> None:
+        """Go back to a checkpoint at so many frames, or forth again to one whose frames were not replaced since."""
+        self._walked, self._last = state.walked, state.last
+        if self._truth is not None:
+            self._theirs.go_to(frames)
+            self._ours.go_to(frames)
+            self._align()
+
+    def compare(self, truth: Trajectory | None, walk: Trajectory, frames: int) -> F64:
+        """Take another truth, or none, from now on.
+
+        Args:
+            walk: in the map, of all frames that are known. frames: how many of them there are now; the truth is
+                aligned to these.
+
+        Returns:
+            (n,) m, distance of every known frame to it; nan where there is none.
+        """
+        self._truth = truth
+        self._theirs, self._ours = Rows(3), Rows(3)
+        self.T_map_truth, self.error = None, float("nan")
+        if truth is None:
+            return np.full(len(walk), np.nan)
+        self._theirs.extend(self._truth_at(walk.stamps_ns))
+        self._ours.extend(walk.positions)
+        for rows in (self._theirs, self._ours):
+            rows.go_to(frames)
+        self._align()
+        for rows in (self._theirs, self._ours):
+            rows.go_to(len(walk))
+        errors = self._distances()
+        for rows in (self._theirs, self._ours):
+            rows.go_to(frames)
+        self.error = float(errors[frames - 1]) if frames else float("nan")
+        return errors
 
     def row(self, result: StepResult) -> list[float]:
         """The readouts of one frame, in the order of SERIES. Call it once for every frame."""
@@ -94,30 +122,38 @@ class Readouts:
         """Distance to the truth (m), aligned to all positions so far; nan where there is none."""
         if self._truth is None:
             return float("nan")
-        there = self._truth_at(stamp_ns)
-        self._theirs.extend(np.full((1, 3), np.nan) if there is None else there[None])
+        self._theirs.extend(self._truth_at(np.array([stamp_ns])))
         self._ours.extend(position[None])
-        if there is None:
-            return float("nan")
+        return float(self._distances(len(self._ours) - 1)[0]) if self._align() else float("nan")
+
+    def _align(self) -> bool:
+        """Lay the truth over the positions so far, if they determine how."""
         known = np.isfinite(self._theirs.view()[:, 0])
         theirs, ours = self._theirs.view()[known], self._ours.view()[known]
-        if np.linalg.norm(np.ptp(theirs, axis=0)) < LEAST_EXTENT_M:
-            return float("nan")
+        if not len(theirs) or np.linalg.norm(np.ptp(theirs, axis=0)) < LEAST_EXTENT_M:
+            return False
         try:
             self.T_map_truth = umeyama(theirs, ours)
         except HemislamError:  # a straight line so far
-            return float("nan")
-        return float(np.linalg.norm(self.T_map_truth[:3, :3] @ there + self.T_map_truth[:3, 3] - position))
+            return False
+        return True
 
-    def _truth_at(self, stamp_ns: int) -> F64 | None:
-        """True position (3,), linearly between the poses around; None outside or in a gap."""
+    def _distances(self, first: int = 0) -> F64:
+        """(n - first,) m, of the frames from `first` on to the truth as it lies; nan where there is none."""
+        theirs, ours = self._theirs.view()[first:], self._ours.view()[first:]
+        if self.T_map_truth is None:
+            return np.full(len(ours), np.nan)
+        laid = theirs @ self.T_map_truth[:3, :3].T + self.T_map_truth[:3, 3]
+        return np.asarray(np.linalg.norm(laid - ours, axis=1))
+
+    def _truth_at(self, stamps_ns: I64) -> F64:
+        """(n, 3) true positions, linearly between the poses around; nan outside of them and in gaps."""
         truth = self._truth
-        if truth is None or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]:
-            return None
-        right = max(1, int(np.searchsorted(truth.stamps_ns, stamp_ns)))
-        before, after = int(truth.stamps_ns[right - 1]), int(truth.stamps_ns[right])
-        if after - before > MAX_TRUTH_GAP_S * 1e9:
-            return None
-        fraction = (stamp_ns - before) / (after - before)
-        position: F64 = (1 - fraction) * truth.positions[right - 1] + fraction * truth.positions[right]
-        return position
+        assert truth is not None
+        right = np.searchsorted(truth.stamps_ns, stamps_ns).clip(1, len(truth) - 1)
+        before, after = truth.stamps_ns[right - 1], truth.stamps_ns[right]
+        fraction = ((stamps_ns - before) / (after - before))[:, None]
+        positions: F64 = (1 - fraction) * truth.positions[right - 1] + fraction * truth.positions[right]
+        outside = (stamps_ns < truth.stamps_ns[0]) | (stamps_ns > truth.stamps_ns[-1])
+        positions[outside | (after - before > MAX_TRUTH_GAP_S * 1e9)] = np.nan
+        return positions

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from app.sensors.findings import Finding
 from app.sensors.live.status import Status
 from app.sensors.recording import Place, Recording, open_recording
 from app.server.checkpoints import DEFAULT_BYTES, Checkpoints
@@ -19,8 +20,8 @@ from app.slam.loops.messages import LoadCommands
 from app.slam.loops.types import Command as Overruling
 from app.slam.params import Params, leaves
 from app.slam.results import LogState, RunInfo, RunLog, prepare_folder, save_results
-from app.slam.trajectory import Trajectory, read_tum, truth_beside, write_tum
-from app.slam.types import DroppedScan, Keyframe, Measurement, StepResult
+from app.slam.trajectory import Trajectory, read_tum, time_apart, write_tum
+from app.slam.types import F64, DroppedScan, Keyframe, Measurement, StepResult
 
 EFFECT = {leaf.path: leaf.effect for leaf in leaves()}
 
@@ -71,6 +72,7 @@ class Run:
         checkpoint_bytes: int = DEFAULT_BYTES,
     ) -> None:
         truth = read_tum(truth_path) if truth_path else None
+        apart = truth and time_apart(str(truth_path), truth.stamps_ns, recording.start_ns, recording.duration_s)
         rest = max(0.0, recording.duration_s - start_s)
         part = (rest if duration_s is None else min(rest, duration_s)) / max(recording.duration_s, 1e-9)
         self.opened = OpenedRecording(
@@ -78,7 +80,7 @@ class Run:
             start_ns=recording.start_ns,
             duration_s=recording.duration_s,
             frames=round(recording.scan_count * part),
-            findings=recording.findings,
+            findings=(*recording.findings, *([Finding("truth", "needs you", apart)] if apart else [])),
             truth_stamps_ns=truth.stamps_ns if truth else None,
             truth_positions=truth.positions if truth else None,
             truth=truth_path,
@@ -195,6 +197,29 @@ class Run:
             self.overrule(state.overrulings, state.undone)
         self._followed = saved if saved.frame > self.frame else None
 
+    def compare_with(self, path: Path | None) -> F64:
+        """Hold the walk against another trajectory, or none, from now on.
+
+        Returns:
+            (n,) m, distance of every frame that is known to it; nan where there is none.
+
+        Raises:
+            HemislamError: it can not be read, or shares no time with the recording; nothing has changed.
+        """
+        truth = read_tum(path) if path else None
+        opened = self.opened
+        if truth and (apart := time_apart(str(path), truth.stamps_ns, opened.start_ns, opened.duration_s)):
+            raise HemislamError(apart)
+        self._truth = truth
+        self.opened = replace(
+            opened,
+            truth=path,
+            truth_stamps_ns=truth.stamps_ns if truth else None,
+            truth_positions=truth.positions if truth else None,
+        )
+        walk = self.engine.map_frame.trajectory(self.log.odometry_of(self.known + 1))
+        return self.readouts.compare(truth, walk, self.frame + 1)
+
     # --- going back ------------------------------------------------------------------------------
     def choose(self, params: Params) -> None:
         """Take these parameters for all frames not yet processed."""
@@ -247,7 +272,7 @@ class Run:
         self.engine.restore(state.engine)
         self.engine.params = self.params
         self.log.restore(state.log)
-        self.readouts.restore(state.readouts)
+        self.readouts.restore(state.readouts, state.frame + 1)
         self.frame = state.frame
         self._incoming = self._recording.measurements(*self._part, after=state.place)
         self._waiting, self._dropped, self.finished = None, 0, False
@@ -327,7 +352,7 @@ def open_run(
     duration_s: float | None = None,
     checkpoint_bytes: int = DEFAULT_BYTES,
 ) -> Run:
-    """Open a recording and give it a new engine. Truth beside the recording is used if none is named.
+    """Open a recording and give it a new engine.
 
     Args:
         checkpoint_bytes: memory for checkpoints, see `app.server.checkpoints`.
@@ -337,11 +362,10 @@ def open_run(
     """
     recording = open_recording(path, params)
     try:
-        truth_path = truth or truth_beside(path)
         return Run(
             recording,
             Engine(params, LoopProcess if params.loops.enabled else None),
-            truth_path=truth_path,
+            truth_path=truth,
             start_s=start_s,
             duration_s=duration_s,
             checkpoint_bytes=checkpoint_bytes,

@@ -15,6 +15,7 @@ from app.server.player import Player
 from app.server.protocol import (
     AddNote,
     Command,
+    CompareWith,
     InspectLoop,
     LoadParams,
     Note,
@@ -49,7 +50,7 @@ POLL_S = 0.02
 
 _AT_ONCE = OpenRecording | Restart | SetSpeed | SetBreakpoints | Shutdown
 """Commands that do not wait until what is being opened is open."""
-_FOR_THE_FRAME = OverruleLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop | AddNote | Save
+_FOR_THE_FRAME = OverruleLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop | AddNote | CompareWith | Save
 
 
 class OpenRun(Protocol):
@@ -157,6 +158,8 @@ class Session:
                 self._set_params(Params().merged_yaml(text))
             case OpenRecording(path, truth):
                 self._open_soon(path, lambda: self._open_other(path, truth))
+            case CompareWith(trajectory):
+                self._compare_with(trajectory)
             case Restart():
                 path = self._need_run().opened.path
                 self._open_soon(path, self._reopen)
@@ -180,6 +183,12 @@ class Session:
                 run.choose(usable)
             self._player.relabelling |= any(EFFECT[path] == "now" for path in changed)
         self._page.params(params, self._pending_restart())
+
+    def _compare_with(self, path: Path | None) -> None:
+        run = self._need_run()
+        if run.live:
+            raise HemislamError("A live walk can not be compared with a trajectory; record it, and open the recording.")
+        self._page.compared(run, run.compare_with(path))
 
     def _show_notes(self, notes: tuple[Note, ...]) -> None:
         self._notes = notes
@@ -308,10 +317,14 @@ class Session:
         saved = read_session(path)
         opened, state = saved.opened, saved.state
         first = state.history[0][1] if state.history else state.params
-        run = self._open_run(opened.recording, opened.truth, first, (opened.start_s, opened.duration_s))
+        gone = opened.truth is not None and not opened.truth.exists()
+        truth = None if gone else opened.truth
+        run = self._open_run(opened.recording, truth, first, (opened.start_s, opened.duration_s))
         self._base = self._params = state.params
         self._player.halt()
         self._take(run, saved)
+        if gone:
+            self._outbox.notice("warning", f"The session was compared with {opened.truth}, which is gone.")
 
     def _take(self, run: Run, saved: SavedSession | None = None) -> None:
         """Let go of the present run and show the first frame of this one, or that at which it was saved."""

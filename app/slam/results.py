@@ -151,8 +151,12 @@ class RunLog:
     @property
     def odometry(self) -> Trajectory:
         """T_odom_imu at every scan's end; while the filter waits at rest to start, the origin."""
-        rows = np.array(self._poses).reshape(-1, 7)[: self._frames]
-        return Trajectory(self.stamps_ns, rows[:, :3], rows[:, 3:])
+        return self.odometry_of(self._frames)
+
+    def odometry_of(self, frames: int) -> Trajectory:
+        """The same of the first `frames`, be it that some were gone back over."""
+        rows = np.array(self._poses).reshape(-1, 7)[:frames]
+        return Trajectory(np.array(self._stamps[:frames], dtype=np.int64), rows[:, :3], rows[:, 3:])
 
 
 def prepare_folder(folder: Path, *, replace: bool = False) -> None:

@@ -138,6 +138,22 @@ def truth_beside(recording: Path) -> Path | None:
     return truth if truth.is_file() else None
 
 
+def time_apart(source: Path | str, stamps_ns: I64, begin_ns: int, duration_s: float) -> str:
+    """What is wrong, in a sentence, if poses and a recording share no time; "" if they do.
+
+    Args:
+        source: of the poses, to name it. stamps_ns: (n,), increasing.
+    """
+    first, last = stamps_ns[0] * 1e-9, stamps_ns[-1] * 1e-9
+    begin, end = begin_ns * 1e-9, begin_ns * 1e-9 + duration_s
+    if begin <= last and first <= end:
+        return ""
+    return (
+        f"{source} covers {first:.1f} s to {last:.1f} s, but the recording {begin:.1f} s to {end:.1f} s;"
+        " both must be stamped by the same clock, in seconds."
+    )
+
+
 def count_text(poses: int) -> str:
     """A number of poses in words fit for a sentence."""
     return {0: "no pose", 1: "1 pose"}.get(poses, f"{poses} poses")

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import viser
 
-from app.server.folders import Entry, Folders
-from app.server.protocol import Command, OpenRecording, Save, Snapshot
+from app.server.folders import RECORDINGS, TRAJECTORIES, Entry, Folders
+from app.server.protocol import Command, CompareWith, OpenRecording, Save, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.trajectory import truth_beside
 from app.ui.html import box, code
@@ -54,21 +54,52 @@ class FilesPanel:
         self._send = send
         self._snapshot = snapshot
         self._open = gui.add_button("Open a recording…", icon=viser.Icon.FOLDER_OPEN, color="gray")
+        self._compare = gui.add_button(
+            "Compare with a trajectory…",
+            icon=viser.Icon.ROUTE,
+            color="gray",
+            disabled=True,
+            hint="Draw the truth, or what another run or program made of this recording, beside the walk, and plot the "
+            "distance to it.",
+        )
         self._save = gui.add_button("Save results…", icon=viser.Icon.DEVICE_FLOPPY, color="gray", disabled=True)
         self._saved = gui.add_html("", visible=False)
         self._open.on_click(by_user(self._browse))
+        self._compare.on_click(by_user(self._browse_trajectories))
         self._save.on_click(by_user(lambda _, client: self._ask_where(client)))
 
     def draw(self, snapshot: Snapshot) -> None:
         """Offer saving once there is something to save; say where the newest results are."""
-        self._save.disabled = snapshot.result is None
+        self._save.disabled = self._compare.disabled = snapshot.result is None
         done = [saved.folder for saved in snapshot.saved if not saved.error]
         self._saved.visible = bool(done)
         if done:
             self._saved.content = box('<span class="hs-quiet">Saved in ', code(str(done[-1])), "</span>")
 
     def _browse(self, _: Any, client: viser.ClientHandle) -> None:
-        FileBrowser(client, self._folders, self._send)
+        browser = FileBrowser(client, self._folders, "Open a recording")
+        with_truth = browser.checkbox(
+            "with truth", "Load the trajectory (.tum) that lies beside the recording, if there is one."
+        )
+
+        def choose(path: Path) -> None:
+            path = self._folders.openable(path)
+            self._send(OpenRecording(path, truth_beside(path) if with_truth.value else None))
+
+        browser.show(RECORDINGS, "No recordings (.bag, .mcap, .db3, .pcap, ROS 2 folders) or sessions here.", choose)
+
+    def _browse_trajectories(self, _: Any, client: viser.ClientHandle) -> None:
+        results = [self._results] if self._results.is_dir() else []
+        folders = Folders([*self._folders.roots, *results])
+        browser = FileBrowser(client, folders, "Compare with a trajectory")
+        recording = self._snapshot().recording
+        if recording is not None and recording.truth is not None:
+            browser.button(f"Not with {recording.truth.name} any more", lambda: self._send(CompareWith(None)))
+        browser.show(
+            TRAJECTORIES,
+            "No trajectories (.tum) here; “Save results…” writes one, and so do most SLAM programs.",
+            lambda path: self._send(CompareWith(folders.inside(path))),
+        )
 
     def _ask_where(self, client: viser.ClientHandle) -> None:
         recording = self._snapshot().recording
@@ -104,23 +135,45 @@ class FilesPanel:
 
 
 class FileBrowser:
-    """A dialog in one browser: goes through folders until a recording is chosen."""
+    """A dialog in one browser: goes through folders until a file is chosen. What it asks beside is added first."""
 
-    def __init__(self, client: viser.ClientHandle, folders: Folders, send: Callable[[Command], None]) -> None:
+    def __init__(self, client: viser.ClientHandle, folders: Folders, title: str) -> None:
         self._gui = client.gui
         self._folders = folders
-        self._send = send
         self._shown: list[viser.GuiButtonHandle | viser.GuiHtmlHandle] = []
-        self._modal = self._gui.add_modal("Open a recording")
+        self._suffixes: tuple[str, ...] = ()
+        self._nothing = ""
+        self._choose: Callable[[Path], None] = lambda _: None
+        self._modal = self._gui.add_modal(title)
         with self._modal:
             self._here = self._gui.add_html("")
             self._list = self._gui.add_folder(None)
-            self._with_truth = self._gui.add_checkbox(
-                "with truth", True, hint="Load the trajectory (.tum) that lies beside the recording, if there is one."
-            )
-            cancel = self._gui.add_button("Cancel", color="gray")
-        cancel.on_click(lambda _: self._modal.close())
-        roots = tuple(folders.roots)
+
+    def checkbox(self, label: str, hint: str) -> viser.GuiCheckboxHandle:
+        with self._modal:
+            return self._gui.add_checkbox(label, True, hint=hint)
+
+    def button(self, text: str, act: Callable[[], None]) -> None:
+        """Another way out of the dialog."""
+        with self._modal:
+            button = self._gui.add_button(text, color="gray")
+
+        def clicked(_: object) -> None:
+            act()
+            self._modal.close()
+
+        button.on_click(clicked)
+
+    def show(self, suffixes: tuple[str, ...], nothing: str, choose: Callable[[Path], None]) -> None:
+        """List the folders.
+
+        Args:
+            suffixes: of the files that may be chosen. nothing: what to say of a folder that is empty.
+            choose: is given the file; it may raise HemislamError, which is shown.
+        """
+        self._suffixes, self._nothing, self._choose = suffixes, nothing, choose
+        self.button("Cancel", lambda: None)
+        roots = self._folders.roots
         self._go(roots[0] if len(roots) == 1 else None)
 
     def _go(self, folder: Path | None) -> None:
@@ -136,7 +189,7 @@ class FileBrowser:
                 return
             self._here.content = box(code(str(folder)))
             try:
-                entries = self._folders.listing(folder)
+                entries = self._folders.listing(folder, self._suffixes)
             except HemislamError as error:
                 self._shown.append(self._gui.add_html(box(code(str(error)))))
                 entries = []
@@ -146,17 +199,15 @@ class FileBrowser:
             for entry in entries[:_MOST_ENTRIES]:
                 self._entry(entry)
             if not entries:
-                self._shown.append(
-                    self._gui.add_html(box("No recordings (.bag, .mcap, .db3, .pcap, ROS 2 folders) or sessions here."))
-                )
+                self._shown.append(self._gui.add_html(box(self._nothing)))
             if len(entries) > _MOST_ENTRIES:
                 more = f"{len(entries) - _MOST_ENTRIES} more are not shown; name the file on the command line."
                 self._shown.append(self._gui.add_html(box(more)))
 
     def _entry(self, entry: Entry) -> None:
         path = entry.path
-        if entry.is_recording:
-            self._button(f"{path.name}   {size_text(entry.size)}", viser.Icon.FILE_DATABASE, lambda: self._choose(path))
+        if entry.is_choice:
+            self._button(f"{path.name}   {size_text(entry.size)}", viser.Icon.FILE_DATABASE, lambda: self._chosen(path))
         else:
             self._button(path.name, viser.Icon.FOLDER, lambda: self._go(path))
 
@@ -165,11 +216,10 @@ class FileBrowser:
         button.on_click(lambda _: act())
         self._shown.append(button)
 
-    def _choose(self, path: Path) -> None:
+    def _chosen(self, path: Path) -> None:
         try:
-            path = self._folders.openable(path)
+            self._choose(path)
         except HemislamError as error:
             self._here.content = box(code(str(error)))
             return
-        self._send(OpenRecording(path, truth_beside(path) if self._with_truth.value else None))
         self._modal.close()

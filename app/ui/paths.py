@@ -63,9 +63,13 @@ class Truth:
         self._scene = scene
         self._root = root
         self._line: viser.LineSegmentsHandle | None = None
+        self._loaded: F64 | None = None
 
     def load(self, positions: F64 | None) -> None:
-        """Replace the line; None or fewer than two (m, 3) positions take it away."""
+        """Replace the line unless it is of these (m, 3) positions; None or fewer than two take it away."""
+        if positions is self._loaded:
+            return
+        self._loaded = positions
         if self._line is not None:
             self._line.remove()
             self._line = None

@@ -85,6 +85,7 @@ class Scene:
             self._chunks.draw(current.chunks[: len(poses)], poses, view)
             if current.trajectory is not None:
                 self._trajectory.draw(current.trajectory, view.path)
+            self._truth.load(current.recording.truth_positions if current.recording else None)
             self._truth.draw(current.T_map_truth, view.path)
             self._grid.visible = view.grid
             if result is None:
@@ -112,7 +113,6 @@ class Scene:
         )
         self._trajectory.clear()
         self._sensor.clear()
-        self._truth.load(recording.truth_positions if recording else None)
 
     def _level_grid(self) -> None:
         """Lay the grid on the ground below the sensor; steps under 3 cm are left out, so it does not shiver."""

@@ -2,6 +2,7 @@
 
 import base64
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -96,6 +97,7 @@ class History:
 
     def _forget(self, session: int, total: int) -> None:
         self._session, self.total, self.present = session, total, -1
+        self._truth: Path | None = None
         self._stamps = np.full(total, np.nan)
         self._values = {strip.key: np.full(total, np.nan) for strip in STRIPS}
         self._loops: dict[Pair, tuple[int, Verdict]] = {}
@@ -105,6 +107,10 @@ class History:
         total = max(snapshot.recording.frames if snapshot.recording else 1, 1)
         if snapshot.session != self._session or total != self.total:
             self._forget(snapshot.session, total)
+        truth = snapshot.recording.truth if snapshot.recording else None
+        if truth != self._truth:
+            self._truth = truth
+            self._values["error"][:] = np.nan  # what there was is the distance to another
         n = min(len(snapshot.series.get("stamp_s", ())), total)
         if n:
             self._stamps[:n] = snapshot.series["stamp_s"][:n]
@@ -173,7 +179,8 @@ def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
         if not np.isfinite(high).any() and strip.key == "error":
             continue  # no truth, no strip
         largest = float(np.fmax.reduce(high, initial=0.0))
-        usual = float(np.nanpercentile(high, 98)) if np.isfinite(high).any() else 0.0
+        finite = high[np.isfinite(high)]
+        usual = float(np.percentile(finite, 98)) if len(finite) else 0.0
         strips.append(
             {
                 "name": strip.name,

@@ -54,7 +54,7 @@ def test_a_folder_whose_name_begins_alike_is_not_inside(disk: Path) -> None:
 
 def test_a_listing_shows_folders_and_recordings_but_no_way_out(disk: Path) -> None:
     listing = Folders([disk / "open"]).listing("")
-    assert [(entry.path.name, entry.is_recording, entry.size) for entry in listing] == [
+    assert [(entry.path.name, entry.is_choice, entry.size) for entry in listing] == [
         ("loop", False, 0), ("walks", False, 0), ("a.mcap", True, 4), ("ros2", True, 4),
     ]  # fmt: skip
 

@@ -8,7 +8,18 @@ import pytest
 import server_fakes as fakes
 from session_desk import Desk, last_notice
 
-from app.server.protocol import Command, OpenRecording, Play, Restart, Save, Seek, SetParams, SetSpeed, StepFrame
+from app.server.protocol import (
+    Command,
+    CompareWith,
+    OpenRecording,
+    Play,
+    Restart,
+    Save,
+    Seek,
+    SetParams,
+    SetSpeed,
+    StepFrame,
+)
 from app.slam.params import Params
 from app.slam.trajectory import Trajectory, write_tum
 
@@ -126,3 +137,49 @@ def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
         desk.session.work()
     assert str(tmp_path / "file") in desk.see().saved[0].error
     assert str(tmp_path / "file") in last_notice(desk.see())
+
+
+def test_a_walk_is_compared_with_another_trajectory_without_being_walked_again(tmp_path: Path) -> None:
+    desk, truth = Desk(), truth_file(tmp_path, 60, wobble=0.01)
+    before = desk.do(Seek(59), Seek(40))
+    assert np.isnan(before.series["error_m"]).all()
+    compared = desk.do(CompareWith(truth))
+    assert len(compared.series["error_m"]) == 41 and compared.transport.frame == 40
+    assert compared.series["error_m"] == pytest.approx(0.01, rel=0.2), "of frames that were walked before, too"
+    np.testing.assert_array_equal(compared.series["stamp_s"], before.series["stamp_s"])
+    np.testing.assert_array_equal(compared.trajectory, before.trajectory)
+    assert compared.recording is not None and compared.recording.truth == truth
+    assert compared.T_map_truth is not None
+    later = desk.do(Seek(59), StepFrame(-1))
+    assert later.series["error_m"] == pytest.approx(0.01, rel=0.2), "of those gone back over, and when stepping back"
+    nothing = desk.do(CompareWith(None))
+    assert np.isnan(nothing.series["error_m"]).all() and nothing.T_map_truth is None
+
+
+def test_a_trajectory_of_another_time_is_refused_and_the_one_before_stays(tmp_path: Path) -> None:
+    truth = truth_file(tmp_path, 60)
+    desk = Desk(truth=truth)
+    desk.do(Seek(20))
+    elsewhere = tmp_path / "later.tum"
+    write_tum(elsewhere, Trajectory.from_poses(10**18 + np.arange(9) * fakes.FRAME_NS, np.tile(np.eye(4), (9, 1, 1))))
+    snapshot = desk.do(CompareWith(elsewhere))
+    assert "later.tum covers 1000000000.0 s to" in last_notice(snapshot)
+    assert snapshot.recording is not None and snapshot.recording.truth == truth
+    assert np.isfinite(snapshot.series["error_m"][-1])
+    opened = Desk(truth=elsewhere).see()
+    assert "later.tum covers" in last_notice(opened), "also when it is opened with the recording"
+
+
+def test_a_session_remembers_what_it_was_compared_with_and_opens_without_it_if_that_is_gone(tmp_path: Path) -> None:
+    recording, truth = tmp_path / "walk-60.mcap", truth_file(tmp_path, 60, wobble=0.01)
+    recording.write_bytes(b"something to hash")
+    desk = Desk(str(recording), journals=tmp_path / "sessions")
+    snapshot = desk.do(Seek(30), CompareWith(truth))
+    assert snapshot.journal is not None
+    desk.session.close()
+    again = Desk(str(snapshot.journal)).see()
+    assert again.series["error_m"][-1] == pytest.approx(0.01, rel=0.2)
+    truth.unlink()
+    without = Desk(str(snapshot.journal)).see()
+    assert without.transport.frame == 30 and np.isnan(without.series["error_m"]).all()
+    assert "truth.tum, which is gone" in last_notice(without)
