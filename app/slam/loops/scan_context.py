@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from app.slam.types import F32, F64
+from app.slam.types import F32, F64, U8
 
 RINGS, SECTORS = 20, 60
 RADIUS = 20.0
@@ -29,17 +29,31 @@ LEAST_COMMON = 0.4
 """At a shift, at least this share of the smaller context's seen cells must be seen in both."""
 
 
+UNSEEN = 255
+_SHARES: F32 = np.sqrt(np.arange(_BINS + 1) / _BINS).astype(np.float32)
+
+
 @dataclass(frozen=True, slots=True)
 class ScanContext:
-    """Attributes:
-    cells: (RINGS, SECTORS) float32, share of occupied height bins, square root; 0 where unseen.
-    seen: (RINGS, SECTORS) bool. ring_key: (RINGS,) float32, mean of each ring's seen cells, the
-        same however the place is turned.
+    """In bytes, since every keyframe's is kept.
+
+    Attributes:
+        filled: (RINGS, SECTORS) uint8, how many height bins are occupied; UNSEEN where nothing is known.
+        ring_key: (RINGS,) float32, mean of each ring's seen cells, the same however the place is turned.
     """
 
-    cells: F32
-    seen: npt.NDArray[np.bool_]
+    filled: U8
     ring_key: F32
+
+    @property
+    def seen(self) -> npt.NDArray[np.bool_]:
+        """(RINGS, SECTORS)."""
+        return np.asarray(self.filled != UNSEEN)
+
+    @property
+    def cells(self) -> F32:
+        """(RINGS, SECTORS), square root of the share of occupied height bins; 0 where unseen."""
+        return np.asarray(_SHARES[np.where(self.seen, self.filled, 0)])
 
 
 def describe(points: F32) -> ScanContext:
@@ -55,22 +69,22 @@ def describe(points: F32) -> ScanContext:
     filled = occupied.sum(axis=2)
     # a sector was looked through as far as its farthest return; behind that nothing is known
     seen = np.cumsum(filled[::-1], axis=0)[::-1] > 0
-    cells = np.sqrt(filled / _BINS).astype(np.float32)
-    key = cells.sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
-    return ScanContext(cells, seen, key.astype(np.float32))
+    key = _SHARES[filled].sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    return ScanContext(np.where(seen, filled, UNSEEN).astype(np.uint8), key.astype(np.float32))
 
 
 def shift_distances(a: ScanContext, b: ScanContext) -> F64:
     """(SECTORS,) distance of b, its columns shifted by s, to a: 1 - cosine over the cells seen in both."""
-    fa, fb = np.fft.rfft(a.cells, axis=1), np.fft.rfft(b.cells, axis=1)
-    fa2, fb2 = np.fft.rfft(a.cells**2, axis=1), np.fft.rfft(b.cells**2, axis=1)
-    ma, mb = np.fft.rfft(a.seen, axis=1), np.fft.rfft(b.seen, axis=1)
+    cells_a, cells_b, seen_a, seen_b = a.cells, b.cells, a.seen, b.seen
+    fa, fb = np.fft.rfft(cells_a, axis=1), np.fft.rfft(cells_b, axis=1)
+    fa2, fb2 = np.fft.rfft(cells_a**2, axis=1), np.fft.rfft(cells_b**2, axis=1)
+    ma, mb = np.fft.rfft(seen_a, axis=1), np.fft.rfft(seen_b, axis=1)
 
     def correlate(left: npt.NDArray[np.complex128], right: npt.NDArray[np.complex128]) -> F64:
         return np.asarray(np.fft.irfft((left * right.conj()).sum(axis=0), SECTORS))
 
     norms = np.sqrt(np.maximum(correlate(fa2, mb), 0.0) * np.maximum(correlate(ma, fb2), 0.0))
-    common = correlate(ma, mb) / max(min(int(a.seen.sum()), int(b.seen.sum())), 1)
+    common = correlate(ma, mb) / max(min(int(seen_a.sum()), int(seen_b.sum())), 1)
     usable = (common >= LEAST_COMMON) & (norms > 1e-9)
     cosine = correlate(fa, fb) / np.where(usable, norms, 1.0)
     return np.where(usable, np.clip(1.0 - cosine, 0.0, 1.0), 1.0)
