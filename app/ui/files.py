@@ -69,8 +69,9 @@ class FilesPanel:
         self._save.on_click(by_user(lambda _, client: self._ask_where(client)))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Offer saving once there is something to save; say where the newest results are."""
-        self._save.disabled = self._compare.disabled = snapshot.result is None
+        """Offer what there is something for; say where the newest results are."""
+        self._save.disabled = snapshot.result is None
+        self._compare.disabled = snapshot.recording is None or snapshot.live is not None
         done = [saved.folder for saved in snapshot.saved if not saved.error]
         self._saved.visible = bool(done)
         if done:

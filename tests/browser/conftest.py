@@ -116,6 +116,7 @@ def bench(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     """On a recording of thirty columns of building, in a small window."""
     folder = tmp_path_factory.mktemp("recordings")
     (folder / "garage.mcap").write_bytes(b"x" * 2_000)
+    (folder / "other_slam.tum").write_text("0 0 0 0 0 0 0 1\n")
     (folder / "older").mkdir()
     engine = FakeEngine(columns=30)
     with opened(chromium, engine, folder, 1000, 620) as bench:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
-from app.server.protocol import OpenRecording, Pause, Play, Seek, SetParams, StepFrame
+from app.server.protocol import CompareWith, OpenRecording, Pause, Play, Seek, SetParams, StepFrame
 from app.server.viser_page import PLAIN_EDGES
 from tests.browser.conftest import Bench
 
@@ -145,6 +145,20 @@ def test_a_recording_is_chosen_from_the_allowed_folder(bench: Bench) -> None:
     dialog.get_by_role("button", name="garage.mcap").click()
     bench.eventually(lambda: any(isinstance(command, OpenRecording) for command in bench.engine.sent))
     expect(bench.page.get_by_text("garage.mcap").first).to_be_visible()
+    bench.page.get_by_role("tab", name="Tune").click()
+
+
+def test_a_trajectory_to_compare_with_is_chosen_from_the_allowed_folders(bench: Bench) -> None:
+    bench.page.get_by_role("tab", name="Files").click()
+    bench.page.get_by_role("button", name="Compare with a trajectory").click()
+    dialog = bench.page.get_by_role("dialog")
+    expect(dialog.get_by_role("button", name="older")).to_be_visible()
+    expect(dialog.get_by_role("button", name="garage.mcap")).to_have_count(0)
+    dialog.get_by_role("button", name="other_slam.tum").click()
+    bench.eventually(lambda: any(isinstance(command, CompareWith) for command in bench.engine.sent))
+    (command,) = (command for command in bench.engine.sent if isinstance(command, CompareWith))
+    assert command.path is not None and command.path.name == "other_slam.tum"
+    expect(dialog).to_have_count(0)
     bench.page.get_by_role("tab", name="Tune").click()
 
 
