@@ -2,8 +2,10 @@
 
 A keyframe's points are sent once, in its own LiDAR frame; a pose that moves later sends 7 numbers.
 When the map outgrows the point budget, snapshots hold some keyframes with fewer points: those are sent again.
+What one goes back over is hidden, not taken away: going forth again, over the whole map too, sends no points.
 """
 
+from collections import deque
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -36,6 +38,15 @@ class _Drawn:
     """None while no point of it is shown."""
     limits: dict[ColourBy, Limits]
     """Ends of the colour maps with this keyframe and those before it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Hidden:
+    """A keyframe that was gone back over. view, limits: with which it was drawn last."""
+
+    drawn: _Drawn
+    view: View
+    limits: Limits | None
 
 
 def chunk_values(chunk: Chunk, T_map_lidar: F64, by: ColourBy, start_ns: int) -> F64:
@@ -75,6 +86,7 @@ class MapChunks:
         self._scene = scene
         self._root = root
         self._drawn: list[_Drawn] = []
+        self._hidden: deque[_Hidden] = deque()  # those that followed
         self._view = View()
         self._limits: dict[ColourBy, Limits] = {}
         self._poses: F64 = np.empty((0, 4, 4))
@@ -96,38 +108,57 @@ class MapChunks:
             if drawn.handle is not None:
                 drawn.handle.remove()
         self._drawn.clear()
+        self._drop_hidden()
         self._poses = np.empty((0, 4, 4))
         self._start_ns = start_ns
         self._limits = {ColourBy.TIME: Limits(0.0, max(duration_s, 1.0))}
 
-    def _take_back(self, chunks: tuple[Chunk, ...]) -> None:
-        """Take away the keyframes from the first on that is not among `chunks` any more, be it thinned or not."""
+    def _drop_hidden(self) -> None:
+        for hidden in self._hidden:
+            if hidden.drawn.handle is not None:
+                hidden.drawn.handle.remove()
+        self._hidden.clear()
+
+    def _take_back(self, chunks: tuple[Chunk, ...], seen: View) -> None:
+        """Hide the keyframes from the first on that is not among `chunks` any more, be it thinned or not.
+
+        Args:
+            seen: with which they were drawn.
+        """
         same = (_same(drawn.chunk, chunk) for drawn, chunk in zip(self._drawn, chunks, strict=False))
         kept = next((index for index, is_same in enumerate(same) if not is_same), min(len(chunks), len(self._drawn)))
         if kept == len(self._drawn):
             return
+        limits = self._limits.get(seen.colour_by)
+        self._hidden.extendleft(_Hidden(drawn, seen, limits) for drawn in reversed(self._drawn[kept:]))
         for drawn in self._drawn[kept:]:
             if drawn.handle is not None:
-                drawn.handle.remove()
+                drawn.handle.visible = False
         del self._drawn[kept:]
         self._poses = self._poses[:kept]
         before = self._drawn[-1].limits if self._drawn else {}
         self._limits = {ColourBy.TIME: self._limits[ColourBy.TIME], **before}
 
     def draw(self, chunks: tuple[Chunk, ...], poses: F64, view: View) -> None:
-        """Add chunks that are new, take away those that are gone, thin, move and colour anew where needed.
+        """Add chunks that are new, hide those that are gone, thin, move and colour anew where needed.
 
         Args:
             poses: (k, 4, 4) T_map_imu by keyframe index.
         """
         before, seen = self._limits.get(view.colour_by), self._view
         self._view = view
-        self._take_back(chunks)
-        new = []
+        self._take_back(chunks, seen)
+        new: list[_Drawn] = []
+        again: list[tuple[_Hidden, Chunk, F64]] = []
         for chunk in chunks[len(self._drawn) :]:
             T = poses[chunk.index] @ chunk.T_imu_lidar
-            self._widen(chunk, T)
-            new.append(_Drawn(chunk, T, slice(None), 0, None, self._limits.copy()))
+            hidden = self._hidden_one(chunk)
+            if hidden is None:
+                self._widen(chunk, T)
+                new.append(_Drawn(chunk, T, slice(None), 0, None, self._limits.copy()))
+            else:
+                self._limits = hidden.drawn.limits.copy()
+                again.append((hidden, chunk, T))
         recolour = view.colour_by is not seen.colour_by or self._limits.get(view.colour_by) != before
         restyle = (view.point_size, view.map) != (seen.point_size, seen.map)
         now = poses[[drawn.chunk.index for drawn in self._drawn]]
@@ -145,10 +176,37 @@ class MapChunks:
                     drawn.handle.point_size, drawn.handle.visible = view.point_size, view.map
                 if recolour or (has_moved and view.colour_by is ColourBy.HEIGHT):
                     drawn.handle.colors = self._colours(drawn)
+        for hidden, chunk, T in again:
+            self._drawn.append(hidden.drawn)
+            self._show_again(hidden, chunk, T)
         for drawn in new:
             self._drawn.append(drawn)
             self._send(drawn)
         self._poses = poses[[drawn.chunk.index for drawn in self._drawn]]
+
+    def _hidden_one(self, chunk: Chunk) -> _Hidden | None:
+        """The next that was hidden, if it is this one; else none of them comes again."""
+        if self._hidden and _same(self._hidden[0].drawn.chunk, chunk):
+            return self._hidden.popleft()
+        self._drop_hidden()
+        return None
+
+    def _show_again(self, hidden: _Hidden, chunk: Chunk, T_map_lidar: F64) -> None:
+        drawn, seen, view = hidden.drawn, hidden.view, self._view
+        moved = float(np.abs(T_map_lidar - drawn.T_map_lidar).max()) > 1e-5
+        drawn.T_map_lidar = T_map_lidar
+        if chunk is not drawn.chunk or view.ceilings != seen.ceilings:
+            drawn.chunk = chunk
+            self._send(drawn)
+        elif drawn.handle is not None:
+            if moved:
+                drawn.handle.wxyz, drawn.handle.position = _pose(T_map_lidar)
+            if view.point_size != seen.point_size:
+                drawn.handle.point_size = view.point_size
+            recolour = view.colour_by is not seen.colour_by or self._limits.get(view.colour_by) != hidden.limits
+            if recolour or (moved and view.colour_by is ColourBy.HEIGHT):
+                drawn.handle.colors = self._colours(drawn)
+            drawn.handle.visible = view.map
 
     def _widen(self, chunk: Chunk, T_map_lidar: F64) -> None:
         for by in MEASURED:

@@ -41,8 +41,9 @@ class Drawn:
 
 
 def chunk_nodes(server: viser.ViserServer) -> dict[str, viser.PointCloudHandle]:
-    nodes = server.scene._handle_from_node_name
-    return {n: h for n, h in nodes.items() if isinstance(h, viser.PointCloudHandle) and n.startswith("/map/keyframes/")}
+    """Keyframes that are seen; what was gone back over is hidden."""
+    clouds = {n: h for n, h in server.scene._handle_from_node_name.items() if isinstance(h, viser.PointCloudHandle)}
+    return {name: cloud for name, cloud in clouds.items() if name.startswith("/map/keyframes/") and cloud.visible}
 
 
 @pytest.fixture
@@ -207,6 +208,51 @@ def test_going_back_and_forth_leaves_nothing_behind(drawn: Drawn, wire: Wire, se
         server._run_garbage_collector(force=True)
         kept.append(wire.kept)
     assert kept[0] == kept[-1]
+
+
+def test_going_forth_again_sends_no_points_of_the_map(drawn: Drawn, wire: Wire, server: viser.ViserServer) -> None:
+    drawn.engine.send(Seek(60))
+    drawn.draw()
+    there, chunks = shown(drawn, server), drawn.engine.snapshot.chunks
+    for by in (ColourBy.LABEL, ColourBy.HEIGHT):
+        drawn.draw(chunks=chunks[:2])
+        assert list(chunk_nodes(server)) == ["/map/keyframes/0", "/map/keyframes/1"]
+        drawn.draw(View(colour_by=by, point_size=0.05), chunks=chunks[:2])
+        wire.clear()
+        drawn.draw(chunks=chunks)
+        assert [name for name in wire.nodes("PointCloudMessage") if name.startswith("/map/keyframes/")] == []
+        assert all(node.point_size == pytest.approx(0.05) for node in chunk_nodes(server).values())
+    coloured = shown(drawn, server)["map"]
+    drawn.draw(View())
+    assert shown(drawn, server) == there
+    drawn.draw(View(colour_by=ColourBy.HEIGHT))
+    assert shown(drawn, server)["map"] == coloured != there["map"], "what was hidden is coloured as all else"
+
+
+def test_what_was_hidden_comes_again_where_loops_have_moved_it_meanwhile(
+    drawn: Drawn, server: viser.ViserServer
+) -> None:
+    snapshot = drawn.engine.snapshot
+    poses = np.array(snapshot.keyframe_poses)
+    drawn.draw(chunks=snapshot.chunks[:1])
+    assert list(chunk_nodes(server)) == ["/map/keyframes/0"]
+    poses[1:, :3, 3] += [1.0, 2.0, 0.0]
+    drawn.draw(chunks=snapshot.chunks, keyframe_poses=poses)
+    for chunk in snapshot.chunks:
+        node = chunk_nodes(server)[f"/map/keyframes/{chunk.index}"]
+        np.testing.assert_allclose(node.position, (poses[chunk.index] @ chunk.T_imu_lidar)[:3, 3], atol=1e-6)
+
+
+def test_a_hidden_keyframe_that_another_walk_put_in_place_of_one_is_drawn(
+    drawn: Drawn, server: viser.ViserServer
+) -> None:
+    first, *rest = drawn.engine.snapshot.chunks
+    drawn.draw(View(ceilings=True), chunks=(first,))
+    other = replace(rest[0], points=rest[0].points + np.float32(1.0))
+    drawn.draw(View(ceilings=True), chunks=(first, other))
+    assert np.array_equal(chunk_nodes(server)["/map/keyframes/1"].points, other.points.astype(np.float16))
+    assert len(chunk_nodes(server)) == 2
+    assert sum(name.startswith("/map/keyframes/") for name in server.scene._handle_from_node_name) == 2
 
 
 def test_a_keyframe_that_another_walk_put_in_place_of_one_is_drawn(drawn: Drawn, server: viser.ViserServer) -> None:
