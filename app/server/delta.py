@@ -32,7 +32,7 @@ class Delta:
         replaced: new values of fields of `Snapshot`; `loops` without its edges.
         edges: what has changed of those.
         positions: (m, 3) and series: (m, len(SERIES)), rows of the frames since then.
-        chunks: new since then, in place of those that the reader has from number `first_chunk` on.
+        chunks: new since then, each in place of the one that the reader has of its keyframe.
         shown: how many of all these there are now; the reader keeps the others, since they come again
             when one goes forth again.
         notices: new since then.
@@ -45,7 +45,6 @@ class Delta:
     edges: EdgesChange | None
     positions: F64
     series: F64
-    first_chunk: int
     chunks: tuple[Chunk, ...]
     shown: int
     notices: tuple[Notice, ...]
@@ -68,8 +67,8 @@ class Outbox:
         self._replaced: dict[str, Any] = {"params": params}
         self._positions: list[F64] = []
         self._rows: list[list[float]] = []
-        self._chunks: list[Chunk] = []
-        self._first_chunk = chunks
+        self._chunks: dict[int, Chunk] = {}  # by keyframe
+        self._held = chunks  # that the reader has once it has taken everything, shown or not
         self._edges = EdgesSender()
         self._kept: int | None = None
         self._moved: tuple[int, F64] | None = None
@@ -82,7 +81,7 @@ class Outbox:
         """Start a new session: what belonged to the old one and was not taken is dropped."""
         self._session += 1
         self.urgent = True
-        self._positions, self._rows, self._chunks, self._first_chunk = [], [], [], 0
+        self._positions, self._rows, self._chunks, self._held = [], [], {}, 0
         self._kept, self._moved, self.frames, self.chunks = None, None, 0, 0
         self._replaced |= {"result": None, "keyframe_poses": None, "T_map_truth": None, "loops": LoopsView()}
 
@@ -98,11 +97,10 @@ class Outbox:
         self.frames += 1
 
     def chunk(self, chunk: Chunk) -> None:
-        """Add a chunk, in place of those that were gone back over."""
-        self._first_chunk = min(self._first_chunk, self.chunks)
-        del self._chunks[self.chunks - self._first_chunk :]
-        self._chunks.append(chunk)
+        """Add the next chunk, in place of the one that may have been gone back over."""
+        self._chunks[self.chunks] = chunk
         self.chunks += 1
+        self._held = max(self._held, self.chunks)
 
     def move(self, first: int, positions: F64) -> None:
         """The frames from `first` on lie elsewhere now.
@@ -125,7 +123,7 @@ class Outbox:
             first, moved = self._moved
             self._moved = (first, moved[: frames - first]) if first < frames else None
         del self._positions[max(frames - taken_frames, 0) :], self._rows[max(frames - taken_frames, 0) :]
-        self.frames, self.chunks = frames, min(chunks, self._first_chunk + len(self._chunks))
+        self.frames, self.chunks = frames, min(chunks, self._held)
 
     def notice(self, level: Literal["info", "warning", "error"], text: str) -> None:
         self._notices_given += 1
@@ -152,13 +150,11 @@ class Outbox:
             edges=edges,
             positions=np.array(self._positions, dtype=np.float64).reshape(-1, 3),
             series=np.array(self._rows, dtype=np.float64).reshape(-1, len(SERIES)),
-            first_chunk=self._first_chunk,
-            chunks=tuple(self._chunks),
+            chunks=tuple(self._chunks[index] for index in sorted(self._chunks)),
             shown=self.chunks,
             notices=tuple(self._notices),
         )
-        self._first_chunk += len(self._chunks)
-        self._replaced, self._positions, self._rows, self._chunks, self._notices = {}, [], [], [], []
+        self._replaced, self._positions, self._rows, self._chunks, self._notices = {}, [], [], {}, []
         self._kept = self._moved = None
         self.urgent = False
         return delta
@@ -250,10 +246,12 @@ class Fold:
         """The chunks that there are with this delta, within the budget."""
         poses = delta.replaced.get("keyframe_poses", self.snapshot.keyframe_poses)
         result = delta.replaced.get("result", self.snapshot.result)
-        if delta.chunks:
-            self._chunks = (*self._chunks[: delta.first_chunk], *delta.chunks)
-        shown, others = self._chunks[: delta.shown], self._chunks[delta.shown :]
+        held = list(self._chunks)
+        for chunk in delta.chunks:
+            held[chunk.index : chunk.index + 1] = [chunk]
+        shown, others = tuple(held[: delta.shown]), held[delta.shown :]
         if poses is None or len(poses) < len(shown):
+            self._chunks = tuple(held)
             return shown
         sensor = result.T_map_imu[:3, 3] if result is not None else poses[-1, :3, 3]
         shown = within_budget(shown, poses, sensor, self._point_budget)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import server_fakes as fakes
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from test_delta import content
 
@@ -123,6 +123,7 @@ def straight_to(expected: Expected) -> Snapshot:
 
 
 @settings(deadline=None, max_examples=40)
+@example(script=[Seek(10), Seek(0), StepFrame(5), Seek(10)])
 @given(script=SCRIPTS)
 def test_the_page_is_that_of_a_run_that_went_straight_there(script: list[Command]) -> None:
     desk, expected = Desk(Params(), fakes.open_fake, Path(f"walk-{FRAMES}.mcap")), Expected()
