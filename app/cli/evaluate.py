@@ -89,6 +89,8 @@ def evaluate(
     from app.evaluation.truth import read_truth
     from app.evaluation.variants import choose_variants, parse_variant
 
+    if suite is None and (short or seeds):
+        raise HemislamError("--short and --seed belong to --suite; with a RECORDING, --duration shortens it.")
     chosen = choose_variants([parse_variant(text) for text in variants or []], ablation=ablation)
     paths = list(recordings or [])
     _make_folder(out)
@@ -97,7 +99,7 @@ def evaluate(
     if not paths:
         raise HemislamError("There is nothing to evaluate; name a RECORDING or use --suite paper.")
     names = _names(paths)
-    others = _compared(compare or [], names)
+    others = _compared(compare or [], names, [variant.name for variant in chosen])
     arm = _lever(lever)
     subjects = []
     for path, name, text in zip(paths, names, _truth_texts(paths, truths or []), strict=True):
@@ -165,8 +167,8 @@ def _lever(text: str | None) -> tuple[float, float, float] | None:
     return x, y, z
 
 
-def _compared(texts: list[str], names: list[str]) -> dict[str, list[tuple[str, "Trajectory"]]]:
-    """By recording: names and trajectories."""
+def _compared(texts: list[str], names: list[str], variants: list[str]) -> dict[str, list[tuple[str, "Trajectory"]]]:
+    """By recording: names, which are columns beside the variants', and trajectories."""
     from app.slam.trajectory import read_tum
 
     found: dict[str, list[tuple[str, Trajectory]]] = {name: [] for name in names}
@@ -180,5 +182,7 @@ def _compared(texts: list[str], names: list[str]) -> dict[str, list[tuple[str, "
         recording = recording if at else names[0]
         if recording not in found:
             raise HemislamError(f"`--compare {text}`: there is no recording {recording}; there are {', '.join(names)}.")
+        if system in variants or any(system == name for name, _ in found[recording]):
+            raise HemislamError(f"`--compare {text}`: there is a column {system} already; give it another name.")
         found[recording].append((system, read_tum(Path(file))))
     return found

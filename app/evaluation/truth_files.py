@@ -25,14 +25,7 @@ def read_file(path: Path) -> Truth:
     Raises:
         HemislamError: it can not be read, or is none of the formats, or holds NaN.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise HemislamError(f"The truth {path} is not a text file; {_FORMATS}.") from None
-    except OSError as error:
-        raise HemislamError(f"The truth {path} can not be read: {error.strerror}; check the path.") from None
-    rows = [(number, line.partition("#")[0].split()) for number, line in enumerate(lines, 1)]
-    rows = [(number, words) for number, words in rows if words]
+    rows = _rows(path, _FORMATS)
     if rows and rows[0][1][0].lower().startswith("gpstime"):
         rows = rows[1:]  # the table's heading
     if not rows:
@@ -46,6 +39,22 @@ def read_file(path: Path) -> Truth:
     if columns == GNSS_COLUMNS:
         return _gnss(path, _numbers(path, rows, GNSS_COLUMNS))
     raise HemislamError(f"{path}, line {rows[0][0]} has {columns} columns; {_FORMATS}.")
+
+
+def _rows(path: Path, should: str) -> list[tuple[int, list[str]]]:
+    """Number and words of each line that is not empty, less comments.
+
+    Args:
+        should: how such a file is to be, for the sentence about one that is no text.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise HemislamError(f"The truth {path} is not a text file; {should}.") from None
+    except OSError as error:
+        raise HemislamError(f"The truth {path} can not be read: {error.strerror}; check the path.") from None
+    rows = [(number, line.partition("#")[0].split()) for number, line in enumerate(lines, 1)]
+    return [(number, words) for number, words in rows if words]
 
 
 def _numbers(path: Path, rows: list[tuple[int, list[str]]], columns: int) -> F64:
@@ -86,7 +95,10 @@ def _kitti(path: Path, table: F64) -> Truth:
 
 
 def _times(path: Path, poses: int) -> I64:
-    rows = [(number, line.split()) for number, line in enumerate(path.read_text().splitlines(), 1) if line.strip()]
+    should = "it holds one time a line, in seconds"
+    rows = _rows(path, should)
+    if odd := next((number for number, words in rows if len(words) != 1), None):
+        raise HemislamError(f"{path}, line {odd} is no time; {should}.")
     seconds = _numbers(path, rows, 1)[:, 0]
     if len(seconds) != poses:
         raise HemislamError(f"{path} holds {len(seconds)} times for {poses} poses; there must be one a pose.")

@@ -183,6 +183,8 @@ def test_two_variants_of_one_name_and_misspelt_parameters_are_refused() -> None:
         (["--suite", "papre"], "no suite `papre`"),
         (["RECORDING", "--lever", "1,2"], "not three numbers"),
         (["RECORDING", "--compare", "theirs.tum"], "NAME=FILE"),
+        (["RECORDING", "--compare", "Ours=theirs.tum"], "a column Ours already"),
+        (["RECORDING", "--short"], "--duration shortens it"),
         (["RECORDING", "--truth", "topic:/odom"], "no topic /odom"),
         (["RECORDING", "--truth", "a", "--truth", "b"], "2 --truth for 1 recordings"),
     ],

@@ -91,6 +91,21 @@ def test_kitti_poses_belong_to_frames_or_to_the_times_beside_them(tmp_path: Path
     assert matched.offset_s == pytest.approx(walks.START_NS * 1e-9 + 0.1, abs=0.002)
 
 
+@pytest.mark.parametrize(
+    ("times", "says"),
+    [
+        (b"\xff\xfe\x00", "times.txt is not a text file; it holds one time a line"),
+        (b"# s\n0.0 0\n0.1 1\n0.2 2\n", "line 2 is no time"),
+        (b"0.0\n0.1\n", "holds 2 times for 3 poses"),
+    ],
+)
+def test_times_beside_kitti_poses_that_are_none_are_refused(tmp_path: Path, times: bytes, says: str) -> None:
+    path = walks.write(tmp_path / "poses.txt", ["1 0 0 0 0 1 0 0 0 0 1 0"] * 3)
+    (tmp_path / "times.txt").write_bytes(times)
+    with pytest.raises(HemislamError, match=says):
+        read_truth(str(path))
+
+
 def write_topic(path: Path, kind: str, messages: list[tuple[int, dict[str, object]]]) -> Path:
     store = get_typestore(Stores.ROS2_HUMBLE)
     types = store.types
@@ -141,6 +156,18 @@ def test_poses_of_a_topic_are_truth(tmp_path: Path, kind: str, values: Callable[
     assert error.position.max < 0.01 and error.rotation.max < 0.2
     with pytest.raises(HemislamError, match=r"no topic /odom to take as truth; it has /truth\."):
         read_truth("topic:/odom", recording)
+
+
+def test_a_topic_whose_orientation_is_not_known_once_is_refused(tmp_path: Path) -> None:
+    types = get_typestore(Stores.ROS2_HUMBLE).types
+    messages = []
+    for k in range(5):
+        turn = types["geometry_msgs/msg/Quaternion"](float("nan") if k == 3 else 0.0, 0.0, 0.0, 1.0)
+        pose = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](0.1 * k, 0.0, 0.0), turn)
+        messages.append((walks.START_NS + k * 100_000_000, _stamped(types, pose)))
+    recording = write_topic(tmp_path / "rec", "geometry_msgs/msg/PoseStamped", messages)
+    with pytest.raises(HemislamError, match="no unit quaternions"):
+        read_truth("topic:/truth", recording)
 
 
 def test_satellite_fixes_are_metres_east_north_up(tmp_path: Path) -> None:
