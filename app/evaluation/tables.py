@@ -119,9 +119,11 @@ def stages(recordings: Sequence[Evaluated]) -> Table | None:
         for column in recording.columns:
             time = column.runtime
             if time:
-                cells = tuple(f"{time[stage]['median']:.2f} ({time[stage]['p95']:.2f})" for stage in TIMINGS)
+                cells = tuple(
+                    " / ".join(f"{time[stage][what]:.2f}" for what in ("median", "p95", "max")) for stage in TIMINGS
+                )
                 rows.append(Row(recording.name, column.name, cells))
-    return Table("Stages, median and 95 % (ms)", TIMINGS, tuple(rows)) if rows else None
+    return Table("Stages, median / 95 % / max (ms)", TIMINGS, tuple(rows)) if rows else None
 
 
 def fineness(recordings: Sequence[Evaluated]) -> Table | None:
