@@ -124,7 +124,8 @@ class LiveRun(Run):
         part = self._folder / "checkpoint.part"
         try:
             self._keep_rows()
-            part.write_bytes(pickle.dumps(self._state(), protocol=5))
+            with part.open("wb") as file:  # not by way of bytes: the local map is some ten megabytes
+                pickle.dump(self._state(), file, protocol=5)
             part.replace(self._folder / CHECKPOINT)
         except OSError as error:
             log.warning("What a new engine would need can not be kept: %s", error)
@@ -180,7 +181,8 @@ class LiveRun(Run):
     def revive(self) -> bool:
         """Go on where an engine that died was; whether there is anything to go on from."""
         try:
-            kept = pickle.loads((self._folder / CHECKPOINT).read_bytes())
+            with (self._folder / CHECKPOINT).open("rb") as file:
+                kept = pickle.load(file)
             assert isinstance(kept, _Kept)
             if kept.engine.keyframes > len(self.engine.keyframes):
                 return False
