@@ -122,7 +122,7 @@ class ComparePanel:
         for title, lines in (
             ("A to B, cm", [both]),
             ("A to B, °", [both]),
-            ("Frame time, ms", [a, b]),
+            ("Frame time, ms (peaks cut)", [a, b]),
             ("Position error to truth, cm", [a, b]),
         ):
             named = gui.add_html(heading(title), visible=False)

@@ -6,12 +6,12 @@ import numpy as np
 import viser
 
 from app.server.protocol import Snapshot
-from app.slam.types import F64, STAGES, StepResult
+from app.slam.types import F64, I64, STAGES, StepResult
 from app.ui.colours import Rgb
 from app.ui.html import BAD, GOOD, WARN, css, dot, heading, number, tile, tiles
 
 HISTORY: Final = 300
-"""Frames in a plot."""
+"""Most frames in a plot."""
 
 STAGE_COLOURS: Final[dict[str, Rgb]] = {
     "propagate": (99, 132, 255),
@@ -124,17 +124,33 @@ def _vector(v: F64, digits: int) -> str:
 
 def recent(series: dict[str, F64], *names: str) -> tuple[F64, ...]:
     """The last `HISTORY` values of series, and of `stamp_s` first; one zero each before the first frame."""
+    return _chosen(series, slice(-HISTORY, None), names)
+
+
+def worst(series: dict[str, F64], by: str, *names: str) -> tuple[F64, ...]:
+    """As `recent`, but of all frames: `HISTORY` that are spread evenly, each the one of its part with the most `by`."""
+    count = len(series.get("stamp_s", ()))
+    if count <= HISTORY:
+        return recent(series, *names)
+    starts = np.arange(HISTORY + 1) * count // HISTORY
+    part = np.repeat(np.arange(HISTORY), np.diff(starts))
+    order = np.lexsort((np.nan_to_num(series[by], nan=-np.inf), part))
+    return _chosen(series, order[starts[1:] - 1], names)
+
+
+def _chosen(series: dict[str, F64], frames: slice | I64, names: tuple[str, ...]) -> tuple[F64, ...]:
     if not len(series.get("stamp_s", ())):
         return tuple(np.zeros(1) for _ in range(1 + len(names)))
-    return tuple(series[name][-HISTORY:] for name in ("stamp_s", *names))
+    return tuple(series[name][frames] for name in ("stamp_s", *names))
 
 
-def stacked_stages(series: dict[str, F64]) -> tuple[F64, ...]:
+def stacked_stages(series: dict[str, F64], *, whole: bool = False) -> tuple[F64, ...]:
     """Stamps, then running sums of the stages' milliseconds from the highest down, for filled areas.
 
     Peaks are cut at four times the median: the first frame's would leave nothing of all others.
     """
-    stamps, *stages = recent(series, *(f"{stage}_ms" for stage in STAGES))
+    names = [f"{stage}_ms" for stage in STAGES]
+    stamps, *stages = worst(series, "total_ms", *names) if whole else recent(series, *names)
     sums = np.cumsum(np.nan_to_num(np.array(stages)), axis=0)
     sums = np.minimum(sums, 4 * np.median(sums[-1]))
     return (stamps, *sums[::-1])
@@ -147,7 +163,11 @@ class ReadoutPanel:
         self._tiles = gui.add_html("")
         self._time = gui.add_html("")
         layers = [(css(STAGE_COLOURS[stage]), 0.0, css(STAGE_COLOURS[stage])) for stage in reversed(STAGES)]
-        gui.add_html(heading("Frame time by stage, ms"))
+        self._whole = gui.add_checkbox(
+            "all frames", False, hint="In the plots. Where frames share a place, the worst is drawn. Else the last 300."
+        )
+        self._drawn_whole = False
+        gui.add_html(heading("Frame time by stage, ms (peaks cut)"))
         self._stages = plot(gui, stacked_stages({}), layers)
         gui.add_html(heading("λ3/λ2 of the seeds and its limit"))
         self._planarity = plot(
@@ -158,6 +178,11 @@ class ReadoutPanel:
         self._error_title = gui.add_html(heading("Position error to truth, cm"), visible=False)
         self._error = plot(gui, recent({}, "error_m"), [("#ff5c8d", 1.5, "")])
         self._error.visible = False
+
+    @property
+    def stale(self) -> bool:
+        """Whether the plots are to be drawn otherwise than they are."""
+        return self._whole.value != self._drawn_whole
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the snapshot's numbers. Called a few times a second at most: they are not read faster."""
@@ -181,12 +206,17 @@ class ReadoutPanel:
     def draw_plots(self, snapshot: Snapshot) -> None:
         """Show the snapshot's plots, of which a browser draws each point anew."""
         series = snapshot.series
-        self._stages.data = stacked_stages(series)
-        stamps, planarity = recent(series, "planarity")
+        whole = self._drawn_whole = self._whole.value
+
+        def curve(name: str) -> tuple[F64, ...]:
+            return worst(series, name, name) if whole else recent(series, name)
+
+        self._stages.data = stacked_stages(series, whole=whole)
+        stamps, planarity = curve("planarity")
         self._planarity.data = (stamps, planarity, np.full(len(stamps), snapshot.params.ground.planarity))
-        stamps, residual = recent(series, "residual_rms")
+        stamps, residual = curve("residual_rms")
         self._residual.data = (stamps, 1000 * residual)
-        stamps, error = recent(series, "error_m")
+        stamps, error = curve("error_m")
         self._error.visible = self._error_title.visible = bool(np.isfinite(error).any() and len(error) > 1)
         self._error.data = (stamps, 100 * error)
 

@@ -200,6 +200,7 @@ class Workbench:
             self._live.draw(current)
             self._files.draw(current)
             self._appearance.draw(view, self._scene.limits(view.colour_by), self._scene.points, self._budget)
+        self._plots_due |= self._readouts.stale
         if self._plots_due and now - self._plots_drawn_at >= (_PLAYING_PLOTS_PERIOD_S if playing else _PANEL_PERIOD_S):
             self._plots_due, self._plots_drawn_at = False, now
             self._readouts.draw_plots(current)

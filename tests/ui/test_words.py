@@ -18,7 +18,7 @@ from app.ui.files import result_folder_name, size_text
 from app.ui.header import title
 from app.ui.html import legend, tile
 from app.ui.notices import log_html
-from app.ui.readouts import HISTORY, recent, stacked_stages
+from app.ui.readouts import HISTORY, recent, stacked_stages, worst
 from tests.ui.fake_engine import FINDINGS, FakeEngine
 
 
@@ -67,6 +67,19 @@ def test_plots_show_the_newest_frames_only(engine: FakeEngine) -> None:
     stamps, planarity = recent(engine.snapshot.series, "planarity")
     assert len(stamps) == len(planarity) == HISTORY
     assert stamps[-1] == pytest.approx(0.1 * (HISTORY + 19))
+
+
+def test_plots_of_all_frames_leave_out_no_peak_and_no_part_of_the_walk() -> None:
+    count = 4 * HISTORY + 7
+    error = np.full(count, np.nan)  # not known for most frames
+    error[[5, 900]] = 3.0, 2.0
+    series = {"stamp_s": np.arange(count) * 0.1, "error_m": error, "total_ms": np.full(count, 9.0)}
+    stamps, errors, total = worst(series, "error_m", "error_m", "total_ms")
+    assert len(stamps) == HISTORY and (np.diff(stamps) > 0).all()
+    assert stamps[0] < 0.5 and stamps[-1] > 0.1 * (count - 5)
+    known = np.isfinite(errors)
+    assert errors[known].tolist() == [3.0, 2.0] and stamps[known].tolist() == pytest.approx([0.5, 90.0])
+    assert (total == 9.0).all()
 
 
 def test_stages_are_stacked_to_the_total(engine: FakeEngine) -> None:

@@ -15,8 +15,9 @@ from app.server.protocol import (
     SetParams,
     StepFrame,
 )
+from app.ui.readouts import HISTORY
 from app.ui.workbench import Workbench
-from tests.ui.conftest import Clock, Wire
+from tests.ui.conftest import Clock, Wire, user_sets
 from tests.ui.fake_engine import FakeEngine
 
 
@@ -94,6 +95,19 @@ def test_a_page_at_rest_sends_nothing(page: Page, wire: Wire) -> None:
     wire.clear()
     page.draw(0.5)
     assert wire.messages == []
+
+
+def test_a_page_at_rest_shows_the_plots_of_the_whole_walk_once_asked(page: Page) -> None:
+    page.engine.send(StepFrame(HISTORY + 50))
+    for _ in range(5):
+        page.draw(0.5)
+    readouts = page.workbench._readouts
+    first = page.engine.snapshot.series["stamp_s"][:2]
+    assert readouts._residual.data[0][0] > first[1]
+    user_sets(readouts._whole, True)
+    page.draw(0.5)
+    for chart in (readouts._stages, readouts._residual):
+        assert chart.data[0][0] <= first[1] and len(chart.data[0]) == HISTORY
 
 
 def test_the_page_says_that_the_engine_is_gone(page: Page) -> None:
