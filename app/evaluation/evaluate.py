@@ -101,7 +101,7 @@ def _evaluated(
             columns.append(Column(variant.name, variant.meaning, missing=missing))
         else:
             columns.append(load(jobs[which], variant.meaning))
-    columns += [Column(name, "a trajectory from elsewhere", trajectory=path) for name, path in subject.compared]
+    columns += [Column(name, "a trajectory from elsewhere", trajectory=other) for name, other in subject.compared]
     columns, matched, problem = measure(columns, subject.truth)
     truth = subject.truth
     notes = () if truth is None else (matched.notes if matched else (problem,))

@@ -19,8 +19,6 @@ from app.evaluation.tables import make_tables
 from app.slam.errors import HemislamError
 from app.slam.provenance import describe_machine
 
-REPORT_FILES = ("report.html", "report.md", "results.json", "accuracy.csv", "runtime.csv", "fineness.csv", "ground.csv")
-
 
 def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
     """Write all files, each whole or not at all, and return the findings.

@@ -24,7 +24,7 @@ from app.ui.compare_words import legend, numbers, status
 from app.ui.html import box, css, heading
 from app.ui.readouts import plot
 from app.ui.view import View
-from app.ui.widgets import by_user, show
+from app.ui.widgets import by_user, same, show, unchanged
 
 _SCENE_PERIOD_S: Final = 1 / 15
 _PANEL_PERIOD_S: Final = 1 / 4
@@ -149,11 +149,11 @@ class ComparePanel:
             while len(self._recent) > _RECENT:
                 del self._recent[next(iter(self._recent))]
         look = (view.point_size, view.scan, view.path, self._by_ground.value)
-        if not _same(self._in_scene, (a, b, look)) and (now - self._scene_at >= _SCENE_PERIOD_S or b is None):
+        if not same(self._in_scene, (a, b, look), 2) and (now - self._scene_at >= _SCENE_PERIOD_S or b is None):
             self._in_scene, self._scene_at = (a, b, look), now
             self._draw_scene(a, b, view)
         told = (a, b, self._scene_at)  # the scene finds the frame that both have, maybe after the panel was drawn
-        if not _same(self._in_panel, told) and (now - self._panel_at >= _PANEL_PERIOD_S or b is None):
+        if not same(self._in_panel, told, 2) and (now - self._panel_at >= _PANEL_PERIOD_S or b is None):
             self._in_panel, self._panel_at = told, now
             self._draw_panel(a, b)
 
@@ -165,7 +165,7 @@ class ComparePanel:
         part = positions[max(self._forks.forked_at, 0) :] if positions is not None else None
         self._scene.draw_b(part, at, view.path)
         pair = self._matching(a, b) if b is not None and comparable else None
-        if pair is not None and not _same(self._pair or (), pair):
+        if pair is not None and not unchanged(self._pair or (), pair):
             self._ground = ground_difference(pair[0].cloud, pair[1].cloud)
         self._pair = pair
         self._covering = pair is not None and view.scan and bool(self._by_ground.value) and len(pair[0].cloud) > 0
@@ -257,8 +257,3 @@ def _curves(found: Difference) -> "list[tuple[Any, ...] | None]":
     columns = [(100 * found.position_m,), (found.turn_deg,), (ms_a, ms_b), (100 * error_a, 100 * error_b)]
     curves = [thinned(found.stamps_s, *column) for column in columns]
     return [curve if len(curve[0]) > 1 else None for curve in curves]
-
-
-def _same(before: tuple[Any, ...], now: tuple[Any, ...]) -> bool:
-    """Whether two states are of the same objects, and equal in what comes third."""
-    return len(before) == len(now) and before[0] is now[0] and before[1] is now[1] and before[2:] == now[2:]

@@ -1,4 +1,4 @@
-"""What the newest frame measured: tiles for now, plots for the last few hundred frames."""
+"""What the newest frame measured: tiles for now, plots of the last few hundred frames or of all."""
 
 from typing import Any, Final
 

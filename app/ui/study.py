@@ -19,7 +19,7 @@ from app.ui.study_curve import HEADROOM, Curve, curve
 from app.ui.study_point import Picked, describe, nearest_to_ray, pick
 from app.ui.study_scene import StudyScene
 from app.ui.view import View
-from app.ui.widgets import by_user, show
+from app.ui.widgets import by_user, same, show
 
 _PERIOD_S: Final = 1 / 15
 _CURVE_PERIOD_S: Final = 0.25
@@ -80,7 +80,7 @@ class StudyPanel:
     def tick(self, snapshot: Snapshot, view: View) -> None:
         """Called by the drawing thread, often."""
         now, result, by = self._now(), snapshot.result, StudyBy(self._by.value)
-        if not _same(self._drawn, (result, by, view.point_size)) and (
+        if not same(self._drawn, (result, by, view.point_size), 1) and (
             now - self._drawn_at >= _PERIOD_S or by is not self._drawn[1]
         ):
             self._drawn, self._drawn_at = (result, by, view.point_size), now
@@ -88,7 +88,7 @@ class StudyPanel:
             self._legend.content = study_legend(result, by)
         self._tick_point(snapshot, view)
         sigma = snapshot.params.ground.sigma
-        if not _same(self._curve_of, (result, sigma)) and now - self._curve_at >= _CURVE_PERIOD_S:
+        if not same(self._curve_of, (result, sigma), 1) and now - self._curve_at >= _CURVE_PERIOD_S:
             if snapshot.transport.playing and self._curve_of[0] is not None:
                 return
             self._curve_of, self._curve_at = (result, sigma), now
@@ -105,7 +105,7 @@ class StudyPanel:
             T = result.T_map_imu @ result.state.T_imu_lidar
             origin, direction = T[:3, :3].T @ (clicked[0] - T[:3, 3]), T[:3, :3].T @ clicked[1]
             index = nearest_to_ray(result.cloud.points, origin, direction)
-        elif _same(self._marked, (result, sigma, count, view.point_size)):
+        elif same(self._marked, (result, sigma, count, view.point_size), 1):
             return
         self._marked = (result, sigma, count, view.point_size)
         if index is None and self._picked is None:
@@ -147,11 +147,6 @@ class StudyPanel:
         write = {"PLY": study.ply, "PCD": study.pcd}[kind]
         name = f"{snapshot.recording.path.stem}-frame-{snapshot.result.index:06d}.{kind.lower()}"
         client.send_file_download(name, write(snapshot.result), save_immediately=True)
-
-
-def _same(before: tuple[Any, ...], now: tuple[Any, ...]) -> bool:
-    """Whether two states are of the same result, which comes first, and equal in the rest."""
-    return before[0] is now[0] and before[1:] == now[1:]
 
 
 def _scales(drawn: Curve) -> dict[str, Any]:

@@ -17,6 +17,11 @@ def unchanged(before: tuple[object, ...], now: tuple[object, ...]) -> bool:
     return len(before) == len(now) and all(a is b for a, b in zip(before, now, strict=True))
 
 
+def same(before: tuple[object, ...], now: tuple[object, ...], objects: int) -> bool:
+    """Whether the first so many parts are the same objects still, and the others equal."""
+    return unchanged(before[:objects], now[:objects]) and before[objects:] == now[objects:]
+
+
 def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callable[[viser.GuiEvent[Any]], None]:
     """A callback that is called with the new value and the browser, and only when a person changed it.
 

@@ -17,13 +17,13 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from app.__main__ import cli
-from app.evaluation.report import REPORT_FILES
 from app.evaluation.variants import PAPER, choose_variants, parse_variant
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.trajectory import read_tum, write_tum
 from tests.cli.conftest import ROOT, write_walk
 
+REPORT_FILES = ("report.html", "report.md", "results.json", "accuracy.csv", "runtime.csv", "fineness.csv", "ground.csv")
 VARIANT = "coarse:scan.voxel_size=0.8,ground.alpha=30"
 
 
