@@ -161,6 +161,8 @@ def simulate(
     from app.cli.suite import make_suite
     from app.sensors.simulator import SCENES, simulate
 
+    if (scene is not None) if suite is not None else short:
+        raise HemislamError("A SCENE takes --duration, --suite takes --short; give one of SCENE and --suite.")
     if suite is not None:
         make_suite(suite, out, [seed], short=short, every_block=every_block)
         return

@@ -116,11 +116,15 @@ def serve(
     tls = Tls(certificate, key) if certificate else None
     if tls is not None:
         tls.check()
-    start_logging(json_lines=log_json)
     if live is not None and recording is not None:
         raise HemislamError("Give a recording or --live, not both.")
     if live is None and (imu or record):
         raise HemislamError("--imu and --record belong to --live; say with it where scans come from.")
+    if live is not None and (paused or start or duration is not None or truth is not None):
+        raise HemislamError(
+            "--paused, --start, --duration and --truth belong to a recording; leave them out with --live."
+        )
+    start_logging(json_lines=log_json)
     session = read_session(recording) if recording is not None and recording.suffix == SUFFIX else None
     params = session.state.params if session else resolve_for(recording)
     if recording is not None:

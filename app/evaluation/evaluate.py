@@ -110,10 +110,16 @@ def _evaluated(
         recording=subject.recording,
         sha256=sha256,
         columns=tuple(columns),
-        truth="" if truth is None else f"{truth.source}: {truth.kind}, {len(truth)} poses.",
+        truth="" if truth is None else _described(truth),
         notes=notes,
         truth_path=_path(matched.trajectory, columns) if matched else None,
     )
+
+
+def _described(truth: Truth) -> str:
+    """What it is; where a lever arm is taken off, the notes tell it."""
+    point = "" if any(truth.lever) else " of a point taken as the IMU's own (no lever arm)"
+    return f"{truth.source}: {truth.kind}, {len(truth)} poses{point}."
 
 
 def _path(truth: Trajectory, columns: Sequence[Column]) -> F64:

@@ -207,7 +207,9 @@ def add_yaml_buttons(gui: viser.GuiApi, params: Callable[[], Params], send: Call
 def _show_yaml(client: viser.ClientHandle, params: Params) -> None:
     text = params.to_yaml()
     with client.gui.add_modal("Parameters as YAML") as modal:
-        client.gui.add_html(box("Select all and copy, or download; <code>hemislam --config FILE</code> reads it."))
+        client.gui.add_html(
+            box("Select all and copy, or download; <code>--config FILE</code> of hemislam's commands reads it.")
+        )
         client.gui.add_text("yaml", text, multiline=True)
         download = client.gui.add_button("Download", icon=viser.Icon.DOWNLOAD)
         close = client.gui.add_button("Close", color="gray")

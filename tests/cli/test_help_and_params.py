@@ -75,6 +75,20 @@ def test_a_parameter_that_can_not_be_is_refused_by_name(hemislam: Call, argument
     assert says in hemislam("params", *arguments).refused()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["serve", "--live", "rsbpearl://:0,0", "--imu", "imu-udp://:0", "--paused"], "--paused"),
+        (["serve", "--live", "rsbpearl://:0,0", "--imu", "imu-udp://:0", "--truth", "walk.tum"], "--truth"),
+        (["serve", "--record", "walk.mcap"], "belong to --live"),
+        (["simulate", "room", "--short", "--out", "nowhere/room.mcap"], "--suite takes --short"),
+        (["simulate", "room", "--suite", "paper", "--out", "nowhere"], "give one of SCENE and --suite"),
+    ],
+)
+def test_an_option_that_would_be_ignored_is_refused(hemislam: Call, arguments: list[str], says: str) -> None:
+    assert says in hemislam(*arguments).refused()
+
+
 def test_simulate_keeps_a_file_that_is_there_and_names_the_scenes(hemislam: Call, tmp_path: Path) -> None:
     there = tmp_path / "walk.mcap"
     there.write_bytes(b"mine")

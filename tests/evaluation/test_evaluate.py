@@ -95,6 +95,12 @@ def test_the_page_needs_nothing_else(evaluated: Path) -> None:
         assert text in page
 
 
+def test_it_is_said_which_point_the_truth_is_taken_of(evaluated: Path) -> None:
+    assert results(evaluated)["recordings"][0]["truth"].endswith(
+        "poses of a point taken as the IMU's own (no lever arm)."
+    )
+
+
 def test_a_finished_run_is_not_run_again(recording: Path, evaluated: Path) -> None:
     runs = sorted((evaluated / "runs").rglob("run.json"))
     before = {path: path.stat().st_mtime_ns for path in runs}
