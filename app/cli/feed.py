@@ -16,7 +16,10 @@ def feed(
         typer.Option("--to", metavar="URL", help="rsbpearl://HOST:MSOP,DIFOP, or foxglove://HOST:PORT to serve at."),
     ],
     imu_to: Annotated[
-        str | None, typer.Option("--imu-to", metavar="URL", help="imu-udp://HOST:PORT, beside packets.")
+        str | None,
+        typer.Option(
+            "--imu-to", metavar="URL", help="imu-udp://HOST:PORT, beside packets; else port 6700 of their HOST."
+        ),
     ] = None,
     speed: Annotated[float, typer.Option("--speed", metavar="X", help="Times real time; 0: as fast as it goes.")] = 1.0,
     preset: Preset = None,
@@ -41,10 +44,12 @@ def feed(
     from app.sensors.live.feed import feed as play
     from app.sensors.live.urls import parse_address
 
-    if speed < 0:
+    if not speed >= 0:  # nan neither
         raise HemislamError(f"`--speed {speed:g}` is less than nothing; 1 is real time, 0 as fast as it goes.")
     params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
     target, beside = parse_address(to), parse_address(imu_to) if imu_to else None
+    if target.scheme == "foxglove" and beside is not None:
+        raise HemislamError("--imu-to belongs to packets; a Foxglove server sends the IMU's samples too.")
     if target.scheme == "rsbpearl" and beside is None:
         beside = parse_address(f"imu-udp://{target.host}")
         typer.echo(f"IMU samples go to imu-udp://{target.host}:{beside.ports[0]}")

@@ -53,7 +53,7 @@ STRIPS: Final = (
     Strip("took", "frame time", "ms", 1, "#b8c0cc", 20.0, "Of the engine. Red: slower than the sensor."),
     Strip("error", "error", "cm", 1, "#ff5c8d", 5.0, "Distance to the truth, aligned to the walk so far."),
 )  # fmt: skip
-"""In the order shown; loops come between frame time and error."""
+"""In the order shown; the loops' row comes last."""
 
 
 def values(series: dict[str, F64]) -> dict[str, F64]:

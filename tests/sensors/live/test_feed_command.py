@@ -27,6 +27,7 @@ def test_it_plays_packets_to_whoever_listens_or_nobody() -> None:
         (["--to", "http://x"], "is no live source"),
         (["--to", "imu-udp://127.0.0.1:1"], "Play it out to rsbpearl:// or foxglove://"),
         (["--to", "foxglove://127.0.0.1:1", "--speed", "-1"], "less than nothing"),
+        (["--to", "foxglove://127.0.0.1:1", "--imu-to", "imu-udp://127.0.0.1:1"], "belongs to packets"),
     ],
 )
 def test_what_can_not_be_is_refused(arguments: list[str], words: str) -> None:
