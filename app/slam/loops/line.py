@@ -126,10 +126,12 @@ class LoopLine:
         Nothing waits here; the state follows with the next frame or `poll`.
         """
         self._finished = False
+        commanded = False
         for asked in self._asked:
             asked.void = True
             if asked.keyframes is None and not isinstance(asked.request, Finish):
                 self._known.forget_states()  # the user's command changes them all
+                commanded = True
         self._arrived.clear()
         self._count = len(self._keyframes)
         self._due = min(self._known.until(frame - 1 - self._latency), self._count)
@@ -137,6 +139,8 @@ class LoopLine:
             self._in_effect = -1
             self._begin_again()
             return
+        if self._due == 0 and not commanded:
+            self._known.remember(0, self._without_keyframes())
         wanted, states = range(self._due, self._count + 1), self._known.states
         if all(count in states for count in wanted):
             self._in_effect = self._due
@@ -291,6 +295,12 @@ class LoopLine:
         while self._arrived and self._in_effect < self._due:
             self._in_effect, state = self._arrived.popleft()
             self._take(state)
+
+    def _without_keyframes(self) -> LoopState:
+        """What the answer for none would be, so that nobody is asked for it and waited for."""
+        undo, redo = (self.state.undo, self.state.redo) if self.state is not None else ((), ())
+        nothing = np.empty((0, 4, 4))
+        return LoopState(0, len(self._known), False, nothing, (), (), undo, redo, ())
 
     def _take(self, state: LoopState) -> None:
         self.state = state

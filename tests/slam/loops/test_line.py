@@ -197,6 +197,20 @@ def test_a_step_back_waits_for_nobody(walk: Walk) -> None:
     assert walk.client.waits == waits
 
 
+@pytest.mark.parametrize("frame", [0, 1, LATENCY, LATENCY + 1])
+def test_before_the_first_loop_counts_nobody_is_asked_for_it(walk: Walk, frame: int) -> None:
+    """Whoever does the work may still be busy with the end of the walk."""
+    for _ in range(30):
+        walk.client.answered = 10
+        walk.step()
+    walk.line.finish()
+    waits, asked = walk.client.waits, len(walk.client.requests)
+    walk.go_to(frame)
+    assert walk.line.frame.newest[0, 3] == shift_at(frame - 1)
+    assert walk.step()[1] == shift_at(frame)
+    assert (walk.client.waits, len(walk.client.requests)) == (waits, asked)
+
+
 def test_a_command_given_just_before_going_back_is_not_lost(walk: Walk) -> None:
     for _ in range(30):
         walk.step()
