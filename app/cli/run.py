@@ -65,9 +65,10 @@ def run(
       hemislam run walk.mcap --set ground.alpha=30 --start 10 --duration 60 --truth walk.tum
       hemislam run walk.mcap --loops edits.yaml
     """
+    from app.evaluation.truth import read_poses
     from app.server.run import open_run
     from app.slam.results import RunInfo, prepare_folder
-    from app.slam.trajectory import read_tum, time_apart, truth_beside
+    from app.slam.trajectory import time_apart, truth_beside
 
     params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
     overrulings = _read_overrulings(loops) if loops else ()
@@ -75,7 +76,7 @@ def run(
     truth_path = truth or truth_beside(recording)
     work = open_run(recording, truth_path, params, start, duration)
     try:
-        true_poses = read_tum(truth_path) if truth_path else None
+        true_poses = read_poses(truth_path) if truth_path else None
         opened = work.opened
         if truth and true_poses:
             if apart := time_apart(truth, true_poses.stamps_ns, opened.start_ns, opened.duration_s):

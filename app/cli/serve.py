@@ -92,6 +92,7 @@ def serve(
       hemislam serve --live foxglove://robot:8765 --preset rslidar
       hemislam serve walk.mcap --host 0.0.0.0            from other computers, by the printed link
     """
+    from app.evaluation.truth import read_poses
     from app.logs import start_logging
     from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording
@@ -100,7 +101,7 @@ def serve(
     from app.server.protocol import LIVE
     from app.server.setup import Setup
     from app.server.web import Tls, run_server
-    from app.slam.trajectory import read_tum, truth_beside
+    from app.slam.trajectory import truth_beside
     from app.ui.workbench import Workbench
 
     resolve_for = partial(
@@ -131,7 +132,7 @@ def serve(
         opened = session.opened.recording if session else recording
         open_recording(opened, params).close()  # so that a mistake is told here and not in the page
     if truth is not None:
-        read_tum(truth)
+        read_poses(truth)
     elif recording is not None:
         truth = truth_beside(recording)
     with (

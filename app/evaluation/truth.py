@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from app.evaluation import alignment
 from app.slam.errors import HemislamError
 from app.slam.metrics import interpolate, umeyama
-from app.slam.trajectory import Trajectory, time_apart
+from app.slam.trajectory import Trajectory, read_tum, time_apart
 from app.slam.types import F64, I64
 
 JUMP_M, JUMP_M_S, JUMP_TIMES = 1.0, 15.0, 5.0
@@ -81,6 +81,13 @@ def read_truth(text: str, recording: Path | None = None, lever: tuple[float, flo
         truth = replace(truth, lever=lever)
     _check(truth)
     return truth
+
+
+def read_poses(path: Path) -> Trajectory:
+    """Poses of the IMU itself, as TUM, where no other truth is taken. Raises HemislamError as `read_truth`."""
+    poses = read_tum(path)
+    _check(Truth(f"The truth {path}", "TUM", poses.stamps_ns, poses.positions, poses.quaternions))
+    return poses
 
 
 def match(truth: Truth, estimate: Trajectory, offset_s: float | None = None) -> Matched:

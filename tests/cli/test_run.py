@@ -140,10 +140,15 @@ def test_of_a_recording_that_was_cut_short_the_rest_is_used_and_said_to_be_one(
     assert 15 <= json.loads((tmp_path / "out" / "report.json").read_text())["frames"]["processed"] < 39
 
 
-def test_a_truth_of_another_day_or_none_at_all_is_refused(hemislam: Call, walk: Path, tmp_path: Path) -> None:
+def test_a_truth_of_another_day_or_none_at_all_or_whose_frame_jumps_is_refused(
+    hemislam: Call, walk: Path, tmp_path: Path
+) -> None:
     assert "none.tum" in hemislam("run", walk, "--truth", tmp_path / "none.tum", folder=tmp_path).refused()
     truth = read_tum(walk.with_name("walk_truth.tum"))
     write_tum(tmp_path / "late.tum", Trajectory(truth.stamps_ns + 86_400 * 10**9, truth.positions, truth.quaternions))
+    moved = truth.positions + np.where(np.arange(len(truth)) > len(truth) // 2, 40.0, 0.0)[:, None]
+    write_tum(tmp_path / "moved.tum", Trajectory(truth.stamps_ns, moved, truth.quaternions))
+    assert "jumps by 69" in hemislam("run", walk, "--truth", tmp_path / "moved.tum", folder=tmp_path).refused()
     late = hemislam("run", walk, "--truth", tmp_path / "late.tum", folder=tmp_path).refused()
     assert "late.tum" in late
     assert "same clock" in late
