@@ -40,7 +40,11 @@ def replay(
     saved = read_session(session)
     opened, state = saved.opened, saved.state
     first = state.history[0][1] if state.history else state.params
-    work = open_run(opened.recording, opened.truth, first, opened.start_s, opened.duration_s)
+    truth_path = opened.truth
+    if truth_path is not None and not truth_path.exists():  # nothing of the walk follows from it
+        typer.echo(f"The session was compared with {truth_path}, which is gone.")
+        truth_path = None
+    work = open_run(opened.recording, truth_path, first, opened.start_s, opened.duration_s)
     folder = out or free_folder(session)
     try:
         prepare_folder(folder, replace=force)
@@ -53,7 +57,6 @@ def replay(
             raise stop or HemislamError(
                 f"The session {session} ended before its first frame; there is nothing to repeat."
             )
-        truth_path = work.opened.truth
         info = RunInfo(
             recording=opened.recording,
             params=work.engine.params,

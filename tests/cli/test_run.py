@@ -10,6 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from app.__main__ import cli
+from app.sensors.presets import resolve_params
+from app.server.journal import Opened, SavedSession, State, size_of, write_session
 from app.server.run import Run
 from app.slam.errors import HemislamError
 from app.slam.metrics import Trajectory, ate, read_tum, write_tum
@@ -109,6 +111,18 @@ def test_a_file_that_is_no_recording_is_refused_by_name(
     spoil(walk, path)
     assert "spoilt.mcap" in hemislam(command, path, folder=tmp_path).refused()
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_session_is_repeated_though_what_it_was_compared_with_is_gone(
+    hemislam: Call, walk: Path, tmp_path: Path
+) -> None:
+    session = tmp_path / "short.hemislam"
+    opened = Opened(walk, tmp_path / "gone.tum", nbytes=size_of(walk))
+    write_session(session, SavedSession(opened, State(resolve_params(walk, None, None, [])), 5))
+    outcome = hemislam("replay", session, "--out", tmp_path / "out")
+    assert outcome.code == 0, outcome.err
+    assert "gone.tum, which is gone" in outcome.out
+    assert len((tmp_path / "out" / "trajectory.tum").read_text().splitlines()) == 6
 
 
 def test_a_recording_whose_imu_is_silent_is_refused(
