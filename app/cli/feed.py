@@ -48,6 +48,8 @@ def feed(
         raise HemislamError(f"`--speed {speed:g}` is less than nothing; 1 is real time, 0 as fast as it goes.")
     params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
     target, beside = parse_address(to), parse_address(imu_to) if imu_to else None
+    if "clock" in target.options:
+        raise HemislamError(f"`{to}`: the clock is chosen by who receives: serve --live '…?clock=…'.")
     if target.scheme == "foxglove" and beside is not None:
         raise HemislamError("--imu-to belongs to packets; a Foxglove server sends the IMU's samples too.")
     if target.scheme == "rsbpearl" and beside is None:

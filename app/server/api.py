@@ -109,7 +109,10 @@ class CompareBody(BaseModel):
     path: str | None = Field(None, description="A TUM file in the folders given at the start; null: against nothing.")
 
 
-Export = Literal["trajectory.tum", "timings.csv", "map.ply", "report.json", "session.hemislam"]
+Export = Literal[
+    "trajectory.tum", "timings.csv", "map.ply", "report.json", "session.hemislam",
+    "trajectory_odometry.tum", "loops.csv", "graph.g2o",
+]  # fmt: skip
 
 
 def make_router(engine: Engine, folders: Folders) -> APIRouter:
@@ -196,6 +199,8 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
         background.add_task(shutil.rmtree, folder, ignore_errors=True)
         try:
             _save(engine, folder, trajectory_only=name == "trajectory.tum")
+            if not (folder / name).exists():
+                raise HTTPException(404, f"There is no {name}, since loops are not looked for; set loops.enabled.")
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise

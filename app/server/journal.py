@@ -12,9 +12,10 @@ parameters by the frame they came into force at, the overrulings of loops, and t
 
 import json
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from typing import Any
 import yaml
 
 from app import __version__
+from app.server.breakpoints import Breakpoints
 from app.server.protocol import Command, CompareWith, Note
 from app.slam.errors import HemislamError
 from app.slam.loops import edits
@@ -54,7 +56,7 @@ class State:
     """Attributes:
     params: as chosen now. history: from which frame on which were in force, ascending.
     overrulings: of loops, in force. undone: that can be done again, the next one last.
-    notes: in the order in which they were made.
+    notes: in the order in which they were made. breakpoints: where playing pauses. speed: to play at.
     """
 
     params: Params
@@ -62,6 +64,8 @@ class State:
     overrulings: tuple[Overruling, ...] = ()
     undone: tuple[Overruling, ...] = ()
     notes: tuple[Note, ...] = ()
+    breakpoints: Breakpoints = field(default_factory=Breakpoints)
+    speed: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +217,8 @@ def _state_tree(state: State) -> dict[str, Any]:
         "overrulings": yaml.safe_load(edits.write(state.overrulings)),
         "undone": yaml.safe_load(edits.write(state.undone)),
         "notes": [[note.frame, note.text] for note in state.notes],
+        "breakpoints": asdict(state.breakpoints),
+        "speed": "max" if math.isinf(state.speed) else state.speed,
     }
 
 
@@ -223,6 +229,8 @@ def _state(tree: Mapping[str, Any]) -> State:
         overrulings=edits.read(yaml.safe_dump(tree["overrulings"])),
         undone=edits.read(yaml.safe_dump(tree["undone"])),
         notes=tuple(Note(int(frame), str(text)) for frame, text in tree.get("notes", ())),
+        breakpoints=Breakpoints(**tree.get("breakpoints", {})),
+        speed=math.inf if tree.get("speed") == "max" else float(tree.get("speed", 1.0)),
     )
 
 

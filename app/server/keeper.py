@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from app.server.delta import Outbox
-from app.server.journal import Journal, Opened, SavedSession, State, new_path, size_of
-from app.server.protocol import Command, Note
+from app.server.journal import Journal, Opened, State, new_path, size_of
+from app.server.protocol import Command
 from app.server.run import Run
-from app.slam.params import Params
 
 
 class Keeper:
@@ -56,15 +55,3 @@ def opened_of(run: Run) -> Opened:
     """What a session file says of where a run comes from."""
     opened = run.opened
     return Opened(opened.path.resolve(), opened.truth and opened.truth.resolve(), *run.part, size_of(opened.path))
-
-
-def state_of(run: Run, chosen: Params, notes: tuple[Note, ...]) -> State:
-    """All that the present state of a run follows from, with the parameters that are chosen now."""
-    loops = run.engine.loops.state if run.engine.loops is not None else None
-    overrulings, undone = (loops.undo, loops.redo) if loops is not None else ((), ())
-    return State(chosen, run.history, overrulings, undone, notes)
-
-
-def session_of(run: Run, chosen: Params, notes: tuple[Note, ...]) -> SavedSession:
-    """The session as a value, to be saved and opened again."""
-    return SavedSession(opened_of(run), state_of(run, chosen, notes), run.frame)

@@ -6,9 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, assert_never
 
+from app.server.breakpoints import Breakpoints
 from app.server.delta import Outbox
-from app.server.journal import SUFFIX, SavedSession, read_session
-from app.server.keeper import Keeper, session_of, state_of
+from app.server.journal import SUFFIX, SavedSession, State, read_session
+from app.server.keeper import Keeper, opened_of
 from app.server.live import LiveRun
 from app.server.loop_desk import LoopDesk
 from app.server.player import Player
@@ -147,8 +148,7 @@ class Session:
             case Seek(frame):
                 self._player.seek(self._need_run(), frame)
             case SetBreakpoints(breakpoints):
-                self._player.breakpoints = breakpoints
-                self._outbox.put(breakpoints=breakpoints, urgent=True)
+                self._set_breakpoints(breakpoints)
             case AddNote(text):
                 if text.strip():
                     self._show_notes((*self._notes, Note(self._need_run().frame, text.strip())))
@@ -165,7 +165,7 @@ class Session:
                 self._open_soon(path, self._reopen)
             case Save(folder, trajectory_only):
                 run = self._need_run()
-                session = session_of(run, self._params, self._notes)
+                session = SavedSession(opened_of(run), self._state(run), run.frame)
                 self._saver.start(folder, run.saver(folder, session, trajectory_only=trajectory_only))
             case OverruleLoop() | UndoLoop() | RedoLoop() | TryLoop() | InspectLoop():
                 self._desk.handle(command, self._need_loops())
@@ -189,6 +189,10 @@ class Session:
         if run.live:
             raise HemislamError("A live walk can not be compared with a trajectory; record it, and open the recording.")
         self._page.compared(run, run.compare_with(path))
+
+    def _set_breakpoints(self, breakpoints: Breakpoints) -> None:
+        self._player.breakpoints = breakpoints
+        self._outbox.put(breakpoints=breakpoints, urgent=True)
 
     def _show_notes(self, notes: tuple[Note, ...]) -> None:
         self._notes = notes
@@ -266,7 +270,20 @@ class Session:
     def _note(self, *, settled: bool) -> None:
         run = self._player.run
         if run is not None and not self._resuming and self._keeper.keeping:
-            self._keeper.note(run.frame, state_of(run, self._params, self._notes), settled=settled)
+            self._keeper.note(run.frame, self._state(run), settled=settled)
+
+    def _state(self, run: Run) -> State:
+        """All that the present state of the session follows from."""
+        loops = run.engine.loops.state if run.engine.loops is not None else None
+        return State(
+            params=self._params,
+            history=run.history,
+            overrulings=loops.undo if loops is not None else (),
+            undone=loops.redo if loops is not None else (),
+            notes=self._notes,
+            breakpoints=self._player.breakpoints,
+            speed=self._page.transport.speed,
+        )
 
     # --- opening ---------------------------------------------------------------------------------
     def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
@@ -323,6 +340,8 @@ class Session:
         self._base = self._params = state.params
         self._player.halt()
         self._take(run, saved)
+        self._set_breakpoints(state.breakpoints)
+        self._player.set_speed(state.speed)
         if gone:
             self._outbox.notice("warning", f"The session was compared with {opened.truth}, which is gone.")
 

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from app.__main__ import cli
 from app.sensors.presets import resolve_params
+from app.server.breakpoints import Breakpoints
 from app.server.journal import (
     EVERY_S,
     SUFFIX,
@@ -62,6 +63,8 @@ def saved(tmp_path: Path) -> SavedSession:
         (Accept(1, 20, 21), Add(2, 30, None, False, 31)),
         (Reject(3, 9),),
         (Note(12, 'the "door" opens\nand closes'),),
+        Breakpoints(no_ground=True, residual=0.05),
+        math.inf,
     )
     return SavedSession(Opened(recording, None, 2.0, 30.0, 5), state, 41)
 
@@ -261,7 +264,7 @@ def _until(engine: EngineProcess, wanted: Callable[[Snapshot], bool]) -> Snapsho
 
 def test_a_session_file_opens_in_the_page_too(tmp_path: Path) -> None:
     desk = Kept(tmp_path)
-    desk.do(SetSpeed(math.inf), Seek(20), SetParams({"ground.sigma": 0.02}), StepFrame(3))
+    desk.do(SetSpeed(0.5), Seek(20), SetParams({"ground.sigma": 0.02}), StepFrame(3))
     other = Kept(tmp_path)
     there = other.do(OpenRecording(desk.journal))
     assert there.transport.frame == 23 and there.params.ground.sigma == 0.02

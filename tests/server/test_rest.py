@@ -49,6 +49,12 @@ def test_parameters_by_rest(site: Site) -> None:
     assert schema["minimum"] == 1 and schema["maximum"] == 90 and schema["unit"] == "deg"
 
 
+def test_what_to_compare_with_by_rest(site: Site) -> None:
+    answer = httpx.post(site.url("/api/truth"), json={"path": "../secret.tum"})
+    assert answer.status_code == 422 and "There is no" in answer.json()["detail"]
+    assert httpx.post(site.url("/api/truth"), json={"path": None}).status_code == 202
+
+
 def test_exports_by_rest(site: Site) -> None:
     httpx.post(site.url("/api/transport"), json={"action": "seek", "frame": 20})
     eventually(site, frame=20)
@@ -57,6 +63,8 @@ def test_exports_by_rest(site: Site) -> None:
     cloud = httpx.get(site.url("/api/export/map.ply"), timeout=PATIENCE_S).content
     assert f"element vertex {5 * fakes.POINTS:012d}".encode() in cloud
     assert httpx.get(site.url("/api/export/passwd")).status_code == 422
+    without_loops = httpx.get(site.url("/api/export/graph.g2o"), timeout=PATIENCE_S)
+    assert without_loops.status_code == 404 and "loops are not looked for" in without_loops.json()["detail"]
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../../../../etc/passwd", "missing.mcap"])

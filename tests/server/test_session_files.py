@@ -8,6 +8,7 @@ import pytest
 import server_fakes as fakes
 from session_desk import Desk, last_notice
 
+from app.server.breakpoints import Breakpoints
 from app.server.protocol import (
     Command,
     CompareWith,
@@ -16,6 +17,7 @@ from app.server.protocol import (
     Restart,
     Save,
     Seek,
+    SetBreakpoints,
     SetParams,
     SetSpeed,
     StepFrame,
@@ -111,6 +113,18 @@ def test_the_error_to_truth_is_what_remains_after_alignment(tmp_path: Path) -> N
 def test_an_error_of_a_centimetre_is_reported_as_such(tmp_path: Path) -> None:
     snapshot = Desk(truth=truth_file(tmp_path, 60, wobble=0.01)).do(Seek(59))
     assert snapshot.series["error_m"][-1] == pytest.approx(0.01, rel=0.1)
+
+
+def test_a_session_is_reopened_with_its_speed_and_breakpoints(tmp_path: Path) -> None:
+    recording = tmp_path / "walk-60.mcap"
+    recording.write_bytes(b"something to hash")
+    desk = Desk(str(recording), journals=tmp_path / "sessions")
+    chosen = Breakpoints(no_ground=True, error=0.2)
+    snapshot = desk.do(SetBreakpoints(chosen), SetSpeed(math.inf), Seek(30))
+    desk.session.close()
+    again = Desk(str(snapshot.journal)).see()
+    assert (again.breakpoints, again.transport.speed, again.transport.frame) == (chosen, math.inf, 30)
+    assert not again.transport.playing
 
 
 def test_results_are_written_while_replay_goes_on(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ def test_it_plays_packets_to_whoever_listens_or_nobody() -> None:
     [
         (["--to", "http://x"], "is no live source"),
         (["--to", "imu-udp://127.0.0.1:1"], "Play it out to rsbpearl:// or foxglove://"),
+        (["--to", "rsbpearl://127.0.0.1:1,2?clock=host"], "chosen by who receives"),
         (["--to", "foxglove://127.0.0.1:1", "--speed", "-1"], "less than nothing"),
         (["--to", "foxglove://127.0.0.1:1", "--imu-to", "imu-udp://127.0.0.1:1"], "belongs to packets"),
     ],
