@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import math
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +17,7 @@ from app.evaluation.measured import Evaluated, as_json
 from app.evaluation.tables import make_tables
 from app.slam.errors import HemislamError
 from app.slam.provenance import describe_machine
+from app.slam.results import finite
 
 
 def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
@@ -67,8 +67,8 @@ def _results(recordings: Sequence[Evaluated], machine: dict[str, Any], said: lis
             for recording in recordings
         ],
     }
-    finite: dict[str, Any] = _finite(results)
-    return finite
+    valid: dict[str, Any] = finite(results)
+    return valid
 
 
 def _flat(results: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
@@ -106,12 +106,3 @@ def _leaves(entry: Any, path: str = "") -> Iterable[tuple[str, Any]]:
             yield from _leaves(value, f"{path}.{name}" if path else str(name))
     else:
         yield path, entry
-
-
-def _finite(value: Any) -> Any:
-    """The same tree with NaN and infinity as None, which JSON can hold."""
-    if isinstance(value, dict):
-        return {name: _finite(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -215,7 +215,7 @@ def save_results(
             parts["graph.g2o"].write_text(loops.g2o, encoding="utf-8")
             report["loops"] = {verdict.value: loops.count(verdict) for verdict in Verdict}
             if info.truth is not None:
-                report["accuracy_odometry"] = _finite(_accuracy(log.odometry, info))
+                report["accuracy_odometry"] = finite(_accuracy(log.odometry, info))
         parts["report.json"].write_text(json.dumps(report, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
         for name, part in parts.items():
             part.replace(folder / name)
@@ -304,8 +304,8 @@ def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo) -> dict[str,
         "machine": describe_machine(),
         "parameters": info.params.model_dump(mode="json"),
     }
-    finite: dict[str, Any] = _finite(report)
-    return finite
+    valid: dict[str, Any] = finite(report)
+    return valid
 
 
 def _accuracy(trajectory: Trajectory, info: RunInfo) -> dict[str, Any] | None:
@@ -344,10 +344,10 @@ def _timing_summary(log: RunLog) -> dict[str, dict[str, float]]:
     }
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """The same tree with NaN and infinity as None, which JSON can hold."""
     if isinstance(value, dict):
-        return {name: _finite(entry) for name, entry in value.items()}
+        return {name: finite(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
+        return [finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
