@@ -66,7 +66,7 @@ class McapStream:
                     self.complete = True
                     return
                 if isinstance(record, Schema):
-                    types[record.id] = _normalised(record.name)
+                    types[record.id] = ros2_type(record.name)
                 elif isinstance(record, Channel):
                     channels[record.id] = record
                 elif isinstance(record, Message):
@@ -76,7 +76,7 @@ class McapStream:
                         yield channel.topic, kind, record.log_time, channel.message_encoding, record.data
 
 
-def _normalised(name: str) -> str:
+def ros2_type(name: str) -> str:
     """`sensor_msgs/Imu` of ROS 1 as `sensor_msgs/msg/Imu`."""
     package, slash, rest = name.partition("/")
     return f"{package}/msg/{rest}" if slash and not rest.startswith("msg/") else name

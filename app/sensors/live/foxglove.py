@@ -19,6 +19,7 @@ from websockets.typing import Subprotocol
 
 from app.sensors.live.clouds import CloudReader
 from app.sensors.live.intake import Intake
+from app.sensors.mcap_stream import ros2_type
 from app.sensors.pointcloud import stamp_ns
 from app.sensors.probe import TYPES
 from app.slam.errors import HemislamError
@@ -103,7 +104,7 @@ class FoxgloveReceiver:
             operation = said["op"]
             if operation == "advertise":
                 for channel in said["channels"]:
-                    kind = _normalised(str(channel["schemaName"]))
+                    kind = ros2_type(str(channel["schemaName"]))
                     found = Channel(int(channel["id"]), str(channel["topic"]), str(channel["encoding"]), kind)
                     channels[found.id] = found
             elif operation == "unadvertise":
@@ -187,12 +188,6 @@ class FoxgloveReceiver:
         if text != self._told:
             self._told = text
             intake.put_status(kind, "source", text)
-
-
-def _normalised(name: str) -> str:
-    """`sensor_msgs/Imu` of ROS 1 as `sensor_msgs/msg/Imu`."""
-    package, slash, rest = name.partition("/")
-    return f"{package}/msg/{rest}" if slash and not rest.startswith("msg/") else name
 
 
 def _brief(error: BaseException) -> str:
