@@ -36,6 +36,8 @@ def findings(recordings: Sequence[Evaluated]) -> list[str]:
                 missing.setdefault(f"{column.name}: {column.missing}", []).append(recording.name)
             elif column.unmeasured:
                 said.append(f"{recording.name}, {column.name}: the error can not be told. {column.unmeasured}")
+            elif column.accuracy and column.accuracy.doubt:
+                said.append(f"{recording.name}, {column.name}: no rotation error. {column.accuracy.doubt}")
             run = column.run or {}
             if run.get("lost"):
                 said.append(f"{recording.name}, {column.name}: lost in {run['lost']} of {run['frames']} frames.")

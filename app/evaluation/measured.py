@@ -24,13 +24,14 @@ BUDGETS_MS = (50.0, 100.0)
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """Errors against truth; those of rotation are None where the truth has no orientations.
+    """Errors against truth; those of rotation are None where the truth has no orientations or they mean nothing.
 
     Attributes:
         ate_m, ate_deg, rpe[over]["m" | "deg"]: {"rmse", "mean", "max"}. distance_m: true length.
         times_s, errors_m: (n,) the position error of each pose after the alignment.
         aligned: (n, 3) the estimate in the truth's world. poses: compared.
         later_m: RMSE of the positions after START_S, aligned without those before; None if there are too few.
+        doubt: why the ATE of rotation is withheld, in a sentence; "" if it is not.
     """
 
     ate_m: dict[str, float]
@@ -42,6 +43,7 @@ class Accuracy:
     errors_m: F64
     aligned: F64
     later_m: float | None
+    doubt: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +168,7 @@ def _accuracy(estimate: Trajectory, matched: Matched) -> Accuracy:
     aligned = ours.positions @ T[:3, :3].T + T[:3, 3]
     return Accuracy(
         ate_m=asdict(absolute.position),
-        ate_deg=asdict(absolute.rotation) if matched.has_rotation else None,
+        ate_deg=asdict(absolute.rotation) if absolute.rotation and matched.has_rotation else None,
         rpe={
             over: {
                 "pairs": error.pairs,
@@ -183,6 +185,7 @@ def _accuracy(estimate: Trajectory, matched: Matched) -> Accuracy:
         errors_m=np.linalg.norm(aligned - theirs.positions, axis=1),
         aligned=aligned,
         later_m=_later(estimate, truth),
+        doubt=absolute.doubt if matched.has_rotation else "",
     )
 
 
@@ -208,6 +211,7 @@ def as_json(column: Column) -> dict[str, Any]:
         else {
             "ate_m": accuracy.ate_m,
             "ate_deg": accuracy.ate_deg,
+            "ate_deg_withheld": accuracy.doubt or None,
             "ate_after_start_m": accuracy.later_m,
             "ate_ratio": accuracy.ate_m["rmse"] / accuracy.distance_m,
             "rpe": accuracy.rpe,

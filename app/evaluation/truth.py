@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from app.evaluation import alignment
 from app.slam.errors import HemislamError
-from app.slam.metrics import interpolate, umeyama
+from app.slam.metrics import alignment_doubt, interpolate, umeyama
 from app.slam.trajectory import Trajectory, read_tum, time_apart
 from app.slam.types import F64, I64
 
@@ -52,8 +52,8 @@ class Matched:
     """Truth beside an estimate: T_world_imu in the recording's clock.
 
     Attributes:
-        has_rotation: whether orientations are the truth's own; if not they are the estimate's, so
-            that motions can be compared, and rotation errors mean nothing.
+        has_rotation: whether orientations are the truth's own, in known axes; if not they are the
+            estimate's, so that motions can be compared, and rotation errors mean nothing.
         offset_s: what was added to the truth's stamps. notes: what was assumed or estimated.
     """
 
@@ -132,10 +132,11 @@ def match(truth: Truth, estimate: Trajectory, offset_s: float | None = None) -> 
         there = replace(there, positions=there.positions - there.rotations.apply(lever))
         axes = "its body's axes" if truth.quaternions is not None else "the IMU's axes"
         notes.append(f"Its point lies {_vector(lever)} m from the IMU, in {axes}; this lever arm was taken off.")
-    if truth.quaternions is not None:
-        there, note = _common_axes(there, estimate, certainly=truth.own_axes)
+    has_rotation = truth.quaternions is not None
+    if has_rotation:
+        there, has_rotation, note = _common_axes(there, estimate, certainly=truth.own_axes)
         notes += [note] if note else []
-    return Matched(there, truth.quaternions is not None, added_s, tuple(notes))
+    return Matched(there, has_rotation, added_s, tuple(notes))
 
 
 def _check(truth: Truth) -> None:
@@ -184,27 +185,42 @@ def _borrow_rotation(there: Trajectory, estimate: Trajectory) -> Trajectory:
     return replace(there, quaternions=rotations.as_quat())
 
 
-def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) -> tuple[Trajectory, str]:
-    """The truth turned into the IMU's axes by the mean rotation between both, if they are `certainly` others."""
+def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) -> tuple[Trajectory, bool, str]:
+    """The truth turned into the IMU's axes by the mean rotation between both, if they are `certainly` others.
+
+    Also whether its orientations are still its own, and what is to be said of it.
+    """
     theirs, usable = interpolate(there, estimate.stamps_ns)
     if len(theirs) < 3:
-        return there, ""  # the metrics will say so
+        return there, True, ""  # the metrics will say so
     ours = estimate.chosen(usable)
-    R_truth_estimate = Rotation.from_matrix(umeyama(ours.positions, theirs.positions)[:3, :3])
+    T = umeyama(ours.positions, theirs.positions)
+    left = ours.positions @ T[:3, :3].T + T[:3, 3] - theirs.positions
+    if doubt := alignment_doubt(theirs.positions, float(np.sqrt((left**2).sum(axis=1).mean()))):
+        if not certainly:
+            return there, True, ""
+        why = f"Its axes are not the IMU's, and this walk does not tell the rotation between them. {doubt}"
+        return _borrow_rotation(there, estimate), False, why
+    R_truth_estimate = Rotation.from_matrix(T[:3, :3])
     between = theirs.rotations.inv() * R_truth_estimate * ours.rotations
     R_body_imu = between.mean()
     angle = float(np.degrees(R_body_imu.magnitude()))
     spread = float(np.degrees(np.median((R_body_imu.inv() * between).magnitude())))
     if not certainly:
         odd = angle > ODD_AXES_DEG and spread < angle / 3
-        return there, (
-            f"Its orientations differ from ours by a constant {angle:.0f}°; its axes may not be the IMU's, and then"
-            " rotation errors and RPE mean little."
-            if odd
-            else ""
+        return (
+            there,
+            True,
+            (
+                f"Its orientations differ from ours by a constant {angle:.0f}°; its axes may not be the IMU's, and then"
+                " rotation errors and RPE mean little."
+                if odd
+                else ""
+            ),
         )
     return (
         replace(there, quaternions=(there.rotations * R_body_imu).as_quat()),
+        True,
         f"Its axes are not the IMU's: the constant rotation between them ({angle:.1f}°) was estimated as the mean"
         f" over the walk (spread {spread:.2f}°) and taken off, so rotation errors do not hold it.",
     )

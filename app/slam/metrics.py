@@ -18,6 +18,10 @@ __all__ = ["Ate", "Errors", "GroundScore", "Rpe", "Trajectory", "ate", "read_tum
 
 MAX_TRUTH_GAP_S = 1.0
 """Truth is not interpolated between poses farther apart than this."""
+MAX_ALIGNMENT_DEG = 5.0
+"""If the alignment may be turned by more than this, a rotation error after it is told of nothing but the alignment."""
+_FINEST_M = 1e-6
+"""Positions are never taken to be more exact: rounding alone would fix the rotation of a straight line."""
 
 
 # --- association and alignment -------------------------------------------------------------------
@@ -81,6 +85,26 @@ def umeyama(source: F64, target: F64) -> F64:
     return transform
 
 
+def alignment_doubt(truth: F64, rmse: float) -> str:
+    """Why an alignment by positions does not fix the rotation, in a sentence; "" if it does.
+
+    Turning about the main direction of the positions moves them by their distance from that line, of RMS w over both
+    other axes. With errors r = `rmse` / sqrt(3) on each axis the rotation's standard deviation is r / (w sqrt(n)) for n
+    independent errors. Those of a walk drift together over its whole length, so n is taken as one.
+
+    Args:
+        truth: (n, 3) positions, m. rmse: of the estimate's positions after the alignment, m.
+    """
+    spread = np.linalg.svd(truth - truth.mean(axis=0), compute_uv=False) / np.sqrt(len(truth))
+    width = float(np.hypot(spread[1], spread[2]))
+    if max(rmse, _FINEST_M) / np.sqrt(3) <= np.radians(MAX_ALIGNMENT_DEG) * width:
+        return ""
+    return (
+        f"The truth lies within {width:.2g} m (RMS) of one straight line and the position error is {rmse:.2g} m, so"
+        f" positions fix the rotation between the two worlds to no better than {MAX_ALIGNMENT_DEG:g}°; walk a bend."
+    )
+
+
 # --- errors --------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Errors:
@@ -100,15 +124,17 @@ class Ate:
     """Absolute trajectory error after one rigid alignment.
 
     Attributes:
-        position: m. rotation: deg. poses: compared. distance: true path length over them, m.
-        T_truth_estimate: (4, 4), the alignment.
+        position: m. rotation: deg; None if the alignment does not fix it. poses: compared.
+        distance: true path length over them, m. T_truth_estimate: (4, 4), the alignment.
+        doubt: why there is no rotation error, in a sentence; "" if there is.
     """
 
     position: Errors
-    rotation: Errors
+    rotation: Errors | None
     poses: int
     distance: float
     T_truth_estimate: F64
+    doubt: str = ""
 
 
 def ate(estimate: Trajectory, truth: Trajectory) -> Ate:
@@ -121,12 +147,15 @@ def ate(estimate: Trajectory, truth: Trajectory) -> Ate:
     transform = umeyama(ours.positions, theirs.positions)
     aligned = ours.positions @ transform[:3, :3].T + transform[:3, 3]
     turned = theirs.rotations.inv() * Rotation.from_matrix(transform[:3, :3]) * ours.rotations
+    position = Errors.of(np.linalg.norm(aligned - theirs.positions, axis=1))
+    doubt = alignment_doubt(theirs.positions, position.rmse)
     return Ate(
-        position=Errors.of(np.linalg.norm(aligned - theirs.positions, axis=1)),
-        rotation=Errors.of(np.degrees(turned.magnitude())),
+        position=position,
+        rotation=None if doubt else Errors.of(np.degrees(turned.magnitude())),
         poses=len(ours),
         distance=theirs.distance,
         T_truth_estimate=transform,
+        doubt=doubt,
     )
 
 

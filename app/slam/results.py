@@ -255,10 +255,13 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
     if accuracy and "error" in accuracy:
         lines.append(f"error      not measured: {accuracy['error']}")
     elif accuracy:
+        turned = f", {accuracy['ate_deg']['rmse']:.3f}°" if accuracy["ate_deg"] else ""
         lines.append(
-            f"error      ATE {accuracy['ate_m']['rmse']:.4f} m (max {accuracy['ate_m']['max']:.4f}),"
-            f" {accuracy['ate_deg']['rmse']:.3f}° over {accuracy['poses']} poses"
+            f"error      ATE {accuracy['ate_m']['rmse']:.4f} m (max {accuracy['ate_m']['max']:.4f}){turned}"
+            f" over {accuracy['poses']} poses"
         )
+        if accuracy["ate_deg_withheld"]:
+            lines.append(f"           no rotation error: {accuracy['ate_deg_withheld']}")
         if (before := report.get("accuracy_odometry")) and "ate_m" in before:
             lines.append(f"           without loops ATE {before['ate_m']['rmse']:.4f} m")
     lines += [f"memory     {report['peak_memory_mb']:.0f} MB at most", f"saved in   {folder}"]
@@ -322,7 +325,8 @@ def _accuracy(trajectory: Trajectory, info: RunInfo) -> dict[str, Any] | None:
         "poses": absolute.poses,
         "distance_m": absolute.distance,
         "ate_m": asdict(absolute.position),
-        "ate_deg": asdict(absolute.rotation),
+        "ate_deg": asdict(absolute.rotation) if absolute.rotation else None,
+        "ate_deg_withheld": absolute.doubt or None,
         "rpe": {
             over: {"pairs": error.pairs, "m": asdict(error.position), "deg": asdict(error.rotation)} if error else None
             for over, error in relative.items()

@@ -38,7 +38,8 @@ def as_evo(trajectory: Trajectory) -> PoseTrajectory3D:
     )
 
 
-def check_against_evo(estimate: Trajectory, truth: Trajectory) -> None:
+def check_against_evo(estimate: Trajectory, truth: Trajectory) -> bool:
+    """Whether there is a rotation error after the alignment."""
     given_truth = Truth("The truth", "TUM", truth.stamps_ns, truth.positions, truth.quaternions)
     columns, _, problem = measure([Column("ours", trajectory=estimate)], given_truth)
     accuracy = columns[0].accuracy
@@ -49,7 +50,9 @@ def check_against_evo(estimate: Trajectory, truth: Trajectory) -> None:
         by_evo = evo_metrics.APE(relation)
         by_evo.process_data((as_evo(truth), aligned))
         theirs = by_evo.get_all_statistics()
-        assert ours is not None
+        if ours is None:  # not fixed by positions along one line
+            assert relation is ROTATION and "one straight line" in accuracy.doubt
+            continue
         assert [ours[name] for name in ("rmse", "mean", "max")] == pytest.approx(
             [theirs[name] for name in ("rmse", "mean", "max")], abs=EXACT
         )
@@ -69,6 +72,7 @@ def check_against_evo(estimate: Trajectory, truth: Trajectory) -> None:
                 [theirs[kind] for kind in ("rmse", "mean", "max")], abs=EXACT
             )
     assert accuracy.distance_m == pytest.approx(as_evo(truth).path_length, abs=EXACT)
+    return accuracy.ate_deg is not None
 
 
 def test_a_slip_at_the_start_is_told_from_the_errors_after_it() -> None:
@@ -86,10 +90,10 @@ def test_a_slip_at_the_start_is_told_from_the_errors_after_it() -> None:
 @given(seed=st.integers(0, 10_000))
 def test_errors_equal_those_of_evo_on_random_walks(seed: int) -> None:
     truth = walks.wandering(walks.frames(), seed)
-    check_against_evo(drifting(truth, seed + 1), truth)
+    assert check_against_evo(drifting(truth, seed + 1), truth)
 
 
 @pytest.mark.parametrize("name", ["hall_bpearl_truth.tum", "outdoor_bpearl_truth.tum", "garage_hdl32e_reference.tum"])
 def test_errors_equal_those_of_evo_on_real_trajectories(shared_data: Path, name: str) -> None:
     truth = read_tum(shared_data / name)
-    check_against_evo(drifting(truth, 3), truth)
+    assert check_against_evo(drifting(truth, 3), truth) is not name.startswith("garage")  # 4.5 s straight ahead

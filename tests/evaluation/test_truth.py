@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from app.evaluation.alignment import find_offset
-from app.evaluation.truth import check_overlap, match, read_truth
+from app.evaluation.truth import Truth, check_overlap, match, read_truth
 from app.evaluation.truth_files import H2LID_LEVER
 from app.slam.errors import HemislamError
 from app.slam.metrics import Trajectory, ate, rpe, write_tum
@@ -203,6 +203,21 @@ def test_a_truth_in_the_imus_axes_is_left_alone(tmp_path: Path) -> None:
     matched = match(read_truth(str(path)), ESTIMATE)
     assert matched.notes == () and matched.offset_s == 0.0
     assert ate(ESTIMATE, matched.trajectory).position.max < 1e-6
+
+
+def test_axes_that_a_straight_walk_does_not_tell_are_not_guessed() -> None:
+    """Motion is compared nevertheless: guessed axes would bring along a roll about the way of any size."""
+    seconds, rng = walks.frames(20.0), np.random.default_rng(3)
+    walk = walks.wandering(seconds)
+    way = np.column_stack([seconds, 0 * seconds, 0 * seconds])
+    at, true_at = (way + rng.normal(scale=scale, size=way.shape) for scale in (0.003, 0.001))
+    estimate = seen_elsewhere(Trajectory(walk.stamps_ns, at, walk.quaternions))
+    body = (walk.rotations * walks.R_BODY_IMU.inv()).as_quat()
+    matched = match(Truth("The truth", "odometry", walk.stamps_ns, true_at, body, own_axes=True), estimate)
+    assert not matched.has_rotation
+    assert any("does not tell the rotation between them" in note for note in matched.notes)
+    moved = rpe(estimate, matched.trajectory, metres=1)
+    assert moved is not None and moved.position.max < 0.03
 
 
 GOOD = "1700000000.{} {} 0 0 0 0 0 1"

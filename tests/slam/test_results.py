@@ -13,7 +13,7 @@ from app.slam.map_frame import MapFrame
 from app.slam.metrics import Trajectory, read_tum
 from app.slam.params import Params
 from app.slam.ply import VERTEX, write_map
-from app.slam.results import RESULT_FILES, TIMINGS, RunInfo, RunLog, save_results
+from app.slam.results import RESULT_FILES, TIMINGS, RunInfo, RunLog, save_results, summarise
 from app.slam.types import (
     GROUND,
     NON_GROUND,
@@ -180,6 +180,23 @@ def test_the_report_measures_against_truth(tmp_path: Path, recording: Path) -> N
     assert report["accuracy"]["ate_m"]["rmse"] < 1e-9
     assert report["accuracy"]["poses"] == 8
     assert report["accuracy"]["rpe"]["50 m"] is None
+
+
+def test_degrees_that_positions_do_not_fix_are_withheld_with_the_reason(tmp_path: Path, recording: Path) -> None:
+    log = logged(8)
+    ours = log.odometry
+    bent = Trajectory(ours.stamps_ns, ours.positions, ours.quaternions)
+    nearly_straight = Trajectory(ours.stamps_ns, ours.positions * [1.0, 0.001, 1.0], ours.quaternions)
+    told, withheld = (
+        save_results(tmp_path / name, log, [], RunInfo(recording, Params(), truth=truth))
+        for name, truth in (("told", bent), ("withheld", nearly_straight))
+    )
+    assert told["accuracy"]["ate_deg"]["rmse"] < 1e-4 and told["accuracy"]["ate_deg_withheld"] is None
+    assert "0.000° over 8 poses" in summarise(told, tmp_path)
+    assert withheld["accuracy"]["ate_deg"] is None
+    assert withheld["accuracy"]["ate_m"]["rmse"] > 0.1
+    assert "one straight line" in withheld["accuracy"]["ate_deg_withheld"]
+    assert "no rotation error: The truth lies within" in summarise(withheld, tmp_path)
 
 
 def test_a_truth_that_does_not_fit_is_told_in_the_report(tmp_path: Path, recording: Path) -> None:
