@@ -40,11 +40,13 @@ def _table(table: Table) -> str:
         shown = escape(row.group) if row.group != group else ""
         rows.append(f'<tr{first}><th class="group">{shown}</th><th>{escape(row.label)}</th>{cells}</tr>')
         group = row.group
-    note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
-    return (
-        f'<section id="{_anchor(table.title)}"><h2>{escape(table.title)}</h2>{note}<div class="scroll"><table>'
-        f"<thead><tr><th>recording</th><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div></section>"
+    title = f"<h2>{escape(table.title)}</h2>"
+    content = (
+        (f'<p class="note">{escape(table.note)}</p>' if table.note else "") + '<div class="scroll"><table>'
+        f"<thead><tr><th>recording</th><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
     )
+    inner = f"<details><summary>{title}</summary>{content}</details>" if table.folded else title + content
+    return f'<section id="{_anchor(table.title)}">{inner}</section>'
 
 
 def _recording(recording: Evaluated, colours: dict[str, str]) -> str:
@@ -152,6 +154,7 @@ header,section{max-width:1240px;margin:16px auto;padding:20px 28px;background:va
 border-radius:10px}
 h1{margin:0 0 4px;font-size:24px}h2{margin:0 0 8px;font-size:18px}h3{margin:20px 0 8px;font-size:14px}
 header p,.note{color:var(--soft);margin:0 0 12px}.note{font-size:12.5px;padding-left:0}ul.note{list-style:none}
+summary{cursor:pointer}summary h2{display:inline}details[open] summary{margin-bottom:8px}
 .findings ul{margin:0;padding-left:20px}
 nav{display:flex;flex-wrap:wrap;gap:6px 16px}a{color:#2563eb;text-decoration:none}a:hover{text-decoration:underline}
 .scroll{overflow-x:auto}

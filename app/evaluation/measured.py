@@ -45,6 +45,13 @@ class Accuracy:
     later_m: float | None
     doubt: str = ""
 
+    def errors(self) -> dict[tuple[str, str], dict[str, float] | None]:
+        """All of them by ("ATE" | "RPE over ...", "m" | "deg"), each {"rmse", "mean", "max"}."""
+        found: dict[tuple[str, str], dict[str, float] | None] = {("ATE", "m"): self.ate_m, ("ATE", "deg"): self.ate_deg}
+        for over, error in self.rpe.items():
+            found |= {(f"RPE over {over}", unit): error[unit] if error else None for unit in ("m", "deg")}
+        return found
+
 
 @dataclass(frozen=True, slots=True)
 class Column:
@@ -215,8 +222,13 @@ def as_json(column: Column) -> dict[str, Any]:
             "ate_after_start_m": accuracy.later_m,
             "ate_ratio": accuracy.ate_m["rmse"] / accuracy.distance_m,
             "rpe": accuracy.rpe,
+            "ate_ratio_deg_per_m": accuracy.ate_deg["rmse"] / accuracy.distance_m if accuracy.ate_deg else None,
             "rpe_ratio": {
                 over: error["m"]["rmse"] / accuracy.distance_m if error else None
+                for over, error in accuracy.rpe.items()
+            },
+            "rpe_ratio_deg_per_m": {
+                over: error["deg"]["rmse"] / accuracy.distance_m if error and error["deg"] else None
                 for over, error in accuracy.rpe.items()
             },
             "poses": accuracy.poses,

@@ -1,7 +1,7 @@
 """The tables of the report as plain rows; HTML and Markdown only dress them."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -33,12 +33,14 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[Row, ...]
     note: str = ""
+    folded: bool = False
+    """Opened by those who want it, where a page can be folded."""
 
 
 def make_tables(recordings: Sequence[Evaluated]) -> list[Table]:
     """All that have anything to say."""
-    made = [accuracy(recordings), runtime(recordings), stages(recordings), fineness(recordings), ground(recordings)]
-    made.append(beside_paper(recordings))
+    made = [accuracy(recordings), all_errors(recordings), runtime(recordings), stages(recordings)]
+    made += [fineness(recordings), ground(recordings), beside_paper(recordings)]
     return [table for table in made if table is not None]
 
 
@@ -78,6 +80,42 @@ def accuracy(recordings: Sequence[Evaluated]) -> Table | None:
     )
 
 
+def all_errors(recordings: Sequence[Evaluated]) -> Table | None:
+    """Every error of position and of rotation, and each as a ratio to the path length."""
+    names = _names(recordings)
+    rows = []
+    for recording in recordings:
+        errors = [column.accuracy if column else None for column in _by_name(recording, names)]
+        found = [a.errors() if a else {} for a in errors]  # without any there is no row
+        for of in dict.fromkeys(key for entry in found for key in entry):
+            unit, form = ("m", ".4f") if of[1] == "m" else ("°", ".3f")
+            what = f"{of[0]}, {'position' if unit == 'm' else 'rotation'}"
+            spreads = [entry.get(of) for entry in found]
+            ratios = [
+                {kind: value / a.distance_m for kind, value in spread.items()} if a and spread else None
+                for a, spread in zip(errors, spreads, strict=True)
+            ]
+            per_length = f"{what} / path length" + (" (°/m)" if unit == "°" else "")
+            rows.append(_spreads(recording.name, f"{what} ({unit})", spreads, form))
+            if any(ratios):
+                rows.append(_spreads(recording.name, per_length, ratios, ".2e"))
+        if _any(lengths := [a.distance_m if a else None for a in errors]):
+            rows.append(_row(recording.name, "true path length (m)", lengths, ".2f", ranked=False))
+            poses = [float(a.poses) if a else None for a in errors]
+            rows.append(_row(recording.name, "poses compared", poses, ".0f", ranked=False))
+    if not rows:
+        return None
+    return Table(
+        "All errors, RMSE / mean / max",
+        names,
+        tuple(rows),
+        "As the table before. A ratio is the error divided by the true path length of the whole walk; that of position"
+        " has no unit. A dash: the path is too short for a pair so far apart, the truth has no orientations, or"
+        " positions along one line do not fix the rotation. The smallest RMSE of a row is bold.",
+        folded=True,
+    )
+
+
 def runtime(recordings: Sequence[Evaluated]) -> Table | None:
     """As the paper's Table 3."""
     indicators: list[tuple[str, Callable[[dict[str, Any]], float], str, bool]] = [
@@ -85,7 +123,7 @@ def runtime(recordings: Sequence[Evaluated]) -> Table | None:
         ("95 % (ms)", lambda r: r["total"]["p95"], ".2f", True),
         ("max (ms)", lambda r: r["total"]["max"], ".2f", False),
         ("mean (ms)", lambda r: r["total"]["mean"], ".2f", True),
-        ("CPU time, mean (ms)", lambda r: r["cpu"]["mean"], ".2f", True),
+        ("CPU time a frame, mean (ms)", lambda r: r["cpu"]["mean"], ".2f", True),
         ("under 50 ms (%)", lambda r: 100 * r["under_50_ms"], ".1f", False),
         ("under 100 ms (%)", lambda r: 100 * r["under_100_ms"], ".1f", False),
         ("peak memory (MB)", lambda r: r["peak_memory_mb"], ".0f", False),
@@ -109,7 +147,7 @@ def runtime(recordings: Sequence[Evaluated]) -> Table | None:
         f"As the paper's Table 3. All stages of a frame, reading the file not counted, on {_list(threads)} thread(s) a"
         " variant; variants that ran side by side share the machine's memory and caches, so --jobs 1 gives the quietest"
         f" times. The machine's load was up to {load:.1f}: where that is more than its cores, other work made frames"
-        " wait, and CPU time tells more.",
+        " wait, and CPU time tells more. CPU time is measured over whole frames, not by stage.",
     )
 
 
@@ -123,7 +161,8 @@ def stages(recordings: Sequence[Evaluated]) -> Table | None:
                     " / ".join(f"{time[stage][what]:.2f}" for what in ("median", "p95", "max")) for stage in TIMINGS
                 )
                 rows.append(Row(recording.name, column.name, cells))
-    return Table("Stages, median / 95 % / max (ms)", TIMINGS, tuple(rows)) if rows else None
+    note = "Wall time of each stage of a frame; CPU time is measured over whole frames only: see the table before."
+    return Table("Stages, median / 95 % / max (ms)", TIMINGS, tuple(rows), note) if rows else None
 
 
 def fineness(recordings: Sequence[Evaluated]) -> Table | None:
@@ -216,6 +255,16 @@ def _row(group: str, label: str, values: Sequence[float | None], form: str, *, r
         best = tuple(index for index, cell in enumerate(cells) if cell == smallest)
         best = () if len(best) == len(numbers) else best
     return Row(group, label, cells, best)
+
+
+def _spreads(group: str, label: str, spreads: Sequence[dict[str, float] | None], form: str) -> Row:
+    """RMSE, mean and maximum in one cell; ranked by the first."""
+    ranked = _row(group, label, [spread["rmse"] if spread else None for spread in spreads], form)
+    cells = tuple(
+        " / ".join(format(spread[kind], form) for kind in ("rmse", "mean", "max")) if spread else "–"
+        for spread in spreads
+    )
+    return replace(ranked, cells=cells)
 
 
 def _rpe(a: Accuracy, over: str, unit: str = "m") -> float | None:

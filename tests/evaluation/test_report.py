@@ -1,0 +1,116 @@
+"""The report shows every figure that was measured, with its unit, in all of its forms."""
+
+import csv
+import html
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.evaluation.measured import Accuracy, Column, Evaluated
+from app.evaluation.report import write_report
+from app.slam.results import TIMINGS
+
+LENGTH_M = 200.0
+
+
+def spread(rmse: float) -> dict[str, float]:
+    return {"rmse": rmse, "mean": 0.8 * rmse, "max": 3 * rmse}
+
+
+def column(name: str, size: float, *, bent: bool = True) -> Column:
+    """Errors of position and of rotation, all different; the walk is too short for pairs 50 m apart."""
+    rpe: dict[str, dict[str, Any] | None] = {
+        over: {"pairs": 9, "m": spread(size * k), "deg": spread(10 * size * k)}
+        for k, over in ((0.1, "1 frame"), (0.2, "1 m"), (0.5, "10 m"))
+    }
+    accuracy = Accuracy(
+        ate_m=spread(size),
+        ate_deg=spread(20 * size) if bent else None,
+        rpe=rpe | {"50 m": None},
+        poses=100,
+        distance_m=LENGTH_M,
+        times_s=np.arange(2.0),
+        errors_m=np.ones(2),
+        aligned=np.zeros((2, 3)),
+        later_m=size,
+        doubt="" if bent else "It lies on one straight line.",
+    )
+    run = {
+        "peak_memory_mb": 100.0, "threads": 1, "load": 0.5, "ground": None, "parameters": {},
+        "fineness": dict.fromkeys(("entropy", "thickness", "revisit_median", "revisit_p95")),
+    }  # fmt: skip
+    return Column(name, run=run, timings_ms=np.ones((2, len(TIMINGS))), cpu_ms=np.ones(2), accuracy=accuracy)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("report")
+    columns = (column("FAST-LIO", 0.2), column("Ours", 0.1), column("Theirs", 0.4, bent=False))
+    write_report(made, [Evaluated("walk", Path("walk.mcap"), "0" * 64, columns)])
+    return made
+
+
+def rows(page: str, title: str) -> dict[str, list[str]]:
+    """Cells by label, of the table under a heading of report.md."""
+    text = page.split(f"## {title}")[1].split("## ")[0]
+    table = [
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| walk")
+    ]
+    return {cells[1]: cells[2:] for cells in table}
+
+
+def test_every_error_stands_in_the_report_with_its_unit_and_as_a_ratio_to_the_path(folder: Path) -> None:
+    shown = rows((folder / "report.md").read_text(), "All errors, RMSE / mean / max")
+    assert shown["ATE, position (m)"][:2] == ["0.2000 / 0.1600 / 0.6000", "**0.1000 / 0.0800 / 0.3000**"]
+    assert shown["ATE, rotation (°)"][:2] == ["4.000 / 3.200 / 12.000", "**2.000 / 1.600 / 6.000**"]
+    assert shown["ATE, position / path length"][1] == "**5.00e-04 / 4.00e-04 / 1.50e-03**"
+    assert shown["ATE, rotation / path length (°/m)"][1] == "**1.00e-02 / 8.00e-03 / 3.00e-02**"
+    for over, metres, degrees, per_metre in (
+        ("1 frame", "0.0100 / 0.0080 / 0.0300", "0.100 / 0.080 / 0.300", "5.00e-04 / 4.00e-04 / 1.50e-03"),
+        ("1 m", "0.0200 / 0.0160 / 0.0600", "0.200 / 0.160 / 0.600", "1.00e-03 / 8.00e-04 / 3.00e-03"),
+        ("10 m", "0.0500 / 0.0400 / 0.1500", "0.500 / 0.400 / 1.500", "2.50e-03 / 2.00e-03 / 7.50e-03"),
+    ):
+        assert shown[f"RPE over {over}, position (m)"][1] == f"**{metres}**"
+        assert shown[f"RPE over {over}, rotation (°)"][1] == f"**{degrees}**"
+        assert shown[f"RPE over {over}, rotation / path length (°/m)"][1] == f"**{per_metre}**"
+    assert shown["RPE over 50 m, position (m)"] == ["–", "–", "–"]
+    assert shown["true path length (m)"] == ["200.00"] * 3
+    assert len(rows((folder / "report.md").read_text(), "Trajectory accuracy")) < len(shown)
+
+
+def test_the_page_folds_the_same_table(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    (folded,) = re.findall(r"<details>.*?</details>", page, re.DOTALL)
+    text = html.unescape(re.sub(r"<[^>]*>", "\n", folded))
+    for label, cells in rows((folder / "report.md").read_text(), "All errors, RMSE / mean / max").items():
+        assert label in text
+        assert all(cell.strip("*") in text for cell in cells)
+
+
+def test_a_rotation_error_that_means_nothing_is_a_dash_with_its_reason(folder: Path) -> None:
+    page = (folder / "report.md").read_text()
+    assert rows(page, "All errors, RMSE / mean / max")["ATE, rotation (°)"][2] == "–"
+    assert "- walk, Theirs: no rotation error. It lies on one straight line." in page
+
+
+def test_the_same_ratios_are_in_the_files_for_machines(folder: Path) -> None:
+    found = json.loads((folder / "results.json").read_text())["recordings"][0]["variants"]
+    ours, theirs = found[1]["accuracy"], found[2]["accuracy"]
+    assert ours["rpe_ratio_deg_per_m"]["10 m"] == pytest.approx(0.5 / LENGTH_M)
+    assert ours["ate_ratio_deg_per_m"] == pytest.approx(2.0 / LENGTH_M)
+    assert (theirs["ate_ratio_deg_per_m"], theirs["ate_deg_withheld"]) == (None, "It lies on one straight line.")
+    with (folder / "accuracy.csv").open(newline="") as file:
+        line = list(csv.DictReader(file))[1]
+    assert float(line["rpe.10 m.deg.max"]) == pytest.approx(1.5)
+    assert float(line["rpe_ratio_deg_per_m.10 m"]) == pytest.approx(0.5 / LENGTH_M)
+
+
+def test_it_is_said_that_cpu_time_is_of_whole_frames(folder: Path) -> None:
+    page = (folder / "report.md").read_text()
+    assert rows(page, "Run time per frame")["CPU time a frame, mean (ms)"] == ["1.00"] * 3
+    assert "CPU time is measured over whole frames" in page.split("## Run time per frame")[1].split("## ")[0]
+    assert "CPU time is measured over whole frames" in page.split("## Stages")[1].split("## ")[0]
