@@ -44,9 +44,9 @@ HELP: Final = (
     + box(
         "<b>Fork here</b> under <b>A/B</b> on the left goes on from this frame twice: A (pink) as it is, and B "
         "(blue) with what you then set under Tune, where <b>act on</b> says whose parameters you see. B goes where A "
-        "goes, and pauses where A does; the scan tells who calls a point ground. <b>Swap</b> shows B whole; <b>keep</b> "
-        "leaves a session file that can be opened again. B is a second engine: it doubles memory and work, and first "
-        "has to come to this frame by itself."
+        "goes, and pauses where A does; the scan tells who calls a point ground. <b>Swap</b> shows B whole; "
+        "<b>keep</b> leaves a session file that can be opened again. B is a second engine: it doubles memory and "
+        "work, and first has to come to this frame by itself."
     )
     + heading("Live")
     + box(
