@@ -116,7 +116,8 @@ if __name__ == "__main__":
         time.sleep(0.01)
     try:
         print(engine.pid, flush=True)
-        time.sleep(60)
+        for _ in range(600):
+            time.sleep(0.1)  # of one long sleep a signal that another thread was given would not wake it
     except KeyboardInterrupt:
         engine.close()
         print("closed", engine.snapshot.engine_alive, flush=True)
