@@ -16,6 +16,7 @@ from app.server.edges import EdgesChange, EdgesReceiver, EdgesSender
 from app.server.protocol import SERIES, Chunk, LoopsView, Notice, Snapshot
 from app.server.setup import POINT_BUDGET
 from app.slam.params import Params
+from app.slam.rows import table
 from app.slam.types import F64
 
 NOTICES_KEPT = 50
@@ -160,45 +161,6 @@ class Outbox:
         return delta
 
 
-class Rows:
-    """A table that grows at its end. Views handed out are read-only and never change.
-
-    Capacity doubles, so that n rows cost O(n) copies in all; columns are contiguous.
-    """
-
-    def __init__(self, width: int) -> None:
-        self._table = np.empty((256, width), order="F")
-        self._length = 0
-
-    def extend(self, rows: F64) -> None:
-        needed = self._length + len(rows)
-        if needed > len(self._table):
-            larger = np.empty((max(needed, 2 * len(self._table)), self._table.shape[1]), order="F")
-            larger[: self._length] = self._table[: self._length]
-            self._table = larger
-        self._table[self._length : needed] = rows
-        self._length = needed
-
-    def __len__(self) -> int:
-        return self._length
-
-    def go_to(self, length: int) -> None:
-        """Go back to so many rows, or forth again to as many as there were. Views handed out may then change."""
-        self._length = min(length, len(self._table))
-
-    def rewound(self, length: int) -> "Rows":
-        """Another table, of the first `length` rows: views handed out of this one stay as they are."""
-        rows = Rows(self._table.shape[1])
-        rows.extend(self._table[: min(length, self._length)])
-        return rows
-
-    def view(self) -> F64:
-        """(n, width), read-only."""
-        view = self._table[: self._length]
-        view.setflags(write=False)
-        return view
-
-
 class Fold:
     """Lays deltas over a snapshot, in their order. One thread writes; anybody may read `snapshot`.
 
@@ -209,14 +171,14 @@ class Fold:
     def __init__(self, snapshot: Snapshot | None = None, point_budget: int = POINT_BUDGET) -> None:
         self.snapshot = snapshot or Snapshot()
         self._point_budget = point_budget
-        self._positions, self._series = Rows(3), Rows(len(SERIES))
+        self._positions, self._series = table(3), table(len(SERIES))
         self._chunks: tuple[Chunk, ...] = ()  # also those that were gone back over
         self._edges = EdgesReceiver()
 
     def apply(self, delta: Delta) -> Snapshot:
         before, delta = self.snapshot, read_only(delta)
         if delta.session != before.session:
-            self._positions, self._series, self._chunks = Rows(3), Rows(len(SERIES)), ()
+            self._positions, self._series, self._chunks = table(3), table(len(SERIES)), ()
         if delta.kept is not None:
             self._positions, self._series = self._positions.rewound(delta.kept), self._series.rewound(delta.kept)
         if delta.moved is not None:

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from app.server.chunks import thinned
-from app.server.delta import Outbox, Rows
+from app.server.delta import Outbox
 from app.server.live import LiveRun
 from app.server.protocol import SERIES, Saved, Transport
 from app.server.run import Run
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
+from app.slam.rows import table
 from app.slam.types import F64, Keyframe, StepResult
 
 REPEAT_AFTER_S = 10.0
@@ -40,8 +41,8 @@ class Publisher:
 
     def _begin_history(self) -> None:
         """Of all frames that are known, also those that the page was taken back over."""
-        self._rows, self._odometry = Rows(len(SERIES)), Rows(16)  # the latter: T_odom_imu of keyframes
-        self._positions, self._frame = Rows(3), MapFrame()  # as the page has them
+        self._rows, self._odometry = table(len(SERIES)), table(16)  # the latter: T_odom_imu of keyframes
+        self._positions, self._frame = table(3), MapFrame()  # as the page has them
         self._poses_changed = True
 
     def opened(self, run: Run) -> None:

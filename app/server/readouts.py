@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.server.delta import Rows
 from app.server.protocol import SERIES
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.metrics import MAX_TRUTH_GAP_S, umeyama
+from app.slam.rows import table
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64, I64, StepResult
 
@@ -37,7 +37,7 @@ class Readouts:
         self._truth = truth
         self._walked = 0.0
         self._last: F64 | None = None
-        self._theirs, self._ours = Rows(3), Rows(3)  # row by frame; theirs is nan where there is no truth
+        self._theirs, self._ours = table(3), table(3)  # row by frame; theirs is nan where there is no truth
         self.T_map_truth: F64 | None = None
         self.error = float("nan")
 
@@ -63,7 +63,7 @@ class Readouts:
             (n,) m, distance of every known frame to it; nan where there is none.
         """
         self._truth = truth
-        self._theirs, self._ours = Rows(3), Rows(3)
+        self._theirs, self._ours = table(3), table(3)
         self.T_map_truth, self.error = None, float("nan")
         if truth is None:
             return np.full(len(walk), np.nan)

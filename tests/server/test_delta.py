@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.server.chunks import one_per_voxel
-from app.server.delta import Fold, Outbox, Rows
+from app.server.delta import Fold, Outbox
 from app.server.protocol import (
     SERIES,
     Command,
@@ -26,6 +26,7 @@ from app.server.protocol import (
 )
 from app.server.session import Session
 from app.slam.params import Params
+from app.slam.rows import table
 
 COMMANDS: list[Command] = [
     Play(),
@@ -99,7 +100,7 @@ def test_nothing_is_kept_for_a_reader_that_has_it() -> None:
 
 @given(st.lists(st.integers(0, 400), max_size=8))
 def test_views_of_a_growing_table_stay_as_they_were(lengths: list[int]) -> None:
-    rows, views, expected = Rows(2), [], np.zeros((0, 2))
+    rows, views, expected = table(2), [], np.zeros((0, 2))
     for number, length in enumerate(lengths):
         block = np.full((length, 2), float(number))
         rows.extend(block)

@@ -14,11 +14,11 @@ from scipy.spatial import KDTree
 from app.slam import lie
 from app.slam.loops import scan_context, verification
 from app.slam.loops.drift import Expectation
-from app.slam.loops.rows import Rows
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.submap import Recent, Submap, Submaps
 from app.slam.loops.verification import Fit, Prepared
 from app.slam.params import Loops
+from app.slam.rows import Rows
 from app.slam.types import F64, I64, Keyframe
 
 NEAR_M = 3.0
@@ -84,7 +84,7 @@ class Detector:
     @property
     def poses(self) -> F64:
         """(k, 4, 4) T_odom_imu."""
-        return self._poses.array
+        return self._poses.view()
 
     def take(self, keyframe: Keyframe) -> None:
         """Store the cloud of a keyframe that was never there before; `stand` goes to it."""
@@ -139,7 +139,7 @@ class Detector:
         if not len(candidates):
             return []
         context = self._contexts[newer]
-        keys = self._keys.array[candidates]
+        keys = self._keys.view()[candidates]
         ranks = np.arange(1, min(p.candidates, len(keys)) + 1)
         _, nearest = KDTree(keys).query(context.ring_key, k=ranks)  # type: ignore[no-untyped-call]  # no types
         sightings = [self._compare(int(older), newer, expectation, p) for older in candidates[nearest]]
@@ -170,7 +170,7 @@ class Detector:
     def _eligible(self, newer: int, expectation: Expectation, params: Loops) -> I64:
         """Keyframes left long enough ago, as near as drift may have brought them."""
         old = np.flatnonzero(
-            self._stamps.array[: self.described] <= self._heads[newer].stamp_ns - round(params.min_time * 1e9)
+            self._stamps.view()[: self.described] <= self._heads[newer].stamp_ns - round(params.min_time * 1e9)
         )
         away = np.linalg.norm(expectation.poses[old, :3, 3] - expectation.poses[newer, :3, 3], axis=1)
         reach = params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M

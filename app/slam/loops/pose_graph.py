@@ -16,8 +16,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from app.slam.loops.rows import Rows
 from app.slam.loops.types import HUBER
+from app.slam.rows import Rows
 from app.slam.types import F64
 
 RELINEARISE = 0.05
@@ -191,8 +191,11 @@ class _All:
 
     def poses(self) -> F64:
         if self._poses is None:
-            self._poses = Rows((4, 4), np.float64, [*_matrices(self._isam.calculateEstimate()), *self._ahead])
-        return self._poses.array
+            self._poses = Rows((4, 4), np.float64)
+            self._poses.extend(_matrices(self._isam.calculateEstimate()))
+            for pose in self._ahead:
+                self._poses.append(pose)
+        return self._poses.view()
 
 
 class _Window:
