@@ -1,165 +1,32 @@
 """When what was found takes effect: at a frame that depends on nothing but the walk."""
 
-from collections import deque
 from collections.abc import Iterator
-from dataclasses import replace
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.slam.keyframes import KeyframeStore
-from app.slam.loops.line import MOST_DEATHS, LoopLine
+from app.slam.loops.line import MOST_DEATHS
 from app.slam.loops.messages import (
     AddKeyframe,
-    AskG2o,
     Failure,
-    Finish,
-    G2o,
-    GoTo,
-    LoadCommands,
-    LoopState,
-    LoopWorkerDied,
     Overrule,
-    Reply,
-    Request,
     Undo,
 )
-from app.slam.loops.types import Accept, Command, Evidence, LoopEdge, Verdict
+from app.slam.loops.types import Accept, Command
 from app.slam.params import Loops
-from app.slam.types import Cloud, Keyframe
-
-LOOPS = Loops()
-LATENCY = 5
-EVERY = 3  # frames between keyframes
-
-
-class Client:
-    """Finds with every keyframe a loop that shifts the map by as many metres as there are keyframes.
-
-    Answers once `answered` is raised, or at once when somebody waits for it.
-    """
-
-    def __init__(self) -> None:
-        self.requests: list[Request] = []
-        self.added: list[int] = []
-        self.params: list[Loops] = []
-        self.count = self.known = 0
-        self.answered = 0
-        self.waits = 0
-        self.dead = False
-        self._pending: deque[Reply] = deque()
-        self._commands: tuple[Command, ...] = ()
-
-    @property
-    def pending(self) -> int:
-        return len(self._pending)
-
-    def send(self, request: Request) -> None:
-        self.requests.append(request)
-        match request:
-            case AddKeyframe(keyframe, params):
-                assert keyframe.index == self.count, "keyframes come in their order"
-                self.count += 1
-                self.known = max(self.known, self.count)
-                self.added.append(keyframe.index)
-                self.params.append(params)
-            case GoTo(count, _):
-                assert count <= self.known
-                self.count = count
-            case Overrule(command):
-                self._commands = (*self._commands, command)
-            case LoadCommands(commands, _):
-                self._commands = commands
-            case AskG2o():
-                self._pending.append(G2o(f"graph of {self.count}"))
-                return
-        self._pending.append(replace(state(self.count, self._commands), finished=isinstance(request, Finish)))
-
-    def receive(self, timeout: float | None = None) -> Reply | None:
-        if self.dead:
-            raise LoopWorkerDied("It is gone.")
-        if not self._pending:
-            return None
-        if timeout is None:
-            self.waits += 1
-        elif not self.answered:
-            return None
-        else:
-            self.answered -= 1
-        return self._pending.popleft()
-
-    def close(self) -> None:
-        pass
-
-
-def state(count: int, commands: tuple[Command, ...] = ()) -> LoopState:
-    shifted = np.tile(np.eye(4), (count, 1, 1))
-    shifted[:, 0, 3] = count
-    found = (edge(count - 1),) if count else ()
-    return LoopState(count, count, False, shifted, found, found, commands, (), ())
-
-
-def edge(newer: int) -> LoopEdge:
-    return LoopEdge(0, newer, newer, np.eye(4), np.eye(6), Verdict.ACCEPTED, "it fits", Evidence())
-
-
-class Walk:
-    """Every third frame is a keyframe; the first is frame 0."""
-
-    def __init__(self) -> None:
-        self.store = KeyframeStore()
-        self.clients: list[Client] = []
-        self.line = LoopLine(self._client, self.store, Loops(latency=LATENCY))
-        self.frame = 0
-
-    def _client(self) -> Client:
-        self.clients.append(Client())
-        return self.clients[-1]
-
-    @property
-    def client(self) -> Client:
-        return self.clients[-1]
-
-    def step(self, params: Loops = LOOPS) -> tuple[tuple[LoopEdge, ...], float]:
-        """The next frame: loops that came into effect, and the map's shift."""
-        news = self.line.due(self.frame)
-        if self.frame % EVERY == 0:
-            keyframe = a_keyframe(len(self.store), self.frame)
-            self.store.append(keyframe)
-            self.line.add(keyframe, params)
-        self.frame += 1
-        return news, float(self.line.frame.newest[0, 3])
-
-    def go_to(self, frame: int) -> None:
-        self.frame = frame
-        self.store.truncate(-(-frame // EVERY))
-        self.line.go_to(frame)
-
-
-def a_keyframe(index: int, frame: int) -> Keyframe:
-    none = Cloud(*(np.zeros(shape, dtype) for shape, dtype in CLOUD))
-    return Keyframe(index, frame, 100 * frame, np.eye(4), np.eye(4), np.eye(6), none)
-
-
-CLOUD = (((0, 3), np.float32), (0, np.uint8), (0, np.float32), (0, np.uint16), (0, np.int32))
+from tests.slam.loops.held_walk import EVERY, LATENCY, HeldWalk, shift_at
 
 
 @pytest.fixture
-def walk() -> Iterator[Walk]:
-    walk = Walk()
+def walk() -> Iterator[HeldWalk]:
+    walk = HeldWalk()
     yield walk
     walk.store.close()
 
 
-def shift_at(frame: int) -> int:
-    """Keyframes that are `LATENCY` frames past at a frame."""
-    return 0 if frame < LATENCY else (frame - LATENCY) // EVERY + 1
-
-
 @pytest.mark.parametrize("speed", [0, 1, 100])
-def test_a_loop_takes_effect_at_its_frame_however_fast_the_work_is(walk: Walk, speed: int) -> None:
+def test_a_loop_takes_effect_at_its_frame_however_fast_the_work_is(walk: HeldWalk, speed: int) -> None:
     for frame in range(40):
         walk.client.answered = speed
         news, shift = walk.step()
@@ -168,7 +35,7 @@ def test_a_loop_takes_effect_at_its_frame_however_fast_the_work_is(walk: Walk, s
     assert bool(walk.client.waits) == (speed == 0)
 
 
-def test_nobody_waits_for_work_that_is_done_in_time(walk: Walk) -> None:
+def test_nobody_waits_for_work_that_is_done_in_time(walk: HeldWalk) -> None:
     for _ in range(30):
         walk.client.answered = 1
         walk.step()
@@ -176,7 +43,7 @@ def test_nobody_waits_for_work_that_is_done_in_time(walk: Walk) -> None:
 
 
 @pytest.mark.parametrize("frame", [1, 7, 20, 28])
-def test_gone_back_and_on_again_every_frame_is_as_it_was(walk: Walk, frame: int) -> None:
+def test_gone_back_and_on_again_every_frame_is_as_it_was(walk: HeldWalk, frame: int) -> None:
     before = [walk.step() for _ in range(30)]
     sent = len(walk.client.added)
     walk.go_to(frame)
@@ -185,7 +52,7 @@ def test_gone_back_and_on_again_every_frame_is_as_it_was(walk: Walk, frame: int)
     assert len(walk.client.added) == sent, "what is known is not handed over twice"
 
 
-def test_a_step_back_waits_for_nobody(walk: Walk) -> None:
+def test_a_step_back_waits_for_nobody(walk: HeldWalk) -> None:
     walk.client.answered = 100
     shifts = [walk.step()[1] for _ in range(30)]
     walk.line.poll()
@@ -198,7 +65,7 @@ def test_a_step_back_waits_for_nobody(walk: Walk) -> None:
 
 
 @pytest.mark.parametrize("frame", [0, 1, LATENCY, LATENCY + 1])
-def test_before_the_first_loop_counts_nobody_is_asked_for_it(walk: Walk, frame: int) -> None:
+def test_before_the_first_loop_counts_nobody_is_asked_for_it(walk: HeldWalk, frame: int) -> None:
     """Whoever does the work may still be busy with the end of the walk."""
     for _ in range(30):
         walk.client.answered = 10
@@ -211,7 +78,7 @@ def test_before_the_first_loop_counts_nobody_is_asked_for_it(walk: Walk, frame: 
     assert (walk.client.waits, len(walk.client.requests)) == (waits, asked)
 
 
-def test_a_command_given_just_before_going_back_is_not_lost(walk: Walk) -> None:
+def test_a_command_given_just_before_going_back_is_not_lost(walk: HeldWalk) -> None:
     for _ in range(30):
         walk.step()
     walk.line.command(Overrule(Accept(0, 2)))
@@ -221,7 +88,7 @@ def test_a_command_given_just_before_going_back_is_not_lost(walk: Walk) -> None:
     assert walk.line.frame.newest[0, 3] == shift_at(20)
 
 
-def test_a_walk_that_goes_on_differently_hands_its_keyframes_over_anew(walk: Walk) -> None:
+def test_a_walk_that_goes_on_differently_hands_its_keyframes_over_anew(walk: HeldWalk) -> None:
     for _ in range(30):
         walk.step()
     walk.go_to(10)
@@ -232,7 +99,7 @@ def test_a_walk_that_goes_on_differently_hands_its_keyframes_over_anew(walk: Wal
     assert walk.client.added == [4, 5, 6]
 
 
-def test_a_command_takes_effect_when_it_is_answered_and_holds(walk: Walk) -> None:
+def test_a_command_takes_effect_when_it_is_answered_and_holds(walk: HeldWalk) -> None:
     for _ in range(10):
         walk.step()
     walk.line.command(Overrule(Accept(0, 2)))
@@ -246,7 +113,7 @@ def test_a_command_takes_effect_when_it_is_answered_and_holds(walk: Walk) -> Non
     assert walk.line.state.undo == (Accept(0, 2),)
 
 
-def test_work_that_died_is_begun_again_with_all_keyframes_and_commands(walk: Walk) -> None:
+def test_work_that_died_is_begun_again_with_all_keyframes_and_commands(walk: HeldWalk) -> None:
     for _ in range(20):
         walk.step()
     walk.line.command(Overrule(Accept(0, 2)))
@@ -264,7 +131,7 @@ def test_work_that_died_is_begun_again_with_all_keyframes_and_commands(walk: Wal
     assert any("started again" in alarm for alarm in walk.line.take_alarms())
 
 
-def test_work_that_keeps_dying_is_given_up_and_frames_go_on(walk: Walk) -> None:
+def test_work_that_keeps_dying_is_given_up_and_frames_go_on(walk: HeldWalk) -> None:
     for _ in range(60):
         walk.client.dead = True
         walk.step()
@@ -275,7 +142,7 @@ def test_work_that_keeps_dying_is_given_up_and_frames_go_on(walk: Walk) -> None:
 
 
 @pytest.mark.parametrize("death", range(1, 40, 4))
-def test_whenever_the_work_dies_the_end_is_the_same_and_what_came_into_effect_stays(walk: Walk, death: int) -> None:
+def test_whenever_the_work_dies_the_end_is_the_same_and_what_came_into_effect_stays(walk: HeldWalk, death: int) -> None:
     shifts = []
     for frame in range(40):
         if frame == death:
@@ -293,7 +160,7 @@ def test_whenever_the_work_dies_the_end_is_the_same_and_what_came_into_effect_st
 
 
 @pytest.mark.parametrize("moment", ["before the end", "at the end", "after it"])
-def test_work_that_dies_at_the_end_of_the_walk_is_done_again(walk: Walk, moment: str) -> None:
+def test_work_that_dies_at_the_end_of_the_walk_is_done_again(walk: HeldWalk, moment: str) -> None:
     for _ in range(20):
         walk.step()
     walk.client.dead = moment == "before the end"
@@ -308,7 +175,7 @@ def test_work_that_dies_at_the_end_of_the_walk_is_done_again(walk: Walk, moment:
     assert results.g2o == "graph of 7"
 
 
-def test_what_the_user_asked_is_answered_by_whoever_comes_after_a_death(walk: Walk) -> None:
+def test_what_the_user_asked_is_answered_by_whoever_comes_after_a_death(walk: HeldWalk) -> None:
     for _ in range(20):
         walk.step()
     walk.line.command(Overrule(Accept(0, 2)))  # not answered yet
@@ -325,7 +192,7 @@ def test_what_the_user_asked_is_answered_by_whoever_comes_after_a_death(walk: Wa
     assert walk.line.frame.newest[0, 3] == 7, "a command acts on all there is"
 
 
-def test_keyframes_handed_over_again_are_looked_at_with_the_parameters_of_then(walk: Walk) -> None:
+def test_keyframes_handed_over_again_are_looked_at_with_the_parameters_of_then(walk: HeldWalk) -> None:
     given = [Loops(min_time=10.0 + k) for k in range(10)]
     for frame in range(30):
         walk.step(given[frame // EVERY])
@@ -335,7 +202,7 @@ def test_keyframes_handed_over_again_are_looked_at_with_the_parameters_of_then(w
     assert walk.client.params == given
 
 
-def test_going_back_while_keyframes_are_handed_over_again(walk: Walk) -> None:
+def test_going_back_while_keyframes_are_handed_over_again(walk: HeldWalk) -> None:
     for _ in range(40):
         walk.step()
     walk.client.dead = True
@@ -353,7 +220,7 @@ def test_going_back_while_keyframes_are_handed_over_again(walk: Walk) -> None:
     assert walk.line.take_notices() == []
 
 
-def test_work_given_up_answers_that_at_once_and_nobody_waits_for_it(walk: Walk) -> None:
+def test_work_given_up_answers_that_at_once_and_nobody_waits_for_it(walk: HeldWalk) -> None:
     for _ in range(10):
         walk.step()
     walk.line.command(Undo())
@@ -375,7 +242,7 @@ ACTIONS = st.lists(
 @settings(max_examples=150, deadline=None)
 @given(ACTIONS)
 def test_whatever_happens_the_end_is_that_of_the_walk_and_no_command_is_lost(actions: list[str]) -> None:
-    walk, commands = Walk(), list[Command]()
+    walk, commands = HeldWalk(), list[Command]()
     for number, action in enumerate(actions):
         match action:
             case "step":
