@@ -104,20 +104,20 @@ def test_opening_another_recording_revives_a_dead_engine(engine: EngineProcess) 
 
 
 PARENT = """
-import sys, time
+import signal, sys, time
 sys.path[:0] = {path!r}
 import server_fakes as fakes
 from pathlib import Path
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job is started to ignore it
     engine = EngineProcess(Setup(recording=Path("walk-300.mcap")), main=fakes.fake_main)
     while engine.snapshot.transport.frame < 0:
         time.sleep(0.01)
     try:
         print(engine.pid, flush=True)
-        for _ in range(600):
-            time.sleep(0.1)  # of one long sleep a signal that another thread was given would not wake it
+        time.sleep(60)
     except KeyboardInterrupt:
         engine.close()
         print("closed", engine.snapshot.engine_alive, flush=True)
