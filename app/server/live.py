@@ -25,8 +25,8 @@ POLL_S = 0.02
 """How long to wait for the next scan before looking for commands."""
 
 
-EVERY = 30
-"""Frames between two checkpoints, some 12 MB on disk each; what came since is given again (`LiveClient.place`)."""
+EVERY = 10
+"""Frames between two checkpoints; the receiving process can give six seconds of scans again."""
 KEYFRAMES, CHECKPOINT, ROWS = "keyframes", "checkpoint", "rows"
 
 log = logging.getLogger(__name__)

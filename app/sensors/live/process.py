@@ -33,7 +33,7 @@ from app.slam.types import DroppedScan, Measurement
 log = logging.getLogger(__name__)
 
 HISTORY = 60
-"""Scans that can be had again: six seconds, and an engine's checkpoints are three apart."""
+"""Scans that can be had again: six seconds, and an engine's checkpoints are one apart."""
 MOST_GIVEN = 100_000
 """The same with those that were let go, of which nothing is kept but their time."""
 LOST = "it was lost with the engine that had it"
