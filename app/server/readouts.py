@@ -50,6 +50,7 @@ class Readouts:
         if self._truth is not None:
             self._theirs.go_to(frames)
             self._ours.go_to(frames)
+            self.T_map_truth = None
             self._align()
 
     def compare(self, truth: Trajectory | None, walk: Trajectory, frames: int) -> F64:

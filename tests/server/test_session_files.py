@@ -101,7 +101,9 @@ def truth_file(folder: Path, frames: int, wobble: float = 0.0) -> Path:
 
 
 def test_the_error_to_truth_is_what_remains_after_alignment(tmp_path: Path) -> None:
-    snapshot = Desk(truth=truth_file(tmp_path, 60)).do(Seek(59))
+    desk = Desk(truth=truth_file(tmp_path, 60))
+    snapshot = desk.do(Seek(59))
+    assert desk.do(Seek(0)).T_map_truth is None, "as it was before the walk had begun"
     assert np.isnan(snapshot.series["error_m"][:3]).all(), "nothing to align before the walk has begun"
     assert snapshot.series["error_m"][-1] == pytest.approx(0.0, abs=1e-6)
     assert snapshot.T_map_truth is not None
