@@ -8,6 +8,7 @@ A pose is T_map_imu of a keyframe; its error is a right perturbation, rotation t
 """
 
 import tempfile
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from app.slam import lie
+from app.slam.loops.chain import Chain
 from app.slam.loops.types import HUBER
 from app.slam.rows import Rows
 from app.slam.types import F64
@@ -155,10 +158,9 @@ def g2o_text(poses: F64, factors: Sequence[Factor]) -> str:
 
 
 class _All:
-    """Every pose is solved for.
+    """Every pose is solved for. The solver has those that loops tie, with the odometry between them as one factor.
 
-    Odometry alone adds a pose and moves none: it waits for the next loop, and a walk without loops costs
-    the same however long it has become.
+    All others follow from these (`Chain`), so what the solver takes and costs grows with loops, not with the walk.
 
     Attributes:
         count: of poses. newest: (4, 4), the last of them.
@@ -168,34 +170,75 @@ class _All:
         self.count, self.newest = 1, first
         self._isam = gtsam.ISAM2(_params())
         self._isam.update(*_start(first))
-        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()  # not yet in the solver
+        self._factors = 1  # that the solver ever got
+        self._chain = Chain(first)
+        self._tied = [0]
+        self._odometry: dict[tuple[int, int], int] = {}  # number of the factor between two of these
         self._poses: Rows[np.float64] | None = Rows((4, 4), np.float64, [first])  # None: loops have moved them since
         self._ahead: list[F64] = []  # the poses after those
 
     def update(self, step: Step) -> None:
-        """Raises what gtsam raises, ValueError and ArithmeticError; it is of no use then."""
+        """Raises what gtsam raises, IndexError, ValueError and ArithmeticError; it is of no use then."""
         if step.odometry is not None:
             if not np.isfinite(np.linalg.cholesky(step.odometry.covariance)).all():
                 raise ArithmeticError("a covariance is not finite")  # or the next loop would fail, and be blamed
-            self.newest = _add(step.odometry, self.newest, self._graph, self._values)
+            self._chain.append(step.odometry.T_first_second, step.odometry.covariance)
+            self.newest = self.newest @ step.odometry.T_first_second
             self.count += 1
             (self._ahead if self._poses is None else self._poses).append(self.newest)
         if not step.loops:
             return
-        for loop in step.loops:
-            self._graph.add(_between(loop))
-        self._isam.update(self._graph, self._values)
-        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        if not all(0 <= loop.first < loop.second < self.count for loop in step.loops):
+            raise IndexError("a loop ties poses that are not there")
         self._poses, self._ahead = None, []
-        self.newest = _settled(self._isam, self._isam.update, self.count - 1, self.newest)
+        T_last, odometry = self._tie(step.loops), self._chain.poses
+        self.newest = T_last @ lie.inverse(odometry[self._tied[-1]]) @ odometry[-1]
 
     def poses(self) -> F64:
         if self._poses is None:
+            ends = np.array(self._tied)
+            T_ends = _matrices(self._isam.calculateEstimate())
             self._poses = Rows((4, 4), np.float64)
-            self._poses.extend(_matrices(self._isam.calculateEstimate()))
+            self._poses.extend(self._chain.laid(ends, T_ends, self.count - len(self._ahead)))
             for pose in self._ahead:
                 self._poses.append(pose)
         return self._poses.view()
+
+    def _tie(self, loops: Sequence[Factor]) -> F64:
+        """Solve with more loops. Returns the last pose (4, 4) that one ties."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        new = sorted({key for loop in loops for key in (loop.first, loop.second)}.difference(self._tied))
+        expected = {key: self._expected(key) for key in new}
+        removed, added = [], dict[tuple[int, int], None]()
+        for key, pose in expected.items():
+            values.insert(key, gtsam.Pose3(pose))
+            at = bisect_left(self._tied, key)
+            before, after = self._tied[at - 1], self._tied[at : at + 1]
+            self._tied.insert(at, key)
+            added[before, key] = None
+            for end in after:  # odometry from `before` to there is two factors now
+                added[key, end] = None
+                if (before, end) in added:
+                    del added[before, end]
+                else:
+                    removed.append(self._odometry.pop((before, end)))
+        for first, second in added:
+            self._odometry[first, second] = self._factors + graph.size()
+            graph.add(_between(Factor(first, second, *self._chain.between(first, second))))
+        for loop in loops:
+            graph.add(_between(loop))
+        self._factors += graph.size()
+        last = self._tied[-1]
+        T_last = expected[last] if last in expected else _estimate(self._isam, last)
+        self._isam.update(graph, values, removed)
+        return _settled(self._isam, self._isam.update, last, T_last)
+
+    def _expected(self, key: int) -> F64:
+        """(4, 4) of a pose that no loop has tied so far."""
+        at = bisect_left(self._tied, key)
+        ends = self._tied[at - 1 : at + 1]
+        T_ends = np.array([_estimate(self._isam, end) for end in ends])
+        return np.asarray(self._chain.laid(np.array(ends), T_ends, max(key, ends[-1]) + 1)[key - ends[0]])
 
 
 class _Window:

@@ -1,4 +1,4 @@
-"""Exponential and logarithm of SE(3), many at once (Barfoot 2017): rotation vector, then translation."""
+"""Exponential, logarithm and adjoint of SE(3), many at once (Barfoot 2017): rotation vector, then translation."""
 
 import numpy as np
 
@@ -38,3 +38,12 @@ def log(T: F64) -> F64:
     K = lie.hat(w)
     V_inverse = np.eye(3) - 0.5 * K + a * (K @ K)
     return np.concatenate([w, (V_inverse @ T[..., :3, 3:])[..., 0]], axis=-1)
+
+
+def adjoint(T: F64) -> F64:
+    """(..., 4, 4) to (..., 6, 6): exp(adjoint(T) @ v) @ T is T @ exp(v)."""
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., 3:, :3] = lie.hat(T[..., :3, 3]) @ R
+    return out

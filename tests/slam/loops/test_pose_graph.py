@@ -165,7 +165,27 @@ def test_a_window_leaves_old_poses_where_they_are_and_solves_for_the_new_ones() 
 
 def test_a_window_wider_than_the_walk_is_no_window() -> None:
     odometry, loops = chain(20)
-    np.testing.assert_allclose(graph_of(odometry, loops, window=50).poses, graph_of(odometry, loops).poses, atol=2e-3)
+    wide, whole = graph_of(odometry, loops, window=50).poses, graph_of(odometry, loops).poses
+    assert np.abs(whole - graph_of(odometry, []).poses).max() > 0.4
+    np.testing.assert_allclose(wide, whole, atol=0.01)  # a stretch of odometry is linearised where it was measured
+
+
+@pytest.mark.parametrize("count", [20, 200])
+def test_leaving_out_poses_that_no_loop_ties_changes_next_to_nothing(count: int) -> None:
+    odometry, loops = chain(count, noise=0.005)
+    graph = graph_of(odometry, loops)
+    for first in (count // 4, count // 3):  # splits a stretch, and ends at one that is tied from then on
+        T = lie.inverse(graph.poses[first]) @ graph.poses[-2] @ random_pose(np.random.default_rng(first), 0.003)
+        graph.close([Factor(first, count - 2, T, np.eye(6) * 0.01**2)])
+    factors = odometry + [loop for step in graph.steps for loop in step.loops]
+
+    def cost(poses: F64) -> float:
+        return sum(residual.sigmas**2 for residual in residuals(factors, poses))
+
+    best = optimise(np.eye(4), factors, graph.poses)
+    moved = np.abs(best - graph_of(odometry, []).poses).max()
+    assert np.abs(graph.poses - best).max() < 0.01 * moved
+    assert cost(graph.poses) - cost(best) < 0.01, "a hundredth of what one measurement that is off by its sigma adds"
 
 
 def test_the_g2o_file_holds_the_poses_and_factors(tmp_path: Path) -> None:
