@@ -104,6 +104,7 @@ class LoopView(BaseModel):
     origin: str
     overruled: bool = Field(description="Whether the verdict is the user's.")
     weight: float
+    represented_by: tuple[int, int] | None = Field(description="A loop next to it that is in the graph for both.")
 
 
 class LoopsState(BaseModel):
@@ -139,6 +140,7 @@ def loops_state(view: LoopsView) -> LoopsState:
                 origin=edge.origin,
                 overruled=edge.overruled,
                 weight=edge.weight,
+                represented_by=edge.represented_by,
             )
             for edge in view.edges
         ],

@@ -7,7 +7,7 @@ came, so that undoing is the same as never having done. A command forgets nothin
 but keyframes that come after it are looked at with the loops as they count then.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -172,10 +172,12 @@ class LoopBackend:
     def _learn(self, found: Found) -> None:
         """What was found with the newest keyframe takes effect."""
         self._found.update((edge.pair, edge) for edge in found.updates)
-        updates, newest = {edge.pair: edge for edge in found.updates}, len(self) - 1
-        decided = [edge for edge in self._accepted(self._edges(updates).values()) if edge.decided_at == newest]
+        self._by_pair, newest = None, len(self) - 1
+        decided = [edge for edge in self.edges if edge.counts and edge.decided_at == newest]
+        broken = self._solution.broken
         self._solution.close([loop_factor(edge) for edge in decided])
-        self._by_pair = None
+        if self._solution.broken != broken:
+            self._by_pair = None
 
     def _look(self, first: int, end: int, params: Loops) -> Found:
         """Look for loops of the keyframes from `first` to before `end`; the graph stays as it is."""
@@ -362,17 +364,14 @@ class LoopBackend:
             self._solution.clear()
             return
         arrivals: dict[int, list[Factor]] = {}
-        for edge in self._accepted(self._overrulings.lay_over(self._found, len(self)).values()):
-            arrivals.setdefault(edge.decided_at, []).append(loop_factor(edge))
+        for edge in self._overrulings.lay_over(self._found, len(self)).values():
+            if edge.counts:
+                arrivals.setdefault(edge.decided_at, []).append(loop_factor(edge))
         steps = self._history.steps(len(self), arrivals)
         self._solution.solve(self._history[0].head.T_odom_imu, self._start.window, steps)
 
-    @staticmethod
-    def _accepted(edges: Iterable[LoopEdge]) -> list[LoopEdge]:
-        return [edge for edge in edges if edge.verdict is Verdict.ACCEPTED]
-
     def _factors(self, edges: tuple[LoopEdge, ...]) -> list[Factor]:
-        return self._history.odometry(len(self)) + [loop_factor(edge) for edge in self._accepted(edges)]
+        return self._history.odometry(len(self)) + [loop_factor(edge) for edge in edges if edge.counts]
 
     def _optimum(self, edges: tuple[LoopEdge, ...]) -> F64:
         """(k, 4, 4) T_map_imu by all factors at once. Raises HemislamError if the solver fails."""

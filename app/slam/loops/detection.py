@@ -58,10 +58,13 @@ class Detector:
 
     Args:
         params: those that act on restart are read here; others are given where they are used.
+
+    Attributes:
+        half: keyframes on either side of one that make its submap with it.
     """
 
     def __init__(self, params: Loops) -> None:
-        self._half = params.submap_keyframes
+        self.half = params.submap_keyframes
         self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS)
         self._around: Recent[tuple[int, int], Submap] = Recent(KEPT_SUBMAPS, self._make)
         self._prepared: Recent[tuple[int, int], Prepared] = Recent(
@@ -189,11 +192,11 @@ class Detector:
 
     def _last(self, index: int) -> int:
         """The last keyframe of a submap, of those there are."""
-        return min(len(self) - 1, index + self._half)
+        return min(len(self) - 1, index + self.half)
 
     def _make(self, key: tuple[int, int]) -> Submap:
         index, last = key
-        return self._submaps.around(index, self.poses, max(0, index - self._half), last)
+        return self._submaps.around(index, self.poses, max(0, index - self.half), last)
 
 
 def _wrapped(angle: npt.NDArray[np.float64]) -> F64:

@@ -134,7 +134,7 @@ class Overrulings:
                     edges[pair] = entry.added
             elif pair in edges:
                 edges[pair] = _overruled(edges[pair], entry.command)
-        return {pair: edges[pair] for pair in sorted(edges)}
+        return {pair: _represented(edges[pair], edges) for pair in sorted(edges)}
 
 
 def check(command: Command) -> None:
@@ -159,6 +159,7 @@ def in_words(command: Command) -> str:
 
 
 def _overruled(edge: LoopEdge, command: Command) -> LoopEdge:
+    edge = replace(edge, represented_by=None)  # what the user has a word on is in the graph itself
     if isinstance(command, SetWeight):
         return replace(edge, weight=command.weight)
     if isinstance(command, Add | Solve):  # one that waits; one that is for no loop
@@ -168,3 +169,12 @@ def _overruled(edge: LoopEdge, command: Command) -> LoopEdge:
         return replace(edge, overruled=True)
     reason = f"{verdict} by hand; found {edge.verdict}: {edge.reason}"
     return replace(edge, verdict=verdict, overruled=True, reason=reason)
+
+
+def _represented(edge: LoopEdge, edges: Mapping[Pair, LoopEdge]) -> LoopEdge:
+    """The same; in the graph itself if the one that was there for it no longer is."""
+    if edge.represented_by is None:
+        return edge
+    there = edges.get(edge.represented_by)
+    stands = there is not None and there.verdict is Verdict.ACCEPTED
+    return edge if stands else replace(edge, represented_by=None)

@@ -4,7 +4,7 @@ One registration can be fooled by a place that looks the same; several, at diffe
 that tell the same story are fooled more rarely. Where two stories are told, neither is believed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -59,3 +59,23 @@ def settle(
             contradicted = f", {against} contradict it" if against else ""
             out[edge.pair] = replace(edge, reason=waits + contradicted, evidence=evidence, weight=1.0)
     return list(out.values())
+
+
+def represented(settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], half: int) -> list[LoopEdge]:
+    """The same, those just accepted with the loop that is in the graph for them, if one is next to them.
+
+    Submaps of keyframes no farther apart than `half` share most of their points. Two loops between such neighbours,
+    at both ends, are one measurement rather than two, and a graph of all of them is dense for nothing.
+
+    Args:
+        edges: all, as they count. half: keyframes on either side of one that make its submap.
+    """
+    counting = [edge.pair for edge in edges if edge.counts]
+    out = []
+    for edge in settled:
+        if edge.verdict is Verdict.ACCEPTED and edge.represented_by is None and edge.pair not in counting:
+            near = [pair for pair in counting if max(abs(pair[0] - edge.older), abs(pair[1] - edge.newer)) <= half]
+            edge = replace(edge, represented_by=near[0] if near else None)
+            counting += [] if near else [edge.pair]
+        out.append(edge)
+    return out

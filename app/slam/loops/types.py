@@ -78,6 +78,7 @@ class LoopEdge:
         origin: who proposed it. overruled: whether the verdict is the user's.
         weight: the covariance is divided by it in the graph.
         evidence: the numbers.
+        represented_by: a loop next to it, which shares most of its points and is in the graph for both.
     """
 
     older: int
@@ -91,10 +92,16 @@ class LoopEdge:
     origin: Origin = Origin.DETECTED
     overruled: bool = False
     weight: float = 1.0
+    represented_by: Pair | None = None
 
     @property
     def pair(self) -> Pair:
         return self.older, self.newer
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is a factor of the graph."""
+        return self.verdict is Verdict.ACCEPTED and self.represented_by is None
 
 
 # --- the user's commands -------------------------------------------------------------------------

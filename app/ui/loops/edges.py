@@ -13,7 +13,7 @@ import viser
 from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
-from app.ui.loops.kinds import COLOURS, Kind, in_graph, kind_of, name
+from app.ui.loops.kinds import COLOURS, Kind, kind_of, name
 from app.ui.widgets import unchanged
 
 _RISE: Final = (0.7, 0.12)
@@ -80,7 +80,7 @@ class LoopEdges:
         seen = [edge for edge in there if kind_of(edge) in shown or edge.pair == chosen]
         lines = arches(seen, poses)
         self._pickable = ([edge.pair for edge in seen], lines)
-        styles = np.array([list(Kind).index(kind_of(edge)) * 2 + in_graph(edge) for edge in seen], dtype=np.int64)
+        styles = np.array([list(Kind).index(kind_of(edge)) * 2 + edge.counts for edge in seen], dtype=np.int64)
         marked = np.array([edge.pair == chosen for edge in seen], dtype=np.bool_)
         for number in range(2 * len(Kind)):
             self._draw_style(list(Kind)[number // 2], bool(number % 2), lines[(styles == number) & ~marked])

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Final
 
-from app.slam.loops.types import Accept, Add, Command, LoopEdge, Origin, Pair, SetWeight, Solve, Verdict
+from app.slam.loops.types import Accept, Add, Command, LoopEdge, Origin, Pair, SetWeight, Solve
 from app.ui.colours import Rgb
 
 
@@ -32,10 +32,6 @@ def kind_of(edge: LoopEdge) -> Kind:
     if edge.overruled or edge.origin is Origin.USER:
         return Kind.USER
     return Kind(edge.verdict.value)
-
-
-def in_graph(edge: LoopEdge) -> bool:
-    return edge.verdict is Verdict.ACCEPTED
 
 
 def name(pair: Pair) -> str:

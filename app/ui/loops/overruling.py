@@ -13,7 +13,7 @@ from app.slam.loops import edits
 from app.slam.loops.types import Accept, LoopEdge, Pair, Preview, Reject, SetWeight, Solve, Verdict
 from app.slam.loops.types import Command as Overrule
 from app.ui.html import box
-from app.ui.loops.kinds import in_graph, say
+from app.ui.loops.kinds import say
 from app.ui.loops.overlay import Ghost
 from app.ui.loops.words import forecast, headline
 from app.ui.widgets import by_user, show, unchanged
@@ -159,7 +159,7 @@ class SolvePanel:
         """Nothing to ask for where it is so already, or where there is no loop. considered: it is being decided."""
         loops = snapshot.loops
         self._where.visible = considered
-        self._button.disabled = Solve() in loops.undo or not any(in_graph(edge) for edge in loops.edges)
+        self._button.disabled = Solve() in loops.undo or not any(edge.counts for edge in loops.edges)
 
 
 class EditsPanel:

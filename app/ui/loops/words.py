@@ -23,8 +23,14 @@ def headline(edge: LoopEdge) -> str:
     return box(
         f'<div class="hs-row"><span>keyframes <b>{name(edge.pair)}</b></span><b style="color:{colour}">'
         f"{escape(edge.verdict)}{escape(weight)}</b></div>",
-        f'<div class="hs-item" style="border-color:{colour}">{escape(edge.reason)}</div>',
+        f'<div class="hs-item" style="border-color:{colour}">{escape(edge.reason)}{_represented(edge)}</div>',
     )
+
+
+def _represented(edge: LoopEdge) -> str:
+    if edge.represented_by is None:
+        return ""
+    return f"; {name(edge.represented_by)}, next to it, is in the graph for both"
 
 
 def evidence(edge: LoopEdge, params: Loops) -> str:

@@ -1,5 +1,6 @@
 """What a walk with drifting odometry comes to: loops found, its history, and what is shown of it."""
 
+import csv
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from app.slam.errors import HemislamError
 from app.slam.loops.backend import LoopBackend
+from app.slam.loops.files import loops_csv
 from app.slam.loops.types import Add, Origin, Solve, Verdict, rows
 from app.slam.metrics import umeyama
 from app.slam.params import Loops
@@ -192,7 +194,17 @@ def test_the_g2o_file_holds_the_graph(backend: LoopBackend, tmp_path: Path) -> N
     (tmp_path / "graph.g2o").write_text(backend.g2o())
     graph, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
     assert values.size() == len(backend)
-    assert graph.size() == len(backend) - 1 + len(accepted(backend)) == len(backend.factor_residuals())
+    loops = [edge for edge in backend.edges if edge.counts]
+    assert graph.size() == len(backend) - 1 + len(loops) == len(backend.factor_residuals())
+
+
+def test_the_table_of_loops_says_of_each_what_is_in_the_graph_for_it(backend: LoopBackend) -> None:
+    lines = list(csv.DictReader(loops_csv(backend.edges, np.arange(len(backend))).splitlines()))
+    counting = {f"{line['older']}-{line['newer']}" for line in lines if line["verdict"] == "accepted"} - {
+        f"{line['older']}-{line['newer']}" for line in lines if line["represented_by"]
+    }
+    assert counting == {f"{edge.older}-{edge.newer}" for edge in backend.edges if edge.counts}
+    assert {""} < {line["represented_by"] for line in lines} <= {*counting, ""}
 
 
 def test_a_covariance_that_is_no_number_does_not_stop_the_walk(walked: Walked) -> None:

@@ -337,3 +337,29 @@ def test_a_weight_must_be_positive(backend: LoopBackend) -> None:
     for weight in (0.0, -1.0, float("nan")):
         with pytest.raises(HemislamError, match="greater than 0"):
             backend.apply(SetWeight(*backend.edges[0].pair, weight))
+
+
+def test_loops_next_to_one_another_are_one_factor_and_rejecting_it_hands_over_to_the_others(
+    walked: Walked, backend: LoopBackend
+) -> None:
+    loops = accepted(backend)
+    counting = {edge.pair for edge in loops if edge.counts}
+    assert len(counting) < len(loops) / 2
+    for edge in loops:
+        near = {
+            pair
+            for pair in counting - {edge.pair}
+            if max(abs(pair[0] - edge.older), abs(pair[1] - edge.newer)) <= PARAMS.submap_keyframes
+        }
+        assert edge.counts or edge.represented_by in near
+        assert not (edge.counts and near), "two factors that share most of their points"
+    first = min(counting)
+    behind = {edge.pair for edge in loops if edge.represented_by == first}
+    backend.apply(Reject(*first))
+    assert {edge.pair for edge in accepted(backend) if edge.counts} == counting - {first} | behind
+    backend.apply(SetWeight(*max(behind), 2.0))
+    backend.undo()
+    backend.undo()
+    assert same(backend.edges, walked.edges[-1])
+    word = max(edge.pair for edge in loops if not edge.counts)
+    assert applied(backend, SetWeight(*word, 2.0)).counts, "what the user has a word on is a factor"

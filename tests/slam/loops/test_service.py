@@ -74,7 +74,7 @@ def test_questions_change_nothing(walked: Walked, service: LoopService) -> None:
     assert isinstance(inspected, Inspected)
     assert inspected.pair == edge.pair
     assert isinstance(residuals, Residuals)
-    loops = sum(edge.verdict is Verdict.ACCEPTED for edge in before.edges)
+    loops = sum(edge.counts for edge in before.edges)
     assert len(residuals.residuals) == before.count - 1 + loops
     assert isinstance(solved, Tried)
     assert solved.preview.poses.shape == (before.count, 4, 4)

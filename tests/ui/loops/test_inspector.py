@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from app.server.protocol import InspectLoop, Seek
 from app.ui.loops.inspector import CLOSE, SEEK
+from app.ui.loops.words import headline
 from tests.ui.conftest import SOMEONE, Wire, user_clicks, user_sets
 from tests.ui.loops.conftest import GOOD, NEWER, OLDER, Page
 
@@ -92,3 +93,9 @@ def test_a_page_with_a_chosen_loop_and_a_ghost_at_rest_sends_nothing(page: Page,
     wire.clear()
     page.draw()
     assert wire.messages == []
+
+
+def test_a_loop_that_another_is_in_the_graph_for_says_which(page: Page) -> None:
+    edge = next(edge for edge in page.engine.snapshot.loops.edges if edge.counts)
+    assert "in the graph" not in headline(edge)
+    assert "12–340, next to it, is in the graph for both" in headline(replace(edge, represented_by=(12, 340)))
