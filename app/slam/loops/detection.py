@@ -23,8 +23,8 @@ from app.slam.types import F64, I64, Keyframe
 
 NEAR_M = 3.0
 """Beyond the reach of drift, places this far apart still see each other."""
-KEPT_PREPARED = 16
-"""Submaps ready for registration that stay in memory, some 1 MB each."""
+KEPT_PREPARED = 4
+"""Submaps ready for registration that stay in memory, 1 to 2 MB each; more would hardly be used again."""
 KEPT_SUBMAPS = 2
 """Others; of a keyframe that is looked at one is needed twice."""
 

@@ -19,7 +19,7 @@ import numpy as np
 from app.slam.types import F32, F64, Keyframe
 from app.slam.voxel import VoxelGrid
 
-KEPT_CLOUDS = 256
+KEPT_CLOUDS = 64
 """Thinned clouds, some 70 kB each, that stay in memory; others are read again."""
 
 K = TypeVar("K")
