@@ -131,7 +131,10 @@ def _stalled_page(url: str) -> socket.socket:
 
 
 def _memory(server: "subprocess.Popen[str]") -> dict[str, float]:
-    """MB that belong to each process alone: the server, and those that it started. Linux only."""
+    """MB that each process has written and shares with no other: the server, and those that it started. Linux only.
+
+    Pages of libraries do not count: whether they are shared depends on what else the machine happens to run.
+    """
     found = {"server": _private_mb(server.pid)}
     names = ["receiver", "engine"]  # in the order in which they are started
     for pid in _children(server.pid):
@@ -152,7 +155,7 @@ def _children(pid: int) -> list[int]:
 
 def _private_mb(pid: int) -> float:
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    return sum(int(line.split()[1]) for line in lines if line.startswith("Private_")) / 1e3
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Private_Dirty")) / 1e3
 
 
 def _tell(seconds: float, state: Any, memory: dict[str, float]) -> None:
