@@ -141,10 +141,9 @@ class Detector:
         candidates = self._eligible(newer, expectation, p)
         if not len(candidates):
             return []
-        context = self._contexts[newer]
-        keys = self._keys.view()[candidates]
-        ranks = np.arange(1, min(p.candidates, len(keys)) + 1)
-        _, nearest = KDTree(keys).query(context.ring_key, k=ranks)  # type: ignore[no-untyped-call]  # no types
+        keys = self._keys.view()
+        ranks = np.arange(1, min(p.candidates, len(candidates)) + 1)
+        _, nearest = KDTree(keys[candidates]).query(keys[newer], k=ranks)  # type: ignore[no-untyped-call]  # no types
         sightings = [self._compare(int(older), newer, expectation, p) for older in candidates[nearest]]
         chosen: list[Sighting] = []
         for sighting in sorted(sightings, key=lambda s: s.distance):
