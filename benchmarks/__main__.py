@@ -4,13 +4,14 @@ import os
 import sys
 from pathlib import Path
 
-from benchmarks import frame, kill, latency, live, loops, packets, page, replay, rewind, seek, walk
+from benchmarks import frame, kill, latency, latency_page, live, loops, packets, page, replay, rewind, seek, walk
 from benchmarks.record import show
 
 BENCHMARKS = {
     "frame": frame.run,
     "kill": kill.run,
     "latency": latency.run,
+    "latency-page": latency_page.run,
     "live": live.run,
     "loops": loops.run,
     "packets": packets.run,

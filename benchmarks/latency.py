@@ -70,7 +70,7 @@ def run() -> list[Line]:
 def _to_poses(walk: Path) -> tuple[list[float], dict[int, F64]]:
     """Seconds for each scan until the server's process has its pose, and positions by the scan's end."""
     came: dict[int, float] = {}
-    with _received(walk) as (engine, sending):
+    with received(walk) as (engine, sending):
         while not sending.ended or time.monotonic() - sending.last < 1.0:
             snapshot = engine.wait(engine.snapshot.revision, timeout=0.1)
             if snapshot.result is not None:
@@ -91,7 +91,7 @@ def _to_page(walk: Path, positions: dict[int, F64]) -> list[float]:
         ended = threading.Event()
         page = threading.Thread(target=_listen, args=(url, heard, ended))
         page.start()
-        with _sent(walk, packets, imu) as sending:
+        with sent(walk, packets, imu) as sending:
             while not sending.ended or time.monotonic() - sending.last < 1.0:
                 time.sleep(0.1)
         ended.set()
@@ -118,7 +118,7 @@ class _Killed:
 def _after_kills(walk: Path) -> _Killed:
     with TemporaryDirectory() as folder:
         record = Path(folder) / "live.mcap"
-        with _received(walk, record) as (engine, sending):
+        with received(walk, record) as (engine, sending):
             _until(engine, lambda s: s.transport.frame >= 40)
             seconds = []
             for _ in range(KILLS):
@@ -180,7 +180,7 @@ def _messages(raw: bytes) -> list[dict[str, Any]]:
 
 
 # --- the sensor ----------------------------------------------------------------------------------
-class _Sending:
+class Sending:
     """Sends a walk in a process of its own, which tells when each packet of the LiDAR was sent."""
 
     def __init__(self, walk: Path, packets: str, imu: str) -> None:
@@ -234,8 +234,8 @@ def _send(walk: Path, packets: str, imu: str, told: Any, go: Event) -> None:
 
 
 @contextmanager
-def _sent(walk: Path, packets: str, imu: str) -> Iterator[_Sending]:
-    sending = _Sending(walk, packets, imu)
+def sent(walk: Path, packets: str, imu: str) -> Iterator[Sending]:
+    sending = Sending(walk, packets, imu)
     try:
         yield sending
     finally:
@@ -243,7 +243,7 @@ def _sent(walk: Path, packets: str, imu: str) -> Iterator[_Sending]:
 
 
 @contextmanager
-def _received(walk: Path, record: Path | None = None) -> Iterator[tuple[EngineProcess, _Sending]]:
+def received(walk: Path, record: Path | None = None) -> Iterator[tuple[EngineProcess, Sending]]:
     """An engine's process that maps what is sent, without a page."""
     ports = [free_port() for _ in range(3)]
     packets, imu = f"rsbpearl://127.0.0.1:{ports[0]},{ports[1]}", f"imu-udp://127.0.0.1:{ports[2]}"
@@ -253,7 +253,7 @@ def _received(walk: Path, record: Path | None = None) -> Iterator[tuple[EnginePr
         engine = EngineProcess(setup)
         try:
             _until(engine, lambda s: s.recording is not None)
-            with _sent(walk, packets, imu) as sending:
+            with sent(walk, packets, imu) as sending:
                 yield engine, sending
         finally:
             engine.close()

@@ -32,6 +32,7 @@ from app.server.folders import Folders
 from app.server.fork import Engine, Workspace
 from app.server.logs import log_notices
 from app.server.setup import Setup
+from app.server.slow_page import quickened
 from app.server.viser_page import BUFFER_BYTES, Viser, bridge, page_html, start_viser, viewer_html
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
@@ -59,7 +60,7 @@ def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) ->
         redoc_url=None,
     )
     app.add_middleware(Guard, access=access)
-    page = page_html()
+    page = quickened(page_html())
     viewers_page = viewer_html(page)
 
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)

@@ -18,6 +18,7 @@ from app.ui.sensor import Sensor
 from app.ui.view import View
 
 ROOT: Final = "/map"
+_FOLLOWED_M: Final = 1e-3
 _FOLLOW_RATE: Final = 0.3
 """Share of the way to the sensor that the view goes per drawing: the walker's sway is not the viewer's."""
 _FOLLOW_JUMP_M: Final = 4.0
@@ -124,5 +125,5 @@ class Scene:
         behind = -position - self._root.position
         if jump or float(np.linalg.norm(behind)) > _FOLLOW_JUMP_M:
             self._root.position = -position
-        else:
+        elif float(np.linalg.norm(behind)) > _FOLLOWED_M:  # else it would never arrive, and the page draw for ever
             self._root.position = self._root.position + _FOLLOW_RATE * behind

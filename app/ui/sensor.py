@@ -48,6 +48,7 @@ class Sensor:
             color=seed,
             opacity=0.14,
             side="double",
+            material="toon3",
             cast_shadow=False,
             receive_shadow=False,
         )
@@ -64,6 +65,7 @@ class Sensor:
             color=ground,
             opacity=0.16,
             side="double",
+            material="toon3",
             cast_shadow=False,
             receive_shadow=False,
         )
