@@ -58,6 +58,6 @@ def search(
         if any(edge.verdict is Verdict.CANDIDATE for edge in fresh.values()):
             counted = counting({**known, **fresh})
             settled = settle(fresh, counted, detector.poses, drift, params, now)
-            updates.update((edge.pair, edge) for edge in represented(settled, counted.values(), detector.half))
+            updates.update((edge.pair, edge) for edge in represented(settled, counted.values(), detector.half // 2))
     contexts = tuple(detector.context(index) for index in range(described, keyframes.stop))
     return Found(contexts, tuple(updates.values()))

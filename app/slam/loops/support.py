@@ -61,20 +61,20 @@ def settle(
     return list(out.values())
 
 
-def represented(settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], half: int) -> list[LoopEdge]:
+def represented(settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], reach: int) -> list[LoopEdge]:
     """The same, those just accepted with the loop that is in the graph for them, if one is next to them.
 
-    Submaps of keyframes no farther apart than `half` share most of their points. Two loops between such neighbours,
+    Submaps of keyframes a quarter of their length apart share three quarters of it. Two loops between such neighbours,
     at both ends, are one measurement rather than two, and a graph of all of them is dense for nothing.
 
     Args:
-        edges: all, as they count. half: keyframes on either side of one that make its submap.
+        edges: all, as they count. reach: that quarter, in keyframes.
     """
     counting = [edge.pair for edge in edges if edge.counts]
     out = []
     for edge in settled:
         if edge.verdict is Verdict.ACCEPTED and edge.represented_by is None and edge.pair not in counting:
-            near = [pair for pair in counting if max(abs(pair[0] - edge.older), abs(pair[1] - edge.newer)) <= half]
+            near = [pair for pair in counting if max(abs(pair[0] - edge.older), abs(pair[1] - edge.newer)) <= reach]
             edge = replace(edge, represented_by=near[0] if near else None)
             counting += [] if near else [edge.pair]
         out.append(edge)
