@@ -94,6 +94,7 @@ def serve(
     """
     from app.evaluation.truth import read_poses
     from app.logs import start_logging
+    from app.memory import give_back
     from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording
     from app.server.folders import Folders
@@ -126,6 +127,7 @@ def serve(
             "--paused, --start, --duration and --truth belong to a recording; leave them out with --live."
         )
     start_logging(json_lines=log_json)
+    give_back()
     session = read_session(recording) if recording is not None and recording.suffix == SUFFIX else None
     params = session.state.params if session else resolve_for(recording)
     if recording is not None:

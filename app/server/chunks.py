@@ -78,7 +78,7 @@ def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
         positions = poses[[chunks[index].index for index in shown], :3, 3]
         around = np.linalg.norm(positions[2:] - positions[:-2], axis=1)
         index = shown.pop(1 + int(np.argmin(around)))
-        kept[index] = _taken(kept[index], np.zeros(0, dtype=np.int64), EMPTY_LEVEL)
+        kept[index] = _emptied(kept[index])
     return tuple(kept)
 
 
@@ -87,6 +87,25 @@ def coarser(chunk: Chunk) -> Chunk:
     level = chunk.level + 1
     chosen = np.sort(_first_per_voxel(chunk.points, voxel_of_level(level)))  # of random points in their order
     return _taken(chunk, chosen, level)
+
+
+_NO_POINTS: Final = np.empty((0, 3), np.float32)
+_NO_LABELS: Final = np.empty(0, np.uint8)
+_NO_INTENSITY: Final = np.empty(0, np.float32)
+_NO_RING: Final = np.empty(0, np.uint16)
+
+
+def _emptied(chunk: Chunk) -> Chunk:
+    """Without its points. The arrays are in common: of a walk that goes on, most keyframes end so."""
+    return replace(
+        chunk, points=_NO_POINTS, labels=_NO_LABELS, intensity=_NO_INTENSITY, ring=_NO_RING, level=EMPTY_LEVEL
+    )
+
+
+def with_same_mounting(chunk: Chunk, before: Chunk) -> Chunk:
+    """The chunk with its T_imu_lidar in common with the one before, where the two are equal."""
+    same = np.array_equal(chunk.T_imu_lidar, before.T_imu_lidar)
+    return replace(chunk, T_imu_lidar=before.T_imu_lidar) if same else chunk
 
 
 def _taken(chunk: Chunk, chosen: I64, level: int) -> Chunk:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from app.server.chunks import within_budget
+from app.server.chunks import with_same_mounting, within_budget
 from app.server.edges import EdgesChange, EdgesReceiver, EdgesSender
 from app.server.protocol import SERIES, Chunk, LoopsView, Notice, Snapshot
 from app.server.setup import POINT_BUDGET
@@ -210,7 +210,7 @@ class Fold:
         result = delta.replaced.get("result", self.snapshot.result)
         held = list(self._chunks)
         for chunk in delta.chunks:
-            held[chunk.index : chunk.index + 1] = [chunk]
+            held[chunk.index : chunk.index + 1] = [with_same_mounting(chunk, held[chunk.index - 1]) if held else chunk]
         shown, others = tuple(held[: delta.shown]), held[delta.shown :]
         if poses is None or len(poses) < len(shown):
             self._chunks = tuple(held)

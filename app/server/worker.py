@@ -17,6 +17,7 @@ from multiprocessing import resource_tracker
 from typing import Any
 
 from app.logs import process_logs
+from app.memory import give_back
 from app.server import wire
 from app.server.delta import Delta, Fold
 from app.server.protocol import LIVE, Command, Notice, OpenRecording, Progress, Restart, Shutdown, Snapshot
@@ -36,6 +37,7 @@ def _run_engine(commands: Pipe, updates: Pipe, setup: Setup) -> None:
 
 
 def _logged(main: Main, commands: Pipe, updates: Pipe, setup: Setup) -> None:
+    give_back()
     with process_logs("engine"):
         main(commands, updates, setup)
 

@@ -22,29 +22,32 @@ from app.ui.view import View
 
 Chosen: TypeAlias = npt.NDArray[np.bool_] | slice
 """Which points of a chunk."""
+_ALL: Final = slice(None)
 
 MEASURED: Final = (ColourBy.HEIGHT, ColourBy.INTENSITY, ColourBy.RING)
 """Colourings whose limits grow with the map; time's are the recording's duration."""
+_STILL: Final = 1e-5
+"""Of poses (m, and of rotation matrices)."""
 
 
 @dataclass(slots=True)
 class _Drawn:
     chunk: Chunk
-    T_map_lidar: F64
     shown: Chosen
     count: int
     """Points that are shown."""
     handle: viser.PointCloudHandle | None
     """None while no point of it is shown."""
     limits: dict[ColourBy, Limits]
-    """Ends of the colour maps with this keyframe and those before it."""
+    """Ends of the colour maps with this keyframe and those before it; in common with others, never changed."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Hidden:
-    """A keyframe that was gone back over. view, limits: with which it was drawn last."""
+    """A keyframe that was gone back over. T_map_lidar, view, limits: with which it was drawn last."""
 
     drawn: _Drawn
+    T_map_lidar: F64
     view: View
     limits: Limits | None
 
@@ -63,7 +66,7 @@ def chunk_values(chunk: Chunk, T_map_lidar: F64, by: ColourBy, start_ns: int) ->
 def shown_points(chunk: Chunk, T_map_lidar: F64, ceilings: bool) -> Chosen:
     """The points that are drawn, with or without the ceiling above them."""
     mask = None if ceilings else below_ceiling(chunk.points, chunk.labels, T_map_lidar[2, :3])
-    return slice(None) if mask is None else mask
+    return _ALL if mask is None or not len(mask) else mask
 
 
 def _same(drawn: Chunk, chunk: Chunk) -> bool:
@@ -89,7 +92,7 @@ class MapChunks:
         self._hidden: deque[_Hidden] = deque()  # those that followed
         self._view = View()
         self._limits: dict[ColourBy, Limits] = {}
-        self._poses: F64 = np.empty((0, 4, 4))
+        self._poses: F64 = np.empty((0, 4, 4))  # of all keyframes, as the last snapshot had them
         self._start_ns = 0
 
     @property
@@ -130,12 +133,12 @@ class MapChunks:
         if kept == len(self._drawn):
             return
         limits = self._limits.get(seen.colour_by)
-        self._hidden.extendleft(_Hidden(drawn, seen, limits) for drawn in reversed(self._drawn[kept:]))
+        gone = [_Hidden(drawn, self._placed(drawn.chunk), seen, limits) for drawn in self._drawn[kept:]]
+        self._hidden.extendleft(reversed(gone))
         for drawn in self._drawn[kept:]:
             if drawn.handle is not None:
                 drawn.handle.visible = False
         del self._drawn[kept:]
-        self._poses = self._poses[:kept]
         before = self._drawn[-1].limits if self._drawn else {}
         self._limits = {ColourBy.TIME: self._limits[ColourBy.TIME], **before}
 
@@ -148,41 +151,48 @@ class MapChunks:
         before, seen = self._limits.get(view.colour_by), self._view
         self._view = view
         self._take_back(chunks, seen)
+        moved = self._move(poses)
         new: list[_Drawn] = []
-        again: list[tuple[_Hidden, Chunk, F64]] = []
+        again: list[tuple[_Hidden, Chunk]] = []
         for chunk in chunks[len(self._drawn) :]:
-            T = poses[chunk.index] @ chunk.T_imu_lidar
             hidden = self._hidden_one(chunk)
             if hidden is None:
-                self._widen(chunk, T)
-                new.append(_Drawn(chunk, T, slice(None), 0, None, self._limits.copy()))
+                self._widen(chunk)
+                new.append(_Drawn(chunk, _ALL, 0, None, self._limits))
             else:
-                self._limits = hidden.drawn.limits.copy()
-                again.append((hidden, chunk, T))
+                self._limits = hidden.drawn.limits
+                again.append((hidden, chunk))
         recolour = view.colour_by is not seen.colour_by or self._limits.get(view.colour_by) != before
         restyle = (view.point_size, view.map) != (seen.point_size, seen.map)
-        now = poses[[drawn.chunk.index for drawn in self._drawn]]
-        moved = np.abs(now - self._poses).max(axis=(1, 2), initial=0.0) > 1e-5
         for drawn, chunk, has_moved in zip(self._drawn, chunks, moved, strict=False):
-            if has_moved:
-                drawn.T_map_lidar = poses[drawn.chunk.index] @ drawn.chunk.T_imu_lidar
             if view.ceilings != seen.ceilings or chunk is not drawn.chunk:
                 drawn.chunk = chunk
                 self._send(drawn)
             elif drawn.handle is not None:
                 if has_moved:
-                    drawn.handle.wxyz, drawn.handle.position = _pose(drawn.T_map_lidar)
+                    drawn.handle.wxyz, drawn.handle.position = _pose(self._placed(chunk))
                 if restyle:
                     drawn.handle.point_size, drawn.handle.visible = view.point_size, view.map
                 if recolour or (has_moved and view.colour_by is ColourBy.HEIGHT):
                     drawn.handle.colors = self._colours(drawn)
-        for hidden, chunk, T in again:
+        for hidden, chunk in again:
             self._drawn.append(hidden.drawn)
-            self._show_again(hidden, chunk, T)
+            self._show_again(hidden, chunk)
         for drawn in new:
             self._drawn.append(drawn)
             self._send(drawn)
-        self._poses = poses[[drawn.chunk.index for drawn in self._drawn]]
+
+    def _move(self, poses: F64) -> npt.NDArray[np.bool_]:
+        """Take the poses of now; which of the keyframes that are drawn have others."""
+        before, self._poses, count = self._poses, poses, len(self._drawn)
+        if poses is before:
+            return np.zeros(count, dtype=np.bool_)
+        moved: npt.NDArray[np.bool_] = np.abs(poses[:count] - before[:count]).max(axis=(1, 2), initial=0.0) > _STILL
+        return moved
+
+    def _placed(self, chunk: Chunk) -> F64:
+        """(4, 4) T_map_lidar."""
+        return np.asarray(self._poses[chunk.index] @ chunk.T_imu_lidar)
 
     def _hidden_one(self, chunk: Chunk) -> _Hidden | None:
         """The next that was hidden, if it is this one; else none of them comes again."""
@@ -191,10 +201,9 @@ class MapChunks:
         self._drop_hidden()
         return None
 
-    def _show_again(self, hidden: _Hidden, chunk: Chunk, T_map_lidar: F64) -> None:
-        drawn, seen, view = hidden.drawn, hidden.view, self._view
-        moved = float(np.abs(T_map_lidar - drawn.T_map_lidar).max()) > 1e-5
-        drawn.T_map_lidar = T_map_lidar
+    def _show_again(self, hidden: _Hidden, chunk: Chunk) -> None:
+        drawn, seen, view, T_map_lidar = hidden.drawn, hidden.view, self._view, self._placed(chunk)
+        moved = float(np.abs(T_map_lidar - hidden.T_map_lidar).max()) > _STILL
         if chunk is not drawn.chunk or view.ceilings != seen.ceilings:
             drawn.chunk = chunk
             self._send(drawn)
@@ -208,11 +217,13 @@ class MapChunks:
                 drawn.handle.colors = self._colours(drawn)
             drawn.handle.visible = view.map
 
-    def _widen(self, chunk: Chunk, T_map_lidar: F64) -> None:
+    def _widen(self, chunk: Chunk) -> None:
+        T = self._placed(chunk)
         for by in MEASURED:
-            limits = grown(self._limits.get(by), by, chunk_values(chunk, T_map_lidar, by, self._start_ns))
-            if limits is not None:
-                self._limits[by] = limits
+            before = self._limits.get(by)
+            limits = grown(before, by, chunk_values(chunk, T, by, self._start_ns))
+            if limits is not None and limits != before:
+                self._limits = {**self._limits, by: limits}
 
     def _send(self, drawn: _Drawn) -> None:
         """Send the points of a keyframe that are shown now in place of those sent before.
@@ -220,7 +231,8 @@ class MapChunks:
         Under the same name instead of through the handle's properties: a page that connects later is
         then not sent what was thinned away.
         """
-        drawn.shown = shown_points(drawn.chunk, drawn.T_map_lidar, self._view.ceilings)
+        T_map_lidar = self._placed(drawn.chunk)
+        drawn.shown = shown_points(drawn.chunk, T_map_lidar, self._view.ceilings)
         points = drawn.chunk.points[drawn.shown]
         drawn.count = len(points)
         if not len(points):  # the page can not draw a cloud of no points
@@ -228,7 +240,7 @@ class MapChunks:
                 drawn.handle.remove()
                 drawn.handle = None
             return
-        orientation, position = _pose(drawn.T_map_lidar)
+        orientation, position = _pose(T_map_lidar)
         drawn.handle = self._scene.add_point_cloud(
             f"{self._root}/{drawn.chunk.index}",
             points,
@@ -245,5 +257,5 @@ class MapChunks:
         by, chunk = self._view.colour_by, drawn.chunk
         if by is ColourBy.LABEL:
             return label_colours(chunk.labels[drawn.shown])
-        values = chunk_values(chunk, drawn.T_map_lidar, by, self._start_ns)[drawn.shown]
+        values = chunk_values(chunk, self._placed(chunk), by, self._start_ns)[drawn.shown]
         return value_colours(values, self._limits.get(by, Limits(0.0, 1.0)), TABLES[MAP_OF[by]])

@@ -1,13 +1,15 @@
 """What the scene sends: differences, and nothing twice."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import viser
 
-from app.server.chunks import within_budget
+from app.server.chunks import coarser, within_budget
 from app.server.protocol import Seek, SetParams, Snapshot, StepFrame
+from app.ui.chunks import MapChunks
 from app.ui.colours import LABEL_COLOURS, ColourBy
 from app.ui.scene import Scene
 from app.ui.view import View
@@ -260,6 +262,22 @@ def test_a_keyframe_that_another_walk_put_in_place_of_one_is_drawn(drawn: Drawn,
     other = replace(rest[0], points=rest[0].points + np.float32(1.0))
     drawn.draw(View(ceilings=True), chunks=(first, other, *rest[1:]))
     assert np.array_equal(chunk_nodes(server)["/map/keyframes/1"].points, other.points.astype(np.float16))
+
+
+def test_a_keyframe_without_points_costs_next_to_nothing(drawn: Drawn, server: viser.ViserServer) -> None:
+    """They are most of those of a long walk."""
+    first = drawn.engine.snapshot.chunks[0]
+    none = coarser(replace(first, **{n: getattr(first, n)[:0] for n in ("points", "labels", "intensity", "ring")}))
+    walk = tuple(replace(none, index=index) for index in range(1000))
+    poses = np.tile(np.eye(4), (len(walk), 1, 1))
+    chunks = MapChunks(server.scene, "/map/keyframes")
+    chunks.clear(0, 100.0)
+    tracemalloc.start()
+    chunks.draw(walk, poses, View())
+    each = tracemalloc.get_traced_memory()[0] / len(walk)
+    tracemalloc.stop()
+    assert chunks.points == 0
+    assert each < 200
 
 
 def test_following_keeps_the_sensor_near_the_origin_and_leaves_the_camera_alone(drawn: Drawn, wire: Wire) -> None:
