@@ -59,6 +59,8 @@ class CloudMessage:
         if height <= 1 or row_step == 0:  # many writers leave row_step unset; one row needs none
             row_step = width * point_step
         needed = (height - 1) * row_step + width * point_step if height and width else 0
+        if height and width and point_step < 1:  # of nothing there is any number
+            raise CloudError(f"the cloud states {height}x{width} points of {point_step} bytes")
         if needed > data.size:
             raise CloudError(f"the cloud states {height}x{width} points, {needed} bytes, but holds {data.size}")
         if row_step < width * point_step:

@@ -28,6 +28,8 @@ MAX_BACKLOG_ABSENT = 100
 catches up it may still fall behind by `MAX_BACKLOG`: its first frame takes a while."""
 MAX_WAITING = 600_000
 """IMU samples and news that may wait: twenty minutes at 500 Hz. If there are more, nobody reads any longer."""
+MAX_HELD = 50_000
+"""Entries that may wait for the start, 10 s of an IMU at 5 kHz; the oldest go, should a clock be set back meanwhile."""
 _SETTLE_NS = 1_000_000_000
 _SETTLE_SCANS = 3
 BUSY, NO_IMU = "the engine was too busy", "no IMU sample came to cover it"
@@ -166,12 +168,15 @@ class Intake:
     def _settled(self) -> bool:
         """Once there is a second of the IMU and a few scans: decide unit and clock. Holds on to 10 s at most."""
         assert self._held is not None
-        while self._held[-1].arrival_ns - self._held[0].arrival_ns > 10 * _SETTLE_NS:
+        while len(self._held) > MAX_HELD or self._held[-1].arrival_ns - self._held[0].arrival_ns > 10 * _SETTLE_NS:
             old = self._held.popleft()
             if isinstance(old, LiveScan):
                 self.counters.dropped += 1
                 self._rest.append(DroppedScan(old.scan.stamp_ns, NO_IMU))
-        samples = [entry for entry in self._held if isinstance(entry, LiveImu)] if len(self._held) > 20 else []
+        # Asked for each of thousands that are held: only once a scan is there, are all of them looked at.
+        if not isinstance(self._held[-1], LiveScan):
+            return False
+        samples = [entry for entry in self._held if isinstance(entry, LiveImu)]
         scans = sum(isinstance(entry, LiveScan) and isinstance(entry.scan, Scan) for entry in self._held)
         if scans < _SETTLE_SCANS or len(samples) < 20:
             return False

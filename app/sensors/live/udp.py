@@ -14,6 +14,7 @@ from app.sensors.live.difop import DIFOP_ID, Calibration, Difop, read_difop
 from app.sensors.live.frames import Assembler, Frame
 from app.sensors.live.imu_udp import ImuOrder
 from app.sensors.live.intake import Intake
+from app.sensors.live.msop import MSOP_ID
 from app.slam.errors import HemislamError
 from app.slam.types import Scan
 
@@ -57,12 +58,16 @@ def open_socket(host: str, port: int) -> socket.socket:
     return made
 
 
-def _drain(ready: socket.socket) -> list[tuple[bytes, int]]:
-    """The datagrams that wait there, some at a time, and when each came by the host's clock."""
-    found: list[tuple[bytes, int]] = []
+Peer = tuple[str, int]
+"""Address and port of whoever sent a datagram."""
+
+
+def _drain(ready: socket.socket) -> list[tuple[bytes, int, Peer]]:
+    """The datagrams that wait there, some at a time, when each came by the host's clock, and from whom."""
+    found: list[tuple[bytes, int, Peer]] = []
     while len(found) < _DRAIN:
         try:
-            data, extra, _, _ = ready.recvmsg(65_536, 64)
+            data, extra, _, peer = ready.recvmsg(65_536, 64)
         except (BlockingIOError, ConnectionError):
             break
         arrival_ns = time.time_ns()
@@ -70,7 +75,7 @@ def _drain(ready: socket.socket) -> list[tuple[bytes, int]]:
             if level == socket.SOL_SOCKET and kind == _TIMESTAMP and len(value) == _TIMESPEC.size:
                 seconds, nanoseconds = _TIMESPEC.unpack(value)
                 arrival_ns = seconds * 1_000_000_000 + nanoseconds
-        found.append((data, arrival_ns))
+        found.append((data, arrival_ns, (str(peer[0]), int(peer[1]))))
     return found
 
 
@@ -97,6 +102,9 @@ class RsbpearlReceiver:
         self._device: Difop | None = None
         self._frames: deque[Frame] = deque()
         self._known_angles = angles is not None
+        self._sensor: Peer | None = None
+        self._heard_s = 0.0
+        self._told_another = False
 
     def __call__(self, intake: Intake, stop: threading.Event) -> None:
         self._assembler.counters = intake.counters
@@ -107,15 +115,19 @@ class RsbpearlReceiver:
                 ready, _, _ = select.select(self._sockets, [], [], 0.05)
                 now = time.time_ns()
                 for readable in ready:
-                    for packet, arrival_ns in _drain(readable):
-                        self._take(packet, arrival_ns, intake)
+                    for packet, arrival_ns, peer in _drain(readable):
+                        self._take(packet, arrival_ns, peer, intake)
                 since = self._assembler.pending_since()
                 if not ready and since is not None and now - since > _REST_NS:
                     self._frames += self._assembler.flush()
                 self._give(now, intake)
 
-    def _take(self, packet: bytes, now: int, intake: Intake) -> None:
-        if packet[:8] == DIFOP_ID:
+    def _take(self, packet: bytes, now: int, peer: Peer, intake: Intake) -> None:
+        device = packet[:8] == DIFOP_ID
+        if (device or packet[:8] == MSOP_ID) and self._is_another(peer, device, intake):
+            intake.counters.foreign += 1
+            return
+        if device:
             said = read_difop(packet)
             if said is None:
                 intake.counters.truncated += 1
@@ -124,6 +136,24 @@ class RsbpearlReceiver:
                 self._configure(said, now, intake)
             return
         self._frames += self._assembler.add(packet, now)
+
+    def _is_another(self, peer: Peer, device: bool, intake: Intake) -> bool:
+        """Whether it sends beside the sensor that is listened to: the first one, until that has been silent a while.
+
+        device: it tells about itself, which a sensor does from another port than it measures.
+        """
+        known, now = self._sensor, time.monotonic()
+        if known is None or now - self._heard_s > _REST_NS * 1e-9:
+            known = None if device else peer
+        elif (peer[0] != known[0]) if device else (peer != known):
+            if not self._told_another:
+                self._told_another = True
+                text = f"{peer[0]} sends to the port of {known[0]} too; its packets are left out, as long as both send"
+                intake.put_status("configuration", "LiDAR", text)
+            return True
+        if not device:
+            self._sensor, self._heard_s = known, now
+        return False
 
     def _configure(self, said: Difop, now: int, intake: Intake) -> None:
         before, self._device = self._device, said
@@ -172,7 +202,7 @@ class ImuReceiver:
         with self._socket:
             while not stop.is_set():
                 ready, _, _ = select.select([self._socket], [], [], 0.05)
-                samples = [(s, at) for datagram, at in _drain(self._socket) for s in self._order.add(datagram)]
+                samples = [(s, at) for datagram, at, _ in _drain(self._socket) for s in self._order.add(datagram)]
                 samples = samples or [(s, time.time_ns()) for s in ([] if ready else self._order.flush())]
                 for sample, arrival_ns in samples:
                     intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, arrival_ns)

@@ -1,5 +1,6 @@
 """Where live data come from and go to, as one writes it: `rsbpearl://0.0.0.0:6699,7788?clock=host`."""
 
+import ipaddress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, cast
@@ -47,7 +48,10 @@ def parse_address(text: str) -> Address:
     scheme, separator, rest = text.partition("://")
     if not separator or scheme not in _DEFAULT_PORTS:
         raise HemislamError(f"`{text}` is no live source; write one of {', '.join(_EXAMPLES.values())}.")
-    parts = urlsplit(f"//{rest}")
+    try:
+        parts = urlsplit(f"//{rest}")
+    except ValueError:  # a bracket that is not closed
+        raise HemislamError(f"`{text}` has no host as it must be; write it as {_EXAMPLES[scheme]}.") from None
     host, colon, numbers = parts.netloc.rpartition(":")
     if not colon:
         host, numbers = parts.netloc, ""
@@ -59,13 +63,30 @@ def parse_address(text: str) -> Address:
             raise ValueError
     except ValueError:
         raise HemislamError(f"`{text}` has no ports as they must be; write it as {_EXAMPLES[scheme]}.") from None
+    if not _is_host(host := host.strip("[]")):
+        raise HemislamError(f"`{text}`: `{host}` can be no host; write it as {_EXAMPLES[scheme]}.")
     options = dict(parse_qsl(parts.query))
     if unknown := [name for name in options if name not in _OPTIONS[scheme]]:
         known = ", ".join(_OPTIONS[scheme]) or "none"
         raise HemislamError(f"`{text}`: there is no option `{unknown[0]}`; there are: {known}.")
     if options.get("clock", "auto") not in ("auto", "sensor", "host"):
         raise HemislamError(f"`{text}`: the clock is `auto`, `sensor` or `host`.")
-    return Address(cast(Scheme, scheme), host.strip("[]"), ports, options)
+    return Address(cast(Scheme, scheme), host, ports, options)
+
+
+def _is_host(host: str) -> bool:
+    """Whether it is a name or an address, or nothing: whether it exists is another question."""
+    if ":" in host:
+        try:
+            ipaddress.IPv6Address(host)
+        except ValueError:
+            return False
+        return True
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        return False
+    return not any(character.isspace() or character in "@[]\0" for character in host)
 
 
 def open_live(lidar: str, params: Params, imu: str | None = None, record: Path | None = None) -> LiveSource:
