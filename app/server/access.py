@@ -14,7 +14,7 @@ import logging
 import secrets
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import parse_qsl, quote, urlencode, urlsplit
 
 from fastapi import HTTPException
 from starlette.datastructures import Headers, MutableHeaders
@@ -102,7 +102,8 @@ class Guard:
             return
         if refusal := self._refusal(scope, Headers(scope=scope)):
             client = scope.get("client") or ("?", 0)
-            log.warning("Refused %s from %s: %s", scope["path"], client[0], refusal[1], extra={"status": refusal[0]})
+            path = quote(scope["path"])  # it must not look like another line of the log
+            log.warning("Refused %s from %s: %s", path, client[0], refusal[1], extra={"status": refusal[0]})
             await _refuse(scope, receive, send, *refusal)
         elif token := self._linked(scope):
             await self._keep(scope, token)(scope, receive, _with_headers(send))
@@ -114,8 +115,7 @@ class Guard:
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
         """Status and reason, if the request must not go on. Notes in its scope if it may look only."""
         host = headers.get("host", "")
-        origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+        if any(_origin(origin) != host.lower() for origin in headers.getlist("origin")):
             return 403, "This page belongs to another site and may not talk to hemislam."
         if refusal := self._without_token(scope, headers, host):
             return refusal
@@ -167,6 +167,14 @@ class Guard:
 
 def _query(scope: Scope) -> list[tuple[str, str]]:
     return parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
+
+
+def _origin(origin: str) -> str | None:
+    """Host and port of an Origin header; None: it names none."""
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return None
 
 
 def _name(host: str) -> str:

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import json
 import logging
 import math
 import os
@@ -21,6 +22,7 @@ from typing import Protocol
 import uvicorn
 import viser
 from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse
 from starlette.websockets import WebSocket
 from tqdm import tqdm
@@ -48,6 +50,13 @@ class Page(Protocol):
 
 
 BuildPage = Callable[[viser.ViserServer, Workspace, Folders], Page]
+
+
+class _Refused(JSONResponse):
+    """What can not be used is named as it came, be it half of a character: as ASCII, all can be written."""
+
+    def render(self, content: object) -> bytes:
+        return json.dumps(content).encode("ascii")
 
 
 def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) -> FastAPI:
@@ -82,7 +91,12 @@ def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) ->
 
     @app.exception_handler(HemislamError)
     def refused(request: Request, error: HemislamError) -> JSONResponse:
-        return JSONResponse({"detail": str(error)}, status_code=422)
+        return _Refused({"detail": str(error)}, status_code=422)
+
+    @app.exception_handler(RequestValidationError)
+    def not_understood(request: Request, error: RequestValidationError) -> JSONResponse:
+        told = [{name: one[name] for name in ("type", "loc", "msg")} for one in error.errors()]
+        return _Refused({"detail": told}, status_code=422)
 
     app.include_router(make_router(engine, folders))
     return app

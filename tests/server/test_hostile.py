@@ -1,0 +1,61 @@
+"""Requests that no well-behaved client makes: each is refused as what it is, and none is an error of the server."""
+
+import socket
+from typing import Any
+
+import httpx
+import pytest
+from server_site import Site
+
+JSON = {"Content-Type": "application/json"}
+
+
+def answer(site: Site, head: str) -> int:
+    """The status of a request that is written by hand."""
+    with socket.create_connection(("127.0.0.1", site.port), 10.0) as peer:
+        peer.sendall(f"GET {head}\r\n\r\n".encode())
+        return int(peer.recv(100).split()[1])
+
+
+@pytest.mark.parametrize(
+    "origins",
+    ["Origin: http://[", "Origin: null", "Origin: ", "Origin: http://127.0.0.1:{port}\r\nOrigin: http://elsewhere"],
+)
+def test_an_origin_that_is_none_or_two_is_another_site(site: Site, origins: str) -> None:
+    host = f"Host: 127.0.0.1:{site.port}"
+    assert answer(site, f"/api/state HTTP/1.1\r\n{host}\r\n{origins.format(port=site.port)}") == 403
+    assert answer(site, f"/api/state HTTP/1.1\r\n{host}\r\nOrigin: http://127.0.0.1:{site.port}") == 200
+
+
+def test_a_refused_path_can_not_forge_a_line_of_the_log(site: Site, caplog: Any) -> None:
+    assert answer(site, "/%0aAll%20is%20well%1b[2J HTTP/1.1\r\nHost: elsewhere") == 403
+    (record,) = [record for record in caplog.records if record.name == "app.server.access"]
+    assert record.getMessage().isprintable()
+    assert "All%20is%20well" in record.getMessage()
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body"),
+    [
+        ("POST", "/api/notes", b'{"text": "\\ud800"}'),
+        ("PATCH", "/api/params", b'{"\\ud800": {"alpha": 1}}'),
+        ("PATCH", "/api/params", b'{"ground": {"\\ud800": 1}}'),
+        ("PATCH", "/api/params", b'{"ground": {"alpha": NaN}}'),
+        ("PUT", "/api/breakpoints", b'{"planarity": NaN}'),
+        ("PUT", "/api/breakpoints", b'{"residual": -Infinity}'),
+        ("PUT", "/api/breakpoints", b'{"\\ud800": 1}'),
+        ("POST", "/api/transport", b'{"action": "speed", "factor": NaN}'),
+        ("POST", "/api/transport", b'{"action": "\\ud800"}'),
+        ("POST", "/api/loops", b'{"action": "weigh", "older": 0, "newer": 1, "weight": NaN}'),
+        ("POST", "/api/recordings", b'{"path": "\\ud800"}'),
+        ("POST", "/api/recordings", b'{"path": "\\u0000"}'),
+        ("POST", "/api/truth", b'{"path": "\\ud800"}'),
+    ],
+)
+def test_what_json_can_say_and_nobody_can_use_is_refused_as_such(
+    site: Site, method: str, path: str, body: bytes
+) -> None:
+    refused = httpx.request(method, site.url(path), content=body, headers=JSON)
+    assert refused.status_code == 422
+    assert refused.json()["detail"]
+    assert httpx.get(site.url("/api/state")).status_code == 200
