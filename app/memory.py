@@ -1,4 +1,4 @@
-"""How the processes that run for hours take memory from the system: what is free is not hoarded."""
+"""How processes take memory from the system that may run for hours: what is free is not hoarded."""
 
 import contextlib
 import ctypes

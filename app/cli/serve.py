@@ -127,7 +127,8 @@ def serve(
             "--paused, --start, --duration and --truth belong to a recording; leave them out with --live."
         )
     start_logging(json_lines=log_json)
-    give_back()
+    if live is not None:
+        give_back()
     session = read_session(recording) if recording is not None and recording.suffix == SUFFIX else None
     params = session.state.params if session else resolve_for(recording)
     if recording is not None:

@@ -16,6 +16,7 @@ from multiprocessing.connection import Connection, Pipe
 from typing import Final
 
 from app.logs import process_logs
+from app.memory import give_back
 from app.server import wire
 from app.server.edges import EdgesReceiver, EdgesSender
 from app.slam.loops.messages import LoopState, LoopWorkerDied, Reply, Request
@@ -24,8 +25,6 @@ NICENESS: Final = 10
 """The frame loop comes first."""
 _ALONE: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "NUMBA", "OPENBLAS", "MKL")}
 """More threads would fight the frame loop's for the cores."""
-_LEAN: Final = {"MALLOC_MMAP_THRESHOLD_": "131072", "MALLOC_TRIM_THRESHOLD_": "131072"}
-"""What was large once is given back to the system; glibc would keep it, here a third of all that is taken."""
 
 
 class LoopProcess:
@@ -41,7 +40,7 @@ class LoopProcess:
             [sys.executable, "-m", __name__, *map(str, ends)],
             pass_fds=ends,
             stdin=subprocess.DEVNULL,
-            env={**os.environ, **_ALONE, **_LEAN, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            env={**os.environ, **_ALONE, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
             process_group=0,  # Ctrl-C goes to all of the terminal's group; this one is ended by its owner
         )
         requests_in.close()
@@ -133,6 +132,7 @@ def main() -> None:
     requests: Connection[object, object] = Connection(int(sys.argv[1]), writable=False)
     replies: Connection[object, object] = Connection(int(sys.argv[2]), readable=False)
     os.nice(NICENESS)
+    give_back()  # glibc would keep what was large once, here a third of all that is taken
     from app.slam.loops.service import LoopService  # the owner has no need of the solver
     from app.slam.loops.warmup import warm_up
 

@@ -37,7 +37,8 @@ def _run_engine(commands: Pipe, updates: Pipe, setup: Setup) -> None:
 
 
 def _logged(main: Main, commands: Pipe, updates: Pipe, setup: Setup) -> None:
-    give_back()
+    if setup.live is not None:
+        give_back()
     with process_logs("engine"):
         main(commands, updates, setup)
 
