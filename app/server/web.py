@@ -83,11 +83,13 @@ def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) ->
 
     @app.get("/healthz")
     def health(response: Response) -> dict[str, str]:
-        """Whether the server is there, and its engine with it: 200, or 503 if the engine has ended for good."""
-        if engine.snapshot.engine_alive:
+        """Whether all is there: 200, or 503 if the engine or the live source has ended for good."""
+        snapshot = engine.snapshot
+        source_ended = snapshot.live is not None and snapshot.transport.finished
+        if snapshot.engine_alive and not source_ended:
             return {"status": "ok"}
         response.status_code = 503
-        return {"status": "engine down"}
+        return {"status": "live source down" if snapshot.engine_alive else "engine down"}
 
     @app.exception_handler(HemislamError)
     def refused(request: Request, error: HemislamError) -> JSONResponse:

@@ -36,9 +36,13 @@ _TROUBLES: Final = {
 """Counted, and shown once they are not zero."""
 
 
-def live_html(state: LiveState) -> str:
-    """The panel: one tile a reading, coloured by how good it is; then the sensor's words and the rarer counts."""
-    parts = [box(f'<div class="hs-row"><b>{escape(_sensor(state))}</b>{chip(*verdict(state))}</div>')]
+def live_html(state: LiveState, *, ended: bool = False) -> str:
+    """The panel: one tile a reading, coloured by how good it is; then the sensor's words and the rarer counts.
+
+    ended: nothing will come any more; these are the last readings.
+    """
+    judged = ("ended", BAD) if ended else verdict(state)
+    parts = [box(f'<div class="hs-row"><b>{escape(_sensor(state))}</b>{chip(*judged)}</div>')]
     parts.append(tiles(_tiles(state)))
     if rare := [f"{getattr(state.counters, name):,} {text}" for name, text in _TROUBLES.items() if _has(state, name)]:
         parts.append(box(f'<span class="hs-note">{escape(" · ".join(rare))}</span>'))
@@ -141,11 +145,13 @@ class LivePanel:
     def __init__(self, gui: viser.GuiApi) -> None:
         self._html = gui.add_html("", visible=False)
         self._drawn: LiveState | None = None
+        self._ended = False
 
     def draw(self, snapshot: Snapshot) -> None:
-        if snapshot.live is self._drawn:
+        ended = snapshot.transport.finished
+        if snapshot.live is self._drawn and ended == self._ended:
             return
-        self._drawn = snapshot.live
+        self._drawn, self._ended = snapshot.live, ended
         self._html.visible = snapshot.live is not None
         if snapshot.live is not None:
-            self._html.content = live_html(snapshot.live)
+            self._html.content = live_html(snapshot.live, ended=ended)

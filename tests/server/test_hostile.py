@@ -1,11 +1,17 @@
 """Requests that no well-behaved client makes: each is refused as what it is, and none is an error of the server."""
 
 import socket
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from server_site import Site
+from server_site import Site, serving
+
+from app.sensors.live.status import LiveState
+from app.server.viser_page import Viser
+from tests.ui.fake_engine import FakeEngine
 
 JSON = {"Content-Type": "application/json"}
 
@@ -59,3 +65,16 @@ def test_what_json_can_say_and_nobody_can_use_is_refused_as_such(
     assert refused.status_code == 422
     assert refused.json()["detail"]
     assert httpx.get(site.url("/api/state")).status_code == 200
+
+
+def test_health_tells_when_nothing_will_be_received_any_more(tmp_path: Path) -> None:
+    engine = FakeEngine()
+    with serving(engine, Viser(None, ""), tmp_path, None) as site:  # type: ignore[arg-type]
+        engine.publish(live=LiveState())
+        assert httpx.get(site.url("/healthz")).status_code == 200
+        engine.publish(transport=replace(engine.snapshot.transport, finished=True))
+        told = httpx.get(site.url("/healthz"))
+        assert (told.status_code, told.json()) == (503, {"status": "live source down"})
+        engine.publish(live=None)
+        assert httpx.get(site.url("/healthz")).status_code == 200, "a recording that is over is well"
+    engine.close()

@@ -60,6 +60,11 @@ def test_the_worst_is_said_in_a_word(state: LiveState, words: str, colour: str) 
     assert verdict(state) == (words, colour)
 
 
+def test_a_source_that_has_ended_for_good_is_not_said_to_receive() -> None:
+    ended = live_html(WELL, ended=True)
+    assert "receiving" not in ended and "ended" in ended and BAD in ended
+
+
 def test_only_trouble_is_coloured_as_trouble() -> None:
     assert BAD not in live_html(WELL) and WARN not in live_html(WELL)
     for worse in (
@@ -105,3 +110,13 @@ def test_live_there_is_no_way_back_and_the_page_says_why(server: viser.ViserServ
     panel.tick(engine.snapshot)
     assert not panel._slider.disabled and not panel._speed.disabled and panel._frames.visible
     assert "--record" not in panel._where.content
+
+
+def test_the_panel_tells_the_end_although_no_new_reading_came(server: viser.ViserServer, engine: FakeEngine) -> None:
+    panel = LivePanel(server.gui)
+    engine.publish(live=WELL)
+    panel.draw(engine.snapshot)
+    assert "receiving" in panel._html.content
+    engine.publish(transport=replace(engine.snapshot.transport, finished=True))
+    panel.draw(engine.snapshot)
+    assert "receiving" not in panel._html.content and "ended" in panel._html.content

@@ -36,6 +36,7 @@ HISTORY = 60
 """Scans that can be had again: six seconds, and an engine's checkpoints are one apart."""
 MOST_GIVEN = 100_000
 """The same with those that were let go, of which nothing is kept but their time."""
+ENDED = "The process that receives live data has ended; start hemislam again."
 LOST = "it was lost with the engine that had it"
 _START_S = 30.0
 _STOP_S = 10.0
@@ -115,8 +116,8 @@ class LiveClient:
     def __init__(self, address: LiveAddress) -> None:
         try:
             self._connection: Connection[Any, Any] = Client(address.path, authkey=address.key)
-        except OSError as error:
-            raise HemislamError(f"The process that receives live data has ended ({error}).") from None
+        except OSError:
+            raise HemislamError(ENDED) from None
         self.place: int = self._ask("place")
 
     def poll(self, timeout_s: float = 0.1) -> Event | None:
@@ -141,7 +142,7 @@ class LiveClient:
             self._connection.send(request)
             return self._connection.recv()
         except (OSError, EOFError):
-            raise HemislamError("The process that receives live data has ended.") from None
+            raise HemislamError(ENDED) from None
 
 
 class Desk:

@@ -38,12 +38,14 @@ class Recorder:
         self.bytes_written = 0
         self.left_out = 0
         self.failure = ""
+        if path.suffix != ".mcap":
+            raise HemislamError(f"{path} can not be recorded into; name a file that ends in .mcap, as it will be one.")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("xb")
-        except FileExistsError:
-            raise HemislamError(f"{path} is there already; record into another file.") from None
         except OSError as error:
+            if isinstance(error, FileExistsError) and path.exists():
+                raise HemislamError(f"{path} is there already; record into another file.") from None
             raise HemislamError(f"{path} can not be written ({error.strerror}); choose another place.") from None
         self._mcap = Writer(self._file, compression=CompressionType.ZSTD)
         self._mcap.start(profile="ros2")
