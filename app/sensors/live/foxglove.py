@@ -83,10 +83,13 @@ class FoxgloveReceiver:
     def _session(self, connection: Connection, intake: Intake, stop: threading.Event) -> None:
         channels: dict[int, Channel] = {}
         subscribed: dict[int, tuple[Sensor, Channel]] = {}
+        begun = time.monotonic()
         while not stop.is_set():
             try:
                 message = connection.recv(timeout=0.1)
             except TimeoutError:
+                if not channels and time.monotonic() - begun > RETRY_S:
+                    self._tell("configuration", f"{self._url} offers no topic at all; waiting for one", intake)
                 continue
             if isinstance(message, str):
                 if self._read_text(message, channels, subscribed):
@@ -115,7 +118,7 @@ class FoxgloveReceiver:
                     del subscribed[number]
             else:
                 return False
-        except (ValueError, KeyError, TypeError, AttributeError):  # not of this protocol
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):  # not of the protocol
             return False
         return True
 

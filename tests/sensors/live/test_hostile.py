@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from websockets.sync.server import ServerConnection, serve
 
 from app.sensors.live import messages
 from app.sensors.live.clouds import CloudReader
+from app.sensors.live.foxglove import SUBPROTOCOLS
 from app.sensors.live.intake import MAX_HELD, Intake
 from app.sensors.live.source import Event
 from app.sensors.live.status import Status
@@ -148,3 +150,42 @@ def test_clouds_that_contradict_themselves_are_told_and_take_no_memory() -> None
     nothing.point_step, nothing.width = 0, 2_000_000_000
     (arrived,) = CloudReader(Params(), "/points").add(nothing, 0, 0)
     assert isinstance(arrived.scan, DroppedScan) and "of 0 bytes" in arrived.scan.reason
+
+
+def _channels(*channels: str) -> str:
+    return '{"op": "advertise", "channels": [' + ", ".join(channels) + "]}"
+
+
+TEXTS = (
+    "[" * 100_000,
+    "[]",
+    '{"op": "advertise", "channels": ' + "9" * 5000 + "}",
+    _channels('{"id": 1e400, "topic": "/points", "encoding": "cdr", "schemaName": "sensor_msgs/msg/PointCloud2"}'),
+    _channels('{"id": null, "topic": 3, "encoding": [], "schemaName": "sensor_msgs/msg/Imu"}'),
+    '{"op": "unadvertise", "channelIds": [[], {}, 1e400]}',
+)
+
+
+def test_a_server_that_talks_nonsense_is_still_listened_to_afterwards() -> None:
+    said = threading.Event()
+
+    def speak(connection: ServerConnection) -> None:
+        for text in TEXTS:
+            connection.send(text)
+        said.wait(10.0)
+        connection.send(_channels('{"id": 3, "topic": "/imu", "encoding": "cdr", "schemaName": "sensor_msgs/msg/Imu"}'))
+        connection.recv(5.0)
+
+    with serve(speak, "127.0.0.1", 0, subprotocols=[SUBPROTOCOLS[0]]) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        with open_live(f"foxglove://127.0.0.1:{server.socket.getsockname()[1]}", Params()) as source:
+
+            def heard(words: str) -> list[Event]:
+                return ports.collect(source, lambda found: any(words in getattr(event, "text", "") for event in found))
+
+            heard("offers no topic at all")
+            said.set()
+            heard("IMU on /imu")
+        server.shutdown()
+        thread.join(5.0)
