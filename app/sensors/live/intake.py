@@ -85,6 +85,7 @@ class Intake:
         self._rest: deque[LiveImu | DroppedScan | Status] = deque()
         self._held: deque[LiveScan | LiveImu] | None = deque()
         self._suspect: LiveImu | None = None
+        self._told_still = False
         self._absent = False
         self._limit = MAX_BACKLOG
         self._maps = {"LiDAR": ClockMap(), "IMU": ClockMap()}
@@ -181,6 +182,9 @@ class Intake:
         if scans < _SETTLE_SCANS or len(samples) < 20:
             return False
         if abs(samples[-1].stamp_ns - samples[0].stamp_ns) < _SETTLE_NS:
+            if not self._told_still and samples[-1].arrival_ns - samples[0].arrival_ns > 5 * _SETTLE_NS:
+                self._told_still = True
+                self._tell("clocks", "IMU", "the IMU's stamps do not go on with time; check its driver")
             return False
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         accel = np.array([sample.accel for sample in samples], np.float64)

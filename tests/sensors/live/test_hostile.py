@@ -189,3 +189,17 @@ def test_a_server_that_talks_nonsense_is_still_listened_to_afterwards() -> None:
             heard("IMU on /imu")
         server.shutdown()
         thread.join(5.0)
+
+
+def test_an_imu_whose_clock_stands_still_is_told_once() -> None:
+    intake = Intake(Params())
+    told = []
+    for tenth in range(100):
+        now = sensor.START_NS + tenth * SECOND_NS // 10
+        for _ in range(20):
+            intake.put_imu(sensor.START_NS, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), now)
+        points, nothing = np.ones((5, 3), np.float32), np.zeros(5)
+        scan = Scan(now, points, *(nothing.astype(kind) for kind in ("i4", "f4", "u2")))
+        intake.put_scan(scan, now)
+        told += [entry.text for entry in intake.take(0.0, scan=False)[0] if isinstance(entry, Status)]
+    assert told == ["the IMU's stamps do not go on with time; check its driver"]
