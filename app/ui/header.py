@@ -78,6 +78,7 @@ HELP: Final = (
 _WELCOME: Final = (
     "Press <b>Play</b> or " + key("space") + " to map it; " + key("→") + " goes one frame. Then move the sliders below."
 )
+_WAITS: Final = "Mapping begins with the first scan, as soon as IMU samples have come for it."
 
 
 def status(snapshot: Snapshot) -> tuple[str, str]:
@@ -111,7 +112,8 @@ def title(snapshot: Snapshot) -> str:
     elif recording is not None:
         parts.append(f"<div>{verdicts(recording.findings)}</div>")
         if snapshot.transport.frame < 0 and snapshot.progress is None:
-            parts.append(f'<div style="margin-top:6px">{_WELCOME}</div>')
+            words = _WAITS if snapshot.live is not None and snapshot.transport.playing else _WELCOME
+            parts.append(f'<div style="margin-top:6px">{words}</div>')
     return box(*parts)
 
 

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.sensors.live.status import LiveState
 from app.server.protocol import (
     Notice,
     Snapshot,
     StepFrame,
+    Transport,
 )
 from app.ui.doctor import findings_html, verdicts
 from app.ui.files import result_folder_name, size_text
@@ -40,6 +42,13 @@ def test_what_needs_the_user_comes_first_with_its_option() -> None:
 )
 def test_names_from_a_recording_are_never_markup(render: Callable[[str], str]) -> None:
     assert "<script" not in render("<script>alert(1)<")
+
+
+def test_a_live_run_waits_for_its_first_scan_and_asks_for_no_button() -> None:
+    recorded = Snapshot(recording=FakeEngine(frames=2).snapshot.recording)
+    assert "Press <b>Play</b>" in title(recorded)
+    live = title(replace(recorded, live=LiveState(), transport=Transport(playing=True)))
+    assert "first scan" in live and "Press" not in live
 
 
 def test_the_legend_names_limits_and_unit() -> None:
