@@ -1,5 +1,6 @@
 """Who is refused what, over real sockets: those who may look only, and whatever is too large; https; the logs."""
 
+import asyncio
 import json
 import os
 import signal
@@ -21,6 +22,7 @@ from mcap.reader import make_reader
 from server_site import PATIENCE_S, PROTOCOL, Site
 from test_live_run import free_ports
 from test_rewind import SAMPLE
+from websockets.asyncio.client import connect as asyncio_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
@@ -302,14 +304,21 @@ def test_page_rest_and_websocket_by_https(site: Site, certificate: Tls) -> None:
             assert "Secure" in cookie and "HttpOnly" in cookie
             assert browser.get(f"https://127.0.0.1:{access.port}/api/state", headers=OWNER).status_code == 200
         address = f"wss://127.0.0.1:{access.port}/"
-        with connect(address, ssl=trust, subprotocols=[PROTOCOL], additional_headers=OWNER, proxy=None) as socket:
-            assert socket.subprotocol == PROTOCOL
+        assert asyncio.run(_protocol(address, trust)) == PROTOCOL
         with pytest.raises(httpx.HTTPError):
             httpx.get(f"http://127.0.0.1:{access.port}/healthz")
     finally:
         server.should_exit = True
         thread.join()
         listener.close()
+
+
+async def _protocol(address: str, trust: ssl.SSLContext) -> str | None:
+    """By one thread: with two, that of websockets' other client, OpenSSL now and then waits for ever."""
+    async with asyncio_connect(
+        address, ssl=trust, subprotocols=[PROTOCOL], additional_headers=OWNER, proxy=None
+    ) as socket:
+        return socket.subprotocol
 
 
 def test_a_certificate_that_can_not_be_used_is_told_at_once(certificate: Tls, tmp_path: Path) -> None:
