@@ -24,7 +24,7 @@ from test_live_run import free_ports
 from test_rewind import SAMPLE
 from websockets.asyncio.client import connect as asyncio_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import ClientConnection
 from websockets.typing import Origin
 
 from app.logs import JsonLines

@@ -181,12 +181,15 @@ def test_a_server_that_talks_nonsense_is_still_listened_to_afterwards() -> None:
         thread.start()
         with open_live(f"foxglove://127.0.0.1:{server.socket.getsockname()[1]}", Params()) as source:
 
-            def heard(words: str) -> list[Event]:
-                return ports.collect(source, lambda found: any(words in getattr(event, "text", "") for event in found))
+            def heard(words: str) -> bool:
+                def told(found: list[Event]) -> bool:
+                    return any(words in getattr(event, "text", "") for event in found)
 
-            heard("offers no topic at all")
+                return told(ports.collect(source, told))
+
+            assert heard("offers no topic at all")
             said.set()
-            heard("IMU on /imu")
+            assert heard("IMU on /imu")
         server.shutdown()
         thread.join(5.0)
 
