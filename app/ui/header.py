@@ -35,10 +35,10 @@ HELP: Final = (
     + box(
         "Where the walk comes back, a <b>loop</b> ties two keyframes together and straightens the map. Arches show "
         "them: green counts, amber waits for others that agree, red was turned down, violet is your word. Of loops "
-        "next to one another the thick one is in the graph for all. Click an arch, or a row under <b>Loops</b> on the left, to see both submaps (blue the older, orange the newer) and "
-        "why it was judged so. <b>Accept</b>, <b>reject</b>, weigh or add one: a pale ghost shows the walk as it would "
-        "become, then commit or cancel. Every word can be undone; <b>Save edits</b> keeps them for "
-        "<code>hemislam run --loops</code>."
+        "next to one another the thick one is in the graph for all. Click an arch, or a row under <b>Loops</b> on the "
+        "left, to see both submaps (blue the older, orange the newer) and why it was judged so. <b>Accept</b>, "
+        "<b>reject</b>, weigh or add one: a pale ghost shows the walk as it would become, then commit or cancel. Every "
+        "word can be undone; <b>Save edits</b> keeps them for <code>hemislam run --loops</code>."
     )
     + heading("Two settings side by side")
     + box(
