@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -304,7 +305,8 @@ def test_page_rest_and_websocket_by_https(site: Site, certificate: Tls) -> None:
             assert "Secure" in cookie and "HttpOnly" in cookie
             assert browser.get(f"https://127.0.0.1:{access.port}/api/state", headers=OWNER).status_code == 200
         address = f"wss://127.0.0.1:{access.port}/"
-        assert asyncio.run(_protocol(address, trust)) == PROTOCOL
+        with ThreadPoolExecutor(1) as beside:  # here a browser's loop may be running
+            assert beside.submit(asyncio.run, _protocol(address, trust)).result() == PROTOCOL
         with pytest.raises(httpx.HTTPError):
             httpx.get(f"http://127.0.0.1:{access.port}/healthz")
     finally:
