@@ -23,6 +23,7 @@ from benchmarks.live import served, wait_until
 from benchmarks.page import CHROMIUM
 from benchmarks.record import Line
 from benchmarks.scenes import recording
+from benchmarks.uploads import WATCH
 
 LEAST_POINTS = 1000
 """Fewer are no scan."""
@@ -32,33 +33,17 @@ SAME_M = 0.02
 """The same scan in another run, rounded to 16 bits; others differ by what the sensor moved and by its noise."""
 
 # Of all points that go to the drawing: the first of them, when (ms since 1970), when they were there, when drawn.
-PROBE = """
-([least, compared]) => {
+PROBE = f"""
+([least, compared]) => {{{WATCH}
   window.seen = [];
   const now = () => performance.timeOrigin + performance.now();
-  const watch = (gl, points) => {
+  watchUploads(Uint16Array, 3 * least, (gl, points) => {{
     const image = [Array.from(points.subarray(0, 3 * compared)), now(), null];
     window.seen.push(image);
-    queueMicrotask(() => {  // once all of the image is on its way: it is drawn in one go
-      const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-      gl.flush();
-      const look = () => {
-        if (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) { setTimeout(look, 2); return; }
-        image[2] = now();
-        gl.deleteSync(fence);
-      };
-      look();
-    });
-  };
-  for (const [name, at] of [['bufferData', 1], ['bufferSubData', 2]]) {
-    const upload = WebGL2RenderingContext.prototype[name];
-    WebGL2RenderingContext.prototype[name] = function (...given) {
-      const data = given[at];
-      if (data instanceof Uint16Array && data.length > 3 * least) watch(this, data);
-      return upload.apply(this, given);
-    };
-  }
-}
+    // once all of the image is on its way: it is drawn in one go
+    queueMicrotask(() => onceDrawn(gl, () => {{ image[2] = now(); }}));
+  }});
+}}
 """
 
 

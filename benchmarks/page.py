@@ -21,6 +21,7 @@ import numpy as np
 from playwright.sync_api import Page, expect, sync_playwright
 
 from benchmarks.record import Line
+from benchmarks.uploads import WATCH
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data" / "museum.mcap"
 CHROMIUM = (
@@ -35,40 +36,23 @@ LEAST_COLOURS = 3000
 """Bytes of colours, three a point: what is smaller is no scan."""
 
 # Of all colours of points that go to the drawing: when, the share of points in the colour of ground, when drawn.
-PROBE = """
-(least) => {
+PROBE = f"""
+(least) => {{{WATCH}
   window.drawn = [];
   window.pressed = 0;
-  addEventListener('keydown', () => { window.pressed = performance.now(); }, true);
-  const teal = (colours) => {
+  addEventListener('keydown', () => {{ window.pressed = performance.now(); }}, true);
+  const teal = (colours) => {{
     let n = 0;
     for (let i = 0; i < colours.length; i += 3) n += colours[i + 1] > colours[i] + 40 && colours[i + 1] > 60;
     return 3 * n / colours.length;
-  };
-  const watch = (gl, colours) => {
+  }};
+  watchUploads(Uint8Array, least, (gl, colours) => {{
     const image = [performance.now(), teal(colours), null];
     window.drawn.push(image);
     if (window.drawn.length > 600) window.drawn.shift();
-    setTimeout(() => {  // once the image is on its way
-      const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-      gl.flush();
-      const look = () => {
-        if (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) { setTimeout(look, 2); return; }
-        image[2] = performance.now();
-        gl.deleteSync(fence);
-      };
-      look();
-    }, 0);
-  };
-  for (const [name, at] of [['bufferData', 1], ['bufferSubData', 2]]) {
-    const upload = WebGL2RenderingContext.prototype[name];
-    WebGL2RenderingContext.prototype[name] = function (...given) {
-      const data = given[at];
-      if (data instanceof Uint8Array && data.length > least) watch(this, data);
-      return upload.apply(this, given);
-    };
-  }
-}
+    setTimeout(() => onceDrawn(gl, () => {{ image[2] = performance.now(); }}), 0);  // the image is on its way by then
+  }});
+}}
 """
 
 
