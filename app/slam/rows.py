@@ -1,18 +1,30 @@
-"""Arrays that grow at their end, so that a long walk does not put the same rows together again and again."""
+"""Arrays that grow at their end, so that a long walk does not put the same rows together again and again.
 
+Once they are large they lie on disk: as with keyframes, memory stays as it is however long the walk.
+"""
+
+import math
+import mmap
+import os
+import sys
+import tempfile
 from collections.abc import Iterable
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Final, Generic, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 T = TypeVar("T", bound=np.generic)
 
+ON_DISK: Final = 256 << 10
+"""Bytes from which on rows lie on disk."""
+
 
 class Rows(Generic[T]):
     """Rows of one shape and type. Views handed out are read-only and stay as they are when rows are added.
 
-    Capacity doubles, so that n rows cost O(n) copies in all.
+    Capacity doubles, so that n rows cost O(n) copies in all. Large ones are a temporary file without a name that is
+    mapped, so the system may take the memory for something else and read the rows again when they are wanted.
 
     Args:
         shape: of a row. order: "F" if columns are to be contiguous, which whoever reads one of them wants.
@@ -59,7 +71,21 @@ class Rows(Generic[T]):
         return view
 
     def _room(self, length: int, shape: tuple[int, ...], dtype: type[T]) -> npt.NDArray[T]:
-        return np.empty((length, *shape), dtype, order=self._order)
+        return np.ndarray(
+            (length, *shape), dtype, _space(length * math.prod(shape) * np.dtype(dtype).itemsize), order=self._order
+        )
+
+
+def _space(size: int) -> mmap.mmap | None:
+    """A file of so many bytes, mapped; None if memory is to be taken, where it is small or there is no disk for it."""
+    if size < ON_DISK or sys.platform != "linux":
+        return None
+    try:
+        with tempfile.TemporaryFile(prefix="hemislam-rows-") as file:
+            os.posix_fallocate(file.fileno(), 0, size)  # a full disk is said now, not by a signal at some later row
+            return mmap.mmap(file.fileno(), size)
+    except OSError:
+        return None
 
 
 def table(width: int) -> Rows[np.float64]:
