@@ -11,9 +11,10 @@ from tqdm import tqdm
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.slam.engine import Engine
+from app.slam.loops.factors import Factor
 from app.slam.loops.inspection import residuals
 from app.slam.loops.messages import AddKeyframe, LoopState, Overrule, Undo
-from app.slam.loops.pose_graph import Factor, PoseGraph, optimise
+from app.slam.loops.pose_graph import PoseGraph, optimise
 from app.slam.loops.service import LoopService
 from app.slam.loops.types import Reject, Verdict
 from app.slam.loops.warmup import warm_up
@@ -38,7 +39,8 @@ def _garage() -> list[Line]:
     for factor in tqdm(odometry, desc=GARAGE.stem, unit=" poses", leave=False, disable=None):
         closing = [loop for loop in loops if loop.second == factor.second]
         begin = time.perf_counter()
-        graph.extend(factor, closing)
+        graph.extend(factor)
+        graph.close(closing)
         times.append((time.perf_counter() - begin) * 1e3)
     factors = [*odometry, *loops]
     batch = optimise(first, factors, start)

@@ -17,11 +17,12 @@ from app.slam.errors import HemislamError
 from app.slam.loops import inspection
 from app.slam.loops.detection import Detector, Head
 from app.slam.loops.drift import Drift
+from app.slam.loops.factors import Factor
 from app.slam.loops.history import History, Record
 from app.slam.loops.judgement import by_hand, worth_correcting
 from app.slam.loops.odometry import odometry_factor
 from app.slam.loops.overruling import Entry, Overrulings, check, in_words
-from app.slam.loops.pose_graph import Factor, g2o_text, optimise
+from app.slam.loops.pose_graph import g2o_text, optimise
 from app.slam.loops.search import Found, search
 from app.slam.loops.solution import Solution, loop_factor
 from app.slam.loops.types import (
@@ -84,8 +85,7 @@ class LoopBackend:
         if keyframe.index != len(self):
             raise HemislamError(f"Keyframe {keyframe.index} can not follow on {len(self)} keyframes; one is missing.")
         self.go_to(len(self))
-        head = Head(keyframe.stamp_ns, keyframe.T_odom_imu, keyframe.covariance)
-        if self._history.holds(len(self), head, params):
+        if self._is_known(keyframe, params):
             self.go_to(len(self) + 1)
             return
         self.forget()
@@ -94,13 +94,14 @@ class LoopBackend:
         elif params == self._history[-1].params:
             params = self._history[-1].params  # so that they are kept once
         self._detector.take(keyframe)
-        odometry = odometry_factor(len(self), self._detector.heads[-1], head, _drift(params)) if len(self) else None
-        self._step(head, odometry)
+        index, head = len(self), self._detector.head
+        odometry = odometry_factor(index, head(index - 1), head(index), _drift(params)) if index else None
+        self._step(odometry)
         found = Found()
         if params.enabled:
             complete = len(self) - 1 - self._start.submap_keyframes
             found = self._look(max(complete, self._detector.described), complete + 1, params)
-        self._history.append(Record(head, odometry, params, found))
+        self._history.append(Record(params, found), odometry)
         self._learn(found)
         self._reach(self.known)
 
@@ -126,10 +127,10 @@ class LoopBackend:
             self._finished = False
             self._stand(count)
         elif count == len(self) + 1:  # as `_stand` would, but quicker
-            record = self._history[len(self)]
-            self._step(record.head, record.odometry)
-            self._detector.learn(record.found.contexts)
-            self._learn(record.found)
+            found = self._history[len(self)].found
+            self._step(self._history.odometry_to(len(self)))
+            self._detector.learn(found.contexts)
+            self._learn(found)
         self._resolve()
 
     def forget(self) -> None:
@@ -156,16 +157,22 @@ class LoopBackend:
     def _stand(self, count: int) -> None:
         """Take from the history what was found with the first `count` keyframes, and solve."""
         parts = self._history.found(count, finished=self._finished)
-        self._detector.stand(self._history.heads(count), (c for part in parts for c in part.contexts))
+        self._detector.stand(count, (context for part in parts for context in part.contexts))
         self._found = {edge.pair: edge for part in parts for edge in part.updates}
         self._solve()
 
-    def _step(self, head: Head, odometry: Factor | None) -> None:
+    def _is_known(self, keyframe: Keyframe, params: Loops) -> bool:
+        """Whether this is the next one of the history, looked at with the same parameters."""
+        index = len(self)
+        looked = index < self.known and self._history[index].params == params
+        return looked and self._detector.head(index).same(Head.of(keyframe))
+
+    def _step(self, odometry: Factor | None) -> None:
         """One more keyframe in the graph."""
-        self._detector.go_on(head)
+        self._detector.go_on()
         self._by_pair = None
         if odometry is None:
-            self._solution.begin(head.T_odom_imu, self._start.window)
+            self._solution.begin(self._detector.poses[0], self._start.window)
         else:
             self._solution.extend(odometry)
 
@@ -368,7 +375,7 @@ class LoopBackend:
             if edge.counts:
                 arrivals.setdefault(edge.decided_at, []).append(loop_factor(edge))
         steps = self._history.steps(len(self), arrivals)
-        self._solution.solve(self._history[0].head.T_odom_imu, self._start.window, steps)
+        self._solution.solve(self._detector.poses[0], self._start.window, steps)
 
     def _factors(self, edges: tuple[LoopEdge, ...]) -> list[Factor]:
         return self._history.odometry(len(self)) + [loop_factor(edge) for edge in edges if edge.counts]

@@ -4,7 +4,7 @@ A keyframe is looked at once the keyframes after it that belong to its submap ha
 on either side of it is then as dense as at the older ones it is compared with.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +52,54 @@ class Head:
     T_odom_imu: F64
     covariance: F64
 
+    @classmethod
+    def of(cls, keyframe: Keyframe) -> "Head":
+        return cls(keyframe.stamp_ns, keyframe.T_odom_imu, keyframe.covariance)
+
+    def same(self, other: "Head") -> bool:
+        """To the last bit."""
+        return (
+            self.stamp_ns == other.stamp_ns
+            and np.array_equal(self.T_odom_imu, other.T_odom_imu)
+            and np.array_equal(self.covariance, other.covariance, equal_nan=True)
+        )
+
+
+class _Heads:
+    """Heads as rows of numbers: those of all keyframes there ever were are kept."""
+
+    def __init__(self) -> None:
+        self._stamps = Rows((), np.int64)
+        self._poses = Rows((4, 4), np.float64)
+        self._covariances = Rows((6, 6), np.float64)
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def __getitem__(self, index: int) -> Head:
+        return Head(int(self._stamps.view()[index]), self.poses[index], self._covariances.view()[index])
+
+    @property
+    def stamps_ns(self) -> I64:
+        """(n,)."""
+        return self._stamps.view()
+
+    @property
+    def poses(self) -> F64:
+        """(n, 4, 4) T_odom_imu."""
+        return self._poses.view()
+
+    def append(self, head: Head) -> None:
+        self._stamps.append(head.stamp_ns)
+        self._poses.append(head.T_odom_imu)
+        self._covariances.append(head.covariance)
+
+    def cut(self, count: int) -> None:
+        """Keep the first `count`; views of all are as they were."""
+        self._stamps = self._stamps.rewound(count)
+        self._poses = self._poses.rewound(count)
+        self._covariances = self._covariances.rewound(count)
+
 
 class Detector:
     """Describes keyframes and compares them. What it answers follows from the keyframes it stands at alone.
@@ -70,41 +118,39 @@ class Detector:
         self._prepared: Recent[tuple[int, int], Prepared] = Recent(
             KEPT_PREPARED, lambda key: verification.prepare(self._around[key])
         )
-        self.stand((), ())
+        self._heads = _Heads()
+        self.stand(0, ())
 
     def __len__(self) -> int:
-        return len(self._heads)
+        return self._count
 
     @property
     def described(self) -> int:
         """How many keyframes, from the first on, can be looked for."""
         return len(self._contexts)
 
-    @property
-    def heads(self) -> Sequence[Head]:
-        return self._heads
+    def head(self, index: int) -> Head:
+        """Of any keyframe that was taken, there or beyond."""
+        return self._heads[index]
 
     @property
     def poses(self) -> F64:
         """(k, 4, 4) T_odom_imu."""
-        return self._poses.view()
+        return self._heads.poses[: len(self)]
 
     def take(self, keyframe: Keyframe) -> None:
-        """Store the cloud of a keyframe that was never there before; `stand` goes to it."""
+        """Store a keyframe that was never there before, with its cloud; `go_on` and `stand` go to it."""
+        self._heads.append(Head.of(keyframe))
         self._submaps.append(keyframe)
 
-    def stand(self, heads: Iterable[Head], contexts: Iterable[ScanContext]) -> None:
-        """Be where these keyframes and contexts, the first ones of those there ever were, are all there are."""
-        self._heads, self._contexts = list(heads), list(contexts)
-        self._stamps = Rows((), np.int64, (head.stamp_ns for head in self._heads))
-        self._poses = Rows((4, 4), np.float64, (head.T_odom_imu for head in self._heads))
+    def stand(self, count: int, contexts: Iterable[ScanContext]) -> None:
+        """Be where the first `count` keyframes of those that were taken, and these contexts, are all there are."""
+        self._count, self._contexts = count, list(contexts)
         self._keys = Rows((scan_context.RINGS,), np.float32, (context.ring_key for context in self._contexts))
 
-    def go_on(self, head: Head) -> None:
-        """The next keyframe, whose cloud was taken."""
-        self._heads.append(head)
-        self._stamps.append(head.stamp_ns)
-        self._poses.append(head.T_odom_imu)
+    def go_on(self) -> None:
+        """To the next keyframe that was taken."""
+        self._count += 1
 
     def learn(self, contexts: Iterable[ScanContext]) -> None:
         """The contexts of the next keyframes that have none, as they were described before."""
@@ -113,7 +159,8 @@ class Detector:
             self._keys.append(context.ring_key)
 
     def forget(self) -> None:
-        """Forget the clouds beyond where it stands."""
+        """Forget the keyframes beyond where it stands."""
+        self._heads.cut(len(self))
         self._submaps.truncate(len(self))
         self._around.clear()
         self._prepared.clear()
@@ -133,7 +180,7 @@ class Detector:
 
     def T_level_imu(self, index: int) -> F64:
         """(4, 4) from a keyframe's IMU frame to its level frame: a rotation."""
-        return lie.transform(self._heads[index].T_odom_imu[:3, :3], np.zeros(3))
+        return lie.transform(self.poses[index, :3, :3], np.zeros(3))
 
     def look(self, newer: int, expectation: Expectation, params: Loops) -> list[Sighting]:
         """Older places that look like this one, the most alike first, each well apart from the others."""
@@ -147,8 +194,8 @@ class Detector:
         sightings = [self._compare(int(older), newer, expectation, p) for older in candidates[nearest]]
         chosen: list[Sighting] = []
         for sighting in sorted(sightings, key=lambda s: s.distance):
-            where = self._heads[sighting.older].T_odom_imu[:3, 3]
-            if all(np.linalg.norm(where - self._heads[other.older].T_odom_imu[:3, 3]) > NEAR_M for other in chosen):
+            where = self.poses[sighting.older, :3, 3]
+            if all(np.linalg.norm(where - self.poses[other.older, :3, 3]) > NEAR_M for other in chosen):
                 chosen.append(sighting)
         return chosen[: p.verified]
 
@@ -171,9 +218,8 @@ class Detector:
 
     def _eligible(self, newer: int, expectation: Expectation, params: Loops) -> I64:
         """Keyframes left long enough ago, as near as drift may have brought them."""
-        old = np.flatnonzero(
-            self._stamps.view()[: self.described] <= self._heads[newer].stamp_ns - round(params.min_time * 1e9)
-        )
+        stamps = self._heads.stamps_ns
+        old = np.flatnonzero(stamps[: self.described] <= stamps[newer] - round(params.min_time * 1e9))
         away = np.linalg.norm(expectation.poses[old, :3, 3] - expectation.poses[newer, :3, 3], axis=1)
         reach = params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M
         return np.asarray(old[away < reach])

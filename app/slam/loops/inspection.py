@@ -7,7 +7,7 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops import scan_context, se3
 from app.slam.loops.detection import Detector
-from app.slam.loops.pose_graph import Factor
+from app.slam.loops.factors import Factor
 from app.slam.loops.types import FactorResidual, LoopDetail
 from app.slam.types import F64
 

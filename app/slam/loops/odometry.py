@@ -5,7 +5,7 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops.detection import Head
 from app.slam.loops.drift import Drift
-from app.slam.loops.pose_graph import Factor
+from app.slam.loops.factors import Factor
 from app.slam.types import F64
 
 STILL_M, STILL_RAD = 0.001, np.radians(0.02)

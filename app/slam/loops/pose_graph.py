@@ -10,7 +10,7 @@ A pose is T_map_imu of a keyframe; its error is a right perturbation, rotation t
 import tempfile
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from app.slam import lie
 from app.slam.loops.chain import Chain
+from app.slam.loops.factors import Factor, Step, Steps
 from app.slam.loops.types import HUBER
 from app.slam.rows import Rows
 from app.slam.types import F64
@@ -29,29 +30,6 @@ MOST_UPDATES = 5
 """After a loop the update is repeated while the newest pose moves more than that, at most so often."""
 _HELD = 1e-6
 """Standard deviation (rad, m) with which the first pose is held."""
-
-
-@dataclass(frozen=True, slots=True)
-class Factor:
-    """A measured T_first_second (4, 4) with its covariance (6, 6), first < second.
-
-    Attributes:
-        robust: whether a large error pulls less than its square, as a loop's should.
-    """
-
-    first: int
-    second: int
-    T_first_second: F64
-    covariance: F64
-    robust: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One change of the graph: the next pose (or none) and loops between poses that are there."""
-
-    odometry: Factor | None
-    loops: tuple[Factor, ...] = ()
 
 
 class PoseGraph:
@@ -78,18 +56,17 @@ class PoseGraph:
     def steps(self) -> tuple[Step, ...]:
         return tuple(self._steps)
 
-    def extend(self, odometry: Factor, loops: Iterable[Factor] = ()) -> tuple[Factor, ...]:
-        """Add the next pose by its odometry factor, and loops that end at poses there are.
+    def extend(self, odometry: Factor) -> tuple[Factor, ...]:
+        """Add the next pose by its odometry factor.
 
         Returns:
-            The factors that the solver failed with. The loops among them are not in the graph; in
-            place of the odometry there is one that says little.
+            The factor if the solver failed with it; in its place there is one that says little.
         """
-        return self._do(Step(odometry, tuple(loops)))
+        return self._do(odometry)
 
     def close(self, loops: Sequence[Factor]) -> tuple[Factor, ...]:
         """Add loops. Returns those that the solver failed with; they are not in the graph."""
-        return self._do(Step(None, tuple(loops))) if loops else ()
+        return self._do(tuple(loops)) if loops else ()
 
     def replay(self, steps: Iterable[Step]) -> tuple[Factor, ...]:
         """Be what these steps make of the first pose. Returns the factors that the solver failed with."""
@@ -97,7 +74,7 @@ class PoseGraph:
         return tuple(failed for step in steps for failed in self._do(step))
 
     def _reset(self) -> None:
-        self._steps: list[Step] = []
+        self._steps = Steps()
         self._solver: _All | _Window = _Window(self._first, self._window) if self._window else _All(self._first)
 
     def _do(self, step: Step) -> tuple[Factor, ...]:
@@ -107,16 +84,14 @@ class PoseGraph:
             return ()
         except (RuntimeError, ValueError, IndexError, ArithmeticError):  # gtsam's exceptions, and our own below
             self.replay(self._steps)
-        if step.odometry is not None and step.loops:
-            return self._do(Step(step.odometry)) + self.close(step.loops)
-        if step.odometry is not None:
-            sound = np.isfinite(step.odometry.T_first_second).all()
-            T = step.odometry.T_first_second if sound else np.eye(4)
-            self._do(Step(replace(step.odometry, T_first_second=T, covariance=np.eye(6))))
-            return (step.odometry,)
-        if len(step.loops) == 1:
-            return step.loops
-        return tuple(failed for loop in step.loops for failed in self.close([loop]))
+        if isinstance(step, Factor):
+            sound = np.isfinite(step.T_first_second).all()
+            T = step.T_first_second if sound else np.eye(4)
+            self._do(replace(step, T_first_second=T, covariance=np.eye(6)))
+            return (step,)
+        if len(step) == 1:
+            return step
+        return tuple(failed for loop in step for failed in self.close([loop]))
 
     def _try(self, step: Step) -> None:
         self._solver.update(step)
@@ -179,19 +154,18 @@ class _All:
 
     def update(self, step: Step) -> None:
         """Raises what gtsam raises, IndexError, ValueError and ArithmeticError; it is of no use then."""
-        if step.odometry is not None:
-            if not np.isfinite(np.linalg.cholesky(step.odometry.covariance)).all():
+        if isinstance(step, Factor):
+            if not np.isfinite(np.linalg.cholesky(step.covariance)).all():
                 raise ArithmeticError("a covariance is not finite")  # or the next loop would fail, and be blamed
-            self._chain.append(step.odometry.T_first_second, step.odometry.covariance)
-            self.newest = self.newest @ step.odometry.T_first_second
+            self._chain.append(step.T_first_second, step.covariance)
+            self.newest = self.newest @ step.T_first_second
             self.count += 1
             (self._ahead if self._poses is None else self._poses).append(self.newest)
-        if not step.loops:
             return
-        if not all(0 <= loop.first < loop.second < self.count for loop in step.loops):
+        if not all(0 <= loop.first < loop.second < self.count for loop in step):
             raise IndexError("a loop ties poses that are not there")
         self._poses, self._ahead = None, []
-        T_last, odometry = self._tie(step.loops), self._chain.poses
+        T_last, odometry = self._tie(step), self._chain.poses
         self.newest = T_last @ lie.inverse(odometry[self._tied[-1]]) @ odometry[-1]
 
     def poses(self) -> F64:
@@ -254,20 +228,23 @@ class _Window:
     def update(self, step: Step) -> None:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         stamps: dict[Any, Any] = {}
-        if step.odometry is not None:
-            self.newest = _add(step.odometry, self.newest, graph, values)
+        loops: tuple[Factor, ...] = ()
+        if isinstance(step, Factor):
+            self.newest = _add(step, self.newest, graph, values)
             stamps[self.count] = float(self.count)
             if self.count - len(self._left) == self._size:
                 self._left.append(_estimate(self._smoother, len(self._left)))
             self.count += 1
-        for loop in step.loops:
+        else:
+            loops = step
+        for loop in loops:
             if loop.first >= len(self._left):
                 graph.add(_between(loop))
             elif loop.second >= len(self._left):  # the older pose stays where it was left
                 where = gtsam.Pose3(self._left[loop.first] @ loop.T_first_second)
                 graph.add(gtsam.PriorFactorPose3(loop.second, where, _noise(loop)))
         self._smoother.update(graph, values, stamps)
-        if step.loops:
+        if loops:
             self.newest = _settled(self._smoother, self._smoother.update, self.count - 1, self.newest)
 
     def poses(self) -> F64:

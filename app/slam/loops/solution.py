@@ -4,7 +4,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from app.slam.loops.pose_graph import Factor, PoseGraph, Step
+from app.slam.loops.factors import Factor, Step
+from app.slam.loops.pose_graph import PoseGraph
 from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F64
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from app.slam.loops import scan_context, verification
-from app.slam.loops.pose_graph import Factor, PoseGraph
+from app.slam.loops.factors import Factor
+from app.slam.loops.pose_graph import PoseGraph
 from app.slam.loops.submap import Submap
 from app.slam.voxel import VoxelGrid
 

@@ -6,8 +6,9 @@ import pytest
 from scipy.optimize import least_squares
 
 from app.slam import lie
+from app.slam.loops.factors import Factor
 from app.slam.loops.inspection import residuals
-from app.slam.loops.pose_graph import HUBER, Factor, PoseGraph, Step, g2o_text, optimise
+from app.slam.loops.pose_graph import HUBER, PoseGraph, g2o_text, optimise
 from app.slam.types import F64
 
 
@@ -39,7 +40,8 @@ def chain(count: int, seed: int = 0, noise: float = 0.02) -> tuple[list[Factor],
 def graph_of(odometry: list[Factor], loops: list[Factor], window: int = 0) -> PoseGraph:
     graph = PoseGraph(np.eye(4), window)
     for factor in odometry:
-        graph.extend(factor, [loop for loop in loops if loop.second == factor.second])
+        graph.extend(factor)
+        graph.close([loop for loop in loops if loop.second == factor.second])
     return graph
 
 
@@ -177,7 +179,7 @@ def test_leaving_out_poses_that_no_loop_ties_changes_next_to_nothing(count: int)
     for first in (count // 4, count // 3):  # splits a stretch, and ends at one that is tied from then on
         T = lie.inverse(graph.poses[first]) @ graph.poses[-2] @ random_pose(np.random.default_rng(first), 0.003)
         graph.close([Factor(first, count - 2, T, np.eye(6) * 0.01**2)])
-    factors = odometry + [loop for step in graph.steps for loop in step.loops]
+    factors = odometry + [loop for step in graph.steps if isinstance(step, tuple) for loop in step]
 
     def cost(poses: F64) -> float:
         return sum(residual.sigmas**2 for residual in residuals(factors, poses))
@@ -224,7 +226,7 @@ def test_the_parking_garage_fed_pose_by_pose_ends_at_the_batch_optimum(shared_da
     first = values.atPose3(0).matrix()
     graph = PoseGraph(first)
     for j in range(1, count):
-        assert graph.extend(odometry[j], [loop for loop in loops if loop.second == j]) == ()
+        assert graph.extend(odometry[j]) == graph.close([loop for loop in loops if loop.second == j]) == ()
     factors = [*odometry.values(), *loops]
     batch = optimise(first, factors, [values.atPose3(k).matrix() for k in range(count)])
 
@@ -239,6 +241,12 @@ def test_steps_say_what_was_done() -> None:
     odometry, loops = chain(6)
     graph = graph_of(odometry, [])
     graph.close(loops)
-    assert graph.steps == (*(Step(factor) for factor in odometry), Step(None, tuple(loops)))
+    *first, last = graph.steps
+    for step, factor in zip(first, odometry, strict=True):
+        assert isinstance(step, Factor)
+        assert (step.first, step.second) == (factor.first, factor.second)
+        np.testing.assert_array_equal(step.T_first_second, factor.T_first_second)
+        np.testing.assert_array_equal(step.covariance, factor.covariance)
+    assert last == tuple(loops)
     assert graph.close([]) == ()
     assert len(graph.steps) == 6
