@@ -91,8 +91,6 @@ class LoopBackend:
         self.forget()
         if not self.known:
             self._begin(params)
-        elif params == self._history[-1].params:
-            params = self._history[-1].params  # so that they are kept once
         self._detector.take(keyframe)
         index, head = len(self), self._detector.head
         odometry = odometry_factor(index, head(index - 1), head(index), _drift(params)) if index else None
@@ -156,9 +154,8 @@ class LoopBackend:
 
     def _stand(self, count: int) -> None:
         """Take from the history what was found with the first `count` keyframes, and solve."""
-        parts = self._history.found(count, finished=self._finished)
-        self._detector.stand(count, (context for part in parts for context in part.contexts))
-        self._found = {edge.pair: edge for part in parts for edge in part.updates}
+        self._detector.stand(count, self._history.contexts(count, finished=self._finished))
+        self._found = {edge.pair: edge for edge in self._history.updates(count, finished=self._finished)}
         self._solve()
 
     def _is_known(self, keyframe: Keyframe, params: Loops) -> bool:

@@ -4,7 +4,7 @@ A keyframe is looked at once the keyframes after it that belong to its submap ha
 on either side of it is then as dense as at the older ones it is compared with.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from app.slam import lie
 from app.slam.loops import scan_context, verification
 from app.slam.loops.drift import Expectation
-from app.slam.loops.scan_context import ScanContext
+from app.slam.loops.scan_context import Contexts, ScanContext
 from app.slam.loops.submap import Recent, Submap, Submaps
 from app.slam.loops.verification import Fit, Prepared
 from app.slam.params import Loops
@@ -143,10 +143,10 @@ class Detector:
         self._heads.append(Head.of(keyframe))
         self._submaps.append(keyframe)
 
-    def stand(self, count: int, contexts: Iterable[ScanContext]) -> None:
+    def stand(self, count: int, contexts: Sequence[ScanContext]) -> None:
         """Be where the first `count` keyframes of those that were taken, and these contexts, are all there are."""
-        self._count, self._contexts = count, list(contexts)
-        self._keys = Rows((scan_context.RINGS,), np.float32, (context.ring_key for context in self._contexts))
+        self._count, self._contexts = count, Contexts(contexts)
+        self._keys = Rows((scan_context.RINGS,), np.float32, (context.ring_key for context in contexts))
 
     def go_on(self) -> None:
         """To the next keyframe that was taken."""

@@ -3,9 +3,14 @@
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from app.slam.loops.factors import Factor, Odometry, Step
+from app.slam.loops.scan_context import Contexts, ScanContext
 from app.slam.loops.search import Found
+from app.slam.loops.types import LoopEdge
 from app.slam.params import Loops
+from app.slam.rows import Rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,31 +30,50 @@ class History:
 
     def __init__(self) -> None:
         self.ends: dict[int, Found] = {}
-        self._records: list[Record] = []
+        self._params: list[Loops] = []
+        self._updates: dict[int, tuple[LoopEdge, ...]] = {}  # of the keyframes with which there were any
+        self._contexts = Contexts()
+        self._described = Rows((), np.int64, [0])  # how many of those before the first keyframe, and after each
         self._odometry = Odometry()
 
     def __len__(self) -> int:
-        return len(self._records)
+        return len(self._params)
 
     def __getitem__(self, index: int) -> Record:
-        return self._records[index]
+        begin, end = self._described.view()[index : index + 2]
+        contexts = tuple(self._contexts[number] for number in range(begin, end))
+        return Record(self._params[index], Found(contexts, self._updates.get(index, ())))
 
     def append(self, record: Record, odometry: Factor | None) -> None:
         """The next keyframe, with the odometry to it; None for the first."""
-        self._records.append(record)
+        if record.found.updates:
+            self._updates[len(self)] = record.found.updates
+        for context in record.found.contexts:
+            self._contexts.append(context)
+        self._described.append(len(self._contexts))
         if odometry is not None:
             self._odometry.append(odometry)
+        same = self._params and record.params == self._params[-1]
+        self._params.append(self._params[-1] if same else record.params)  # kept once
 
     def cut(self, count: int) -> None:
         """Keep the first `count`."""
-        del self._records[count:]
+        del self._params[count:]
+        self._updates = {index: updates for index, updates in self._updates.items() if index < count}
+        self._described.go_to(count + 1)
+        self._contexts.cut(int(self._described.view()[-1]))
         self._odometry.cut(max(count - 1, 0))
         self.ends = {end: found for end, found in self.ends.items() if end <= count}
 
-    def found(self, count: int, *, finished: bool) -> list[Found]:
-        """With the first `count`, in order, and if the walk is finished at the end too."""
-        end = [self.ends[count]] if finished else []
-        return [record.found for record in self._records[:count]] + end
+    def contexts(self, count: int, *, finished: bool) -> list[ScanContext]:
+        """Found with the first `count`, in order, and if the walk is finished at the end too."""
+        end = self.ends[count].contexts if finished else ()
+        return [*(self._contexts[number] for number in range(self._described.view()[count])), *end]
+
+    def updates(self, count: int, *, finished: bool) -> list[LoopEdge]:
+        """The same of candidates."""
+        end = self.ends[count].updates if finished else ()
+        return [*(edge for index in range(count) for edge in self._updates.get(index, ())), *end]
 
     def odometry_to(self, index: int) -> Factor | None:
         """From the keyframe before; None for the first."""

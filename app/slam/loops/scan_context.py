@@ -10,11 +10,13 @@ Differences from the paper, for a scanner that sees a hemisphere and walks indoo
 """
 
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from app.slam.rows import Rows
 from app.slam.types import F32, F64, U8
 
 RINGS, SECTORS = 20, 60
@@ -68,6 +70,32 @@ class ScanContext:
     def ring_key(self) -> F32:
         """(RINGS,), mean of each ring's seen cells, the same however the place is turned."""
         return np.asarray(self.cells.sum(axis=1) / np.maximum(self.seen.sum(axis=1), 1), dtype=np.float32)
+
+
+class Contexts:
+    """One after the other, on disk once they are many."""
+
+    def __init__(self, contexts: Iterable[ScanContext] = ()) -> None:
+        packed = [context.packed for context in contexts]
+        self._bytes, self._ends = Rows((), np.uint8), Rows((), np.int64)  # the latter: before the first, after each
+        self._bytes.extend(np.frombuffer(b"".join(packed), np.uint8))
+        self._ends.extend(np.cumsum([0, *map(len, packed)]))
+
+    def __len__(self) -> int:
+        return len(self._ends) - 1
+
+    def __getitem__(self, index: int) -> ScanContext:
+        begin, end = self._ends.view()[index : index + 2]
+        return ScanContext(self._bytes.view()[begin:end].tobytes())
+
+    def append(self, context: ScanContext) -> None:
+        self._bytes.extend(np.frombuffer(context.packed, np.uint8))
+        self._ends.append(len(self._bytes))
+
+    def cut(self, count: int) -> None:
+        """Keep the first `count`."""
+        self._ends.go_to(count + 1)
+        self._bytes.go_to(int(self._ends.view()[-1]))
 
 
 def describe(points: F32) -> ScanContext:
