@@ -1,5 +1,6 @@
 """Loop candidates on their way to another process: of thousands, only those that are others than before are sent."""
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 from app.slam.loops.types import LoopEdge, Pair
@@ -23,15 +24,17 @@ class EdgesSender:
     """Knows what was sent. A candidate that stays the same object is not sent again."""
 
     def __init__(self) -> None:
-        self._sent: dict[Pair, LoopEdge] | None = None
+        self._sent: tuple[LoopEdge, ...] | None = None
 
     def change(self, edges: tuple[LoopEdge, ...]) -> EdgesChange:
-        before, now = self._sent, {edge.pair: edge for edge in edges}
-        self._sent = now
+        before, self._sent = self._sent, edges
         if before is None:
             return EdgesChange(True, edges, ())
-        new = tuple(edge for pair, edge in now.items() if before.get(pair) is not edge)
-        return EdgesChange(False, new, tuple(pair for pair in before if pair not in now))
+        sent, there = set(before), set(edges)  # as objects
+        new = tuple(edge for edge in edges if edge not in sent)
+        others = {edge.pair for edge in new}
+        lost = (edge.pair for edge in before if edge not in there)
+        return EdgesChange(False, new, tuple(pair for pair in lost if pair not in others))
 
 
 class EdgesReceiver:
@@ -43,14 +46,19 @@ class EdgesReceiver:
 
     def __init__(self) -> None:
         self.edges: tuple[LoopEdge, ...] = ()
-        self._held: dict[Pair, LoopEdge] = {}
 
     def take(self, change: EdgesChange) -> None:
         if not (change.afresh or change.new or change.gone):
             return
-        if change.afresh:
-            self._held.clear()
-        self._held.update((edge.pair, edge) for edge in change.new)
+        held = [] if change.afresh else list(self.edges)
+        for edge in change.new:
+            place = bisect_left(held, edge.pair, key=_pair)
+            there = place < len(held) and held[place].pair == edge.pair
+            held[place : place + there] = [edge]
         for pair in change.gone:
-            del self._held[pair]
-        self.edges = tuple(self._held[pair] for pair in sorted(self._held))
+            del held[bisect_left(held, pair, key=_pair)]
+        self.edges = tuple(held)
+
+
+def _pair(edge: LoopEdge) -> Pair:
+    return edge.pair
