@@ -71,6 +71,18 @@ class Sequencer:
             _intervals_ns=self._intervals_ns.copy(),
         )
 
+    def tail(self) -> "Sequencer":
+        """What another one needs to notice what is missing between this one's last scan and its own first."""
+        return Sequencer(
+            self.max_gap_s,
+            replace(self.counts),
+            _stamps=self._stamps[-1:],
+            _values=self._values[-1:],
+            _last_stamp_ns=self._last_stamp_ns,
+            _last_end_ns=self._last_end_ns,
+            _intervals_ns=self._intervals_ns.copy(),
+        )
+
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector) -> None:
         """One IMU sample: rad/s and m/s^2, IMU frame."""
         values = (*gyro, *accel)

@@ -150,7 +150,7 @@ class LiveRun(Run):
 
     @property
     def _end_ns(self) -> int:
-        return self.log.rows(len(self.log) - 1)[0][0]
+        return int(self.log.stamps_ns[-1])
 
     def _keep_rows(self) -> None:
         """Put what is new behind what is kept; a piece behind that may be there, of an engine that died meanwhile."""
@@ -242,4 +242,4 @@ def _clear(folder: Path) -> None:
 
 def tells(status: Status) -> bool:
     """Whether a status is a warning, not only news."""
-    return status.kind in ("disconnected", "silent", "jump", "recording", "units")
+    return status.kind in ("disconnected", "silent", "jump", "recording", "units", "restarted")

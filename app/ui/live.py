@@ -32,6 +32,7 @@ _TROUBLES: Final = {
     "imu_late": "IMU samples too late",
     "jumps": "jumps of a sensor's clock",
     "reconnects": "reconnections",
+    "restarts": "restarts of the receiver",
 }
 """Counted, and shown once they are not zero."""
 

@@ -14,6 +14,7 @@ class Counters:
     imu, imu_lost, imu_late, imu_foreign: datagrams or messages of the IMU.
     jumps: of a sensor's clock. dropped: scans that the engine was too busy for.
     reconnects: of a connection. unreadable: messages that could not be decoded.
+    restarts: of the process that receives.
     """
 
     packets: int = 0
@@ -36,6 +37,7 @@ class Counters:
     dropped: int = 0
     reconnects: int = 0
     unreadable: int = 0
+    restarts: int = 0
 
     def describe(self) -> str:
         """Those that are not zero."""

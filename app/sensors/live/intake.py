@@ -8,6 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
@@ -56,6 +57,19 @@ class LiveScan:
     arrival_ns: int
 
 
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """What the first second told, and how the clocks stand: another intake goes on with it.
+
+    Attributes:
+        clock: in use. maps: by sensor. accel_scale: to m/s^2.
+    """
+
+    clock: Clock
+    maps: dict[str, ClockMap]
+    accel_scale: float
+
+
 class Tap(Protocol):
     """Whoever wants to see everything that comes, in the engine's time: the recorder."""
 
@@ -72,10 +86,20 @@ class Intake:
 
     Attributes:
         counters: shared with the receiving threads. sensor: what the LiDAR says about itself.
+
+    Args:
+        counters, settled: to go on with, of an intake that this one follows.
     """
 
-    def __init__(self, params: Params, clock: Clock = "auto", tap: Tap | None = None) -> None:
-        self.counters = Counters()
+    def __init__(
+        self,
+        params: Params,
+        clock: Clock = "auto",
+        tap: Tap | None = None,
+        counters: Counters | None = None,
+        settled: Settled | None = None,
+    ) -> None:
+        self.counters = counters or Counters()
         self.sensor = ""
         self._params = params
         self._clock: Clock = clock
@@ -92,6 +116,9 @@ class Intake:
         self._offset = OffsetEstimate()
         self._arrivals: dict[str, deque[int]] = {"LiDAR": deque(maxlen=50), "IMU": deque(maxlen=1000)}
         self._accel_scale = 1.0
+        if settled is not None:
+            self._held = None
+            self._clock, self._maps, self._accel_scale = settled.clock, settled.maps, settled.accel_scale
 
     # --- the receiving threads -------------------------------------------------------------------
 
@@ -135,6 +162,13 @@ class Intake:
         """Whether there is no reader at present. What waited for one is not let go when it is back."""
         with self._changed:
             self._absent = absent
+
+    def settled(self) -> Settled | None:
+        """What another one could go on with; None as long as it is not known."""
+        with self._changed:
+            if self._held is not None:
+                return None
+            return Settled(self._clock, deepcopy(self._maps), self._accel_scale)
 
     def state(self) -> LiveState:
         now = time.time_ns()

@@ -5,6 +5,7 @@ the disk: a crash costs less than the last second, and a missing end is no obsta
 (`mcap_stream.py`).
 """
 
+import itertools
 import os
 import struct
 import threading
@@ -24,6 +25,12 @@ MAX_SCANS, MAX_SAMPLES = 200, 100_000
 Vector = tuple[float, float, float]
 _Scan = tuple[Scan, int]
 _Imu = tuple[int, Vector, Vector, int]
+
+
+def further(path: Path) -> Path:
+    """Where to go on when `path` can not be gone on with: `walk-2.mcap` for `walk.mcap`, or the next that is free."""
+    names = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
+    return next(name for name in names if not name.exists())
 
 
 class Recorder:

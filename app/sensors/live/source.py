@@ -4,12 +4,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.sensors.live.intake import Intake, LiveImu, Receive
+from app.sensors.live.counters import Counters
+from app.sensors.live.intake import Intake, LiveImu, Receive, Settled
 from app.sensors.live.recorder import Recorder
-from app.sensors.live.status import LiveState, Status
+from app.sensors.live.status import Kind, LiveState, Status
 from app.sensors.sequencer import Counts, Sequencer
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
@@ -20,18 +21,41 @@ SILENCE_S = 1.0
 Event = Measurement | DroppedScan | Status
 
 
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What a source has found out, for one that takes its place.
+
+    Attributes:
+        at_ns: when, by the host's clock. counters: so far. settled: None while it is not.
+        pairing: where it was. recorded: bytes written so far.
+    """
+
+    at_ns: int
+    counters: Counters
+    settled: Settled | None = None
+    pairing: Sequencer | None = None
+    recorded: int = 0
+
+
 class LiveSource:
     """Receives on threads of its own; `poll` gives scans paired with IMU samples, and what happened.
 
     One thread may poll. A context manager; `close` ends the threads and the recording.
+    before: of a source that this one takes the place of.
     """
 
     def __init__(
-        self, receivers: list[Receive], intake: Intake, params: Params, recorder: Recorder | None = None
+        self,
+        receivers: list[Receive],
+        intake: Intake,
+        params: Params,
+        recorder: Recorder | None = None,
+        before: Known | None = None,
     ) -> None:
         self._intake = intake
         self._recorder = recorder
-        self._sequencer = Sequencer(params.imu.max_gap)
+        self._recorded_before = before.recorded if before else 0
+        self._sequencer = (before and before.pairing) or Sequencer(params.imu.max_gap)
         self._stop = threading.Event()
         self._events: deque[Event] = deque()
         self._pairing = False
@@ -66,8 +90,18 @@ class LiveSource:
 
     def state(self) -> LiveState:
         """How it is doing, now."""
-        recorded = None if self._recorder is None else self._recorder.bytes_written
+        recorded = None if self._recorder is None else self._recorded_before + self._recorder.bytes_written
         return replace(self._intake.state(), recorded=recorded)
+
+    def known(self) -> Known:
+        """For a source that takes the place of this one. Not while another thread polls."""
+        state = self.state()
+        pairing = self._sequencer.tail()
+        return Known(time.time_ns(), state.counters, self._intake.settled(), pairing, state.recorded or 0)
+
+    def tell(self, kind: Kind, text: str) -> None:
+        """Give this as news to whoever polls."""
+        self._intake.put_status(kind, "source", text)
 
     def set_absent(self, absent: bool) -> None:
         """Whether nobody polls at present, and will come back: then more scans may wait."""

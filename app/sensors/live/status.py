@@ -1,11 +1,13 @@
 """What a live source has to tell beside measurements."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from app.sensors.live.counters import Counters
 
-Kind = Literal["connected", "disconnected", "silent", "back", "jump", "configuration", "clocks", "units", "recording"]
+Kind = Literal[
+    "connected", "disconnected", "silent", "back", "jump", "configuration", "clocks", "units", "recording", "restarted",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,3 +46,8 @@ class LiveState:
     offset_s: float | None = None
     sensor: str = ""
     recorded: int | None = None
+
+    def unheard(self, seconds: float) -> "LiveState":
+        """The same after so long in which nothing was heard of the source."""
+        lidar, imu = (None if age is None else age + seconds for age in (self.lidar_age_s, self.imu_age_s))
+        return replace(self, lidar_hz=0.0, imu_hz=0.0, lidar_age_s=lidar, imu_age_s=imu)

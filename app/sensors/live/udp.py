@@ -108,6 +108,7 @@ class RsbpearlReceiver:
 
     def __call__(self, intake: Intake, stop: threading.Event) -> None:
         self._assembler.counters = intake.counters
+        self._decoder.bad_blocks = intake.counters.bad_blocks
         with contextlib.ExitStack() as stack:
             for opened in self._sockets:
                 stack.enter_context(opened)

@@ -11,7 +11,7 @@ from app.sensors.live.imu_udp import IMU_PORT
 from app.sensors.live.intake import Clock, Intake, Receive
 from app.sensors.live.msop import MSOP_PORT
 from app.sensors.live.recorder import Recorder
-from app.sensors.live.source import LiveSource
+from app.sensors.live.source import Known, LiveSource
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 
@@ -89,13 +89,16 @@ def _is_host(host: str) -> bool:
     return not any(character.isspace() or character in "@[]\0" for character in host)
 
 
-def open_live(lidar: str, params: Params, imu: str | None = None, record: Path | None = None) -> LiveSource:
+def open_live(
+    lidar: str, params: Params, imu: str | None = None, record: Path | None = None, before: Known | None = None
+) -> LiveSource:
     """Begin to receive.
 
     Args:
         lidar: `rsbpearl://HOST:MSOP,DIFOP` or `foxglove://HOST:PORT`. imu: `imu-udp://HOST:PORT`, or another
             `foxglove://`; None: from the LiDAR's Foxglove source.
         record: an .mcap to write all of it into.
+        before: what a source that this one takes the place of had found out.
 
     Raises:
         HemislamError: an address can not be understood, a port not opened, a file not written.
@@ -124,7 +127,8 @@ def open_live(lidar: str, params: Params, imu: str | None = None, record: Path |
         receivers.append(FoxgloveReceiver(foxglove.host or "127.0.0.1", foxglove.ports[0], wanted, params))
     recorder = Recorder(record) if record else None
     clock = cast(Clock, address.options.get("clock", "auto"))
-    return LiveSource(receivers, Intake(params, clock, recorder), params, recorder)
+    known = (before.counters, before.settled) if before else ()
+    return LiveSource(receivers, Intake(params, clock, recorder, *known), params, recorder, before)
 
 
 def _foxglove(address: Address, beside: Address | None) -> list[tuple[Address, frozenset[str]]]:

@@ -73,13 +73,12 @@ def test_it_ends_cleanly_with_sigterm_and_says_that_it_did(tmp_path: Path) -> No
     wire, record = Wire(), tmp_path / "session.mcap"
     with LiveProcess(wire.url, Params(), wire.imu_url, record) as process:
         client = LiveClient(process.address)
-        pid = process._process.pid
-        assert pid is not None and process.alive
-        os.kill(pid, signal.SIGTERM)
+        assert process.pid is not None and process.alive
+        os.kill(process.pid, signal.SIGTERM)
         with pytest.raises(HemislamError, match="has ended"):
             for _ in range(100):
                 client.poll(0.1)
         client.close()
-        process._process.join(5.0)
+        process._watcher.join(5.0)
         assert not process.alive
     assert record.read_bytes().endswith(b"\x89MCAP0\r\n")

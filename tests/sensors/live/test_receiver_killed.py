@@ -1,0 +1,165 @@
+"""A receiving process that is killed comes back: what it had learnt, counted and recorded is still there."""
+
+import contextlib
+import math
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from app.sensors.live import process as live_process
+from app.sensors.live.process import LiveClient, LiveProcess
+from app.sensors.live.recorder import further
+from app.sensors.live.source import Event
+from app.sensors.live.status import Status
+from app.sensors.recording import open_recording
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import Measurement
+from tests.sensors.live import sensor
+from tests.sensors.live.test_live import Wire
+
+TURN_NS = 1801 * 55_520
+PATIENCE_S = 30.0
+
+
+class Walk:
+    """Revolutions in real time, and what becomes of them."""
+
+    def __init__(self, wire: Wire, client: LiveClient) -> None:
+        self._wire, self._client = wire, client
+        self.events: list[Event] = []
+        self._began_s = time.monotonic()
+
+    def turn(self, count: int) -> int:
+        """So many, of the sensor that turned all the time. Returns the number of the first."""
+        first = math.ceil(self._now() + 5)
+        packets = sensor.turns(count, start_ns=sensor.START_NS + first * TURN_NS)
+        while self._now() < first:
+            self.poll()
+        thread = threading.Thread(target=self._wire.turns, args=(first, packets, 0.1))
+        thread.start()
+        while thread.is_alive():
+            self.poll()
+        thread.join()
+        return first
+
+    def _now(self) -> float:
+        return (time.monotonic() - self._began_s) * 1e9 / TURN_NS
+
+    def poll(self) -> None:
+        event = self._client.poll(0.05)
+        if event is not None:
+            self.events.append(event)
+
+    def until(self, place: int) -> None:
+        """That revolution was given."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not self.turns or self.turns[-1] < place:
+            assert time.monotonic() < deadline, (self.turns[-5:], self._client.state())
+            self.poll()
+
+    @property
+    def turns(self) -> list[int]:
+        return turns_of(self.events)
+
+
+def turns_of(events: list[Event]) -> list[int]:
+    found = [event for event in events if isinstance(event, Measurement)]
+    return [round((event.scan.stamp_ns - sensor.START_NS) / TURN_NS) for event in found]
+
+
+def recorded(path: Path) -> list[int]:
+    """What can be read of it, be it that its end is missing."""
+    found: list[Event] = []
+    with contextlib.suppress(HemislamError), open_recording(path, Params()) as recording:
+        found.extend(recording.measurements())
+    return turns_of(found)
+
+
+@contextmanager
+def walking(record: Path) -> Iterator[tuple[LiveProcess, LiveClient, Walk]]:
+    wire = Wire()
+    with LiveProcess(wire.url, Params(), wire.imu_url, record) as process:
+        client = LiveClient(process.address)
+        yield process, client, Walk(wire, client)
+        client.close()
+
+
+def kill(process: LiveProcess) -> None:
+    """And wait until there is another one, or none any more."""
+    killed = process.pid
+    assert killed is not None
+    os.kill(killed, signal.SIGKILL)
+    deadline = time.monotonic() + PATIENCE_S
+    while process.alive and process.pid == killed:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_a_receiver_that_is_killed_comes_back_and_records_into_a_further_file(tmp_path: Path) -> None:
+    record = tmp_path / "walk.mcap"
+    (tmp_path / "walk-2.mcap").write_bytes(b"of somebody else")
+    with walking(record) as (process, client, walk):
+        walk.until(walk.turn(16) + 13)
+        last, deadline = walk.turns[-1], time.monotonic() + PATIENCE_S
+        while (before := client.state()).recorded == 0 or last - 1 not in recorded(record):  # the disk may be slow
+            assert time.monotonic() < deadline
+        time.sleep(0.5)  # what is known is told five times a second
+        kill(process)
+        while client.state().counters.restarts == 0:  # it is asked all the time, and never in vain
+            walk.poll()
+        assert walk.turns == list(range(walk.turns[0], walk.turns[-1] + 1))
+        first = walk.turn(8)
+        walk.until(first + 5)
+        after = client.state()
+    assert after.counters.restarts == 1
+    assert after.counters.frames >= before.counters.frames + 6 and after.counters.imu > before.counters.imu
+    assert (after.counters.lost, after.counters.dropped, after.counters.jumps) == (0, 0, 0)
+    assert before.recorded is not None and after.recorded is not None and after.recorded >= before.recorded > 0
+    assert walk.turns[-6:] == list(range(first, first + 6)), "no second is waited for again to learn units and clocks"
+
+    (told,) = [event for event in walk.events if isinstance(event, Status) and event.kind == "restarted"]
+    assert "signal 9" in told.text and "walk-3.mcap" in told.text and "nothing was received for" in told.text
+    gap = next(event for event in walk.events if isinstance(event, Measurement) and turns_of([event])[0] >= first)
+    assert any("no usable scan for" in notice for notice in gap.notices)
+
+    assert last - 1 in recorded(record), "what was on disk stays readable"
+    assert (tmp_path / "walk-2.mcap").read_bytes() == b"of somebody else"
+    assert set(recorded(tmp_path / "walk-3.mcap")) >= set(range(first + 1, first + 6))
+
+
+def test_a_receiver_that_keeps_dying_is_given_up_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_process, "MOST_DEATHS", 3)
+    with walking(tmp_path / "walk.mcap") as (process, _, walk):
+        for _ in range(3):
+            kill(process)
+        with pytest.raises(HemislamError, match=r"ended unexpectedly 3 times .*signal 9.*start hemislam again"):
+            for _ in range(200):
+                walk.poll()
+        with pytest.raises(HemislamError, match="3 times"):
+            LiveClient(process.address)
+        assert not process.alive
+
+
+def test_deaths_far_from_one_another_are_no_reason_to_give_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_process, "MOST_DEATHS", 2)
+    monkeypatch.setattr(live_process, "WITHIN_S", 0.0)
+    with walking(tmp_path / "walk.mcap") as (process, client, _):
+        for count in (1, 2):
+            kill(process)
+            while client.state().counters.restarts < count:
+                time.sleep(0.05)
+        assert process.alive
+
+
+def test_further_files_have_the_next_number_that_is_free(tmp_path: Path) -> None:
+    walk = tmp_path / "a.b.mcap"
+    assert further(walk) == tmp_path / "a.b-2.mcap"
+    further(walk).touch()
+    assert further(walk) == tmp_path / "a.b-3.mcap"

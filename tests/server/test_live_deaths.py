@@ -1,0 +1,55 @@
+"""The receiver, the engine, or both die while a walk is mapped live: it goes on in the same map, and says so."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_live_run import PATIENCE_S, SAMPLE, free_ports, receiving
+
+from app.sensors.presets import resolve_params
+from app.server.protocol import Snapshot
+from app.slam.params import Params
+
+
+@pytest.fixture(scope="module")
+def params() -> Params:
+    return resolve_params(SAMPLE, None, None, []).with_values({"loops.enabled": False})
+
+
+def restarts(snapshot: Snapshot) -> int:
+    return snapshot.live.counters.restarts if snapshot.live is not None else 0
+
+
+def test_whoever_dies_the_walk_goes_on_in_the_same_map(params: Params, tmp_path: Path) -> None:
+    (port,) = free_ports(1)
+    with receiving(params, tmp_path, f"foxglove://127.0.0.1:{port}") as live:
+        thread = live.play(1.0, patiently=False)
+        before = live.until(lambda s: s.transport.frame >= 15)
+        for dying, count in ({"receiver"}, 1), ({"engine"}, 1), ({"receiver", "engine"}, 2):
+            pids = {"receiver": live.source.pid, "engine": live.engine.pid}
+            for name in dying:
+                os.kill(pids[name] or 0, signal.SIGKILL)
+            deadline = time.monotonic() + PATIENCE_S
+            while any(
+                pids[name] == pid
+                for name, pid in (("receiver", live.source.pid), ("engine", live.engine.pid))
+                if name in dying
+            ):
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            back = live.until(lambda s, count=count: restarts(s) == count and s.progress is None)  # type: ignore[misc]
+            live.until(lambda s, frame=back.transport.frame: s.transport.frame > frame + 3)  # type: ignore[misc]
+        thread.join(PATIENCE_S)
+        assert not live.errors
+        end = live.until(lambda s: s.live is not None and (s.live.lidar_age_s or 0.0) > 1.0)
+    assert end.session == before.session, "the page keeps its map"
+    assert end.engine_alive and not end.transport.finished
+    assert [chunk.index for chunk in end.chunks] == list(range(len(end.chunks)))
+    assert end.trajectory is not None and len(end.trajectory) == end.transport.frame + 1
+    assert (np.diff(end.series["stamp_s"]) > 0.05).all(), "no scan twice, and none before another"
+    told = [notice.text for notice in end.notices]
+    assert sum("was started again, nothing was received for" in text for text in told) == 2
+    assert sum("goes where it was" in text for text in told) == 2
