@@ -15,9 +15,12 @@ from dataclasses import replace
 from multiprocessing.connection import Connection, Pipe
 from typing import Final
 
+import numpy as np
+
 from app.logs import process_logs
 from app.memory import give_back
 from app.server import wire
+from app.server.corrections import Corrections
 from app.server.edges import EdgesReceiver, EdgesSender
 from app.slam.loops.messages import LoopState, LoopWorkerDied, Reply, Request
 
@@ -25,6 +28,7 @@ NICENESS: Final = 10
 """The frame loop comes first."""
 _ALONE: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "NUMBA", "OPENBLAS", "MKL")}
 """More threads would fight the frame loop's for the cores."""
+_NONE: Final = np.empty((0, 4, 4))
 
 
 class LoopProcess:
@@ -114,14 +118,14 @@ class LoopProcess:
                     return
 
     def _read(self, replies: "Connection[object, object]") -> None:
-        edges = EdgesReceiver()
+        edges, corrections = EdgesReceiver(), Corrections()
         with replies:
             try:
                 while True:
-                    reply, change = wire.receive(replies)
+                    reply, changes = wire.receive(replies)
                     if isinstance(reply, LoopState):
-                        edges.take(change)
-                        reply = replace(reply, edges=edges.edges)
+                        edges.take(changes[0])
+                        reply = replace(reply, edges=edges.edges, corrections=corrections.take(changes[1]))
                     self._answers.put(reply)
             except (EOFError, OSError):
                 self._answers.put(None)
@@ -138,15 +142,15 @@ def main() -> None:
 
     warm_up()
     service = LoopService()
-    edges = EdgesSender()
+    edges, corrections = EdgesSender(), Corrections()
     try:
         while True:
             reply = service.handle(wire.receive(requests))
-            change = None
+            changes = None
             if isinstance(reply, LoopState):
-                change = edges.change(reply.edges)
-                reply = replace(reply, edges=())
-            wire.send(replies, (reply, change))
+                changes = edges.change(reply.edges), corrections.change(reply.corrections)
+                reply = replace(reply, edges=(), corrections=_NONE)
+            wire.send(replies, (reply, changes))
     except (EOFError, OSError):  # the owner has gone, or wants no more
         return
 

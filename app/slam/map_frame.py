@@ -3,10 +3,14 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from app.slam.loops.corrections import corrected
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64, I64
+
+PIECE = 1024
+"""Frames that are laid into the map at once: all of a long walk would take tens of megabytes for a moment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +47,17 @@ class MapFrame:
         """In the map. Between two keyframes the correction goes over from one's to the other's."""
         if not len(self.T_map_odom) or not len(odometry):
             return odometry
-        T = np.tile(np.eye(4), (len(odometry), 1, 1))
-        T[:, :3, :3] = odometry.rotations.as_matrix()
-        T[:, :3, 3] = odometry.positions
+        pieces = [self._laid(odometry, slice(first, first + PIECE)) for first in range(0, len(odometry), PIECE)]
+        positions, quaternions = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+        return Trajectory(odometry.stamps_ns, positions, quaternions)
+
+    def _laid(self, odometry: Trajectory, piece: slice) -> tuple[F64, F64]:
+        """Positions and quaternions in the map, of a piece of it."""
+        T = np.tile(np.eye(4), (len(odometry.stamps_ns[piece]), 1, 1))
+        T[:, :3, :3] = Rotation.from_quat(odometry.quaternions[piece]).as_matrix()
+        T[:, :3, 3] = odometry.positions[piece]
         stamps = self.stamps_ns[: len(self.T_map_odom)]
-        return Trajectory.from_poses(odometry.stamps_ns, corrected(odometry.stamps_ns, T, stamps, self.T_map_odom))
+        laid = Trajectory.from_poses(
+            odometry.stamps_ns[piece], corrected(odometry.stamps_ns[piece], T, stamps, self.T_map_odom)
+        )
+        return laid.positions, laid.quaternions

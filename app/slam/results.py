@@ -8,7 +8,6 @@ import copy
 import json
 import math
 import os
-from array import array
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ from app.slam.metrics import GroundScore, Trajectory, ate, rpe, write_tum
 from app.slam.params import Params
 from app.slam.ply import Keyframes, write_map
 from app.slam.provenance import describe_machine, hash_input, peak_memory_mb
+from app.slam.rows import Rows
 from app.slam.trajectory import stamp_text
 from app.slam.types import F64, I64, NON_GROUND, STAGES, DroppedScan, FrameStatus, StepResult
 
@@ -58,8 +58,8 @@ class RunInfo:
     stopped: str = ""
 
 
-LogRows = tuple["array[int]", "array[float]", "array[float]"]
-"""Rows of a `RunLog`: stamps, poses, timings."""
+LogRows = tuple[I64, F64, F64]
+"""Rows of a `RunLog`: (n,) stamps, (n, 7) poses, (n, len(TIMINGS)) timings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,10 +77,9 @@ class RunLog:
     """
 
     def __init__(self) -> None:
-        self._frames = 0
-        self._stamps = array("q")
-        self._poses = array("d")
-        self._timings = array("d")
+        self._stamps = Rows((), np.int64)
+        self._poses = Rows((7,), np.float64)
+        self._timings = Rows((len(TIMINGS),), np.float64)
         self.statuses: Counter[FrameStatus] = Counter()
         self.dropped: Counter[str] = Counter()
         self.notices: Counter[str] = Counter()
@@ -89,17 +88,15 @@ class RunLog:
         self.ground_score: GroundScore | None = None
 
     def __len__(self) -> int:
-        return self._frames
+        return len(self._stamps)
 
     def add(self, result: StepResult) -> None:
         """Take in a processed frame."""
-        T_odom_imu, frame = result.state.T_odom_imu, self._frames
+        T_odom_imu = result.state.T_odom_imu
         pose = (*T_odom_imu[:3, 3], *Rotation.from_matrix(T_odom_imu[:3, :3]).as_quat())
-        timings = [result.timings_ms.get(stage, 0.0) for stage in TIMINGS]
-        self._stamps[frame : frame + 1] = array("q", [result.stamp_ns])
-        self._poses[7 * frame : 7 * (frame + 1)] = array("d", pose)
-        self._timings[len(TIMINGS) * frame : len(TIMINGS) * (frame + 1)] = array("d", timings)
-        self._frames += 1
+        self._stamps.append(result.stamp_ns)
+        self._poses.append(pose)
+        self._timings.append([result.timings_ms.get(stage, 0.0) for stage in TIMINGS])
         self.statuses[result.status] += 1
         self._count(result.notices)
         self.points += len(result.cloud)
@@ -113,50 +110,60 @@ class RunLog:
         self.dropped[scan.reason] += 1
 
     def checkpoint(self) -> LogState:
-        return LogState(self._frames, {name: copy.copy(getattr(self, name)) for name in _SUMS})
+        return LogState(len(self), {name: copy.copy(getattr(self, name)) for name in _SUMS})
 
     def restore(self, state: LogState) -> None:
         """Go back to a checkpoint of this log, or forth again to one whose rows were not replaced since."""
-        self._frames = state.frames
+        self._go_to(state.frames)
         for name, value in state.sums.items():
             setattr(self, name, copy.copy(value))
 
     def rows(self, first: int) -> LogRows:
         """The rows of the frames from `first` on."""
-        n, width = self._frames, len(TIMINGS)
-        return self._stamps[first:n], self._poses[7 * first : 7 * n], self._timings[width * first : width * n]
+        return self._stamps.view()[first:], self._poses.view()[first:], self._timings.view()[first:]
 
     def extend(self, rows: LogRows) -> None:
         """Put rows of another log behind those of this one; `restore` says what they amount to."""
-        self._stamps += rows[0]
-        self._poses += rows[1]
-        self._timings += rows[2]
-        self._frames = len(self._stamps)
+        for table, more in zip(self._tables, rows, strict=True):
+            table.extend(more)
+
+    @property
+    def _tables(self) -> tuple[Rows[Any], ...]:
+        return self._stamps, self._poses, self._timings
+
+    def _go_to(self, frames: int) -> None:
+        for table in self._tables:
+            table.go_to(frames)
 
     def _count(self, notices: tuple[str, ...]) -> None:
         for notice in notices:
             if notice in self.notices or len(self.notices) < MOST_NOTICES:
                 self.notices[notice] += 1
 
+    # Arrays are read-only, and as they are only until the log goes back and on from there.
     @property
     def stamps_ns(self) -> I64:
         """(n,) scan ends of all processed frames."""
-        return np.array(self._stamps[: self._frames], dtype=np.int64)
+        return self._stamps.view()
 
     @property
     def timings_ms(self) -> F64:
         """(n, len(TIMINGS)) milliseconds."""
-        return np.array(self._timings).reshape(-1, len(TIMINGS))[: self._frames]
+        return self._timings.view()
 
     @property
     def odometry(self) -> Trajectory:
         """T_odom_imu at every scan's end; while the filter waits at rest to start, the origin."""
-        return self.odometry_of(self._frames)
+        poses = self._poses.view()
+        return Trajectory(self.stamps_ns, poses[:, :3], poses[:, 3:])
 
     def odometry_of(self, frames: int) -> Trajectory:
         """The same of the first `frames`, be it that some were gone back over."""
-        rows = np.array(self._poses).reshape(-1, 7)[:frames]
-        return Trajectory(np.array(self._stamps[:frames], dtype=np.int64), rows[:, :3], rows[:, 3:])
+        now = len(self)
+        self._go_to(frames)
+        odometry = self.odometry
+        self._go_to(now)
+        return odometry
 
 
 def prepare_folder(folder: Path, *, replace: bool = False) -> None:

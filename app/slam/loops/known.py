@@ -1,11 +1,10 @@
 """What is remembered of the keyframes of a walk, those included that were gone back over."""
 
-from bisect import bisect_right
-
 import numpy as np
 
 from app.slam.loops.messages import LoopState
 from app.slam.params import Loops
+from app.slam.rows import Rows
 from app.slam.types import I64, Keyframe
 
 STATES_BYTES = 128 << 20
@@ -25,8 +24,8 @@ class KnownKeyframes:
         self.states: dict[int, LoopState] = {}
         self.states_bytes = STATES_BYTES
         self._nbytes = 0
-        self._frames: list[int] = []
-        self._stamps: list[int] = []
+        self._frames = Rows((), np.int64)
+        self._stamps = Rows((), np.int64)
         self._params: list[Loops] = []
 
     def __len__(self) -> int:
@@ -34,15 +33,15 @@ class KnownKeyframes:
 
     def holds(self, index: int, frame: int) -> bool:
         """Whether the keyframe of this index is known and was this frame."""
-        return index < len(self) and self._frames[index] == frame
+        return index < len(self) and int(self._frames.view()[index]) == frame
 
     def until(self, frame: int) -> int:
         """How many are at this frame or before."""
-        return bisect_right(self._frames, frame)
+        return int(np.searchsorted(self._frames.view(), frame, side="right"))
 
     def stamps_ns(self, count: int) -> I64:
-        """(count,) of the first ones."""
-        return np.array(self._stamps[:count], dtype=np.int64)
+        """(count,) of the first ones, read-only; they stay as they are."""
+        return self._stamps.view()[:count]
 
     def params(self, index: int) -> Loops:
         return self._params[index]
@@ -58,7 +57,8 @@ class KnownKeyframes:
         """All but the first `count`."""
         if count >= len(self):
             return
-        del self._frames[count:], self._stamps[count:], self._params[count:]
+        self._frames, self._stamps = self._frames.rewound(count), self._stamps.rewound(count)
+        del self._params[count:]
         self._keep({known: state for known, state in self.states.items() if known <= count})
 
     def remember(self, count: int, state: LoopState) -> None:

@@ -1,0 +1,49 @@
+"""Corrections on their way out of the process that finds loops: of thousands, only those from the first new one on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.slam.rows import Rows
+from app.slam.types import F64
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionsChange:
+    """What makes the corrections that were sent before those that there are now.
+
+    Attributes:
+        kept: how many of the first stay. new: (n, 4, 4), those after them.
+    """
+
+    kept: int
+    new: F64
+
+
+class Corrections:
+    """What one side has sent, or the other was sent. While none changes they are the same memory, however many come."""
+
+    def __init__(self) -> None:
+        self._rows = Rows((4, 4), np.float64)
+
+    def change(self, corrections: F64) -> CorrectionsChange:
+        """What to send, so that the other side has these (k, 4, 4)."""
+        before = self._rows.view()
+        both = min(len(before), len(corrections))
+        differ = (_bits(before[:both]) != _bits(corrections[:both])).any(axis=(1, 2))
+        kept = int(np.argmax(differ)) if differ.any() else both
+        change = CorrectionsChange(kept, corrections[kept:])
+        self.take(change)
+        return change
+
+    def take(self, change: CorrectionsChange) -> F64:
+        """All that there are now, (k, 4, 4), read-only; those given before stay as they are."""
+        if change.kept < len(self._rows):
+            self._rows = self._rows.rewound(change.kept)
+        self._rows.extend(change.new)
+        return self._rows.view()
+
+
+def _bits(numbers: F64) -> np.ndarray:
+    """To compare to the last bit, the sign of zero too."""
+    return np.ascontiguousarray(numbers).view(np.int64)
