@@ -56,19 +56,31 @@ STRIPS: Final = (
 """In the order shown; the loops' row comes last."""
 
 
-def values(series: dict[str, F64]) -> dict[str, F64]:
-    """(n,) by `Strip.key`, in its unit; nan where there is none."""
+_STAMP: Final = "stamp"
+_KEYS: Final = (*(strip.key for strip in STRIPS), _STAMP)
+_MEASURED: Final = {
+    "residual": ("residual_rms", 1e3),
+    "ground": ("ground_share", 1e2),
+    "gap": ("imu_gap_s", 1e3),
+    "dropped": ("dropped", 1.0),
+    "took": ("total_ms", 1.0),
+    "error": ("error_m", 1e2),
+    _STAMP: ("stamp_s", 1.0),
+}
+"""The readout that a strip shows in another unit, and by which factor."""
+
+
+def value(key: str, series: dict[str, F64]) -> F64:
+    """(n,) of a strip, in its unit; nan where there is none."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return {
-            "residual": 1e3 * series["residual_rms"],
-            "inliers": 100 * series["inliers"] / np.where(series["used"] > 0, series["used"], np.nan),
-            "uncertain": 100 / np.sqrt(series["degeneracy"]),
-            "ground": 100 * series["ground_share"],
-            "gap": 1e3 * series["imu_gap_s"],
-            "dropped": series["dropped"],
-            "took": series["total_ms"],
-            "error": 100 * series["error_m"],
-        }
+        match key:
+            case "inliers":
+                return 100 * series["inliers"] / np.where(series["used"] > 0, series["used"], np.nan)
+            case "uncertain":
+                return 100 / np.sqrt(series["degeneracy"])
+            case _:
+                name, scale = _MEASURED[key]
+                return scale * series[name]
 
 
 def limits(snapshot: Snapshot) -> dict[str, float]:
@@ -87,63 +99,80 @@ def limits(snapshot: Snapshot) -> dict[str, float]:
 class History:
     """All frames that were seen in a session: those that were gone back over stay until they are replaced.
 
+    Only these are kept here. All others are in the snapshot seen last.
+
     Attributes:
-        total: frames of the recording. present: the newest frame of the snapshot seen last, or -1.
+        total: frames of the recording.
     """
 
     def __init__(self) -> None:
-        self._session = -1
-        self._forget(-1, 1)
+        self.total = 1
+        self._forget()
 
-    def _forget(self, session: int, total: int) -> None:
-        self._session, self.total, self.present = session, total, -1
-        self._truth: Path | None = None
-        self._stamps = np.full(total, np.nan)
-        self._values = {strip.key: np.full(total, np.nan) for strip in STRIPS}
-        self._loops: dict[Pair, tuple[int, Verdict]] = {}
+    def _forget(self) -> None:
+        self._seen = Snapshot(session=-1)
+        self._later: dict[str, F64] = {}  # by strip, of frames after `present`
+        self._later_loops: dict[Pair, tuple[int, Verdict]] = {}
+
+    @property
+    def present(self) -> int:
+        """The newest frame of the snapshot seen last, or -1."""
+        return min(len(self._seen.series.get("stamp_s", ())), self.total) - 1
 
     def see(self, snapshot: Snapshot) -> None:
         """Take in what a snapshot says of all frames up to its newest."""
-        total = max(snapshot.recording.frames if snapshot.recording else 1, 1)
-        if snapshot.session != self._session or total != self.total:
-            self._forget(snapshot.session, total)
-        truth = snapshot.recording.truth if snapshot.recording else None
-        if truth != self._truth:
-            self._truth = truth
-            self._values["error"][:] = np.nan  # what there was is the distance to another
-        n = min(len(snapshot.series.get("stamp_s", ())), total)
-        if n:
-            self._stamps[:n] = snapshot.series["stamp_s"][:n]
-            for key, column in values(snapshot.series).items():
-                self._values[key][:n] = column[:n]
-        self.present = n - 1
-        later = {pair: entry for pair, entry in self._loops.items() if entry[0] > self.present}
-        self._loops = later | loop_frames(snapshot.loops.edges, snapshot.chunks)
+        self.total = max(snapshot.recording.frames if snapshot.recording else 1, 1)
+        if snapshot.session != self._seen.session:
+            self._forget()
+        count = len(snapshot.series.get("stamp_s", ()))
+        if self._later or count <= self.present:
+            self._later = {key: self._known(key)[count:] for key in _KEYS}
+            self._later_loops = {pair: entry for pair, entry in self._loops().items() if entry[0] >= count}
+        if self._later and _truth(snapshot) != _truth(self._seen):
+            self._later["error"][:] = np.nan  # what there was is the distance to another
+        self._seen = snapshot
+
+    def _known(self, key: str) -> F64:
+        """(n,) of a strip, or stamps, of all frames that there were."""
+        series = self._seen.series
+        parts = [value(key, series)] if series else []
+        return np.concatenate((*parts, self._later.get(key, np.empty(0))))
+
+    def _column(self, key: str) -> F64:
+        """(total,), nan where there is none."""
+        known = self._known(key)[: self.total]
+        return np.concatenate((known, np.full(self.total - len(known), np.nan)))
+
+    def _loops(self) -> dict[Pair, tuple[int, Verdict]]:
+        """The frames at which candidates got their verdicts, and these."""
+        return self._later_loops | loop_frames(self._seen.loops.edges, self._seen.chunks)
 
     def columns(self, most: int = COLUMNS) -> "Columns":
         """Everything, thinned to at most so many columns of equally many frames."""
         count = min(self.total, most)
         starts = np.arange(count) * self.total // count
         loops: dict[str, list[int]] = {verdict: [0] * count for verdict in Verdict}
-        for frame, verdict in self._loops.values():
+        for frame, verdict in self._loops().values():
             loops[verdict][int(np.searchsorted(starts, frame, side="right")) - 1] += 1
-        return Columns(
-            starts=starts,
-            stamps=self._stamps[starts],
-            low={key: np.fmin.reduceat(column, starts) for key, column in self._values.items()},
-            high={key: np.fmax.reduceat(column, starts) for key, column in self._values.items()},
-            loops=loops,
-        )
+        low, high = {}, {}
+        for strip in STRIPS:
+            column = self._column(strip.key)
+            low[strip.key], high[strip.key] = np.fmin.reduceat(column, starts), np.fmax.reduceat(column, starts)
+        return Columns(starts=starts, stamps=self._column(_STAMP)[starts], low=low, high=high, loops=loops)
 
     def troubles(self, limits: dict[str, float]) -> list[int]:
         """Frames where something begins to be bad, or a loop was decided; ascending."""
-        frames = {frame for frame, verdict in self._loops.values() if verdict is not Verdict.CANDIDATE}
+        frames = {frame for frame, verdict in self._loops().values() if verdict is not Verdict.CANDIDATE}
         for strip in STRIPS:
             if (limit := limits.get(strip.key)) is not None:
-                column = self._values[strip.key]
+                column = self._column(strip.key)
                 bad = column > limit if strip.worse == "high" else column < limit
                 frames |= set(np.flatnonzero(bad & ~np.concatenate(([False], bad[:-1]))).tolist())
         return sorted(frames)
+
+
+def _truth(snapshot: Snapshot) -> Path | None:
+    return snapshot.recording.truth if snapshot.recording else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -87,6 +88,28 @@ def test_frames_gone_back_over_stay_until_they_are_processed_anew() -> None:
     history.see(snapshot(20, 60, total_ms=np.full(20, 7.0)))
     took = history.columns().high["took"]
     assert took[19] == 7.0 and took[20] == 5.0
+
+
+def test_of_frames_that_a_snapshot_tells_nothing_is_kept_beside_it() -> None:
+    long = snapshot(HOUR, HOUR)
+    history = seen(snapshot(1, HOUR))
+    tracemalloc.start()
+    history.see(long)
+    kept = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert history.present == HOUR - 1 and kept < HOUR
+
+
+def test_frames_gone_back_over_twice_stay_and_another_truth_makes_their_errors_unknown() -> None:
+    history = seen(*(snapshot(n, 60, total_ms=np.full(n, float(n))) for n in (40, 30, 10, 20)))
+    took = history.columns().high["took"]
+    assert took[[0, 19, 20, 29, 30, 39]].tolist() == [20, 20, 30, 30, 40, 40] and np.isnan(took[40:]).all()
+    other = snapshot(20, 60)
+    assert other.recording is not None
+    history.see(replace(other, recording=replace(other.recording, truth=Path("other.tum"))))
+    error = history.columns().high["error"]
+    assert np.isfinite(error[:20]).all() and np.isnan(error[20:]).all()
+    assert np.isfinite(history.columns().high["took"][20:40]).all()
 
 
 def test_another_session_forgets() -> None:
