@@ -2,8 +2,8 @@
 
 Every chunk has a level: 0 is as it was made, each further one leaves one point per voxel, with edges that
 double, and the last one leaves none. Levels rise where they are missed least and never fall, and what was thinned
-away is kept nowhere: however long the walk, its map takes no more memory than a page's budget of points, and the
-page draws no more clouds than it can at once.
+away is kept nowhere: however long the walk, its map takes no more memory than a page's budget of points. Nor has it
+more clouds than a page can draw: where keyframes are close, one takes over the points of the one before it.
 """
 
 from collections.abc import Sequence
@@ -13,13 +13,14 @@ from typing import Final
 import numpy as np
 
 from app.server.protocol import Chunk
+from app.slam import lie
 from app.slam.types import F32, F64, I64, Keyframe
 
 FINEST_VOXEL_M: Final = 0.08
 COARSEST_LEVEL: Final = 8
 """At 0.08 m · 2^7 = 10 m a keyframe is down to a handful of points; there is nothing left to thin."""
 EMPTY_LEVEL: Final = COARSEST_LEVEL + 1
-MOST_SHOWN: Final = 2000
+MOST_SHOWN: Final = 1000
 """Keyframes that have points: each costs the page a drawing of its own, and the server some kilobytes."""
 _SLACK: Final = 0.97
 """Over budget, the map is thinned to this share of it, so that not every new keyframe thins again."""
@@ -69,7 +70,10 @@ def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: in
 
 
 def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
-    """The same with at most `MOST_SHOWN` that have points: those between two close neighbours lose theirs first."""
+    """The same with at most `MOST_SHOWN` that have points: those between two close neighbours give theirs away first.
+
+    They give them to the one after them, so that going back shows nothing that was not measured yet.
+    """
     shown = [index for index, chunk in enumerate(chunks) if chunk.level < EMPTY_LEVEL]
     if len(shown) <= MOST_SHOWN:
         return chunks
@@ -77,9 +81,27 @@ def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
     while len(shown) > MOST_SHOWN:
         positions = poses[[chunks[index].index for index in shown], :3, 3]
         around = np.linalg.norm(positions[2:] - positions[:-2], axis=1)
-        index = shown.pop(1 + int(np.argmin(around)))
-        kept[index] = _emptied(kept[index])
+        place = 1 + int(np.argmin(around))
+        index, after = shown.pop(place), shown[place]
+        kept[index], kept[after] = _emptied(kept[index]), _joined(kept[index], kept[after], poses)
     return tuple(kept)
+
+
+def _joined(chunk: Chunk, after: Chunk, poses: F64) -> Chunk:
+    """The chunk `after` with the points of another, where `poses` lay them; they move with it from then on."""
+    T_map_lidar, T_map_after = (poses[one.index] @ one.T_imu_lidar for one in (chunk, after))
+    T = lie.inverse(T_map_after) @ T_map_lidar
+    points = (chunk.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    order = np.random.default_rng(after.index).permutation(len(points) + len(after.points))
+    return replace(
+        after,
+        points=np.concatenate((points, after.points))[order],
+        labels=np.concatenate((chunk.labels, after.labels))[order],
+        intensity=np.concatenate((chunk.intensity, after.intensity))[order],
+        ring=np.concatenate((chunk.ring, after.ring))[order],
+        level=max(chunk.level, after.level),
+        joined=chunk.joined + after.joined + 1,
+    )
 
 
 def coarser(chunk: Chunk) -> Chunk:

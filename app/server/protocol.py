@@ -184,7 +184,7 @@ class Chunk:
     Attributes:
         index: of the keyframe. frame: that it was. stamp_ns: its time.
         points: (n, 3) float32 m. labels: (n,) uint8. intensity: (n,) float32. ring: (n,) uint16.
-        T_imu_lidar: (4, 4). level: how often it was thinned.
+        T_imu_lidar: (4, 4). level: how often it was thinned. joined: how many keyframes' points it took over.
     """
 
     index: int
@@ -196,6 +196,7 @@ class Chunk:
     ring: U16
     T_imu_lidar: F64
     level: int = 0
+    joined: int = 0
 
 
 @dataclass(frozen=True, slots=True)

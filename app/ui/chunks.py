@@ -3,8 +3,10 @@
 A keyframe's points are sent once, in its own LiDAR frame; a pose that moves later sends 7 numbers.
 When the map outgrows the point budget, snapshots hold some keyframes with fewer points: those are sent again.
 What one goes back over is hidden, not taken away: going forth again, over the whole map too, sends no points.
+Names of nodes that were taken away are used again, since viser remembers every name until another page connects.
 """
 
+import heapq
 from collections import deque
 from dataclasses import dataclass
 from typing import Final, TypeAlias
@@ -26,6 +28,8 @@ _ALL: Final = slice(None)
 
 MEASURED: Final = (ColourBy.HEIGHT, ColourBy.INTENSITY, ColourBy.RING)
 """Colourings whose limits grow with the map; time's are the recording's duration."""
+_NO_POINTS: Final = np.empty((0, 3), np.float16)
+_NO_COLOURS: Final = np.empty((0, 3), np.uint8)
 _STILL: Final = 1e-5
 """Of poses (m, and of rotation matrices)."""
 
@@ -70,12 +74,17 @@ def shown_points(chunk: Chunk, T_map_lidar: F64, ceilings: bool) -> Chosen:
 
 
 def _same(drawn: Chunk, chunk: Chunk) -> bool:
-    """Whether one is the other or, thinned, what it has become."""
+    """Whether one is the other or what it has become: thinned, or with others' points."""
     if drawn is chunk:
         return True
     return (drawn.index, drawn.frame, drawn.stamp_ns) == (chunk.index, chunk.frame, chunk.stamp_ns) and (
-        drawn.level < chunk.level
+        drawn.level + drawn.joined < chunk.level + chunk.joined
     )
+
+
+def _forget(handle: viser.PointCloudHandle) -> None:
+    """Keep what was sent once: viser has it in the message for pages to come, and again in the handle's properties."""
+    handle._impl.props.points, handle._impl.props.colors = _NO_POINTS, _NO_COLOURS
 
 
 def _pose(T: F64) -> tuple[F64, F64]:
@@ -90,6 +99,8 @@ class MapChunks:
         self._root = root
         self._drawn: list[_Drawn] = []
         self._hidden: deque[_Hidden] = deque()  # those that followed
+        self._named = 0
+        self._free: list[int] = []  # of these so many names; a heap
         self._view = View()
         self._limits: dict[ColourBy, Limits] = {}
         self._poses: F64 = np.empty((0, 4, 4))  # of all keyframes, as the last snapshot had them
@@ -106,10 +117,9 @@ class MapChunks:
         return sum(drawn.count for drawn in self._drawn)
 
     def clear(self, start_ns: int, duration_s: float) -> None:
-        """Take everything away for a new session. Names are used again, so nothing piles up."""
+        """Take everything away for a new session."""
         for drawn in self._drawn:
-            if drawn.handle is not None:
-                drawn.handle.remove()
+            self._remove(drawn)
         self._drawn.clear()
         self._drop_hidden()
         self._poses = np.empty((0, 4, 4))
@@ -118,9 +128,21 @@ class MapChunks:
 
     def _drop_hidden(self) -> None:
         for hidden in self._hidden:
-            if hidden.drawn.handle is not None:
-                hidden.drawn.handle.remove()
+            self._remove(hidden.drawn)
         self._hidden.clear()
+
+    def _remove(self, drawn: _Drawn) -> None:
+        if drawn.handle is not None:
+            heapq.heappush(self._free, int(drawn.handle.name.rpartition("/")[2]))
+            drawn.handle.remove()
+            drawn.handle = None
+
+    def _name(self) -> str:
+        """For another node."""
+        if not self._free:
+            self._free.append(self._named)
+            self._named += 1
+        return f"{self._root}/{heapq.heappop(self._free)}"
 
     def _take_back(self, chunks: tuple[Chunk, ...], seen: View) -> None:
         """Hide the keyframes from the first on that is not among `chunks` any more, be it thinned or not.
@@ -151,7 +173,7 @@ class MapChunks:
         before, seen = self._limits.get(view.colour_by), self._view
         self._view = view
         self._take_back(chunks, seen)
-        moved = self._move(poses)
+        moved, lifted = self._move(poses)
         new: list[_Drawn] = []
         again: list[tuple[_Hidden, Chunk]] = []
         for chunk in chunks[len(self._drawn) :]:
@@ -164,7 +186,7 @@ class MapChunks:
                 again.append((hidden, chunk))
         recolour = view.colour_by is not seen.colour_by or self._limits.get(view.colour_by) != before
         restyle = (view.point_size, view.map) != (seen.point_size, seen.map)
-        for drawn, chunk, has_moved in zip(self._drawn, chunks, moved, strict=False):
+        for drawn, chunk, has_moved, is_lifted in zip(self._drawn, chunks, moved, lifted, strict=False):
             if view.ceilings != seen.ceilings or chunk is not drawn.chunk:
                 drawn.chunk = chunk
                 self._send(drawn)
@@ -173,8 +195,8 @@ class MapChunks:
                     drawn.handle.wxyz, drawn.handle.position = _pose(self._placed(chunk))
                 if restyle:
                     drawn.handle.point_size, drawn.handle.visible = view.point_size, view.map
-                if recolour or (has_moved and view.colour_by is ColourBy.HEIGHT):
-                    drawn.handle.colors = self._colours(drawn)
+                if recolour or (is_lifted and view.colour_by is ColourBy.HEIGHT):
+                    self._colour(drawn, drawn.handle)
         for hidden, chunk in again:
             self._drawn.append(hidden.drawn)
             self._show_again(hidden, chunk)
@@ -182,13 +204,15 @@ class MapChunks:
             self._drawn.append(drawn)
             self._send(drawn)
 
-    def _move(self, poses: F64) -> npt.NDArray[np.bool_]:
-        """Take the poses of now; which of the keyframes that are drawn have others."""
+    def _move(self, poses: F64) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Take the poses of now; which of the keyframes that are drawn have others, and which have their points at
+        other heights.
+        """
         before, self._poses, count = self._poses, poses, len(self._drawn)
         if poses is before:
-            return np.zeros(count, dtype=np.bool_)
-        moved: npt.NDArray[np.bool_] = np.abs(poses[:count] - before[:count]).max(axis=(1, 2), initial=0.0) > _STILL
-        return moved
+            return np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+        moved = np.abs(poses[:count] - before[:count]) > _STILL
+        return np.asarray(moved.any(axis=(1, 2))), np.asarray(moved[:, 2].any(axis=1))
 
     def _placed(self, chunk: Chunk) -> F64:
         """(4, 4) T_map_lidar."""
@@ -214,7 +238,7 @@ class MapChunks:
                 drawn.handle.point_size = view.point_size
             recolour = view.colour_by is not seen.colour_by or self._limits.get(view.colour_by) != hidden.limits
             if recolour or (moved and view.colour_by is ColourBy.HEIGHT):
-                drawn.handle.colors = self._colours(drawn)
+                self._colour(drawn, drawn.handle)
             drawn.handle.visible = view.map
 
     def _widen(self, chunk: Chunk) -> None:
@@ -236,13 +260,11 @@ class MapChunks:
         points = drawn.chunk.points[drawn.shown]
         drawn.count = len(points)
         if not len(points):  # the page can not draw a cloud of no points
-            if drawn.handle is not None:
-                drawn.handle.remove()
-                drawn.handle = None
+            self._remove(drawn)
             return
         orientation, position = _pose(T_map_lidar)
         drawn.handle = self._scene.add_point_cloud(
-            f"{self._root}/{drawn.chunk.index}",
+            drawn.handle.name if drawn.handle is not None else self._name(),
             points,
             self._colours(drawn),
             point_size=self._view.point_size,
@@ -252,6 +274,11 @@ class MapChunks:
             position=position,
             visible=self._view.map,
         )
+        _forget(drawn.handle)
+
+    def _colour(self, drawn: _Drawn, handle: viser.PointCloudHandle) -> None:
+        handle.colors = self._colours(drawn)
+        _forget(handle)
 
     def _colours(self, drawn: _Drawn) -> U8:
         by, chunk = self._view.colour_by, drawn.chunk

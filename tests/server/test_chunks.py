@@ -1,9 +1,14 @@
 """Of a map that outgrows its budget of points, what is far is thinned, and what is thinned away is held nowhere."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
+from app.server import chunks as chunks_module
 from app.server.chunks import COARSEST_LEVEL, MOST_SHOWN, coarser, next_to_thin, voxel_of_level, within_budget
 from app.server.delta import Fold, Outbox
 from app.server.protocol import Chunk
@@ -104,17 +109,53 @@ def test_keyframes_that_come_again_are_as_they_were_thinned_and_within_the_budge
     assert fold.apply(outbox.take()).chunks == every[:120], "levels never fall"
 
 
+def drawn_with_all_points(keyframes: list[Chunk], poses: np.ndarray) -> tuple[Chunk, ...]:
+    """What a reader holds at the end of a walk, with a budget for all points."""
+    chunks: tuple[Chunk, ...] = ()
+    for one in keyframes:
+        chunks = within_budget((*chunks, one), poses, poses[one.index, :3, 3], 10**9)
+    return chunks
+
+
 def test_of_more_keyframes_than_a_page_can_draw_those_left_are_spread_over_the_whole_walk() -> None:
     """Walked slowly at first, so that keyframes are denser there."""
     count = MOST_SHOWN + 500
     poses = walk(count)
-    poses[:, 0, 3] = np.cumsum(np.where(np.arange(count) < 1000, 0.1, 0.4))
-    chunks: tuple[Chunk, ...] = ()
-    for index in range(count):
-        chunks = within_budget((*chunks, chunk(index, 3)), poses, poses[index, :3, 3], 10**9)
+    poses[:, 0, 3] = np.cumsum(np.where(np.arange(count) < MOST_SHOWN // 2, 0.1, 0.4))
+    chunks = drawn_with_all_points([chunk(index, 3) for index in range(count)], poses)
     shown = [one.index for one in chunks if len(one.points)]
     assert len(chunks) == count and len(shown) == MOST_SHOWN
     assert shown[0] == 0 and shown[-1] == count - 1
     gaps = np.diff(poses[shown, 0, 3])
     assert gaps.max() < 0.85
-    assert sum(index < 1000 for index in shown) < 600, "the dense part is thinned first"
+    assert sum(index < MOST_SHOWN // 2 for index in shown) < 0.3 * MOST_SHOWN, "the dense part is thinned first"
+
+
+def test_points_of_keyframes_that_share_a_cloud_stay_where_they_were_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chunks_module, "MOST_SHOWN", 10)
+    rng, poses = np.random.default_rng(1), walk(60)
+    poses[:, :3, :3] = Rotation.random(60, rng=rng).as_matrix()
+    T_imu_lidar = np.eye(4)
+    T_imu_lidar[:3, :3], T_imu_lidar[:3, 3] = Rotation.random(rng=rng).as_matrix(), (0.1, -0.2, 0.3)
+    names = [1000 * index + np.arange(50, dtype=np.float32) for index in range(60)]  # of every point, as intensity
+    keyframes = [
+        replace(chunk(i, 50), intensity=name, T_imu_lidar=T_imu_lidar, ring=np.full(50, i, np.uint16), level=i % 3)
+        for i, name in enumerate(names)
+    ]
+
+    def in_map(one: Chunk) -> np.ndarray:
+        T = poses[one.index] @ one.T_imu_lidar
+        return np.asarray(Rotation.from_matrix(T[:3, :3]).apply(one.points) + T[:3, 3])
+
+    measured = dict(zip(np.concatenate(names), np.concatenate([in_map(one) for one in keyframes]), strict=True))
+    labels = dict(zip(np.concatenate(names), np.concatenate([one.labels for one in keyframes]), strict=True))
+    drawn = drawn_with_all_points(keyframes, poses)
+    assert sum(len(one.points) > 0 for one in drawn) == 10
+    assert sorted(np.concatenate([one.intensity for one in drawn])) == sorted(measured), "none is lost, none is doubled"
+    for one in drawn:
+        np.testing.assert_allclose(in_map(one), [measured[n] for n in one.intensity] or np.empty((0, 3)), atol=1e-4)
+        assert np.array_equal(one.labels, [labels[name] for name in one.intensity])
+        assert np.array_equal(one.ring, one.intensity // 1000)
+        assert one.ring.max(initial=0) <= one.index, "going back shows nothing that was measured later"
+    first = next(one for one in drawn if len(one.points) and one.joined >= 3)
+    assert len(set(first.ring[:50])) > 2, "the first points are a fair sample of all"

@@ -3,8 +3,10 @@
 import asyncio
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 import viser
 from viser._messages import GuiUpdateMessage
@@ -45,6 +47,33 @@ class Wire:
     def kept(self) -> int:
         """Messages that a browser which connects now is sent."""
         return len(self.server._websock_server._broadcast_buffer.message_from_id)
+
+
+@dataclass(slots=True)
+class Cloud:
+    """A node of points, as a browser shows it."""
+
+    points: np.ndarray
+    colors: np.ndarray
+    point_size: float
+    visible: bool = True
+    wxyz: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+
+def clouds(server: viser.ViserServer) -> dict[str, Cloud]:
+    """All clouds by their names, as a browser has them that connects now."""
+    found: dict[str, Cloud] = {}
+    for message in server._websock_server._broadcast_buffer.message_from_id.values():
+        kind, name = type(message).__name__, getattr(message, "name", "")
+        if kind == "PointCloudMessage":
+            props = message.props  # type: ignore[attr-defined]
+            found[name] = Cloud(props.points, props.colors, props.point_size)
+        elif name in found:
+            told = message.updates if kind == "SceneNodeUpdateMessage" else vars(message)  # type: ignore[attr-defined]
+            for prop in set(Cloud.__slots__) & told.keys():
+                setattr(found[name], prop, told[prop])
+    return found
 
 
 @pytest.fixture(scope="session")

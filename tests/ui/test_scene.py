@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import viser
 
+from app.server import chunks as server_chunks
 from app.server.chunks import coarser, within_budget
 from app.server.protocol import Seek, SetParams, Snapshot, StepFrame
 from app.ui.chunks import MapChunks
 from app.ui.colours import LABEL_COLOURS, ColourBy
 from app.ui.scene import Scene
 from app.ui.view import View
-from tests.ui.conftest import Wire
+from tests.ui.conftest import Cloud, Wire, clouds
 from tests.ui.fake_engine import FakeEngine
 
 SCAN = "/map/sensor/lidar/scan"
@@ -42,10 +43,10 @@ class Drawn:
         self.snapshot, self.view = snapshot, view
 
 
-def chunk_nodes(server: viser.ViserServer) -> dict[str, viser.PointCloudHandle]:
+def chunk_nodes(server: viser.ViserServer) -> dict[str, Cloud]:
     """Keyframes that are seen; what was gone back over is hidden."""
-    clouds = {n: h for n, h in server.scene._handle_from_node_name.items() if isinstance(h, viser.PointCloudHandle)}
-    return {name: cloud for name, cloud in clouds.items() if name.startswith("/map/keyframes/") and cloud.visible}
+    found = clouds(server)
+    return {name: cloud for name, cloud in found.items() if name.startswith("/map/keyframes/") and cloud.visible}
 
 
 @pytest.fixture
@@ -105,7 +106,9 @@ def test_points_are_drawn_where_the_map_has_them(drawn: Drawn, server: viser.Vis
     snapshot = drawn.engine.snapshot
     for chunk, T in zip(snapshot.chunks, snapshot.keyframe_poses, strict=True):  # type: ignore[arg-type]
         node = chunk_nodes(server)[f"/map/keyframes/{chunk.index}"]
-        placed = SE3.from_rotation_and_translation(SO3(node.wxyz), node.position) @ node.points.astype(float)
+        placed = SE3.from_rotation_and_translation(
+            SO3(np.array(node.wxyz)), np.array(node.position)
+        ) @ node.points.astype(float)
         assert np.abs(placed - (chunk.points @ T[:3, :3].T + T[:3, 3])).max() < 0.03  # float16 at 40 m
 
 
@@ -278,6 +281,44 @@ def test_a_keyframe_without_points_costs_next_to_nothing(drawn: Drawn, server: v
     tracemalloc.stop()
     assert chunks.points == 0
     assert each < 200
+
+
+def test_of_points_that_were_sent_one_copy_is_kept(drawn: Drawn, server: viser.ViserServer) -> None:
+    first = drawn.engine.snapshot.chunks[0]
+    points = np.random.default_rng(0).normal(size=(100_000, 3)).astype(np.float32)
+    few = {name: np.resize(getattr(first, name), len(points)) for name in ("labels", "intensity", "ring")}
+    chunks, whole = MapChunks(server.scene, "/map/keyframes"), (replace(first, points=points, **few),)
+    chunks.clear(0, 100.0)
+    tracemalloc.start()
+    for by in (ColourBy.LABEL, ColourBy.RING):
+        chunks.draw(whole, np.eye(4)[None], View(ceilings=True, colour_by=by))
+    kept = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    half_floats, colours = points.nbytes / 2, points.nbytes / 4
+    assert kept < 1.1 * (half_floats + 2 * colours), "viser keeps colours with the points, and those that came later"
+
+
+def test_of_keyframes_that_gave_their_points_away_no_node_and_no_message_is_left(
+    drawn: Drawn, wire: Wire, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if no other page connects, which would have viser sweep."""
+    monkeypatch.setattr(server_chunks, "MOST_SHOWN", 5)
+    first = replace(drawn.engine.snapshot.chunks[0], joined=0)
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, 0, 3] = np.arange(40)
+    map_chunks, held, kept = MapChunks(server.scene, "/other"), (), []
+    map_chunks.clear(0, 100.0)
+    for index in range(40):
+        held = within_budget((*held, replace(first, index=index)), poses, poses[index, :3, 3], 10**9)
+        map_chunks.draw(held, poses[: index + 1], View(ceilings=True))
+        kept.append(wire.kept)
+    assert max(kept[10:]) <= max(kept[:10])
+    assert sum(name.startswith("/other/") for name in server.scene._handle_from_node_name) == 5
+    nodes = [cloud for name, cloud in clouds(server).items() if name.startswith("/other/")]
+    assert sorted(node.position for node in nodes) == sorted(
+        tuple((poses[one.index] @ one.T_imu_lidar)[:3, 3]) for one in held if len(one.points)
+    )
+    assert map_chunks.points == 40 * len(first.points)
 
 
 def test_following_keeps_the_sensor_near_the_origin_and_leaves_the_camera_alone(drawn: Drawn, wire: Wire) -> None:
