@@ -18,6 +18,8 @@ bias, gravity (2, tangent of S²), extrinsic rotation (LiDAR frame), extrinsic t
 
 MAX_KNOT_STEP = 0.0025
 """s; poses in between are interpolated linearly."""
+LONG_GAP = 0.4
+"""s; longer than that, a step's half, the accelerations at both ends say nothing of the velocity in between."""
 GAP_NOISE = (0.5, 3.0)
 """Densities (rad/s, m/s² per sqrt Hz) for bridging a gap: walking and turning, unseen."""
 
@@ -46,7 +48,8 @@ class Path:
 def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: Imu) -> tuple[Belief, Path]:
     """Carry the belief forward to `end_ns` through the samples that cover the time from its stamp.
 
-    Rates are linear between samples, constant before the first and after the last one.
+    Rates are linear between samples, constant before the first and after the last one; through a long gap the
+    velocity stays as it was.
     Returns the predicted belief and the path in between.
     """
     state = belief.state
@@ -61,7 +64,7 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: Imu) -> tupl
     knot_t, knot_T = np.empty(knots), np.empty((knots, 3, 4))
     basis = manifold.tangent_basis(state.g_odom)
     n = motion.propagate(
-        times, gyro, accel, spacing > params.max_gap, MAX_KNOT_STEP, R, p, v,
+        times, gyro, accel, spacing > params.max_gap, spacing > LONG_GAP, MAX_KNOT_STEP, R, p, v,
         state.b_gyro, state.b_accel, state.g_odom, basis, P, noise, knot_t, knot_T,
     )  # fmt: skip
     R = 1.5 * R - 0.5 * R @ R.T @ R  # back onto SO(3) after many products: one Newton step of the polar form

@@ -232,6 +232,25 @@ def test_a_missing_sample_is_not_a_gap() -> None:
     np.testing.assert_allclose(sigma_after(with_gap(0.1, 0.11), (0.5,)), sigma_after(with_gap(0, 0), (0.5,)), rtol=0.05)
 
 
+@pytest.mark.parametrize(("gap_s", "coasts"), [(0.3, False), (2.0, True)])
+def test_through_a_long_gap_one_walks_on_as_one_walked(gap_s: float, coasts: bool) -> None:
+    """A foot that lands at both its ends brakes with 3 m/s^2, and no one brakes for seconds."""
+    end_ns = START_NS + round(gap_s * 1e9)
+    braking = np.tile([-3.0, 0.0, GRAVITY], (2, 1))
+    samples = ImuSamples(np.array([START_NS, end_ns]), np.zeros((2, 3)), braking)
+    state = replace(
+        state_at(Walk(still=100), 0.0),
+        R_odom_imu=np.eye(3),
+        v_odom_imu=np.array([1.3, 0.0, 0.0]),
+        b_gyro=np.zeros(3),
+        b_accel=np.zeros(3),
+    )
+    predicted, _ = imu.propagate(Belief(state, np.eye(DIM) * 1e-10), samples, end_ns, Imu())
+    v = 1.3 - (0.0 if coasts else 3.0 * gap_s)
+    np.testing.assert_allclose(predicted.state.v_odom_imu, [v, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(predicted.state.p_odom_imu - state.p_odom_imu, [(1.3 + v) / 2 * gap_s, 0, 0], atol=1e-6)
+
+
 def test_samples_that_end_early_are_held() -> None:
     """A path is there for every point, even if the last sample is from before the scan's end."""
     samples = imu_samples(Walk(still=100), Rig(), np.arange(0, 18) / 200)

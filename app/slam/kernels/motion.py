@@ -9,13 +9,14 @@ from app.slam.kernels.small import CHUNKS, cross, rotation
 
 
 @njit(cache=True)
-def propagate(times, gyro, accel, bridged, max_step, R, p, v, bg, ba, g, B, P, noise, knot_t, knot_T):
+def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, g, B, P, noise, knot_t, knot_T):
     """Integrate the kinematics from times[0] to times[-1]; R, p, v and P are updated in place.
 
     times (k,) s ascending; gyro, accel (k, 3) at those times, linear in between. Error state order
     as in `app.slam.imu`. noise (6,): densities of gyro, accel, gyro bias, accel bias, and those of
-    gyro and accel in intervals that are `bridged` (k - 1,) bool, for want of samples. Knots (time,
-    3x4 pose) are written every `max_step` seconds at most. Returns the number of knots.
+    gyro and accel in intervals that are `bridged` (k - 1,) bool, for want of samples. In those that are
+    `coasting` (k - 1,) bool the velocity stays. Knots (time, 3x4 pose) are written every `max_step` seconds
+    at most. Returns the number of knots.
     """
     d = P.shape[0]
     F = np.zeros((d, d))
@@ -82,6 +83,9 @@ def propagate(times, gyro, accel, bridged, max_step, R, p, v, bg, ba, g, B, P, n
             for i in range(3):
                 w[i] = (1.0 - u) * gyro[s, i] + u * gyro[s + 1, i] - bg[i]
                 a[i] = (1.0 - u) * accel[s, i] + u * accel[s + 1, i] - ba[i]
+            if coasting[s]:  # feels nothing but gravity
+                for i in range(3):
+                    a[i] = -(R[0, i] * g[0] + R[1, i] * g[1] + R[2, i] * g[2])
             rotation(0.5 * w[0] * h, 0.5 * w[1] * h, 0.5 * w[2] * h, dR)
             Rm[:] = R @ dR
             Rn[:] = Rm @ dR
