@@ -13,6 +13,7 @@ NUMBERS: Final = 10
 COUNTS: Final = 6
 CHOICES: Final = 3
 
+_LAST_ROW: Final = np.eye(4)[3].tobytes()
 _UPPER: Final = np.triu_indices(6)
 _ENTRY: Final = np.empty((6, 6), np.intp)
 """Where in the triangle an entry is."""
@@ -20,9 +21,11 @@ _ENTRY[_UPPER] = _ENTRY.T[_UPPER] = np.arange(21)
 
 _NUMBERS: Final = struct.Struct(f"={NUMBERS}d")
 _COUNTS: Final = struct.Struct(f"={COUNTS}i")
+_TWO: Final = struct.Struct("=2i")
 _NUMBERS_AT: Final = 8 * (12 + 21)
 _COUNTS_AT: Final = _NUMBERS_AT + _NUMBERS.size
 _CHOICES_AT: Final = _COUNTS_AT + _COUNTS.size
+_TWO_AT: Final = _CHOICES_AT - _TWO.size
 _TEXT_AT: Final = _CHOICES_AT + CHOICES
 
 
@@ -48,10 +51,7 @@ def pack(
 
 def pose(packed: bytes) -> F64:
     """(4, 4), read-only."""
-    T = np.eye(4)
-    T[:3] = np.frombuffer(packed, np.float64, 12).reshape(3, 4)
-    T.setflags(write=False)
-    return T
+    return np.frombuffer(packed[: 8 * 12] + _LAST_ROW, np.float64).reshape(4, 4)
 
 
 def covariance(packed: bytes) -> F64:
@@ -67,6 +67,15 @@ def numbers(packed: bytes) -> tuple[float, ...]:
 
 def counts(packed: bytes) -> tuple[int, ...]:
     return _COUNTS.unpack_from(packed, _COUNTS_AT)
+
+
+def first_counts(packed: bytes) -> tuple[int, int]:
+    """The first two of them, which is asked most often."""
+    return _TWO.unpack_from(packed, _COUNTS_AT)
+
+
+def last_counts(packed: bytes) -> tuple[int, int]:
+    return _TWO.unpack_from(packed, _TWO_AT)
 
 
 def choice(packed: bytes, index: int) -> int:

@@ -135,8 +135,7 @@ class LoopEdge(_Packed):
 
     @property
     def pair(self) -> Pair:
-        older, newer, *_ = packed.counts(self._bytes)
-        return older, newer
+        return packed.first_counts(self._bytes)
 
     @property
     def counts(self) -> bool:
@@ -162,8 +161,8 @@ def _evidence(whole: bytes) -> Evidence:
 
 
 def _represented_by(whole: bytes) -> Pair | None:
-    *_, older, newer = packed.counts(whole)
-    return None if (older, newer) == _NOBODY else (older, newer)
+    pair = packed.last_counts(whole)
+    return None if pair == _NOBODY else pair
 
 
 # To `dataclasses`, and so to `replace`, they are fields as others are.
