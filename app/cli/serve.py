@@ -94,7 +94,7 @@ def serve(
     """
     from app.evaluation.truth import read_poses
     from app.logs import start_logging
-    from app.memory import give_back
+    from app.memory import LARGE_OF_MAP, give_back
     from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording
     from app.server.folders import Folders
@@ -128,7 +128,7 @@ def serve(
         )
     start_logging(json_lines=log_json)
     if live is not None:
-        give_back()
+        give_back(LARGE_OF_MAP)
     session = read_session(recording) if recording is not None and recording.suffix == SUFFIX else None
     params = session.state.params if session else resolve_for(recording)
     if recording is not None:

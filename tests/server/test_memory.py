@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_chunks import chunk, walk
 
-from app.memory import give_back
+from app.memory import LARGE, LARGE_OF_MAP, give_back
 from app.server import chunks, wire
 from app.server.chunks import EMPTY_LEVEL
 from app.server.delta import Fold, Outbox
@@ -19,8 +19,8 @@ ON_PAGES = """
 import ctypes, sys
 import numpy as np
 from app.memory import give_back
-if sys.argv[1] == "given":
-    give_back()
+if sys.argv[1] != "as it is":
+    give_back(int(sys.argv[1]))
 fields = "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost".split()
 class Info(ctypes.Structure):
     _fields_ = [(name, ctypes.c_size_t) for name in fields]
@@ -28,7 +28,7 @@ libc = ctypes.CDLL(None)
 libc.mallinfo2.restype = Info
 np.ones(20 << 20, np.uint8)  # freed at once: from now on glibc takes arrays up to this size from its heap
 before = libc.mallinfo2().hblkhd
-kept = np.ones(1 << 20, np.uint8)
+kept = [np.ones(20 << 10, np.uint8) for _ in range(500)], np.ones(1 << 20, np.uint8)
 print(libc.mallinfo2().hblkhd - before)
 """
 
@@ -36,11 +36,12 @@ print(libc.mallinfo2().hblkhd - before)
 # Other C libraries have no mallinfo2, nor anything that `give_back` could ask for.
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="of glibc")
 def test_a_large_array_has_pages_of_its_own_that_go_back_with_it() -> None:
-    def on_pages(how: str) -> int:
-        done = subprocess.run([sys.executable, "-c", ON_PAGES, how], capture_output=True, text=True, check=True)
+    def on_pages(large: str) -> int:
+        done = subprocess.run([sys.executable, "-c", ON_PAGES, large], capture_output=True, text=True, check=True)
         return int(done.stdout)
 
-    assert on_pages("given") >= 1 << 20
+    assert 1 << 20 <= on_pages(str(LARGE)) < 2 << 20
+    assert on_pages(str(LARGE_OF_MAP)) >= 9 << 20
     assert on_pages("as it is") == 0, "the test would see it"
 
 
