@@ -4,13 +4,18 @@ import subprocess
 import sys
 import textwrap
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.records import Chunk, ChunkIndex, MessageIndex
+from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from app.sensors.live import recorder as recorder_module
 from app.sensors.live.recorder import MAX_SCANS, Recorder
 from app.sensors.recording import open_recording
 from app.slam.errors import HemislamError
@@ -64,6 +69,51 @@ def test_a_session_reads_again_as_it_was(tmp_path: Path) -> None:
         types = {connection.topic: connection.msgtype for connection in reader.connections}
         assert types == {"/rslidar_points": "sensor_msgs/msg/PointCloud2", "/imu/data": "sensor_msgs/msg/Imu"}
         assert reader.message_count == 12 * 21
+
+
+def test_the_index_of_the_chunks_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the file itself has them, read from its beginning on."""
+    monkeypatch.setattr(recorder_module, "FLUSH_S", 0.02)
+    recorder = Recorder(tmp_path / "session.mcap")
+    for turn in range(12):
+        record(recorder, range(turn, turn + 1))
+        time.sleep(0.05)
+    recorder.close()
+    with recorder.path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        file.seek(0)
+        chunks = [one for one in StreamReader(file, emit_chunks=True).records if isinstance(one, Chunk)]
+        assert len(chunks) > 3
+        assert list(recorder._mcap._Writer__chunk_indices) == summary.chunk_indexes  # type: ignore[attr-defined]
+        for index, chunk in zip(summary.chunk_indexes, chunks, strict=True):
+            assert index.message_start_time == chunk.message_start_time
+            assert index.message_end_time == chunk.message_end_time
+            assert (index.compression, index.compressed_size) == (chunk.compression, len(chunk.data))
+            for channel, at in index.message_index_offsets.items():
+                file.seek(at)
+                entry = next(StreamReader(file, skip_magic=True).records)
+                assert isinstance(entry, MessageIndex)
+                assert entry.channel_id == channel
+        file.seek(0)
+        assert sum(1 for _ in make_reader(file).iter_messages()) == 12 * 21
+
+
+def test_the_index_of_the_chunks_takes_no_memory_of_the_size_of_its_objects() -> None:
+    rng = np.random.default_rng(0)
+
+    def index(at: int) -> ChunkIndex:
+        length, start, compressed, end, indexes, begin, whole = rng.integers(1 << 40, 1 << 60, 7).tolist()
+        return ChunkIndex(length, start, "zstd", compressed, end, indexes, {1: at, 2: at + 1}, begin, whole)
+
+    held = recorder_module._ChunkIndexes()
+    tracemalloc.start()
+    for at in range(1, 4001):
+        held.append(index(at))
+    taken, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert taken < 100 * 4000
+    assert len({entry.message_index_offsets[2] for entry in held}) == 4000
 
 
 def test_a_killed_process_loses_less_than_its_last_second(tmp_path: Path) -> None:
