@@ -40,10 +40,15 @@ CONTENT_SECURITY_POLICY = "; ".join(
 MOST_BYTES = 1 << 20
 """Of a request's body, and of a file that is uploaded in the page: YAML of some kilobytes."""
 
+MOST_BYTES_AT_ONCE = 16 * MOST_BYTES
+"""Of the bodies of all requests that are being read or answered."""
+
 VIEWER = "hemislam.viewer"
 """Set in the scope of requests by those who may look only."""
 
 log = logging.getLogger(__name__)
+
+_TOO_LARGE = f"Nothing that is larger than {MOST_BYTES >> 10} kB is taken."
 
 OPEN_PATHS = ("/healthz",)
 """Answered without a token: they say nothing but that the server is there."""
@@ -95,6 +100,7 @@ class Guard:
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
         self._access = access
+        self._held = 0  # bytes of bodies
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -108,9 +114,30 @@ class Guard:
         elif token := self._linked(scope):
             await self._keep(scope, token)(scope, receive, _with_headers(send))
         elif scope["type"] == "http":
-            await self._app(scope, _limited(receive), _with_headers(send))
+            await self._take(scope, receive, _with_headers(send))
         else:
             await self._app(scope, receive, send)
+
+    async def _take(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, but no body that is too large, whether or not its length was told, nor too many."""
+        received = 0
+
+        async def receiver() -> Message:
+            nonlocal received
+            message = await receive()
+            length = len(message.get("body", b""))
+            received += length
+            self._held += length
+            if received > MOST_BYTES:
+                raise HTTPException(413, _TOO_LARGE)
+            if self._held > MOST_BYTES_AT_ONCE:
+                raise HTTPException(503, "Too much is being sent at once; send it again in a moment.")
+            return message
+
+        try:
+            await self._app(scope, receiver, send)
+        finally:
+            self._held -= received
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
         """Status and reason, if the request must not go on. Notes in its scope if it may look only."""
@@ -123,7 +150,7 @@ class Guard:
         if not length.isdecimal():
             return 400, "The length of the request is not a number."
         if int(length) > MOST_BYTES:
-            return 413, f"Nothing that is larger than {MOST_BYTES >> 10} kB is taken."
+            return 413, _TOO_LARGE
         return None
 
     def _without_token(self, scope: Scope, headers: Headers, host: str) -> tuple[int, str] | None:
@@ -184,21 +211,6 @@ def _name(host: str) -> str:
 
 def _same(given: str, token: str | None) -> bool:
     return token is not None and hmac.compare_digest(given.encode(), token.encode())
-
-
-def _limited(receive: Receive) -> Receive:
-    """The same for a body whose length was not told before."""
-    received = 0
-
-    async def receiver() -> Message:
-        nonlocal received
-        message = await receive()
-        received += len(message.get("body", b""))
-        if received > MOST_BYTES:
-            raise HTTPException(413, f"Nothing that is larger than {MOST_BYTES >> 10} kB is taken.")
-        return message
-
-    return receiver
 
 
 async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, reason: str) -> None:

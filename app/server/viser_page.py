@@ -176,8 +176,8 @@ class Gate:
     def _take(self, message: dict[str, Any]) -> bool:
         """Whether a part belongs to an upload, of which it must not be more than was told."""
         name, content = str(message.get("transfer_uuid")), message.get("content")
-        if name not in self._uploads or not isinstance(content, bytes):
-            return False
+        if name not in self._uploads or not isinstance(content, bytes) or not content:
+            return False  # parts of no bytes would pile up without end
         self._uploads[name] -= len(content)
         if self._uploads[name] < 0:
             raise Refused(1009, "The file is larger than was told.")

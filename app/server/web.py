@@ -13,6 +13,7 @@ import ssl
 import sys
 import threading
 import webbrowser
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ from app.server.api import make_router
 from app.server.folders import Folders
 from app.server.fork import Engine, Workspace
 from app.server.logs import log_notices
+from app.server.patience import PatientProtocol
 from app.server.setup import Setup
 from app.server.slow_page import quickened
 from app.server.viser_page import BUFFER_BYTES, Viser, bridge, page_html, start_viser, viewer_html
@@ -40,6 +42,9 @@ from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
 
 log = logging.getLogger(__name__)
+
+MOST_PAGES = 32
+"""Open at once, of those who may look only, and as many of others: each takes a megabyte or two."""
 
 
 class Page(Protocol):
@@ -71,6 +76,7 @@ def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) ->
     app.add_middleware(Guard, access=access)
     page = quickened(page_html())
     viewers_page = viewer_html(page)
+    pages: Counter[bool] = Counter()  # that are open, of those who may look only and of others
 
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
     def index(request: Request) -> str:
@@ -78,8 +84,16 @@ def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) ->
 
     @app.websocket("/")
     async def messages(browser: WebSocket) -> None:
-        with contextlib.suppress(asyncio.CancelledError):  # the server ends, and a stalled browser does not
-            await bridge(browser, target, viewer=VIEWER in browser.scope)
+        viewer = VIEWER in browser.scope
+        if pages[viewer] >= MOST_PAGES:
+            await browser.close(1013, "Too many pages are open.")
+            return
+        pages[viewer] += 1
+        try:
+            with contextlib.suppress(asyncio.CancelledError):  # the server ends, and a stalled browser does not
+                await bridge(browser, target, viewer=viewer)
+        finally:
+            pages[viewer] -= 1
 
     @app.get("/healthz")
     def health(response: Response) -> dict[str, str]:
@@ -252,6 +266,7 @@ def make_server(app: FastAPI, tls: Tls | None = None) -> uvicorn.Server:
         log_level="warning",
         log_config=None,
         lifespan="off",
+        http=PatientProtocol,
         ws="websockets-sansio",
         ws_per_message_deflate=False,
         ws_max_size=2 * MOST_BYTES,

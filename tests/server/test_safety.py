@@ -274,6 +274,7 @@ def test_uploads_that_never_end_do_not_pile_up() -> None:
         for n in range(20):
             gate.let(packed(type="FileTransferStartUpload", transfer_uuid=str(n), size_bytes=MOST_BYTES))
     assert gate.let(packed(type="FileTransferPart", transfer_uuid="of nobody", content=b"x")) is None
+    assert gate.let(packed(type="FileTransferPart", transfer_uuid="0", content=b"")) is None
 
 
 # --- https ---------------------------------------------------------------------------------------
