@@ -36,6 +36,11 @@ class Corrections:
         self.take(change)
         return change
 
+    def hold(self, corrections: F64) -> F64:
+        """The same, read-only, in the memory of those before as far as they are these."""
+        self.change(corrections)
+        return self._rows.view()
+
     def take(self, change: CorrectionsChange) -> F64:
         """All that there are now, (k, 4, 4), read-only; those given before stay as they are."""
         if change.kept < len(self._rows):

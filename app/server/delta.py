@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from app.server.chunks import with_same_mounting, within_budget
+from app.server.corrections import Corrections
 from app.server.edges import EdgesChange, EdgesReceiver, EdgesSender
 from app.server.protocol import SERIES, Chunk, LoopsView, Notice, Snapshot
 from app.server.setup import POINT_BUDGET
@@ -174,6 +175,7 @@ class Fold:
         self._positions, self._series = table(3), table(len(SERIES))
         self._chunks: tuple[Chunk, ...] = ()  # also those that were gone back over
         self._edges = EdgesReceiver()
+        self._poses = Corrections()
 
     def apply(self, delta: Delta) -> Snapshot:
         before, delta = self.snapshot, read_only(delta)
@@ -192,6 +194,8 @@ class Fold:
         if delta.chunks or delta.shown != len(chunks) or delta.session != before.session:
             chunks = self._shown(delta)
         replaced = delta.replaced
+        if replaced.get("keyframe_poses") is not None:
+            replaced = {**replaced, "keyframe_poses": self._poses.hold(replaced["keyframe_poses"])}
         if delta.edges is not None:
             self._edges.take(delta.edges)
             replaced = {**replaced, "loops": replace(replaced["loops"], edges=self._edges.edges)}

@@ -90,6 +90,22 @@ def test_a_reader_that_misses_updates_ends_with_the_same_snapshot(
     assert content(attentive) == content(lazy)
 
 
+def test_poses_that_stay_are_held_once_however_many_snapshots_there_are_of_them() -> None:
+    fold, outbox = Fold(), Outbox(Params())
+
+    def told(poses: np.ndarray) -> np.ndarray:
+        outbox.put(keyframe_poses=poses.copy())
+        shown = fold.apply(outbox.take()).keyframe_poses
+        assert shown is not None
+        np.testing.assert_array_equal(shown, poses)
+        return shown
+
+    walk = np.random.default_rng(0).normal(size=(102, 4, 4))
+    first, longer, corrected = told(walk[:100]), told(walk), told(walk + 1.0)
+    assert np.shares_memory(first, longer) and not np.shares_memory(longer, corrected)
+    np.testing.assert_array_equal(longer, walk, "what was shown stays as it was")
+
+
 def test_nothing_is_kept_for_a_reader_that_has_it() -> None:
     outbox = Outbox(Params())
     outbox.frame(np.zeros(3), [0.0] * len(SERIES))
