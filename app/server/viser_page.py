@@ -192,7 +192,7 @@ async def bridge(browser: WebSocket, target: Viser, *, viewer: bool = False) -> 
     Each direction takes a message only when the one before was delivered, so a slow browser slows
     viser's sending, and viser then sends it fewer, newer updates.
     """
-    pipe = socket.socket()
+    pipe = socket.socket(proto=socket.IPPROTO_TCP)  # as `listen`
     pipe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
     pipe.setblocking(False)
     try:
