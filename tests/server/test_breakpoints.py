@@ -20,7 +20,8 @@ from app.server.session import Session
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
-from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
+from app.slam.loops.measured import Evidence, Measured
+from app.slam.loops.types import LoopEdge, Origin, Verdict
 from app.slam.params import Params
 from app.slam.types import ImuSamples, Scan, StepResult
 
@@ -48,7 +49,8 @@ def frame(**changes: object) -> StepResult:
 
 
 def edge(verdict: Verdict, newer: int = 9) -> LoopEdge:
-    return LoopEdge(2, newer, newer, np.eye(4), np.eye(6), verdict, "overlap 0.2 is below 0.5", Evidence())
+    measured = Measured.of(np.eye(4), np.eye(6), Evidence())
+    return LoopEdge(2, newer, newer, measured, verdict, "overlap 0.2 is below 0.5")
 
 
 GOOD = frame()

@@ -7,13 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.server.edges import EdgesReceiver, EdgesSender
-from app.slam.loops.types import Evidence, LoopEdge, Pair, Verdict
+from app.slam.loops.measured import Evidence, Measured
+from app.slam.loops.types import LoopEdge, Pair, Verdict
 
 PAIRS = [(older, newer) for newer in range(8, 12) for older in range(3)]
 
 
 def edge(pair: Pair) -> LoopEdge:
-    return LoopEdge(*pair, pair[1], np.eye(4), np.eye(6), Verdict.ACCEPTED, "it fits", Evidence())
+    measured = Measured.of(np.eye(4), np.eye(6), Evidence())
+    return LoopEdge(*pair, pair[1], measured, Verdict.ACCEPTED, "it fits")
 
 
 @given(st.lists(st.tuples(st.booleans(), st.dictionaries(st.sampled_from(PAIRS), st.integers(0, 2))), max_size=8))

@@ -26,7 +26,8 @@ from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops import scan_context
 from app.slam.loops import types as loops
-from app.slam.loops.types import Accept, Add, Evidence, FactorResidual, LoopDetail, LoopEdge, Origin, Pair, Verdict
+from app.slam.loops.measured import Evidence, Measured
+from app.slam.loops.types import Accept, Add, FactorResidual, LoopDetail, LoopEdge, Origin, Pair, Verdict
 from tests.ui.fake_engine import START_NS, FakeEngine
 
 LAP = 76
@@ -217,9 +218,7 @@ class LoopEngine(FakeEngine):
                 T = lie.inverse(self.truth[pair[0]]) @ self.truth[pair[1]]
                 if not command.register and command.guess is not None:
                     T = np.array(command.guess)
-                edges[pair] = LoopEdge(
-                    *pair, pair[1], T, 1e-4 * np.eye(6), Verdict.ACCEPTED, "tied by hand", Evidence(), Origin.USER
-                )
+                edges[pair] = LoopEdge(*pair, pair[1], _measured(T), Verdict.ACCEPTED, "tied by hand", Origin.USER)
             elif isinstance(command, loops.SetWeight):
                 edges[pair] = replace(edges[pair], weight=command.weight)
             else:
@@ -251,11 +250,15 @@ class LoopEngine(FakeEngine):
         return tuple(out)
 
 
+def _measured(T_older_newer: np.ndarray, evidence: Evidence = Evidence()) -> Measured:  # noqa: B008 - a value
+    return Measured.of(T_older_newer, 1e-4 * np.eye(6), evidence)
+
+
 def _found(truth: np.ndarray, rng: np.random.Generator) -> dict[Pair, LoopEdge]:
     def edge(pair: Pair, verdict: Verdict, reason: str, off: float, evidence: Evidence) -> LoopEdge:
         T = lie.inverse(truth[pair[0]]) @ truth[pair[1]]
         T[:3, 3] += rng.normal(0, off, 3)
-        return LoopEdge(*pair, min(pair[1] + 8, KEYFRAMES - 1), T, 1e-4 * np.eye(6), verdict, reason, evidence)
+        return LoopEdge(*pair, min(pair[1] + 8, KEYFRAMES - 1), _measured(T, evidence), verdict, reason)
 
     edges = []
     for older in (4, 12, 27, 41, 55, 66):

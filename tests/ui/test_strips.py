@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from app.server.protocol import SERIES, Chunk, LoopsView, OpenedRecording, Snapshot, Transport
 from app.slam import iekf
-from app.slam.loops.types import Evidence, LoopEdge, Verdict
+from app.slam.loops.measured import Evidence, Measured
+from app.slam.loops.types import LoopEdge, Verdict
 from app.ui import strips
 from app.ui.strips import COLUMNS, DEGENERATE_CM, STRIPS, History, limits, message, packed
 from tests.ui.fake_engine import START_NS
@@ -118,7 +119,8 @@ def test_another_session_forgets() -> None:
 
 
 def edge(newer: int, decided_at: int, verdict: Verdict) -> LoopEdge:
-    return LoopEdge(0, newer, decided_at, np.eye(4), np.eye(6), verdict, "fits", Evidence())
+    measured = Measured.of(np.eye(4), np.eye(6), Evidence())
+    return LoopEdge(0, newer, decided_at, measured, verdict, "fits")
 
 
 def test_loops_are_where_they_were_decided_and_stay_there_when_going_back() -> None:

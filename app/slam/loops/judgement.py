@@ -8,8 +8,11 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops.detection import Detector, Sighting
 from app.slam.loops.drift import Expectation
+from app.slam.loops.measured import Evidence, Measured
+from app.slam.loops.measured import covariances as measured_covariances
+from app.slam.loops.measured import poses as measured_poses
 from app.slam.loops.rivals import rival
-from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
+from app.slam.loops.types import LoopEdge, Origin, Verdict
 from app.slam.loops.verification import Fit
 from app.slam.params import Loops
 from app.slam.types import F64
@@ -33,7 +36,7 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
 
     def edge(T_older_newer: F64, covariance: F64, evidence: Evidence, reason: str) -> LoopEdge:
         verdict = Verdict.REJECTED if reason else Verdict.CANDIDATE
-        return LoopEdge(older, newer, now, T_older_newer, covariance, verdict, reason, evidence)
+        return LoopEdge(older, newer, now, Measured.of(T_older_newer, covariance, evidence), verdict, reason)
 
     if sighting.distance > params.context_distance:
         reason = (
@@ -67,11 +70,8 @@ def by_hand(older: int, newer: int, detector: Detector, T_older_newer: F64, *, r
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
     reason = f"added by hand: overlap {fit.overlap:.2f}, residual {fit.residual_rms * 1e3:.0f} mm"
     T = _imu(detector, older, newer, fit.T_target_source) if register else T_older_newer
-    return LoopEdge(
-        *(older, newer, newer, T, covariance(detector, newer, fit), Verdict.ACCEPTED, reason, evidence),
-        origin=Origin.USER,
-        overruled=True,
-    )
+    measured = Measured.of(T, covariance(detector, newer, fit), evidence)
+    return LoopEdge(older, newer, newer, measured, Verdict.ACCEPTED, reason, Origin.USER, overruled=True)
 
 
 def covariance(detector: Detector, newer: int, fit: Fit) -> F64:
@@ -140,9 +140,9 @@ def worth_correcting(edges: Iterable[LoopEdge], poses: F64) -> bool:
     if not loops:
         return False
     pairs = np.array([edge.pair for edge in loops])
-    measured = np.array([edge.T_older_newer for edge in loops])
-    missed = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]
-    covariances = np.array([edge.covariance for edge in loops])
+    measured = [edge.measured for edge in loops]
+    missed = lie.inverse(poses[pairs[:, 0]] @ measured_poses(measured)) @ poses[pairs[:, 1]]
+    covariances = measured_covariances(measured)
     turned = _mean_square(lie.log(missed[:, :3, :3]), covariances[:, :3, :3])
     moved = _mean_square(missed[:, :3, 3], covariances[:, 3:, 3:])
     return max(moved, turned) > 0.5**2

@@ -124,8 +124,11 @@ class Overrulings:
         Args:
             count: keyframes there are; loops by hand beyond them do not count.
         """
+        entries = [*self._done, *([extra] if extra else [])]
+        if not entries:
+            return {pair: found[pair] for pair in sorted(found)}
         edges = dict(found)
-        for entry in [*self._done, *([extra] if extra else [])]:
+        for entry in entries:
             pair = entry.pair
             if pair is None or entry.command.since > self.reached:
                 continue

@@ -38,7 +38,8 @@ def settle(
         return abs(float(walked[a.older] - walked[b.older])), abs(float(walked[a.newer] - walked[b.newer]))
 
     alive = [edge for edge in edges.values() if edge.verdict is not Verdict.REJECTED or edge.evidence.ambiguous]
-    near = [edge for edge in alive if any(max(ways(edge, other)) < NEIGHBOURHOOD_M for other in fresh.values())]
+    apart = np.abs(_ends(alive, walked)[:, None] - _ends(fresh.values(), walked)).max(axis=2)
+    near = [alive[index] for index in np.flatnonzero((apart < NEIGHBOURHOOD_M).any(axis=1))]
     out = dict(fresh)
     for edge in near:
         if edge.verdict is not Verdict.CANDIDATE or edge.overruled:
@@ -49,16 +50,22 @@ def settle(
         support = len({other.newer for other, yes in zip(others, verdicts, strict=True) if yes} - {edge.newer})
         against = verdicts.count(False)
         evidence = replace(edge.evidence, support=support)
+        measured = edge.measured.by(evidence)
         if support >= params.support and support > 2 * against:
             reason = f"{summary(evidence)}; {support} others agree"
             out[edge.pair] = replace(
-                edge, verdict=Verdict.ACCEPTED, reason=reason, evidence=evidence, decided_at=now, weight=1.0
+                edge, verdict=Verdict.ACCEPTED, reason=reason, measured=measured, decided_at=now, weight=1.0
             )
         elif edge.pair in out:
             waits = f"{summary(evidence)}; {support} of {params.support} others agree"
             contradicted = f", {against} contradict it" if against else ""
-            out[edge.pair] = replace(edge, reason=waits + contradicted, evidence=evidence, weight=1.0)
+            out[edge.pair] = replace(edge, reason=waits + contradicted, measured=measured, weight=1.0)
     return list(out.values())
+
+
+def _ends(edges: Iterable[LoopEdge], walked: F64) -> F64:
+    """(n, 2) m, walked to the older and to the newer keyframe of each."""
+    return np.asarray(walked[np.array([edge.pair for edge in edges], np.int64).reshape(-1, 2)])
 
 
 def represented(settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], reach: int) -> list[LoopEdge]:

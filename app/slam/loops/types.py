@@ -4,14 +4,12 @@ A loop is named by the two keyframes it ties together, `(older, newer)`: the nam
 whatever else is found, so that a list of overrulings can be replayed.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Final
 
 import numpy as np
 
-from app.slam.loops import packed
+from app.slam.loops.measured import Evidence, Measured
 from app.slam.types import F32, F64
 
 HUBER = 1.345
@@ -33,161 +31,54 @@ class Origin(StrEnum):
     USER = "user"
 
 
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """What speaks for and against one candidate. nan: not looked at.
-
-    Attributes:
-        context_distance: of the two Scan Contexts at the best column shift, 0 (same) to 1.
-        context_yaw: rad, heading of the newer in the older's level frame by that shift.
-        overlap: share of points near both keyframes that have a partner in the other submap, 0-1.
-        residual_rms: m, point to plane, of those.
-        condition: smallest eigenvalue of the registration's translation information over its
-            largest, 0-1; near 0 the two submaps slide along each other.
-        slide: m, how far registrations from disturbed starts ended from one another.
-        rival_m: m to the nearest other alignment that fits as well and that odometry allows too; inf:
-            there is none.
-        mahalanobis: distance to what odometry predicts, in standard deviations.
-        gate_m: m, standard deviation of that prediction's position.
-        support: other candidates nearby that agree.
-    """
-
-    context_distance: float = float("nan")
-    context_yaw: float = float("nan")
-    overlap: float = float("nan")
-    residual_rms: float = float("nan")
-    condition: float = float("nan")
-    slide: float = float("nan")
-    rival_m: float = float("nan")
-    mahalanobis: float = float("nan")
-    gate_m: float = float("nan")
-    support: int = 0
-
-    @property
-    def ambiguous(self) -> bool:
-        return self.rival_m < float("inf")
-
-
-class _Packed:
-    __slots__ = ("_bytes",)
-    _bytes: bytes
-
-
-@dataclass(frozen=True, init=False, eq=False)
-class LoopEdge(_Packed):
-    """One candidate loop, whatever became of it.
-
-    A walk has thousands, and three processes hold them all. So each is one piece of bytes, half as large as its
-    parts would be on their own, and these are made as they are asked for.
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopEdge:
+    """One candidate loop, whatever became of it. The same only as itself, so that thousands are told apart at once.
 
     Attributes:
         older, newer: the keyframes. decided_at: newest keyframe when it got its verdict; from then on
             an accepted loop takes effect.
-        T_older_newer: (4, 4), IMU frames. covariance: (6, 6), rotation then translation, in the
-            newer's IMU frame (right perturbation). Both are read-only.
+        measured: T_older_newer of the IMU frames, its covariance, rotation then translation, in the
+            newer's IMU frame (right perturbation), and the evidence.
         verdict, reason: and why, in words and numbers.
         origin: who proposed it. overruled: whether the verdict is the user's.
         weight: the covariance is divided by it in the graph.
-        evidence: the numbers.
         represented_by: a loop next to it, which shares most of its points and is in the graph for both.
     """
-
-    __slots__ = ()
 
     older: int
     newer: int
     decided_at: int
-    T_older_newer: F64
-    covariance: F64
+    measured: Measured
     verdict: Verdict
     reason: str
-    evidence: Evidence
-    origin: Origin
-    overruled: bool
-    weight: float
-    represented_by: Pair | None
-
-    def __init__(
-        self,
-        older: int,
-        newer: int,
-        decided_at: int,
-        T_older_newer: F64,
-        covariance: F64,
-        verdict: Verdict,
-        reason: str,
-        evidence: Evidence,
-        origin: Origin = Origin.DETECTED,
-        overruled: bool = False,
-        weight: float = 1.0,
-        represented_by: Pair | None = None,
-    ) -> None:
-        *measures, support = (getattr(evidence, each.name) for each in fields(evidence))
-        counts = (older, newer, decided_at, support, *(represented_by or _NOBODY))
-        choices = (_VERDICTS.index(verdict), _ORIGINS.index(origin), overruled)
-        self._hold(packed.pack(T_older_newer, covariance, (*measures, weight), counts, choices, reason))
-
-    def _hold(self, whole: bytes) -> None:
-        object.__setattr__(self, "_bytes", whole)
-
-    def __reduce__(self) -> tuple[Callable[[bytes], "LoopEdge"], tuple[bytes]]:
-        return _edge, (self._bytes,)
+    origin: Origin = Origin.DETECTED
+    overruled: bool = False
+    weight: float = 1.0
+    represented_by: Pair | None = None
 
     @property
     def pair(self) -> Pair:
-        return packed.first_counts(self._bytes)
+        return self.older, self.newer
+
+    @property
+    def T_older_newer(self) -> F64:
+        """(4, 4), read-only."""
+        return self.measured.T_older_newer
+
+    @property
+    def covariance(self) -> F64:
+        """(6, 6), read-only."""
+        return self.measured.covariance
+
+    @property
+    def evidence(self) -> Evidence:
+        return self.measured.evidence
 
     @property
     def counts(self) -> bool:
         """Whether it is a factor of the graph."""
         return self.verdict is Verdict.ACCEPTED and self.represented_by is None
-
-
-_VERDICTS: Final = tuple(Verdict)
-_ORIGINS: Final = tuple(Origin)
-_NOBODY: Final = (-1, -1)
-
-
-def _edge(whole: bytes) -> LoopEdge:
-    edge = object.__new__(LoopEdge)
-    edge._hold(whole)
-    return edge
-
-
-def _evidence(whole: bytes) -> Evidence:
-    distance, yaw, overlap, residual, condition, slide, rival, mahalanobis, gate, _ = packed.numbers(whole)
-    support = packed.counts(whole)[3]
-    return Evidence(distance, yaw, overlap, residual, condition, slide, rival, mahalanobis, gate, support)
-
-
-def _represented_by(whole: bytes) -> Pair | None:
-    pair = packed.last_counts(whole)
-    return None if pair == _NOBODY else pair
-
-
-# To `dataclasses`, and so to `replace`, they are fields as others are.
-_FIELDS: Final[Mapping[str, Callable[[bytes], object]]] = {
-    "older": lambda whole: packed.counts(whole)[0],
-    "newer": lambda whole: packed.counts(whole)[1],
-    "decided_at": lambda whole: packed.counts(whole)[2],
-    "T_older_newer": packed.pose,
-    "covariance": packed.covariance,
-    "verdict": lambda whole: _VERDICTS[packed.choice(whole, 0)],
-    "reason": packed.text,
-    "evidence": _evidence,
-    "origin": lambda whole: _ORIGINS[packed.choice(whole, 1)],
-    "overruled": lambda whole: bool(packed.choice(whole, 2)),
-    "weight": lambda whole: packed.numbers(whole)[-1],
-    "represented_by": _represented_by,
-}
-
-
-def _property(read: Callable[[bytes], object]) -> property:
-    return property(lambda edge: read(edge._bytes))
-
-
-for _name, _read in _FIELDS.items():
-    setattr(LoopEdge, _name, _property(_read))
 
 
 # --- the user's commands -------------------------------------------------------------------------

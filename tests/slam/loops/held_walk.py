@@ -7,6 +7,7 @@ import numpy as np
 
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.line import LoopLine
+from app.slam.loops.measured import Evidence, Measured
 from app.slam.loops.messages import (
     AddKeyframe,
     AskG2o,
@@ -20,7 +21,7 @@ from app.slam.loops.messages import (
     Reply,
     Request,
 )
-from app.slam.loops.types import Command, Evidence, LoopEdge, Verdict
+from app.slam.loops.types import Command, LoopEdge, Verdict
 from app.slam.params import Loops
 from app.slam.types import Cloud, Keyframe
 
@@ -96,7 +97,8 @@ def state(count: int, commands: tuple[Command, ...] = ()) -> LoopState:
 
 
 def edge(newer: int) -> LoopEdge:
-    return LoopEdge(0, newer, newer, np.eye(4), np.eye(6), Verdict.ACCEPTED, "it fits", Evidence())
+    measured = Measured.of(np.eye(4), np.eye(6), Evidence())
+    return LoopEdge(0, newer, newer, measured, Verdict.ACCEPTED, "it fits")
 
 
 class HeldWalk:

@@ -1,0 +1,113 @@
+"""What was measured of a candidate loop, and what speaks for it; kept small, since three processes hold thousands."""
+
+import struct
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from app.slam.types import F64
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What speaks for and against one candidate. nan: not looked at.
+
+    Attributes:
+        context_distance: of the two Scan Contexts at the best column shift, 0 (same) to 1.
+        context_yaw: rad, heading of the newer in the older's level frame by that shift.
+        overlap: share of points near both keyframes that have a partner in the other submap, 0-1.
+        residual_rms: m, point to plane, of those.
+        condition: smallest eigenvalue of the registration's translation information over its
+            largest, 0-1; near 0 the two submaps slide along each other.
+        slide: m, how far registrations from disturbed starts ended from one another.
+        rival_m: m to the nearest other alignment that fits as well and that odometry allows too; inf:
+            there is none.
+        mahalanobis: distance to what odometry predicts, in standard deviations.
+        gate_m: m, standard deviation of that prediction's position.
+        support: other candidates nearby that agree.
+    """
+
+    context_distance: float = float("nan")
+    context_yaw: float = float("nan")
+    overlap: float = float("nan")
+    residual_rms: float = float("nan")
+    condition: float = float("nan")
+    slide: float = float("nan")
+    rival_m: float = float("nan")
+    mahalanobis: float = float("nan")
+    gate_m: float = float("nan")
+    support: int = 0
+
+    @property
+    def ambiguous(self) -> bool:
+        return self.rival_m < float("inf")
+
+
+_POSE, _COVARIANCE = 12, 21
+"""Numbers: the upper three rows of the one, the upper triangle of the other."""
+_EVIDENCE: Final = struct.Struct("=9di")
+_EVIDENCE_AT: Final = 8 * (_POSE + _COVARIANCE)
+_ROW: Final = np.dtype(
+    [("pose", np.float64, (3, 4)), ("covariance", np.float64, _COVARIANCE), ("evidence", np.void, _EVIDENCE.size)]
+)
+_UPPER: Final = np.triu_indices(6)
+_WHERE: Final = np.empty((6, 6), np.intp)
+"""In the triangle, of each entry."""
+_WHERE[_UPPER] = _WHERE.T[_UPPER] = np.arange(_COVARIANCE)
+_LAST_ROW: Final = np.eye(4)[3].tobytes()
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A measured pose with its covariance and evidence; these come out of `packed` to the last bit.
+
+    Two small arrays and ten floats would take three times the memory of their numbers.
+    """
+
+    packed: bytes
+
+    @classmethod
+    def of(cls, T_older_newer: F64, covariance: F64, evidence: Evidence) -> "Measured":
+        """From (4, 4), whose last row is 0 0 0 1, and (6, 6), symmetric."""
+        pose, triangle = np.asarray(T_older_newer, np.float64)[:3], np.asarray(covariance, np.float64)[_UPPER]
+        return cls(pose.tobytes() + triangle.tobytes() + _EVIDENCE.pack(*astuple(evidence)))
+
+    @property
+    def T_older_newer(self) -> F64:
+        """(4, 4), read-only."""
+        return np.frombuffer(self.packed[: 8 * _POSE] + _LAST_ROW, np.float64).reshape(4, 4)
+
+    @property
+    def covariance(self) -> F64:
+        """(6, 6), read-only."""
+        whole = np.frombuffer(self.packed, np.float64, _COVARIANCE, 8 * _POSE)[_WHERE]
+        whole.setflags(write=False)
+        return whole
+
+    @property
+    def evidence(self) -> Evidence:
+        return Evidence(*_EVIDENCE.unpack_from(self.packed, _EVIDENCE_AT))
+
+    def by(self, evidence: Evidence) -> "Measured":
+        """The same with other evidence."""
+        return Measured(self.packed[:_EVIDENCE_AT] + _EVIDENCE.pack(*astuple(evidence)))
+
+
+def poses(measured: Iterable[Measured]) -> F64:
+    """(n, 4, 4) of many at once."""
+    upper = _rows(measured)["pose"]
+    out = np.tile(np.eye(4), (len(upper), 1, 1))
+    out[:, :3] = upper
+    return out
+
+
+def covariances(measured: Iterable[Measured]) -> F64:
+    """(n, 6, 6) of many at once."""
+    return np.asarray(_rows(measured)["covariance"][:, _WHERE])
+
+
+def _rows(measured: Iterable[Measured]) -> npt.NDArray[np.void]:
+    return np.frombuffer(b"".join(each.packed for each in measured), _ROW)

@@ -1,0 +1,73 @@
+"""What was measured of a loop comes out of its bytes as it went in."""
+
+import math
+import pickle
+import tracemalloc
+from dataclasses import astuple, fields
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from app.slam.loops.measured import Evidence, Measured, covariances, poses
+from app.slam.loops.types import LoopEdge, Verdict
+from app.slam.types import F64
+
+NUMBER = st.floats(allow_nan=True, allow_infinity=True)
+COUNT = st.integers(0, 2**31 - 1)
+EVIDENCE = st.builds(Evidence, **{each.name: NUMBER for each in fields(Evidence)} | {"support": COUNT})
+
+
+def pose_and_covariance(seed: int) -> tuple[F64, F64]:
+    rng = np.random.default_rng(seed)
+    T, half = np.eye(4), rng.normal(size=(6, 6))
+    T[:3, :3], T[:3, 3] = Rotation.random(random_state=seed).as_matrix(), rng.normal(0, 100, 3)
+    return T, half + half.T
+
+
+def exactly(evidence: Evidence) -> list[object]:
+    """To compare with ==, to the last bit."""
+    return ["nan" if isinstance(value, float) and math.isnan(value) else value for value in astuple(evidence)]
+
+
+@given(st.integers(0, 2**32 - 1), EVIDENCE, EVIDENCE)
+def test_it_is_what_it_was_made_of_to_the_last_bit(seed: int, evidence: Evidence, other: Evidence) -> None:
+    T, covariance = pose_and_covariance(seed)
+    measured = Measured.of(T, covariance, evidence)
+    for one, expected in ((pickle.loads(pickle.dumps(measured)), evidence), (measured.by(other), other)):
+        assert one.T_older_newer.tobytes() == T.tobytes()
+        assert one.covariance.tobytes() == covariance.tobytes()
+        assert exactly(one.evidence) == exactly(expected)
+
+
+def test_many_at_once_are_the_same_as_one_by_one() -> None:
+    made = [Measured.of(*pose_and_covariance(seed), Evidence()) for seed in range(5)]
+    np.testing.assert_array_equal(poses(made), [each.T_older_newer for each in made])
+    np.testing.assert_array_equal(covariances(made), [each.covariance for each in made])
+    assert poses([]).shape == (0, 4, 4)
+    assert covariances([]).shape == (0, 6, 6)
+
+
+def test_nobody_changes_what_others_hold() -> None:
+    measured = Measured.of(np.eye(4), np.eye(6), Evidence())
+    with pytest.raises(ValueError, match="read-only"):
+        measured.T_older_newer[0, 3] = 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        measured.covariance[0, 0] = 2.0
+
+
+def test_a_loop_takes_little_memory_after_a_way_through_a_pipe() -> None:
+    """As the processes that show loops hold them: with arrays and floats of its own each took 1.6 kB."""
+    reason = "overlap 0.97, residual 6 mm, slide 1 mm, 0.0 σ from odometry; 26 others agree"
+    measured = Measured.of(np.eye(4), np.eye(6), Evidence(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 26))
+    sent = [
+        pickle.dumps(LoopEdge(1000 + k, 3000 + k, 3001 + k, measured, Verdict.ACCEPTED, reason)) for k in range(1000)
+    ]
+    tracemalloc.start()
+    held = [pickle.loads(one) for one in sent]
+    taken, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held[-1].pair == (1999, 3999)
+    assert taken < 950 * len(held)
