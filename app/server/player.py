@@ -114,6 +114,8 @@ class Player:
         if journey is not None and journey.stepping:
             self._page.show(playing=False, frames_per_second=0.0)
             start, again_to = journey.target, journey.again_to
+            if not journey.back:
+                again_to = max(again_to, run.frame)  # what was passed on the way is not gone back over
         else:
             self.halt()
             start = again_to = run.frame

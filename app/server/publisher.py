@@ -122,13 +122,14 @@ class Publisher:
 
     def compared(self, run: Run, errors: F64) -> None:
         """The walk is held against another trajectory: `errors` (n,) m, of all frames that are known."""
-        told = self.outbox.frames
+        told = min(self.outbox.frames, len(errors))  # on the way back, those told that are not known any more go
         self._rows.go_to(len(errors))
         rows = self._rows.view().copy()
         rows[:, SERIES.index("error_m")] = errors
         self._rows.go_to(0)
         self._rows.extend(rows)
         self._rows.go_to(told)
+        self._positions.go_to(told)
         self.outbox.go_to(0, self.outbox.chunks)
         for position, row in zip(self._positions.view()[:told], rows[:told], strict=True):
             self.outbox.frame(position, row.tolist())

@@ -7,7 +7,7 @@ on) or `restart` (when the recording is opened again).
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.config import JsonDict
 
 Effect = Literal["now", "frame", "restart"]
@@ -30,6 +30,13 @@ def _param(
 
 class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @field_validator("*")
+    @classmethod
+    def _can_be_written(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            value.encode()  # half of a character, as JSON can have it, raises
+        return value
 
 
 class Recording(Section):

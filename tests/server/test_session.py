@@ -10,6 +10,7 @@ from session_desk import Desk, last_notice
 
 from app.server.protocol import (
     Command,
+    CompareWith,
     LoadParams,
     Pause,
     Play,
@@ -20,6 +21,7 @@ from app.server.protocol import (
     Snapshot,
     StepFrame,
 )
+from app.server.run import Run
 from app.slam.params import Params
 from app.slam.types import GROUND
 
@@ -233,3 +235,30 @@ def test_loaded_yaml_replaces_all_parameters() -> None:
     desk.do(SetParams({"ground.alpha": 30}))
     snapshot = desk.do(LoadParams("ground: {sigma: 0.05}"))
     assert snapshot.params == Params().with_values({"ground.sigma": 0.05})
+
+
+def test_steps_ahead_that_come_on_the_way_go_on_from_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    desk = Desk()
+    desk.do(Pause())
+    gone_back: list[int] = []
+    monkeypatch.setattr(Run, "go_before", lambda _, frame: gone_back.append(frame))
+    begin = desk.fold.snapshot.transport.frame
+    desk.session.handle(StepFrame(5))
+    for _ in range(3):
+        desk.session.work()
+    desk.session.handle(StepFrame(4))
+    assert desk.settle().transport.frame == begin + 9
+    assert gone_back == []
+
+
+def test_a_comparison_on_the_way_back_waits_for_no_frame_that_is_forgotten() -> None:
+    """The page is told of sixty frames still, and only those up to the one gone to are known."""
+    desk = Desk()
+    desk.do(SetSpeed(math.inf), Play())
+    assert desk.fold.snapshot.transport.frame == 59
+    desk.session.handle(Seek(25))
+    desk.session.work()  # back at a checkpoint, not yet at the frame
+    desk.session.handle(SetParams({"ground.sigma": 0.05}))
+    desk.session.handle(CompareWith(None))
+    assert desk.settle().transport.frame == 25
+    assert len(desk.do(StepFrame(3)).series["stamp_s"]) == 29
