@@ -11,6 +11,7 @@ import numpy as np
 
 from app.slam.errors import HemislamError
 from app.slam.loops.types import Accept, Add, Command, LoopEdge, Pair, SetWeight, Solve, Verdict, pair_of
+from app.slam.types import F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +154,14 @@ def check(command: Command) -> None:
         lengths = {len(row) for row in command.guess}
         if len(command.guess) != 4 or lengths != {4} or not np.isfinite(command.guess).all():
             raise HemislamError("The guess of a loop must be a 4x4 matrix T_older_newer of finite numbers.")
+        if not _is_rigid(np.array(command.guess)):
+            raise HemislamError("The guess of a loop must be a rotation and a position: a rigid 4x4 T_older_newer.")
+
+
+def _is_rigid(T: F64) -> bool:
+    """As exactly as numbers are written that people pass on."""
+    R = T[:3, :3]
+    return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0 and np.allclose(T[3], (0, 0, 0, 1)))
 
 
 def in_words(command: Command) -> str:

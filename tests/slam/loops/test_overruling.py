@@ -313,6 +313,9 @@ def test_a_loop_that_breaks_the_solver_is_reported_and_the_run_goes_on(walked: W
         (Accept(7, 3), "can not be tied together"),
         (Reject(-1, 3), "can not be tied together"),
         (Add(0, 30, ((1.0,),)), "4x4"),
+        (Add(0, 30, rows(np.diag([1.0, 1.0, -1.0, 1.0]))), "rigid"),  # a mirror
+        (Add(0, 30, rows(np.diag([1.1, 1.1, 1.1, 1.0]))), "rigid"),
+        (Add(0, 30, rows(np.eye(4) + np.eye(4)[[3, 0, 1, 2]])), "rigid"),
     ],
 )
 def test_a_command_that_never_makes_sense_is_refused_and_changes_nothing(
