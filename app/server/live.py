@@ -6,6 +6,7 @@ import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from app.memory import tidy
 from app.sensors.findings import Finding
 from app.sensors.live.process import LiveAddress, LiveClient
 from app.sensors.live.status import LiveState, Status
@@ -27,6 +28,8 @@ POLL_S = 0.02
 
 EVERY = 10
 """Frames between two checkpoints; the receiving process can give six seconds of scans again."""
+TIDY_EVERY = 100
+"""Frames between two times at which memory is tidied up."""
 KEYFRAMES, CHECKPOINT, ROWS = "keyframes", "checkpoint", "rows"
 
 log = logging.getLogger(__name__)
@@ -132,6 +135,8 @@ class LiveRun(Run):
             return
         with contextlib.suppress(HemislamError):  # it has ended, which is told when it is asked for the next scan
             self._client.kept()
+        if self.frame % TIDY_EVERY == 0:
+            tidy()
 
     def _state(self) -> _Kept:
         loops = self.engine.loops.state if self.engine.loops else None
