@@ -103,6 +103,13 @@ def test_no_part_of_an_answer_waits_until_the_one_before_is_acknowledged(site: S
         assert taken.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
+def test_a_page_stays_however_long_it_says_nothing(site: Site) -> None:
+    with site.socket() as page:
+        time.sleep(1.6)
+        assert page.ping().wait(PATIENCE_S)
+        assert not PatientProtocol._waiting
+
+
 def test_of_many_who_wait_the_oldest_makes_room(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(patience, "REQUEST_S", 60.0)
     monkeypatch.setattr(patience, "MOST_WAITING", 20)
