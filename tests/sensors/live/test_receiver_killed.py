@@ -4,6 +4,7 @@ import contextlib
 import math
 import os
 import signal
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -40,14 +41,26 @@ class Walk:
         """So many, of the sensor that turned all the time. Returns the number of the first."""
         first = math.ceil(self._now() + 5)
         packets = sensor.turns(count, start_ns=sensor.START_NS + first * TURN_NS)
-        while self._now() < first:
-            self.poll()
-        thread = threading.Thread(target=self._wire.turns, args=(first, packets, 0.1))
+        thread = threading.Thread(target=self._send, args=(first, packets))
         thread.start()
         while thread.is_alive():
             self.poll()
         thread.join()
         return first
+
+    def _send(self, first: int, packets: list[bytes]) -> None:
+        """Each when it is due, or at once if that is over: who is late for long has set its clock, it would seem."""
+        wire = self._wire
+        for at in range(0, len(packets), 15):
+            offset_ns = at // 15 * 10_000_000
+            while self._now() < first + offset_ns / TURN_NS:
+                time.sleep(0.002)
+            for packet in packets[at : at + 15]:
+                wire.send(wire.lidar, packet)
+            for half in range(2):
+                stamp = sensor.START_NS + first * TURN_NS + offset_ns + half * 5_000_000
+                wire.send(wire.imu, struct.pack("<4sIq6d", b"HIMU", wire.number, stamp, 0, 0, 0, 0, 0, 9.81))
+                wire.number += 1
 
     def _now(self) -> float:
         return (time.monotonic() - self._began_s) * 1e9 / TURN_NS
