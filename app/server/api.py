@@ -3,6 +3,7 @@
 import math
 import shutil
 import tempfile
+import threading
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -39,6 +40,8 @@ from app.slam.params import Params
 from app.slam.trajectory import truth_beside
 
 EXPORT_PATIENCE_S = 600.0
+MOST_EXPORTS = 4
+"""At once: each keeps one of the threads that answer, of which there are forty."""
 
 
 class Simple(BaseModel):
@@ -118,6 +121,7 @@ Export = Literal[
 def make_router(engine: Engine, folders: Folders) -> APIRouter:
     """All routes below /api. HemislamError raised here becomes status 422."""
     router = APIRouter(prefix="/api")
+    exporting = threading.BoundedSemaphore(MOST_EXPORTS)
 
     @router.get("/state")
     def state() -> StateView:
@@ -195,16 +199,12 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
     @router.get("/export/{name}", response_class=FileResponse)
     def export(name: Export, background: BackgroundTasks) -> FileResponse:
         """What was processed so far, as `hemislam run` writes it."""
-        folder = Path(tempfile.mkdtemp(prefix="hemislam-export-"))
-        background.add_task(shutil.rmtree, folder, ignore_errors=True)
+        if not exporting.acquire(blocking=False):
+            raise HTTPException(503, "Enough is being exported at present; ask again in a moment.")
         try:
-            _save(engine, folder, trajectory_only=name == "trajectory.tum")
-            if not (folder / name).exists():
-                raise HTTPException(404, f"There is no {name}, since loops are not looked for; set loops.enabled.")
-        except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
-        return FileResponse(folder / name, filename=name, background=background)
+            return _exported(engine, name, background)
+        finally:
+            exporting.release()
 
     return router
 
@@ -247,6 +247,19 @@ def _loop_command(body: OverruleBody | GraphBody) -> Command:
             return UndoLoop()
         case _:
             return RedoLoop()
+
+
+def _exported(engine: Engine, name: str, background: BackgroundTasks) -> FileResponse:
+    folder = Path(tempfile.mkdtemp(prefix="hemislam-export-"))
+    background.add_task(shutil.rmtree, folder, ignore_errors=True)
+    try:
+        _save(engine, folder, trajectory_only=name == "trajectory.tum")
+        if not (folder / name).exists():
+            raise HTTPException(404, f"There is no {name}, since loops are not looked for; set loops.enabled.")
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return FileResponse(folder / name, filename=name, background=background)
 
 
 def _save(engine: Engine, folder: Path, *, trajectory_only: bool) -> None:

@@ -2,8 +2,11 @@
 
 import contextlib
 import socket
+import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import httpx
@@ -12,7 +15,7 @@ from server_site import PATIENCE_S, Site
 from test_safety import CAMERA, packed, until
 from websockets.exceptions import InvalidStatus
 
-from app.server import access, patience, web
+from app.server import access, api, patience, web
 from app.server.access import MOST_BYTES
 from app.server.patience import PatientProtocol
 
@@ -184,3 +187,16 @@ def test_half_an_upload_goes_with_its_page(site: Site) -> None:
     page.socket.shutdown(socket.SHUT_RDWR)  # as a browser that crashes
     until(lambda: "half" not in states)
     button.remove()
+
+
+def test_slow_exports_leave_threads_for_others(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = threading.Event()
+    monkeypatch.setattr(api, "_save", lambda *_, **__: written.wait(PATIENCE_S))
+    ask = partial(httpx.get, site.url("/api/export/map.ply"), timeout=PATIENCE_S)
+    with ThreadPoolExecutor(60) as many:
+        answers = [many.submit(ask) for _ in range(60)]
+        until(lambda: sum(answer.done() for answer in answers) >= 60 - api.MOST_EXPORTS)
+        assert httpx.get(site.url("/api/state")).status_code == 200
+        written.set()
+        assert sum(answer.result().status_code == 503 for answer in answers) == 60 - api.MOST_EXPORTS
+    assert ask().status_code == 404, "others can be exported again; there is none here"
