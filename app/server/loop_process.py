@@ -6,6 +6,7 @@ so that neither sending a keyframe nor a late reader makes anyone wait. When the
 pipe for requests ends and the process ends itself.
 """
 
+import itertools
 import os
 import queue
 import subprocess
@@ -18,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from app.logs import process_logs
-from app.memory import give_back
+from app.memory import give_back, tidy
 from app.server import wire
 from app.server.corrections import Corrections
 from app.server.edges import EdgesReceiver, EdgesSender
@@ -26,6 +27,8 @@ from app.slam.loops.messages import LoopState, LoopWorkerDied, Reply, Request
 
 NICENESS: Final = 10
 """The frame loop comes first."""
+TIDIED: Final = 20
+"""Requests after which the holes in memory are given back; most are keyframes, which leave some."""
 _ALONE: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "NUMBA", "OPENBLAS", "MKL")}
 """More threads would fight the frame loop's for the cores."""
 _NONE: Final = np.empty((0, 4, 4))
@@ -144,13 +147,15 @@ def main() -> None:
     service = LoopService()
     edges, corrections = EdgesSender(), Corrections()
     try:
-        while True:
+        for number in itertools.count(1):
             reply = service.handle(wire.receive(requests))
             changes = None
             if isinstance(reply, LoopState):
                 changes = edges.change(reply.edges), corrections.change(reply.corrections)
                 reply = replace(reply, edges=(), corrections=_NONE)
             wire.send(replies, (reply, changes))
+            if number % TIDIED == 0:
+                tidy()
     except (EOFError, OSError):  # the owner has gone, or wants no more
         return
 
