@@ -55,6 +55,7 @@ def check(client: httpx.Client, site: Site, sent: Sent) -> None:
 @settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(sents=st.lists(described().requests(frozenset({EXPORT})), min_size=1, max_size=4))
 def test_no_request_breaks_anything(real: Site, sents: list[Sent]) -> None:
-    with httpx.Client(timeout=PATIENCE_S) as client:
+    limits = httpx.Limits(keepalive_expiry=1.0)  # well before the server closes what is idle, after five
+    with httpx.Client(timeout=PATIENCE_S, limits=limits) as client:
         for sent in sents:
             check(client, real, sent)
