@@ -186,6 +186,7 @@ def test_half_an_upload_goes_with_its_page(site: Site) -> None:
     until(lambda: "half" in states)
     page.socket.shutdown(socket.SHUT_RDWR)  # as a browser that crashes
     until(lambda: "half" not in states)
+    assert not states, "nor is anything else of it kept"
     button.remove()
 
 
