@@ -33,8 +33,11 @@ print(libc.mallinfo2().hblkhd - before)
 """
 
 
-# Other C libraries have no mallinfo2, nor anything that `give_back` could ask for.
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="of glibc")
+# Other C libraries have no mallinfo2, nor anything that `give_back` and `tidy` could ask for; CI has glibc.
+of_glibc = pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="of glibc")
+
+
+@of_glibc
 def test_a_large_array_has_pages_of_its_own_that_go_back_with_it() -> None:
     def on_pages(large: str) -> int:
         done = subprocess.run([sys.executable, "-c", ON_PAGES, large], capture_output=True, text=True, check=True)
@@ -59,7 +62,7 @@ print(before - held())
 """
 
 
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="of glibc")  # as above
+@of_glibc
 def test_holes_between_what_is_held_are_given_back() -> None:
     done = subprocess.run([sys.executable, "-c", HOLES], capture_output=True, text=True, check=True)
     assert int(done.stdout) > 20_000_000, "of the 38 MB that were freed"

@@ -31,8 +31,8 @@ def test_what_was_handed_out_stays_as_it_is_while_rows_are_added(lengths: list[i
         assert not view.flags.writeable
 
 
-# Elsewhere rows stay in memory, and no file tells how much there is of it.
-@pytest.mark.skipif(sys.platform != "linux", reason="of Linux")
+# Elsewhere rows stay in memory, so there is nothing to hold them to; CI is Linux.
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere rows are kept in memory")
 def test_large_rows_take_no_memory_of_their_own() -> None:
     before = _anonymous_mb()
     grown = Rows((4, 4), np.float64)
