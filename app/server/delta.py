@@ -12,10 +12,10 @@ from typing import Any, Literal
 import numpy as np
 
 from app.server.chunks import with_same_mounting, within_budget
-from app.server.corrections import Corrections
 from app.server.edges import EdgesChange, EdgesReceiver, EdgesSender
 from app.server.protocol import SERIES, Chunk, LoopsView, Notice, Snapshot
 from app.server.setup import POINT_BUDGET
+from app.server.transforms import Transforms
 from app.slam.params import Params
 from app.slam.rows import table
 from app.slam.types import F64
@@ -175,7 +175,7 @@ class Fold:
         self._positions, self._series = table(3), table(len(SERIES))
         self._chunks: tuple[Chunk, ...] = ()  # also those that were gone back over
         self._edges = EdgesReceiver()
-        self._poses = Corrections()
+        self._poses = Transforms()
 
     def apply(self, delta: Delta) -> Snapshot:
         before, delta = self.snapshot, read_only(delta)

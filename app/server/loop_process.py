@@ -21,8 +21,8 @@ import numpy as np
 from app.logs import process_logs
 from app.memory import give_back, tidy
 from app.server import wire
-from app.server.corrections import Corrections
 from app.server.edges import EdgesReceiver, EdgesSender
+from app.server.transforms import Transforms
 from app.slam.loops.messages import LoopState, LoopWorkerDied, Reply, Request
 
 NICENESS: Final = 10
@@ -121,7 +121,7 @@ class LoopProcess:
                     return
 
     def _read(self, replies: "Connection[object, object]") -> None:
-        edges, corrections = EdgesReceiver(), Corrections()
+        edges, corrections = EdgesReceiver(), Transforms()
         with replies:
             try:
                 while True:
@@ -145,7 +145,7 @@ def main() -> None:
 
     warm_up()
     service = LoopService()
-    edges, corrections = EdgesSender(), Corrections()
+    edges, corrections = EdgesSender(), Transforms()
     try:
         for number in itertools.count(1):
             reply = service.handle(wire.receive(requests))
