@@ -23,6 +23,7 @@ import httpx
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.live import children
 from benchmarks.record import Line
 
 SAMPLE = next((Path(__file__).resolve().parents[1] / "sample_data").glob("*.mcap"))
@@ -137,10 +138,11 @@ class Workbench:
     def engine(self) -> int | None:
         """The engine's process; None if there is none just now."""
         assert self.server is not None
-        found = subprocess.run(
-            ["pgrep", "-P", str(self.server.pid), "-f", "spawn_main"], capture_output=True, text=True, check=False
-        )
-        return int(found.stdout.split()[0]) if found.stdout.strip() else None
+        for pid in children(self.server.pid):
+            with contextlib.suppress(OSError):
+                if Path(f"/proc/{pid}/comm").read_text().strip() == "hemislam-engine":
+                    return pid
+        return None
 
     def kill(self, kind: Literal["engine", "server", "both"]) -> None:
         """Returns when it has happened, and the server knows."""

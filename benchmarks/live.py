@@ -36,6 +36,8 @@ MINUTES = float(os.environ.get("HEMISLAM_LIVE_MINUTES", "4"))
 SPEED = float(os.environ.get("HEMISLAM_LIVE_SPEED", "1"))
 """Times real time: at 2, twenty scans a second."""
 REPORT_S = 30.0
+NAMED = "hemislam-"
+"""What the names of processes begin with that the server starts."""
 SETTLE_S = 3.0
 """After the last packet: what waits is mapped by then, and has been told."""
 
@@ -131,31 +133,30 @@ def _stalled_page(url: str) -> socket.socket:
 
 
 def _memory(server: "subprocess.Popen[str]") -> dict[str, float]:
-    """MB that each process has written and shares with no other: the server, and those that it started. Linux only.
+    """MB that each process has written: the server, and those that it started. Linux only.
 
-    Pages of libraries do not count: whether they are shared depends on what else the machine happens to run.
+    What several of them share is shared out among them. Pages of libraries do not count: whether they are shared
+    depends on what else the machine happens to run.
     """
-    found = {"server": _private_mb(server.pid)}
-    names = ["receiver", "engine"]  # in the order in which they are started
-    for pid in _children(server.pid):
-        command = Path(f"/proc/{pid}/cmdline").read_bytes()
-        if b"spawn_main" in command and names:
-            found[names.pop(0)] = _private_mb(pid)
-        elif b"loop_process" in command:
-            found["loops"] = _private_mb(pid)
+    found = {"server": _written_mb(server.pid)}
+    for pid in children(server.pid):
+        name = Path(f"/proc/{pid}/comm").read_text().strip()
+        if name.startswith(NAMED):
+            found[name.removeprefix(NAMED)] = _written_mb(pid)
     return found
 
 
-def _children(pid: int) -> list[int]:
+def children(pid: int) -> list[int]:
+    """Processes that it started, and that these started."""
     direct = [
         int(one) for task in Path(f"/proc/{pid}/task").iterdir() for one in (task / "children").read_text().split()
     ]
-    return [one for child in sorted(direct) for one in (child, *_children(child))]
+    return [one for child in sorted(direct) for one in (child, *children(child))]
 
 
-def _private_mb(pid: int) -> float:
+def _written_mb(pid: int) -> float:
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    return sum(int(line.split()[1]) for line in lines if line.startswith("Private_Dirty")) / 1e3
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Pss_Dirty")) / 1e3
 
 
 def _tell(seconds: float, state: Any, memory: dict[str, float]) -> None:

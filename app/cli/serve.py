@@ -92,8 +92,12 @@ def serve(
       hemislam serve --live foxglove://robot:8765 --preset rslidar
       hemislam serve walk.mcap --host 0.0.0.0            from other computers, by the printed link
     """
-    from app.evaluation.truth import read_poses
+    from app import processes
     from app.logs import start_logging
+
+    start_logging(json_lines=log_json)
+    processes.context()  # what is forked imports for as long as we do here, and beside it
+    from app.evaluation.truth import read_poses
     from app.memory import LARGE_OF_MAP, give_back
     from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording
@@ -126,7 +130,6 @@ def serve(
         raise HemislamError(
             "--paused, --start, --duration and --truth belong to a recording; leave them out with --live."
         )
-    start_logging(json_lines=log_json)
     if live is not None:
         give_back(LARGE_OF_MAP)
     session = read_session(recording) if recording is not None and recording.suffix == SUFFIX else None

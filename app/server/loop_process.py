@@ -18,6 +18,7 @@ from typing import Final
 
 import numpy as np
 
+from app import processes
 from app.logs import process_logs
 from app.memory import give_back, tidy
 from app.server import wire
@@ -138,6 +139,7 @@ def main() -> None:
     """The process: answers until the pipe for requests, whose file descriptors it is given, ends."""
     requests: Connection[object, object] = Connection(int(sys.argv[1]), writable=False)
     replies: Connection[object, object] = Connection(int(sys.argv[2]), readable=False)
+    processes.begin("hemislam-loops")
     os.nice(NICENESS)
     give_back()  # glibc would keep what was large once, here a third of all that is taken
     from app.slam.loops.service import LoopService  # the owner has no need of the solver

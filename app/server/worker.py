@@ -7,15 +7,13 @@ process dies, however, the pipe for commands ends and the engine's process ends 
 
 import contextlib
 import math
-import multiprocessing
-import os
-import signal
+import multiprocessing.process
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from multiprocessing import resource_tracker
 from typing import Any
 
+from app import processes
 from app.logs import process_logs
 from app.memory import give_back
 from app.server import wire
@@ -39,6 +37,7 @@ def _run_engine(commands: Pipe, updates: Pipe, setup: Setup) -> None:
 def _logged(main: Main, commands: Pipe, updates: Pipe, setup: Setup) -> None:
     if setup.live is not None:
         give_back()
+    processes.begin("hemislam-engine")
     with process_logs("engine"):
         main(commands, updates, setup)
 
@@ -119,14 +118,14 @@ class EngineProcess:
     # --- the process -----------------------------------------------------------------------------
     def _start(self, setup: Setup) -> None:
         self._running = setup
-        context = multiprocessing.get_context("spawn")
+        context = processes.context()
         commands_in, commands_out = context.Pipe(duplex=False)
         updates_in, updates_out = context.Pipe(duplex=False)
         wire.widen(updates_out)
         process = context.Process(
             target=_logged, args=(self._main, commands_in, updates_out, setup), name="hemislam engine", daemon=True
         )
-        with _sigint_blocked():
+        with processes.sigint_blocked():
             process.start()
         commands_in.close()
         updates_out.close()
@@ -207,20 +206,3 @@ class EngineProcess:
             if self._commands is not None:
                 self._commands.close()
                 self._commands = None
-
-
-@contextlib.contextmanager
-def _sigint_blocked() -> Iterator[None]:
-    """A process started meanwhile does not see Ctrl-C, not even while it is still importing.
-
-    The terminal sends it to all processes of the foreground; ours is told to end by its parent.
-    """
-    if os.name != "posix":
-        yield
-        return
-    resource_tracker.ensure_running()  # its start, else a part of the process's, would unblock the signal
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -4,6 +4,8 @@ The walk is a circle of 2 m radius at 10 frames a second, every frame turned by 
 reports that pose. Points with z < `ground.sigma` are called ground, so a relabelling can be checked.
 """
 
+import threading
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -193,3 +195,12 @@ def open_fake(path: Path, truth: Path | None, params: Params, part: tuple[float,
 
 def fake_main(commands: Pipe, updates: Pipe, setup: Setup) -> None:
     run_loop(commands, updates, setup, open_fake)
+
+
+def failing_main(commands: Pipe, updates: Pipe, setup: Setup) -> None:
+    """Says a word of warning, loses a thread and ends."""
+    warnings.warn("somewhat odd", stacklevel=1)
+    thread = threading.Thread(target=lambda: [][1], name="side work")
+    thread.start()
+    thread.join()
+    raise ValueError("an engine\nthat fails")

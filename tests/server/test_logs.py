@@ -4,23 +4,10 @@ import json
 import os
 import subprocess
 import sys
-import threading
-import warnings
+from pathlib import Path
 from typing import Any
 
 import pytest
-
-from app.server.setup import Setup
-from app.server.wire import Pipe
-from app.server.worker import EngineProcess
-
-
-def failing_main(commands: Pipe, updates: Pipe, setup: Setup) -> None:
-    warnings.warn("somewhat odd", stacklevel=1)
-    thread = threading.Thread(target=lambda: [][1], name="side work")
-    thread.start()
-    thread.join()
-    raise ValueError("an engine\nthat fails")
 
 
 def entries(err: str) -> list[dict[str, Any]]:
@@ -33,12 +20,25 @@ def as_json(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HEMISLAM_LOG_JSON", "1")
 
 
-def test_what_ends_the_engine_is_one_line_of_json(as_json: None, capfd: pytest.CaptureFixture[str]) -> None:
-    engine = EngineProcess(Setup(), main=failing_main)
-    snapshot = engine.wait(0, timeout=60.0)
-    assert not snapshot.engine_alive
-    engine.close()
-    warned, thread, ended = entries(capfd.readouterr().err)
+OWNER = """
+import server_fakes as fakes
+from app.logs import start_logging
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
+
+start_logging(json_lines=True)
+engine = EngineProcess(Setup(), main=fakes.failing_main)
+assert not engine.wait(0, timeout=60.0).engine_alive
+engine.close()
+"""
+
+
+def test_what_ends_the_engine_is_one_line_of_json() -> None:
+    folders = [str(Path(__file__).parent), str(Path(__file__).resolve().parents[2])]
+    code = f"import sys; sys.path[:0] = {folders}\n{OWNER}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    warned, thread, ended = entries(done.stderr)
     assert warned["level"] == "warning" and "somewhat odd" in warned["message"]
     assert thread["level"] == "error" and "side work" in thread["message"] and "IndexError" in thread["traceback"]
     assert ended["level"] == "critical" and "an engine\nthat fails" in ended["message"]

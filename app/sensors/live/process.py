@@ -25,6 +25,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from app import processes
 from app.logs import process_logs
 from app.sensors.live.counters import Counters
 from app.sensors.live.recorder import further
@@ -128,7 +129,7 @@ class LiveProcess:
     def _start(self, death: str) -> None:
         """Start the process, after another one if there was a `death`. Raises HemislamError: it does not receive."""
         record = further(self._record) if self._record and death else self._record
-        context = multiprocessing.get_context("spawn")
+        context = processes.context()
         ours, theirs = context.Pipe()
         arguments = (theirs, self.address, *self._wanted, record, death, self._known)
         process = context.Process(target=_logged, args=arguments, name="hemislam-live", daemon=True)
@@ -334,6 +335,7 @@ def _stamp(event: Measurement | DroppedScan) -> int:
 
 
 def _logged(*arguments: Any) -> None:
+    processes.begin("hemislam-live")
     with process_logs("live"):
         _serve(*arguments)
 
