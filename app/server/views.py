@@ -105,6 +105,7 @@ class LoopView(BaseModel):
     overruled: bool = Field(description="Whether the verdict is the user's.")
     weight: float
     represented_by: tuple[int, int] | None = Field(description="A loop next to it that is in the graph for both.")
+    repeats: tuple[int, int] | None = Field(description="A loop near it that counts once more for it.")
 
 
 class LoopsState(BaseModel):
@@ -141,6 +142,7 @@ def loops_state(view: LoopsView) -> LoopsState:
                 overruled=edge.overruled,
                 weight=edge.weight,
                 represented_by=edge.represented_by,
+                repeats=edge.repeats,
             )
             for edge in view.edges
         ],

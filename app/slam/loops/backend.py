@@ -24,7 +24,7 @@ from app.slam.loops.odometry import odometry_factor
 from app.slam.loops.overruling import Entry, Overrulings, check, in_words
 from app.slam.loops.pose_graph import g2o_text, optimise
 from app.slam.loops.search import Found, search
-from app.slam.loops.solution import Solution, loop_factor
+from app.slam.loops.solution import Solution, loop_factors
 from app.slam.loops.types import (
     Add,
     Command,
@@ -177,9 +177,9 @@ class LoopBackend:
         """What was found with the newest keyframe takes effect."""
         self._found.update((edge.pair, edge) for edge in found.updates)
         self._by_pair, newest = None, len(self) - 1
-        decided = [edge for edge in self.edges if edge.counts and edge.decided_at == newest]
+        decided = [edge for edge in self.edges if edge.decided_at == newest]
         broken = self._solution.broken
-        self._solution.close([loop_factor(edge) for edge in decided])
+        self._solution.close(loop_factors(decided, self.by_pair))
         if self._solution.broken != broken:
             self._by_pair = None
 
@@ -367,15 +367,17 @@ class LoopBackend:
         if not len(self):
             self._solution.clear()
             return
-        arrivals: dict[int, list[Factor]] = {}
-        for edge in self._overrulings.lay_over(self._found, len(self)).values():
+        edges = self._overrulings.lay_over(self._found, len(self))
+        arrivals: dict[int, list[LoopEdge]] = {}
+        for edge in edges.values():
             if edge.counts:
-                arrivals.setdefault(edge.decided_at, []).append(loop_factor(edge))
-        steps = self._history.steps(len(self), arrivals)
+                arrivals.setdefault(edge.decided_at, []).append(edge)
+        loops = {index: loop_factors(arrived, edges) for index, arrived in arrivals.items()}
+        steps = self._history.steps(len(self), loops)
         self._solution.solve(self._detector.poses[0], self._start.window, steps)
 
     def _factors(self, edges: tuple[LoopEdge, ...]) -> list[Factor]:
-        return self._history.odometry(len(self)) + [loop_factor(edge) for edge in edges if edge.counts]
+        return self._history.odometry(len(self)) + loop_factors(edges, {edge.pair: edge for edge in edges})
 
     def _optimum(self, edges: tuple[LoopEdge, ...]) -> F64:
         """(k, 4, 4) T_map_imu by all factors at once. Raises HemislamError if the solver fails."""

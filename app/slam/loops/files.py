@@ -12,8 +12,8 @@ from app.slam.trajectory import stamp_text
 from app.slam.types import I64
 
 COLUMNS = (
-    "older", "newer", "older_stamp_s", "newer_stamp_s", "verdict", "origin", "overruled", "weight", "represented_by",
-    "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw",
+    "older", "newer", "older_stamp_s", "newer_stamp_s", "verdict", "origin", "overruled", "weight",
+    "represented_by", "repeats", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw",
     "context_distance", "overlap", "residual_m", "slide_m", "rival_m", "mahalanobis_sigma", "gate_m", "support",
     "reason",
 )  # fmt: skip
@@ -60,7 +60,7 @@ def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
                 edge.origin.value,
                 int(edge.overruled),
                 f"{edge.weight:g}",
-                "-".join(str(keyframe) for keyframe in edge.represented_by or ()),
+                *("-".join(str(keyframe) for keyframe in pair or ()) for pair in (edge.represented_by, edge.repeats)),
                 *(f"{value:.6f}" for value in pose),
                 *("" if value != value else f"{value:.4f}" for value in measures),
                 e.support,

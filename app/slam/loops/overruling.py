@@ -171,7 +171,7 @@ def in_words(command: Command) -> str:
 
 
 def _overruled(edge: LoopEdge, command: Command) -> LoopEdge:
-    edge = replace(edge, represented_by=None)  # what the user has a word on is in the graph itself
+    edge = replace(edge, represented_by=None, repeats=None)  # what the user has a word on is in the graph itself
     if isinstance(command, SetWeight):
         return replace(edge, weight=command.weight)
     if isinstance(command, Add | Solve):  # one that waits; one that is for no loop
@@ -184,9 +184,10 @@ def _overruled(edge: LoopEdge, command: Command) -> LoopEdge:
 
 
 def _represented(edge: LoopEdge, edges: Mapping[Pair, LoopEdge]) -> LoopEdge:
-    """The same; in the graph itself if the one that was there for it no longer is."""
-    if edge.represented_by is None:
+    """The same; in the graph itself if the one that was there for it, or that it repeats, no longer is."""
+    first = edge.represented_by or edge.repeats
+    if first is None:
         return edge
-    there = edges.get(edge.represented_by)
+    there = edges.get(first)
     stands = there is not None and there.verdict is Verdict.ACCEPTED
-    return edge if stands else replace(edge, represented_by=None)
+    return edge if stands else replace(edge, represented_by=None, repeats=None)

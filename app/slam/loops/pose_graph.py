@@ -135,7 +135,8 @@ def g2o_text(poses: F64, factors: Sequence[Factor]) -> str:
 class _All:
     """Every pose is solved for. The solver has those that loops tie, with the odometry between them as one factor.
 
-    All others follow from these (`Chain`), so what the solver takes and costs grows with loops, not with the walk.
+    All others follow from these (`Chain`), so what the solver takes and costs grows with loops, not with the walk. A
+    loop that is given again is one factor that counts as often.
 
     Attributes:
         count: of poses. newest: (4, 4), the last of them.
@@ -149,6 +150,7 @@ class _All:
         self._chain = Chain(first)
         self._tied = [0]
         self._odometry: dict[tuple[int, int], int] = {}  # number of the factor between two of these
+        self._loops: dict[_Measured, tuple[int, int]] = {}  # number of its factor, and how often it was given
         self._poses: Rows[np.float64] | None = Rows((4, 4), np.float64, [first])  # None: loops have moved them since
         self._ahead: list[F64] = []  # the poses after those
 
@@ -199,8 +201,16 @@ class _All:
         for first, second in added:
             self._odometry[first, second] = self._factors + graph.size()
             graph.add(_between(Factor(first, second, *self._chain.between(first, second))))
+        given: dict[_Measured, list[Factor]] = {}
         for loop in loops:
-            graph.add(_between(loop))
+            given.setdefault(_measured(loop), []).append(loop)
+        for measured, alike in given.items():
+            number, before = self._loops.get(measured, (-1, 0))
+            if before:
+                removed.append(number)
+            times = before + len(alike)
+            self._loops[measured] = (self._factors + graph.size(), times)
+            graph.add(_between(alike[0], times))
         self._factors += graph.size()
         last = self._tied[-1]
         T_last = expected[last] if last in expected else _estimate(self._isam, last)
@@ -291,15 +301,25 @@ def _params() -> gtsam.ISAM2Params:
     return params
 
 
-def _noise(factor: Factor) -> gtsam.noiseModel.Base:
-    noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
+def _noise(factor: Factor, times: int = 1) -> gtsam.noiseModel.Base:
+    """times: as of so many factors, one beside the other."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance / times)
     if not factor.robust:
         return noise
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER), noise)
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER * times**0.5), noise)
 
 
-def _between(factor: Factor) -> gtsam.BetweenFactorPose3:
-    return gtsam.BetweenFactorPose3(factor.first, factor.second, gtsam.Pose3(factor.T_first_second), _noise(factor))
+def _between(factor: Factor, times: int = 1) -> gtsam.BetweenFactorPose3:
+    T = gtsam.Pose3(factor.T_first_second)
+    return gtsam.BetweenFactorPose3(factor.first, factor.second, T, _noise(factor, times))
+
+
+_Measured = tuple[int, int, bytes, bytes]
+
+
+def _measured(loop: Factor) -> _Measured:
+    """The same for the same measurement."""
+    return loop.first, loop.second, loop.T_first_second.tobytes(), loop.covariance.tobytes()
 
 
 def _matrices(values: Any) -> F64:

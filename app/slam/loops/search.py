@@ -7,7 +7,7 @@ from app.slam.loops.detection import Detector
 from app.slam.loops.drift import Drift, expect
 from app.slam.loops.judgement import judge
 from app.slam.loops.scan_context import ScanContext
-from app.slam.loops.support import represented, settle
+from app.slam.loops.support import placed, settle
 from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.params import Loops
 from app.slam.types import F64
@@ -58,6 +58,7 @@ def search(
         if any(edge.verdict is Verdict.CANDIDATE for edge in fresh.values()):
             counted = counting({**known, **fresh})
             settled = settle(fresh, counted, detector.poses, drift, params, now)
-            updates.update((edge.pair, edge) for edge in represented(settled, counted.values(), detector.half // 2))
+            settled = placed(settled, counted.values(), detector.poses, poses[:, :3, 3], detector.half)
+            updates.update((edge.pair, edge) for edge in settled)
     contexts = tuple(detector.context(index) for index in range(described, keyframes.stop))
     return Found(contexts, tuple(updates.values()))

@@ -1,6 +1,6 @@
 """The graph as the back end uses it: whatever the solver fails with is left out, remembered, and said once."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -69,5 +69,10 @@ class Solution:
                 self._notices.append(text)
 
 
-def loop_factor(edge: LoopEdge) -> Factor:
-    return Factor(edge.older, edge.newer, edge.T_older_newer, edge.covariance / edge.weight, robust=True)
+def loop_factors(edges: Iterable[LoopEdge], by_pair: Mapping[Pair, LoopEdge]) -> list[Factor]:
+    """Of those that count. by_pair: all, with those that they repeat."""
+    firsts = (by_pair.get(edge.repeats, edge) if edge.repeats else edge for edge in edges if edge.counts)
+    return [
+        Factor(first.older, first.newer, first.T_older_newer, first.covariance / first.weight, robust=True)
+        for first in firsts
+    ]

@@ -9,14 +9,20 @@ from dataclasses import replace
 
 import numpy as np
 
+from app.slam import lie
+from app.slam.loops import se3
 from app.slam.loops.drift import Drift, agree
 from app.slam.loops.judgement import summary
-from app.slam.loops.types import LoopEdge, Pair, Verdict
+from app.slam.loops.types import HUBER, LoopEdge, Pair, Verdict
 from app.slam.params import Loops
 from app.slam.types import F64
 
 NEIGHBOURHOOD_M = 15.0
 """Loops with farther to walk between their ends, on either side, say nothing of each other."""
+SAME_PLACE_M = 2.0
+"""Apart in the map at most: as far as a quarter of a submap is walked, at which it shares most points with another."""
+SAME = 2 * HUBER
+"""Standard deviations up to which two loops measured the same: by there the graph's loss halves what one pulls."""
 
 
 def settle(
@@ -68,21 +74,52 @@ def _ends(edges: Iterable[LoopEdge], walked: F64) -> F64:
     return np.asarray(walked[np.array([edge.pair for edge in edges], np.int64).reshape(-1, 2)])
 
 
-def represented(settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], reach: int) -> list[LoopEdge]:
-    """The same, those just accepted with the loop that is in the graph for them, if one is next to them.
+def placed(
+    settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], poses: F64, positions: F64, half: int
+) -> list[LoopEdge]:
+    """The same, those just accepted with the loop that is in the graph for them or that they repeat, if there is one.
 
-    Submaps of keyframes a quarter of their length apart share three quarters of it. Two loops between such neighbours,
-    at both ends, are one measurement rather than two, and a graph of all of them is dense for nothing.
+    Submaps of keyframes a quarter of their length apart share three quarters of it: two loops between such neighbours,
+    at both ends, are one measurement rather than two. Where a place was passed several times before, being tied to one
+    of these times is being tied to all, as they are to each other; else the graph would be the denser the more often
+    one comes by. Of loops up to half a length apart that measured the same, one ties poses and counts for all: a pose
+    costs the solver more than a factor, and submaps that share half of their points err alike.
 
     Args:
-        edges: all, as they count. reach: that quarter, in keyframes.
+        edges: all, as they count. poses: (k, 4, 4) T_odom_imu. positions: (k, 3) in the map.
+        half: of a submap, in keyframes.
     """
-    counting = [edge.pair for edge in edges if edge.counts]
+    counting = {edge.pair: edge for edge in edges if edge.counts}
     out = []
     for edge in settled:
         if edge.verdict is Verdict.ACCEPTED and edge.represented_by is None and edge.pair not in counting:
-            near = [pair for pair in counting if max(abs(pair[0] - edge.older), abs(pair[1] - edge.newer)) <= reach]
-            edge = replace(edge, represented_by=near[0] if near else None)
-            counting += [] if near else [edge.pair]
+            beside = [other for other in counting.values() if abs(edge.newer - other.newer) <= half // 2]
+            near = next((o for o in beside if _within(edge, o, half // 2) or _same_place(edge, o, positions)), None)
+            if near is not None:
+                edge = replace(edge, represented_by=near.pair)
+            else:
+                firsts = (other for other in counting.values() if other.repeats is None)
+                around = (other for other in firsts if _within(edge, other, half))
+                same = next((other for other in around if _same(edge, other, poses)), None)
+                edge = counting[edge.pair] = replace(edge, repeats=None if same is None else same.pair)
         out.append(edge)
     return out
+
+
+def _within(a: LoopEdge, b: LoopEdge, reach: int) -> bool:
+    """Whether they are so many keyframes apart at most, at both ends."""
+    return max(abs(a.older - b.older), abs(a.newer - b.newer)) <= reach
+
+
+def _same_place(a: LoopEdge, b: LoopEdge, positions: F64) -> bool:
+    return float(np.linalg.norm(positions[a.older] - positions[b.older])) < SAME_PLACE_M
+
+
+def _same(edge: LoopEdge, first: LoopEdge, poses: F64) -> bool:
+    """Whether both measured the same by what they say they are sure of, odometry between them taken as exact."""
+    newer = lie.inverse(poses[edge.newer]) @ poses[first.newer]
+    carried = lie.inverse(poses[first.older]) @ poses[edge.older] @ edge.T_older_newer @ newer
+    missed = se3.log(lie.inverse(first.T_older_newer) @ carried)
+    turn = se3.adjoint(lie.inverse(newer))
+    covariance = first.covariance + turn @ edge.covariance @ turn.T
+    return float(missed @ np.linalg.solve(covariance, missed)) <= SAME**2

@@ -4,8 +4,10 @@ A loop is named by the two keyframes it ties together, `(older, newer)`: the nam
 whatever else is found, so that a list of overrulings can be replayed.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
+from operator import attrgetter
+from typing import Any, Final
 
 import numpy as np
 
@@ -43,7 +45,10 @@ class LoopEdge:
         verdict, reason: and why, in words and numbers.
         origin: who proposed it. overruled: whether the verdict is the user's.
         weight: the covariance is divided by it in the graph.
-        represented_by: a loop next to it, which shares most of its points and is in the graph for both.
+        represented_by: a loop next to it that is in the graph for both: its submaps are most of the same points, or the
+            same place at another time.
+        repeats: a loop up to half a submap away that measured the same. In the graph that one counts once more for
+            it, and it ties no poses of its own.
     """
 
     older: int
@@ -56,6 +61,11 @@ class LoopEdge:
     overruled: bool = False
     weight: float = 1.0
     represented_by: Pair | None = None
+    repeats: Pair | None = None
+
+    def __reduce__(self) -> tuple[type["LoopEdge"], tuple[Any, ...]]:
+        """For pipes; what dataclasses have for slots leaves a tuple behind of each."""
+        return LoopEdge, _FIELDS(self)
 
     @property
     def pair(self) -> Pair:
@@ -79,6 +89,9 @@ class LoopEdge:
     def counts(self) -> bool:
         """Whether it is a factor of the graph."""
         return self.verdict is Verdict.ACCEPTED and self.represented_by is None
+
+
+_FIELDS: Final = attrgetter(*(field.name for field in fields(LoopEdge)))
 
 
 # --- the user's commands -------------------------------------------------------------------------

@@ -23,14 +23,16 @@ def headline(edge: LoopEdge) -> str:
     return box(
         f'<div class="hs-row"><span>keyframes <b>{name(edge.pair)}</b></span><b style="color:{colour}">'
         f"{escape(edge.verdict)}{escape(weight)}</b></div>",
-        f'<div class="hs-item" style="border-color:{colour}">{escape(edge.reason)}{_represented(edge)}</div>',
+        f'<div class="hs-item" style="border-color:{colour}">{escape(edge.reason)}{_stead(edge)}</div>',
     )
 
 
-def _represented(edge: LoopEdge) -> str:
-    if edge.represented_by is None:
-        return ""
-    return f"; {name(edge.represented_by)}, next to it, is in the graph for both"
+def _stead(edge: LoopEdge) -> str:
+    if edge.represented_by is not None:
+        return f"; {name(edge.represented_by)}, next to it, is in the graph for both"
+    if edge.repeats is not None:
+        return f"; {name(edge.repeats)}, near it, measured the same and counts once more for it"
+    return ""
 
 
 def evidence(edge: LoopEdge, params: Loops) -> str:
@@ -68,7 +70,7 @@ def worst_factors(residuals: tuple[FactorResidual, ...], most: int = _WORST) -> 
     """The factors that the graph meets least, worst first; a loop can be clicked."""
     if not residuals:
         return box('<span class="hs-quiet">Worked out whenever a loop is chosen, tried or overruled.</span>')
-    worst = sorted(residuals, key=lambda factor: -factor.sigmas)[:most]
+    worst = _worst_first(residuals)[:most]
     top = max(worst[0].sigmas, 1e-9)
     rows = "".join(
         f'<tr{_link(factor)}><td>{_what(factor)}</td><td>{number(factor.rotation, 2)}</td>'
@@ -133,7 +135,7 @@ def _costs(before: tuple[FactorResidual, ...], after: tuple[FactorResidual, ...]
 
 def _comparison(before: tuple[FactorResidual, ...], after: tuple[FactorResidual, ...]) -> str:
     heads = "<tr><th>worst now</th><th>σ</th><th>worst then</th><th>σ</th></tr>"
-    pairs = [sorted(side, key=lambda factor: -factor.sigmas)[:_COMPARED] for side in (before, after)]
+    pairs = [_worst_first(side)[:_COMPARED] for side in (before, after)]
     rows = ""
     for index in range(max(len(side) for side in pairs)):
         cells = [
@@ -145,6 +147,12 @@ def _comparison(before: tuple[FactorResidual, ...], after: tuple[FactorResidual,
         rows += f"<tr>{''.join(cells)}</tr>"
     sums = f"<tr><td>all, cost</td><td>{_cost(before):.4g}</td><td></td><td>{_cost(after):.4g}</td></tr>"
     return f'<table class="hs-table" style="margin-top:4px"><thead>{heads}</thead><tbody>{rows}{sums}</tbody></table>'
+
+
+def _worst_first(residuals: tuple[FactorResidual, ...]) -> list[FactorResidual]:
+    """Each pair once, however often it is in the graph."""
+    by_pair = {factor.pair: factor for factor in residuals}
+    return sorted(by_pair.values(), key=lambda factor: -factor.sigmas)
 
 
 def _cost(residuals: tuple[FactorResidual, ...]) -> float:

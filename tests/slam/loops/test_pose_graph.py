@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -68,6 +69,27 @@ def test_the_optimum_is_that_of_an_independent_least_squares_solver() -> None:
     np.testing.assert_allclose(batch, oracle, atol=1e-6)
     np.testing.assert_allclose(graph.poses, oracle, atol=2e-3)
     assert np.abs(graph_of(odometry, []).poses - oracle).max() > 0.05, "the loops matter"
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_a_loop_given_again_counts_as_one_more_and_takes_no_place(robust: bool) -> None:
+    odometry, loops = chain(12, noise=0.05)
+    loop = replace(loops[1], robust=robust)
+    others = [replace(loop, covariance=loop.covariance * (1 + k * 1e-12)) for k in range(3)]  # so they are not the same
+    graph, apart, once = (graph_of(odometry, []) for _ in range(3))
+    for closing, each in zip(([loop], loops[:1], [loop] * 2), (others[:1], loops[:1], others[1:]), strict=True):
+        graph.close(closing)
+        apart.close(each)
+    once.close([loops[0], loop])
+    np.testing.assert_allclose(graph.poses, apart.poses, atol=1e-9)
+    assert np.abs(graph.poses - once.poses).max() > 1e-3, "that it counts more is felt"
+    assert held(graph) == held(once) == held(apart) - 2
+
+
+def held(graph: PoseGraph) -> int:
+    """Factors that the solver has."""
+    factors = graph._solver._isam.getFactorsUnsafe()  # type: ignore[union-attr]
+    return sum(factors.at(k) is not None for k in range(factors.size()))
 
 
 def test_a_factors_error_is_what_it_says() -> None:

@@ -1,0 +1,142 @@
+"""Which of many loops at the same place tie poses of their own, which repeat one, and which stand by."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from app.slam import lie
+from app.slam.loops import se3
+from app.slam.loops.backend import LoopBackend
+from app.slam.loops.factors import Factor
+from app.slam.loops.judgement import FLOOR_M, FLOOR_RAD
+from app.slam.loops.measured import Evidence, Measured
+from app.slam.loops.pose_graph import optimise
+from app.slam.loops.solution import loop_factors
+from app.slam.loops.support import placed
+from app.slam.loops.types import LoopEdge, Reject, SetWeight, Verdict
+from app.slam.types import F64
+from tests.slam.loops.conftest import Walked, accepted
+
+HALF, TURN = 8, 60
+QUARTER = HALF // 2
+
+
+def there_and_back() -> F64:
+    """(2 * TURN, 4, 4): a keyframe a metre along a line, and back along it."""
+    poses = np.tile(np.eye(4), (2 * TURN, 1, 1))
+    poses[:TURN, 0, 3] = np.arange(TURN)
+    poses[TURN:, 0, 3] = np.arange(TURN)[::-1]
+    poses[TURN:, :2, :2] = -np.eye(2)
+    return poses
+
+
+POSES = there_and_back()
+
+
+def loop(older: int, off: F64 | None = None) -> LoopEdge:
+    """Where the way back comes by a keyframe; off: (3,) m, by how much it was measured wrong."""
+    newer = 2 * TURN - 1 - older
+    T = lie.inverse(POSES[older]) @ POSES[newer]
+    T[:3, 3] += np.zeros(3) if off is None else off
+    covariance = np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
+    return LoopEdge(older, newer, newer, Measured.of(T, covariance, Evidence()), Verdict.ACCEPTED, "")
+
+
+def come(loops: list[LoopEdge], poses: F64 = POSES) -> dict[int, LoopEdge]:
+    """One after the other, by their older ends."""
+    edges: dict[int, LoopEdge] = {}
+    for edge in loops:
+        (edges[edge.older],) = placed([edge], edges.values(), poses, poses[:, :3, 3], HALF)
+    return edges
+
+
+def test_of_loops_along_a_way_every_second_that_is_a_quarter_apart_ties_poses() -> None:
+    edges = come([loop(older) for older in range(50, 0, -1)])
+    apart = QUARTER + 1
+    for older, edge in edges.items():
+        place, beyond = divmod(50 - older, apart)
+        if beyond:
+            assert edge.represented_by == loop(older + beyond).pair
+        else:
+            assert edge.counts and edge.repeats == (loop(older + apart).pair if place % 2 else None)
+
+
+@pytest.mark.parametrize(("aside_m", "tied"), [(0.5, False), (5.0, True)])
+def test_who_comes_by_a_place_once_more_is_tied_to_one_of_the_times_before(aside_m: float, tied: bool) -> None:
+    """Unless the way back went along another aisle."""
+    poses = POSES.copy()
+    poses[TURN:, 1, 3] = aside_m
+    third = np.concatenate([poses, POSES[:TURN]])
+    first = replace(loop(30), older=30, newer=2 * TURN + 30)
+    second = replace(first, older=2 * TURN - 1 - 31, newer=2 * TURN + 32)
+    (edge,) = placed([second], [first], third, third[:, :3, 3], HALF)
+    assert edge.counts is tied and edge.represented_by == (None if tied else first.pair)
+
+
+@pytest.mark.parametrize(("off_m", "same"), [(0.05, True), (0.3, False)])
+def test_what_measured_another_thing_ties_poses_of_its_own(off_m: float, same: bool) -> None:
+    edges = come([loop(40), loop(34, np.array([0.0, off_m, 0.0]))])
+    assert edges[34].counts and edges[34].repeats == (loop(40).pair if same else None)
+
+
+def test_whether_two_measured_the_same_does_not_depend_on_where_the_walk_lies() -> None:
+    moved = lie.transform(lie.exp(np.array([0.3, -0.2, 2.0])), np.array([50.0, -20.0, 7.0])) @ POSES
+    loops = [loop(older, np.array([0.0, off, 0.0])) for older, off in ((40, 0.0), (34, 0.12), (28, 0.17), (22, 0.3))]
+    assert [edge.repeats for edge in come(loops).values()] == [edge.repeats for edge in come(loops, moved).values()]
+
+
+def test_repeated_loops_hold_two_ways_together_nearly_as_well_as_each_by_itself() -> None:
+    """Odometry errs at random on the way there and back, loops by what their submaps' keyframes err by on average: how
+    far apart the two ways come to lie."""
+    sigmas = np.array([np.radians(0.1)] * 3 + [0.01] * 3)
+    apart: dict[str, list[float]] = {"each": [], "repeated": [], "alone": [], "none": []}
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        steps, odometry = [], [POSES[0]]
+        for k, (before, after) in enumerate(pairwise(POSES)):
+            T = lie.inverse(before) @ after @ se3.exp(rng.normal(0.0, sigmas))
+            steps.append(Factor(k, k + 1, T, np.diag(sigmas**2)))
+            odometry.append(odometry[-1] @ T)
+        each_errs = rng.normal(0.0, 0.02 * np.sqrt(2 * HALF + 1), (TURN + 2 * HALF, 3))
+        errs = {older: each_errs[older : older + 2 * HALF + 1].mean(axis=0) for older in range(50, 0, -QUARTER - 1)}
+        found = come([loop(older, off) for older, off in errs.items()], np.array(odometry))
+        edges = {edge.pair: edge for edge in found.values()}
+        factors = {
+            "each": loop_factors([replace(edge, repeats=None) for edge in edges.values()], edges),
+            "repeated": loop_factors(edges.values(), edges),
+            "alone": loop_factors([edge for edge in edges.values() if edge.repeats is None], edges),
+            "none": [],
+        }
+        assert len(factors["repeated"]) == len(factors["each"]) == 2 * len(factors["alone"])
+        for name, loops in factors.items():
+            poses = optimise(POSES[0], steps + loops, np.array(odometry))
+            apart[name].append(float(np.mean((poses[:TURN, :3, 3] - poses[TURN:, :3, 3][::-1]) ** 2)))
+    each, repeated, alone, none = (float(np.sqrt(np.mean(squares))) for squares in apart.values())
+    assert each < 0.15 * none
+    assert repeated < 1.25 * each and repeated < alone
+
+
+def test_rejecting_what_others_repeat_has_them_tie_poses_of_their_own(walked: Walked, backend: LoopBackend) -> None:
+    loops = accepted(backend)
+    counting = [edge for edge in loops if edge.counts]
+    assert 3 * sum(edge.repeats is None for edge in counting) < 2 * len(counting)
+    first = next(edge.repeats for edge in counting if edge.repeats)
+    repeating = {edge.pair for edge in counting if edge.repeats == first}
+    assert ties(backend).count(first) == 1 + len(repeating)
+    before = backend.poses
+    backend.apply(Reject(*first))
+    assert first not in ties(backend) and repeating <= set(ties(backend))
+    backend.undo()
+    np.testing.assert_array_equal(backend.poses, before)
+    backend.apply(SetWeight(*max(repeating), 1.0))
+    assert ties(backend).count(first) == len(repeating), "what the user has a word on ties poses of its own"
+    assert ties(backend).count(max(repeating)) == 1
+
+
+def ties(backend: LoopBackend) -> list[tuple[int, int]]:
+    """Between which keyframes the graph has factors beyond odometry, as its file tells."""
+    lines = (line.split() for line in backend.g2o().splitlines() if line.startswith("EDGE"))
+    pairs = [(int(line[1]), int(line[2])) for line in lines]
+    return [pair for pair in pairs if pair[1] > pair[0] + 1]
