@@ -137,7 +137,7 @@ class Workbench:
 
         self._drawn: Snapshot | None = None
         self._drawn_view: View | None = None
-        self._scene_drawn_at = self._panels_drawn_at = self._plots_drawn_at = -1e9
+        self._scene_drawn_at = self._frame_drawn_at = self._panels_drawn_at = self._plots_drawn_at = -1e9
         self._panels_due = self._plots_due = True
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="workbench", daemon=True)
@@ -164,7 +164,10 @@ class Workbench:
                 time.sleep(_PANEL_PERIOD_S)
 
     def draw(self, current: Snapshot) -> None:
-        """Bring the page up to `current`: at once what a user waits for, the rest no faster than one can see."""
+        """Bring the page up to `current`: at once what a user waits for, the rest no faster than one can see.
+
+        A frame waits for the frame before, not for what else was drawn since.
+        """
         now, drawn = self._now(), self._drawn
         view = self._study.seen(self._loops.seen(self._appearance.view))
         self._compare.tick(current, view)
@@ -178,13 +181,15 @@ class Workbench:
         self._loops.tick(current, view)
         news = drawn is not current
         awaited = drawn is not None and _changed_by_user(drawn, current)
-        due = now - self._scene_drawn_at >= _SCENE_PERIOD_S
+        frame = news and (drawn is None or drawn.result is not current.result)
+        due = now - (self._frame_drawn_at if frame else self._scene_drawn_at) >= _SCENE_PERIOD_S
         if (news and (due or awaited)) or view != self._drawn_view:
             if current.result is not None and (drawn is None or drawn.result is None):
                 self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
             self._scene.draw(drawn, current, view, self._drawn_view)
             self._drawn, self._drawn_view = current, view
             self._scene_drawn_at = now
+            self._frame_drawn_at = now if frame else self._frame_drawn_at
             self._panels_due = self._plots_due = True
             if awaited:  # the page is to be quick with this before anything else
                 self._server.flush()
