@@ -121,6 +121,7 @@ def info(
 
 @cli.command()
 def simulate(
+    ctx: typer.Context,
     out: Annotated[
         Path, typer.Option("--out", metavar="FILE.mcap", help="The recording to write; of a suite a folder.")
     ],
@@ -164,6 +165,11 @@ def simulate(
     if (scene is not None) if suite is not None else short:
         raise HemislamError("A SCENE takes --duration, --suite takes --short; give one of SCENE and --suite.")
     if suite is not None:
+        only = ("duration", "rate", "coordinate_step", "range_step", "force")
+        sources = {name: ctx.get_parameter_source(name) for name in only}
+        if given := [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]:
+            names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise HemislamError(f"A suite does not take {names}; leave that out, or name a SCENE.")
         make_suite(suite, out, [seed], short=short, every_block=every_block)
         return
     if scene is None:

@@ -47,7 +47,8 @@ from app.slam.params import Params
 SOURCE_PERIOD_S = 0.5
 POLL_S = 0.02
 """How often to look for what others are at work on."""
-
+MOST_NOTES = 1000
+"""Of a session: every page and every state by REST has them all."""
 
 _AT_ONCE = OpenRecording | Restart | SetSpeed | SetBreakpoints | Shutdown
 """Commands that do not wait until what is being opened is open."""
@@ -150,6 +151,8 @@ class Session:
             case SetBreakpoints(breakpoints):
                 self._set_breakpoints(breakpoints)
             case AddNote(text):
+                if len(self._notes) >= MOST_NOTES:
+                    raise HemislamError(f"A session keeps {MOST_NOTES:,} notes; this one was not kept.")
                 if text.strip():
                     self._show_notes((*self._notes, Note(self._need_run().frame, text.strip())))
             case SetParams(values):

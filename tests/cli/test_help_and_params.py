@@ -83,6 +83,7 @@ def test_a_parameter_that_can_not_be_is_refused_by_name(hemislam: Call, argument
         (["serve", "--record", "walk.mcap"], "belong to --live"),
         (["simulate", "room", "--short", "--out", "nowhere/room.mcap"], "--suite takes --short"),
         (["simulate", "room", "--suite", "paper", "--out", "nowhere"], "give one of SCENE and --suite"),
+        (["simulate", "--suite", "paper", "--rate", "20", "--force", "--out", "nowhere"], "not take --rate, --force"),
     ],
 )
 def test_an_option_that_would_be_ignored_is_refused(hemislam: Call, arguments: list[str], says: str) -> None:

@@ -42,7 +42,7 @@ from app.server.protocol import (
     StepFrame,
 )
 from app.server.run import Run, open_run
-from app.server.session import Session
+from app.server.session import MOST_NOTES, Session
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
@@ -206,6 +206,15 @@ def test_what_is_wanted_while_a_session_opens_is_not_lost(tmp_path: Path) -> Non
     assert opened.params.ground.sigma == 0.07 and opened.notes[-1] == Note(72, "here")
     for each in (first, desk):
         each.session.close()
+
+
+def test_notes_are_kept_up_to_a_limit_and_what_is_beyond_it_is_told(tmp_path: Path) -> None:
+    desk = Kept(tmp_path)
+    desk.do(*[AddNote(f"note {number}") for number in range(MOST_NOTES + 1)])
+    seen = desk.see()
+    assert [note.text for note in seen.notes] == [f"note {number}" for number in range(MOST_NOTES)]
+    assert "A session keeps 1,000 notes; this one was not kept." in seen.notices[-1].text
+    desk.session.close()
 
 
 def test_a_saved_session_repeats_headless_to_the_same_files(tmp_path: Path) -> None:
