@@ -108,7 +108,7 @@ SCRIPT: Final = (
   };
   // By where its points are: colours come anew for all of the map.
   const isNew = () => [...read.get(vao).pointers.values()].some(
-    ([buffer, given]) => BYTES[given[2]] > 1 && newest - (cameAt.get(buffer) ?? -NEW_MS) < NEW_MS);
+    ([buffer, given]) => BYTES[given[2]] > 1 && cameAt.get(buffer) > Math.max(newest - NEW_MS, now() - REST_MS));
   hook(GL, 'drawArrays', function (plain, given) {
     drew = true;
     const [mode, first, count] = given;

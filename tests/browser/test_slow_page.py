@@ -56,8 +56,8 @@ def test_a_scene_that_changes_is_drawn_with_fewer_points_and_one_that_rests_with
     chromium: Browser, map_of_points: Viser, tmp_path: Path
 ) -> None:
     with serving(FakeEngine(), map_of_points, tmp_path, None) as site:  # type: ignore[arg-type]
+        marker = map_of_points.server.scene.add_frame("/marker")  # comes with the map: nothing comes after it
         page = opened(chromium, site.url())
-        marker = map_of_points.server.scene.add_frame("/marker")
         for step in range(30):
             marker.position = (0.1 * step, 0.0, 0.0)
             page.wait_for_timeout(100)
