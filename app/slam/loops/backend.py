@@ -179,7 +179,7 @@ class LoopBackend:
         self._by_pair, newest = None, len(self) - 1
         decided = [edge for edge in self.edges if edge.decided_at == newest]
         broken = self._solution.broken
-        self._solution.close(loop_factors(decided, self.by_pair))
+        self._solution.close(loop_factors(decided, self.by_pair, self._detector.poses))
         if self._solution.broken != broken:
             self._by_pair = None
 
@@ -372,12 +372,14 @@ class LoopBackend:
         for edge in edges.values():
             if edge.counts:
                 arrivals.setdefault(edge.decided_at, []).append(edge)
-        loops = {index: loop_factors(arrived, edges) for index, arrived in arrivals.items()}
+        poses = self._detector.poses
+        loops = {index: loop_factors(arrived, edges, poses) for index, arrived in arrivals.items()}
         steps = self._history.steps(len(self), loops)
-        self._solution.solve(self._detector.poses[0], self._start.window, steps)
+        self._solution.solve(poses[0], self._start.window, steps)
 
     def _factors(self, edges: tuple[LoopEdge, ...]) -> list[Factor]:
-        return self._history.odometry(len(self)) + loop_factors(edges, {edge.pair: edge for edge in edges})
+        by_pair = {edge.pair: edge for edge in edges}
+        return self._history.odometry(len(self)) + loop_factors(edges, by_pair, self._detector.poses)
 
     def _optimum(self, edges: tuple[LoopEdge, ...]) -> F64:
         """(k, 4, 4) T_map_imu by all factors at once. Raises HemislamError if the solver fails."""

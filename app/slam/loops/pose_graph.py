@@ -18,6 +18,7 @@ import gtsam
 import numpy as np
 
 from app.slam import lie
+from app.slam.loops import se3
 from app.slam.loops.chain import Chain
 from app.slam.loops.factors import Factor, Step, Steps
 from app.slam.loops.types import HUBER
@@ -135,8 +136,8 @@ def g2o_text(poses: F64, factors: Sequence[Factor]) -> str:
 class _All:
     """Every pose is solved for. The solver has those that loops tie, with the odometry between them as one factor.
 
-    All others follow from these (`Chain`), so what the solver takes and costs grows with loops, not with the walk. A
-    loop that is given again is one factor that counts as often.
+    All others follow from these (`Chain`), so what the solver takes and costs grows with loops, not with the walk.
+    Loops between the same two poses are one factor too, their mean.
 
     Attributes:
         count: of poses. newest: (4, 4), the last of them.
@@ -150,7 +151,7 @@ class _All:
         self._chain = Chain(first)
         self._tied = [0]
         self._odometry: dict[tuple[int, int], int] = {}  # number of the factor between two of these
-        self._loops: dict[_Measured, tuple[int, int]] = {}  # number of its factor, and how often it was given
+        self._loops: dict[tuple[int, int], _Mean] = {}
         self._poses: Rows[np.float64] | None = Rows((4, 4), np.float64, [first])  # None: loops have moved them since
         self._ahead: list[F64] = []  # the poses after those
 
@@ -201,16 +202,17 @@ class _All:
         for first, second in added:
             self._odometry[first, second] = self._factors + graph.size()
             graph.add(_between(Factor(first, second, *self._chain.between(first, second))))
-        given: dict[_Measured, list[Factor]] = {}
         for loop in loops:
-            given.setdefault(_measured(loop), []).append(loop)
-        for measured, alike in given.items():
-            number, before = self._loops.get(measured, (-1, 0))
-            if before:
-                removed.append(number)
-            times = before + len(alike)
-            self._loops[measured] = (self._factors + graph.size(), times)
-            graph.add(_between(alike[0], times))
+            pair = loop.first, loop.second
+            if pair in self._loops:
+                self._loops[pair].take(loop)
+            else:
+                self._loops[pair] = _Mean(loop)
+        for mean in {(loop.first, loop.second): self._loops[loop.first, loop.second] for loop in loops}.values():
+            if mean.number is not None:
+                removed.append(mean.number)
+            mean.number = self._factors + graph.size()
+            graph.add(_between(mean.factor, mean.times))
         self._factors += graph.size()
         last = self._tied[-1]
         T_last = expected[last] if last in expected else _estimate(self._isam, last)
@@ -223,6 +225,28 @@ class _All:
         ends = self._tied[at - 1 : at + 1]
         T_ends = np.array([_estimate(self._isam, end) for end in ends])
         return np.asarray(self._chain.laid(np.array(ends), T_ends, max(key, ends[-1]) + 1)[key - ends[0]])
+
+
+class _Mean:
+    """Loops between the same two poses as one: the sum of their squares is that of their mean, but for a constant.
+
+    Attributes:
+        factor: their mean, each by its information. times: how many they are. number: the solver's.
+    """
+
+    def __init__(self, loop: Factor) -> None:
+        self.factor, self.times = loop, 1
+        self.number: int | None = None
+
+    def take(self, loop: Factor) -> None:
+        """One more."""
+        before, own = np.linalg.inv(self.factor.covariance), np.linalg.inv(loop.covariance)
+        covariance = np.linalg.inv(before + own)
+        T = self.factor.T_first_second
+        step = covariance @ own @ se3.log(lie.inverse(T) @ loop.T_first_second)
+        covariance = (covariance + covariance.T) / 2
+        self.factor = replace(self.factor, T_first_second=T @ se3.exp(step), covariance=covariance)
+        self.times += 1
 
 
 class _Window:
@@ -302,8 +326,8 @@ def _params() -> gtsam.ISAM2Params:
 
 
 def _noise(factor: Factor, times: int = 1) -> gtsam.noiseModel.Base:
-    """times: as of so many factors, one beside the other."""
-    noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance / times)
+    """times: of how many it is the mean; together they pull as far as each of them would."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
     if not factor.robust:
         return noise
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER * times**0.5), noise)
@@ -312,14 +336,6 @@ def _noise(factor: Factor, times: int = 1) -> gtsam.noiseModel.Base:
 def _between(factor: Factor, times: int = 1) -> gtsam.BetweenFactorPose3:
     T = gtsam.Pose3(factor.T_first_second)
     return gtsam.BetweenFactorPose3(factor.first, factor.second, T, _noise(factor, times))
-
-
-_Measured = tuple[int, int, bytes, bytes]
-
-
-def _measured(loop: Factor) -> _Measured:
-    """The same for the same measurement."""
-    return loop.first, loop.second, loop.T_first_second.tobytes(), loop.covariance.tobytes()
 
 
 def _matrices(values: Any) -> F64:

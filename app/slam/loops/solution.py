@@ -6,6 +6,7 @@ import numpy as np
 
 from app.slam.loops.factors import Factor, Step
 from app.slam.loops.pose_graph import PoseGraph
+from app.slam.loops.support import carried
 from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F64
 
@@ -69,10 +70,16 @@ class Solution:
                 self._notices.append(text)
 
 
-def loop_factors(edges: Iterable[LoopEdge], by_pair: Mapping[Pair, LoopEdge]) -> list[Factor]:
-    """Of those that count. by_pair: all, with those that they repeat."""
-    firsts = (by_pair.get(edge.repeats, edge) if edge.repeats else edge for edge in edges if edge.counts)
-    return [
-        Factor(first.older, first.newer, first.T_older_newer, first.covariance / first.weight, robust=True)
-        for first in firsts
-    ]
+def loop_factors(edges: Iterable[LoopEdge], by_pair: Mapping[Pair, LoopEdge], poses: F64) -> list[Factor]:
+    """Of those that count.
+
+    Args:
+        by_pair: all, with those that they repeat. poses: (k, 4, 4) T_odom_imu.
+    """
+    factors = []
+    for edge in edges:
+        if edge.counts:
+            first = by_pair[edge.repeats] if edge.repeats else edge
+            T, covariance = (edge.T_older_newer, edge.covariance) if first is edge else carried(edge, first, poses)
+            factors.append(Factor(first.older, first.newer, T, covariance / edge.weight, robust=True))
+    return factors

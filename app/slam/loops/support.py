@@ -6,6 +6,7 @@ that tell the same story are fooled more rarely. Where two stories are told, nei
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -82,8 +83,8 @@ def placed(
     Submaps of keyframes a quarter of their length apart share three quarters of it: two loops between such neighbours,
     at both ends, are one measurement rather than two. Where a place was passed several times before, being tied to one
     of these times is being tied to all, as they are to each other; else the graph would be the denser the more often
-    one comes by. Of loops up to half a length apart that measured the same, one ties poses and counts for all: a pose
-    costs the solver more than a factor, and submaps that share half of their points err alike.
+    one comes by. Of loops whose submaps share any points and that measured the same, one ties poses and the others are
+    laid on these: a pose costs the solver far more than a measurement between poses that are tied already.
 
     Args:
         edges: all, as they count. poses: (k, 4, 4) T_odom_imu. positions: (k, 3) in the map.
@@ -94,21 +95,34 @@ def placed(
     for edge in settled:
         if edge.verdict is Verdict.ACCEPTED and edge.represented_by is None and edge.pair not in counting:
             beside = [other for other in counting.values() if abs(edge.newer - other.newer) <= half // 2]
-            near = next((o for o in beside if _within(edge, o, half // 2) or _same_place(edge, o, positions)), None)
+            near = next((o for o in beside if _apart(edge, o) <= half // 2 or _same_place(edge, o, positions)), None)
             if near is not None:
                 edge = replace(edge, represented_by=near.pair)
             else:
-                firsts = (other for other in counting.values() if other.repeats is None)
-                around = (other for other in firsts if _within(edge, other, half))
+                ties = (other for other in counting.values() if other.repeats is None)
+                around = sorted((o for o in ties if _apart(edge, o) <= 2 * half), key=partial(_apart, edge))
                 same = next((other for other in around if _same(edge, other, poses)), None)
                 edge = counting[edge.pair] = replace(edge, repeats=None if same is None else same.pair)
         out.append(edge)
     return out
 
 
-def _within(a: LoopEdge, b: LoopEdge, reach: int) -> bool:
-    """Whether they are so many keyframes apart at most, at both ends."""
-    return max(abs(a.older - b.older), abs(a.newer - b.newer)) <= reach
+def carried(edge: LoopEdge, first: LoopEdge, poses: F64) -> tuple[F64, F64]:
+    """What a loop measured, as one between the keyframes of another near it: T (4, 4), and its covariance (6, 6).
+
+    Args:
+        poses: (k, 4, 4) by odometry, which is taken as exact between ends that are near each other.
+    """
+    older = lie.inverse(poses[first.older]) @ poses[edge.older]
+    newer = lie.inverse(poses[edge.newer]) @ poses[first.newer]
+    turn = se3.adjoint(lie.inverse(newer))
+    covariance = turn @ edge.covariance @ turn.T
+    return older @ edge.T_older_newer @ newer, (covariance + covariance.T) / 2
+
+
+def _apart(a: LoopEdge, b: LoopEdge) -> int:
+    """Keyframes between them, at the ends that are farther from one another."""
+    return max(abs(a.older - b.older), abs(a.newer - b.newer))
 
 
 def _same_place(a: LoopEdge, b: LoopEdge, positions: F64) -> bool:
@@ -116,10 +130,7 @@ def _same_place(a: LoopEdge, b: LoopEdge, positions: F64) -> bool:
 
 
 def _same(edge: LoopEdge, first: LoopEdge, poses: F64) -> bool:
-    """Whether both measured the same by what they say they are sure of, odometry between them taken as exact."""
-    newer = lie.inverse(poses[edge.newer]) @ poses[first.newer]
-    carried = lie.inverse(poses[first.older]) @ poses[edge.older] @ edge.T_older_newer @ newer
-    missed = se3.log(lie.inverse(first.T_older_newer) @ carried)
-    turn = se3.adjoint(lie.inverse(newer))
-    covariance = first.covariance + turn @ edge.covariance @ turn.T
-    return float(missed @ np.linalg.solve(covariance, missed)) <= SAME**2
+    """Whether both measured the same by what they say they are sure of."""
+    T, covariance = carried(edge, first, poses)
+    missed = se3.log(lie.inverse(first.T_older_newer) @ T)
+    return float(missed @ np.linalg.solve(first.covariance + covariance, missed)) <= SAME**2

@@ -47,8 +47,8 @@ class LoopEdge:
         weight: the covariance is divided by it in the graph.
         represented_by: a loop next to it that is in the graph for both: its submaps are most of the same points, or the
             same place at another time.
-        repeats: a loop up to half a submap away that measured the same. In the graph that one counts once more for
-            it, and it ties no poses of its own.
+        repeats: a loop up to a submap's length away that measured the same. In the graph this one is a further
+            measurement between that one's keyframes, and ties none of its own.
     """
 
     older: int

@@ -31,7 +31,7 @@ def _stead(edge: LoopEdge) -> str:
     if edge.represented_by is not None:
         return f"; {name(edge.represented_by)}, next to it, is in the graph for both"
     if edge.repeats is not None:
-        return f"; {name(edge.repeats)}, near it, measured the same and counts once more for it"
+        return f"; {name(edge.repeats)}, near it, measured the same; in the graph both are between its keyframes"
     return ""
 
 
