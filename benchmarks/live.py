@@ -3,7 +3,7 @@
 Prints memory and drops each half minute, and at the end how much each process has grown since a third of the time.
 The pages are WebSocket clients that take everything that a browser would be sent; the stalled one reads nothing at
 all. `HEMISLAM_LIVE_MINUTES` (4) and `HEMISLAM_LIVE_SPEED` (1): up to eight minutes round a building, from then on
-over new ground outdoors.
+over new ground outdoors, or with `HEMISLAM_LIVE_LAPS=1` round the building all the time.
 """
 
 import os
@@ -30,11 +30,12 @@ from app.sensors.live.feed import Pace, feed
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
 from benchmarks.record import Line
-from benchmarks.scenes import half_hour, walk_in_laps
+from benchmarks.scenes import half_hour, half_hour_in_laps, walk_in_laps
 
 MINUTES = float(os.environ.get("HEMISLAM_LIVE_MINUTES", "4"))
 SPEED = float(os.environ.get("HEMISLAM_LIVE_SPEED", "1"))
 """Times real time: at 2, twenty scans a second."""
+LAPS = os.environ.get("HEMISLAM_LIVE_LAPS", "0") != "0"
 REPORT_S = 30.0
 NAMED = "hemislam-"
 """What the names of processes begin with that the server starts."""
@@ -43,7 +44,7 @@ SETTLE_S = 3.0
 
 
 def run() -> list[Line]:
-    walk = walk_in_laps() if MINUTES * SPEED <= 8 else half_hour()
+    walk = walk_in_laps() if MINUTES * SPEED <= 8 else half_hour_in_laps() if LAPS else half_hour()
     with TemporaryDirectory() as folder, served(walk, Path(folder) / "live.mcap") as (url, server, packets, imu):
         ended = threading.Event()
         wait_until(url, lambda state: state["recording"] is not None)
