@@ -224,7 +224,7 @@ class LoopEngine(FakeEngine):
             else:
                 verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
                 reason = f"{verdict} by hand; found {edges[pair].verdict}: {edges[pair].reason}"
-                edges[pair] = replace(edges[pair], verdict=verdict, overruled=True, reason=reason)
+                edges[pair] = replace(edges[pair], verdict=verdict, overruled=True, words=reason)
         return tuple(edges[pair] for pair in sorted(edges))
 
     def _poses(self, done: list[loops.Command]) -> np.ndarray:

@@ -358,7 +358,7 @@ class LoopBackend:
     def _edges(self, found: dict[Pair, LoopEdge], extra: Entry | None = None) -> dict[Pair, LoopEdge]:
         edges = self._overrulings.lay_over(found, len(self), extra)
         for pair in self._solution.broken & edges.keys():
-            edges[pair] = replace(edges[pair], verdict=Verdict.REJECTED, reason="the solver failed with it")
+            edges[pair] = replace(edges[pair], verdict=Verdict.REJECTED, words="the solver failed with it")
         return edges
 
     def _solve(self) -> None:

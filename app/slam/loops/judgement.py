@@ -84,14 +84,6 @@ def covariance(detector: Detector, newer: int, fit: Fit) -> F64:
     return np.asarray((out + out.T) / 2)
 
 
-def summary(e: Evidence) -> str:
-    """The numbers of a registered candidate in words."""
-    return (
-        f"overlap {e.overlap:.2f}, residual {e.residual_rms * 1e3:.0f} mm, slide {e.slide * 1e3:.0f} mm, "
-        f"{e.mahalanobis:.1f} σ from odometry"
-    )
-
-
 def _objection(e: Evidence, fit: Fit, p: Loops) -> str:
     """The first limit that is not met, in words and numbers; "" if all are."""
     if len(fit.residuals) < 100:

@@ -45,6 +45,14 @@ class Evidence:
     def ambiguous(self) -> bool:
         return self.rival_m < float("inf")
 
+    @property
+    def summary(self) -> str:
+        """Of a candidate that was registered, in words and numbers."""
+        return (
+            f"overlap {self.overlap:.2f}, residual {self.residual_rms * 1e3:.0f} mm, slide {self.slide * 1e3:.0f} mm, "
+            f"{self.mahalanobis:.1f} σ from odometry"
+        )
+
 
 _POSE, _COVARIANCE = 12, 21
 """Numbers: the upper three rows of the one, the upper triangle of the other."""

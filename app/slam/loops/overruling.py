@@ -179,8 +179,8 @@ def _overruled(edge: LoopEdge, command: Command) -> LoopEdge:
     verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
     if verdict is edge.verdict:
         return replace(edge, overruled=True)
-    reason = f"{verdict} by hand; found {edge.verdict}: {edge.reason}"
-    return replace(edge, verdict=verdict, overruled=True, reason=reason)
+    words = f"{verdict} by hand; found {edge.verdict}: {edge.words}"
+    return replace(edge, verdict=verdict, overruled=True, words=words)
 
 
 def _represented(edge: LoopEdge, edges: Mapping[Pair, LoopEdge]) -> LoopEdge:

@@ -58,7 +58,7 @@ def search(
         if any(edge.verdict is Verdict.CANDIDATE for edge in fresh.values()):
             counted = counting({**known, **fresh})
             settled = settle(fresh, counted, detector.poses, drift, params, now)
-            settled = placed(settled, counted.values(), detector.poses, poses[:, :3, 3], detector.half)
+            settled = placed(settled, counted.values(), detector.poses, poses, detector.half)
             updates.update((edge.pair, edge) for edge in settled)
     contexts = tuple(detector.context(index) for index in range(described, keyframes.stop))
     return Found(contexts, tuple(updates.values()))

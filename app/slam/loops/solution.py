@@ -6,7 +6,7 @@ import numpy as np
 
 from app.slam.loops.factors import Factor, Step
 from app.slam.loops.pose_graph import PoseGraph
-from app.slam.loops.support import carried
+from app.slam.loops.support import laid
 from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F64
 
@@ -80,6 +80,6 @@ def loop_factors(edges: Iterable[LoopEdge], by_pair: Mapping[Pair, LoopEdge], po
     for edge in edges:
         if edge.counts:
             first = by_pair[edge.repeats] if edge.repeats else edge
-            T, covariance = (edge.T_older_newer, edge.covariance) if first is edge else carried(edge, first, poses)
+            T, covariance = (edge.T_older_newer, edge.covariance) if first is edge else laid(edge, first, poses)
             factors.append(Factor(first.older, first.newer, T, covariance / edge.weight, robust=True))
     return factors

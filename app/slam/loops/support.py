@@ -13,17 +13,14 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops import se3
 from app.slam.loops.drift import Drift, agree
-from app.slam.loops.judgement import summary
-from app.slam.loops.types import HUBER, LoopEdge, Pair, Verdict
+from app.slam.loops.types import HUBER, SUMMARY, LoopEdge, Pair, Verdict
 from app.slam.params import Loops
 from app.slam.types import F64
 
 NEIGHBOURHOOD_M = 15.0
 """Loops with farther to walk between their ends, on either side, say nothing of each other."""
-SAME_PLACE_M = 2.0
-"""Apart in the map at most: as far as a quarter of a submap is walked, at which it shares most points with another."""
 SAME = 2 * HUBER
-"""Standard deviations up to which two loops measured the same: by there the graph's loss halves what one pulls."""
+"""Standard deviations up to which a loop says what is known: by there the graph's loss halves what it pulls."""
 
 
 def settle(
@@ -59,14 +56,14 @@ def settle(
         evidence = replace(edge.evidence, support=support)
         measured = edge.measured.by(evidence)
         if support >= params.support and support > 2 * against:
-            reason = f"{summary(evidence)}; {support} others agree"
+            words = f"{SUMMARY}; {support} others agree"
             out[edge.pair] = replace(
-                edge, verdict=Verdict.ACCEPTED, reason=reason, measured=measured, decided_at=now, weight=1.0
+                edge, verdict=Verdict.ACCEPTED, words=words, measured=measured, decided_at=now, weight=1.0
             )
         elif edge.pair in out:
-            waits = f"{summary(evidence)}; {support} of {params.support} others agree"
+            waits = f"{SUMMARY}; {support} of {params.support} others agree"
             contradicted = f", {against} contradict it" if against else ""
-            out[edge.pair] = replace(edge, reason=waits + contradicted, measured=measured, weight=1.0)
+            out[edge.pair] = replace(edge, words=waits + contradicted, measured=measured, weight=1.0)
     return list(out.values())
 
 
@@ -76,45 +73,48 @@ def _ends(edges: Iterable[LoopEdge], walked: F64) -> F64:
 
 
 def placed(
-    settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], poses: F64, positions: F64, half: int
+    settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], T_odom_imu: F64, T_map_imu: F64, half: int
 ) -> list[LoopEdge]:
     """The same, those just accepted with the loop that is in the graph for them or that they repeat, if there is one.
 
-    Submaps of keyframes a quarter of their length apart share three quarters of it: two loops between such neighbours,
-    at both ends, are one measurement rather than two. Where a place was passed several times before, being tied to one
-    of these times is being tied to all, as they are to each other; else the graph would be the denser the more often
-    one comes by. Of loops whose submaps share any points and that measured the same, one ties poses and the others are
-    laid on these: a pose costs the solver far more than a measurement between poses that are tied already.
+    A pose costs the solver far more than a measurement between poses that are tied already, so of loops whose submaps
+    share any points and that measured the same, one ties poses and the others are laid on these. Where a place was
+    passed several times before, being tied to one of these times is being tied to all, as they are to each other: what
+    the graph says already by a tie so near is not told it again, else it would be the denser the more often one comes
+    by. And submaps of keyframes a quarter of their length apart share three quarters of it: two loops between such
+    neighbours, at both ends, are one measurement rather than two.
 
     Args:
-        edges: all, as they count. poses: (k, 4, 4) T_odom_imu. positions: (k, 3) in the map.
-        half: of a submap, in keyframes.
+        edges: all, as they count. T_odom_imu, T_map_imu: (k, 4, 4). half: of a submap, in keyframes.
     """
     counting = {edge.pair: edge for edge in edges if edge.counts}
     out = []
     for edge in settled:
         if edge.verdict is Verdict.ACCEPTED and edge.represented_by is None and edge.pair not in counting:
-            beside = [other for other in counting.values() if abs(edge.newer - other.newer) <= half // 2]
-            near = next((o for o in beside if _apart(edge, o) <= half // 2 or _same_place(edge, o, positions)), None)
+            near = next((other for other in counting.values() if _apart(edge, other) <= half // 2), None)
+            ties = [o for o in counting.values() if o.repeats is None and abs(edge.newer - o.newer) <= 2 * half]
+            ties.sort(key=partial(_apart, edge))
+            around = (tie for tie in ties if _apart(edge, tie) <= 2 * half)
             if near is not None:
                 edge = replace(edge, represented_by=near.pair)
+            elif (same := next((tie for tie in around if _same(edge, *laid(tie, edge, T_odom_imu))), None)) is not None:
+                edge = counting[edge.pair] = replace(edge, repeats=same.pair)
+            elif ties and _same(edge, lie.inverse(T_map_imu[edge.older]) @ T_map_imu[edge.newer], 0):
+                edge = replace(edge, represented_by=ties[0].pair)
             else:
-                ties = (other for other in counting.values() if other.repeats is None)
-                around = sorted((o for o in ties if _apart(edge, o) <= 2 * half), key=partial(_apart, edge))
-                same = next((other for other in around if _same(edge, other, poses)), None)
-                edge = counting[edge.pair] = replace(edge, repeats=None if same is None else same.pair)
+                counting[edge.pair] = edge
         out.append(edge)
     return out
 
 
-def carried(edge: LoopEdge, first: LoopEdge, poses: F64) -> tuple[F64, F64]:
+def laid(edge: LoopEdge, first: LoopEdge, T_odom_imu: F64) -> tuple[F64, F64]:
     """What a loop measured, as one between the keyframes of another near it: T (4, 4), and its covariance (6, 6).
 
     Args:
-        poses: (k, 4, 4) by odometry, which is taken as exact between ends that are near each other.
+        T_odom_imu: (k, 4, 4); taken as exact between ends that are near each other.
     """
-    older = lie.inverse(poses[first.older]) @ poses[edge.older]
-    newer = lie.inverse(poses[edge.newer]) @ poses[first.newer]
+    older = lie.inverse(T_odom_imu[first.older]) @ T_odom_imu[edge.older]
+    newer = lie.inverse(T_odom_imu[edge.newer]) @ T_odom_imu[first.newer]
     turn = se3.adjoint(lie.inverse(newer))
     covariance = turn @ edge.covariance @ turn.T
     return older @ edge.T_older_newer @ newer, (covariance + covariance.T) / 2
@@ -125,12 +125,7 @@ def _apart(a: LoopEdge, b: LoopEdge) -> int:
     return max(abs(a.older - b.older), abs(a.newer - b.newer))
 
 
-def _same_place(a: LoopEdge, b: LoopEdge, positions: F64) -> bool:
-    return float(np.linalg.norm(positions[a.older] - positions[b.older])) < SAME_PLACE_M
-
-
-def _same(edge: LoopEdge, first: LoopEdge, poses: F64) -> bool:
-    """Whether both measured the same by what they say they are sure of."""
-    T, covariance = carried(edge, first, poses)
-    missed = se3.log(lie.inverse(first.T_older_newer) @ T)
-    return float(missed @ np.linalg.solve(first.covariance + covariance, missed)) <= SAME**2
+def _same(edge: LoopEdge, T_older_newer: F64, covariance: F64 | float) -> bool:
+    """Whether a loop measured that by what both are sure of."""
+    missed = se3.log(lie.inverse(edge.T_older_newer) @ T_older_newer)
+    return float(missed @ np.linalg.solve(edge.covariance + covariance, missed)) <= SAME**2

@@ -4,6 +4,7 @@ A loop is named by the two keyframes it ties together, `(older, newer)`: the nam
 whatever else is found, so that a list of overrulings can be replayed.
 """
 
+import sys
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from operator import attrgetter
@@ -16,6 +17,9 @@ from app.slam.types import F32, F64
 
 HUBER = 1.345
 """Whitened error from which a loop pulls with constant force (95 % efficient for a Gaussian)."""
+
+SUMMARY: Final = "{}"
+"""In the words for a verdict: that of the evidence."""
 
 Pair = tuple[int, int]
 """(older, newer) keyframe."""
@@ -42,11 +46,11 @@ class LoopEdge:
             an accepted loop takes effect.
         measured: T_older_newer of the IMU frames, its covariance, rotation then translation, in the
             newer's IMU frame (right perturbation), and the evidence.
-        verdict, reason: and why, in words and numbers.
+        verdict, words: and why; `SUMMARY` in the words stands for that of the evidence, so that many share them.
         origin: who proposed it. overruled: whether the verdict is the user's.
         weight: the covariance is divided by it in the graph.
-        represented_by: a loop next to it that is in the graph for both: its submaps are most of the same points, or the
-            same place at another time.
+        represented_by: a loop near it that is in the graph for both: its submaps are most of the same points, or it is
+            to another time at the same place, and the graph says the same.
         repeats: a loop up to a submap's length away that measured the same. In the graph this one is a further
             measurement between that one's keyframes, and ties none of its own.
     """
@@ -56,12 +60,18 @@ class LoopEdge:
     decided_at: int
     measured: Measured
     verdict: Verdict
-    reason: str
+    words: str
     origin: Origin = Origin.DETECTED
     overruled: bool = False
     weight: float = 1.0
     represented_by: Pair | None = None
     repeats: Pair | None = None
+
+    def __post_init__(self) -> None:
+        """What is the same of many is held once, also behind a pipe."""
+        object.__setattr__(self, "words", sys.intern(self.words))
+        if self.weight == 1.0:
+            object.__setattr__(self, "weight", 1.0)
 
     def __reduce__(self) -> tuple[type["LoopEdge"], tuple[Any, ...]]:
         """For pipes; what dataclasses have for slots leaves a tuple behind of each."""
@@ -70,6 +80,11 @@ class LoopEdge:
     @property
     def pair(self) -> Pair:
         return self.older, self.newer
+
+    @property
+    def reason(self) -> str:
+        """For the verdict, in words and numbers."""
+        return self.words.replace(SUMMARY, self.evidence.summary) if SUMMARY in self.words else self.words
 
     @property
     def T_older_newer(self) -> F64:

@@ -354,7 +354,7 @@ def test_loops_next_to_one_another_are_one_factor_and_rejecting_it_hands_over_to
             for pair in counting - {edge.pair}
             if max(abs(pair[0] - edge.older), abs(pair[1] - edge.newer)) <= PARAMS.submap_keyframes // 2
         }
-        assert edge.counts or edge.represented_by in near
+        assert edge.counts or edge.represented_by in counting
         assert not (edge.counts and near), "two factors that share most of their points"
     first = next(edge.represented_by for edge in loops if edge.represented_by)
     behind = {edge.pair for edge in loops if edge.represented_by == first}

@@ -14,7 +14,7 @@ from app.slam.loops.judgement import FLOOR_M, FLOOR_RAD
 from app.slam.loops.measured import Evidence, Measured
 from app.slam.loops.pose_graph import optimise
 from app.slam.loops.solution import loop_factors
-from app.slam.loops.support import carried, placed
+from app.slam.loops.support import laid, placed
 from app.slam.loops.types import LoopEdge, Reject, SetWeight, Verdict
 from app.slam.types import F64
 from tests.slam.loops.conftest import Walked, accepted
@@ -47,7 +47,7 @@ def come(loops: list[LoopEdge], poses: F64 = POSES) -> dict[int, LoopEdge]:
     """One after the other, by their older ends."""
     edges: dict[int, LoopEdge] = {}
     for edge in loops:
-        (edges[edge.older],) = placed([edge], edges.values(), poses, poses[:, :3, 3], HALF)
+        (edges[edge.older],) = placed([edge], edges.values(), poses, poses, HALF)
     return edges
 
 
@@ -65,23 +65,25 @@ def test_of_loops_along_a_way_one_in_a_quarter_of_a_submap_counts_and_one_in_a_w
             assert edge.repeats == (loop(older + first * apart).pair if first else None)
 
 
-@pytest.mark.parametrize(("aside_m", "tied"), [(0.5, False), (5.0, True)])
-def test_who_comes_by_a_place_once_more_is_tied_to_one_of_the_times_before(aside_m: float, tied: bool) -> None:
-    """Unless the way back went along another aisle."""
-    poses = POSES.copy()
-    poses[TURN:, 1, 3] = aside_m
-    third = np.concatenate([poses, POSES[:TURN]])
+@pytest.mark.parametrize(("off_m", "on", "told"), [(0.02, 10, True), (0.3, 10, False), (0.02, 2 * HALF + 1, False)])
+def test_to_another_time_at_a_place_tied_just_now_a_loop_counts_if_it_is_news(
+    off_m: float, on: int, told: bool
+) -> None:
+    third = np.concatenate([POSES, POSES[:TURN]])
     first = replace(loop(30), older=30, newer=2 * TURN + 30)
-    second = replace(first, older=2 * TURN - 1 - 31, newer=2 * TURN + 32)
-    (edge,) = placed([second], [first], third, third[:, :3, 3], HALF)
-    assert edge.counts is tied and edge.represented_by == (None if tied else first.pair)
+    older, newer = 2 * TURN - 1 - 31, 2 * TURN + 30 + on
+    T = lie.inverse(third[older]) @ third[newer]
+    T[1, 3] += off_m
+    second = replace(first, older=older, newer=newer, measured=Measured.of(T, loop(30).covariance, Evidence()))
+    (edge,) = placed([second], [first], third, third, HALF)
+    assert edge.counts is not told and edge.represented_by == (first.pair if told else None)
 
 
 @pytest.mark.parametrize(("off_m", "same"), [(0.05, True), (0.3, False)])
 def test_what_measured_another_thing_ties_poses_of_its_own(off_m: float, same: bool) -> None:
     edges = come([loop(40), loop(34, np.array([0.0, off_m, 0.0]))])
     assert edges[34].counts and edges[34].repeats == (loop(40).pair if same else None)
-    T, covariance = carried(edges[34], edges[40], POSES)
+    T, covariance = laid(edges[34], edges[40], POSES)
     np.testing.assert_allclose(
         T - loop(40).T_older_newer, lie.transform(np.eye(3), [0, off_m, 0]) - np.eye(4), atol=1e-9
     )
