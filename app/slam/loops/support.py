@@ -4,7 +4,7 @@ One registration can be fooled by a place that looks the same; several, at diffe
 that tell the same story are fooled more rarely. Where two stories are told, neither is believed.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -19,8 +19,9 @@ from app.slam.types import F64
 
 NEIGHBOURHOOD_M = 15.0
 """Loops with farther to walk between their ends, on either side, say nothing of each other."""
-SAME = 2 * HUBER
-"""Standard deviations up to which a loop says what is known: by there the graph's loss halves what it pulls."""
+SAME, NO_NEWS = 2 * HUBER, 1.0
+"""Standard deviations up to which a loop says what one near it said, as the graph's loss halves by there what it pulls;
+and up to which it is no news where no other is as near."""
 
 
 def settle(
@@ -80,9 +81,9 @@ def placed(
     A pose costs the solver far more than a measurement between poses that are tied already, so of loops whose submaps
     share any points and that measured the same, one ties poses and the others are laid on these. Where a place was
     passed several times before, being tied to one of these times is being tied to all, as they are to each other: what
-    the graph says already by a tie so near is not told it again, else it would be the denser the more often one comes
-    by. And submaps of keyframes a quarter of their length apart share three quarters of it: two loops between such
-    neighbours, at both ends, are one measurement rather than two.
+    the graph says already, with a tie so short a while ago, is not told it again, else it would be the denser the more
+    often one comes by. And submaps of keyframes a quarter of their length apart share three quarters of it: two loops
+    between such neighbours, at both ends, are one measurement rather than two.
 
     Args:
         edges: all, as they count. T_odom_imu, T_map_imu: (k, 4, 4). half: of a submap, in keyframes.
@@ -91,20 +92,29 @@ def placed(
     out = []
     for edge in settled:
         if edge.verdict is Verdict.ACCEPTED and edge.represented_by is None and edge.pair not in counting:
-            near = next((other for other in counting.values() if _apart(edge, other) <= half // 2), None)
-            ties = [o for o in counting.values() if o.repeats is None and abs(edge.newer - o.newer) <= 2 * half]
-            ties.sort(key=partial(_apart, edge))
-            around = (tie for tie in ties if _apart(edge, tie) <= 2 * half)
-            if near is not None:
-                edge = replace(edge, represented_by=near.pair)
-            elif (same := next((tie for tie in around if _same(edge, *laid(tie, edge, T_odom_imu))), None)) is not None:
-                edge = counting[edge.pair] = replace(edge, repeats=same.pair)
-            elif ties and _same(edge, lie.inverse(T_map_imu[edge.older]) @ T_map_imu[edge.newer], 0):
-                edge = replace(edge, represented_by=ties[0].pair)
-            else:
+            edge = _placed(edge, counting.values(), T_odom_imu, T_map_imu, half)
+            if edge.counts:
                 counting[edge.pair] = edge
         out.append(edge)
     return out
+
+
+def _placed(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_map_imu: F64, half: int) -> LoopEdge:
+    near = next((other for other in counting if _apart(edge, other) <= half // 2), None)
+    if near is not None:
+        return replace(edge, represented_by=near.pair)
+    ties = [other for other in counting if other.repeats is None]
+    around = sorted((tie for tie in ties if _apart(edge, tie) <= 2 * half), key=partial(_apart, edge))
+    same = next((tie for tie in around if _off(edge, *laid(tie, edge, T_odom_imu)) <= SAME), None)
+    if same is not None:
+        return replace(edge, repeats=same.pair)
+    last = min(ties, key=lambda tie: abs(edge.newer - tie.newer), default=edge)
+    ago = abs(edge.newer - last.newer)
+    if last is not edge and ago <= 4 * half:
+        off = _off(edge, lie.inverse(T_map_imu[edge.older]) @ T_map_imu[edge.newer])
+        if off <= (SAME if ago <= 2 * half else NO_NEWS):
+            return replace(edge, represented_by=last.pair)
+    return edge
 
 
 def laid(edge: LoopEdge, first: LoopEdge, T_odom_imu: F64) -> tuple[F64, F64]:
@@ -125,7 +135,7 @@ def _apart(a: LoopEdge, b: LoopEdge) -> int:
     return max(abs(a.older - b.older), abs(a.newer - b.newer))
 
 
-def _same(edge: LoopEdge, T_older_newer: F64, covariance: F64 | float) -> bool:
-    """Whether a loop measured that by what both are sure of."""
+def _off(edge: LoopEdge, T_older_newer: F64, covariance: F64 | float = 0.0) -> float:
+    """Standard deviations by which a loop measured something else than that, by what both are sure of."""
     missed = se3.log(lie.inverse(edge.T_older_newer) @ T_older_newer)
-    return float(missed @ np.linalg.solve(edge.covariance + covariance, missed)) <= SAME**2
+    return float(np.sqrt(missed @ np.linalg.solve(edge.covariance + covariance, missed)))

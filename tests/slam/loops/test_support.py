@@ -43,16 +43,21 @@ def loop(older: int, off: F64 | None = None) -> LoopEdge:
     return LoopEdge(older, newer, newer, Measured.of(T, covariance, Evidence()), Verdict.ACCEPTED, "")
 
 
-def come(loops: list[LoopEdge], poses: F64 = POSES) -> dict[int, LoopEdge]:
+def come(loops: list[LoopEdge], poses: F64 = POSES, in_map: F64 | None = None) -> dict[int, LoopEdge]:
     """One after the other, by their older ends."""
     edges: dict[int, LoopEdge] = {}
     for edge in loops:
-        (edges[edge.older],) = placed([edge], edges.values(), poses, poses, HALF)
+        (edges[edge.older],) = placed([edge], edges.values(), poses, poses if in_map is None else in_map, HALF)
     return edges
 
 
 def test_of_loops_along_a_way_one_in_a_quarter_of_a_submap_counts_and_one_in_a_whole_one_ties_poses() -> None:
-    edges = come([loop(older) for older in range(50, 0, -1)])
+    """Unless the graph knows by the first of them how the way back lies."""
+    apart_in_map = POSES.copy()
+    apart_in_map[TURN:, 1, 3] = 0.5
+    loops = [loop(older) for older in range(50, 0, -1)]
+    assert [older for older, edge in come(loops).items() if edge.counts and not edge.repeats] == [50, 50 - 4 * HALF - 1]
+    edges = come(loops, in_map=apart_in_map)
     apart = HALF // 2 + 1
     together = 2 * HALF // apart + 1
     for older, edge in edges.items():
@@ -65,11 +70,21 @@ def test_of_loops_along_a_way_one_in_a_quarter_of_a_submap_counts_and_one_in_a_w
             assert edge.repeats == (loop(older + first * apart).pair if first else None)
 
 
-@pytest.mark.parametrize(("off_m", "on", "told"), [(0.02, 10, True), (0.3, 10, False), (0.02, 2 * HALF + 1, False)])
-def test_to_another_time_at_a_place_tied_just_now_a_loop_counts_if_it_is_news(
+@pytest.mark.parametrize(
+    ("off_m", "on", "told"),
+    [
+        (0.5 * FLOOR_M, 2 * HALF, True),
+        (2 * FLOOR_M, 2 * HALF, True),
+        (3 * FLOOR_M, 2 * HALF, False),
+        (0.5 * FLOOR_M, 2 * HALF + 1, True),
+        (2 * FLOOR_M, 2 * HALF + 1, False),
+        (0.5 * FLOOR_M, 4 * HALF + 1, False),
+    ],
+)
+def test_to_another_time_at_a_place_a_loop_counts_if_it_is_news_or_the_last_is_long_ago(
     off_m: float, on: int, told: bool
 ) -> None:
-    third = np.concatenate([POSES, POSES[:TURN]])
+    third = np.concatenate([POSES, POSES])
     first = replace(loop(30), older=30, newer=2 * TURN + 30)
     older, newer = 2 * TURN - 1 - 31, 2 * TURN + 30 + on
     T = lie.inverse(third[older]) @ third[newer]
