@@ -104,7 +104,7 @@ class LoopView(BaseModel):
     origin: str
     overruled: bool = Field(description="Whether the verdict is the user's.")
     weight: float
-    represented_by: tuple[int, int] | None = Field(description="A loop next to it that is in the graph for both.")
+    represented_by: tuple[int, int] | None = Field(description="A loop that is in the graph for both.")
     repeats: tuple[int, int] | None = Field(
         description="A loop near it that measured the same; both are between its keyframes."
     )

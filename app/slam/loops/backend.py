@@ -7,7 +7,7 @@ came, so that undoing is the same as never having done. A command forgets nothin
 but keyframes that come after it are looked at with the loops as they count then.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -179,7 +179,7 @@ class LoopBackend:
         self._by_pair, newest = None, len(self) - 1
         decided = [edge for edge in self.edges if edge.decided_at == newest]
         broken = self._solution.broken
-        self._solution.close(loop_factors(decided, self.by_pair, self._detector.poses))
+        self._solution.close(self._loops(decided, self.by_pair))
         if self._solution.broken != broken:
             self._by_pair = None
 
@@ -372,14 +372,16 @@ class LoopBackend:
         for edge in edges.values():
             if edge.counts:
                 arrivals.setdefault(edge.decided_at, []).append(edge)
-        poses = self._detector.poses
-        loops = {index: loop_factors(arrived, edges, poses) for index, arrived in arrivals.items()}
+        loops = {index: self._loops(arrived, edges) for index, arrived in arrivals.items()}
         steps = self._history.steps(len(self), loops)
-        self._solution.solve(poses[0], self._start.window, steps)
+        self._solution.solve(self._detector.poses[0], self._start.window, steps)
 
     def _factors(self, edges: tuple[LoopEdge, ...]) -> list[Factor]:
         by_pair = {edge.pair: edge for edge in edges}
-        return self._history.odometry(len(self)) + loop_factors(edges, by_pair, self._detector.poses)
+        return self._history.odometry(len(self)) + self._loops(edges, by_pair)
+
+    def _loops(self, edges: Iterable[LoopEdge], by_pair: Mapping[Pair, LoopEdge]) -> list[Factor]:
+        return loop_factors(edges, by_pair, self._detector.poses, window=self._start.window)
 
     def _optimum(self, edges: tuple[LoopEdge, ...]) -> F64:
         """(k, 4, 4) T_map_imu by all factors at once. Raises HemislamError if the solver fails."""

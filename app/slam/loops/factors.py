@@ -16,6 +16,7 @@ class Factor:
 
     Attributes:
         robust: whether a large error pulls less than its square, as a loop's should.
+        loop: which loop it is of, if that is not between these two; None: it is.
     """
 
     first: int
@@ -23,6 +24,12 @@ class Factor:
     T_first_second: F64
     covariance: F64
     robust: bool = False
+    loop: tuple[int, int] | None = None
+
+    @property
+    def name(self) -> tuple[int, int]:
+        """The keyframes of the loop or of the step."""
+        return self.loop or (self.first, self.second)
 
 
 class Odometry:

@@ -47,4 +47,4 @@ def residuals(factors: Sequence[Factor], poses: F64) -> tuple[FactorResidual, ..
     turned = np.degrees(np.linalg.norm(errors[:, :3], axis=1))
     moved = np.linalg.norm(errors[:, 3:], axis=1)
     rows = zip(factors, turned.tolist(), moved.tolist(), sigmas.tolist(), strict=True)
-    return tuple(FactorResidual((f.first, f.second), f.robust, r, t, s) for f, r, t, s in rows)
+    return tuple(FactorResidual(f.name, f.robust, r, t, s) for f, r, t, s in rows)

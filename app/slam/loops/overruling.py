@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam.errors import HemislamError
-from app.slam.loops.types import Accept, Add, Command, LoopEdge, Pair, SetWeight, Solve, Verdict, pair_of
+from app.slam.loops.types import Accept, Add, Command, LoopEdge, Origin, Pair, SetWeight, Solve, Verdict, pair_of
 from app.slam.types import F64
 
 
@@ -37,6 +37,7 @@ class Overrulings:
         self.reached = 0
         self._done: list[Entry] = []
         self._undone: list[Entry] = []
+        self._used = False  # ever: what was found meanwhile may be placed by loops that no longer count
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._done)
@@ -64,6 +65,7 @@ class Overrulings:
     def give(self, entry: Entry) -> None:
         self._done.append(entry)
         self._undone.clear()
+        self._used = True
 
     def reach(self, reached: int) -> bool:
         """The walk has come on. Returns whether commands act from now on that did not before."""
@@ -73,6 +75,7 @@ class Overrulings:
     def load(self, commands: tuple[Command, ...], undone: tuple[Command, ...]) -> None:
         self._done = [Entry(command) for command in commands]
         self._undone = [Entry(command) for command in undone]
+        self._used = self._used or bool(commands)
 
     def undo(self) -> None:
         """Raises HemislamError if there is nothing to undo."""
@@ -126,7 +129,7 @@ class Overrulings:
             count: keyframes there are; loops by hand beyond them do not count.
         """
         entries = [*self._done, *([extra] if extra else [])]
-        if not entries:
+        if not (self._used or entries):
             return {pair: found[pair] for pair in sorted(found)}
         edges = dict(found)
         for entry in entries:
@@ -138,7 +141,7 @@ class Overrulings:
                     edges[pair] = entry.added
             elif pair in edges:
                 edges[pair] = _overruled(edges[pair], entry.command)
-        return {pair: _represented(edges[pair], edges) for pair in sorted(edges)}
+        return {pair: _standing(edges[pair], edges) for pair in sorted(edges)}
 
 
 def check(command: Command) -> None:
@@ -183,11 +186,23 @@ def _overruled(edge: LoopEdge, command: Command) -> LoopEdge:
     return replace(edge, verdict=verdict, overruled=True, words=words)
 
 
-def _represented(edge: LoopEdge, edges: Mapping[Pair, LoopEdge]) -> LoopEdge:
-    """The same; in the graph itself if the one that was there for it, or that it repeats, no longer is."""
-    first = edge.represented_by or edge.repeats
-    if first is None:
-        return edge
-    there = edges.get(first)
-    stands = there is not None and there.verdict is Verdict.ACCEPTED
-    return edge if stands else replace(edge, represented_by=None, repeats=None)
+def _standing(edge: LoopEdge, edges: Mapping[Pair, LoopEdge]) -> LoopEdge:
+    """The same; in the graph itself if the one that was there for it, or that it repeats, no longer is.
+
+    A loop by hand is repeated by none: it is the user's word, and not to be outvoted.
+    """
+    if edge.repeats is not None:
+        tie = edges.get(edge.repeats)
+        stands = tie is not None and tie.origin is Origin.DETECTED and tie.repeats is None
+        if not stands or _counting(edge.repeats, edges) != edge.repeats:
+            return replace(edge, repeats=None)
+    first = _counting(edge.represented_by, edges)
+    return edge if first == edge.represented_by else replace(edge, represented_by=first)
+
+
+def _counting(pair: Pair | None, edges: Mapping[Pair, LoopEdge]) -> Pair | None:
+    """The loop that counts where this one was to stand for others: it may have one that stands for it by now."""
+    edge = None if pair is None else edges.get(pair)
+    if edge is None or edge.verdict is not Verdict.ACCEPTED:
+        return None
+    return _counting(edge.represented_by, edges) or pair

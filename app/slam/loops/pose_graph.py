@@ -228,7 +228,7 @@ class _All:
 
 
 class _Mean:
-    """Loops between the same two poses as one: the sum of their squares is that of their mean, but for a constant.
+    """Loops between the same two poses, robust, as one: their squares add up to that of the mean, but for a constant.
 
     Attributes:
         factor: their mean, each by its information. times: how many they are. number: the solver's.
@@ -326,7 +326,7 @@ def _params() -> gtsam.ISAM2Params:
 
 
 def _noise(factor: Factor, times: int = 1) -> gtsam.noiseModel.Base:
-    """times: of how many it is the mean; together they pull as far as each of them would."""
+    """times: of how many it is the mean; equally sure ones pull together as far as each by itself."""
     noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
     if not factor.robust:
         return noise

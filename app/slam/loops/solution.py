@@ -61,8 +61,8 @@ class Solution:
     def _report(self, failed: Iterable[Factor], told: Iterable[str] = ()) -> None:
         for factor in failed:
             if factor.robust:
-                self.broken |= {(factor.first, factor.second)}
-                text = f"The solver failed with the loop {factor.first}-{factor.second}; the graph goes on without."
+                self.broken |= {factor.name}
+                text = f"The solver failed with the loop {factor.name[0]}-{factor.name[1]}; the graph goes on without."
             else:
                 text = f"The solver failed with the step to keyframe {factor.second}; it now says little."
             self._failures.add(text)
@@ -70,16 +70,21 @@ class Solution:
                 self._notices.append(text)
 
 
-def loop_factors(edges: Iterable[LoopEdge], by_pair: Mapping[Pair, LoopEdge], poses: F64) -> list[Factor]:
+def loop_factors(
+    edges: Iterable[LoopEdge], by_pair: Mapping[Pair, LoopEdge], T_odom_imu: F64, *, window: int
+) -> list[Factor]:
     """Of those that count.
 
     Args:
-        by_pair: all, with those that they repeat. poses: (k, 4, 4) T_odom_imu.
+        by_pair: all, with those that they repeat. T_odom_imu: (k, 4, 4). window: of the solver. With one, each is
+            between its own keyframes: there are few poses, and those of the loop that it repeats may not be among them.
     """
     factors = []
     for edge in edges:
         if edge.counts:
-            first = by_pair[edge.repeats] if edge.repeats else edge
-            T, covariance = (edge.T_older_newer, edge.covariance) if first is edge else laid(edge, first, poses)
-            factors.append(Factor(first.older, first.newer, T, covariance / edge.weight, robust=True))
+            first = by_pair[edge.repeats] if edge.repeats and not window else edge
+            T, covariance = edge.T_older_newer, edge.covariance
+            if first is not edge:
+                T, covariance = laid(edge, first, T_odom_imu)
+            factors.append(Factor(first.older, first.newer, T, covariance / edge.weight, True, edge.pair))
     return factors

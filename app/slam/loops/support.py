@@ -13,15 +13,16 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops import se3
 from app.slam.loops.drift import Drift, agree
-from app.slam.loops.types import HUBER, SUMMARY, LoopEdge, Pair, Verdict
+from app.slam.loops.types import HUBER, SUMMARY, LoopEdge, Origin, Pair, Verdict
 from app.slam.params import Loops
 from app.slam.types import F64
 
 NEIGHBOURHOOD_M = 15.0
 """Loops with farther to walk between their ends, on either side, say nothing of each other."""
-SAME, NO_NEWS = 2 * HUBER, 1.0
-"""Standard deviations up to which a loop says what one near it said, as the graph's loss halves by there what it pulls;
-and up to which it is no news where no other is as near."""
+SAME = 2 * HUBER
+"""Standard deviations up to which a loop says what another near it says: by there the graph's loss halves its pull."""
+NO_NEWS = 1.0
+"""The same beyond a submap's length. Of six numbers, few errors are as small; covariances of loops are generous."""
 
 
 def settle(
@@ -81,9 +82,9 @@ def placed(
     A pose costs the solver far more than a measurement between poses that are tied already, so of loops whose submaps
     share any points and that measured the same, one ties poses and the others are laid on these. Where a place was
     passed several times before, being tied to one of these times is being tied to all, as they are to each other: what
-    the graph says already, with a tie so short a while ago, is not told it again, else it would be the denser the more
-    often one comes by. And submaps of keyframes a quarter of their length apart share three quarters of it: two loops
-    between such neighbours, at both ends, are one measurement rather than two.
+    the graph says already, to `SAME` within a submap's length of the last tie or to `NO_NEWS` within two, is not told
+    it again, else it would be the denser the more often one comes by. And submaps of keyframes a quarter of their
+    length apart share three quarters of it: two loops between such neighbours, at both ends, are one measurement.
 
     Args:
         edges: all, as they count. T_odom_imu, T_map_imu: (k, 4, 4). half: of a submap, in keyframes.
@@ -104,7 +105,8 @@ def _placed(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_m
     if near is not None:
         return replace(edge, represented_by=near.pair)
     ties = [other for other in counting if other.repeats is None]
-    around = sorted((tie for tie in ties if _apart(edge, tie) <= 2 * half), key=partial(_apart, edge))
+    found = (tie for tie in ties if tie.origin is Origin.DETECTED)
+    around = sorted((tie for tie in found if _apart(edge, tie) <= 2 * half), key=partial(_apart, edge))
     same = next((tie for tie in around if _off(edge, *laid(tie, edge, T_odom_imu)) <= SAME), None)
     if same is not None:
         return replace(edge, repeats=same.pair)
@@ -136,6 +138,6 @@ def _apart(a: LoopEdge, b: LoopEdge) -> int:
 
 
 def _off(edge: LoopEdge, T_older_newer: F64, covariance: F64 | float = 0.0) -> float:
-    """Standard deviations by which a loop measured something else than that, by what both are sure of."""
+    """Standard deviations by which a loop measured something else than that. covariance: (6, 6) of that; 0: exact."""
     missed = se3.log(lie.inverse(edge.T_older_newer) @ T_older_newer)
     return float(np.sqrt(missed @ np.linalg.solve(edge.covariance + covariance, missed)))

@@ -48,9 +48,9 @@ class LoopEdge:
             newer's IMU frame (right perturbation), and the evidence.
         verdict, words: and why; `SUMMARY` in the words stands for that of the evidence, so that many share them.
         origin: who proposed it. overruled: whether the verdict is the user's.
-        weight: the covariance is divided by it in the graph.
-        represented_by: a loop near it that is in the graph for both: its submaps are most of the same points, or it is
-            to another time at the same place, and the graph says the same.
+        weight: the covariance is divided by it in the graph; that of no other, also of those that repeat it.
+        represented_by: a loop that is in the graph for both: next to it, so its submaps are most of the same points; or
+            the last one that ties poses, where the graph says the same as this one.
         repeats: a loop up to a submap's length away that measured the same. In the graph this one is a further
             measurement between that one's keyframes, and ties none of its own.
     """
@@ -69,7 +69,8 @@ class LoopEdge:
 
     def __post_init__(self) -> None:
         """What is the same of many is held once, also behind a pipe."""
-        object.__setattr__(self, "words", sys.intern(self.words))
+        if SUMMARY in self.words:
+            object.__setattr__(self, "words", sys.intern(self.words))
         if self.weight == 1.0:
             object.__setattr__(self, "weight", 1.0)
 

@@ -29,7 +29,7 @@ def headline(edge: LoopEdge) -> str:
 
 def _stead(edge: LoopEdge) -> str:
     if edge.represented_by is not None:
-        return f"; {name(edge.represented_by)}, next to it, is in the graph for both"
+        return f"; {name(edge.represented_by)} is in the graph for both"
     if edge.repeats is not None:
         return f"; {name(edge.repeats)}, near it, measured the same; in the graph both are between its keyframes"
     return ""
@@ -150,9 +150,7 @@ def _comparison(before: tuple[FactorResidual, ...], after: tuple[FactorResidual,
 
 
 def _worst_first(residuals: tuple[FactorResidual, ...]) -> list[FactorResidual]:
-    """Each pair once, however often it is in the graph."""
-    by_pair = {factor.pair: factor for factor in residuals}
-    return sorted(by_pair.values(), key=lambda factor: -factor.sigmas)
+    return sorted(residuals, key=lambda factor: -factor.sigmas)
 
 
 def _cost(residuals: tuple[FactorResidual, ...]) -> float:

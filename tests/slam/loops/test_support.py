@@ -12,10 +12,11 @@ from app.slam.loops.backend import LoopBackend
 from app.slam.loops.factors import Factor
 from app.slam.loops.judgement import FLOOR_M, FLOOR_RAD
 from app.slam.loops.measured import Evidence, Measured
+from app.slam.loops.overruling import Entry, Overrulings
 from app.slam.loops.pose_graph import optimise
 from app.slam.loops.solution import loop_factors
 from app.slam.loops.support import laid, placed
-from app.slam.loops.types import LoopEdge, Reject, SetWeight, Verdict
+from app.slam.loops.types import Add, LoopEdge, Origin, Reject, SetWeight, Verdict
 from app.slam.types import F64
 from tests.slam.loops.conftest import Walked, accepted
 
@@ -98,14 +99,23 @@ def test_to_another_time_at_a_place_a_loop_counts_if_it_is_news_or_the_last_is_l
 def test_what_measured_another_thing_ties_poses_of_its_own(off_m: float, same: bool) -> None:
     edges = come([loop(40), loop(34, np.array([0.0, off_m, 0.0]))])
     assert edges[34].counts and edges[34].repeats == (loop(40).pair if same else None)
-    T, covariance = laid(edges[34], edges[40], POSES)
-    np.testing.assert_allclose(
-        T - loop(40).T_older_newer, lie.transform(np.eye(3), [0, off_m, 0]) - np.eye(4), atol=1e-9
-    )
-    turned = np.abs(np.diag(covariance) / np.diag(loop(34).covariance) - 1)
-    assert np.allclose(turned[[0, 1, 2, 3]], 0, atol=1e-9) and (turned[[4, 5]] > 0.1).all(), (
-        "a turn there is a shift here"
-    )
+
+
+def test_a_loop_laid_on_other_keyframes_errs_there_by_what_its_error_becomes() -> None:
+    rng = np.random.default_rng(3)
+    poses = se3.exp(rng.normal(0.0, 1.0, (8, 6)))
+    half = rng.normal(0.0, 0.1, (6, 6))
+    ends = {"older": 1, "newer": 6, "decided_at": 6}
+    edge = replace(loop(40), **ends, measured=Measured.of(se3.exp(rng.normal(0.0, 1.0, 6)), half @ half.T, Evidence()))
+    T, covariance = laid(edge, replace(edge, older=0, newer=7), poses)
+    errors = 1e-6 * np.linalg.cholesky(edge.covariance).T  # their squares add up to the covariance
+    there = []
+    for error in errors:
+        off = replace(edge, measured=Measured.of(edge.T_older_newer @ se3.exp(error), edge.covariance, Evidence()))
+        there.append(se3.log(lie.inverse(T) @ laid(off, replace(off, older=0, newer=7), poses)[0]))
+    np.testing.assert_allclose(1e12 * np.transpose(there) @ there, covariance, atol=1e-3 * np.abs(covariance).max())
+    own = lie.inverse(poses[0]) @ poses[1] @ edge.T_older_newer @ lie.inverse(poses[6]) @ poses[7]
+    np.testing.assert_allclose(T, own, atol=1e-12)
 
 
 def test_whether_two_measured_the_same_does_not_depend_on_where_the_walk_lies() -> None:
@@ -130,12 +140,13 @@ def test_repeated_loops_hold_two_ways_together_nearly_as_well_as_each_by_itself(
         errs = {older: each_errs[older : older + 2 * HALF + 1].mean(axis=0) for older in range(50, 0, -HALF // 2 - 1)}
         found = come([loop(older, off) for older, off in errs.items()], np.array(odometry))
         edges = {edge.pair: edge for edge in found.values()}
-        factors = {
-            "each": loop_factors([replace(edge, repeats=None) for edge in edges.values()], edges, np.array(odometry)),
-            "repeated": loop_factors(edges.values(), edges, np.array(odometry)),
-            "alone": loop_factors([edge for edge in edges.values() if edge.repeats is None], edges, np.array(odometry)),
+        chosen = {
+            "each": [replace(edge, repeats=None) for edge in edges.values()],
+            "repeated": list(edges.values()),
+            "alone": [edge for edge in edges.values() if edge.repeats is None],
             "none": [],
         }
+        factors = {name: loop_factors(some, edges, np.array(odometry), window=0) for name, some in chosen.items()}
         assert len(factors["repeated"]) == len(factors["each"]) > 2 * len(factors["alone"])
         for name, loops in factors.items():
             poses = optimise(POSES[0], steps + loops, np.array(odometry))
@@ -167,3 +178,49 @@ def ties(backend: LoopBackend) -> list[tuple[int, int]]:
     lines = (line.split() for line in backend.g2o().splitlines() if line.startswith("EDGE"))
     pairs = [(int(line[1]), int(line[2])) for line in lines]
     return [pair for pair in pairs if pair[1] > pair[0] + 1]
+
+
+def test_no_loop_is_laid_on_one_that_the_user_made() -> None:
+    made = replace(loop(40), origin=Origin.USER, overruled=True)
+    elsewhere = POSES.copy()
+    elsewhere[TURN:, 1, 3] = 0.5
+    (edge,) = placed([loop(34)], [made], POSES, elsewhere, HALF)
+    assert edge.counts and edge.repeats is None
+
+
+def test_what_was_found_beside_a_loop_by_hand_counts_by_itself_once_that_is_undone() -> None:
+    """Also if nothing else is in force, and whether it repeated the loop or was represented by it."""
+    made = replace(loop(40), origin=Origin.USER, overruled=True)
+    beside = [replace(loop(38), represented_by=made.pair), replace(loop(34), repeats=made.pair)]
+    found = {edge.pair: edge for edge in beside}
+    overrulings = Overrulings()
+    overrulings.give(Entry(Add(*made.pair), added=made))
+    laid_over = overrulings.lay_over(found, len(POSES))
+    assert laid_over[made.pair] is made
+    assert laid_over[loop(38).pair].represented_by == made.pair and not laid_over[loop(38).pair].counts
+    assert laid_over[loop(34).pair].repeats is None, "the user's word is not to be outvoted"
+    overrulings.undo()
+    undone = overrulings.lay_over(found, len(POSES))
+    assert all(edge.counts and edge.repeats is None for edge in undone.values())
+    assert loop_factors(undone.values(), undone, POSES, window=0)
+
+
+def test_who_stood_in_for_a_rejected_loop_hands_over_when_that_is_back() -> None:
+    """What was found meanwhile was placed by it."""
+    first, second, third = loop(40), replace(loop(38), represented_by=loop(40).pair), loop(36)
+    found = {edge.pair: edge for edge in (first, second, replace(third, represented_by=second.pair))}
+    overrulings = Overrulings()
+    overrulings.give(Entry(Reject(*first.pair)))
+    rejected = overrulings.lay_over(found, len(POSES))
+    assert rejected[second.pair].counts and rejected[third.pair].represented_by == second.pair
+    overrulings.undo()
+    back = overrulings.lay_over(found, len(POSES))
+    assert [edge.represented_by for _, edge in sorted(back.items())] == [first.pair, first.pair, None]
+
+
+def test_with_a_window_each_loop_is_between_its_own_keyframes() -> None:
+    edges = {edge.pair: edge for edge in (loop(40), replace(loop(34), repeats=loop(40).pair))}
+    for window, pairs in ((0, [loop(40).pair] * 2), (50, [*edges])):
+        factors = loop_factors(edges.values(), edges, POSES, window=window)
+        assert [(factor.first, factor.second) for factor in factors] == pairs
+        assert [factor.name for factor in factors] == [*edges]
