@@ -95,6 +95,19 @@ def test_loops_between_the_same_two_poses_are_one_factor_that_says_what_they_say
     assert held(graph) == held(once)
 
 
+def test_against_odometry_they_pull_as_far_as_each_would_by_itself() -> None:
+    step = lie.transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    odometry = [Factor(k, k + 1, step, np.eye(6) * 0.05**2) for k in range(5)]
+    aside = lie.transform(np.eye(3), np.array([5.0, 3.0, 0.0]))
+    graph = graph_of(odometry, [])
+    for _ in range(4):
+        graph.close([Factor(0, 5, aside, np.eye(6) * 0.1**2, robust=True)])
+    loops = [Factor(0, 5, aside, np.eye(6) * 0.1**2, robust=True)] * 4
+    apart = optimise(np.eye(4), odometry + loops, graph.poses)
+    assert 0.2 < apart[5, 1, 3] < 2.8, "neither has its way"
+    assert graph.poses[5, 1, 3] == pytest.approx(apart[5, 1, 3], rel=0.1)
+
+
 def held(graph: PoseGraph) -> int:
     """Factors that the solver has."""
     factors = graph._solver._isam.getFactorsUnsafe()  # type: ignore[union-attr]
