@@ -33,6 +33,14 @@ BUFFER_BYTES = 1 << 20
 """Of each socket on the way to the browser. The system would let tens of megabytes of old frames queue there."""
 
 
+MOST_AT_ONCE = 16
+"""Updates in one message to a page: clouds of a keyframe among them, about a megabyte in all, as `BUFFER_BYTES`.
+
+A message is held half a dozen times on its way, for each page: with viser's 128, a map that is thinned would take
+a hundred megabytes for a moment.
+"""
+
+
 @dataclass(frozen=True, slots=True)
 class Viser:
     """A running viser server and what is needed to reach it."""
@@ -64,6 +72,7 @@ def start_viser() -> Viser:
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     server._websock_server.unregister_handler(viser._messages.ShareUrlRequest)
     server._websock_server.unregister_handler(viser._messages.ShareUrlDisconnect)
+    server._websock_server._broadcast_buffer.max_window_size = MOST_AT_ONCE
     return Viser(server, key)
 
 
