@@ -70,43 +70,55 @@ def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: in
 
 
 def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
-    """The same with at most `MOST_SHOWN` that have points: those between two close neighbours give theirs away first.
+    """The same with at most `MOST_SHOWN` that have points: where the walk is shortest between two of them, the one
+    between these gives its points away.
 
-    They give them to the one after them, so that going back shows nothing that was not measured yet.
+    It gives them to the one after it, so that going back shows nothing that was not measured yet. As the crow flies,
+    there would be no end to it where one turns round and walks back.
     """
     shown = [index for index, chunk in enumerate(chunks) if chunk.level < EMPTY_LEVEL]
     if len(shown) <= MOST_SHOWN:
         return chunks
     kept = list(chunks)
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    walked = np.concatenate([[0.0], np.cumsum(steps)])
     while len(shown) > MOST_SHOWN:
-        positions = poses[[chunks[index].index for index in shown], :3, 3]
-        around = np.linalg.norm(positions[2:] - positions[:-2], axis=1)
-        place = 1 + int(np.argmin(around))
+        where = walked[[chunks[index].index for index in shown]]
+        place = 1 + int(np.argmin(where[2:] - where[:-2]))
         index, after = shown.pop(place), shown[place]
         kept[index], kept[after] = _emptied(kept[index]), _joined(kept[index], kept[after], poses)
     return tuple(kept)
 
 
 def _joined(chunk: Chunk, after: Chunk, poses: F64) -> Chunk:
-    """The chunk `after` with the points of another, where `poses` lay them; they move with it from then on."""
+    """The chunk `after` with the points of another, where `poses` lay them; they move with it from then on.
+
+    What both of them saw is there once, but for chunks as they were made.
+    """
     T_map_lidar, T_map_after = (poses[one.index] @ one.T_imu_lidar for one in (chunk, after))
     T = lie.inverse(T_map_after) @ T_map_lidar
     points = (chunk.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
     order = np.random.default_rng(after.index).permutation(len(points) + len(after.points))
-    return replace(
+    level = max(chunk.level, after.level)
+    both = replace(
         after,
         points=np.concatenate((points, after.points))[order],
         labels=np.concatenate((chunk.labels, after.labels))[order],
         intensity=np.concatenate((chunk.intensity, after.intensity))[order],
         ring=np.concatenate((chunk.ring, after.ring))[order],
-        level=max(chunk.level, after.level),
+        level=level,
         joined=chunk.joined + after.joined + 1,
     )
+    return _at_level(both, level) if level else both
 
 
 def coarser(chunk: Chunk) -> Chunk:
     """A chunk at the next level."""
-    level = chunk.level + 1
+    return _at_level(chunk, chunk.level + 1)
+
+
+def _at_level(chunk: Chunk, level: int) -> Chunk:
+    """With one of its points per voxel of a level >= 1."""
     chosen = np.sort(_first_per_voxel(chunk.points, voxel_of_level(level)))  # of random points in their order
     return _taken(chunk, chosen, level)
 
