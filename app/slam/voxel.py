@@ -20,11 +20,15 @@ class Downsampled:
 
 
 class VoxelGrid:
-    """Thins clouds by centroid. Owns its scratch memory, so that a frame allocates nothing large."""
+    """Thins clouds by centroid. Owns its scratch memory, so that a frame allocates nothing large.
 
-    def __init__(self) -> None:
+    Args:
+        room: points for which there is some from the start; larger clouds make more.
+    """
+
+    def __init__(self, room: int = 1 << 16) -> None:
         self._generation = 0
-        self._reserve(1 << 16)
+        self._reserve(room)
 
     def _reserve(self, n: int) -> None:
         size = 1 << int(np.ceil(np.log2(max(2 * n, 2))))

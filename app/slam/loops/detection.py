@@ -23,9 +23,9 @@ from app.slam.types import F64, I64, Keyframe
 
 NEAR_M = 3.0
 """Beyond the reach of drift, places this far apart still see each other."""
-KEPT_PREPARED = 4
+KEPT_PREPARED = 2
 """Submaps ready for registration that stay in memory, 1 to 2 MB each; more would hardly be used again."""
-KEPT_SUBMAPS = 2
+KEPT_SUBMAPS = 1
 """Others; of a keyframe that is looked at one is needed twice."""
 
 

@@ -1,6 +1,7 @@
 """What was measured of a candidate loop, and what speaks for it; kept small, since three processes hold thousands."""
 
 import struct
+import sys
 from collections.abc import Iterable
 from dataclasses import astuple, dataclass
 from typing import Final
@@ -56,7 +57,7 @@ class Evidence:
 
 _POSE, _COVARIANCE = 12, 21
 """Numbers: the upper three rows of the one, the upper triangle of the other."""
-_EVIDENCE: Final = struct.Struct("=9di")
+_EVIDENCE: Final = struct.Struct("=9fi")
 _EVIDENCE_AT: Final = 8 * (_POSE + _COVARIANCE)
 _ROW: Final = np.dtype(
     [("pose", np.float64, (3, 4)), ("covariance", np.float64, _COVARIANCE), ("evidence", np.void, _EVIDENCE.size)]
@@ -68,40 +69,45 @@ _WHERE[_UPPER] = _WHERE.T[_UPPER] = np.arange(_COVARIANCE)
 _LAST_ROW: Final = np.eye(4)[3].tobytes()
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """A measured pose with its covariance and evidence; these come out of `packed` to the last bit.
+class Measured(bytes):
+    """A measured pose with its covariance, which come out of it to the last bit, and the evidence, to seven digits.
 
     Two small arrays and ten floats would take three times the memory of their numbers.
     """
 
-    packed: bytes
+    __slots__ = ()
 
     @classmethod
     def of(cls, T_older_newer: F64, covariance: F64, evidence: Evidence) -> "Measured":
         """From (4, 4), whose last row is 0 0 0 1, and (6, 6), symmetric."""
         pose, triangle = np.asarray(T_older_newer, np.float64)[:3], np.asarray(covariance, np.float64)[_UPPER]
-        return cls(pose.tobytes() + triangle.tobytes() + _EVIDENCE.pack(*astuple(evidence)))
+        return cls(pose.tobytes() + triangle.tobytes() + _packed(evidence))
 
     @property
     def T_older_newer(self) -> F64:
         """(4, 4), read-only."""
-        return np.frombuffer(self.packed[: 8 * _POSE] + _LAST_ROW, np.float64).reshape(4, 4)
+        return np.frombuffer(self[: 8 * _POSE] + _LAST_ROW, np.float64).reshape(4, 4)
 
     @property
     def covariance(self) -> F64:
         """(6, 6), read-only."""
-        whole = np.frombuffer(self.packed, np.float64, _COVARIANCE, 8 * _POSE)[_WHERE]
+        whole = np.frombuffer(self, np.float64, _COVARIANCE, 8 * _POSE)[_WHERE]
         whole.setflags(write=False)
         return whole
 
     @property
     def evidence(self) -> Evidence:
-        return Evidence(*_EVIDENCE.unpack_from(self.packed, _EVIDENCE_AT))
+        return Evidence(*_EVIDENCE.unpack_from(self, _EVIDENCE_AT))
 
     def by(self, evidence: Evidence) -> "Measured":
         """The same with other evidence."""
-        return Measured(self.packed[:_EVIDENCE_AT] + _EVIDENCE.pack(*astuple(evidence)))
+        return Measured(self[:_EVIDENCE_AT] + _packed(evidence))
+
+
+def _packed(evidence: Evidence) -> bytes:
+    *numbers, support = astuple(evidence)
+    with np.errstate(over="ignore"):  # infinite, where it is too large
+        return np.array(numbers, np.float32).tobytes() + int(support).to_bytes(4, sys.byteorder)
 
 
 def poses(measured: Iterable[Measured]) -> F64:
@@ -118,4 +124,4 @@ def covariances(measured: Iterable[Measured]) -> F64:
 
 
 def _rows(measured: Iterable[Measured]) -> npt.NDArray[np.void]:
-    return np.frombuffer(b"".join(each.packed for each in measured), _ROW)
+    return np.frombuffer(b"".join(measured), _ROW)

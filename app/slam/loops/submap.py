@@ -22,6 +22,9 @@ from app.slam.voxel import VoxelGrid
 KEPT_CLOUDS = 64
 """Thinned clouds, some 70 kB each, that stay in memory; others are read again."""
 
+AT_ONCE = 1 << 17
+"""Points of a submap before it is thinned: a dozen clouds of some thousands. More are only slower, once."""
+
 K = TypeVar("K")
 V = TypeVar("V")
 
@@ -103,7 +106,7 @@ class Submaps:
 
     def __init__(self, voxel_size: float, radius: float) -> None:
         self._voxel_size, self._radius = voxel_size, radius
-        self._grid = VoxelGrid()
+        self._grid = VoxelGrid(AT_ONCE)
         self._clouds = Clouds()
 
     def append(self, keyframe: Keyframe) -> None:

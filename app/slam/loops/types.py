@@ -7,6 +7,7 @@ whatever else is found, so that a list of overrulings can be replayed.
 import sys
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
+from functools import lru_cache
 from operator import attrgetter
 from typing import Any, Final
 
@@ -35,6 +36,12 @@ class Verdict(StrEnum):
 class Origin(StrEnum):
     DETECTED = "detected"
     USER = "user"
+
+
+@lru_cache(maxsize=1024)
+def _shared(older: int, newer: int) -> Pair:
+    """The same tuple for all that one loop stands for."""
+    return older, newer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +80,9 @@ class LoopEdge:
             object.__setattr__(self, "words", sys.intern(self.words))
         if self.weight == 1.0:
             object.__setattr__(self, "weight", 1.0)
+        for name in ("represented_by", "repeats"):
+            if (pair := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _shared(*pair))
 
     def __reduce__(self) -> tuple[type["LoopEdge"], tuple[Any, ...]]:
         """For pipes; what dataclasses have for slots leaves a tuple behind of each."""
