@@ -15,13 +15,15 @@ from typing import Any
 
 from app import processes
 from app.logs import process_logs
-from app.memory import give_back
+from app.memory import give_back, tidy
 from app.server import wire
 from app.server.delta import Delta, Fold
 from app.server.protocol import LIVE, Command, Notice, OpenRecording, Progress, Restart, Shutdown, Snapshot
 from app.server.setup import Setup
 from app.server.wire import Pipe
 
+TIDIED = 20
+"""Keyframes of a live walk after which the holes are given back that thinned clouds leave in memory."""
 MOST_REVIVALS = 25
 """Deaths of the engine's process after which it is not started again by itself."""
 
@@ -136,6 +138,7 @@ class EngineProcess:
 
     def _read(self, updates: Pipe, commands: Pipe, process: multiprocessing.process.BaseProcess) -> None:
         """Fold what the process sends, until it ends."""
+        tidied = 0
         with contextlib.suppress(EOFError, OSError):
             while True:
                 delta: Delta = wire.receive(updates)
@@ -146,6 +149,10 @@ class EngineProcess:
                         break
                     self._fold.apply(delta)
                     self._changed.notify_all()
+                there = len(self.snapshot.chunks)
+                if self._setup.live is not None and abs(there - tidied) >= TIDIED:
+                    tidied = there
+                    tidy()
         updates.close()
         process.join()
         if process is self._process:
