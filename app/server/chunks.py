@@ -93,23 +93,21 @@ def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
 def _joined(chunk: Chunk, after: Chunk, poses: F64) -> Chunk:
     """The chunk `after` with the points of another, where `poses` lay them; they move with it from then on.
 
-    What both of them saw is there once, but for chunks as they were made.
+    What both of them saw is there once, as fine as its level is, but for a chunk as it was made.
     """
     T_map_lidar, T_map_after = (poses[one.index] @ one.T_imu_lidar for one in (chunk, after))
     T = lie.inverse(T_map_after) @ T_map_lidar
     points = (chunk.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
     order = np.random.default_rng(after.index).permutation(len(points) + len(after.points))
-    level = max(chunk.level, after.level)
     both = replace(
         after,
         points=np.concatenate((points, after.points))[order],
         labels=np.concatenate((chunk.labels, after.labels))[order],
         intensity=np.concatenate((chunk.intensity, after.intensity))[order],
         ring=np.concatenate((chunk.ring, after.ring))[order],
-        level=level,
         joined=chunk.joined + after.joined + 1,
     )
-    return _at_level(both, level) if level else both
+    return _at_level(both, after.level) if after.level else both
 
 
 def coarser(chunk: Chunk) -> Chunk:

@@ -32,12 +32,11 @@ MOST_UPLOADS = 4
 BUFFER_BYTES = 1 << 20
 """Of each socket on the way to the browser. The system would let tens of megabytes of old frames queue there."""
 
+MOST_AT_ONCE = 32
+"""Updates in one message to a page: a frame with its keyframe and some clouds that were thinned, which belong together.
 
-MOST_AT_ONCE = 16
-"""Updates in one message to a page: clouds of a keyframe among them, about a megabyte in all, as `BUFFER_BYTES`.
-
-A message is held half a dozen times on its way, for each page: with viser's 128, a map that is thinned would take
-a hundred megabytes for a moment.
+A message is held half a dozen times on its way, for each page: with viser's 128, a map that is sent in whole would
+take a hundred megabytes for a moment.
 """
 
 

@@ -23,7 +23,7 @@ class VoxelGrid:
     """Thins clouds by centroid. Owns its scratch memory, so that a frame allocates nothing large.
 
     Args:
-        room: points for which there is some from the start; larger clouds make more.
+        room: points for which there is some from the start; for larger clouds it is doubled.
     """
 
     def __init__(self, room: int = 1 << 16) -> None:
@@ -49,7 +49,7 @@ class VoxelGrid:
         """
         n = len(points)
         if n > len(self._order):
-            self._reserve(n)
+            self._reserve(1 << (n - 1).bit_length())
         self._generation += 1
         if chosen is None:
             chosen = np.ones(n, dtype=np.uint8)

@@ -24,9 +24,9 @@ from app.slam.types import F64, I64, Keyframe
 NEAR_M = 3.0
 """Beyond the reach of drift, places this far apart still see each other."""
 KEPT_PREPARED = 2
-"""Submaps ready for registration that stay in memory, 1 to 2 MB each; more would hardly be used again."""
+"""Submaps ready for registration that stay in memory, 1 to 2 MB each: the newer one, and an older one at a time."""
 KEPT_SUBMAPS = 1
-"""Others; of a keyframe that is looked at one is needed twice."""
+"""Others; that of a keyframe that is described is needed once more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,15 +206,20 @@ class Detector:
 
     def register(self, older: int, newer: int, T_guess: F64) -> Fit:
         """Lay the newer submap on the older one from a guess of the level frames' transform."""
-        target, source = self.submap(older), self.submap(newer)
+        target, source = self._both(older, newer)
         return verification.assess(target, source, verification.register(target, source, T_guess))
 
     def assess(self, older: int, newer: int, T: F64) -> Fit:
         """How the newer submap lies on the older one, as the level frames' transform has it."""
-        return verification.assess(self.submap(older), self.submap(newer), T)
+        return verification.assess(*self._both(older, newer), T)
 
     def slide(self, older: int, newer: int, fit: Fit) -> float:
-        return verification.slide(self.submap(older), self.submap(newer), fit)
+        return verification.slide(*self._both(older, newer), fit)
+
+    def _both(self, older: int, newer: int) -> tuple[Prepared, Prepared]:
+        """Their submaps; the newer's is made first: it was described just now, and is compared with others next."""
+        source = self.submap(newer)
+        return self.submap(older), source
 
     def _eligible(self, newer: int, expectation: Expectation, params: Loops) -> I64:
         """Keyframes left long enough ago, as near as drift may have brought them."""

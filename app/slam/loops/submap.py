@@ -23,7 +23,7 @@ KEPT_CLOUDS = 64
 """Thinned clouds, some 70 kB each, that stay in memory; others are read again."""
 
 AT_ONCE = 1 << 17
-"""Points of a submap before it is thinned: a dozen clouds of some thousands. More are only slower, once."""
+"""Points of a submap before it is thinned: by default 17 clouds of some thousands."""
 
 K = TypeVar("K")
 V = TypeVar("V")
