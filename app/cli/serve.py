@@ -1,5 +1,6 @@
 """`hemislam serve`: the workbench in the browser."""
 
+import gc
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -141,6 +142,8 @@ def serve(
         read_poses(truth)
     elif recording is not None:
         truth = truth_beside(recording)
+    gc.collect()
+    gc.freeze()  # what is imported stays; going through all of it again would keep every page waiting for 0.1 s
     with (
         TemporaryDirectory(prefix="hemislam-") as folder_live,
         LiveProcess(live, params, imu, record) if live else nullcontext() as source,
