@@ -143,7 +143,7 @@ def serve(
     elif recording is not None:
         truth = truth_beside(recording)
     gc.collect()
-    gc.freeze()  # what is imported stays; going through all of it again would keep every page waiting for 0.1 s
+    gc.freeze()  # what is imported stays; going through all of it again would keep every page waiting for 0.08 s
     with (
         TemporaryDirectory(prefix="hemislam-") as folder_live,
         LiveProcess(live, params, imu, record) if live else nullcontext() as source,

@@ -35,8 +35,7 @@ BUFFER_BYTES = 1 << 20
 MOST_AT_ONCE = 32
 """Updates in one message to a page: a frame with its keyframe and some clouds that were thinned, which belong together.
 
-A message is held half a dozen times on its way, for each page: with viser's 128, a map that is sent in whole would
-take a hundred megabytes for a moment.
+A message is held half a dozen times on its way, for each page; viser by itself puts 128 in one.
 """
 
 
