@@ -19,9 +19,6 @@ import numpy as np
 from app.slam.types import F32, F64, Keyframe
 from app.slam.voxel import VoxelGrid
 
-KEPT_CLOUDS = 64
-"""Thinned clouds, some 70 kB each, that stay in memory; others are read again."""
-
 AT_ONCE = 1 << 17
 """Points of a submap before it is thinned: by default 17 clouds of some thousands."""
 
@@ -64,37 +61,31 @@ class Recent(Generic[K, V]):
 
 
 class Clouds:
-    """Point clouds (n, 3) float32 in an unnamed temporary file, appended; the newest ones stay in memory."""
+    """Point clouds (n, 3) float32 in an unnamed temporary file, appended. Reading one takes some microseconds."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile(prefix="hemislam-loops-")  # noqa: SIM115 - closed by close()
         self._ends = array("q", [0])  # file offset after each cloud
-        self._recent: Recent[int, F32] = Recent(KEPT_CLOUDS, self._read)
 
     def __len__(self) -> int:
         return len(self._ends) - 1
 
     def __getitem__(self, index: int) -> F32:
-        return self._recent[index]
+        begin, end = self._ends[index], self._ends[index + 1]
+        return np.frombuffer(os.pread(self._file.fileno(), end - begin, begin), dtype=np.float32).reshape(-1, 3)
 
     def append(self, points: F32) -> None:
         self._file.seek(self._ends[-1])
         self._file.write(np.ascontiguousarray(points).tobytes())
         self._file.flush()
         self._ends.append(self._ends[-1] + points.nbytes)
-        self._recent[len(self) - 1] = points
 
     def truncate(self, count: int) -> None:
         """Keep the first `count`."""
         del self._ends[count + 1 :]
-        self._recent.clear()
 
     def close(self) -> None:
         self._file.close()
-
-    def _read(self, index: int) -> F32:
-        begin, end = self._ends[index], self._ends[index + 1]
-        return np.frombuffer(os.pread(self._file.fileno(), end - begin, begin), dtype=np.float32).reshape(-1, 3)
 
 
 class Submaps:
