@@ -4,6 +4,7 @@ A good loop ties keyframes at nearly the same place, so that a straight line wou
 see: every edge rises to a knob above its middle.
 """
 
+import itertools
 from typing import Final
 
 import numpy as np
@@ -26,6 +27,8 @@ _CHOSEN_WIDTH: Final = 5.0
 _PICK_RAD: Final = np.radians(1.5)
 _LABEL: Final = np.array([0.0, 0.0, 0.5])
 _STILL_M: Final = 1e-3
+BLOCK: Final = 256
+"""Loops per node: who walks back finds one with every keyframe, and only the newest node is sent again."""
 _SAMPLES: Final = np.linspace(0.0, 1.0, 12)
 
 
@@ -56,7 +59,9 @@ def nearest(lines: npt.NDArray[np.floating], origin: F64, direction: F64, within
 
 
 class LoopEdges:
-    """Arches and knobs of the loops shown: one node of lines and one of points for each kind, in the graph or not."""
+    """Arches and knobs of the loops shown, in blocks of at most `BLOCK` of a kind, in the graph or not, each a node of
+    lines and one of points.
+    """
 
     def __init__(self, scene: viser.SceneApi, root: str) -> None:
         self._scene = scene
@@ -78,6 +83,7 @@ class LoopEdges:
         self._asked = asked
         there = [edge for edge in edges if edge.newer < len(poses)]
         seen = [edge for edge in there if kind_of(edge) in shown or edge.pair == chosen]
+        seen.sort(key=lambda edge: (edge.newer, edge.older))  # new ones come last
         lines = arches(seen, poses)
         self._pickable = ([edge.pair for edge in seen], lines)
         styles = np.array([list(Kind).index(kind_of(edge)) * 2 + edge.counts for edge in seen], dtype=np.int64)
@@ -93,10 +99,14 @@ class LoopEdges:
         return None if index is None else pairs[index]
 
     def _draw_style(self, kind: Kind, inside: bool, lines: F32) -> None:
-        node = f"{self._root}/{kind.replace(' ', '-')}-{'in' if inside else 'out'}"
-        if self._differs(node, lines):
-            width = _WIDTH[kind] if inside or kind is Kind.CANDIDATE else _OUT_WIDTH
-            self._send(node, lines, COLOURS[kind], width, _KNOB_M[kind])
+        nodes = f"{self._root}/{kind.replace(' ', '-')}-{'in' if inside else 'out'}"
+        width = _WIDTH[kind] if inside or kind is Kind.CANDIDATE else _OUT_WIDTH
+        for block in itertools.count():
+            node, part = f"{nodes}/{block}", lines[block * BLOCK : (block + 1) * BLOCK]
+            if not len(part) and node not in self._drawn:
+                break
+            if self._differs(node, part):
+                self._send(node, part, COLOURS[kind], width, _KNOB_M[kind])
 
     def _draw_chosen(self, text: str, lines: F32) -> None:
         node = f"{self._root}/chosen"
@@ -120,9 +130,10 @@ class LoopEdges:
         before = self._drawn.get(node)
         if before is not None and before.shape == lines.shape and np.allclose(before, lines, atol=_STILL_M):
             return False
-        self._drawn[node] = lines
         if len(lines):
+            self._drawn[node] = lines
             return True
+        self._drawn.pop(node, None)
         for key in [key for key in self._nodes if key == node or key.startswith(f"{node}-")]:
             self._nodes.pop(key).remove()
         return False
