@@ -16,7 +16,7 @@ import numpy.typing as npt
 import viser
 
 from app.server.protocol import Chunk
-from app.slam.types import F64, U8
+from app.slam.types import F32, F64, U8
 from app.ui.ceiling import below_ceiling
 from app.ui.colours import MAP_OF, TABLES, ColourBy, Limits, grown, label_colours, value_colours
 from app.ui.geometry import wxyz
@@ -30,8 +30,14 @@ MEASURED: Final = (ColourBy.HEIGHT, ColourBy.INTENSITY, ColourBy.RING)
 """Colourings whose limits grow with the map; time's are the recording's duration."""
 _NO_POINTS: Final = np.empty((0, 3), np.float16)
 _NO_COLOURS: Final = np.empty((0, 3), np.uint8)
+_NO_POSES: Final[F32] = np.empty((0, 3, 4), np.float32)
+_LAST_ROW: Final = np.eye(4)[3]
 _STILL: Final = 1e-5
 """Of poses (m, and of rotation matrices)."""
+_STILL_M, _STILL_RAD = 1e-3, 5e-5
+"""A cloud is drawn at most so far from where its keyframe is. Each loop moves most of a walk by some hundredths of a
+millimetre: told to the page, that is two messages for each of a thousand clouds.
+"""
 
 
 @dataclass(slots=True)
@@ -103,7 +109,7 @@ class MapChunks:
         self._free: list[int] = []  # of these so many names; a heap
         self._view = View()
         self._limits: dict[ColourBy, Limits] = {}
-        self._poses: F64 = np.empty((0, 4, 4))  # of all keyframes, as the last snapshot had them
+        self._poses = _NO_POSES  # (k, 3, 4) T_map_imu of all keyframes, as they are drawn
         self._start_ns = 0
 
     @property
@@ -122,7 +128,7 @@ class MapChunks:
             self._remove(drawn)
         self._drawn.clear()
         self._drop_hidden()
-        self._poses = np.empty((0, 4, 4))
+        self._poses = _NO_POSES
         self._start_ns = start_ns
         self._limits = {ColourBy.TIME: Limits(0.0, max(duration_s, 1.0))}
 
@@ -208,15 +214,20 @@ class MapChunks:
         """Take the poses of now; which of the keyframes that are drawn have others, and which have their points at
         other heights.
         """
-        before, self._poses, count = self._poses, poses, len(self._drawn)
-        if poses is before:
-            return np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
-        moved = np.abs(poses[:count] - before[:count]) > _STILL
-        return np.asarray(moved.any(axis=(1, 2))), np.asarray(moved[:, 2].any(axis=1))
+        now, count = poses[:, :3].astype(np.float32), len(self._drawn)
+        before = self._poses[: len(now)]
+        apart = np.abs(now[: len(before)] - before)
+        turned, shifted = apart[:, :, :3] > _STILL_RAD, apart[:, :, 3] > _STILL_M
+        moved = np.asarray(turned.any(axis=(1, 2)) | shifted.any(axis=1))
+        lifted = np.asarray(turned[:, 2].any(axis=1) | shifted[:, 2])
+        if moved.any() or len(now) != len(self._poses):
+            now[: len(before)][~moved] = before[~moved]
+            self._poses = now
+        return moved[:count], lifted[:count]
 
     def _placed(self, chunk: Chunk) -> F64:
         """(4, 4) T_map_lidar."""
-        return np.asarray(self._poses[chunk.index] @ chunk.T_imu_lidar)
+        return np.asarray(np.vstack((self._poses[chunk.index], _LAST_ROW)) @ chunk.T_imu_lidar)
 
     def _hidden_one(self, chunk: Chunk) -> _Hidden | None:
         """The next that was hidden, if it is this one; else none of them comes again."""

@@ -13,10 +13,12 @@ PATH_COLOUR: Final = (255, 92, 141)
 TRUTH_COLOUR: Final = (240, 244, 250)
 BLOCK: Final = 256
 """Segments per node: as the walk goes on, only the newest node is sent again."""
+_STILL_M: Final = 1e-3
+"""A block is drawn at most so far from where it is: each loop moves most of a walk by less."""
 _MOST_TRUTH_POINTS: Final = 4000
 
 
-def segments(positions: F64) -> F32:
+def segments(positions: F64 | F32) -> F32:
     """(n, 3) positions -> (n-1, 2, 3) segments between neighbours."""
     return np.stack((positions[:-1], positions[1:]), axis=1).astype(np.float32)
 
@@ -29,31 +31,33 @@ class Trajectory:
         self._root = root
         self._colour = colour
         self._blocks: list[viser.LineSegmentsHandle] = []
-        self._drawn: F64 = np.empty((0, 3))
+        self._drawn: list[F32] = []
 
     def clear(self) -> None:
         """Take the path away; its names are used again."""
         for block in self._blocks:
             block.remove()
         self._blocks.clear()
-        self._drawn = np.empty((0, 3))
+        self._drawn.clear()
 
     def draw(self, positions: F64, visible: bool) -> None:
         """Draw (n, 3) positions, sending the blocks that differ from what is drawn."""
         while len(self._blocks) > -(-max(len(positions) - 1, 0) // BLOCK):
             self._blocks.pop().remove()
+            self._drawn.pop()
         for index, first in enumerate(range(0, len(positions) - 1, BLOCK)):
-            part = positions[first : first + BLOCK + 1]
+            part = positions[first : first + BLOCK + 1].astype(np.float32)
             if index == len(self._blocks):
+                self._drawn.append(part)
                 self._blocks.append(
                     self._scene.add_line_segments(
                         f"{self._root}/{index}", segments(part), self._colour, thickness=3.0, thickness_units="screen"
                     )
                 )
-            elif not np.array_equal(part, self._drawn[first : first + BLOCK + 1]):
+            elif len(part) != len(self._drawn[index]) or np.abs(part - self._drawn[index]).max() > _STILL_M:
+                self._drawn[index] = part
                 self._blocks[index].points = segments(part)
             self._blocks[index].visible = visible
-        self._drawn = positions
 
 
 class Truth:

@@ -1,0 +1,50 @@
+"""Loops move most of a walk by next to nothing: the page is not told of that, until it adds up."""
+
+import numpy as np
+import viser
+
+from app.server.protocol import StepFrame
+from app.slam import lie
+from tests.ui.conftest import Wire
+from tests.ui.fake_engine import FakeEngine
+from tests.ui.test_scene import Drawn, chunk_nodes
+
+STEP_M, STEPS = 3e-4, 30
+
+
+def test_a_map_that_drifts_is_told_of_by_the_millimetre(
+    server: viser.ViserServer, wire: Wire, engine: FakeEngine
+) -> None:
+    drawn = Drawn(server, engine)
+    engine.send(StepFrame(14))
+    drawn.draw()
+    poses, walk = engine.snapshot.keyframe_poses, engine.snapshot.trajectory
+    assert poses is not None and walk is not None and len(chunk_nodes(server)) > 2
+    clouds, paths = [], []
+    for step in range(1, STEPS + 1):
+        shift = np.array([0.0, step * STEP_M, 0.0])
+        moved = poses.copy()
+        moved[:, :3, 3] += shift
+        wire.clear()
+        drawn.draw(keyframe_poses=moved, trajectory=walk + shift)
+        clouds.append([name for name in wire.nodes("SetPositionMessage") if name.startswith("/map/keyframes/")])
+        paths.append([name for name in wire.nodes("SceneNodeUpdateMessage") if name.startswith("/map/trajectory/")])
+        for name, node in chunk_nodes(server).items():
+            T = moved[int(name.rpartition("/")[2])]
+            assert np.abs(np.array(node.position) - T[:3, 3]).max() < 1.001e-3
+    assert [bool(sent) for sent in clouds] == [bool(sent) for sent in paths]
+    assert [step for step, sent in enumerate(clouds, 1) if sent] == [*range(4, STEPS + 1, 4)]
+    assert {len(sent) for sent in clouds} == {0, len(chunk_nodes(server))}
+
+
+def test_a_turn_that_could_be_seen_far_away_is_told(server: viser.ViserServer, wire: Wire, engine: FakeEngine) -> None:
+    drawn = Drawn(server, engine)
+    engine.send(StepFrame(14))
+    drawn.draw()
+    assert engine.snapshot.keyframe_poses is not None
+    for angle, told in ((1e-5, False), (2e-4, True)):
+        turned = engine.snapshot.keyframe_poses.copy()
+        turned[0, :3, :3] = lie.exp(np.array([0.0, 0.0, angle])) @ turned[0, :3, :3]
+        wire.clear()
+        drawn.draw(keyframe_poses=turned)
+        assert ("/map/keyframes/0" in wire.nodes("SetOrientationMessage")) is told
