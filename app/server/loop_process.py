@@ -14,7 +14,7 @@ import sys
 import threading
 from dataclasses import replace
 from multiprocessing.connection import Connection, Pipe
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -22,8 +22,8 @@ from app import processes
 from app.logs import process_logs
 from app.memory import give_back, tidy
 from app.server import wire
-from app.server.edges import EdgesReceiver, EdgesSender
-from app.server.transforms import Transforms
+from app.server.edges import EdgesChange, EdgesReceiver, EdgesSender
+from app.server.transforms import Transforms, TransformsChange
 from app.slam.loops.messages import LoopState, LoopWorkerDied, Reply, Request
 
 NICENESS: Final = 10
@@ -33,6 +33,9 @@ TIDIED: Final = 20
 _ALONE: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "NUMBA", "OPENBLAS", "MKL")}
 """More threads would fight the frame loop's for the cores."""
 _NONE: Final = np.empty((0, 4, 4))
+
+Changes: TypeAlias = tuple[EdgesChange, TransformsChange]
+"""What of a state travels in place of its candidates and corrections."""
 
 
 class LoopProcess:
@@ -148,14 +151,17 @@ def main() -> None:
     warm_up()
     service = LoopService()
     edges, corrections = EdgesSender(), Transforms()
+
+    def answer(request: Request) -> tuple[Reply, Changes | None]:
+        reply = service.handle(request)
+        if not isinstance(reply, LoopState):
+            return reply, None
+        changes = edges.change(reply.edges), corrections.change(reply.corrections)
+        return replace(reply, edges=(), corrections=_NONE), changes
+
     try:
         for number in itertools.count(1):
-            reply = service.handle(wire.receive(requests))
-            changes = None
-            if isinstance(reply, LoopState):
-                changes = edges.change(reply.edges), corrections.change(reply.corrections)
-                reply = replace(reply, edges=(), corrections=_NONE)
-            wire.send(replies, (reply, changes))
+            wire.send(replies, answer(wire.receive(requests)))  # without a name: nothing of it is kept meanwhile
             if number % TIDIED == 0:
                 tidy()
     except (EOFError, OSError):  # the owner has gone, or wants no more
