@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from app.server.protocol import Chunk
+from app.server.setup import POINT_BUDGET
 from app.slam import lie
 from app.slam.types import F32, F64, I64, Keyframe
 
@@ -22,6 +23,9 @@ COARSEST_LEVEL: Final = 8
 EMPTY_LEVEL: Final = COARSEST_LEVEL + 1
 MOST_SHOWN: Final = 1000
 """Keyframes that have points: each costs the page a drawing of its own, and the server some kilobytes."""
+FRAME_POINTS, KEYFRAME_POINTS, CANDIDATE_POINTS = 5, 20, 40
+"""As much memory as so many points of the map (29 bytes each with what viser keeps) take, here and in the page's
+scene: a frame's place on the path, a keyframe without its points, a loop candidate with its arch."""
 _SLACK: Final = 0.97
 """Over budget, the map is thinned to this share of it, so that not every new keyframe thins again."""
 
@@ -45,6 +49,16 @@ def thinned(keyframe: Keyframe, voxel_size: float) -> Chunk:
 def one_per_voxel(points: F32, voxel_size: float, seed: int = 0) -> I64:
     """Indices, shuffled by `seed`, of one point of `points` (n, 3) in every occupied voxel."""
     return np.random.default_rng(seed).permutation(_first_per_voxel(points, voxel_size))
+
+
+def room(budget: int, frames: int, keyframes: int, candidates: int) -> int:
+    """Most points that the map may have, so that memory stays as it is however long the walk.
+
+    What else there is of it takes its part of what `POINT_BUDGET` points take, or as many as `budget`, if that is
+    more; but no more than half of it.
+    """
+    beside = FRAME_POINTS * frames + KEYFRAME_POINTS * keyframes + CANDIDATE_POINTS * candidates
+    return max(min(budget, max(budget, POINT_BUDGET) - beside), budget // 2)
 
 
 def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: int) -> tuple[Chunk, ...]:

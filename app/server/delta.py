@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from app.server.chunks import with_same_mounting, within_budget
+from app.server.chunks import room, with_same_mounting, within_budget
 from app.server.edges import EdgesChange, EdgesReceiver, EdgesSender
 from app.server.protocol import SERIES, Chunk, LoopsView, Notice, Snapshot
 from app.server.setup import POINT_BUDGET
@@ -166,7 +166,7 @@ class Fold:
     """Lays deltas over a snapshot, in their order. One thread writes; anybody may read `snapshot`.
 
     Args:
-        point_budget: most points that all chunks together may have.
+        point_budget: most points that all chunks together may have; fewer, as a long walk leaves less room.
     """
 
     def __init__(self, snapshot: Snapshot | None = None, point_budget: int = POINT_BUDGET) -> None:
@@ -220,7 +220,8 @@ class Fold:
             self._chunks = tuple(held)
             return shown
         sensor = result.T_map_imu[:3, 3] if result is not None else poses[-1, :3, 3]
-        shown = within_budget(shown, poses, sensor, self._point_budget)
+        budget = room(self._point_budget, len(self._positions), len(shown), len(self._edges.edges))
+        shown = within_budget(shown, poses, sensor, budget)
         self._chunks = (*shown, *others)
         return shown
 
