@@ -16,11 +16,13 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from app.slam.types import F32, F64, Keyframe
+from app.slam.types import F32, F64, I64, Keyframe
 from app.slam.voxel import VoxelGrid
 
 AT_ONCE = 1 << 17
 """Points of a submap before it is thinned: by default 17 clouds of some thousands."""
+
+_POINT_BYTES = 12
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -61,18 +63,23 @@ class Recent(Generic[K, V]):
 
 
 class Clouds:
-    """Point clouds (n, 3) float32 in an unnamed temporary file, appended. Reading one takes some microseconds."""
+    """Point clouds (n, 3) float32 in an unnamed temporary file, appended. Reading takes microseconds a cloud."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile(prefix="hemislam-loops-")  # noqa: SIM115 - closed by close()
         self._ends = array("q", [0])  # file offset after each cloud
 
-    def __len__(self) -> int:
-        return len(self._ends) - 1
+    def between(self, first: int, end: int, room: F32) -> tuple[F32, I64]:
+        """Those from `first` to before `end`, one after the other, read into `room` if that is large enough.
 
-    def __getitem__(self, index: int) -> F32:
-        begin, end = self._ends[index], self._ends[index + 1]
-        return np.frombuffer(os.pread(self._file.fileno(), end - begin, begin), dtype=np.float32).reshape(-1, 3)
+        Returns:
+            (n, 3), and (end - first + 1,) at which point each begins and the last one ends.
+        """
+        offsets = np.array(self._ends[first : end + 1])
+        begins = (offsets - offsets[0]) // _POINT_BYTES
+        points = room[: begins[-1]] if begins[-1] <= len(room) else np.empty((begins[-1], 3), np.float32)
+        os.preadv(self._file.fileno(), [points.data], int(offsets[0]))
+        return points, begins
 
     def append(self, points: F32) -> None:
         self._file.seek(self._ends[-1])
@@ -98,6 +105,7 @@ class Submaps:
     def __init__(self, voxel_size: float, radius: float) -> None:
         self._voxel_size, self._radius = voxel_size, radius
         self._grid = VoxelGrid(AT_ONCE)
+        self._room: F32 = np.empty((AT_ONCE, 3), np.float32)
         self._clouds = Clouds()
 
     def append(self, keyframe: Keyframe) -> None:
@@ -117,15 +125,14 @@ class Submaps:
         Args:
             poses: (k, 4, 4) T_odom_imu of all keyframes.
         """
-        centre = poses[index, :3, 3]
-        clouds, eyes = [], []
-        for other in range(first, last + 1):
-            eye = (poses[other, :3, 3] - centre).astype(np.float32)
-            points = self._clouds[other] + eye
-            clouds.append(points[np.einsum("ni,ni->n", points, points) < self._radius**2])
-            eyes.append(np.broadcast_to(eye, clouds[-1].shape))
-        thin = self._grid.downsample(np.concatenate(clouds), self._voxel_size)
-        return Submap(index, thin.points, np.concatenate(eyes)[thin.source])
+        points, begins = self._clouds.between(first, last + 1, self._room)
+        eyes = (poses[first : last + 1, :3, 3] - poses[index, :3, 3]).astype(np.float32)
+        for eye, begin, end in zip(eyes, begins[:-1], begins[1:], strict=True):
+            points[begin:end] += eye
+        near = np.flatnonzero(np.einsum("ni,ni->n", points, points) < self._radius**2)
+        thin = self._grid.downsample(points[near], self._voxel_size)
+        seen = np.searchsorted(begins, near[thin.source], side="right") - 1
+        return Submap(index, thin.points, eyes[seen])
 
     def _level(self, keyframe: Keyframe) -> F32:
         """(n, 3) one keyframe's own points in its level frame, thinned."""
