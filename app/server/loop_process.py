@@ -126,14 +126,17 @@ class LoopProcess:
 
     def _read(self, replies: "Connection[object, object]") -> None:
         edges, corrections = EdgesReceiver(), Transforms()
+
+        def whole(reply: Reply, changes: Changes | None) -> Reply:
+            if not isinstance(reply, LoopState) or changes is None:
+                return reply
+            edges.take(changes[0])
+            return replace(reply, edges=edges.edges, corrections=corrections.take(changes[1]))
+
         with replies:
             try:
                 while True:
-                    reply, changes = wire.receive(replies)
-                    if isinstance(reply, LoopState):
-                        edges.take(changes[0])
-                        reply = replace(reply, edges=edges.edges, corrections=corrections.take(changes[1]))
-                    self._answers.put(reply)
+                    self._answers.put(whole(*wire.receive(replies)))
             except (EOFError, OSError):
                 self._answers.put(None)
 

@@ -26,9 +26,9 @@ class MapFrame:
     T_map_odom: F64 = field(default_factory=lambda: np.empty((0, 4, 4)))
 
     def at(self, keyframe: int) -> F64:
-        """(4, 4) T_map_odom at a keyframe."""
+        """(4, 4) T_map_odom at a keyframe; a copy, as a result that is kept must not keep all others."""
         count = len(self.T_map_odom)
-        return self.T_map_odom[min(keyframe, count - 1)] if count else np.eye(4)
+        return self.T_map_odom[min(keyframe, count - 1)].copy() if count else np.eye(4)
 
     @property
     def newest(self) -> F64:

@@ -1,7 +1,7 @@
 """The numbers of the timeline: what is shown of every frame, thinned to columns in which spikes stay visible."""
 
 import base64
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -130,7 +130,7 @@ class History:
             self._later_loops = {pair: entry for pair, entry in self._loops().items() if entry[0] >= count}
         if self._later and _truth(snapshot) != _truth(self._seen):
             self._later["error"][:] = np.nan  # what there was is the distance to another
-        self._seen = snapshot
+        self._seen = replace(snapshot, result=None, trajectory=None, keyframe_poses=None)  # large, and not needed here
 
     def _known(self, key: str) -> F64:
         """(n,) of a strip, or stamps, of all frames that there were."""

@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import viser
@@ -50,7 +51,8 @@ class TimelinePanel:
         self._latest = snapshot
         if now - self._drawn_at < _PERIOD_S or (drawn is not None and not _differs(drawn, snapshot)):
             return
-        self._drawn, self._drawn_at = snapshot, now
+        self._drawn = replace(snapshot, trajectory=None, keyframe_poses=None)  # large, and not compared
+        self._drawn_at = now
         self._history.see(snapshot)
         if snapshot.result is None:
             self._data.content = data("")
