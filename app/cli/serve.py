@@ -33,7 +33,13 @@ def serve(
         ),
     ] = None,
     point_budget: Annotated[
-        int, typer.Option("--point-budget", min=10_000, metavar="N", help="Most map points that the page draws.")
+        int,
+        typer.Option(
+            "--point-budget",
+            min=10_000,
+            metavar="N",
+            help="Most map points that the page draws; hours of walking leave room for fewer, half of them at least.",
+        ),
     ] = 3_000_000,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the address.")] = False,
     paused: Annotated[bool, typer.Option("--paused", help="Wait for Play instead of starting at once.")] = False,

@@ -174,6 +174,7 @@ class Fold:
         self._point_budget = point_budget
         self._positions, self._series = table(3), table(len(SERIES))
         self._chunks: tuple[Chunk, ...] = ()  # also those that were gone back over
+        self._points = 0  # of those that are shown
         self._edges = EdgesReceiver()
         self._poses = Transforms()
 
@@ -190,14 +191,17 @@ class Fold:
         self._positions.extend(delta.positions)
         self._series.extend(delta.series)
         series = self._series.view()
+        if delta.edges is not None:
+            self._edges.take(delta.edges)
         chunks = before.chunks
-        if delta.chunks or delta.shown != len(chunks) or delta.session != before.session:
+        others = delta.chunks or delta.shown != len(chunks) or delta.session != before.session
+        if others or self._points > self._room(len(chunks)):
             chunks = self._shown(delta)
+            self._points = sum(len(chunk.points) for chunk in chunks)
         replaced = delta.replaced
         if replaced.get("keyframe_poses") is not None:
             replaced = {**replaced, "keyframe_poses": self._poses.hold(replaced["keyframe_poses"])}
         if delta.edges is not None:
-            self._edges.take(delta.edges)
             replaced = {**replaced, "loops": replace(replaced["loops"], edges=self._edges.edges)}
         return self.edit(
             session=delta.session,
@@ -220,10 +224,13 @@ class Fold:
             self._chunks = tuple(held)
             return shown
         sensor = result.T_map_imu[:3, 3] if result is not None else poses[-1, :3, 3]
-        budget = room(self._point_budget, len(self._positions), len(shown), len(self._edges.edges))
-        shown = within_budget(shown, poses, sensor, budget)
+        shown = within_budget(shown, poses, sensor, self._room(len(shown)))
         self._chunks = (*shown, *others)
         return shown
+
+    def _room(self, keyframes: int) -> int:
+        """Most points that all chunks together may have now."""
+        return room(self._point_budget, len(self._positions), keyframes, len(self._edges.edges))
 
     def edit(self, *, notices: Iterable[Notice] = (), **values: Any) -> Snapshot:
         """Replace fields and add notices: the next revision."""

@@ -123,6 +123,7 @@ class LoopProcess:
                     wire.send(self._requests, request)
                 except OSError:  # it has ended; the reader says so
                     return
+                del request  # a keyframe with its cloud, which would be kept until the next one
 
     def _read(self, replies: "Connection[object, object]") -> None:
         edges, corrections = EdgesReceiver(), Transforms()

@@ -24,7 +24,8 @@ class Setup:
         start_s, duration_s: the part of that recording to process.
         resolve: parameters for recordings opened later; None keeps the present ones.
         play: begin at once. speed: to play at. breakpoints: where to pause.
-        chunk_voxel: m, see `Session`. point_budget: most points of the map that are held for pages.
+        chunk_voxel: m, see `Session`. point_budget: most points of the map that are held for pages;
+            see `app.server.chunks.room`.
         checkpoint_bytes: see `app.server.checkpoints`.
         live_folder: where a live run keeps what a process that takes over needs. revive: it is that process.
         live: where to take scans from while `recording` is `app.server.protocol.LIVE`.

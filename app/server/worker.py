@@ -149,6 +149,7 @@ class EngineProcess:
                         break
                     self._fold.apply(delta)
                     self._changed.notify_all()
+                del delta  # clouds as they were before they were thinned, which would be kept until the next one
                 there = len(self.snapshot.chunks)
                 if self._setup.live is not None and abs(there - tidied) >= TIDIED:
                     tidied = there

@@ -63,8 +63,8 @@ class AppearancePanel:
         """Explain the colours as drawn and say how many points the page holds."""
         self._legend.content = legend(view.colour_by, limits)
         self._count.content = box(
-            f'<span class="hs-note">{points:,} map points in the page, at most {budget:,}; '
-            "the whole map stays with the engine.</span>"
+            f'<span class="hs-note">{points:,} map points in the page, at most {budget:,}, and fewer '
+            "the longer the walk; the whole map stays with the engine.</span>"
         )
 
     def _next_colouring(self) -> None:

@@ -7,7 +7,9 @@ Names of nodes that were taken away are used again, since viser remembers every 
 """
 
 import heapq
+import weakref
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -32,11 +34,10 @@ _NO_POINTS: Final = np.empty((0, 3), np.float16)
 _NO_COLOURS: Final = np.empty((0, 3), np.uint8)
 _NO_POSES: Final[F32] = np.empty((0, 3, 4), np.float32)
 _LAST_ROW: Final = np.eye(4)[3]
-_STILL: Final = 1e-5
-"""Of poses (m, and of rotation matrices)."""
-_STILL_M, _STILL_RAD = 1e-3, 5e-5
-"""A cloud is drawn at most so far from where its keyframe is. Each loop moves most of a walk by some hundredths of a
-millimetre: told to the page, that is two messages for each of a thousand clouds.
+_STILL: Final[F32] = np.array([5e-5, 5e-5, 5e-5, 1e-3], np.float32)
+"""Of poses, their rotation and position in m: by more than that no cloud is drawn off its keyframe, nor coloured by
+another height. Each loop moves most of a walk by some hundredths of a millimetre: told to the page, that is two
+messages for each of a thousand clouds.
 """
 
 
@@ -54,10 +55,10 @@ class _Drawn:
 
 @dataclass(frozen=True, slots=True)
 class _Hidden:
-    """A keyframe that was gone back over. T_map_lidar, view, limits: with which it was drawn last."""
+    """A keyframe that was gone back over. T_map_imu (3, 4), view, limits: with which it was drawn last."""
 
     drawn: _Drawn
-    T_map_lidar: F64
+    T_map_imu: F32
     view: View
     limits: Limits | None
 
@@ -110,6 +111,8 @@ class MapChunks:
         self._view = View()
         self._limits: dict[ColourBy, Limits] = {}
         self._poses = _NO_POSES  # (k, 3, 4) T_map_imu of all keyframes, as they are drawn
+        self._lifts = _NO_POSES[:, 2]  # (k, 4), their third rows as they are coloured by height
+        self._given: Callable[[], F64 | None] = lambda: None  # those of the last snapshot
         self._start_ns = 0
 
     @property
@@ -128,7 +131,7 @@ class MapChunks:
             self._remove(drawn)
         self._drawn.clear()
         self._drop_hidden()
-        self._poses = _NO_POSES
+        self._poses, self._lifts, self._given = _NO_POSES, _NO_POSES[:, 2], lambda: None
         self._start_ns = start_ns
         self._limits = {ColourBy.TIME: Limits(0.0, max(duration_s, 1.0))}
 
@@ -161,7 +164,7 @@ class MapChunks:
         if kept == len(self._drawn):
             return
         limits = self._limits.get(seen.colour_by)
-        gone = [_Hidden(drawn, self._placed(drawn.chunk), seen, limits) for drawn in self._drawn[kept:]]
+        gone = [_Hidden(drawn, self._poses[drawn.chunk.index].copy(), seen, limits) for drawn in self._drawn[kept:]]
         self._hidden.extendleft(reversed(gone))
         for drawn in self._drawn[kept:]:
             if drawn.handle is not None:
@@ -214,15 +217,17 @@ class MapChunks:
         """Take the poses of now; which of the keyframes that are drawn have others, and which have their points at
         other heights.
         """
-        now, count = poses[:, :3].astype(np.float32), len(self._drawn)
-        before = self._poses[: len(now)]
-        apart = np.abs(now[: len(before)] - before)
-        turned, shifted = apart[:, :, :3] > _STILL_RAD, apart[:, :, 3] > _STILL_M
-        moved = np.asarray(turned.any(axis=(1, 2)) | shifted.any(axis=1))
-        lifted = np.asarray(turned[:, 2].any(axis=1) | shifted[:, 2])
-        if moved.any() or len(now) != len(self._poses):
-            now[: len(before)][~moved] = before[~moved]
-            self._poses = now
+        count = len(self._drawn)
+        if self._given() is poses:
+            return np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+        self._given = weakref.ref(poses)
+        now = poses[:, :3].astype(np.float32)
+        before, lifts = self._poses[: len(now)], self._lifts[: len(now)]
+        moved = np.asarray((np.abs(now[: len(before)] - before) > _STILL).any(axis=(1, 2)))
+        now[: len(before)][~moved] = before[~moved]
+        lifted = np.asarray((np.abs(now[: len(before), 2] - lifts) > _STILL).any(axis=1))
+        self._poses, self._lifts = now, now[:, 2].copy()
+        self._lifts[: len(before)][~lifted] = lifts[~lifted]
         return moved[:count], lifted[:count]
 
     def _placed(self, chunk: Chunk) -> F64:
@@ -237,14 +242,16 @@ class MapChunks:
         return None
 
     def _show_again(self, hidden: _Hidden, chunk: Chunk) -> None:
-        drawn, seen, view, T_map_lidar = hidden.drawn, hidden.view, self._view, self._placed(chunk)
-        moved = float(np.abs(T_map_lidar - hidden.T_map_lidar).max()) > _STILL
+        drawn, seen, view = hidden.drawn, hidden.view, self._view
+        moved = bool((np.abs(self._poses[chunk.index] - hidden.T_map_imu) > _STILL).any())
+        if not moved:
+            self._poses[chunk.index] = hidden.T_map_imu
         if chunk is not drawn.chunk or view.ceilings != seen.ceilings:
             drawn.chunk = chunk
             self._send(drawn)
         elif drawn.handle is not None:
             if moved:
-                drawn.handle.wxyz, drawn.handle.position = _pose(T_map_lidar)
+                drawn.handle.wxyz, drawn.handle.position = _pose(self._placed(chunk))
             if view.point_size != seen.point_size:
                 drawn.handle.point_size = view.point_size
             recolour = view.colour_by is not seen.colour_by or self._limits.get(view.colour_by) != hidden.limits

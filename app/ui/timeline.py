@@ -51,7 +51,7 @@ class TimelinePanel:
         self._latest = snapshot
         if now - self._drawn_at < _PERIOD_S or (drawn is not None and not _differs(drawn, snapshot)):
             return
-        self._drawn = replace(snapshot, trajectory=None, keyframe_poses=None)  # large, and not compared
+        self._drawn = replace(snapshot, trajectory=None, keyframe_poses=None, chunks=())  # large, and not compared
         self._drawn_at = now
         self._history.see(snapshot)
         if snapshot.result is None:

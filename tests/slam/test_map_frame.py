@@ -44,3 +44,8 @@ def test_a_long_walk_takes_no_more_memory_for_a_moment_than_it_is_large() -> Non
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 4 * (laid.positions.nbytes + laid.quaternions.nbytes)
+
+
+def test_a_correction_that_is_kept_keeps_no_others() -> None:
+    frame = MapFrame(np.arange(50), np.tile(np.eye(4), (50, 1, 1)))
+    assert frame.at(3).base is None and frame.newest.base is None

@@ -101,7 +101,7 @@ def test_a_candidate_takes_no_more_than_the_map_gives_up_for_it(server: viser.Vi
         receiver.take(wire.unpack(wire.pack(EdgesChange(not index, (candidate(MANY - index, 500 + index),), ()))))
         if index % 10 == 9:
             arches.draw(receiver.edges, poses, frozenset(Kind), None)
-    assert 0.5 < (held() - before) / MANY / (CANDIDATE_POINTS * POINT_BYTES) < 1.05
+    assert 0.5 < (held() - before) / MANY / (CANDIDATE_POINTS * POINT_BYTES) < 1
 
 
 def candidate(older: int, newer: int) -> LoopEdge:

@@ -5,6 +5,8 @@ import viser
 
 from app.server.protocol import StepFrame
 from app.slam import lie
+from app.ui.colours import ColourBy
+from app.ui.view import View
 from tests.ui.conftest import Wire
 from tests.ui.fake_engine import FakeEngine
 from tests.ui.test_scene import Drawn, chunk_nodes
@@ -42,9 +44,49 @@ def test_a_turn_that_could_be_seen_far_away_is_told(server: viser.ViserServer, w
     engine.send(StepFrame(14))
     drawn.draw()
     assert engine.snapshot.keyframe_poses is not None
-    for angle, told in ((1e-5, False), (2e-4, True)):
+    for angle, told in ((3e-5, False), (2e-4, True)):
         turned = engine.snapshot.keyframe_poses.copy()
         turned[0, :3, :3] = lie.exp(np.array([0.0, 0.0, angle])) @ turned[0, :3, :3]
         wire.clear()
         drawn.draw(keyframe_poses=turned)
         assert ("/map/keyframes/0" in wire.nodes("SetOrientationMessage")) is told
+
+
+def test_heights_that_change_little_by_little_are_coloured_anew(
+    server: viser.ViserServer, wire: Wire, engine: FakeEngine
+) -> None:
+    """Also where the clouds are moved for another axis each time, before they have risen by a millimetre."""
+    drawn = Drawn(server, engine)
+    engine.send(StepFrame(14))
+    drawn.draw(View(colour_by=ColourBy.HEIGHT))
+    assert engine.snapshot.keyframe_poses is not None
+    wire.clear()
+    for step in range(1, 41):
+        risen = engine.snapshot.keyframe_poses.copy()
+        risen[:, :3, 3] += step * np.array([0.0, 3e-4, 2e-4])
+        drawn.draw(keyframe_poses=risen)
+    coloured = [m for m in wire.messages if type(m).__name__ == "SceneNodeUpdateMessage" and "colors" in m.updates]
+    assert {m.name for m in coloured if m.name.startswith("/map/keyframes/")} == set(chunk_nodes(server))
+    assert 3 <= len(coloured) / len(chunk_nodes(server)) <= 8  # of 8 mm
+
+
+def test_what_was_hidden_a_hair_off_comes_again_as_it_was_drawn(
+    server: viser.ViserServer, wire: Wire, engine: FakeEngine
+) -> None:
+    drawn = Drawn(server, engine)
+    engine.send(StepFrame(14))
+    drawn.draw(View(colour_by=ColourBy.HEIGHT))
+    poses, chunks = engine.snapshot.keyframe_poses, engine.snapshot.chunks
+    assert poses is not None and len(chunks) > 2
+    near = poses.copy()
+    near[:, :3, 3] += 4e-4
+    drawn.draw(keyframe_poses=near)
+    wire.clear()
+    for there in (1, len(chunks), 1, len(chunks)):
+        drawn.draw(keyframe_poses=near[:there], chunks=chunks[:there])
+    sent = {type(m).__name__ for m in wire.messages if getattr(m, "name", "").startswith("/map/keyframes/")}
+    assert sent == {"SetSceneNodeVisibilityMessage"}
+    wire.clear()
+    near[:, :3, 3] += 8e-4  # 1.2 mm from where they are drawn
+    drawn.draw(keyframe_poses=near)
+    assert set(wire.nodes("SetPositionMessage")) >= set(chunk_nodes(server))

@@ -131,7 +131,7 @@ class LoopEdges:
         if before is not None and before.shape == lines.shape and np.allclose(before, lines, atol=_STILL_M):
             return False
         if len(lines):
-            self._drawn[node] = lines
+            self._drawn[node] = lines.copy()  # of a block, without all the others
             return True
         self._drawn.pop(node, None)
         for key in [key for key in self._nodes if key == node or key.startswith(f"{node}-")]:
