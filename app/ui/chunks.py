@@ -22,7 +22,7 @@ from app.slam.types import F32, F64, U8
 from app.ui.ceiling import below_ceiling
 from app.ui.colours import MAP_OF, TABLES, ColourBy, Limits, grown, label_colours, value_colours
 from app.ui.geometry import wxyz
-from app.ui.view import View
+from app.ui.view import STILL_M, View
 
 Chosen: TypeAlias = npt.NDArray[np.bool_] | slice
 """Which points of a chunk."""
@@ -34,10 +34,9 @@ _NO_POINTS: Final = np.empty((0, 3), np.float16)
 _NO_COLOURS: Final = np.empty((0, 3), np.uint8)
 _NO_POSES: Final[F32] = np.empty((0, 3, 4), np.float32)
 _LAST_ROW: Final = np.eye(4)[3]
-_STILL: Final[F32] = np.array([5e-5, 5e-5, 5e-5, 1e-3], np.float32)
-"""Of poses, their rotation and position in m: by more than that no cloud is drawn off its keyframe, nor coloured by
-another height. Each loop moves most of a walk by some hundredths of a millimetre: told to the page, that is two
-messages for each of a thousand clouds.
+_STILL: Final[F32] = np.array([5e-5, 5e-5, 5e-5, STILL_M], np.float32)
+"""Of a pose's rotation and position (m): no cloud is drawn farther off its keyframe, nor coloured by another height.
+Each that is moved is two messages.
 """
 
 

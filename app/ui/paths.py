@@ -8,13 +8,12 @@ import viser
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.geometry import wxyz
+from app.ui.view import STILL_M
 
 PATH_COLOUR: Final = (255, 92, 141)
 TRUTH_COLOUR: Final = (240, 244, 250)
 BLOCK: Final = 256
 """Segments per node: as the walk goes on, only the newest node is sent again."""
-_STILL_M: Final = 1e-3
-"""A block is drawn at most so far from where it is: each loop moves most of a walk by less."""
 _MOST_TRUTH_POINTS: Final = 4000
 
 
@@ -54,7 +53,7 @@ class Trajectory:
                         f"{self._root}/{index}", segments(part), self._colour, thickness=3.0, thickness_units="screen"
                     )
                 )
-            elif len(part) != len(self._drawn[index]) or np.abs(part - self._drawn[index]).max() > _STILL_M:
+            elif len(part) != len(self._drawn[index]) or np.abs(part - self._drawn[index]).max() > STILL_M:
                 self._drawn[index] = part
                 self._blocks[index].points = segments(part)
             self._blocks[index].visible = visible

@@ -1,8 +1,13 @@
 """How the session is looked at: what every page of it shares and the engine never hears of."""
 
 from dataclasses import dataclass
+from typing import Final
 
 from app.ui.colours import ColourBy
+
+STILL_M: Final = 1e-3
+"""What moves by no more since it was drawn is not drawn anew: each loop moves most of a walk by some hundredths of a
+millimetre."""
 
 
 @dataclass(frozen=True, slots=True)

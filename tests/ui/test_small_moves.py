@@ -1,6 +1,7 @@
 """Loops move most of a walk by next to nothing: the page is not told of that, until it adds up."""
 
 import numpy as np
+import pytest
 import viser
 
 from app.server.protocol import StepFrame
@@ -14,12 +15,18 @@ from tests.ui.test_scene import Drawn, chunk_nodes
 STEP_M, STEPS = 3e-4, 30
 
 
-def test_a_map_that_drifts_is_told_of_by_the_millimetre(
-    server: viser.ViserServer, wire: Wire, engine: FakeEngine
-) -> None:
+@pytest.fixture
+def drawn(server: viser.ViserServer, engine: FakeEngine) -> Drawn:
+    """A walk of three keyframes, coloured by height."""
     drawn = Drawn(server, engine)
     engine.send(StepFrame(14))
-    drawn.draw()
+    drawn.draw(View(colour_by=ColourBy.HEIGHT))
+    return drawn
+
+
+def test_a_map_that_drifts_is_told_of_by_the_millimetre(
+    drawn: Drawn, server: viser.ViserServer, wire: Wire, engine: FakeEngine
+) -> None:
     poses, walk = engine.snapshot.keyframe_poses, engine.snapshot.trajectory
     assert poses is not None and walk is not None and len(chunk_nodes(server)) > 2
     clouds, paths = [], []
@@ -39,10 +46,7 @@ def test_a_map_that_drifts_is_told_of_by_the_millimetre(
     assert {len(sent) for sent in clouds} == {0, len(chunk_nodes(server))}
 
 
-def test_a_turn_that_could_be_seen_far_away_is_told(server: viser.ViserServer, wire: Wire, engine: FakeEngine) -> None:
-    drawn = Drawn(server, engine)
-    engine.send(StepFrame(14))
-    drawn.draw()
+def test_a_turn_that_could_be_seen_far_away_is_told(drawn: Drawn, wire: Wire, engine: FakeEngine) -> None:
     assert engine.snapshot.keyframe_poses is not None
     for angle, told in ((3e-5, False), (2e-4, True)):
         turned = engine.snapshot.keyframe_poses.copy()
@@ -53,12 +57,9 @@ def test_a_turn_that_could_be_seen_far_away_is_told(server: viser.ViserServer, w
 
 
 def test_heights_that_change_little_by_little_are_coloured_anew(
-    server: viser.ViserServer, wire: Wire, engine: FakeEngine
+    drawn: Drawn, server: viser.ViserServer, wire: Wire, engine: FakeEngine
 ) -> None:
     """Also where the clouds are moved for another axis each time, before they have risen by a millimetre."""
-    drawn = Drawn(server, engine)
-    engine.send(StepFrame(14))
-    drawn.draw(View(colour_by=ColourBy.HEIGHT))
     assert engine.snapshot.keyframe_poses is not None
     wire.clear()
     for step in range(1, 41):
@@ -71,11 +72,8 @@ def test_heights_that_change_little_by_little_are_coloured_anew(
 
 
 def test_what_was_hidden_a_hair_off_comes_again_as_it_was_drawn(
-    server: viser.ViserServer, wire: Wire, engine: FakeEngine
+    drawn: Drawn, server: viser.ViserServer, wire: Wire, engine: FakeEngine
 ) -> None:
-    drawn = Drawn(server, engine)
-    engine.send(StepFrame(14))
-    drawn.draw(View(colour_by=ColourBy.HEIGHT))
     poses, chunks = engine.snapshot.keyframe_poses, engine.snapshot.chunks
     assert poses is not None and len(chunks) > 2
     near = poses.copy()

@@ -15,6 +15,7 @@ from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.loops.kinds import COLOURS, Kind, kind_of, name
+from app.ui.view import STILL_M
 from app.ui.widgets import unchanged
 
 _RISE: Final = (0.7, 0.12)
@@ -26,7 +27,6 @@ _CHOSEN: Final[Rgb] = (255, 255, 255)
 _CHOSEN_WIDTH: Final = 5.0
 _PICK_RAD: Final = np.radians(1.5)
 _LABEL: Final = np.array([0.0, 0.0, 0.5])
-_STILL_M: Final = 1e-3
 BLOCK: Final = 256
 """Loops per node: who walks back finds one with every keyframe, and only the newest node is sent again."""
 _SAMPLES: Final = np.linspace(0.0, 1.0, 12)
@@ -128,7 +128,7 @@ class LoopEdges:
     def _differs(self, node: str, lines: F32) -> bool:
         """Whether a node has to be sent; one of no lines is taken away."""
         before = self._drawn.get(node)
-        if before is not None and before.shape == lines.shape and np.allclose(before, lines, atol=_STILL_M):
+        if before is not None and before.shape == lines.shape and np.allclose(before, lines, atol=STILL_M):
             return False
         if len(lines):
             self._drawn[node] = lines.copy()  # of a block, without all the others
