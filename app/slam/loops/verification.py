@@ -19,6 +19,8 @@ from app.slam.types import F64, I64
 
 Flags = npt.NDArray[np.bool_]
 
+ONE_THREAD = 1
+"""Given by place: by name, each call would leave an entry in Python's table of strings, which then grows for ever."""
 NEIGHBOURS = 10
 """Points of a patch, to estimate its normal."""
 FLAT_M = 0.04
@@ -95,8 +97,8 @@ class Fit:
 
 def prepare(submap: Submap) -> Prepared:
     points = submap.points.astype(np.float64)
-    tree = small_gicp.KdTree(points, num_threads=1)
-    index, _ = tree.batch_knn_search(points, NEIGHBOURS, num_threads=1)
+    tree = small_gicp.KdTree(points, ONE_THREAD)
+    index, _ = tree.batch_knn_search(points, NEIGHBOURS, ONE_THREAD)
     normals, flat = np.empty_like(points), np.empty(len(points), np.bool_)
     patches.planes(points, np.asarray(index, np.int64), submap.eyes, FLAT_M, normals, flat)
     candidates = np.flatnonzero(flat)
@@ -182,5 +184,5 @@ def _near(points: F64, origin: F64) -> Flags:
 
 
 def _nearest(target: Prepared, points: F64) -> tuple[I64, F64]:
-    index, squared = target.tree.batch_nearest_neighbor_search(points, num_threads=1)
+    index, squared = target.tree.batch_nearest_neighbor_search(points, ONE_THREAD)
     return np.asarray(index, np.int64), np.asarray(squared, np.float64)
