@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 
@@ -32,32 +31,34 @@ class Factor:
         return self.loop or (self.first, self.second)
 
 
-class Odometry:
-    """Factors from each pose to the next, as rows of numbers: every keyframe's is kept."""
+class Factors:
+    """One after the other, as rows of numbers, which lie on disk once they are many."""
 
     def __init__(self) -> None:
+        self._names = Rows((5,), np.int64)  # first, second, robust, and of which loop; -1 for none
         self._transforms = Rows((4, 4), np.float64)
         self._covariances = Rows((6, 6), np.float64)
 
     def __len__(self) -> int:
-        return len(self._transforms)
+        return len(self._names)
 
     def __getitem__(self, index: int) -> Factor:
-        """From pose `index` to the one after it."""
-        return Factor(index, index + 1, self._transforms.view()[index], self._covariances.view()[index])
+        first, second, robust, *loop = self._names.view()[index].tolist()
+        T, covariance = self._transforms.view()[index], self._covariances.view()[index]
+        return Factor(first, second, T, covariance, bool(robust), None if loop[0] < 0 else (loop[0], loop[1]))
 
-    def __iter__(self) -> Iterator[Factor]:
-        return (self[index] for index in range(len(self)))
+    def between(self, begin: int, end: int) -> Iterator[Factor]:
+        return (self[index] for index in range(begin, end))
 
     def append(self, factor: Factor) -> None:
-        """To the next pose."""
+        self._names.append((factor.first, factor.second, factor.robust, *(factor.loop or (-1, -1))))
         self._transforms.append(factor.T_first_second)
         self._covariances.append(factor.covariance)
 
     def cut(self, count: int) -> None:
         """Keep the first `count`."""
-        self._transforms.go_to(count)
-        self._covariances.go_to(count)
+        for rows in (self._names, self._transforms, self._covariances):
+            rows.go_to(count)
 
 
 Step = Factor | tuple[Factor, ...]
@@ -68,19 +69,21 @@ class Steps:
     """What was done to a graph, in order."""
 
     def __init__(self) -> None:
-        self._odometry = Odometry()
-        self._loops: list[tuple[int, tuple[Factor, ...]]] = []  # with how much odometry before them
+        self._odometry, self._loops = Factors(), Factors()
+        self._closed = Rows((2,), np.int64)  # how many of both there were after each step that was loops
 
     def __iter__(self) -> Iterator[Step]:
-        odometry, gone = iter(self._odometry), 0
-        for count, loops in self._loops:
-            yield from islice(odometry, count - gone)
-            yield loops
-            gone = count
-        yield from odometry
+        count = looped = 0
+        for after, loops in self._closed.view().tolist():
+            yield from self._odometry.between(count, after)
+            yield tuple(self._loops.between(looped, loops))
+            count, looped = after, loops
+        yield from self._odometry.between(count, len(self._odometry))
 
     def append(self, step: Step) -> None:
         if isinstance(step, Factor):
             self._odometry.append(step)
         else:
-            self._loops.append((len(self._odometry), step))
+            for loop in step:
+                self._loops.append(loop)
+            self._closed.append((len(self._odometry), len(self._loops)))

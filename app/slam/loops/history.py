@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.slam.loops.factors import Factor, Odometry, Step
+from app.slam.loops.factors import Factor, Factors, Step
 from app.slam.loops.scan_context import Contexts, ScanContext
 from app.slam.loops.search import Found
 from app.slam.loops.types import LoopEdge
@@ -31,10 +31,11 @@ class History:
     def __init__(self) -> None:
         self.ends: dict[int, Found] = {}
         self._params: list[Loops] = []
-        self._updates: dict[int, tuple[LoopEdge, ...]] = {}  # of the keyframes with which there were any
+        self._updates: list[LoopEdge] = []
+        self._updated = Rows((), np.int64, [0])  # how many of those before the first keyframe, and after each
         self._contexts = Contexts()
-        self._described = Rows((), np.int64, [0])  # how many of those before the first keyframe, and after each
-        self._odometry = Odometry()
+        self._described = Rows((), np.int64, [0])  # the same of these
+        self._odometry = Factors()  # from each keyframe to the next
 
     def __len__(self) -> int:
         return len(self._params)
@@ -42,12 +43,13 @@ class History:
     def __getitem__(self, index: int) -> Record:
         begin, end = self._described.view()[index : index + 2]
         contexts = tuple(self._contexts[number] for number in range(begin, end))
-        return Record(self._params[index], Found(contexts, self._updates.get(index, ())))
+        first, last = self._updated.view()[index : index + 2]
+        return Record(self._params[index], Found(contexts, tuple(self._updates[first:last])))
 
     def append(self, record: Record, odometry: Factor | None) -> None:
         """The next keyframe, with the odometry to it; None for the first."""
-        if record.found.updates:
-            self._updates[len(self)] = record.found.updates
+        self._updates += record.found.updates
+        self._updated.append(len(self._updates))
         for context in record.found.contexts:
             self._contexts.append(context)
         self._described.append(len(self._contexts))
@@ -59,7 +61,8 @@ class History:
     def cut(self, count: int) -> None:
         """Keep the first `count`."""
         del self._params[count:]
-        self._updates = {index: updates for index, updates in self._updates.items() if index < count}
+        self._updated.go_to(count + 1)
+        del self._updates[self._updated.view()[-1] :]
         self._described.go_to(count + 1)
         self._contexts.cut(int(self._described.view()[-1]))
         self._odometry.cut(max(count - 1, 0))
@@ -73,7 +76,7 @@ class History:
     def updates(self, count: int, *, finished: bool) -> list[LoopEdge]:
         """The same of candidates."""
         end = self.ends[count].updates if finished else ()
-        return [*(edge for index in range(count) for edge in self._updates.get(index, ())), *end]
+        return [*self._updates[: self._updated.view()[count]], *end]
 
     def odometry_to(self, index: int) -> Factor | None:
         """From the keyframe before; None for the first."""
@@ -81,7 +84,7 @@ class History:
 
     def odometry(self, count: int) -> list[Factor]:
         """Between the first `count`."""
-        return [self._odometry[index] for index in range(count - 1)]
+        return list(self._odometry.between(0, count - 1))
 
     def steps(self, count: int, loops: Mapping[int, Iterable[Factor]]) -> Iterator[Step]:
         """The graph of the first `count`, in the order in which keyframes came, and loops with them."""
