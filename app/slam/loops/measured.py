@@ -58,9 +58,10 @@ class Evidence:
 _POSE, _COVARIANCE = 12, 21
 """Numbers: the upper three rows of the one, the upper triangle of the other."""
 _EVIDENCE: Final = struct.Struct("=9fi")
-_EVIDENCE_AT: Final = 8 * (_POSE + _COVARIANCE)
+_EVIDENCE_AT: Final = 8 * _POSE
+_COVARIANCE_AT: Final = _EVIDENCE_AT + _EVIDENCE.size
 _ROW: Final = np.dtype(
-    [("pose", np.float64, (3, 4)), ("covariance", np.float64, _COVARIANCE), ("evidence", np.void, _EVIDENCE.size)]
+    [("pose", np.float64, (3, 4)), ("evidence", np.void, _EVIDENCE.size), ("covariance", np.float64, _COVARIANCE)]
 )
 _UPPER: Final = np.triu_indices(6)
 _WHERE: Final = np.empty((6, 6), np.intp)
@@ -72,7 +73,8 @@ _LAST_ROW: Final = np.eye(4)[3].tobytes()
 class Measured(bytes):
     """A measured pose with its covariance, which come out of it to the last bit, and the evidence, to seven digits.
 
-    Two small arrays and ten floats would take three times the memory of their numbers.
+    Two small arrays and ten floats would take three times the memory of their numbers. Through a pipe the covariance,
+    half of them, stays behind: it is of use only where loops are looked for.
     """
 
     __slots__ = ()
@@ -81,7 +83,10 @@ class Measured(bytes):
     def of(cls, T_older_newer: F64, covariance: F64, evidence: Evidence) -> "Measured":
         """From (4, 4), whose last row is 0 0 0 1, and (6, 6), symmetric."""
         pose, triangle = np.asarray(T_older_newer, np.float64)[:3], np.asarray(covariance, np.float64)[_UPPER]
-        return cls(pose.tobytes() + triangle.tobytes() + _packed(evidence))
+        return cls(pose.tobytes() + _packed(evidence) + triangle.tobytes())
+
+    def __reduce__(self) -> tuple[type["Measured"], tuple[bytes]]:
+        return Measured, (self[:_COVARIANCE_AT],)
 
     @property
     def T_older_newer(self) -> F64:
@@ -90,8 +95,8 @@ class Measured(bytes):
 
     @property
     def covariance(self) -> F64:
-        """(6, 6), read-only."""
-        whole = np.frombuffer(self, np.float64, _COVARIANCE, 8 * _POSE)[_WHERE]
+        """(6, 6), read-only. Raises ValueError where this came through a pipe."""
+        whole = np.frombuffer(self, np.float64, _COVARIANCE, _COVARIANCE_AT)[_WHERE]
         whole.setflags(write=False)
         return whole
 
@@ -101,7 +106,7 @@ class Measured(bytes):
 
     def by(self, evidence: Evidence) -> "Measured":
         """The same with other evidence."""
-        return Measured(self[:_EVIDENCE_AT] + _packed(evidence))
+        return Measured(self[:_EVIDENCE_AT] + _packed(evidence) + self[_COVARIANCE_AT:])
 
 
 def _packed(evidence: Evidence) -> bytes:

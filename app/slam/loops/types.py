@@ -104,7 +104,7 @@ class LoopEdge:
 
     @property
     def covariance(self) -> F64:
-        """(6, 6), read-only."""
+        """(6, 6), read-only. Raises ValueError where this came through a pipe."""
         return self.measured.covariance
 
     @property
