@@ -23,7 +23,7 @@ COARSEST_LEVEL: Final = 8
 EMPTY_LEVEL: Final = COARSEST_LEVEL + 1
 MOST_SHOWN: Final = 1000
 """Keyframes that have points: each costs the page a drawing of its own, and the server some kilobytes."""
-FRAME_POINTS, KEYFRAME_POINTS, CANDIDATE_POINTS = 5, 22, 33
+FRAME_POINTS, KEYFRAME_POINTS, CANDIDATE_POINTS = 5, 22, 36
 """As much memory as so many points of the map (29 bytes each with what viser keeps) take, here and in the page's
 scene: a frame's place on the path, a keyframe without its points, a loop candidate with its arch."""
 _SLACK: Final = 0.97

@@ -33,7 +33,7 @@ def test_room_shrinks_with_the_walk_from_the_whole_budget_to_half_of_it(
 
 def test_who_lets_the_page_draw_few_points_is_not_left_fewer_as_long_as_memory_is_that_of_many() -> None:
     assert room(100_000, 36_000, 8_000, 5_000) == 100_000  # an hour's walk
-    assert room(POINT_BUDGET, 36_000, 8_000, 5_000) == POINT_BUDGET - 180_000 - 176_000 - 165_000
+    assert room(POINT_BUDGET, 36_000, 8_000, 5_000) == POINT_BUDGET - 180_000 - 176_000 - 180_000
 
 
 def test_a_reader_holds_fewer_points_the_longer_the_walk(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -105,7 +105,10 @@ def test_a_candidate_takes_no_more_than_the_map_gives_up_for_it(server: viser.Vi
 
 
 def candidate(older: int, newer: int) -> LoopEdge:
-    """One of eight counts."""
+    """One of eight counts; every other one has words of its own."""
     measured = Measured.of(np.eye(4), np.eye(6), Evidence(*np.random.default_rng(newer).random(9), 3))
     first = (older + older % 8, newer - newer % 8) if newer % 8 else None
-    return LoopEdge(older, newer, newer + 8, measured, Verdict.ACCEPTED, "{}; 3 others agree", represented_by=first)
+    verdict, words = Verdict.ACCEPTED, "{}; 3 others agree"
+    if newer % 2:
+        verdict, words = Verdict.REJECTED, f"the residual is {newer:05d} m, and that is more than there may be of it"
+    return LoopEdge(older, newer, newer + 8, measured, verdict, words, represented_by=first)

@@ -34,7 +34,7 @@ class History:
         self._updates: list[LoopEdge] = []
         self._updated = Rows((), np.int64, [0])  # how many of those before the first keyframe, and after each
         self._contexts = Contexts()
-        self._described = Rows((), np.int64, [0])  # the same of these
+        self._described = Rows((), np.int64, [0])  # the same of contexts
         self._odometry = Factors()  # from each keyframe to the next
 
     def __len__(self) -> int:
@@ -84,7 +84,7 @@ class History:
 
     def odometry(self, count: int) -> list[Factor]:
         """Between the first `count`."""
-        return list(self._odometry.between(0, count - 1))
+        return list(self._odometry.stretch(0, count - 1))
 
     def steps(self, count: int, loops: Mapping[int, Iterable[Factor]]) -> Iterator[Step]:
         """The graph of the first `count`, in the order in which keyframes came, and loops with them."""

@@ -1,4 +1,7 @@
-"""What was measured of a candidate loop, and what speaks for it; kept small, since three processes hold thousands."""
+"""What was measured of a candidate loop, and what speaks for it; kept small, since three processes hold thousands.
+
+Pickled, as for a pipe, it leaves its covariance behind, half of it: that is of use only where loops are looked for.
+"""
 
 import struct
 import sys
@@ -7,7 +10,6 @@ from dataclasses import astuple, dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from app.slam.types import F64
 
@@ -60,9 +62,6 @@ _POSE, _COVARIANCE = 12, 21
 _EVIDENCE: Final = struct.Struct("=9fi")
 _EVIDENCE_AT: Final = 8 * _POSE
 _COVARIANCE_AT: Final = _EVIDENCE_AT + _EVIDENCE.size
-_ROW: Final = np.dtype(
-    [("pose", np.float64, (3, 4)), ("evidence", np.void, _EVIDENCE.size), ("covariance", np.float64, _COVARIANCE)]
-)
 _UPPER: Final = np.triu_indices(6)
 _WHERE: Final = np.empty((6, 6), np.intp)
 """In the triangle, of each entry."""
@@ -73,8 +72,7 @@ _LAST_ROW: Final = np.eye(4)[3].tobytes()
 class Measured(bytes):
     """A measured pose with its covariance, which come out of it to the last bit, and the evidence, to seven digits.
 
-    Two small arrays and ten floats would take three times the memory of their numbers. Through a pipe the covariance,
-    half of them, stays behind: it is of use only where loops are looked for.
+    Two small arrays and ten floats would take three times the memory of their numbers.
     """
 
     __slots__ = ()
@@ -95,8 +93,8 @@ class Measured(bytes):
 
     @property
     def covariance(self) -> F64:
-        """(6, 6), read-only. Raises ValueError where this came through a pipe."""
-        whole = np.frombuffer(self, np.float64, _COVARIANCE, _COVARIANCE_AT)[_WHERE]
+        """(6, 6), read-only. Raises ValueError if it was left behind."""
+        whole = covariances([self])[0]
         whole.setflags(write=False)
         return whole
 
@@ -117,16 +115,15 @@ def _packed(evidence: Evidence) -> bytes:
 
 def poses(measured: Iterable[Measured]) -> F64:
     """(n, 4, 4) of many at once."""
-    upper = _rows(measured)["pose"]
+    upper = np.frombuffer(b"".join(one[:_EVIDENCE_AT] for one in measured), np.float64).reshape(-1, 3, 4)
     out = np.tile(np.eye(4), (len(upper), 1, 1))
     out[:, :3] = upper
     return out
 
 
 def covariances(measured: Iterable[Measured]) -> F64:
-    """(n, 6, 6) of many at once."""
-    return np.asarray(_rows(measured)["covariance"][:, _WHERE])
-
-
-def _rows(measured: Iterable[Measured]) -> npt.NDArray[np.void]:
-    return np.frombuffer(b"".join(measured), _ROW)
+    """(n, 6, 6) of many at once. Raises ValueError if one was left behind."""
+    triangles = [one[_COVARIANCE_AT:] for one in measured]
+    if not all(triangles):
+        raise ValueError("a covariance was left behind: it is only where loops are looked for")
+    return np.asarray(np.frombuffer(b"".join(triangles), np.float64).reshape(-1, _COVARIANCE)[:, _WHERE])

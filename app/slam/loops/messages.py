@@ -110,8 +110,8 @@ class LoopState:
         count: keyframes. known: how many `GoTo` can go to. finished: whether `Finish` holds.
         corrections: (count, 4, 4), T_map_odom at each keyframe: its T_map_imu is
             corrections[i] @ T_odom_imu.
-        edges: all candidates as they count now, by keyframes. changed: those of them that are new by
-            this request, or have another verdict, weight or measurement.
+        edges: all candidates as they count now, by keyframes; from another process without covariances. changed:
+            those of them that are new by this request, or have another verdict, weight or measurement.
         undo, redo: commands in force and taken back; the last of each is the next one.
         notices: new since the last reply.
     """

@@ -52,7 +52,7 @@ class LoopEdge:
         older, newer: the keyframes. decided_at: newest keyframe when it got its verdict; from then on
             an accepted loop takes effect.
         measured: T_older_newer of the IMU frames, its covariance, rotation then translation, in the
-            newer's IMU frame (right perturbation), and the evidence.
+            newer's IMU frame (right perturbation), which pickling leaves behind, and the evidence.
         verdict, words: and why; `SUMMARY` in the words stands for that of the evidence, so that many share them.
         origin: who proposed it. overruled: whether the verdict is the user's.
         weight: the covariance is divided by it in the graph; that of no other, also of those that repeat it.
@@ -104,7 +104,7 @@ class LoopEdge:
 
     @property
     def covariance(self) -> F64:
-        """(6, 6), read-only. Raises ValueError where this came through a pipe."""
+        """(6, 6), read-only. Raises ValueError in another process than that where loops are looked for."""
         return self.measured.covariance
 
     @property
