@@ -94,9 +94,9 @@ class Measured(bytes):
     @property
     def covariance(self) -> F64:
         """(6, 6), read-only. Raises ValueError if it was left behind."""
-        whole = covariances([self])[0]
+        whole = covariances([self])
         whole.setflags(write=False)
-        return whole
+        return np.asarray(whole[0])
 
     @property
     def evidence(self) -> Evidence:
