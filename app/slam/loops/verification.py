@@ -20,7 +20,7 @@ from app.slam.types import F64, I64
 Flags = npt.NDArray[np.bool_]
 
 ONE_THREAD = 1
-"""Given by place: by name, each call would leave an entry in Python's table of strings, which then grows for ever."""
+"""Given by place: by name, each call leaves a dead entry in Python's table of strings, which is doubled for them."""
 NEIGHBOURS = 10
 """Points of a patch, to estimate its normal."""
 FLAT_M = 0.04
