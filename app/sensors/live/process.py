@@ -359,11 +359,12 @@ def _serve(
         return
     log.info("Receiving from %s", ", ".join(filter(None, (lidar, imu))))
     if death:
+        lost = f"; about {known.waiting} scans that waited for the engine are lost" if known.waiting else ""
         into = f"; recording goes on in {record}" if record else ""
         source.tell(
             "restarted",
             f"the process that receives had ended unexpectedly ({death}) and was started again,"
-            f" nothing was received for {(time.time_ns() - known.at_ns) * 1e-9:.1f} s{into}",
+            f" nothing was received for {(time.time_ns() - known.at_ns) * 1e-9:.1f} s{lost}{into}",
         )
     desk = Desk(source, known.counters.restarts * _NUMBERS)
     source.set_absent(True)

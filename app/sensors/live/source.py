@@ -27,7 +27,7 @@ class Known:
 
     Attributes:
         at_ns: when, by the host's clock. counters: so far. settled: None while it is not.
-        pairing: where it was. recorded: bytes written so far.
+        pairing: where it was. recorded: bytes written so far. waiting: scans that nobody has taken yet.
     """
 
     at_ns: int
@@ -35,6 +35,7 @@ class Known:
     settled: Settled | None = None
     pairing: Sequencer | None = None
     recorded: int = 0
+    waiting: int = 0
 
 
 class LiveSource:
@@ -97,7 +98,8 @@ class LiveSource:
         """For a source that takes the place of this one. Not while another thread polls."""
         state = self.state()
         pairing = self._sequencer.tail()
-        return Known(time.time_ns(), state.counters, self._intake.settled(), pairing, state.recorded or 0)
+        recorded, waiting = state.recorded or 0, state.backlog
+        return Known(time.time_ns(), state.counters, self._intake.settled(), pairing, recorded, waiting)
 
     def tell(self, kind: Kind, text: str) -> None:
         """Give this as news to whoever polls."""

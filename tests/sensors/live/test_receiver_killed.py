@@ -37,13 +37,13 @@ class Walk:
         self.events: list[Event] = []
         self._began_s = time.monotonic()
 
-    def turn(self, count: int) -> int:
+    def turn(self, count: int, *, polling: bool = True) -> int:
         """So many, of the sensor that turned all the time. Returns the number of the first."""
         first = math.ceil(self._now() + 5)
         packets = sensor.turns(count, start_ns=sensor.START_NS + first * TURN_NS)
         thread = threading.Thread(target=self._send, args=(first, packets))
         thread.start()
-        while thread.is_alive():
+        while polling and thread.is_alive():
             self.poll()
         thread.join()
         return first
@@ -145,6 +145,19 @@ def test_a_receiver_that_is_killed_comes_back_and_records_into_a_further_file(tm
     assert last - 1 in recorded(record), "what was on disk stays readable"
     assert (tmp_path / "walk-2.mcap").read_bytes() == b"of somebody else"
     assert set(recorded(tmp_path / "walk-3.mcap")) >= set(range(first + 1, first + 6))
+
+
+def test_scans_that_waited_for_the_engine_when_it_died_are_told(tmp_path: Path) -> None:
+    with walking(tmp_path / "walk.mcap") as (process, client, walk):
+        walk.until(walk.turn(16) + 13)
+        walk.turn(8, polling=False)
+        waiting = client.state().backlog
+        assert waiting >= 5
+        time.sleep(0.5)  # what is known is told five times a second
+        kill(process)
+        while not (told := [e for e in walk.events if isinstance(e, Status) and e.kind == "restarted"]):
+            walk.poll()
+    assert f"about {waiting} scans that waited for the engine are lost" in told[0].text
 
 
 def test_a_receiver_that_keeps_dying_is_given_up_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
