@@ -359,7 +359,7 @@ def _serve(
         return
     log.info("Receiving from %s", ", ".join(filter(None, (lidar, imu))))
     if death:
-        lost = f"; about {known.waiting} scans that waited for the engine are lost" if known.waiting else ""
+        lost = f", scans lost that waited for the engine: {known.waiting} by the last count" if known.waiting else ""
         into = f"; recording goes on in {record}" if record else ""
         source.tell(
             "restarted",

@@ -128,7 +128,7 @@ class LoopEdges:
     def _differs(self, node: str, lines: F32) -> bool:
         """Whether a node has to be sent; one of no lines is taken away."""
         before = self._drawn.get(node)
-        if before is not None and before.shape == lines.shape and np.allclose(before, lines, atol=STILL_M):
+        if before is not None and before.shape == lines.shape and np.allclose(before, lines, rtol=0.0, atol=STILL_M):
             return False
         if len(lines):
             self._drawn[node] = lines.copy()  # of a block, without all the others

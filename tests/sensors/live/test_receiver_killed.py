@@ -157,7 +157,7 @@ def test_scans_that_waited_for_the_engine_when_it_died_are_told(tmp_path: Path) 
         kill(process)
         while not (told := [e for e in walk.events if isinstance(e, Status) and e.kind == "restarted"]):
             walk.poll()
-    assert f"about {waiting} scans that waited for the engine are lost" in told[0].text
+    assert f"scans lost that waited for the engine: {waiting} by the last count" in told[0].text
 
 
 def test_a_receiver_that_keeps_dying_is_given_up_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
