@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from app.sensors.live import messages
-from app.sensors.live.difop import Calibration, Difop, read_angles, write_difop
+from app.sensors.live.difop import NOMINAL, Calibration, Difop, read_angles, write_difop
 from app.sensors.live.firings import firings_of, fit_angles, rate_of
 from app.sensors.live.foxglove_server import FoxgloveServer, Offer
 from app.sensors.live.imu_udp import ImuSample, write_imu
@@ -64,7 +64,9 @@ def packets_of(
     first = _first_scans(recording)
     rate = rate_of(first)
     calibration = angles or fit_angles(first, model, rate)
-    difop = Difop(rpm=60 * rate, serial="68656d690001", calibration=calibration)
+    # A packet's angles have two decimals, the nominal ones four: who is not told any others takes these.
+    own = None if calibration.same(NOMINAL) else calibration
+    difop = Difop(rpm=60 * rate, serial="68656d690001", calibration=own)
     writer = PacketWriter(model)
     waiting: list[Sent] = []
     number = samples = 0

@@ -18,6 +18,12 @@ from app.slam.types import F64, I64, U8, U16, Scan
 _CENTI = 100.0
 MISFIT_M = 0.05
 """Points this far from the ray they would have to be on (95 of 100 are closer) are not of this sensor."""
+_CUT_DEG = 4.0
+"""Scans that begin this near are cut where the azimuth passes 0."""
+_LEAST_TURN = 30.0
+"""deg; from less of a turn its speed is not read off."""
+_FITS, _OUTLYING = 3, 4.0
+"""Straight lines through the azimuths, each without points so many times the median beside the one before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +51,11 @@ def firings_of(scan: Scan, calibration: Calibration = NOMINAL, model: Model = BP
     """
     channel = np.argsort(calibration.rings)[np.minimum(scan.ring, CHANNELS - 1)]
     block, base_ns = _blocks(scan, channel, model)
-    per_block = TURN * rate_hz * model.block_ns * 1e-9
-    turned = per_block / _CENTI * (block + model.firing_offsets_ns[channel] / model.block_ns)
-    start = _start_deg(scan, channel, turned, calibration)
+    share = model.firing_offsets_ns[channel] / model.block_ns
     blocks = int(block.max()) + 1
-    raw = _wrapped(start) * _CENTI + per_block * np.arange(blocks)
-    if abs(raw[0]) < 20 * per_block:  # cut where the azimuth passes 0: keep the cut between the same blocks
+    start, per_block = _turning(scan, channel, block + share, 360.0 * rate_hz * model.block_ns * 1e-9, calibration)
+    raw = _CENTI * (_wrapped(start) + per_block * np.arange(blocks))
+    if abs(raw[0]) < _CENTI * _CUT_DEG:  # keep the cut between the same blocks
         raw = np.clip(raw, 0, TURN - 1)
     azimuth = np.rint(raw).astype(np.int64) % TURN
 
@@ -58,8 +63,7 @@ def firings_of(scan: Scan, calibration: Calibration = NOMINAL, model: Model = BP
     head = np.radians(azimuth[block] / _CENTI)
     lever = np.column_stack([model.rx * np.cos(head), -model.rx * np.sin(head), np.full(len(head), model.rz)])
     elevation = np.radians(calibration.elevations_deg[channel])
-    share = model.firing_offsets_ns[channel] / model.block_ns
-    at = head + np.radians(per_block / _CENTI * share + calibration.horizontal_deg[channel])
+    at = head + np.radians(per_block * share + calibration.horizontal_deg[channel])
     ray = np.column_stack([np.cos(elevation) * np.cos(at), -np.cos(elevation) * np.sin(at), np.sin(elevation)])
     count = np.rint(np.linalg.norm(points - lever, axis=1) / model.range_step)
     misfit = float(
@@ -90,18 +94,20 @@ def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> C
     """The unit's angles from a few of its scans; the nominal ones, if they explain the points."""
     elevations: list[list[F64]] = [[] for _ in range(CHANNELS)]
     sideways: list[list[F64]] = [[] for _ in range(CHANNELS)]
+    late = []
     channel_of = np.argsort(NOMINAL.rings)
     for scan in scans:
         channel = channel_of[np.minimum(scan.ring, CHANNELS - 1)]
         block, _ = _blocks(scan, channel, model)
-        per_block = 360.0 * rate_hz * model.block_ns * 1e-9
-        turned = per_block * (block + model.firing_offsets_ns[channel] / model.block_ns)
-        head = np.radians(_start_deg(scan, channel, turned, NOMINAL) + per_block * block)
+        fired = block + model.firing_offsets_ns[channel] / model.block_ns
+        start, per_block = _turning(scan, channel, fired, 360.0 * rate_hz * model.block_ns * 1e-9, NOMINAL)
+        head = np.radians(start + per_block * block)
+        late.append(float(_wrapped(start) - np.clip(_wrapped(start), 0.0, per_block)))
         x = scan.points[:, 0] - model.rx * np.cos(head)
         y = scan.points[:, 1] + model.rx * np.sin(head)
         z = scan.points[:, 2] - model.rz
         elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
-        aside = _wrapped(np.degrees(np.arctan2(-y, x)) - np.degrees(head) - turned + per_block * block)
+        aside = _wrapped(np.degrees(np.arctan2(-y, x)) - start - per_block * fired)
         far = np.linalg.norm(scan.points, axis=1) > 1.0
         for c in range(CHANNELS):
             mine = far & (channel == c)
@@ -110,6 +116,10 @@ def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> C
     found = np.array([np.median(all_) if len(all_ := np.concatenate(parts)) else np.nan for parts in elevations])
     aside_deg = np.array([np.median(all_) if len(all_ := np.concatenate(parts)) else 0.0 for parts in sideways])
     found = np.where(np.isnan(found), NOMINAL.elevations_deg, found)
+    # All channels' corrections and the head's azimuth together are free by a constant. Where scans are cut at 0,
+    # the one that lets the first block be there is right; others would put it into the revolution before.
+    if abs(begin := float(np.median(late))) < _CUT_DEG:
+        aside_deg += begin
     # Near the pole a coordinate's last digit turns the azimuth by degrees: judged by its effect.
     off = np.hypot(found - NOMINAL.elevations_deg, aside_deg * np.cos(np.radians(NOMINAL.elevations_deg)))
     if off.max() < 0.03:
@@ -126,17 +136,29 @@ def _blocks(scan: Scan, channel: I64, model: Model) -> tuple[I64, int]:
     return block - first, scan.stamp_ns + round(phase + first * model.block_ns)
 
 
-def _start_deg(scan: Scan, channel: I64, turned_deg: F64, calibration: Calibration) -> float:
-    """Azimuth of block 0, degrees: what the points' azimuths agree on."""
+def _turning(scan: Scan, channel: I64, fired: F64, nominal: float, calibration: Calibration) -> tuple[float, float]:
+    """Azimuth of block 0 and from block to block, degrees: what the points' azimuths agree on.
+
+    Args:
+        fired: (n,) when each point was, in blocks. nominal: degrees from block to block, about.
+    """
     x, y = scan.points[:, 0].astype(np.float64), scan.points[:, 1].astype(np.float64)
     # High up the azimuth says little, and the lever much.
     good = (calibration.elevations_deg[channel] < 60.0) & (np.hypot(x, y) > 0.5)
     if not good.any():
         good = np.ones(len(x), bool)
-    azimuth = np.degrees(np.arctan2(-y, x)) - turned_deg - calibration.horizontal_deg[channel]
-    azimuth = azimuth[good]
-    middle = float(np.degrees(np.angle(np.exp(1j * np.radians(azimuth)).mean())))
-    return middle + float(np.median(_wrapped(azimuth - middle)))
+    fired = fired[good]
+    start = np.degrees(np.arctan2(-y, x))[good] - nominal * fired - calibration.horizontal_deg[channel][good]
+    middle = float(np.degrees(np.angle(np.exp(1j * np.radians(start)).mean())))
+    off = _wrapped(start - middle)
+    # No motor turns at just its nominal speed, and 2 in 10,000 are a degree's tenth at the end of a turn.
+    line = np.array([0.0, np.median(off)])
+    if np.ptp(fired) > _LEAST_TURN / nominal:
+        for _ in range(_FITS):
+            beside = np.abs(off - np.polyval(line, fired))
+            kept = beside <= _OUTLYING * np.median(beside)
+            line = np.polyfit(fired[kept], off[kept], 1)
+    return middle + float(line[1]), nominal + float(line[0])
 
 
 def _wrapped(degrees: F64 | float) -> F64:
