@@ -16,7 +16,7 @@ from app.slam.loops.messages import LoopClient
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
-from app.slam.voxel import VoxelGrid
+from app.slam.voxel import VoxelGrid, spread
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +92,8 @@ class Engine:
         # paper 2.3, eq. 5-7
         posterior, registration = predicted, _NOT_REGISTERED
         if self._map.voxels:
-            posterior, registration = iekf.update(
-                predicted, _spread(sampled.points, p.filter.max_points), self._map, p.filter
-            )
+            chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
+            posterior, registration = iekf.update(predicted, chosen, self._map, p.filter)
         status = _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 
@@ -230,11 +229,6 @@ def _down_in_lidar(belief: Belief) -> np.ndarray:
     state = belief.state
     down = (state.R_odom_imu @ state.R_imu_lidar).T @ state.g_odom
     return np.asarray(down / np.linalg.norm(down))
-
-
-def _spread(points: np.ndarray, most: int) -> np.ndarray:
-    """At most `most` of the points, evenly over their order."""
-    return points if len(points) <= most else points[np.arange(most) * len(points) // most]
 
 
 def _in_range(scan: Scan, nearest: float, farthest: float) -> Scan:

@@ -222,7 +222,7 @@ class Filter(Section):
     )
     max_points: int = _param(
         1000,
-        "Most points of a scan, spread evenly over it, that are looked up in the map.",
+        "Most points of a scan, evenly over space, that are looked up in the map.",
         ge=100,
         le=20_000,
         step=100,

@@ -7,6 +7,9 @@ import numpy as np
 from app.slam.kernels import voxels as kernels
 from app.slam.types import F32, I32, U8
 
+_PHI = 1.2207440846057596
+"""The root of x^4 = x + 1, for three dimensions what the golden ratio is for one."""
+
 
 @dataclass(frozen=True, slots=True)
 class Downsampled:
@@ -57,3 +60,23 @@ class VoxelGrid:
             points, chosen, voxel_size, self._table, self._stamp, self._generation, self._cells, self._sums, self._order
         )
         return Downsampled(self._sums[:m, :3].astype(np.float32), self._order[:m].copy())
+
+
+def spread(points: F32, most: int, voxel_size: float) -> F32:
+    """At most `most` of the points, evenly over the space that they fill, in the order in which they came.
+
+    A voxel's place alone says how soon its point is taken, so that one point more or less changes nothing
+    but itself: counted off by their order, all points behind it would be others. The places are those of
+    an additive recurrence (Roberts 2018, "The unreasonable effectiveness of quasirandom sequences"): any
+    few voxels beside each other hold their share.
+
+    Args:
+        points: (n, 3) float32, one for each voxel. voxel_size: edge in the unit of the points.
+    """
+    if len(points) <= most:
+        return points
+    x, y, z = np.floor(points.T * np.float64(1.0 / voxel_size))
+    place = np.mod(x / _PHI + y / _PHI**2 + z / _PHI**3, 1.0)
+    chosen = np.argpartition(place, most - 1)[:most]
+    chosen.sort()
+    return points[chosen]

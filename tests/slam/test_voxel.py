@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.slam.voxel import VoxelGrid
+from app.slam.voxel import VoxelGrid, spread
 
 GRID = VoxelGrid()
 
@@ -26,17 +26,17 @@ def by_dictionary(points: np.ndarray, size: float, chosen: np.ndarray) -> tuple[
     seed=st.integers(0, 2**32),
     n=st.integers(0, 300),
     size=st.sampled_from([0.05, 0.3, 0.5, 1.0, 5.0]),
-    spread=st.sampled_from([0.2, 3.0, 80.0]),
+    width=st.sampled_from([0.2, 3.0, 80.0]),
     share=st.sampled_from([0.0, 0.3, 1.0]),
 )
-def test_centroids_are_those_of_a_dictionary(seed: int, n: int, size: float, spread: float, share: float) -> None:
+def test_centroids_are_those_of_a_dictionary(seed: int, n: int, size: float, width: float, share: float) -> None:
     rng = np.random.default_rng(seed)
-    points = rng.normal(scale=spread, size=(n, 3)).astype(np.float32)
+    points = rng.normal(scale=width, size=(n, 3)).astype(np.float32)
     chosen = (rng.random(n) < share).astype(np.uint8) * 2  # any value but zero takes part
     result = GRID.downsample(points, size, chosen)
     centroids, first = by_dictionary(points, size, chosen)
     assert result.source.tolist() == first
-    np.testing.assert_allclose(result.points, np.array(centroids).reshape(-1, 3), rtol=1e-6, atol=1e-6 * spread)
+    np.testing.assert_allclose(result.points, np.array(centroids).reshape(-1, 3), rtol=1e-6, atol=1e-6 * width)
 
 
 def test_points_that_do_not_take_part_are_unchanged_to_the_bit() -> None:
@@ -91,3 +91,47 @@ def test_no_points_give_no_points() -> None:
     result = GRID.downsample(np.empty((0, 3), np.float32), 0.5)
     assert result.points.shape == (0, 3)
     assert len(result.source) == 0
+
+
+def hall() -> np.ndarray:
+    """(n, 3) voxels that a floor and two walls go through, in no order."""
+    floor = [(x, y, 0) for x in range(60) for y in range(60)]
+    walls = [(x, 0, z) for x in range(60) for z in range(1, 20)] + [
+        (0, y, z) for y in range(1, 60) for z in range(1, 20)
+    ]
+    rng = np.random.default_rng(7)
+    return rng.permutation(np.array(floor + walls)) - 30
+
+
+def in_voxels(cells: np.ndarray, seed: int) -> np.ndarray:
+    return ((cells + np.random.default_rng(seed).uniform(0.05, 0.95, cells.shape)) * 0.4).astype(np.float32)
+
+
+@given(seed=st.integers(0, 2**32), most=st.integers(1, 6000), gone=st.integers(0, 20))
+def test_a_point_more_or_less_and_noise_leave_the_choice_of_all_others(seed: int, most: int, gone: int) -> None:
+    cells = hall()
+    all_chosen = spread(in_voxels(cells, seed), most, 0.4)
+    assert len(all_chosen) == min(most, len(cells))
+    left = np.delete(cells, np.random.default_rng(seed).choice(len(cells), gone, replace=False), axis=0)
+    chosen = spread(in_voxels(left, seed + 1), most, 0.4)
+    before, after = ({tuple(cell) for cell in np.floor(points / 0.4)} for points in (all_chosen, chosen))
+    assert len(before - after) <= gone
+    assert len(after - before) <= gone
+
+
+def test_what_is_chosen_is_even_over_every_surface_and_keeps_its_order() -> None:
+    cells = hall()
+    points = in_voxels(cells, 0)
+    chosen = spread(points, 1000, 0.4)
+    places = {tuple(point): index for index, point in enumerate(points)}
+    order = [places[tuple(point)] for point in chosen]
+    assert order == sorted(order)
+    floor = np.floor(chosen[np.floor(chosen[:, 2] / 0.4) == -30] / 0.4)[:, :2] + 30
+    counts, *_ = np.histogram2d(*floor.T, bins=6, range=[[0, 60], [0, 60]])  # squares of 4 m
+    share = 100 * 1000 / len(cells)
+    assert np.abs(counts - share).max() < 4.0  # by chance it would be 4 on average, and 10 somewhere
+
+
+def test_few_points_are_all_chosen() -> None:
+    points = in_voxels(hall(), 0)
+    assert spread(points, len(points), 0.4) is points
