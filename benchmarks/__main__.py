@@ -4,10 +4,11 @@ import os
 import sys
 from pathlib import Path
 
-from benchmarks import frame, kill, latency, latency_page, live, loops, packets, page, replay, rewind, seek, walk
+from benchmarks import fed, frame, kill, latency, latency_page, live, loops, packets, page, replay, rewind, seek, walk
 from benchmarks.record import show
 
 BENCHMARKS = {
+    "fed": fed.run,
     "frame": frame.run,
     "kill": kill.run,
     "latency": latency.run,
@@ -21,7 +22,7 @@ BENCHMARKS = {
     "page": page.run,
     "walk": walk.run,
 }
-ON_A_RECORDING = {"kill": kill.run, "rewind": rewind.run, "seek": seek.run}
+ON_A_RECORDING = {"fed": fed.run, "kill": kill.run, "rewind": rewind.run, "seek": seek.run}
 
 
 def main() -> None:

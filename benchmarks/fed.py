@@ -1,0 +1,97 @@
+"""A recording fed at real time, as packets and through Foxglove: how far the walk is from the file's.
+
+The whole recording, fed by a process of its own. Compared is where the map has each frame at the end, against the
+same engine on the file, by the scans' ends; nothing is aligned. `HEMISLAM_PRESET` names the device, if the
+recording has no parameters beside it.
+"""
+
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from app.sensors.live.process import LiveProcess
+from app.sensors.presets import resolve_params
+from app.server.protocol import LIVE, Snapshot
+from app.server.setup import Setup
+from app.server.worker import EngineProcess
+from app.slam.params import Params
+from app.slam.types import F64, I64
+from benchmarks.live import free_port
+from benchmarks.record import Line
+
+SAMPLE = next((Path(__file__).resolve().parents[1] / "sample_data").glob("*.mcap"))
+PRESET = os.environ.get("HEMISLAM_PRESET")
+SAME_NS = 10_000
+"""Ends of scans this near are of the same scan; packets hold whole microseconds."""
+PATIENCE_S, SILENT_S = 120.0, 3.0
+
+
+def run(recording: Path | None = None) -> list[Line]:
+    recording = recording or SAMPLE
+    params = resolve_params(recording, PRESET, None, [])
+    with closing(EngineProcess(Setup(recording, params=params, play=True, speed=math.inf))) as engine:
+        stamps, positions = _positions(_until(engine, lambda s: s.transport.finished))
+    lines = []
+    ports = [free_port() for _ in range(4)]
+    for way, url, imu in (
+        ("as packets", f"rsbpearl://127.0.0.1:{ports[0]},{ports[1]}", f"imu-udp://127.0.0.1:{ports[2]}"),
+        ("through Foxglove", f"foxglove://127.0.0.1:{ports[3]}", None),
+    ):
+        end = _fed(recording, params, url, imu)
+        if isinstance(end, str):
+            print(f"{way}: {end}")
+            continue
+        ends, there = _positions(end)
+        nearest = np.abs(stamps[None, :] - ends[:, None]).argmin(axis=1)
+        same = np.abs(stamps[nearest] - ends) < SAME_NS
+        apart = np.linalg.norm(there[same] - positions[nearest[same]], axis=1)
+        assert end.live is not None
+        on = f"{recording.stem} at real time, {way}, against the file"
+        lines += [
+            Line.of("distance of a frame", on, "mm", 1e3 * apart),
+            Line.of("frames that are not compared", on, "", [len(stamps) - len(apart)]),
+            Line.of("scans dropped", on, "", [end.transport.dropped]),
+            Line.of("packets or samples lost", on, "", [end.live.counters.lost + end.live.counters.imu_lost]),
+        ]
+    return lines
+
+
+def _fed(recording: Path, params: Params, url: str, imu: str | None) -> Snapshot | str:
+    """The end of a live run on it, or why it can not be played out so."""
+    with TemporaryDirectory() as folder, LiveProcess(url, params, imu) as source:
+        setup = Setup(LIVE, params=params, play=True, speed=math.inf, live=source.address, live_folder=Path(folder))
+        with closing(EngineProcess(setup)) as engine:
+            _until(engine, lambda s: s.recording is not None)
+            to = ["--to", url, *(["--imu-to", imu] if imu else [])]
+            command = [sys.executable, "-m", "app", "feed", str(recording), *to]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                return done.stderr.strip()
+            time.sleep(SILENT_S)
+            return engine.wait(engine.snapshot.revision, timeout=1.0)
+
+
+def _positions(snapshot: Snapshot) -> tuple[I64, F64]:
+    """Ends of scans (n,), ns, and where the map has the IMU then (n, 3), m."""
+    assert snapshot.trajectory is not None and snapshot.recording is not None
+    stamps = snapshot.recording.start_ns + np.round(snapshot.series["stamp_s"] * 1e9)
+    known = np.isfinite(stamps)
+    return stamps[known].astype(np.int64), np.array(snapshot.trajectory)[known]
+
+
+def _until(engine: EngineProcess, wanted: Callable[[Snapshot], bool]) -> Snapshot:
+    deadline = time.monotonic() + PATIENCE_S
+    snapshot = engine.snapshot
+    while not wanted(snapshot):
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"nothing comes: {snapshot.notices}")
+        snapshot = engine.wait(snapshot.revision, timeout=0.1)
+    return snapshot

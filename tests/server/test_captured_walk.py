@@ -1,0 +1,42 @@
+"""The packets of a walk as a capture file: the same walk, but for the steps in which packets hold it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.sensors.live.feed import packets_of
+from app.sensors.presets import resolve_params
+from app.sensors.recording import open_recording
+from app.slam.engine import Engine
+from app.slam.params import Params
+from app.slam.types import F64, I64, Measurement
+from tests.sensors.live import captures
+
+MUSEUM = Path(__file__).resolve().parents[2] / "sample_data" / "museum.mcap"
+PORTS = (6699, 7788, 6700)
+
+
+def walked(path: Path, params: Params) -> tuple[I64, F64]:
+    """Ends of scans (n,), ns, and where odometry has the IMU then (n, 3), m."""
+    engine = Engine(params)
+    with open_recording(path, params) as recording:
+        results = [engine.step(m.scan, m.imu) for m in recording.measurements() if isinstance(m, Measurement)]
+    engine.close()
+    return np.array([r.stamp_ns for r in results]), np.array([r.state.p_odom_imu for r in results])
+
+
+@pytest.mark.parametrize("name", ["museum", "hall_bpearl", "outdoor_bpearl"])
+def test_from_its_packets_a_whole_walk_is_within_their_steps_at_every_frame(
+    name: str, shared_data: Path, tmp_path: Path
+) -> None:
+    path = MUSEUM if name == "museum" else shared_data / f"{name}.mcap"
+    params = resolve_params(path, "h2lid-mount", None, [])
+    with open_recording(path, params) as recording:
+        sent = [(one.time_ns, PORTS[one.stream], one.data) for one in packets_of(recording)]
+    capture = tmp_path / f"{name}.pcap"
+    capture.write_bytes(captures.pcap(sent))
+    (ends, positions), (again, there) = walked(path, params), walked(capture, params)
+    assert len(again) == len(ends)
+    assert np.abs(again - ends).max() < 2_000
+    assert np.linalg.norm(there - positions, axis=1).max() < 0.005
