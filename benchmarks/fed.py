@@ -1,8 +1,8 @@
 """A recording fed at real time, as packets and through Foxglove: how far the walk is from the file's.
 
 The whole recording, fed by a process of its own. Compared is where the map has each frame at the end, against the
-same engine on the file, by the scans' ends; nothing is aligned. `HEMISLAM_PRESET` names the device, if the
-recording has no parameters beside it.
+same engine on the file, by the scans' ends; nothing is aligned. `HEMISLAM_PRESET` names the device; what lies
+beside the recording still holds.
 """
 
 import math
@@ -31,7 +31,8 @@ SAMPLE = next((Path(__file__).resolve().parents[1] / "sample_data").glob("*.mcap
 PRESET = os.environ.get("HEMISLAM_PRESET")
 SAME_NS = 10_000
 """Ends of scans this near are of the same scan; packets hold whole microseconds."""
-PATIENCE_S, SILENT_S = 120.0, 3.0
+PATIENCE_S, SILENT_S = 60.0, 3.0
+"""Without anything new before it gives up, and to wait after the last that was sent."""
 
 
 def run(recording: Path | None = None) -> list[Line]:
@@ -88,10 +89,9 @@ def _positions(snapshot: Snapshot) -> tuple[I64, F64]:
 
 
 def _until(engine: EngineProcess, wanted: Callable[[Snapshot], bool]) -> Snapshot:
-    deadline = time.monotonic() + PATIENCE_S
     snapshot = engine.snapshot
     while not wanted(snapshot):
-        if time.monotonic() > deadline:
-            raise RuntimeError(f"nothing comes: {snapshot.notices}")
-        snapshot = engine.wait(snapshot.revision, timeout=0.1)
+        before, snapshot = snapshot, engine.wait(snapshot.revision, timeout=PATIENCE_S)
+        if snapshot.revision == before.revision:
+            raise SystemExit(f"Nothing came for {PATIENCE_S:.0f} s: {[notice.text for notice in snapshot.notices]}")
     return snapshot

@@ -7,8 +7,9 @@ import numpy as np
 from app.slam.kernels import voxels as kernels
 from app.slam.types import F32, I32, U8
 
-_PHI = 1.2207440846057596
-"""The root of x^4 = x + 1, for three dimensions what the golden ratio is for one."""
+_STEPS = np.sqrt([6.0, 11.0, 14.0]) % 1.0
+"""By how much a voxel's place differs from its neighbour's, along x, y and z. Of three roots of whole numbers up to 23
+these are the most even at once along lines, over planes and in space, for shares of 5 to 50 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +68,8 @@ def spread(points: F32, most: int, voxel_size: float) -> F32:
 
     A voxel's place alone says how soon its point is taken, so that one point more or less changes nothing
     but itself: counted off by their order, all points behind it would be others. The places are those of
-    an additive recurrence (Roberts 2018, "The unreasonable effectiveness of quasirandom sequences"): any
-    few voxels beside each other hold their share.
+    an additive recurrence (as in Roberts 2018, "The unreasonable effectiveness of quasirandom sequences"):
+    of voxels that lie beside each other, every part has its share.
 
     Args:
         points: (n, 3) float32, one for each voxel. voxel_size: edge in the unit of the points.
@@ -76,7 +77,7 @@ def spread(points: F32, most: int, voxel_size: float) -> F32:
     if len(points) <= most:
         return points
     x, y, z = np.floor(points.T * np.float64(1.0 / voxel_size))
-    place = np.mod(x / _PHI + y / _PHI**2 + z / _PHI**3, 1.0)
+    place = np.mod(x * _STEPS[0] + y * _STEPS[1] + z * _STEPS[2], 1.0)
     chosen = np.argpartition(place, most - 1)[:most]
     chosen.sort()
     return points[chosen]

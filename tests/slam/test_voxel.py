@@ -1,6 +1,7 @@
 """Voxel-grid downsampling against a dictionary."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -119,17 +120,35 @@ def test_a_point_more_or_less_and_noise_leave_the_choice_of_all_others(seed: int
     assert len(after - before) <= gone
 
 
-def test_what_is_chosen_is_even_over_every_surface_and_keeps_its_order() -> None:
+@pytest.mark.parametrize("most", [300, 600, 1000, 2000, 4000])
+def test_what_is_chosen_is_even_over_every_surface(most: int) -> None:
     cells = hall()
-    points = in_voxels(cells, 0)
-    chosen = spread(points, 1000, 0.4)
+    share = most / len(cells)
+    chosen = np.floor(spread(in_voxels(cells, 0), most, 0.4) / 0.4) + 30
+    by_chance = np.sqrt(share * (1.0 - share) * 100)
+    for flat, across in ((2, (0, 1)), (1, (0, 2)), (0, (1, 2))):
+        surface = chosen[chosen[:, flat] == 0][:, across]
+        sides = [60 if axis < 2 else 20 for axis in across]
+        squares, *_ = np.histogram2d(
+            *surface.T, bins=[side // 10 for side in sides], range=[[0, side] for side in sides]
+        )
+        assert np.std(squares) < 0.7 * by_chance  # of squares of 4 m
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("share", [0.05, 0.1, 0.2, 0.4])
+def test_along_a_line_none_is_long_without_a_point(axis: int, share: float) -> None:
+    line = np.zeros((2000, 3))
+    line[:, axis] = np.arange(2000) - 1000
+    chosen = np.floor(spread(in_voxels(line, 0), round(share * 2000), 0.4) / 0.4)
+    assert np.diff(chosen[:, axis]).max() < 3.0 / share  # by chance it would be over 5 somewhere
+
+
+def test_what_is_chosen_keeps_its_order() -> None:
+    points = in_voxels(hall(), 0)
     places = {tuple(point): index for index, point in enumerate(points)}
-    order = [places[tuple(point)] for point in chosen]
+    order = [places[tuple(point)] for point in spread(points, 1000, 0.4)]
     assert order == sorted(order)
-    floor = np.floor(chosen[np.floor(chosen[:, 2] / 0.4) == -30] / 0.4)[:, :2] + 30
-    counts, *_ = np.histogram2d(*floor.T, bins=6, range=[[0, 60], [0, 60]])  # squares of 4 m
-    share = 100 * 1000 / len(cells)
-    assert np.abs(counts - share).max() < 4.0  # by chance it would be 4 on average, and 10 somewhere
 
 
 def test_few_points_are_all_chosen() -> None:

@@ -19,11 +19,11 @@ _CENTI = 100.0
 MISFIT_M = 0.05
 """Points this far from the ray they would have to be on (95 of 100 are closer) are not of this sensor."""
 _CUT_DEG = 4.0
-"""Scans that begin this near are cut where the azimuth passes 0."""
-_LEAST_TURN = 30.0
-"""deg; from less of a turn its speed is not read off."""
-_FITS, _OUTLYING = 3, 4.0
-"""Straight lines through the azimuths, each without points so many times the median beside the one before."""
+"""A unit's scans that seem to begin so little before azimuth 0 begin there, and its angles are off by as much."""
+_CUT_BLOCKS = 2
+"""A scan's ends that lie no more than this beyond azimuth 0 are cut there: they are moved within the revolution."""
+_LEAST_TURN_DEG = 30.0
+"""From less of a turn its speed is not read off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,29 +49,30 @@ def firings_of(scan: Scan, calibration: Calibration = NOMINAL, model: Model = BP
     Raises:
         HemislamError: its points do not lie on the rays of such a sensor.
     """
-    channel = np.argsort(calibration.rings)[np.minimum(scan.ring, CHANNELS - 1)]
-    block, base_ns = _blocks(scan, channel, model)
-    share = model.firing_offsets_ns[channel] / model.block_ns
-    blocks = int(block.max()) + 1
-    start, per_block = _turning(scan, channel, block + share, 360.0 * rate_hz * model.block_ns * 1e-9, calibration)
-    raw = _CENTI * (_wrapped(start) + per_block * np.arange(blocks))
-    if abs(raw[0]) < _CENTI * _CUT_DEG:  # keep the cut between the same blocks
-        raw = np.clip(raw, 0, TURN - 1)
+    turn = _turn(scan, calibration, model, rate_hz)
+    channel, block = turn.channel, turn.block
+    order = np.arange(int(block.max()) + 1)
+    raw = _CENTI * (_wrapped(turn.start_deg) + turn.step_deg * order)
+    slack = _CUT_BLOCKS * _CENTI * turn.step_deg
+    if -slack < raw[0]:
+        raw = np.maximum(raw, order)  # one count each: equal ones would be two returns of one firing
+    if raw[-1] < TURN + slack:
+        raw = np.minimum(raw, TURN - 1 - order[::-1])
     azimuth = np.rint(raw).astype(np.int64) % TURN
 
     points = scan.points.astype(np.float64)
     head = np.radians(azimuth[block] / _CENTI)
     lever = np.column_stack([model.rx * np.cos(head), -model.rx * np.sin(head), np.full(len(head), model.rz)])
     elevation = np.radians(calibration.elevations_deg[channel])
-    at = head + np.radians(per_block * share + calibration.horizontal_deg[channel])
+    at = head + np.radians(turn.step_deg * turn.share + calibration.horizontal_deg[channel])
     ray = np.column_stack([np.cos(elevation) * np.cos(at), -np.cos(elevation) * np.sin(at), np.sin(elevation)])
     count = np.rint(np.linalg.norm(points - lever, axis=1) / model.range_step)
     misfit = float(
         np.percentile(np.linalg.norm(lever + (count * model.range_step)[:, None] * ray - points, axis=1), 95)
     )
 
-    counts = np.zeros((blocks, CHANNELS), np.uint16)
-    intensity = np.zeros((blocks, CHANNELS), np.uint8)
+    counts = np.zeros((len(order), CHANNELS), np.uint16)
+    intensity = np.zeros((len(order), CHANNELS), np.uint8)
     counts[block, channel] = np.clip(count, 0, 65535)
     intensity[block, channel] = np.clip(np.rint(scan.intensity), 0, 255)
     kept = np.count_nonzero(counts) / max(int(np.count_nonzero(count)), 1)
@@ -80,7 +81,7 @@ def firings_of(scan: Scan, calibration: Calibration = NOMINAL, model: Model = BP
             f"The recording's points are not those of an RS-Bpearl ({misfit:.2f} m beside its rays, {1 - kept:.0%} of "
             "them in a firing that is taken): play it out as foxglove://127.0.0.1:8765 instead."
         )
-    times = base_ns + model.block_ns * np.arange(blocks, dtype=np.int64)
+    times = turn.base_ns + model.block_ns * order.astype(np.int64)
     return Firings(times, azimuth.astype(np.uint16), counts, intensity, misfit)
 
 
@@ -91,40 +92,74 @@ def rate_of(scans: list[Scan]) -> int:
 
 
 def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> Calibration:
-    """The unit's angles from a few of its scans; the nominal ones, if they explain the points."""
-    elevations: list[list[F64]] = [[] for _ in range(CHANNELS)]
-    sideways: list[list[F64]] = [[] for _ in range(CHANNELS)]
-    late = []
-    channel_of = np.argsort(NOMINAL.rings)
+    """The unit's angles from a few of its scans; the nominal ones, if they explain the points.
+
+    Its channels must be in the nominal order: points tell which ring they are of, and no channel.
+    """
+    seen, starts = [], []
     for scan in scans:
-        channel = channel_of[np.minimum(scan.ring, CHANNELS - 1)]
-        block, _ = _blocks(scan, channel, model)
-        fired = block + model.firing_offsets_ns[channel] / model.block_ns
-        start, per_block = _turning(scan, channel, fired, 360.0 * rate_hz * model.block_ns * 1e-9, NOMINAL)
-        head = np.radians(start + per_block * block)
-        late.append(float(_wrapped(start) - np.clip(_wrapped(start), 0.0, per_block)))
+        turn = _turn(scan, NOMINAL, model, rate_hz)
+        head = np.radians(turn.start_deg + turn.step_deg * turn.block)
+        starts.append(float(_wrapped(turn.start_deg)))
         x = scan.points[:, 0] - model.rx * np.cos(head)
         y = scan.points[:, 1] + model.rx * np.sin(head)
         z = scan.points[:, 2] - model.rz
         elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
-        aside = _wrapped(np.degrees(np.arctan2(-y, x)) - start - per_block * fired)
+        aside = _wrapped(np.degrees(np.arctan2(-y, x) - head) - turn.step_deg * turn.share)
         far = np.linalg.norm(scan.points, axis=1) > 1.0
-        for c in range(CHANNELS):
-            mine = far & (channel == c)
-            elevations[c].append(elevation[mine])
-            sideways[c].append(aside[mine])
-    found = np.array([np.median(all_) if len(all_ := np.concatenate(parts)) else np.nan for parts in elevations])
-    aside_deg = np.array([np.median(all_) if len(all_ := np.concatenate(parts)) else 0.0 for parts in sideways])
-    found = np.where(np.isnan(found), NOMINAL.elevations_deg, found)
-    # All channels' corrections and the head's azimuth together are free by a constant. Where scans are cut at 0,
-    # the one that lets the first block be there is right; others would put it into the revolution before.
-    if abs(begin := float(np.median(late))) < _CUT_DEG:
-        aside_deg += begin
+        seen.append(np.array([turn.channel, elevation, aside])[:, far])
+    channel, elevation, aside = np.concatenate(seen, axis=1)
+    elevations, sideways = NOMINAL.elevations_deg.copy(), NOMINAL.horizontal_deg.copy()
+    for c in np.unique(channel).astype(int):
+        elevations[c], sideways[c] = np.median(elevation[channel == c]), np.median(aside[channel == c])
     # Near the pole a coordinate's last digit turns the azimuth by degrees: judged by its effect.
-    off = np.hypot(found - NOMINAL.elevations_deg, aside_deg * np.cos(np.radians(NOMINAL.elevations_deg)))
+    off = np.hypot(elevations - NOMINAL.elevations_deg, sideways * np.cos(np.radians(NOMINAL.elevations_deg)))
     if off.max() < 0.03:
         return NOMINAL
-    return Calibration(np.round(found, 2), np.round(aside_deg, 2))
+    # The head's azimuth and all corrections together are free by a constant. Where revolutions are cut at 0, the one
+    # that lets none begin before is right; a scan that begins later may have seen nothing until then.
+    if -_CUT_DEG < (start := min(starts)) < 0.0:
+        sideways += start
+    return Calibration(np.round(elevations, 2), np.round(sideways, 2))
+
+
+@dataclass(frozen=True, slots=True)
+class _Turn:
+    """How the head turned while a scan was taken.
+
+    Attributes:
+        channel: (n,) of each point. block: (n,) from 0. share: (n,) of the block's duration at which it fired.
+        base_ns: time of block 0. start_deg: its azimuth. step_deg: azimuth from block to block.
+    """
+
+    channel: I64
+    block: I64
+    share: F64
+    base_ns: int
+    start_deg: float
+    step_deg: float
+
+
+def _turn(scan: Scan, calibration: Calibration, model: Model, rate_hz: int) -> _Turn:
+    """What the points' times and azimuths agree on."""
+    channel = np.argsort(calibration.rings)[np.minimum(scan.ring, CHANNELS - 1)]
+    block, base_ns = _blocks(scan, channel, model)
+    share = model.firing_offsets_ns[channel] / model.block_ns
+    step = 360.0 * rate_hz * model.block_ns * 1e-9
+    x, y = scan.points[:, 0].astype(np.float64), scan.points[:, 1].astype(np.float64)
+    flat = np.hypot(x, y)
+    # High up the azimuth says little, and the lever much.
+    good = (calibration.elevations_deg[channel] < 60.0) & (flat > 0.5)
+    if not good.any():
+        good = np.ones(len(x), bool)
+    fired, which = (block + share)[good], channel[good]
+    start = np.degrees(np.arctan2(-y, x))[good] - step * fired - calibration.horizontal_deg[which]
+    middle = float(np.degrees(np.angle(np.exp(1j * np.radians(start)).mean())))
+    off = _wrapped(start - middle)
+    # No motor turns at just its nominal speed, and 2 in 10,000 are a degree's tenth at the end of a turn.
+    # Every channel tells by itself, so that corrections which are not known do not matter.
+    faster = _slope(fired, off, which, _LEAST_TURN_DEG / step)
+    return _Turn(channel, block, share, base_ns, middle + float(np.median(off - faster * fired)), step + faster)
 
 
 def _blocks(scan: Scan, channel: I64, model: Model) -> tuple[I64, int]:
@@ -136,29 +171,12 @@ def _blocks(scan: Scan, channel: I64, model: Model) -> tuple[I64, int]:
     return block - first, scan.stamp_ns + round(phase + first * model.block_ns)
 
 
-def _turning(scan: Scan, channel: I64, fired: F64, nominal: float, calibration: Calibration) -> tuple[float, float]:
-    """Azimuth of block 0 and from block to block, degrees: what the points' azimuths agree on.
-
-    Args:
-        fired: (n,) when each point was, in blocks. nominal: degrees from block to block, about.
-    """
-    x, y = scan.points[:, 0].astype(np.float64), scan.points[:, 1].astype(np.float64)
-    # High up the azimuth says little, and the lever much.
-    good = (calibration.elevations_deg[channel] < 60.0) & (np.hypot(x, y) > 0.5)
-    if not good.any():
-        good = np.ones(len(x), bool)
-    fired = fired[good]
-    start = np.degrees(np.arctan2(-y, x))[good] - nominal * fired - calibration.horizontal_deg[channel][good]
-    middle = float(np.degrees(np.angle(np.exp(1j * np.radians(start)).mean())))
-    off = _wrapped(start - middle)
-    # No motor turns at just its nominal speed, and 2 in 10,000 are a degree's tenth at the end of a turn.
-    line = np.array([0.0, np.median(off)])
-    if np.ptp(fired) > _LEAST_TURN / nominal:
-        for _ in range(_FITS):
-            beside = np.abs(off - np.polyval(line, fired))
-            kept = beside <= _OUTLYING * np.median(beside)
-            line = np.polyfit(fired[kept], off[kept], 1)
-    return middle + float(line[1]), nominal + float(line[0])
+def _slope(x: F64, y: F64, group: I64, least: float) -> float:
+    """Least squares' slope of y over x (n,), each group with an intercept of its own; 0 if x spreads over less."""
+    count = np.maximum(np.bincount(group), 1)
+    x, y = (v - (np.bincount(group, v) / count)[group] for v in (x, y))
+    spread = float(x @ x)
+    return float(x @ y) / spread if spread > len(x) * least**2 / 12.0 else 0.0  # as if even over so much
 
 
 def _wrapped(degrees: F64 | float) -> F64:
