@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from app.slam import iekf
 from app.slam.iekf import boxminus, boxplus
 from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
-from app.slam.kernels.registration import SHARED
+from app.slam.kernels.registration import HUBER, SHARED
 from app.slam.local_map import LocalMap
 from app.slam.params import Filter
 from app.slam.params import LocalMap as MapParams
@@ -272,13 +272,18 @@ def correlated_prior(scale: float) -> Belief:
 
 @pytest.mark.parametrize("extrinsics", [False, True], ids=["extrinsics fixed", "extrinsics estimated"])
 def test_one_iteration_is_the_textbook_kalman_update(room: LocalMap, extrinsics: bool) -> None:
-    """K = P H^T (H P H^T + R)^-1 with a Jacobian by finite differences: the gain in its other form."""
+    """K = P H^T (H P H^T + R)^-1 with a Jacobian by finite differences: the gain in its other form.
+
+    What is over HUBER standard deviations off counts as so much noisier that it pulls as one of HUBER would.
+    """
     params = Filter(max_iterations=1, estimate_extrinsics=extrinsics)
     prior, points = correlated_prior(5e-3), points_of(furnished_room())
     problem = Problem(room, prior, points, params)
     free = slice(0, DIM if extrinsics else 17)
     H, P = problem.jacobian(prior.state)[:, free], prior.covariance[free, free]
-    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(problem.sigma**2))
+    over = np.abs(problem.distances(prior.state)) / (HUBER * problem.sigma)
+    assert 0.01 < (over > 1.0).mean() < 0.5
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(problem.sigma**2 * np.maximum(over, 1.0)))
     step = np.zeros(DIM)
     step[free] = -K @ problem.distances(prior.state)
 
@@ -288,23 +293,43 @@ def test_one_iteration_is_the_textbook_kalman_update(room: LocalMap, extrinsics:
     np.testing.assert_allclose(posterior.covariance[free, free], (np.eye(len(P)) - K @ H) @ P, atol=1e-10)
 
 
+@pytest.mark.parametrize("strays", [0.0, 0.1], ids=["all on their planes", "some off them"])
 @pytest.mark.parametrize("extrinsics", [False, True], ids=["extrinsics fixed", "extrinsics estimated"])
-def test_the_iteration_ends_at_the_minimum_of_equation_7(room: LocalMap, extrinsics: bool) -> None:
-    """SciPy's Levenberg-Marquardt on the same sum of squares, from the same prior."""
+def test_the_iteration_ends_at_the_minimum_of_equation_7(room: LocalMap, extrinsics: bool, strays: float) -> None:
+    """SciPy's Levenberg-Marquardt on the same sum, from the same prior: squares, and beyond HUBER straight lines."""
     params = Filter(max_iterations=20, estimate_extrinsics=extrinsics, gate=1.0)
     prior, points = correlated_prior(2e-4), points_of(furnished_room())
+    moved = np.random.default_rng(4).random(len(points)) < strays
+    points[moved] *= np.float32(1.03)
     problem = Problem(room, prior, points, params)
     free = DIM if extrinsics else 17
     whiten = np.linalg.inv(np.linalg.cholesky(prior.covariance[:free, :free]))
 
     def residuals(d: np.ndarray) -> np.ndarray:
         x = boxplus(prior.state, np.concatenate([d, np.zeros(DIM - free)]))
-        return np.concatenate([whiten @ d, problem.distances(x) / problem.sigma])
+        off = problem.distances(x) / problem.sigma
+        beyond = np.sqrt(2.0 * HUBER * np.maximum(np.abs(off), HUBER) - HUBER**2)
+        return np.concatenate([whiten @ d, np.where(np.abs(off) > HUBER, beyond, off)])
 
     best = least_squares(residuals, np.zeros(free), method="lm", xtol=1e-12, ftol=1e-12).x
     posterior, registration = iekf.update(prior, points, room, params)
     assert registration.converged
+    far = np.abs(problem.distances(posterior.state)) > HUBER * problem.sigma
+    assert (far.mean() > 0.05) == (strays > 0.0)
     np.testing.assert_allclose(boxminus(posterior.state, prior.state)[:free], best, atol=2e-6)
+
+
+def test_twice_as_far_from_where_the_map_has_it_a_thing_pulls_no_harder(room: LocalMap) -> None:
+    """A tenth of all points farther away than the map has them, as behind a door that was opened since."""
+    prior, points = Belief(truth(), uncertain(1e-3, 1e-2)), points_of(furnished_room())
+
+    def pulled(farther: float) -> float:
+        moved = points.copy()
+        moved[: len(points) // 10] *= np.float32(1.0 + farther)
+        there, _ = iekf.update(prior, moved, room, Filter(gate=1.0))
+        return float(np.linalg.norm(there.state.p_odom_imu - truth().p_odom_imu))
+
+    assert pulled(0.06) < 1.2 * pulled(0.03) < 0.02
 
 
 def test_the_residual_told_is_that_of_the_inliers(room: LocalMap) -> None:
