@@ -26,7 +26,7 @@ from app.slam.types import F64, I64
 from app.slam.warmup import compile_kernels
 
 DRIFTING = (
-    "filter.max_points=100", "filter.plane_tilt=20", "map.spacing=0.5", "map.points_per_voxel=10", "map.radius=12",
+    "filter.max_points=100", "filter.plane_tilt=20", "map.spacing=0.6", "map.points_per_voxel=10", "map.radius=12",
     "sensor.max_range=12",
 )  # fmt: skip
 """So little of each scan that odometry drifts by decimetres, as it would on a worse sensor or a longer walk."""

@@ -35,7 +35,7 @@ from app.slam.results import LOOP_FILES
 
 FILES = ("trajectory.tum", *LOOP_FILES)
 DRIFTING = (
-    "filter.max_points=100", "filter.plane_tilt=20", "map.spacing=0.5", "map.points_per_voxel=10", "map.radius=12",
+    "filter.max_points=100", "filter.plane_tilt=20", "map.spacing=0.6", "map.points_per_voxel=10", "map.radius=12",
     "sensor.max_range=12",
 )  # fmt: skip
 """So little of each scan that odometry drifts by a decimetre and loops have something to correct."""
