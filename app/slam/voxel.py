@@ -8,8 +8,8 @@ from app.slam.kernels import voxels as kernels
 from app.slam.types import F32, I32, U8
 
 _STEPS = np.sqrt([6.0, 11.0, 14.0]) % 1.0
-"""By how much a voxel's place differs from its neighbour's, along x, y and z. Of three roots of whole numbers up to 23
-these are the most even at once along lines, over planes and in space, for shares of 5 to 50 %."""
+"""By how much a voxel's place differs from its neighbour's, along x, y and z. Of the roots of whole numbers up to 23,
+three that are among the most even at once along lines, over planes and in space, for shares of 5 to 50 %."""
 
 
 @dataclass(frozen=True, slots=True)
