@@ -199,10 +199,10 @@ def _overrules(at: float, number: int, word: str, **more: float) -> Deed:
     def pair(bench: Workbench) -> tuple[int, int]:
         found, before, deadline = list[State](), list[State](), time.monotonic() + PATIENCE_S
         while not chosen and (len(found) <= number or found != before):  # they may still be on their way
-            assert time.monotonic() < deadline, "there is no such loop to overrule; choose another recording"
+            assert time.monotonic() < deadline, "there is no such loop to edit; choose another recording"
             time.sleep(1.0)
             before, loops = found, bench.ask("GET", "loops").json()["loops"]
-            found = [loop for loop in loops if loop["verdict"] == "accepted" or loop["overruled"]]
+            found = [loop for loop in loops if loop["verdict"] == "accepted" or loop["edited"]]
         if not chosen:
             chosen.append((found[number]["older"], found[number]["newer"]))
         return chosen[0]
@@ -214,7 +214,7 @@ def _overrules(at: float, number: int, word: str, **more: float) -> Deed:
         bench.ask("POST", "loops", json={"action": word, "older": older, "newer": newer, **more})
 
     def done(bench: Workbench) -> bool:
-        return any(word in entry for entry in bench.ask("GET", "loops").json()["overrulings"])
+        return any(word in entry for entry in bench.ask("GET", "loops").json()["edits"])
 
     return Deed(at, act, done)
 

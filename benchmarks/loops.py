@@ -13,7 +13,7 @@ from app.sensors.recording import open_recording
 from app.slam.engine import Engine
 from app.slam.loops.factors import Factor
 from app.slam.loops.inspection import residuals
-from app.slam.loops.messages import AddKeyframe, LoopState, Overrule, Undo
+from app.slam.loops.messages import AddKeyframe, ApplyEdit, LoopState, Undo
 from app.slam.loops.pose_graph import PoseGraph, optimise
 from app.slam.loops.service import LoopService
 from app.slam.loops.types import Reject, Verdict
@@ -91,13 +91,13 @@ def _search() -> list[Line]:
     accepted = [edge for edge in state.edges if edge.verdict is Verdict.ACCEPTED]
     undoing = []
     for edge in accepted[:: max(1, len(accepted) // 10)]:
-        for request in (Overrule(Reject(*edge.pair)), Undo()):
+        for request in (ApplyEdit(Reject(*edge.pair)), Undo()):
             begin = time.perf_counter()
             service.handle(request)
             undoing.append((time.perf_counter() - begin) * 1e3)
     service.close()
     on = f"building in laps: {len(keyframes):,} keyframes, {len(accepted)} loops, one each {every_ms:.0f} ms"
-    return [Line.of("loop search of a keyframe", on, "ms", times), Line.of("overruling and undoing", on, "ms", undoing)]
+    return [Line.of("loop search of a keyframe", on, "ms", times), Line.of("editing and undoing", on, "ms", undoing)]
 
 
 def _keyframes(path: Path, params: Params) -> list[Keyframe]:

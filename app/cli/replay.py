@@ -23,7 +23,7 @@ def replay(
     """Repeat a session of the workbench to the same result.
 
     A session is kept in runs/sessions/ while it goes on, and saved beside its results. It holds what
-    was opened, the parameters by the frame from which on they were in force, and the overrulings of
+    was opened, the parameters by the frame from which on they were in force, and the edits of
     loops. Writes the same files as `hemislam run`.
 
     \b

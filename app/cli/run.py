@@ -24,7 +24,7 @@ from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
     from app.server.run import Run
-    from app.slam.loops.types import Command as Overruling
+    from app.slam.loops.types import LoopEdit
     from app.slam.results import RunInfo
 
 
@@ -43,7 +43,7 @@ def run(
     duration: Duration = None,
     truth: Truth = None,
     loops: Annotated[
-        Path | None, typer.Option("--loops", metavar="FILE", help="Overrulings of loops, as the workbench saves them.")
+        Path | None, typer.Option("--loops", metavar="FILE", help="EditList of loops, as the workbench saves them.")
     ] = None,
 ) -> None:
     """Process a recording without a browser and write the results.
@@ -71,7 +71,7 @@ def run(
     from app.slam.trajectory import time_apart, truth_beside
 
     params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
-    overrulings = _read_overrulings(loops) if loops else ()
+    edits = _read_edits(loops) if loops else ()
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
     work = open_run(recording, truth_path, params, start, duration)
@@ -90,8 +90,8 @@ def run(
         compile_behind_bar()
         if work.engine.loops:
             work.engine.loops.wait_ready()
-        if overrulings:
-            work.overrule(overrulings)
+        if edits:
+            work.edit_loops(edits)
         stop = process(work)
         if not len(work.log):
             with contextlib.suppress(OSError):
@@ -132,13 +132,13 @@ def save(work: "Run", folder: Path, info: "RunInfo", stop: BaseException | None,
         raise stop
 
 
-def _read_overrulings(path: Path) -> "tuple[Overruling, ...]":
-    from app.slam.loops import edits
+def _read_edits(path: Path) -> "tuple[LoopEdit, ...]":
+    from app.slam.loops import edit_files
 
     try:
-        return edits.read(path.read_text(encoding="utf-8"), str(path))
+        return edit_files.read(path.read_text(encoding="utf-8"), str(path))
     except UnicodeDecodeError:
-        raise HemislamError(f"{path} is not a text file; save overrulings of loops in the workbench.") from None
+        raise HemislamError(f"{path} is not a text file; save edits of loops in the workbench.") from None
     except OSError as error:
         raise HemislamError(f"{path} can not be read: {error.strerror}.") from None
 

@@ -17,7 +17,7 @@ from app.sensors.rings import Sample, settle_rings
 from app.sensors.timing import Clocked, Timing, may_be_time, settle_timing
 from app.slam import lie
 from app.slam.errors import HemislamError
-from app.slam.params import Params, Recording
+from app.slam.params import Params, RecordingParams
 from app.slam.types import F32, F64, I64, U16
 
 INTENSITY_NAMES = ("intensity", "intensities", "reflectivity", "reflectance", "i")
@@ -46,7 +46,7 @@ class ImuProbe:
     accel: F64
 
 
-def settle_cloud(probes: list[Probe], chosen: Recording, where: str) -> tuple[CloudLayout, list[Finding]]:
+def settle_cloud(probes: list[Probe], chosen: RecordingParams, where: str) -> tuple[CloudLayout, list[Finding]]:
     """Decide a topic's layout from its first clouds, each with at least one valid point.
 
     Raises:
@@ -92,7 +92,7 @@ def settle_cloud(probes: list[Probe], chosen: Recording, where: str) -> tuple[Cl
     return layout, [*findings, *time_findings, ring_finding]
 
 
-def settle_imu(probe: ImuProbe, chosen: Recording) -> tuple[float, list[Finding]]:
+def settle_imu(probe: ImuProbe, chosen: RecordingParams) -> tuple[float, list[Finding]]:
     """The factor that makes the accelerometer m/s^2, decided from the norm of its first samples."""
     norm = float(np.median(np.linalg.norm(probe.accel, axis=1)))
     text = f"the acceleration's norm is {norm:.3f} at the start"

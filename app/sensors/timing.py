@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.sensors.findings import Finding
-from app.slam.params import Recording
+from app.slam.params import RecordingParams
 
 TIME_NAMES = ("timestamp", "time", "t", "offset_time", "time_stamp", "timeoffset", "time_offset", "stamp", "ts")
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -50,7 +50,7 @@ class Timing:
     period_ns: int
 
 
-def settle_timing(clouds: list[Clocked], chosen: Recording) -> tuple[Timing, list[Finding]]:
+def settle_timing(clouds: list[Clocked], chosen: RecordingParams) -> tuple[Timing, list[Finding]]:
     """Decide from a few clouds. Bad choices of the user are findings, not errors."""
     period_ns, period_known = scan_period_ns(clouds, chosen.rotation_rate)
     rejected: list[str] = []
@@ -89,7 +89,7 @@ def may_be_time(name: str) -> bool:
 
 
 def _try_field(
-    name: str, clouds: list[Clocked], chosen: Recording, period_ns: int
+    name: str, clouds: list[Clocked], chosen: RecordingParams, period_ns: int
 ) -> tuple[Timing, str, list[Finding]]:
     """Timing by this field; a problem, if it can not be the time of the points; the findings.
 
@@ -135,7 +135,7 @@ def _reference(
     unit_ns: int,
     columns: list[npt.NDArray[Any]],
     clouds: list[Clocked],
-    chosen: Recording,
+    chosen: RecordingParams,
     period_ns: int,
 ) -> tuple[Timing, list[Finding]]:
     """What the field counts from, and which point the header belongs to."""
@@ -180,7 +180,9 @@ def _reference(
     ]
 
 
-def _absolute_findings(to_first: float, to_last: float, period_ns: int, chosen: Recording, near: bool) -> list[Finding]:
+def _absolute_findings(
+    to_first: float, to_last: float, period_ns: int, chosen: RecordingParams, near: bool
+) -> list[Finding]:
     header, offset = ("first", to_first) if abs(to_first) < abs(to_last) else ("last", to_last)
     if not near:
         text = f"taken as absolute, as you set it, yet {abs(offset) / 1e9:.1f} s from the header stamps"
@@ -198,7 +200,7 @@ def _absolute_findings(to_first: float, to_last: float, period_ns: int, chosen: 
 
 
 def _header_of(
-    clouds: list[Clocked], least: list[int], most: list[int], period_ns: int, chosen: Recording
+    clouds: list[Clocked], least: list[int], most: list[int], period_ns: int, chosen: RecordingParams
 ) -> tuple[Literal["first", "last"], str, Literal["fine", "corrected", "needs you"]]:
     """Which point the header belongs to, why, and how sure that is."""
     if chosen.header_stamp != "auto":
@@ -245,7 +247,7 @@ def log_delay_ns(clouds: list[Clocked]) -> float | None:
 
 
 def _without_field(
-    clouds: list[Clocked], chosen: Recording, period_ns: int, period_known: bool, rejected: list[str]
+    clouds: list[Clocked], chosen: RecordingParams, period_ns: int, period_known: bool, rejected: list[str]
 ) -> tuple[Timing, list[Finding]]:
     if chosen.rotation_rate > 0:
         period_ns = round(1e9 / chosen.rotation_rate)

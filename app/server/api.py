@@ -20,8 +20,8 @@ from app.server.protocol import (
     AddNote,
     Command,
     CompareWith,
+    EditLoop,
     OpenRecording,
-    OverruleLoop,
     Pause,
     Play,
     RedoLoop,
@@ -82,7 +82,7 @@ class BreakpointsBody(BaseModel):
     error: float | None = Field(None, ge=0, description="To the truth, m.")
 
 
-class OverruleBody(BaseModel):
+class EditBody(BaseModel):
     """The user's word on the loop of two keyframes."""
 
     action: Literal["accept", "reject", "weigh", "add"]
@@ -96,7 +96,7 @@ class GraphBody(BaseModel):
     action: Literal["undo", "redo", "solve"]
 
 
-LoopAction = Annotated[OverruleBody | GraphBody, Field(discriminator="action")]
+LoopAction = Annotated[EditBody | GraphBody, Field(discriminator="action")]
 
 
 class NoteBody(BaseModel):
@@ -171,7 +171,7 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
         return loops_state(engine.snapshot.loops)
 
     @router.post("/loops", status_code=202)
-    def overrule(body: LoopAction) -> None:
+    def edit_loops(body: LoopAction) -> None:
         """Accept, reject, weigh or add a loop; solve all factors at once (Levenberg-Marquardt); undo or redo that."""
         _send(engine, _loop_command(body))
 
@@ -231,18 +231,18 @@ def _command(action: Simple | StepBody | SeekBody | SpeedBody) -> Command:
             return Restart()
 
 
-def _loop_command(body: OverruleBody | GraphBody) -> Command:
+def _loop_command(body: EditBody | GraphBody) -> Command:
     match body:
-        case OverruleBody(action="accept", older=older, newer=newer):
-            return OverruleLoop(Accept(older, newer))
-        case OverruleBody(action="reject", older=older, newer=newer):
-            return OverruleLoop(Reject(older, newer))
-        case OverruleBody(action="weigh", older=older, newer=newer):
-            return OverruleLoop(SetWeight(older, newer, body.weight))
-        case OverruleBody(older=older, newer=newer):
-            return OverruleLoop(Add(older, newer, register=body.register_))
+        case EditBody(action="accept", older=older, newer=newer):
+            return EditLoop(Accept(older, newer))
+        case EditBody(action="reject", older=older, newer=newer):
+            return EditLoop(Reject(older, newer))
+        case EditBody(action="weigh", older=older, newer=newer):
+            return EditLoop(SetWeight(older, newer, body.weight))
+        case EditBody(older=older, newer=newer):
+            return EditLoop(Add(older, newer, register=body.register_))
         case GraphBody(action="solve"):
-            return OverruleLoop(Solve())
+            return EditLoop(Solve())
         case GraphBody(action="undo"):
             return UndoLoop()
         case _:

@@ -94,7 +94,7 @@ def _events(wanted: Breakpoints, result: StepResult) -> list[str]:
         scans = "1 scan was" if result.dropped == 1 else f"{result.dropped} scans were"
         texts.append(f"{scans} left out just before this frame.")
     for edge in result.loops:
-        if edge.overruled or edge.origin is Origin.USER:  # that is no news to the user
+        if edge.edited or edge.origin is Origin.USER:  # that is no news to the user
             continue
         between = f"between keyframes {edge.older} and {edge.newer}"
         if wanted.loop_found and edge.verdict is Verdict.ACCEPTED:

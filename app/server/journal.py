@@ -2,7 +2,7 @@
 
 Lines of JSON, only ever appended, each whole or not there: a file cut anywhere tells the session up to
 its last whole line. The engine is deterministic, so a session is no more than the recording, the
-parameters by the frame they came into force at, the overrulings of loops, and the frame it is at.
+parameters by the frame they came into force at, the edits of loops, and the frame it is at.
 
     {"hemislam": "0.3.0", "format": 1, "recording": "/data/walk.mcap", ...}    what was opened
     {"frame": 120, "did": "SetParams", "values": {"ground.alpha": 30}}         what the user did, for people
@@ -26,8 +26,8 @@ from app import __version__
 from app.server.breakpoints import Breakpoints
 from app.server.protocol import Command, CompareWith, Note
 from app.slam.errors import HemislamError
-from app.slam.loops import edits
-from app.slam.loops.types import Command as Overruling
+from app.slam.loops import edit_files
+from app.slam.loops.types import LoopEdit
 from app.slam.params import Params
 
 log = logging.getLogger(__name__)
@@ -55,14 +55,14 @@ class Opened:
 class State:
     """Attributes:
     params: as chosen now. history: from which frame on which were in force, ascending.
-    overrulings: of loops, in force. undone: that can be done again, the next one last.
+    edits: of loops, in force. undone: that can be done again, the next one last.
     notes: in the order in which they were made. breakpoints: where playing pauses. speed: to play at.
     """
 
     params: Params
     history: tuple[tuple[int, Params], ...] = ()
-    overrulings: tuple[Overruling, ...] = ()
-    undone: tuple[Overruling, ...] = ()
+    edits: tuple[LoopEdit, ...] = ()
+    undone: tuple[LoopEdit, ...] = ()
     notes: tuple[Note, ...] = ()
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     speed: float = 1.0
@@ -214,8 +214,8 @@ def _state_tree(state: State) -> dict[str, Any]:
     return {
         "params": Params().changed(state.params),
         "history": [[frame, Params().changed(params)] for frame, params in state.history],
-        "overrulings": yaml.safe_load(edits.write(state.overrulings)),
-        "undone": yaml.safe_load(edits.write(state.undone)),
+        "edits": yaml.safe_load(edit_files.write(state.edits)),
+        "undone": yaml.safe_load(edit_files.write(state.undone)),
         "notes": [[note.frame, note.text] for note in state.notes],
         "breakpoints": asdict(state.breakpoints),
         "speed": "max" if math.isinf(state.speed) else state.speed,
@@ -226,8 +226,8 @@ def _state(tree: Mapping[str, Any]) -> State:
     return State(
         params=Params().with_values(tree["params"]),
         history=tuple((int(frame), Params().with_values(values)) for frame, values in tree["history"]),
-        overrulings=edits.read(yaml.safe_dump(tree["overrulings"])),
-        undone=edits.read(yaml.safe_dump(tree["undone"])),
+        edits=edit_files.read(yaml.safe_dump(tree["edits"])),
+        undone=edit_files.read(yaml.safe_dump(tree["undone"])),
         notes=tuple(Note(int(frame), str(text)) for frame, text in tree.get("notes", ())),
         breakpoints=Breakpoints(**tree.get("breakpoints", {})),
         speed=math.inf if tree.get("speed") == "max" else float(tree.get("speed", 1.0)),

@@ -17,7 +17,7 @@ from app.server.run import Quiet, Run
 from app.slam.engine import Checkpoint, Engine
 from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
-from app.slam.loops.types import Command
+from app.slam.loops.types import LoopEdit
 from app.slam.params import Params
 from app.slam.results import LogState
 from app.slam.types import DroppedScan, Measurement, StepResult
@@ -53,7 +53,7 @@ class _Kept:
     opened: OpenedRecording
     log: LogState
     readouts: Readouts
-    overrulings: tuple[tuple[Command, ...], tuple[Command, ...]]
+    edits: tuple[tuple[LoopEdit, ...], tuple[LoopEdit, ...]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,7 @@ class LiveRun(Run):
             opened=self.opened,
             log=self.log.checkpoint(),
             readouts=self.readouts,
-            overrulings=(loops.undo, loops.redo) if loops else ((), ()),
+            edits=(loops.undo, loops.redo) if loops else ((), ()),
         )
 
     @property
@@ -199,8 +199,8 @@ class LiveRun(Run):
         self.choose(kept.params)
         self.frame = self.known = kept.frame
         self.history, self.opened, self.readouts = kept.history, kept.opened, kept.readouts
-        if any(kept.overrulings):
-            self.overrule(*kept.overrulings)
+        if any(kept.edits):
+            self.edit_loops(*kept.edits)
         self._client.place = kept.place
         return True
 

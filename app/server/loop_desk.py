@@ -3,15 +3,15 @@
 from dataclasses import replace
 
 from app.server.delta import Outbox
-from app.server.protocol import InspectLoop, LoopCommand, LoopsView, OverruleLoop, RedoLoop, TryLoop, UndoLoop
+from app.server.protocol import EditLoop, InspectLoop, LoopCommand, LoopsView, RedoLoop, TryLoop, UndoLoop
 from app.slam.loops.line import LoopLine
 from app.slam.loops.messages import (
+    ApplyEdit,
     AskResiduals,
     Failure,
     Inspect,
     Inspected,
     LoopState,
-    Overrule,
     Redo,
     Residuals,
     Tried,
@@ -38,8 +38,8 @@ class LoopDesk:
         """Pass a command of the page on; `update` brings what comes of it."""
         view = self._view
         match command:
-            case OverruleLoop(overruling):
-                loops.command(Overrule(overruling))
+            case EditLoop(edit):
+                loops.command(ApplyEdit(edit))
                 view = replace(view, tried=None)
             case UndoLoop():
                 loops.command(Undo())

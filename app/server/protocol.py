@@ -117,15 +117,15 @@ class Save:
 
 
 @dataclass(frozen=True, slots=True)
-class OverruleLoop:
+class EditLoop:
     """The user's word on a loop: accept, reject, add or weigh it."""
 
-    command: loops.Command
+    command: loops.LoopEdit
 
 
 @dataclass(frozen=True, slots=True)
 class UndoLoop:
-    """Take the last `OverruleLoop` back."""
+    """Take the last `EditLoop` back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,7 @@ class RedoLoop:
 class TryLoop:
     """Show in `LoopsView.tried` what the graph would become by a command, without doing it; None: no more."""
 
-    command: loops.Command | None
+    command: loops.LoopEdit | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ class Shutdown:
     """End the engine's process cleanly."""
 
 
-LoopCommand = OverruleLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop
+LoopCommand = EditLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop
 Command = (
     Play
     | Pause
@@ -271,10 +271,10 @@ class LoopsView:
 
     edges: tuple[loops.LoopEdge, ...] = ()
     residuals: tuple[loops.FactorResidual, ...] = ()
-    undo: tuple[loops.Command, ...] = ()
-    redo: tuple[loops.Command, ...] = ()
+    undo: tuple[loops.LoopEdit, ...] = ()
+    redo: tuple[loops.LoopEdit, ...] = ()
     inspected: tuple[loops.Pair, loops.LoopDetail] | None = None
-    tried: tuple[loops.Command, loops.Preview] | None = None
+    tried: tuple[loops.LoopEdit, loops.Preview] | None = None
 
 
 SERIES = (

@@ -17,7 +17,7 @@ from app.slam.engine import Checkpoint, Engine
 from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.messages import LoadCommands
-from app.slam.loops.types import Command as Overruling
+from app.slam.loops.types import LoopEdit
 from app.slam.params import Params, leaves
 from app.slam.results import LogState, RunInfo, RunLog, prepare_folder, save_results
 from app.slam.trajectory import Trajectory, read_tum, time_apart, write_tum
@@ -173,14 +173,14 @@ class Run:
         """Start and duration (s) of what is processed of the recording."""
         return self._part
 
-    def overrule(self, commands: tuple[Overruling, ...], undone: tuple[Overruling, ...] = ()) -> None:
+    def edit_loops(self, commands: tuple[LoopEdit, ...], undone: tuple[LoopEdit, ...] = ()) -> None:
         """Put these commands over the loops that are found, now and later; the undone ones can be done again.
 
         Raises:
             HemislamError: loops are not looked for.
         """
         if self.engine.loops is None:
-            raise HemislamError("Loops are not looked for, so none can be overruled; set loops.enabled.")
+            raise HemislamError("Loops are not looked for, so there are none to edit; set loops.enabled.")
         self.engine.loops.command(LoadCommands(commands, undone))
 
     def resume(self, saved: SavedSession) -> None:
@@ -189,12 +189,12 @@ class Run:
         Seeking does so; a frame that is played, or a change of parameters before, makes another walk of it.
 
         Raises:
-            HemislamError: it overrules loops, and none are looked for.
+            HemislamError: it edits loops, and none are looked for.
         """
         state = saved.state
         self.choose(self.usable(state.params))
-        if state.overrulings or state.undone:
-            self.overrule(state.overrulings, state.undone)
+        if state.edits or state.undone:
+            self.edit_loops(state.edits, state.undone)
         self._followed = saved if saved.frame > self.frame else None
 
     def compare_with(self, path: Path | None) -> F64:

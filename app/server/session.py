@@ -17,11 +17,11 @@ from app.server.protocol import (
     AddNote,
     Command,
     CompareWith,
+    EditLoop,
     InspectLoop,
     LoadParams,
     Note,
     OpenRecording,
-    OverruleLoop,
     Pause,
     Play,
     Progress,
@@ -52,7 +52,7 @@ MOST_NOTES = 1000
 
 _AT_ONCE = OpenRecording | Restart | SetSpeed | SetBreakpoints | Shutdown
 """Commands that do not wait until what is being opened is open."""
-_FOR_THE_FRAME = OverruleLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop | AddNote | CompareWith | Save
+_FOR_THE_FRAME = EditLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop | AddNote | CompareWith | Save
 
 
 class OpenRun(Protocol):
@@ -170,7 +170,7 @@ class Session:
                 run = self._need_run()
                 session = SavedSession(opened_of(run), self._state(run), run.frame)
                 self._saver.start(folder, run.saver(folder, session, trajectory_only=trajectory_only))
-            case OverruleLoop() | UndoLoop() | RedoLoop() | TryLoop() | InspectLoop():
+            case EditLoop() | UndoLoop() | RedoLoop() | TryLoop() | InspectLoop():
                 self._desk.handle(command, self._need_loops())
             case _:
                 assert_never(command)
@@ -281,7 +281,7 @@ class Session:
         return State(
             params=self._params,
             history=run.history,
-            overrulings=loops.undo if loops is not None else (),
+            edits=loops.undo if loops is not None else (),
             undone=loops.redo if loops is not None else (),
             notes=self._notes,
             breakpoints=self._player.breakpoints,

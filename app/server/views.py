@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from app.sensors.live.status import LiveState
 from app.server.protocol import LoopsView, OpenedRecording, Snapshot
-from app.slam.loops import edits
+from app.slam.loops import edit_files
 from app.slam.types import StepResult
 
 Speed = Annotated[float, Field(ge=0.1)] | Literal["max"]
@@ -102,7 +102,7 @@ class LoopView(BaseModel):
     verdict: str
     reason: str
     origin: str
-    overruled: bool = Field(description="Whether the verdict is the user's.")
+    edited: bool = Field(description="Whether the verdict is the user's.")
     weight: float
     represented_by: tuple[int, int] | None = Field(description="A loop that is in the graph for both.")
     repeats: tuple[int, int] | None = Field(
@@ -112,7 +112,7 @@ class LoopView(BaseModel):
 
 class LoopsState(BaseModel):
     loops: list[LoopView]
-    overrulings: list[dict[str, Any]] = Field(description="The user's word on loops, in order, as in a file of edits.")
+    edits: list[dict[str, Any]] = Field(description="The user's word on loops, in order, as in a file of edits.")
     undone: list[dict[str, Any]] = Field(description="That can be done again, the next one last.")
 
 
@@ -141,15 +141,15 @@ def loops_state(view: LoopsView) -> LoopsState:
                 verdict=edge.verdict,
                 reason=edge.reason,
                 origin=edge.origin,
-                overruled=edge.overruled,
+                edited=edge.edited,
                 weight=edge.weight,
                 represented_by=edge.represented_by,
                 repeats=edge.repeats,
             )
             for edge in view.edges
         ],
-        overrulings=yaml.safe_load(edits.write(view.undo)),
-        undone=yaml.safe_load(edits.write(view.redo)),
+        edits=yaml.safe_load(edit_files.write(view.undo)),
+        undone=yaml.safe_load(edit_files.write(view.redo)),
     )
 
 

@@ -46,7 +46,7 @@ class Engine:
     Attributes:
         params: used from the next step on; those that act on restart are read only once, here.
         keyframes: the full map so far.
-        loops: what was found, and the way to overrule it; None for odometry alone.
+        loops: what was found, and the way to edit it; None for odometry alone.
     """
 
     def __init__(

@@ -3,14 +3,14 @@
 import numpy as np
 
 from app.slam.kernels import ground as kernels
-from app.slam.params import Ground
+from app.slam.params import GroundParams
 from app.slam.types import F32, F64, NON_GROUND, U8, U16, GroundResult
 
 MIN_SEEDS = 20
 """Fewer seeds than this do not make a plane worth believing."""
 
 
-def segment(points: F32, ring: U16, down: F64, params: Ground) -> GroundResult:
+def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundResult:
     """Label the ground of one scan.
 
     Args:

@@ -11,7 +11,7 @@ from app.slam.imu import DIM, POS, ROT, Belief
 from app.slam.kernels import manifold
 from app.slam.kernels import registration as kernels
 from app.slam.local_map import LocalMap, Planes
-from app.slam.params import Filter
+from app.slam.params import FilterParams
 from app.slam.types import F32, F64, Matches, NavState, Registration
 
 RESEARCH_ROTATION = 1e-3
@@ -59,7 +59,7 @@ def _unpacked(x: F64, stamp_ns: int) -> NavState:
     return NavState(stamp_ns, R.reshape(3, 3), p, v, bg, ba, g, R_il.reshape(3, 3), p_il)
 
 
-def update(prior: Belief, points: F32, local_map: LocalMap, params: Filter) -> tuple[Belief, Registration]:
+def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams) -> tuple[Belief, Registration]:
     """Fuse one scan: minimise eq. 7 from the predicted belief.
 
     Args:

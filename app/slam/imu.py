@@ -6,7 +6,7 @@ import numpy as np
 
 from app.slam import lie
 from app.slam.kernels import manifold, motion
-from app.slam.params import Imu
+from app.slam.params import ImuParams
 from app.slam.types import F32, F64, ImuSamples, NavState, Scan
 
 DIM = 23
@@ -45,7 +45,7 @@ class Path:
     poses: F64
 
 
-def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: Imu) -> tuple[Belief, Path]:
+def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -> tuple[Belief, Path]:
     """Carry the belief forward to `end_ns` through the samples that cover the time from its stamp.
 
     Rates are linear between samples, constant before the first and after the last one; through a long gap the

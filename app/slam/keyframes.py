@@ -14,7 +14,7 @@ from typing import IO
 import numpy as np
 
 from app.slam import lie
-from app.slam.params import Keyframes
+from app.slam.params import KeyframeParams
 from app.slam.types import F64, Cloud, Keyframe
 
 _HEAD = np.dtype(
@@ -33,7 +33,7 @@ _POINT = np.dtype(
 """One point of a `Cloud`; the names are its attributes."""
 
 
-def is_due(T_odom_last: F64 | None, T_odom_imu: F64, params: Keyframes) -> bool:
+def is_due(T_odom_last: F64 | None, T_odom_imu: F64, params: KeyframeParams) -> bool:
     """Whether the pose is far or turned enough from the last keyframe's, if there is one."""
     if T_odom_last is None:
         return True

@@ -7,8 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.slam.kernels import map as kernels
-from app.slam.params import Filter
-from app.slam.params import LocalMap as MapParams
+from app.slam.params import FilterParams, MapParams
 from app.slam.types import F32, F64, I32, U8
 
 LEAST_SCATTER = 2.0
@@ -89,7 +88,7 @@ class LocalMap:
         )
         self._center = np.array(center)
 
-    def planes(self, queries: F64, params: Filter, relaxed: float = 1.0) -> Planes:
+    def planes(self, queries: F64, params: FilterParams, relaxed: float = 1.0) -> Planes:
         """A plane for each of (n, 3) odom points; see `kernels.map.planes`. `relaxed` widens the tilt allowed."""
         n = len(queries)
         out = Planes(np.empty((n, 3)), np.empty((n, 3)), np.empty(n))

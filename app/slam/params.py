@@ -12,31 +12,31 @@ from pydantic import ValidationError
 from app.slam.errors import HemislamError
 from app.slam.sections import (
     Effect,
-    Filter,
-    Ground,
-    Imu,
-    Keyframes,
-    LocalMap,
-    Loops,
-    Recording,
-    ScanVoxel,
+    FilterParams,
+    GroundParams,
+    ImuParams,
+    KeyframeParams,
+    LoopsParams,
+    MapParams,
+    RecordingParams,
+    ScanParams,
     Section,
-    Sensor,
+    SensorParams,
 )
 
 __all__ = [
     "Effect",
-    "Filter",
-    "Ground",
-    "Imu",
-    "Keyframes",
+    "FilterParams",
+    "GroundParams",
+    "ImuParams",
+    "KeyframeParams",
     "Leaf",
-    "LocalMap",
-    "Loops",
+    "LoopsParams",
+    "MapParams",
     "Params",
-    "Recording",
-    "ScanVoxel",
-    "Sensor",
+    "RecordingParams",
+    "ScanParams",
+    "SensorParams",
     "leaves",
 ]
 
@@ -44,15 +44,15 @@ __all__ = [
 class Params(Section):
     """All parameters of hemislam."""
 
-    recording: Recording = Recording()
-    sensor: Sensor = Sensor()
-    ground: Ground = Ground()
-    scan: ScanVoxel = ScanVoxel()
-    imu: Imu = Imu()
-    filter: Filter = Filter()
-    map: LocalMap = LocalMap()
-    keyframe: Keyframes = Keyframes()
-    loops: Loops = Loops()
+    recording: RecordingParams = RecordingParams()
+    sensor: SensorParams = SensorParams()
+    ground: GroundParams = GroundParams()
+    scan: ScanParams = ScanParams()
+    imu: ImuParams = ImuParams()
+    filter: FilterParams = FilterParams()
+    map: MapParams = MapParams()
+    keyframe: KeyframeParams = KeyframeParams()
+    loops: LoopsParams = LoopsParams()
 
     @classmethod
     def parse(cls, tree: Mapping[str, Any]) -> "Params":

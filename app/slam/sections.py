@@ -39,7 +39,7 @@ class Section(BaseModel):
         return value
 
 
-class Recording(Section):
+class RecordingParams(Section):
     """How a recording is read. `auto` lets the recording doctor decide and say so."""
 
     lidar_topic: str = _param(
@@ -75,7 +75,7 @@ class Recording(Section):
     )
 
 
-class Sensor(Section):
+class SensorParams(Section):
     """Where the LiDAR sits on the IMU, and which returns are believed."""
 
     translation: tuple[float, float, float] = _param(
@@ -94,7 +94,7 @@ class Sensor(Section):
     max_range: float = _param(100.0, "Returns farther than this are dropped.", unit="m", ge=1, le=300, step=1)
 
 
-class Ground(Section):
+class GroundParams(Section):
     """Seed-point ground segmentation and ground downsampling (paper 2.2, eq. 1-3)."""
 
     enabled: bool = _param(True, "Segment the ground and thin it before the filter.", effect="now")
@@ -151,7 +151,7 @@ class Ground(Section):
     )
 
 
-class ScanVoxel(Section):
+class ScanParams(Section):
     """What the filter sees of a scan, after the ground was thinned."""
 
     voxel_size: float = _param(
@@ -164,7 +164,7 @@ class ScanVoxel(Section):
     )
 
 
-class Imu(Section):
+class ImuParams(Section):
     """The IMU's noise and how the filter starts."""
 
     gyro_noise: float = _param(1.2e-3, "Gyroscope noise density.", unit="rad/s/√Hz", ge=1e-6, le=1, step=1e-4)
@@ -195,7 +195,7 @@ class Imu(Section):
     )
 
 
-class Filter(Section):
+class FilterParams(Section):
     """The iterated Kalman filter's update (paper 2.3, eq. 5-7)."""
 
     point_noise: float = _param(
@@ -237,7 +237,7 @@ class Filter(Section):
     estimate_extrinsics: bool = _param(False, "Estimate the LiDAR's pose on the IMU while mapping.")
 
 
-class LocalMap(Section):
+class MapParams(Section):
     """The hashed voxel map that scans are registered to. Its memory is bounded."""
 
     voxel_size: float = _param(
@@ -271,14 +271,14 @@ class LocalMap(Section):
     )
 
 
-class Keyframes(Section):
+class KeyframeParams(Section):
     """Which frames are kept for the map."""
 
     distance: float = _param(0.5, "A new keyframe after walking this far.", unit="m", ge=0.05, le=20, step=0.05)
     angle: float = _param(15.0, "A new keyframe after turning this far.", unit="deg", ge=1, le=180, step=1)
 
 
-class Loops(Section):
+class LoopsParams(Section):
     """Recognising places seen before, and the graph that they straighten (paper 2.4, eq. 8)."""
 
     enabled: bool = _param(True, "Look for loops and correct the map by them.", effect="restart")

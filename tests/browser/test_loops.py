@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
-from app.server.protocol import InspectLoop, OverruleLoop, RedoLoop, TryLoop, UndoLoop
+from app.server.protocol import EditLoop, InspectLoop, RedoLoop, TryLoop, UndoLoop
 from app.slam.loops.types import Reject
 from tests.browser.conftest import Bench, opened
 from tests.ui.fake_loops import LoopEngine
@@ -72,7 +72,7 @@ def test_a_loop_is_rejected_undone_and_rejected_again(bench: Bench) -> None:
     expect(page.get_by_text("Keyframes would move by up to")).to_be_visible()
     page.get_by_role("button", name="Commit").click()
     expect(page.get_by_role("button", name="Undo: reject 12–89")).to_be_visible()
-    bench.eventually(lambda: OverruleLoop(Reject(*GOOD)) in bench.engine.sent)
+    bench.eventually(lambda: EditLoop(Reject(*GOOD)) in bench.engine.sent)
     assert bench.engine.sent[0] == TryLoop(Reject(*GOOD))
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Control+z")

@@ -7,7 +7,7 @@ from app.sensors.findings import Finding
 from app.sensors.layout import ImuProbe, Probe, gravity_findings, settle_cloud, settle_imu
 from app.sensors.pointcloud import CloudLayout, CloudMessage, decode
 from app.slam.errors import HemislamError
-from app.slam.params import Params, Recording
+from app.slam.params import Params, RecordingParams
 from tests.sensors import rig
 
 XYZ = [("x", "f4", "x"), ("y", "f4", "y"), ("z", "f4", "z")]
@@ -24,7 +24,7 @@ def clouds(layout: rig.Layout, *, log_delay_ns: int = 3_000_000, turns: int = 4,
 
 
 def settle(probes: list[Probe], **chosen: object) -> tuple[CloudLayout, dict[str, Finding]]:
-    layout, findings = settle_cloud(probes, Recording(**chosen), "/points")
+    layout, findings = settle_cloud(probes, RecordingParams(**chosen), "/points")
     return layout, {finding.subject: finding for finding in findings}
 
 
@@ -256,13 +256,13 @@ def imu_probe(accel: tuple[float, ...], gyro: tuple[float, ...] = (0, 0, 0), wob
     ],
 )
 def test_the_unit_of_acceleration_is_known_by_gravity(norm: float, chosen: str, scale: float, verdict: str) -> None:
-    got, findings = settle_imu(imu_probe((0.6 * norm, 0.0, -0.8 * norm)), Recording(acceleration_unit=chosen))
+    got, findings = settle_imu(imu_probe((0.6 * norm, 0.0, -0.8 * norm)), RecordingParams(acceleration_unit=chosen))
     assert got == scale
     assert findings[0].verdict == verdict
 
 
 def test_a_gyroscope_in_degrees_is_suspected() -> None:
-    _, findings = settle_imu(imu_probe((0, 0, 9.81), gyro=(0, 25.0, 0)), Recording())
+    _, findings = settle_imu(imu_probe((0, 0, 9.81), gyro=(0, 25.0, 0)), RecordingParams())
     assert findings[-1].verdict == "needs you" and "rad/s" in findings[-1].text
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from app.sensors.layout import Probe, settle_cloud
 from app.sensors.pointcloud import CloudError, CloudLayout, CloudMessage, decode
-from app.slam.params import Recording
+from app.slam.params import RecordingParams
 from tests.sensors import rig
 
 UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
@@ -22,7 +22,7 @@ def settle(layout: rig.Layout, lost: tuple[int, ...] = ()) -> tuple[list[Probe],
         made = rig.turn(number, columns=20)
         cloud = CloudMessage.from_ros(rig.message(made, layout, lost=lost))
         probes.append(Probe(made.begin_ns + rig.PERIOD_NS + 3_000_000, cloud))
-    return probes, settle_cloud(probes, Recording(), "/points")[0]
+    return probes, settle_cloud(probes, RecordingParams(), "/points")[0]
 
 
 @st.composite
@@ -113,7 +113,7 @@ def test_nanoseconds_as_unsigned_64_bit_integers_lose_no_digit() -> None:
     data[:, offset : offset + 8] = stamps.view(np.uint8).reshape(-1, 8)
     fields = cloud.fields | {"timestamp": (offset, np.dtype("<u8"))}
     cloud = replace(cloud, fields=fields, data=data.reshape(-1))
-    settled, _ = settle_cloud([Probe(cloud.stamp_ns + 1_000_000, cloud)], Recording(), "/points")
+    settled, _ = settle_cloud([Probe(cloud.stamp_ns + 1_000_000, cloud)], RecordingParams(), "/points")
     scan = decode(cloud, settled)
     np.testing.assert_array_equal(scan.stamp_ns + scan.offsets_ns.astype(np.int64), stamps.astype(np.int64))
 

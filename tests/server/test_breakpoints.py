@@ -104,7 +104,7 @@ def test_a_loop_pauses_at_the_frame_at_which_it_takes_effect_and_says_why() -> N
 
 
 def test_the_users_own_word_on_a_loop_pauses_nothing() -> None:
-    overruled = replace(edge(Verdict.ACCEPTED), overruled=True)
+    overruled = replace(edge(Verdict.ACCEPTED), edited=True)
     added = replace(edge(Verdict.ACCEPTED), origin=Origin.USER)
     result = frame(loops=(overruled, added))
     assert reasons(Breakpoints(loop_found=True), Moment(GOOD), Moment(result)) == ()

@@ -9,7 +9,7 @@ from test_fork import SAMPLE, both_at, same, until
 
 from app.sensors.presets import resolve_params
 from app.server.fork import Workspace
-from app.server.protocol import OverruleLoop, Play, Seek, Snapshot, UndoLoop
+from app.server.protocol import EditLoop, Play, Seek, Snapshot, UndoLoop
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.loops.types import Pair, SetWeight, Verdict
@@ -56,7 +56,7 @@ def test_a_fork_with_the_same_parameters_has_the_same_loops_and_map(walked: Work
 def test_a_word_on_a_loop_in_b_moves_b_alone_and_undone_leaves_nothing(walked: Workspace) -> None:
     before, _ = agreed(walked)
     pair = accepted(before)[-1]
-    walked.send_other(OverruleLoop(SetWeight(*pair, 20.0)))
+    walked.send_other(EditLoop(SetWeight(*pair, 20.0)))
     b = until(lambda: walked.other, lambda s: s.loops.undo == (SetWeight(*pair, 20.0),))
     a = walked.snapshot
     assert accepted(a) == accepted(before) and not a.loops.undo

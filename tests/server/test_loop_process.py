@@ -13,13 +13,13 @@ import pytest
 
 from app.server.loop_process import LoopProcess
 from app.slam import lie
-from app.slam.loops.messages import AddKeyframe, Finish, GoTo, LoopState, LoopWorkerDied, Overrule, Request, Undo
+from app.slam.loops.messages import AddKeyframe, ApplyEdit, Finish, GoTo, LoopState, LoopWorkerDied, Request, Undo
 from app.slam.loops.service import InlineLoops
 from app.slam.loops.types import Add, Reject, rows
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.types import NON_GROUND, Cloud, Keyframe
 
-PARAMS = Loops(submap_keyframes=1, min_time=1.0, support=0)
+PARAMS = LoopsParams(submap_keyframes=1, min_time=1.0, support=0)
 PATIENCE_S = 60.0
 
 
@@ -66,8 +66,8 @@ def until_gone(pid: int) -> None:
 def test_it_answers_as_one_in_this_process_would(process: LoopProcess) -> None:
     far = rows(lie.transform(np.eye(3), np.array([0.5, 0.1, 0.0])))
     requests: list[Request] = [AddKeyframe(keyframe, PARAMS) for keyframe in keyframes()]
-    requests += [Finish(), Overrule(Add(1, 5, far, register=False)), Overrule(Reject(1, 5)), Undo(), Undo()]
-    requests += [GoTo(4), GoTo(5), GoTo(2, forget=True), Overrule(Reject(3, 3))]
+    requests += [Finish(), ApplyEdit(Add(1, 5, far, register=False)), ApplyEdit(Reject(1, 5)), Undo(), Undo()]
+    requests += [GoTo(4), GoTo(5), GoTo(2, forget=True), ApplyEdit(Reject(3, 3))]
     inline = InlineLoops()
     for request in requests:
         process.send(request)

@@ -16,8 +16,8 @@ from app.__main__ import cli
 from app.sensors.presets import resolve_params
 from app.server.loop_process import LoopProcess
 from app.server.protocol import (
+    EditLoop,
     InspectLoop,
-    OverruleLoop,
     Pause,
     Play,
     RedoLoop,
@@ -29,7 +29,7 @@ from app.server.protocol import (
     UndoLoop,
 )
 from app.server.run import open_run
-from app.slam.loops import edits
+from app.slam.loops import edit_files
 from app.slam.loops.types import Accept, LoopEdge, Reject, SetWeight, Verdict
 from app.slam.results import LOOP_FILES
 
@@ -110,7 +110,7 @@ def test_all_rejected_leaves_odometry_and_undone_leaves_nothing(
 ) -> None:
     before = walk.end()
     loops = accepted(before)
-    after = walk.do(*(OverruleLoop(Reject(*edge.pair)) for edge in loops))
+    after = walk.do(*(EditLoop(Reject(*edge.pair)) for edge in loops))
     assert not accepted(after) and len(after.loops.undo) == len(loops)
     np.testing.assert_array_equal(after.result.T_map_odom, np.eye(4))
     assert after.trajectory is not None and before.trajectory is not None
@@ -124,15 +124,15 @@ def test_all_rejected_leaves_odometry_and_undone_leaves_nothing(
 def test_the_file_of_what_was_done_in_the_page_repeats_it_headless(walk: Walk, tmp_path: Path) -> None:
     loops = accepted(walk.end())
     snapshot = walk.do(
-        OverruleLoop(Reject(*loops[0].pair)),
-        OverruleLoop(SetWeight(*loops[-1].pair, 0.1)),
-        OverruleLoop(Accept(*loops[0].pair)),
+        EditLoop(Reject(*loops[0].pair)),
+        EditLoop(SetWeight(*loops[-1].pair, 0.1)),
+        EditLoop(Accept(*loops[0].pair)),
         UndoLoop(),
         RedoLoop(),
         UndoLoop(),
     )
     path = tmp_path / "edits.yaml"
-    path.write_text(edits.write(snapshot.loops.undo) + "- accept: [1, 2]\n")
+    path.write_text(edit_files.write(snapshot.loops.undo) + "- accept: [1, 2]\n")
     ours = walk.saved(tmp_path / "page")
     walk.do(UndoLoop(), UndoLoop())
     settings = [word for setting in DRIFTING for word in ("--set", setting)]
@@ -158,7 +158,7 @@ def test_a_loop_can_be_looked_at_and_a_command_tried_without_doing_it(walk: Walk
 
 def test_what_can_not_be_done_is_said_and_changes_nothing(walk: Walk) -> None:
     before = walk.end()
-    after = walk.do(OverruleLoop(SetWeight(*accepted(before)[0].pair, -1.0)))
+    after = walk.do(EditLoop(SetWeight(*accepted(before)[0].pair, -1.0)))
     assert after.notices[-1].level == "error" and "weight" in after.notices[-1].text
     assert after.loops.edges == before.loops.edges
 
@@ -169,7 +169,7 @@ def test_a_factor_that_the_solver_fails_with_is_left_out_the_page_says_so_and_th
 ) -> None:
     """gtsam raises IndeterminantLinearSystemException with so large a weight."""
     pair = accepted(walk.end())[0].pair
-    broken = walk.do(OverruleLoop(SetWeight(*pair, 1e306)))
+    broken = walk.do(EditLoop(SetWeight(*pair, 1e306)))
     assert f"The solver failed with the loop {pair[0]}-{pair[1]}" in broken.notices[-1].text
     (edge,) = (edge for edge in broken.loops.edges if edge.pair == pair)
     assert edge.verdict is Verdict.REJECTED and "solver" in edge.reason
@@ -193,7 +193,7 @@ def test_the_loops_process_killed_twice_is_revived_and_leaves_the_same_files(
     ended = walk.end()
     assert any("started again" in notice.text for notice in ended.notices)
     pair = accepted(ended)[0].pair
-    walk.session.handle(OverruleLoop(Reject(*pair)))
+    walk.session.handle(EditLoop(Reject(*pair)))
     kill()  # before it has answered
     walk.settle()
     assert walk.see().loops.undo == (Reject(*pair),)

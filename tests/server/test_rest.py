@@ -133,7 +133,7 @@ def test_a_note_stays_with_its_frame(site: Site) -> None:
 
 
 def test_a_loop_that_can_not_be_overruled_is_told(site: Site) -> None:
-    assert httpx.get(site.url("/api/loops")).json() == {"loops": [], "overrulings": [], "undone": []}
+    assert httpx.get(site.url("/api/loops")).json() == {"loops": [], "edits": [], "undone": []}
     before = len(told(site))
     for action in ({"action": "reject", "older": 1, "newer": 5}, {"action": "solve"}):
         assert httpx.post(site.url("/api/loops"), json=action).status_code == 202

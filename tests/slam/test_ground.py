@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from app.slam import ground
-from app.slam.params import Ground
+from app.slam.params import GroundParams
 from app.slam.types import GROUND, NON_GROUND, SEED, GroundResult, Scan
 
 from .scenes import FORWARD, Rig, Scene, Walk, box, corridor, furnished_room, sweep
@@ -39,8 +39,8 @@ def room_seen_by(mount: str) -> Scan:
     return seen(furnished_room(), MOUNTS[mount])
 
 
-def segment(scan: Scan, R: np.ndarray, params: Ground | None = None) -> GroundResult:
-    return ground.segment(scan.points, scan.ring, R.T @ [0.0, 0.0, -1.0], params or Ground())
+def segment(scan: Scan, R: np.ndarray, params: GroundParams | None = None) -> GroundResult:
+    return ground.segment(scan.points, scan.ring, R.T @ [0.0, 0.0, -1.0], params or GroundParams())
 
 
 def heights(scan: Scan, R: np.ndarray) -> np.ndarray:
@@ -91,7 +91,7 @@ def test_a_sensor_that_looks_straight_down_sees_nothing_but_floor_below() -> Non
     """z down: the outermost lines look sideways; with all lines as candidates the floor is found."""
     R = np.diag([1.0, -1.0, -1.0])
     scan = seen(furnished_room(), R)
-    result = segment(scan, R, Ground(scan_lines=32))
+    result = segment(scan, R, GroundParams(scan_lines=32))
     assert result.found
     assert (result.labels != NON_GROUND)[scan.truth_ground == 1].mean() > 0.99
     assert not np.any((result.labels != NON_GROUND) & (heights(scan, R) > 0))
@@ -111,8 +111,8 @@ def test_a_slope_is_ground(degrees: float) -> None:
 def test_the_limit_of_the_slope_decides_and_is_named() -> None:
     up = Rotation.from_euler("y", -35, degrees=True).apply([0.0, 0.0, 1.0])
     scan = seen(Scene(ground=(up, -1.3 * up[2])), FORWARD)
-    assert segment(scan, FORWARD, Ground(max_slope=37)).found
-    refused = segment(scan, FORWARD, Ground(max_slope=33))
+    assert segment(scan, FORWARD, GroundParams(max_slope=37)).found
+    refused = segment(scan, FORWARD, GroundParams(max_slope=33))
     assert not refused.found
     assert "35" in refused.reason
     assert "33" in refused.reason
@@ -124,7 +124,7 @@ def test_a_heap_under_the_sensor_is_no_plane_and_the_ratio_is_told() -> None:
     points = (FORWARD.T @ (np.array([0, 0, -1.3])[:, None] + rng.normal(scale=0.15, size=(3, 300)))).T.astype(
         np.float32
     )
-    result = ground.segment(points, np.zeros(300, np.uint16), FORWARD.T @ [0.0, 0, -1], Ground())
+    result = ground.segment(points, np.zeros(300, np.uint16), FORWARD.T @ [0.0, 0, -1], GroundParams())
     assert not result.found
     assert not result.labels.any()
     assert "λ3/λ2" in result.reason
@@ -134,7 +134,7 @@ def test_a_heap_under_the_sensor_is_no_plane_and_the_ratio_is_told() -> None:
 
 def test_few_points_below_make_no_plane() -> None:
     points = np.tile(np.array([[0.0, 0.0, -1.3]], np.float32), (ground.MIN_SEEDS - 1, 1))
-    result = ground.segment(points, np.zeros(len(points), np.uint16), np.array([0.0, 0, -1]), Ground())
+    result = ground.segment(points, np.zeros(len(points), np.uint16), np.array([0.0, 0, -1]), GroundParams())
     assert not result.found
     assert str(ground.MIN_SEEDS - 1) in result.reason
 
@@ -144,19 +144,21 @@ def test_one_line_of_seeds_makes_no_plane() -> None:
     x = np.linspace(-0.4, 0.4, 60)
     points = np.column_stack([x, np.zeros(60), np.full(60, -1.3)])
     points += np.random.default_rng(0).normal(scale=0.004, size=points.shape)
-    result = ground.segment(points.astype(np.float32), np.zeros(60, np.uint16), np.array([0.0, 0, -1]), Ground())
+    result = ground.segment(points.astype(np.float32), np.zeros(60, np.uint16), np.array([0.0, 0, -1]), GroundParams())
     assert not result.found
     assert not result.labels.any()
 
 
 def test_seeds_all_in_one_place_make_no_plane() -> None:
     points = np.tile(np.array([[0.1, 0.0, -1.3]], np.float32), (100, 1))
-    result = ground.segment(points, np.zeros(100, np.uint16), np.array([0.0, 0, -1]), Ground())
+    result = ground.segment(points, np.zeros(100, np.uint16), np.array([0.0, 0, -1]), GroundParams())
     assert not result.found
 
 
 def test_a_scan_without_points_says_so() -> None:
-    result = ground.segment(np.empty((0, 3), np.float32), np.empty(0, np.uint16), np.array([0.0, 0, -1]), Ground())
+    result = ground.segment(
+        np.empty((0, 3), np.float32), np.empty(0, np.uint16), np.array([0.0, 0, -1]), GroundParams()
+    )
     assert not result.found
     assert "no points" in result.reason
     assert len(result.labels) == 0
@@ -164,14 +166,16 @@ def test_a_scan_without_points_says_so() -> None:
 
 def test_switched_off_it_labels_nothing() -> None:
     scan = seen(furnished_room(), FORWARD)
-    result = segment(scan, FORWARD, Ground(enabled=False))
+    result = segment(scan, FORWARD, GroundParams(enabled=False))
     assert not result.found
     assert not result.labels.any()
     assert "off" in result.reason
 
 
 # --- the paper's equations -----------------------------------------------------------------------
-def by_numpy(scan: Scan, down: np.ndarray, p: Ground) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray]:
+def by_numpy(
+    scan: Scan, down: np.ndarray, p: GroundParams
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray]:
     """Seeds, normal, centroid, λ3/λ2 and each point's (distance, threshold), in double precision."""
     points = scan.points.astype(np.float64)
     lines = np.unique(scan.ring)[: p.scan_lines]
@@ -199,7 +203,7 @@ def by_numpy(scan: Scan, down: np.ndarray, p: Ground) -> tuple[np.ndarray, np.nd
 )
 def test_labels_and_plane_are_those_of_the_papers_equations(lines: int, alpha: float, sigma: float, mount: str) -> None:
     R = MOUNTS[mount]
-    params = Ground(scan_lines=lines, alpha=alpha, sigma=sigma, max_slope=90)
+    params = GroundParams(scan_lines=lines, alpha=alpha, sigma=sigma, max_slope=90)
     scan = room_seen_by(mount)
     seeds, normal, centroid, ratio, (distance, threshold) = by_numpy(scan, R.T @ [0, 0, -1], params)
     result = segment(scan, R, params)
@@ -224,7 +228,7 @@ def test_the_threshold_grows_with_range_exactly_as_equation_3_says(sigma: float,
     probes = np.column_stack([np.full(3000, where[0]), np.full(3000, where[1]), lift - 1.0])
     points = np.concatenate([floor, probes]).astype(np.float32)
     ring = np.concatenate([np.zeros(len(floor)), np.full(3000, 20)]).astype(np.uint16)
-    result = ground.segment(points, ring, np.array([0.0, 0, -1]), Ground(sigma=sigma, scan_lines=1, alpha=35))
+    result = ground.segment(points, ring, np.array([0.0, 0, -1]), GroundParams(sigma=sigma, scan_lines=1, alpha=35))
     assert result.found
     expected = lift < sigma * np.linalg.norm(probes, axis=1)
     clear = np.abs(lift - sigma * np.linalg.norm(probes, axis=1)) > 1e-5
@@ -239,7 +243,7 @@ def test_the_planarity_limit_lets_a_rougher_floor_pass() -> None:
     ratio = np.divide(*np.linalg.eigvalsh(np.cov(points.T))[:2])
     for limit in (0.5 * ratio, 2 * ratio):
         result = ground.segment(
-            points.astype(np.float32), np.zeros(400, np.uint16), np.array([0.0, 0, -1]), Ground(planarity=limit)
+            points.astype(np.float32), np.zeros(400, np.uint16), np.array([0.0, 0, -1]), GroundParams(planarity=limit)
         )
         assert result.found == (limit > ratio)
         assert result.planarity == pytest.approx(ratio, rel=0.05)
@@ -247,9 +251,9 @@ def test_the_planarity_limit_lets_a_rougher_floor_pass() -> None:
 
 def test_more_lines_and_a_wider_angle_give_more_seeds_and_a_wider_sigma_more_ground() -> None:
     scan = seen(furnished_room(), FORWARD)
-    by_lines = [segment(scan, FORWARD, Ground(scan_lines=m)).seeds for m in (1, 2, 4, 8, 16, 32)]
-    by_alpha = [segment(scan, FORWARD, Ground(alpha=a)).seeds for a in (5, 10, 20, 40, 60)]
-    shares = [segment(scan, FORWARD, Ground(sigma=s)) for s in (0.002, 0.01, 0.025, 0.1)]
+    by_lines = [segment(scan, FORWARD, GroundParams(scan_lines=m)).seeds for m in (1, 2, 4, 8, 16, 32)]
+    by_alpha = [segment(scan, FORWARD, GroundParams(alpha=a)).seeds for a in (5, 10, 20, 40, 60)]
+    shares = [segment(scan, FORWARD, GroundParams(sigma=s)) for s in (0.002, 0.01, 0.025, 0.1)]
     assert by_lines == sorted(by_lines)
     assert by_lines[0] < by_lines[-1]
     assert by_alpha == sorted(by_alpha)
@@ -263,10 +267,10 @@ def test_lines_are_ranked_among_those_that_are_there() -> None:
     """Some drivers leave lines out, or number them with holes: the outermost present ones count."""
     scan = seen(furnished_room(), FORWARD)
     keep = scan.ring % 3 == 1
-    spread = ground.segment(scan.points[keep], scan.ring[keep], FORWARD.T @ [0.0, 0, -1], Ground(scan_lines=4))
+    spread = ground.segment(scan.points[keep], scan.ring[keep], FORWARD.T @ [0.0, 0, -1], GroundParams(scan_lines=4))
     _, dense_ring = np.unique(scan.ring[keep], return_inverse=True)
     dense = ground.segment(
-        scan.points[keep], dense_ring.astype(np.uint16), FORWARD.T @ [0.0, 0, -1], Ground(scan_lines=4)
+        scan.points[keep], dense_ring.astype(np.uint16), FORWARD.T @ [0.0, 0, -1], GroundParams(scan_lines=4)
     )
     assert spread.found
     np.testing.assert_array_equal(spread.labels, dense.labels)
@@ -275,7 +279,7 @@ def test_lines_are_ranked_among_those_that_are_there() -> None:
 def test_the_length_of_down_does_not_matter() -> None:
     scan = seen(furnished_room(), FORWARD)
     unit = segment(scan, FORWARD)
-    long = ground.segment(scan.points, scan.ring, FORWARD.T @ [0.0, 0.0, -9.81], Ground())
+    long = ground.segment(scan.points, scan.ring, FORWARD.T @ [0.0, 0.0, -9.81], GroundParams())
     np.testing.assert_array_equal(long.labels, unit.labels)
     np.testing.assert_allclose(long.down, FORWARD.T @ [0, 0, -1], atol=1e-12)
 
@@ -292,7 +296,7 @@ def test_a_floor_far_from_the_origin_of_the_seeds_keeps_its_precision() -> None:
     """A drone's height: 60 m over a flat field, millimetre noise."""
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-20, 20, (2000, 2)), rng.normal(-60, 0.002, 2000)]).astype(np.float32)
-    result = ground.segment(points, np.zeros(2000, np.uint16), np.array([0.0, 0, -1]), Ground())
+    result = ground.segment(points, np.zeros(2000, np.uint16), np.array([0.0, 0, -1]), GroundParams())
     assert result.found
     assert result.centroid[2] == pytest.approx(-60, abs=1e-3)
     assert result.normal[2] == pytest.approx(1.0, abs=1e-7)

@@ -14,8 +14,7 @@ from app.slam.iekf import boxminus, boxplus
 from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
 from app.slam.kernels.registration import HUBER, SHARED
 from app.slam.local_map import LocalMap
-from app.slam.params import Filter
-from app.slam.params import LocalMap as MapParams
+from app.slam.params import FilterParams, MapParams
 from app.slam.types import NavState
 
 from .scenes import START_NS, Rig, Scene, Walk, box, furnished_room, mounted, pose_error, sweep
@@ -79,7 +78,7 @@ def test_five_degrees_and_twenty_centimetres_are_recovered(
     d = np.zeros(DIM)
     d[ROT][axis], d[POS][direction] = np.radians(degrees), 0.2 * np.sign(degrees)
     prior = Belief(boxplus(truth(), d), uncertain())
-    posterior, registration = iekf.update(prior, points_of(furnished_room()), room, Filter(max_iterations=10))
+    posterior, registration = iekf.update(prior, points_of(furnished_room()), room, FilterParams(max_iterations=10))
     metres, angle = pose_error(posterior.state.T_odom_imu, truth().T_odom_imu)
     assert metres < 0.01
     assert angle < 0.2
@@ -90,7 +89,7 @@ def test_five_degrees_and_twenty_centimetres_are_recovered(
 
 def test_a_good_prior_stays_good_and_converges_at_once(room: LocalMap) -> None:
     posterior, registration = iekf.update(
-        Belief(truth(), uncertain(1e-3, 1e-2)), points_of(furnished_room()), room, Filter()
+        Belief(truth(), uncertain(1e-3, 1e-2)), points_of(furnished_room()), room, FilterParams()
     )
     metres, angle = pose_error(posterior.state.T_odom_imu, truth().T_odom_imu)
     assert metres < 0.003
@@ -101,7 +100,7 @@ def test_a_good_prior_stays_good_and_converges_at_once(room: LocalMap) -> None:
 
 def test_the_posterior_is_more_certain_than_the_prior(room: LocalMap) -> None:
     prior = Belief(truth(), uncertain())
-    posterior, _ = iekf.update(prior, points_of(furnished_room()), room, Filter())
+    posterior, _ = iekf.update(prior, points_of(furnished_room()), room, FilterParams())
     np.testing.assert_array_equal(posterior.covariance, posterior.covariance.T)
     assert np.linalg.eigvalsh(posterior.covariance)[0] > 0
     assert np.linalg.eigvalsh(prior.covariance - posterior.covariance)[0] > -1e-12
@@ -116,7 +115,7 @@ def test_what_is_correlated_with_the_pose_is_corrected_with_it(room: LocalMap) -
     P[POS, POS] += np.eye(3) * 0.25 * 0.1**2
     P[POS, VEL] = P[VEL, POS] = np.eye(3) * 0.25 * 0.1
     wrong = replace(truth(), v_odom_imu=error / 0.1, p_odom_imu=truth().p_odom_imu + error)
-    posterior, _ = iekf.update(Belief(wrong, P), points_of(furnished_room()), room, Filter())
+    posterior, _ = iekf.update(Belief(wrong, P), points_of(furnished_room()), room, FilterParams())
     np.testing.assert_allclose(posterior.state.v_odom_imu, 0, atol=0.05)
 
 
@@ -124,7 +123,7 @@ def test_what_is_correlated_with_the_pose_is_corrected_with_it(room: LocalMap) -
 @pytest.mark.parametrize("count", [0, 1, iekf.MIN_INLIERS - 1])
 def test_too_few_points_leave_the_prior_as_it_is_and_say_so(room: LocalMap, count: int) -> None:
     prior = Belief(boxplus(truth(), np.full(DIM, 1e-3)), uncertain())
-    posterior, registration = iekf.update(prior, points_of(furnished_room())[:count], room, Filter())
+    posterior, registration = iekf.update(prior, points_of(furnished_room())[:count], room, FilterParams())
     for field in fields(NavState):
         np.testing.assert_array_equal(getattr(posterior.state, field.name), getattr(prior.state, field.name))
     np.testing.assert_array_equal(posterior.covariance, prior.covariance)
@@ -135,7 +134,7 @@ def test_too_few_points_leave_the_prior_as_it_is_and_say_so(room: LocalMap, coun
 
 def test_points_of_another_place_leave_the_prior_as_it_is(room: LocalMap) -> None:
     far = replace(truth(), p_odom_imu=np.array([200.0, 0, 0]))
-    posterior, registration = iekf.update(Belief(far, uncertain()), points_of(furnished_room()), room, Filter())
+    posterior, registration = iekf.update(Belief(far, uncertain()), points_of(furnished_room()), room, FilterParams())
     np.testing.assert_array_equal(posterior.state.p_odom_imu, [200.0, 0, 0])
     assert registration.inliers == 0
     assert registration.reason
@@ -153,7 +152,7 @@ def test_a_plain_corridor_holds_everything_but_the_way_along_it() -> None:
     d[POS] = [0.05, 0.05, -0.05]
     d[ROT] = np.radians([0.5, -0.5, 0.5])
     prior = Belief(boxplus(truth(NEAR), d), uncertain(0.02, 0.1))
-    posterior, registration = iekf.update(prior, points, surveyed(corridor), Filter())
+    posterior, registration = iekf.update(prior, points, surveyed(corridor), FilterParams())
     assert registration.degenerate
     assert "direction" in registration.reason
     assert registration.eigenvalues[0] < 1e-2 * registration.eigenvalues[1]
@@ -167,7 +166,7 @@ def test_a_plain_corridor_holds_everything_but_the_way_along_it() -> None:
 def test_a_corridors_end_in_sight_ends_the_degeneracy() -> None:
     ending = Scene(box(-60.0, -1.2, -1.3, 8.0, 1.2, 1.2))
     points = points_of(ending, NEAR)
-    _, registration = iekf.update(Belief(truth(NEAR), uncertain(0.02, 0.1)), points, surveyed(ending), Filter())
+    _, registration = iekf.update(Belief(truth(NEAR), uncertain(0.02, 0.1)), points, surveyed(ending), FilterParams())
     assert not registration.degenerate
     assert registration.reason == ""
 
@@ -175,7 +174,7 @@ def test_a_corridors_end_in_sight_ends_the_degeneracy() -> None:
 def test_eigenvalues_ascend_and_are_of_the_information(room: LocalMap) -> None:
     points = points_of(furnished_room())
     few, many = (
-        iekf.update(Belief(truth(), uncertain()), p, room, Filter())[1].eigenvalues for p in (points[::3], points)
+        iekf.update(Belief(truth(), uncertain()), p, room, FilterParams())[1].eigenvalues for p in (points[::3], points)
     )
     assert np.all(np.diff(many) >= 0)
     assert np.all(many > few)  # three times the points, about three times the information
@@ -235,7 +234,7 @@ def test_each_error_moves_what_its_name_says() -> None:
 class Problem:
     """A scan against the room's planes, linearised by finite differences of the distances themselves."""
 
-    def __init__(self, room: LocalMap, prior: Belief, points: np.ndarray, params: Filter) -> None:
+    def __init__(self, room: LocalMap, prior: Belief, points: np.ndarray, params: FilterParams) -> None:
         self.prior, self.points, self.params = prior, points.astype(np.float64), params
         planes = room.planes(self._world(prior.state), params)
         self.normals, self.centers = planes.normals, planes.centers
@@ -276,7 +275,7 @@ def test_one_iteration_is_the_textbook_kalman_update(room: LocalMap, extrinsics:
 
     What is over HUBER standard deviations off counts as so much noisier that it pulls as one of HUBER would.
     """
-    params = Filter(max_iterations=1, estimate_extrinsics=extrinsics)
+    params = FilterParams(max_iterations=1, estimate_extrinsics=extrinsics)
     prior, points = correlated_prior(5e-3), points_of(furnished_room())
     problem = Problem(room, prior, points, params)
     free = slice(0, DIM if extrinsics else 17)
@@ -297,7 +296,7 @@ def test_one_iteration_is_the_textbook_kalman_update(room: LocalMap, extrinsics:
 @pytest.mark.parametrize("extrinsics", [False, True], ids=["extrinsics fixed", "extrinsics estimated"])
 def test_the_iteration_ends_at_the_minimum_of_equation_7(room: LocalMap, extrinsics: bool, strays: float) -> None:
     """SciPy's Levenberg-Marquardt on the same sum, from the same prior: squares, and beyond HUBER straight lines."""
-    params = Filter(max_iterations=20, estimate_extrinsics=extrinsics, gate=1.0)
+    params = FilterParams(max_iterations=20, estimate_extrinsics=extrinsics, gate=1.0)
     prior, points = correlated_prior(2e-4), points_of(furnished_room())
     moved = np.random.default_rng(4).random(len(points)) < strays
     points[moved] *= np.float32(1.03)
@@ -326,14 +325,14 @@ def test_twice_as_far_from_where_the_map_has_it_a_thing_pulls_no_harder(room: Lo
     def pulled(farther: float) -> float:
         moved = points.copy()
         moved[: len(points) // 10] *= np.float32(1.0 + farther)
-        there, _ = iekf.update(prior, moved, room, Filter(gate=1.0))
+        there, _ = iekf.update(prior, moved, room, FilterParams(gate=1.0))
         return float(np.linalg.norm(there.state.p_odom_imu - truth().p_odom_imu))
 
     assert pulled(0.06) < 1.2 * pulled(0.03) < 0.02
 
 
 def test_the_residual_told_is_that_of_the_inliers(room: LocalMap) -> None:
-    params, prior = Filter(max_iterations=1), Belief(truth(), uncertain(1e-3, 1e-2))
+    params, prior = FilterParams(max_iterations=1), Belief(truth(), uncertain(1e-3, 1e-2))
     points = points_of(furnished_room())
     problem = Problem(room, prior, points, params)
     _, registration = iekf.update(prior, points, room, params)
@@ -343,7 +342,7 @@ def test_the_residual_told_is_that_of_the_inliers(room: LocalMap) -> None:
 
 def test_extrinsics_stay_unless_they_are_estimated(room: LocalMap) -> None:
     prior, points = correlated_prior(5e-3), points_of(furnished_room())
-    kept, _ = iekf.update(prior, points, room, Filter())
+    kept, _ = iekf.update(prior, points, room, FilterParams())
     np.testing.assert_array_equal(kept.state.R_imu_lidar, prior.state.R_imu_lidar)
     np.testing.assert_array_equal(kept.state.p_imu_lidar, prior.state.p_imu_lidar)
     np.testing.assert_array_equal(kept.covariance[17:, 17:], prior.covariance[17:, 17:])
@@ -353,5 +352,5 @@ def test_switching_the_extrinsics_on_and_off_keeps_the_covariance_one(room: Loca
     """A covariance with a negative eigenvalue claims to know more than everything."""
     belief, points = correlated_prior(5e-3), points_of(furnished_room())
     for extrinsics in (True, False, False, True, False, True):
-        belief, _ = iekf.update(belief, points, room, Filter(estimate_extrinsics=extrinsics))
+        belief, _ = iekf.update(belief, points, room, FilterParams(estimate_extrinsics=extrinsics))
         assert np.linalg.eigvalsh(belief.covariance)[0] > 0

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from app.slam import imu
 from app.slam.iekf import boxminus, boxplus
 from app.slam.imu import DIM, POS, ROT, VEL, Belief
-from app.slam.params import Imu
+from app.slam.params import ImuParams
 from app.slam.types import ImuSamples, NavState
 
 from .scenes import (
@@ -30,7 +30,7 @@ from .scenes import (
     sweep,
 )
 
-QUIET = Imu(gyro_noise=1e-6, accel_noise=1e-6, gyro_bias_walk=0, accel_bias_walk=0)
+QUIET = ImuParams(gyro_noise=1e-6, accel_noise=1e-6, gyro_bias_walk=0, accel_bias_walk=0)
 
 
 def state_at(walk: Walk, t: float, rig: Rig | None = None) -> NavState:
@@ -159,7 +159,7 @@ def test_the_covariance_is_carried_by_the_motions_true_jacobian() -> None:
 
 def test_noise_grows_as_random_walks_do() -> None:
     """At rest: angle and velocity as sqrt(t), position as t^1.5 / sqrt(3), from the noise densities."""
-    params = Imu(gyro_noise=2e-3, accel_noise=1e-2, gyro_bias_walk=0, accel_bias_walk=0)
+    params = ImuParams(gyro_noise=2e-3, accel_noise=1e-2, gyro_bias_walk=0, accel_bias_walk=0)
     samples = imu_samples(Walk(still=100), Rig(), np.arange(0, 102) / 200)
     start = Belief(state_at(Walk(still=100), 0.0), np.eye(DIM) * 1e-20)
     predicted, _ = imu.propagate(start, samples, START_NS + 500_000_000, params)
@@ -175,7 +175,7 @@ def test_noise_grows_as_random_walks_do() -> None:
 def test_simulated_noise_scatters_as_the_covariance_says() -> None:
     """Monte Carlo over noisy IMUs on the same walk: normalised errors squared average to the dimension."""
     density_gyro, density_accel, rate = 5e-3, 5e-2, 200
-    params = Imu(gyro_noise=density_gyro, accel_noise=density_accel, gyro_bias_walk=0, accel_bias_walk=0)
+    params = ImuParams(gyro_noise=density_gyro, accel_noise=density_accel, gyro_bias_walk=0, accel_bias_walk=0)
     rig = Rig(gyro_noise=density_gyro * np.sqrt(rate), accel_noise=density_accel * np.sqrt(rate))
     walk, seconds = Walk(still=0.0), np.arange(200, 282) / rate
     start, end_ns = Belief(state_at(walk, 1.0), np.eye(DIM) * 1e-16), START_NS + 1_400_000_000
@@ -197,7 +197,7 @@ def test_the_covariance_stays_symmetric_and_positive() -> None:
     walk, belief = Walk(still=0.0), Belief(state_at(Walk(still=0.0), 0.0), np.diag(np.geomspace(1e-8, 1, DIM)))
     for k in range(30):
         samples = imu_samples(walk, Rig(), np.arange(20 * k, 20 * k + 22) / 200)
-        belief, _ = imu.propagate(belief, samples, START_NS + (k + 1) * 100_000_000, Imu())
+        belief, _ = imu.propagate(belief, samples, START_NS + (k + 1) * 100_000_000, ImuParams())
     np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
     assert np.linalg.eigvalsh(belief.covariance)[0] > 0
 
@@ -212,7 +212,7 @@ def sigma_after(samples: ImuSamples, ends_s: tuple[float, ...]) -> np.ndarray:
     """Standard deviations after propagating to each of the ends in turn."""
     belief = Belief(state_at(Walk(still=100), 0.0), np.eye(DIM) * 1e-10)
     for end in ends_s:
-        belief, _ = imu.propagate(belief, samples, START_NS + round(end * 1e9), Imu())
+        belief, _ = imu.propagate(belief, samples, START_NS + round(end * 1e9), ImuParams())
     return np.asarray(np.sqrt(np.diag(belief.covariance)))
 
 
@@ -245,7 +245,7 @@ def test_through_a_long_gap_one_walks_on_as_one_walked(gap_s: float, coasts: boo
         b_gyro=np.zeros(3),
         b_accel=np.zeros(3),
     )
-    predicted, _ = imu.propagate(Belief(state, np.eye(DIM) * 1e-10), samples, end_ns, Imu())
+    predicted, _ = imu.propagate(Belief(state, np.eye(DIM) * 1e-10), samples, end_ns, ImuParams())
     v = 1.3 - (0.0 if coasts else 3.0 * gap_s)
     np.testing.assert_allclose(predicted.state.v_odom_imu, [v, 0, 0], atol=1e-6)
     np.testing.assert_allclose(predicted.state.p_odom_imu - state.p_odom_imu, [(1.3 + v) / 2 * gap_s, 0, 0], atol=1e-6)
@@ -255,7 +255,7 @@ def test_samples_that_end_early_are_held() -> None:
     """A path is there for every point, even if the last sample is from before the scan's end."""
     samples = imu_samples(Walk(still=100), Rig(), np.arange(0, 18) / 200)
     predicted, path = imu.propagate(
-        Belief(state_at(Walk(still=100), 0.0), np.eye(DIM) * 1e-10), samples, START_NS + 100_000_000, Imu()
+        Belief(state_at(Walk(still=100), 0.0), np.eye(DIM) * 1e-10), samples, START_NS + 100_000_000, ImuParams()
     )
     assert path.times[0] == pytest.approx(-0.1)
     np.testing.assert_allclose(predicted.state.p_odom_imu, 0, atol=1e-9)
@@ -264,7 +264,7 @@ def test_samples_that_end_early_are_held() -> None:
 def test_time_that_stands_still_changes_nothing() -> None:
     belief = Belief(state_at(Walk(still=100), 0.0), np.eye(DIM) * 1e-4)
     samples = imu_samples(Walk(still=100), Rig(), np.arange(0, 3) / 200)
-    predicted, path = imu.propagate(belief, samples, START_NS, Imu())
+    predicted, path = imu.propagate(belief, samples, START_NS, ImuParams())
     np.testing.assert_allclose(predicted.covariance, belief.covariance, atol=1e-12)
     np.testing.assert_array_equal(predicted.state.p_odom_imu, belief.state.p_odom_imu)
     np.testing.assert_allclose(path.poses, np.tile(belief.state.T_odom_imu[:3], (len(path.poses), 1, 1)))
@@ -291,7 +291,7 @@ def test_a_wall_seen_while_moving_fast_is_flat_again(mount: str, device: np.ndar
     scan = sweep(wall, walk, rig, begin, seed=0)
     end = seconds_of(scan.end_ns)
     samples = imu_samples(walk, rig, np.arange(np.floor(begin * 200), np.ceil(end * 200) + 1) / 200)
-    predicted, path = imu.propagate(Belief(state_at(walk, begin, rig), np.eye(DIM)), samples, scan.end_ns, Imu())
+    predicted, path = imu.propagate(Belief(state_at(walk, begin, rig), np.eye(DIM)), samples, scan.end_ns, ImuParams())
     points = imu.deskew(scan, path, predicted.state)
 
     T = walk.pose(end) @ rig.T_imu_lidar
@@ -311,7 +311,7 @@ def test_a_scan_at_rest_is_returned_as_it_is() -> None:
     scan = sweep(Scene(box(-3, -3, -1, 4, 3, 2)), walk, Rig(T_imu_lidar=MOUNTS["sideways"]), 0.0, seed=1)
     rig = Rig(T_imu_lidar=MOUNTS["sideways"])
     samples = imu_samples(walk, rig, np.arange(0, 22) / 200)
-    predicted, path = imu.propagate(Belief(state_at(walk, 0.0, rig), np.eye(DIM)), samples, scan.end_ns, Imu())
+    predicted, path = imu.propagate(Belief(state_at(walk, 0.0, rig), np.eye(DIM)), samples, scan.end_ns, ImuParams())
     np.testing.assert_allclose(imu.deskew(scan, path, predicted.state), scan.points, atol=1e-5)
 
 
@@ -321,7 +321,7 @@ def test_points_from_before_the_path_are_extrapolated() -> None:
     scan = sweep(Scene(box(-6, -6, -6, 6, 6, 6)), walk, rig, 2.0, seed=0)
     late = 2.01
     samples = imu_samples(walk, rig, np.arange(400, 423) / 200)
-    predicted, path = imu.propagate(Belief(state_at(walk, late, rig), np.eye(DIM)), samples, scan.end_ns, Imu())
+    predicted, path = imu.propagate(Belief(state_at(walk, late, rig), np.eye(DIM)), samples, scan.end_ns, ImuParams())
     points = imu.deskew(scan, path, predicted.state)
     T = walk.pose(seconds_of(scan.end_ns)) @ rig.T_imu_lidar
     world = points.astype(float) @ T[:3, :3].T + T[:3, 3]
@@ -334,7 +334,7 @@ def test_no_points_deskew_to_no_points() -> None:
     scan = sweep(Scene(), walk, Rig(), 0.0, seed=0)
     assert len(scan) == 0
     samples = imu_samples(walk, Rig(), np.arange(0, 3) / 200)
-    predicted, path = imu.propagate(Belief(state_at(walk, 0.0), np.eye(DIM)), samples, START_NS + 1, Imu())
+    predicted, path = imu.propagate(Belief(state_at(walk, 0.0), np.eye(DIM)), samples, START_NS + 1, ImuParams())
     assert imu.deskew(scan, path, predicted.state).shape == (0, 3)
 
 

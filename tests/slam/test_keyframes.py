@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from app.slam.keyframes import KeyframeStore, is_due
-from app.slam.params import Keyframes
+from app.slam.params import KeyframeParams
 from app.slam.types import Cloud, Keyframe
 
 
@@ -120,11 +120,11 @@ def test_a_keyframe_is_due_after_walking_or_turning_far_enough(metres: float, de
     moved = np.eye(4)
     moved[:3, 3] = metres * np.array([0.6, 0.0, -0.8])
     moved[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * np.array([0.0, 0.6, 0.8])).as_matrix()
-    assert is_due(last.T_odom_imu, last.T_odom_imu @ moved, Keyframes(distance=0.5, angle=15)) is due
+    assert is_due(last.T_odom_imu, last.T_odom_imu @ moved, KeyframeParams(distance=0.5, angle=15)) is due
 
 
 def test_the_first_frame_is_a_keyframe() -> None:
-    assert is_due(None, np.eye(4), Keyframes())
+    assert is_due(None, np.eye(4), KeyframeParams())
 
 
 def test_after_going_back_the_later_ones_can_be_gone_forth_to_until_others_take_their_place() -> None:

@@ -10,11 +10,10 @@ from scipy.spatial import cKDTree
 
 from app.slam.kernels.map import BINS, MOST
 from app.slam.local_map import LEAST_SCATTER, LocalMap, MapState, Planes
-from app.slam.params import Filter
-from app.slam.params import LocalMap as MapParams
+from app.slam.params import FilterParams, MapParams
 
 SMALL = MapParams(max_voxels=5000)
-LOOSE = Filter(plane_tilt=20.0)
+LOOSE = FilterParams(plane_tilt=20.0)
 HERE = np.zeros(3)
 
 
@@ -91,7 +90,7 @@ def test_standing_still_piles_up_nothing() -> None:
 
 # --- planes --------------------------------------------------------------------------------------
 def expected_plane(
-    query: np.ndarray, near: np.ndarray, p: Filter, reach: float
+    query: np.ndarray, near: np.ndarray, p: FilterParams, reach: float
 ) -> tuple[np.ndarray, np.ndarray, float] | str | None:
     """Normal, centre and thickness by numpy, from neighbours sorted exactly; None: no plane.
 
@@ -125,7 +124,7 @@ def expected_plane(
 @pytest.mark.parametrize("tilt", [1.5, 5.0, 20.0])
 @pytest.mark.parametrize("reach", [0.6, 1.0])
 def test_planes_are_those_through_the_nearest_neighbours(tilt: float, reach: float) -> None:
-    params = Filter(plane_tilt=tilt, neighbour_distance=reach)
+    params = FilterParams(plane_tilt=tilt, neighbour_distance=reach)
     local_map = filled(surface(3))
     points = stored(local_map)
     tree = cKDTree(points)
@@ -155,7 +154,7 @@ def test_a_plane_is_found_across_the_borders_of_voxels() -> None:
     rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(-3, 3, (3000, 2)), rng.normal(scale=0.002, size=3000)])
     queries = np.column_stack([rng.uniform(-2, 2, (200, 2)), np.zeros(200)])
-    planes = filled(floor).planes(queries, Filter())
+    planes = filled(floor).planes(queries, FilterParams())
     assert np.all(planes.variances >= 0)
     assert np.abs(planes.normals[:, 2]).min() > np.cos(np.radians(2.0))
     assert np.abs(planes.centers[:, 2]).max() < 0.005
@@ -171,7 +170,7 @@ def test_points_along_one_scan_line_make_no_plane(noise: float) -> None:
     rng = np.random.default_rng(1)
     params = MapParams(spacing=0.02, max_voxels=1000)
     local_map = filled(line(0.0) + rng.normal(scale=noise, size=(200, 3)), params)
-    planes = local_map.planes(line(0.01, 50), Filter())
+    planes = local_map.planes(line(0.01, 50), FilterParams())
     assert np.all(planes.variances < 0)
 
 
@@ -179,7 +178,7 @@ def test_a_second_scan_line_makes_them_a_plane() -> None:
     rng = np.random.default_rng(1)
     points = np.concatenate([line(0.0), line(0.4)]) + rng.normal(scale=0.003, size=(400, 3))
     local_map = filled(points, MapParams(spacing=0.05, max_voxels=1000))
-    planes = local_map.planes(line(0.2, 30)[5:-5], Filter())
+    planes = local_map.planes(line(0.2, 30)[5:-5], FilterParams())
     assert np.all(planes.variances >= 0)
     assert np.abs(planes.normals[:, 2]).min() > np.cos(np.radians(3.0))
 
@@ -190,7 +189,7 @@ def test_a_corner_is_no_plane() -> None:
     a, b = rng.uniform(0, 1, (2, 1500))
     edge = np.concatenate([np.column_stack([a, b, 0 * a]), np.column_stack([0 * a, b, a])])
     queries = np.column_stack([np.zeros(20), np.linspace(0.3, 0.7, 20), np.zeros(20)]) + 0.3
-    planes = filled(edge).planes(queries, Filter(plane_tilt=20, neighbours=20))
+    planes = filled(edge).planes(queries, FilterParams(plane_tilt=20, neighbours=20))
     flat = planes.variances >= 0
     assert np.all(np.abs(planes.normals[flat]).max(axis=1) > 0.9)  # never the diagonal
 
@@ -206,7 +205,7 @@ def test_neighbours_are_not_looked_for_beyond_a_voxels_edge() -> None:
     """Whatever the reach asked for, it is cut to where 27 voxels surely hold everything."""
     local_map = filled(surface(3))
     queries = surface(6, 200)
-    far, near = (local_map.planes(queries, Filter(neighbour_distance=d)) for d in (5.0, SMALL.voxel_size))
+    far, near = (local_map.planes(queries, FilterParams(neighbour_distance=d)) for d in (5.0, SMALL.voxel_size))
     assert equal(far, near)
     assert np.any(near.variances >= 0)
 

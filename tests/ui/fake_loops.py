@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from app.server.protocol import (
     Chunk,
     Command,
+    EditLoop,
     InspectLoop,
     LoopsView,
-    OverruleLoop,
     RedoLoop,
     Transport,
     TryLoop,
@@ -121,8 +121,8 @@ class LoopEngine(FakeEngine):
     def __init__(self) -> None:
         super().__init__(columns=30, frames=6 * KEYFRAMES, truth=False)
         self.truth, self.odometry, self._points, self._found, chunks = _world()
-        self._done: list[loops.Command] = []
-        self._undone: list[loops.Command] = []
+        self._done: list[loops.LoopEdit] = []
+        self._undone: list[loops.LoopEdit] = []
         frame = chunks[-1].frame
         self.publish(
             chunks=chunks,
@@ -162,9 +162,9 @@ class LoopEngine(FakeEngine):
     def _obey(self, command: Command) -> None:
         view = self.snapshot.loops
         match command:
-            case OverruleLoop(overruling):
-                self._check(overruling)
-                self._done.append(overruling)
+            case EditLoop(edit):
+                self._check(edit)
+                self._done.append(edit)
                 self._undone.clear()
                 self._show()
             case UndoLoop() if self._done:
@@ -189,7 +189,7 @@ class LoopEngine(FakeEngine):
             case _:
                 super()._obey(command)
 
-    def _check(self, command: loops.Command) -> None:
+    def _check(self, command: loops.LoopEdit) -> None:
         pair = loops.pair_of(command)
         if pair and not isinstance(command, Add) and pair not in {edge.pair for edge in self._edges(self._done)}:
             raise HemislamError(f"There is no loop candidate of keyframes {pair[0]} and {pair[1]}.")
@@ -208,7 +208,7 @@ class LoopEngine(FakeEngine):
             ),
         )
 
-    def _edges(self, done: list[loops.Command]) -> tuple[LoopEdge, ...]:
+    def _edges(self, done: list[loops.LoopEdit]) -> tuple[LoopEdge, ...]:
         edges = dict(self._found)
         for command in done:
             if isinstance(command, loops.Solve):
@@ -224,10 +224,10 @@ class LoopEngine(FakeEngine):
             else:
                 verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
                 reason = f"{verdict} by hand; found {edges[pair].verdict}: {edges[pair].reason}"
-                edges[pair] = replace(edges[pair], verdict=verdict, overruled=True, words=reason)
+                edges[pair] = replace(edges[pair], verdict=verdict, edited=True, words=reason)
         return tuple(edges[pair] for pair in sorted(edges))
 
-    def _poses(self, done: list[loops.Command]) -> np.ndarray:
+    def _poses(self, done: list[loops.LoopEdit]) -> np.ndarray:
         """The more loops count, the nearer to the truth; nearer still solved at once."""
         counted = sum(edge.weight for edge in self._edges(done) if edge.verdict is Verdict.ACCEPTED)
         counted += 5 * (loops.Solve() in done)
@@ -236,7 +236,7 @@ class LoopEngine(FakeEngine):
         poses[:, :3, 3] += (1 - share) * (self.odometry[:, :3, 3] - self.truth[:, :3, 3])
         return poses
 
-    def _residuals(self, done: list[loops.Command]) -> tuple[FactorResidual, ...]:
+    def _residuals(self, done: list[loops.LoopEdit]) -> tuple[FactorResidual, ...]:
         poses, out = self._poses(done), []
         for index in range(1, KEYFRAMES):
             bend = 0.01 * abs(np.sin(index))

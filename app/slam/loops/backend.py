@@ -17,20 +17,20 @@ from app.slam.errors import HemislamError
 from app.slam.loops import inspection
 from app.slam.loops.detection import Detector, Head
 from app.slam.loops.drift import Drift
+from app.slam.loops.edits import EditList, Entry, check, in_words
 from app.slam.loops.factors import Factor
 from app.slam.loops.history import History, Record
 from app.slam.loops.judgement import by_hand, worth_correcting
 from app.slam.loops.odometry import odometry_factor
-from app.slam.loops.overruling import Entry, Overrulings, check, in_words
 from app.slam.loops.pose_graph import g2o_text, optimise
 from app.slam.loops.search import Found, search
 from app.slam.loops.solution import Solution, loop_factors
 from app.slam.loops.types import (
     Add,
-    Command,
     FactorResidual,
     LoopDetail,
     LoopEdge,
+    LoopEdit,
     Pair,
     Preview,
     Solve,
@@ -38,7 +38,7 @@ from app.slam.loops.types import (
     pair_of,
     rows,
 )
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.types import F64, Keyframe
 
 
@@ -50,8 +50,8 @@ class LoopBackend:
 
     def __init__(self) -> None:
         self._history = History()
-        self._overrulings = Overrulings()
-        self._start = Loops()  # for what acts on restart
+        self._edits = EditList()
+        self._start = LoopsParams()  # for what acts on restart
         self._detector = Detector(self._start)
         self._solution = Solution()
         self._found: dict[Pair, LoopEdge] = {}
@@ -77,7 +77,7 @@ class LoopBackend:
         self._detector.close()
 
     # --- the walk --------------------------------------------------------------------------------
-    def add(self, keyframe: Keyframe, params: Loops) -> None:
+    def add(self, keyframe: Keyframe, params: LoopsParams) -> None:
         """Take the next keyframe; look for loops of the newest one whose surroundings are complete.
 
         A keyframe of the history, as it was, only goes forth to it. Raises HemislamError if it is not the next.
@@ -114,7 +114,7 @@ class LoopBackend:
             )
         self._finished = True
         self._stand(count)
-        self._reach(max(self.known + 1, self._overrulings.latest) if count == self.known else 0)
+        self._reach(max(self.known + 1, self._edits.latest) if count == self.known else 0)
         self._tell_idle()
 
     def go_to(self, count: int) -> None:
@@ -139,16 +139,16 @@ class LoopBackend:
         half = self._start.submap_keyframes
         self._history.cut(count)
         self._detector.forget()
-        self._overrulings.go_back(count, lambda pair: pair[1] + half >= count)
+        self._edits.go_back(count, lambda pair: pair[1] + half >= count)
         self._stand(count)
 
     def _reach(self, reached: int) -> None:
         """The walk has come so far: commands that were given here the last time act from now on."""
-        if self._overrulings.reach(reached):
+        if self._edits.reach(reached):
             self._solve()
         self._resolve()
 
-    def _begin(self, params: Loops) -> None:
+    def _begin(self, params: LoopsParams) -> None:
         self._detector.close()
         self._start, self._detector = params, Detector(params)
 
@@ -158,7 +158,7 @@ class LoopBackend:
         self._found = {edge.pair: edge for edge in self._history.updates(count, finished=self._finished)}
         self._solve()
 
-    def _is_known(self, keyframe: Keyframe, params: Loops) -> bool:
+    def _is_known(self, keyframe: Keyframe, params: LoopsParams) -> bool:
         """Whether this is the next one of the history, looked at with the same parameters."""
         index = len(self)
         looked = index < self.known and self._history[index].params == params
@@ -183,7 +183,7 @@ class LoopBackend:
         if self._solution.broken != broken:
             self._by_pair = None
 
-    def _look(self, first: int, end: int, params: Loops) -> Found:
+    def _look(self, first: int, end: int, params: LoopsParams) -> Found:
         """Look for loops of the keyframes from `first` to before `end`; the graph stays as it is."""
         keyframes = range(first, max(end, 0))
         return search(self._detector, keyframes, self._found, self._edges, self._solution.poses, _drift(params), params)
@@ -192,7 +192,7 @@ class LoopBackend:
     @property
     def poses(self) -> F64:
         """(k, 4, 4) T_map_imu of all keyframes."""
-        if not self._overrulings.solving:
+        if not self._edits.solving:
             return self._solution.poses
         try:
             return self._optimum(self.edges)
@@ -205,7 +205,7 @@ class LoopBackend:
     @property
     def corrections(self) -> F64:
         """(k, 4, 4) T_map_odom at each keyframe; identity while odometry meets the loops as well as they are known."""
-        if self._overrulings.solving or worth_correcting(self.edges, self._detector.poses):
+        if self._edits.solving or worth_correcting(self.edges, self._detector.poses):
             return self.corrections_of(self.poses)
         return np.tile(np.eye(4), (len(self), 1, 1))
 
@@ -247,19 +247,19 @@ class LoopBackend:
         """The graph as the text of a g2o file."""
         return g2o_text(self.poses, self._factors(self.edges))
 
-    # --- overruling ------------------------------------------------------------------------------
+    # --- edits -----------------------------------------------------------------------------------
     @property
-    def commands(self) -> tuple[Command, ...]:
+    def commands(self) -> tuple[LoopEdit, ...]:
         """The commands in force, in order."""
-        return self._overrulings.commands
+        return self._edits.commands
 
     @property
-    def undone(self) -> tuple[Command, ...]:
+    def undone(self) -> tuple[LoopEdit, ...]:
         """The commands that `redo` would do again, the next one last."""
-        return self._overrulings.undone
+        return self._edits.undone
 
-    def apply(self, command: Command) -> None:
-        """Overrule. What was undone before can no longer be redone. Raises HemislamError if it makes no sense."""
+    def apply(self, command: LoopEdit) -> None:
+        """ApplyEdit. What was undone before can no longer be redone. Raises HemislamError if it makes no sense."""
         check(command)
         pair = pair_of(command)
         if isinstance(command, Add):
@@ -268,33 +268,31 @@ class LoopBackend:
                 command = replace(command, guess=rows(self._present(command.older, command.newer)))
         else:
             there = pair is None or pair in self.by_pair
-        self._overrulings.give(
-            self._fitting(self._entry(replace(command, since=self._overrulings.reached if there else 0)))
-        )
+        self._edits.give(self._fitting(self._entry(replace(command, since=self._edits.reached if there else 0))))
         self._solve()
         if not there:
             self._notices.append(f"{in_words(command)} waits until there is such a loop.")
 
-    def load(self, commands: tuple[Command, ...], undone: tuple[Command, ...] = ()) -> None:
+    def load(self, commands: tuple[LoopEdit, ...], undone: tuple[LoopEdit, ...] = ()) -> None:
         """These commands in place of all there are. Raises as `apply`, and then nothing has changed."""
         for command in (*commands, *undone):
             check(command)
-        self._overrulings.load(commands, undone)
+        self._edits.load(commands, undone)
         self._solve()
         self._resolve()
 
     def undo(self) -> None:
         """Take the last command back. Raises HemislamError if there is none."""
-        self._overrulings.undo()
+        self._edits.undo()
         self._solve()
 
     def redo(self) -> None:
         """Do the command again that was last undone. Raises HemislamError if there is none."""
-        self._overrulings.redo()
+        self._edits.redo()
         self._solve()
         self._resolve()
 
-    def preview(self, command: Command) -> Preview:
+    def preview(self, command: LoopEdit) -> Preview:
         """What the graph would become by a command, without doing it.
 
         Raises:
@@ -309,7 +307,7 @@ class LoopBackend:
         poses = self._optimum(edges)
         return Preview(poses, inspection.residuals(self._factors(edges), poses))
 
-    def _entry(self, command: Command) -> Entry:
+    def _entry(self, command: LoopEdit) -> Entry:
         there = isinstance(command, Add) and command.newer < len(self)
         return Entry(command, self._made(command) if isinstance(command, Add) and there else None)
 
@@ -337,12 +335,12 @@ class LoopBackend:
         """Make the loops by hand that waited for keyframes."""
         count = len(self)
         complete = count if self._finished else count - self._start.submap_keyframes
-        if self._overrulings.resolve(count, complete, self._made):
+        if self._edits.resolve(count, complete, self._made):
             self._solve()
 
     def _tell_idle(self) -> None:
         """At the end: which commands found nothing to act on; each is said once."""
-        idle = [in_words(entry.command) for entry in self._overrulings if entry.pair and entry.pair not in self.by_pair]
+        idle = [in_words(entry.command) for entry in self._edits if entry.pair and entry.pair not in self.by_pair]
         new = [words for words in idle if words not in self._idle]
         self._notices += [f"{words} has no effect: there is no such loop; loops.csv lists all." for words in new]
         self._idle = set(idle)
@@ -356,7 +354,7 @@ class LoopBackend:
 
     # --- the graph -------------------------------------------------------------------------------
     def _edges(self, found: dict[Pair, LoopEdge], extra: Entry | None = None) -> dict[Pair, LoopEdge]:
-        edges = self._overrulings.lay_over(found, len(self), extra)
+        edges = self._edits.lay_over(found, len(self), extra)
         for pair in self._solution.broken & edges.keys():
             edges[pair] = replace(edges[pair], verdict=Verdict.REJECTED, words="the solver failed with it")
         return edges
@@ -367,7 +365,7 @@ class LoopBackend:
         if not len(self):
             self._solution.clear()
             return
-        edges = self._overrulings.lay_over(self._found, len(self))
+        edges = self._edits.lay_over(self._found, len(self))
         arrivals: dict[int, list[LoopEdge]] = {}
         for edge in edges.values():
             if edge.counts:
@@ -394,5 +392,5 @@ class LoopBackend:
             raise HemislamError(f"The solver fails with this graph ({error}); reject the loop added last.") from error
 
 
-def _drift(params: Loops) -> Drift:
+def _drift(params: LoopsParams) -> Drift:
     return Drift(params.drift_translation / 100, np.radians(params.drift_rotation))

@@ -17,7 +17,7 @@ from app.slam.loops.drift import Expectation
 from app.slam.loops.scan_context import Contexts, ScanContext
 from app.slam.loops.submap import Recent, Submap, Submaps
 from app.slam.loops.verification import Fit, Prepared
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.rows import Rows
 from app.slam.types import F64, I64, Keyframe
 
@@ -111,7 +111,7 @@ class Detector:
         half: keyframes on either side of one that make its submap with it.
     """
 
-    def __init__(self, params: Loops) -> None:
+    def __init__(self, params: LoopsParams) -> None:
         self.half = params.submap_keyframes
         self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS)
         self._around: Recent[tuple[int, int], Submap] = Recent(KEPT_SUBMAPS, self._make)
@@ -182,7 +182,7 @@ class Detector:
         """(4, 4) from a keyframe's IMU frame to its level frame: a rotation."""
         return lie.transform(self.poses[index, :3, :3], np.zeros(3))
 
-    def look(self, newer: int, expectation: Expectation, params: Loops) -> list[Sighting]:
+    def look(self, newer: int, expectation: Expectation, params: LoopsParams) -> list[Sighting]:
         """Older places that look like this one, the most alike first, each well apart from the others."""
         p = params
         candidates = self._eligible(newer, expectation, p)
@@ -221,7 +221,7 @@ class Detector:
         source = self.submap(newer)
         return self.submap(older), source
 
-    def _eligible(self, newer: int, expectation: Expectation, params: Loops) -> I64:
+    def _eligible(self, newer: int, expectation: Expectation, params: LoopsParams) -> I64:
         """Keyframes left long enough ago, as near as drift may have brought them."""
         stamps = self._heads.stamps_ns
         old = np.flatnonzero(stamps[: self.described] <= stamps[newer] - round(params.min_time * 1e9))
@@ -229,7 +229,7 @@ class Detector:
         reach = params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M
         return np.asarray(old[away < reach])
 
-    def _compare(self, older: int, newer: int, expectation: Expectation, params: Loops) -> Sighting:
+    def _compare(self, older: int, newer: int, expectation: Expectation, params: LoopsParams) -> Sighting:
         """Scan Contexts at the column shifts that odometry allows."""
         distances = scan_context.shift_distances(self._contexts[older], self._contexts[newer])
         expected = self.guess(older, newer, expectation.poses)

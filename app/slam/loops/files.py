@@ -12,7 +12,7 @@ from app.slam.trajectory import stamp_text
 from app.slam.types import I64
 
 COLUMNS = (
-    "older", "newer", "older_stamp_s", "newer_stamp_s", "verdict", "origin", "overruled", "weight",
+    "older", "newer", "older_stamp_s", "newer_stamp_s", "verdict", "origin", "edited", "weight",
     "represented_by", "repeats", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw",
     "context_distance", "overlap", "residual_m", "slide_m", "rival_m", "mahalanobis_sigma", "gate_m", "support",
     "reason",
@@ -58,7 +58,7 @@ def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
                 stamp_text(int(stamps_ns[edge.newer])),
                 edge.verdict.value,
                 edge.origin.value,
-                int(edge.overruled),
+                int(edge.edited),
                 f"{edge.weight:g}",
                 *("-".join(str(keyframe) for keyframe in pair or ()) for pair in (edge.represented_by, edge.repeats)),
                 *(f"{value:.6f}" for value in pose),

@@ -9,7 +9,7 @@ from app.slam.loops.factors import Factor, Factors, Step
 from app.slam.loops.scan_context import Contexts, ScanContext
 from app.slam.loops.search import Found
 from app.slam.loops.types import LoopEdge
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.rows import Rows
 
 
@@ -17,7 +17,7 @@ from app.slam.rows import Rows
 class Record:
     """What one keyframe was looked at with, and what was found when it came."""
 
-    params: Loops
+    params: LoopsParams
     found: Found
 
 
@@ -30,7 +30,7 @@ class History:
 
     def __init__(self) -> None:
         self.ends: dict[int, Found] = {}
-        self._params: list[Loops] = []
+        self._params: list[LoopsParams] = []
         self._updates: list[LoopEdge] = []
         self._updated = Rows((), np.int64, [0])  # how many of those before the first keyframe, and after each
         self._contexts = Contexts()

@@ -14,7 +14,7 @@ from app.slam.loops.measured import poses as measured_poses
 from app.slam.loops.rivals import rival
 from app.slam.loops.types import LoopEdge, Origin, Verdict
 from app.slam.loops.verification import Fit
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.types import F64
 
 FARTHEST_RIVAL_M = 10.0
@@ -26,7 +26,7 @@ POINT_M, INDEPENDENT = 0.1, 0.05
 points whose errors are independent of their neighbours'."""
 
 
-def judge(sighting: Sighting, detector: Detector, expectation: Expectation, params: Loops) -> LoopEdge:
+def judge(sighting: Sighting, detector: Detector, expectation: Expectation, params: LoopsParams) -> LoopEdge:
     """Register a sighting and hold it against the limits: a candidate if it meets them all, else rejected."""
     older, newer = sighting.older, sighting.newer
     guess = detector.guess(older, newer, expectation.poses)
@@ -71,7 +71,7 @@ def by_hand(older: int, newer: int, detector: Detector, T_older_newer: F64, *, r
     reason = f"added by hand: overlap {fit.overlap:.2f}, residual {fit.residual_rms * 1e3:.0f} mm"
     T = _imu(detector, older, newer, fit.T_target_source) if register else T_older_newer
     measured = Measured.of(T, covariance(detector, newer, fit), evidence)
-    return LoopEdge(older, newer, newer, measured, Verdict.ACCEPTED, reason, Origin.USER, overruled=True)
+    return LoopEdge(older, newer, newer, measured, Verdict.ACCEPTED, reason, Origin.USER, edited=True)
 
 
 def covariance(detector: Detector, newer: int, fit: Fit) -> F64:
@@ -84,7 +84,7 @@ def covariance(detector: Detector, newer: int, fit: Fit) -> F64:
     return np.asarray((out + out.T) / 2)
 
 
-def _objection(e: Evidence, fit: Fit, p: Loops) -> str:
+def _objection(e: Evidence, fit: Fit, p: LoopsParams) -> str:
     """The first limit that is not met, in words and numbers; "" if all are."""
     if len(fit.residuals) < 100:
         return f"only {len(fit.residuals)} points correspond (least 100)"
@@ -103,7 +103,9 @@ def _objection(e: Evidence, fit: Fit, p: Loops) -> str:
     return ""
 
 
-def _rival(older: int, newer: int, detector: Detector, expectation: Expectation, fit: Fit, params: Loops) -> float:
+def _rival(
+    older: int, newer: int, detector: Detector, expectation: Expectation, fit: Fit, params: LoopsParams
+) -> float:
     def allowed(T_level: F64) -> bool:
         return expectation.mahalanobis(older, _imu(detector, older, newer, T_level)) <= params.max_mahalanobis
 
@@ -127,7 +129,7 @@ def worth_correcting(edges: Iterable[LoopEdge], poses: F64) -> bool:
         poses: (k, 4, 4) T_odom_imu of all keyframes.
     """
     loops = [edge for edge in edges if edge.verdict is Verdict.ACCEPTED]
-    if any(edge.overruled or edge.origin is Origin.USER or edge.weight != 1.0 for edge in loops):
+    if any(edge.edited or edge.origin is Origin.USER or edge.weight != 1.0 for edge in loops):
         return True
     if not loops:
         return False

@@ -3,7 +3,7 @@
 import numpy as np
 
 from app.slam.loops.messages import LoopState
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.rows import Rows
 from app.slam.types import I64, Keyframe
 
@@ -26,7 +26,7 @@ class KnownKeyframes:
         self._nbytes = 0
         self._frames = Rows((), np.int64)
         self._stamps = Rows((), np.int64)
-        self._params: list[Loops] = []
+        self._params: list[LoopsParams] = []
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -43,10 +43,10 @@ class KnownKeyframes:
         """(count,) of the first ones, read-only; they stay as they are."""
         return self._stamps.view()[:count]
 
-    def params(self, index: int) -> Loops:
+    def params(self, index: int) -> LoopsParams:
         return self._params[index]
 
-    def put(self, keyframe: Keyframe, params: Loops) -> None:
+    def put(self, keyframe: Keyframe, params: LoopsParams) -> None:
         """In place of the one of its index and of all after it."""
         self.forget(keyframe.index)
         self._frames.append(keyframe.frame)

@@ -31,7 +31,7 @@ from app.slam.loops.messages import (
 )
 from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.map_frame import MapFrame
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.types import Keyframe
 
 MOST_DEATHS = 3
@@ -67,7 +67,7 @@ class LoopLine:
         state: in effect; None before the first. frame: where that lays odometry in the map.
     """
 
-    def __init__(self, client: Callable[[], LoopClient], keyframes: KeyframeStore, params: Loops) -> None:
+    def __init__(self, client: Callable[[], LoopClient], keyframes: KeyframeStore, params: LoopsParams) -> None:
         self.state: LoopState | None = None
         self.frame = MapFrame()
         self._answers: list[Reply] = []
@@ -106,7 +106,7 @@ class LoopLine:
         news, self._news = tuple(self._news), []
         return news
 
-    def add(self, keyframe: Keyframe, params: Loops) -> None:
+    def add(self, keyframe: Keyframe, params: LoopsParams) -> None:
         """The walk has a new keyframe, or comes by a known one again."""
         index = self._count
         known = self._known.holds(index, keyframe.frame)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from app.slam.errors import HemislamError
-from app.slam.loops.types import Command, FactorResidual, LoopDetail, LoopEdge, Pair, Preview
-from app.slam.params import Loops
+from app.slam.loops.types import FactorResidual, LoopDetail, LoopEdge, LoopEdit, Pair, Preview
+from app.slam.params import LoopsParams
 from app.slam.types import F64, Keyframe
 
 
@@ -24,7 +24,7 @@ class AddKeyframe:
     """
 
     keyframe: Keyframe
-    params: Loops
+    params: LoopsParams
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +48,10 @@ class Finish:
 
 # --- the user's commands -------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
-class Overrule:
+class ApplyEdit:
     """Put a command over what was found. One for a pair that is not there yet waits for it."""
 
-    command: Command
+    command: LoopEdit
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +68,8 @@ class Redo:
 class LoadCommands:
     """These commands in place of all there are. `redo`: as in `LoopState`."""
 
-    commands: tuple[Command, ...]
-    redo: tuple[Command, ...] = ()
+    commands: tuple[LoopEdit, ...]
+    redo: tuple[LoopEdit, ...] = ()
 
 
 # --- questions -----------------------------------------------------------------------------------
@@ -77,7 +77,7 @@ class LoadCommands:
 class TryOut:
     """What would the graph become by this command? Answered by `Tried`."""
 
-    command: Command
+    command: LoopEdit
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,9 @@ class AskG2o:
     """The graph as the text of a g2o file. Answered by `G2o`."""
 
 
-Request = AddKeyframe | GoTo | Finish | Overrule | Undo | Redo | LoadCommands | TryOut | Inspect | AskResiduals | AskG2o
+Request = (
+    AddKeyframe | GoTo | Finish | ApplyEdit | Undo | Redo | LoadCommands | TryOut | Inspect | AskResiduals | AskG2o
+)
 
 
 # --- replies -------------------------------------------------------------------------------------
@@ -122,8 +124,8 @@ class LoopState:
     corrections: F64
     edges: tuple[LoopEdge, ...]
     changed: tuple[LoopEdge, ...]
-    undo: tuple[Command, ...]
-    redo: tuple[Command, ...]
+    undo: tuple[LoopEdit, ...]
+    redo: tuple[LoopEdit, ...]
     notices: tuple[str, ...]
 
 
@@ -131,7 +133,7 @@ class LoopState:
 class Tried:
     """By `TryOut`: poses T_map_imu of all keyframes and residuals as they would be."""
 
-    command: Command
+    command: LoopEdit
     preview: Preview
 
 

@@ -9,7 +9,7 @@ from app.slam.loops.judgement import judge
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.support import placed, settle
 from app.slam.loops.types import LoopEdge, Pair, Verdict
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.types import F64
 
 SURE_M = 0.3
@@ -33,7 +33,7 @@ def search(
     counting: Callable[[Edges], Edges],
     poses: F64,
     drift: Drift,
-    params: Loops,
+    params: LoopsParams,
 ) -> Found:
     """Look for loops of some keyframes; all before the last of them are described on the way.
 

@@ -9,6 +9,7 @@ from app.slam.errors import HemislamError
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.messages import (
     AddKeyframe,
+    ApplyEdit,
     AskG2o,
     AskResiduals,
     Failure,
@@ -19,7 +20,6 @@ from app.slam.loops.messages import (
     Inspected,
     LoadCommands,
     LoopState,
-    Overrule,
     Redo,
     Reply,
     Request,
@@ -59,7 +59,7 @@ class LoopService:
                     backend.forget()
             case Finish():
                 backend.finish()
-            case Overrule(command):
+            case ApplyEdit(command):
                 backend.apply(command)
             case Undo():
                 backend.undo()

@@ -14,7 +14,7 @@ from app.slam import lie
 from app.slam.loops import se3
 from app.slam.loops.drift import Drift, agree
 from app.slam.loops.types import HUBER, SUMMARY, LoopEdge, Origin, Pair, Verdict
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.types import F64
 
 NEIGHBOURHOOD_M = 15.0
@@ -26,7 +26,12 @@ NO_NEWS = 1.0
 
 
 def settle(
-    fresh: Mapping[Pair, LoopEdge], edges: Mapping[Pair, LoopEdge], poses: F64, drift: Drift, params: Loops, now: int
+    fresh: Mapping[Pair, LoopEdge],
+    edges: Mapping[Pair, LoopEdge],
+    poses: F64,
+    drift: Drift,
+    params: LoopsParams,
+    now: int,
 ) -> list[LoopEdge]:
     """Verdicts on the candidates seen just now, and on those before that they bear on.
 
@@ -48,7 +53,7 @@ def settle(
     near = [alive[index] for index in np.flatnonzero((apart < NEIGHBOURHOOD_M).any(axis=1))]
     out = dict(fresh)
     for edge in near:
-        if edge.verdict is not Verdict.CANDIDATE or edge.overruled:
+        if edge.verdict is not Verdict.CANDIDATE or edge.edited:
             continue
         others = [o for o in near if o.pair != edge.pair and max(ways(edge, o)) < NEIGHBOURHOOD_M]
         # what is ambiguous agrees with nothing: where a place has twins, all that was seen there may be one's

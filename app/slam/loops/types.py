@@ -1,7 +1,7 @@
 """Values of the loop back end: candidates with their verdicts, and the user's commands over them.
 
 A loop is named by the two keyframes it ties together, `(older, newer)`: the name stays the same
-whatever else is found, so that a list of overrulings can be replayed.
+whatever else is found, so that a list of edits can be replayed.
 """
 
 import sys
@@ -54,7 +54,7 @@ class LoopEdge:
         measured: T_older_newer of the IMU frames, its covariance, rotation then translation, in the
             newer's IMU frame (right perturbation), which pickling leaves behind, and the evidence.
         verdict, words: and why; `SUMMARY` in the words stands for that of the evidence, so that many share them.
-        origin: who proposed it. overruled: whether the verdict is the user's.
+        origin: who proposed it. edited: whether the verdict is the user's.
         weight: the covariance is divided by it in the graph; that of no other, also of those that repeat it.
         represented_by: a loop that is in the graph for both: next to it, so its submaps are most of the same points; or
             the last one that ties poses, where the graph says the same as this one.
@@ -69,7 +69,7 @@ class LoopEdge:
     verdict: Verdict
     words: str
     origin: Origin = Origin.DETECTED
-    overruled: bool = False
+    edited: bool = False
     weight: float = 1.0
     represented_by: Pair | None = None
     repeats: Pair | None = None
@@ -178,7 +178,7 @@ class Solve:
     since: int = field(default=0, compare=False)
 
 
-Command = Accept | Reject | SetWeight | Add | Solve
+LoopEdit = Accept | Reject | SetWeight | Add | Solve
 
 
 # --- what the inspector and the files show -------------------------------------------------------
@@ -238,7 +238,7 @@ class LoopDetail:
     residuals: F64
 
 
-def pair_of(command: Command) -> Pair | None:
+def pair_of(command: LoopEdit) -> Pair | None:
     """What a command is for; None: the graph as a whole."""
     return None if isinstance(command, Solve) else (command.older, command.newer)
 

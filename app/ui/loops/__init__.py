@@ -1,1 +1,1 @@
-"""Loops in the page: edges in the scene, the ledger, all there is on one of them, and overruling."""
+"""Loops in the page: edges in the scene, the ledger, all there is on one of them, and editing them."""

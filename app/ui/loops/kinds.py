@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Final
 
-from app.slam.loops.types import Accept, Add, Command, LoopEdge, Origin, Pair, SetWeight, Solve
+from app.slam.loops.types import Accept, Add, LoopEdge, LoopEdit, Origin, Pair, SetWeight, Solve
 from app.ui.colours import Rgb
 
 
@@ -29,7 +29,7 @@ GHOST: Final[Rgb] = (206, 176, 255)
 
 
 def kind_of(edge: LoopEdge) -> Kind:
-    if edge.overruled or edge.origin is Origin.USER:
+    if edge.edited or edge.origin is Origin.USER:
         return Kind.USER
     return Kind(edge.verdict.value)
 
@@ -39,7 +39,7 @@ def name(pair: Pair) -> str:
     return f"{pair[0]}–{pair[1]}"
 
 
-def say(command: Command) -> str:
+def say(command: LoopEdit) -> str:
     """A command in a few words."""
     if isinstance(command, Solve):
         return "solve all at once"

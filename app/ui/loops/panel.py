@@ -9,17 +9,16 @@ import numpy as np
 import viser
 
 from app.server.protocol import Command, InspectLoop, Seek, Snapshot
-from app.slam.loops.types import Command as Overrule
-from app.slam.loops.types import LoopEdge, Pair, SetWeight, Solve, pair_of
+from app.slam.loops.types import LoopEdge, LoopEdit, Pair, SetWeight, Solve, pair_of
 from app.slam.types import F64
 from app.ui.html import box
 from app.ui.loops import ledger
 from app.ui.loops.bridge import Bridge
 from app.ui.loops.edges import LoopEdges
+from app.ui.loops.edits import EditsPanel, Proposal, SolvePanel, VerdictPanel
 from app.ui.loops.fly import fly
 from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
 from app.ui.loops.kinds import Kind
-from app.ui.loops.overruling import EditsPanel, Proposal, SolvePanel, VerdictPanel
 from app.ui.loops.tie import TiePanel
 from app.ui.loops.words import worst_factors
 from app.ui.view import View
@@ -70,7 +69,7 @@ class LoopsPanel:
             self._inspector = Inspector(server, f"{root}/submaps", self._go)
         with gui.add_folder("Tie two keyframes by hand", expand_by_default=False):
             self._tie = TiePanel(server, f"{root}/tie", self._proposal.propose, snapshot, self._fly, now)
-        with gui.add_folder("Overrulings"):
+        with gui.add_folder("EditList"):
             self._edits = EditsPanel(gui, send, snapshot)
         with gui.add_folder("How well the graph is met", expand_by_default=False):
             self._solve = SolvePanel(gui, self._proposal.propose)
@@ -201,7 +200,7 @@ class LoopsPanel:
         self._look_freely()
         fly(client, place + self._offset(), distance)
 
-    def _committed(self, command: Overrule) -> None:
+    def _committed(self, command: LoopEdit) -> None:
         self._tie.done()
         if (pair := pair_of(command)) is not None:
             self._chosen = self._coming = pair  # a loop by hand has yet to arrive

@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops.types import Command, FactorResidual, LoopEdge, Pair, Preview, Solve
-from app.slam.params import Loops
+from app.slam.loops.types import FactorResidual, LoopEdge, LoopEdit, Pair, Preview, Solve
+from app.slam.params import LoopsParams
 from app.slam.types import F64
 from app.ui.html import BAD, GOOD, box, css, number, tile, tiles
 from app.ui.loops.kinds import COLOURS, NEWER, OLDER, kind_of, name, say
@@ -35,7 +35,7 @@ def _stead(edge: LoopEdge) -> str:
     return ""
 
 
-def evidence(edge: LoopEdge, params: Loops) -> str:
+def evidence(edge: LoopEdge, params: LoopsParams) -> str:
     """The numbers of a loop, green or red by the present limits."""
     e = edge.evidence
     alone = "none" if np.isinf(e.rival_m) and e.rival_m > 0 else f"{number(e.rival_m, 1)}"
@@ -69,7 +69,7 @@ def submap_legend(pair: Pair) -> str:
 def worst_factors(residuals: tuple[FactorResidual, ...], most: int = _WORST) -> str:
     """The factors that the graph meets least, worst first; a loop can be clicked."""
     if not residuals:
-        return box('<span class="hs-quiet">Worked out whenever a loop is chosen, tried or overruled.</span>')
+        return box('<span class="hs-quiet">Worked out whenever a loop is chosen, tried or edited.</span>')
     worst = _worst_first(residuals)[:most]
     top = max(worst[0].sigmas, 1e-9)
     rows = "".join(
@@ -83,7 +83,7 @@ def worst_factors(residuals: tuple[FactorResidual, ...], most: int = _WORST) -> 
     return (
         box(
             f'<span class="hs-note">{len(residuals) - loops} odometry and {loops} loop factors, cost '
-            f"{_cost(residuals):.4g}, as of the loop chosen or overruled last; the worst:</span>"
+            f"{_cost(residuals):.4g}, as of the loop chosen or edited last; the worst:</span>"
         )
         + '<div class="hs-scroll" style="max-height:none"><table class="hs-table"><thead><tr><th>factor</th>'
         f"<th>°</th><th>cm</th><th>σ</th><th></th></tr></thead><tbody>{rows}</tbody></table></div>"
@@ -91,7 +91,7 @@ def worst_factors(residuals: tuple[FactorResidual, ...], most: int = _WORST) -> 
 
 
 def forecast(
-    command: Command, preview: Preview | None, poses: F64, residuals: tuple[FactorResidual, ...], working: str = ""
+    command: LoopEdit, preview: Preview | None, poses: F64, residuals: tuple[FactorResidual, ...], working: str = ""
 ) -> str:
     """What a command would change: how far keyframes move, and the factors that are met worst, before and after.
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from app.slam.loops.backend import LoopBackend
-from app.slam.loops.types import Command, LoopEdge, Verdict
-from app.slam.params import Loops
+from app.slam.loops.types import LoopEdge, LoopEdit, Verdict
+from app.slam.params import LoopsParams
 from app.slam.types import F64, Keyframe
 from tests.slam.loops.walks import Walk, drive, take
 
-PARAMS = Loops(submap_keyframes=5)
+PARAMS = LoopsParams(submap_keyframes=5)
 
 
 def same(ours: tuple[LoopEdge, ...], theirs: tuple[LoopEdge, ...]) -> bool:
@@ -24,7 +24,7 @@ def accepted(backend: LoopBackend) -> list[LoopEdge]:
     return [edge for edge in backend.edges if edge.verdict is Verdict.ACCEPTED]
 
 
-def applied(backend: LoopBackend, command: Command) -> LoopEdge:
+def applied(backend: LoopBackend, command: LoopEdit) -> LoopEdge:
     backend.apply(command)
     return next(edge for edge in backend.edges if edge.pair == (command.older, command.newer))
 

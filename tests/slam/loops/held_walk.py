@@ -10,6 +10,7 @@ from app.slam.loops.line import LoopLine
 from app.slam.loops.measured import Evidence, Measured
 from app.slam.loops.messages import (
     AddKeyframe,
+    ApplyEdit,
     AskG2o,
     Finish,
     G2o,
@@ -17,15 +18,14 @@ from app.slam.loops.messages import (
     LoadCommands,
     LoopState,
     LoopWorkerDied,
-    Overrule,
     Reply,
     Request,
 )
-from app.slam.loops.types import Command, LoopEdge, Verdict
-from app.slam.params import Loops
+from app.slam.loops.types import LoopEdge, LoopEdit, Verdict
+from app.slam.params import LoopsParams
 from app.slam.types import Cloud, Keyframe
 
-LOOPS = Loops()
+LOOPS = LoopsParams()
 LATENCY = 5
 EVERY = 3  # frames between keyframes
 
@@ -39,13 +39,13 @@ class Client:
     def __init__(self) -> None:
         self.requests: list[Request] = []
         self.added: list[int] = []
-        self.params: list[Loops] = []
+        self.params: list[LoopsParams] = []
         self.count = self.known = 0
         self.answered = 0
         self.waits = 0
         self.dead = False
         self._pending: deque[Reply] = deque()
-        self._commands: tuple[Command, ...] = ()
+        self._commands: tuple[LoopEdit, ...] = ()
 
     @property
     def pending(self) -> int:
@@ -63,7 +63,7 @@ class Client:
             case GoTo(count, _):
                 assert count <= self.known
                 self.count = count
-            case Overrule(command):
+            case ApplyEdit(command):
                 self._commands = (*self._commands, command)
             case LoadCommands(commands, _):
                 self._commands = commands
@@ -89,7 +89,7 @@ class Client:
         pass
 
 
-def state(count: int, commands: tuple[Command, ...] = ()) -> LoopState:
+def state(count: int, commands: tuple[LoopEdit, ...] = ()) -> LoopState:
     shifted = np.tile(np.eye(4), (count, 1, 1))
     shifted[:, 0, 3] = count
     found = (edge(count - 1),) if count else ()
@@ -107,7 +107,7 @@ class HeldWalk:
     def __init__(self) -> None:
         self.store = KeyframeStore()
         self.clients: list[Client] = []
-        self.line = LoopLine(self._client, self.store, Loops(latency=LATENCY))
+        self.line = LoopLine(self._client, self.store, LoopsParams(latency=LATENCY))
         self.frame = 0
 
     def _client(self) -> Client:
@@ -118,7 +118,7 @@ class HeldWalk:
     def client(self) -> Client:
         return self.clients[-1]
 
-    def step(self, params: Loops = LOOPS) -> tuple[tuple[LoopEdge, ...], float]:
+    def step(self, params: LoopsParams = LOOPS) -> tuple[tuple[LoopEdge, ...], float]:
         """The next frame: loops that came into effect, and the map's shift."""
         news = self.line.due(self.frame)
         if self.frame % EVERY == 0:

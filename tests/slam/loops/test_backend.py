@@ -14,7 +14,7 @@ from app.slam.loops.backend import LoopBackend
 from app.slam.loops.files import loops_csv
 from app.slam.loops.types import Add, Origin, Solve, Verdict, rows
 from app.slam.metrics import umeyama
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.types import F64
 from tests.slam.loops.conftest import PARAMS, Walked, accepted, same
 from tests.slam.loops.walks import drive, error, revisits, take
@@ -136,8 +136,8 @@ def test_a_keyframe_out_of_turn_is_refused(walked: Walked, backend: LoopBackend)
     assert len(backend) == 50
 
 
-def with_params(**values: object) -> Loops:
-    return Loops.model_validate({**PARAMS.model_dump(), **values})
+def with_params(**values: object) -> LoopsParams:
+    return LoopsParams.model_validate({**PARAMS.model_dump(), **values})
 
 
 def test_switched_off_it_is_the_odometry(walked: Walked) -> None:

@@ -1,89 +1,368 @@
-"""Overrulings as a file."""
+"""The user's commands over what was found: given, undone, waiting, replayed."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
+from app.slam import lie
 from app.slam.errors import HemislamError
-from app.slam.loops.edits import read, write
-from app.slam.loops.types import Accept, Add, Command, Reject, SetWeight, Solve, rows
+from app.slam.loops import inspection, se3
+from app.slam.loops.backend import LoopBackend
+from app.slam.loops.types import Accept, Add, FactorResidual, LoopEdit, Origin, Reject, SetWeight, Solve, Verdict, rows
+from app.slam.types import F64
+from tests.slam.loops.conftest import PARAMS, Walked, accepted, applied, same
+from tests.slam.loops.walks import drive, error
 
 
-@st.composite
-def _commands(draw: st.DrawFn) -> Command:
-    older = draw(st.integers(0, 10_000))
-    newer = draw(st.integers(older + 1, 20_000))
-    weight = draw(st.floats(1e-9, 1e9))
-    guess = np.eye(4)
-    turn = draw(st.tuples(*(st.floats(-3, 3) for _ in range(3))))
-    guess[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    guess[:3, 3] = draw(st.tuples(*(st.floats(-1e4, 1e4) for _ in range(3))))
-    register = draw(st.booleans())
-    since = draw(st.integers(0, 20_000))
-    return draw(
-        st.sampled_from(
-            (
-                Accept(older, newer, since),
-                Reject(older, newer, since),
-                SetWeight(older, newer, weight, since),
-                Add(older, newer, None, register, since),
-                Add(older, newer, rows(guess), register, since),
-                Solve(since),
-            )
-        )
+def commands(backend: LoopBackend) -> st.SearchStrategy[LoopEdit]:
+    pairs = st.sampled_from([edge.pair for edge in backend.edges])
+    far = st.tuples(st.integers(0, 30), st.integers(60, len(backend) - 1))
+    shift = st.tuples(*[st.floats(-1, 1)] * 3)
+    return st.one_of(
+        pairs.map(lambda pair: Accept(*pair)),
+        pairs.map(lambda pair: Reject(*pair)),
+        st.just(Solve()),
+        st.tuples(pairs, st.sampled_from([0.01, 0.5, 7.0])).map(lambda x: SetWeight(*x[0], x[1])),
+        st.tuples(far, shift).map(lambda x: Add(*x[0], rows(lie.transform(np.eye(3), np.array(x[1]))), register=False)),
     )
 
 
-@settings(deadline=None)
-@given(st.lists(_commands(), max_size=6))
-def test_what_is_written_is_read_again_to_the_last_digit(commands: list[Command]) -> None:
-    again = read(write(commands))
-    assert again == tuple(commands)
-    assert [command.since for command in again] == [command.since for command in commands]
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data())
+def test_undoing_any_overrulings_is_never_having_done_them(walked: Walked, data: st.DataObject) -> None:
+    backend = walked.again()
+    poses, edges = backend.poses, backend.edges
+    residuals = backend.factor_residuals()
+    trail = []
+    given_ = data.draw(st.lists(commands(backend), min_size=1, max_size=5))
+    for command in given_:
+        backend.apply(command)
+        trail.append(backend.poses)
+    assert backend.commands == tuple(given_)
+    for k in reversed(range(len(given_))):
+        np.testing.assert_allclose(backend.poses, trail[k], atol=1e-9, rtol=0)
+        backend.undo()
+        assert (backend.commands, backend.undone[-1]) == (tuple(given_[:k]), given_[k])
+    with pytest.raises(HemislamError, match="undo"):
+        backend.undo()
+    np.testing.assert_allclose(backend.poses, poses, atol=1e-9, rtol=0)
+    assert backend.factor_residuals() == residuals
+    assert same(backend.edges, edges)
+    for k in range(len(given_)):
+        backend.redo()
+        np.testing.assert_allclose(backend.poses, trail[k], atol=1e-9, rtol=0)
+    with pytest.raises(HemislamError, match="redo"):
+        backend.redo()
 
 
-def test_a_list_written_by_hand_is_understood() -> None:
-    text = (
-        "- accept: [12, 340]\n- reject: [3, 40]\n- {weigh: [12, 340], weight: 2}\n- add: [5, 300]\n- solve: at once\n"
+def test_undone_in_the_middle_of_the_walk_the_rest_goes_as_without(walked: Walked, backend: LoopBackend) -> None:
+    backend.go_to(walked.halfway)
+    backend.apply(SetWeight(*backend.edges[-1].pair, 0.5))
+    backend.undo()
+    backend.forget()
+    for keyframe in walked.keyframes[walked.halfway :]:
+        backend.add(keyframe, PARAMS)
+    backend.finish()
+    assert backend.poses.tobytes() == walked.poses[-1].tobytes()
+
+
+def edits(walked: Walked, backend: LoopBackend) -> list[LoopEdit]:
+    """One of each kind, and one for a loop that is not there."""
+    first, *_, last = (edge.pair for edge in accepted(backend))
+    far = rows(lie.inverse(walked.walk.truth[3]) @ walked.walk.truth[60])
+    return [
+        SetWeight(*first, 2.0),
+        Reject(*last),
+        Add(3, 60, far, register=False),
+        Add(5, 62, register=False),
+        Accept(0, 1),
+    ]
+
+
+def test_a_session_given_again_before_the_walk_goes_as_it_went(walked: Walked, backend: LoopBackend) -> None:
+    """Commands from the middle of the walk and from after its end, to the last bit."""
+    reject, *rest = edits(walked, backend)
+    backend.go_to(walked.halfway)
+    backend.forget()
+    backend.apply(reject)
+    for keyframe in walked.keyframes[walked.halfway :]:
+        backend.add(keyframe, PARAMS)
+    backend.finish()
+    for command in rest:
+        backend.apply(command)
+    again = LoopBackend()
+    again.load(backend.commands)
+    for keyframe in walked.keyframes:
+        again.add(keyframe, PARAMS)
+    again.finish()
+    assert again.commands == backend.commands
+    assert same(again.edges, backend.edges)
+    assert again.poses.tobytes() == backend.poses.tobytes()
+    for count in (70, walked.halfway):
+        again.go_to(count)
+        backend.go_to(count)
+        assert again.poses.tobytes() == backend.poses.tobytes()
+    again.close()
+
+
+def test_a_list_written_by_hand_waits_for_its_keyframes(walked: Walked, backend: LoopBackend) -> None:
+    commands = tuple(edits(walked, backend)[2:])
+    early = LoopBackend()
+    early.load(commands)
+    for keyframe in walked.keyframes[:70]:
+        early.add(keyframe, PARAMS)
+    assert {edge.pair for edge in early.edges} == {(3, 60), (5, 62)}
+    assert error(early.edges[0], walked.walk.truth)[0] < 1e-6
+    early.finish()
+    assert early.take_notices() == ("Accept 0-1 has no effect: there is no such loop; loops.csv lists all.",)
+    early.close()
+
+
+def test_commands_from_a_walk_with_more_keyframes_act_at_the_end(walked: Walked) -> None:
+    backend = LoopBackend()
+    backend.load((Add(3, 25, rows(np.eye(4)), register=False, since=141), Accept(1, 2, since=500)))
+    for keyframe in walked.keyframes[:30]:
+        backend.add(keyframe, PARAMS)
+    assert backend.edges == ()
+    backend.finish()
+    assert [edge.pair for edge in backend.edges] == [(3, 25)]
+    assert backend.take_notices() == ("Accept 1-2 has no effect: there is no such loop; loops.csv lists all.",)
+    backend.go_to(28)
+    assert [edge.pair for edge in backend.edges] == [(3, 25)], "given once, it belongs to the present"
+    backend.go_to(30)
+    backend.finish()
+    assert backend.take_notices() == (), "it is said once"
+    backend.close()
+
+
+def test_a_command_of_the_present_counts_for_what_is_found_from_then_on(walked: Walked, backend: LoopBackend) -> None:
+    """A false loop that was let in rules out the true ones; rejected, it stands in their way no more."""
+    start = next(k for k, edges in enumerate(walked.edges) if edges) - 2
+    later = [e for e in accepted(backend) if e.decided_at > start + 3]
+    backend.go_to(start)
+    backend.forget()
+    wrong = rows(lie.transform(np.eye(3), np.array([3.0, 3.0, 0.0])))
+    for index in range(4):
+        backend.apply(Add(index, start - 5 + index, wrong, register=False))
+    for keyframe in walked.keyframes[start : start + 12]:
+        backend.add(keyframe, PARAMS)
+    misled = [edge for edge in accepted(backend) if edge.origin is Origin.DETECTED]
+    backend.go_to(start)
+    backend.forget()
+    for index in range(4):
+        backend.apply(Reject(index, start - 5 + index))
+    for keyframe in walked.keyframes[start:]:
+        backend.add(keyframe, PARAMS)
+    found = {edge.pair for edge in accepted(backend) if edge.origin is Origin.DETECTED}
+    assert not misled
+    assert len(found & {edge.pair for edge in later}) > 0.8 * len(later)
+
+
+def test_a_loop_by_hand_waits_again_when_its_keyframe_is_forgotten(walked: Walked, backend: LoopBackend) -> None:
+    backend.apply(Add(3, 100, rows(np.eye(4)), register=False))
+    backend.go_to(100)
+    assert (3, 100) not in {edge.pair for edge in backend.edges}, "there is no keyframe 100 yet"
+    assert backend.commands == (Add(3, 100, rows(np.eye(4)), register=False),)
+    backend.forget()
+    for keyframe in walked.keyframes[100:110]:
+        backend.add(keyframe, PARAMS)
+    assert (3, 100) in {edge.pair for edge in backend.edges}
+
+
+def test_with_every_loop_rejected_the_map_is_the_odometry(walked: Walked, backend: LoopBackend) -> None:
+    for edge in accepted(backend):
+        backend.apply(Reject(edge.older, edge.newer))
+    np.testing.assert_allclose(backend.poses, [k.T_odom_imu for k in walked.keyframes], atol=1e-9)
+    assert all(
+        edge.edited and "by hand" in edge.reason for edge in backend.edges if edge.pair in backend_pairs(backend)
     )
-    assert read(text) == (Accept(12, 340), Reject(3, 40), SetWeight(12, 340, 2.0), Add(5, 300), Solve())
 
 
-def test_an_empty_file_overrules_nothing() -> None:
-    assert read("") == read("# nothing yet\n") == read(write([])) == ()
+def backend_pairs(backend: LoopBackend) -> set[tuple[int, int]]:
+    return {(command.older, command.newer) for command in backend.commands}
+
+
+def test_a_loop_by_hand_is_registered_from_a_rough_guess(walked: Walked, backend: LoopBackend) -> None:
+    truth = walked.walk.truth
+    older, newer = next(edge.pair for edge in reversed(accepted(backend)))
+    older += 1
+    rough = lie.inverse(truth[older]) @ truth[newer] @ lie.transform(lie.exp(np.array([0.05, 0, 0])), np.full(3, 0.2))
+    edge = applied(backend, Add(older, newer, rows(rough)))
+    assert edge.origin is Origin.USER
+    assert edge.verdict is Verdict.ACCEPTED
+    assert error(edge, truth)[0] < 0.05
+    as_it_is = applied(backend, Add(older, newer, rows(rough), register=False))
+    np.testing.assert_allclose(as_it_is.T_older_newer, rough)
+    present = applied(backend, Add(older, newer))
+    assert error(present, truth)[0] < 0.05
+
+
+# --- all at once ---------------------------------------------------------------------------------
+def cost(residuals: tuple[FactorResidual, ...]) -> float:
+    return sum(factor.cost for factor in residuals)
+
+
+def test_solved_at_once_a_graph_of_which_a_window_is_kept_comes_to_the_optimum_too(walked: Walked) -> None:
+    backend = drive(walked.keyframes, PARAMS.model_copy(update={"window": 20}))
+    before, residuals = backend.poses, backend.factor_residuals()
+    tried = backend.preview(Solve())
+    assert backend.poses.tobytes() == before.tobytes()
+    assert cost(tried.residuals) < 0.5 * cost(residuals)
+    backend.apply(Solve())
+    assert backend.poses.tobytes() == tried.poses.tobytes()
+    np.testing.assert_allclose(backend.corrections @ odometry(walked), backend.poses, atol=1e-9)
+    factors, best = backend._factors(backend.edges), cost(backend.factor_residuals())
+    rng = np.random.default_rng(1)
+    for size in (1e-3, 1e-4):
+        for _ in range(20):
+            aside = se3.exp(rng.normal(0, size, (len(before), 6)))
+            aside[0] = np.eye(4)
+            assert cost(inspection.residuals(factors, backend.poses @ aside)) > best
+    backend.undo()
+    assert backend.poses.tobytes() == before.tobytes()
+    backend.close()
+
+
+def odometry(walked: Walked) -> F64:
+    return np.array([keyframe.T_odom_imu for keyframe in walked.keyframes])
+
+
+def test_solving_at_once_holds_from_where_it_was_asked_for(walked: Walked, backend: LoopBackend) -> None:
+    backend.go_to(walked.halfway)
+    backend.forget()
+    before = backend.poses
+    backend.apply(Solve())
+    backend.add(walked.keyframes[walked.halfway], PARAMS)
+    assert backend.poses.tobytes() == backend.preview(Solve()).poses.tobytes()
+    (command,) = backend.commands
+    assert command.since == walked.halfway
+    again = LoopBackend()
+    again.load((command,))
+    for keyframe in walked.keyframes[: walked.halfway - 1]:
+        again.add(keyframe, PARAMS)
+    assert again.poses.tobytes() == walked.poses[walked.halfway - 2].tobytes(), "not before it was given"
+    again.add(walked.keyframes[walked.halfway - 1], PARAMS)
+    assert again.poses.tobytes() != before.tobytes()
+    again.add(walked.keyframes[walked.halfway], PARAMS)
+    assert again.poses.tobytes() == backend.poses.tobytes()
+    again.close()
+
+
+def test_a_graph_that_can_not_be_solved_at_once_stays_as_it_is_and_that_is_said_once(
+    backend: LoopBackend, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise ArithmeticError("Indeterminant linear system")
+
+    monkeypatch.setattr("app.slam.loops.backend.optimise", fail)
+    before = backend.poses
+    backend.apply(Solve())
+    assert backend.poses.tobytes() == backend.poses.tobytes() == before.tobytes()
+    (notice,) = backend.take_notices()
+    assert "Indeterminant" in notice
+
+
+# --- one loop ------------------------------------------------------------------------------------
+def test_a_heavier_loop_is_met_better(backend: LoopBackend) -> None:
+    def left(backend: LoopBackend) -> float:
+        return next(r.translation for r in backend.factor_residuals() if r.loop and r.pair == pair)
+
+    pair = max((r for r in backend.factor_residuals() if r.loop), key=lambda r: r.translation).pair
+    before = left(backend)
+    assert applied(backend, SetWeight(*pair, 100.0)).weight == 100.0
+    assert left(backend) < before
+
+
+def test_a_preview_shows_what_comes_and_changes_nothing(backend: LoopBackend) -> None:
+    backend.go_to(60)
+    poses, edges = backend.poses, backend.edges
+    command = Add(2, 50, rows(lie.transform(np.eye(3), np.array([5.0, 0.0, 0.0]))), register=False)
+    ghost = backend.preview(command)
+    np.testing.assert_array_equal(backend.poses, poses)
+    assert len(backend.edges) == len(edges)
+    assert backend.commands == ()
+    assert np.abs(ghost.poses - poses).max() > 0.1
+    backend.apply(command)
+    np.testing.assert_allclose(backend.poses[:, :3, 3], ghost.poses[:, :3, 3], atol=0.05)
+    assert [r.pair for r in ghost.residuals] == [r.pair for r in backend.factor_residuals()]
+
+
+def test_a_loop_that_breaks_the_solver_is_reported_and_the_run_goes_on(walked: Walked, backend: LoopBackend) -> None:
+    backend.go_to(walked.halfway)
+    pair = accepted(backend)[0].pair
+    edge = applied(backend, SetWeight(*pair, 1e306))
+    assert edge.verdict is Verdict.REJECTED
+    assert "solver" in edge.reason
+    (notice,) = backend.take_notices()
+    assert f"{pair[0]}-{pair[1]}" in notice
+    for keyframe in walked.keyframes[walked.halfway : walked.halfway + 3]:
+        backend.add(keyframe, PARAMS)
+    assert len(backend.poses) == walked.halfway + 3
+    assert np.isfinite(backend.poses).all()
+    backend.go_to(walked.halfway)
+    assert backend.take_notices() == (), "it is said once"
+    backend.undo()
+    assert backend.poses.tobytes() == walked.poses[walked.halfway - 1].tobytes()
 
 
 @pytest.mark.parametrize(
-    ("entry", "what"),
+    ("command", "message"),
     [
-        ("acept: [1, 2]", "accept, reject, weigh or add"),
-        ("{accept: [1, 2], reject: [1, 2]}", "accept, reject, weigh or add"),
-        ("accept: [2, 1]", "older one first"),
-        ("accept: [-1, 1]", "older one first"),
-        ("accept: [1, 2, 3]", "two keyframes"),
-        ("accept: [1.5, 2]", "two keyframes"),
-        ("{accept: [1, 2], weight: 3}", "weight means nothing to accept"),
-        ("{accept: [1, 2], since: -1}", "number of keyframes"),
-        ("weigh: [1, 2]", "weight is None"),
-        ("{weigh: [1, 2], weight: 0}", "greater than 0"),
-        ("{weigh: [1, 2], weight: .nan}", "greater than 0"),
-        ("{add: [1, 2], register: perhaps}", "true or false"),
-        ("{add: [1, 2], guess: [[1, 0], [0, 1]]}", "4x4"),
-        ("{add: [1, 2], guess: [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}", "no rigid transform"),
-        ("solve: twice", "at once"),
-        ("{solve: at once, accept: [1, 2]}", "solve: at once"),
-        ("12", "accept, reject, weigh or add"),
+        (Add(5, 5), "can not be tied together"),
+        (Accept(7, 3), "can not be tied together"),
+        (Reject(-1, 3), "can not be tied together"),
+        (Add(0, 30, ((1.0,),)), "4x4"),
+        (Add(0, 30, rows(np.diag([1.0, 1.0, -1.0, 1.0]))), "rigid"),  # a mirror
+        (Add(0, 30, rows(np.diag([1.1, 1.1, 1.1, 1.0]))), "rigid"),
+        (Add(0, 30, rows(np.eye(4) + np.eye(4)[[3, 0, 1, 2]])), "rigid"),
     ],
 )
-def test_an_entry_that_can_not_be_used_is_named(entry: str, what: str) -> None:
-    with pytest.raises(HemislamError) as caught:
-        read(f"- accept: [1, 2]\n- {entry}\n", "edits.yaml")
-    assert str(caught.value).startswith("edits.yaml, entry 2: ") and what in str(caught.value)
+def test_a_command_that_never_makes_sense_is_refused_and_changes_nothing(
+    backend: LoopBackend, command: LoopEdit, message: str
+) -> None:
+    with pytest.raises(HemislamError, match=message):
+        backend.apply(command)
+    with pytest.raises(HemislamError, match=message):
+        backend.load((SetWeight(1, 2, 3.0), command))
+    assert backend.commands == ()
 
 
-@pytest.mark.parametrize("text", ["a: [1", "accept: [1, 2]", "12"])
-def test_what_is_no_list_is_told_with_an_example(text: str) -> None:
-    with pytest.raises(HemislamError, match=r"edits\.yaml.*- accept: \[12, 340\]"):
-        read(text, "edits.yaml")
+@pytest.mark.parametrize(
+    ("command", "message"), [(Accept(1, 2), "no loop candidate of keyframes 1 and 2"), (Add(0, 10_000), "of the")]
+)
+def test_what_is_not_there_can_not_be_tried_out(backend: LoopBackend, command: LoopEdit, message: str) -> None:
+    with pytest.raises(HemislamError, match=message):
+        backend.preview(command)
+
+
+def test_a_weight_must_be_positive(backend: LoopBackend) -> None:
+    for weight in (0.0, -1.0, float("nan")):
+        with pytest.raises(HemislamError, match="greater than 0"):
+            backend.apply(SetWeight(*backend.edges[0].pair, weight))
+
+
+def test_loops_next_to_one_another_are_one_factor_and_rejecting_it_hands_over_to_the_others(
+    walked: Walked, backend: LoopBackend
+) -> None:
+    loops = accepted(backend)
+    counting = {edge.pair for edge in loops if edge.counts}
+    assert len(counting) < len(loops) / 2
+    for edge in loops:
+        near = {
+            pair
+            for pair in counting - {edge.pair}
+            if max(abs(pair[0] - edge.older), abs(pair[1] - edge.newer)) <= PARAMS.submap_keyframes // 2
+        }
+        assert edge.counts or edge.represented_by in counting
+        assert not (edge.counts and near), "two factors that share most of their points"
+    first = next(edge.represented_by for edge in loops if edge.represented_by)
+    behind = {edge.pair for edge in loops if edge.represented_by == first}
+    backend.apply(Reject(*first))
+    assert {edge.pair for edge in accepted(backend) if edge.counts} == counting - {first} | behind
+    backend.apply(SetWeight(*max(behind), 2.0))
+    backend.undo()
+    backend.undo()
+    assert same(backend.edges, walked.edges[-1])
+    word = max(edge.pair for edge in loops if not edge.counts)
+    assert applied(backend, SetWeight(*word, 2.0)).counts, "what the user has a word on is a factor"

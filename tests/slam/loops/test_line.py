@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from app.slam.loops.line import MOST_DEATHS
 from app.slam.loops.messages import (
     AddKeyframe,
+    ApplyEdit,
     Failure,
-    Overrule,
     Undo,
 )
-from app.slam.loops.types import Accept, Command
-from app.slam.params import Loops
+from app.slam.loops.types import Accept, LoopEdit
+from app.slam.params import LoopsParams
 from tests.slam.loops.held_walk import EVERY, LATENCY, HeldWalk, shift_at
 
 
@@ -81,7 +81,7 @@ def test_before_the_first_loop_counts_nobody_is_asked_for_it(walk: HeldWalk, fra
 def test_a_command_given_just_before_going_back_is_not_lost(walk: HeldWalk) -> None:
     for _ in range(30):
         walk.step()
-    walk.line.command(Overrule(Accept(0, 2)))
+    walk.line.command(ApplyEdit(Accept(0, 2)))
     walk.go_to(20)
     walk.step()
     assert walk.line.state is not None and walk.line.state.undo == (Accept(0, 2),)
@@ -102,7 +102,7 @@ def test_a_walk_that_goes_on_differently_hands_its_keyframes_over_anew(walk: Hel
 def test_a_command_takes_effect_when_it_is_answered_and_holds(walk: HeldWalk) -> None:
     for _ in range(10):
         walk.step()
-    walk.line.command(Overrule(Accept(0, 2)))
+    walk.line.command(ApplyEdit(Accept(0, 2)))
     assert not walk.line.idle
     walk.client.answered = 10
     walk.line.poll()
@@ -116,7 +116,7 @@ def test_a_command_takes_effect_when_it_is_answered_and_holds(walk: HeldWalk) ->
 def test_work_that_died_is_begun_again_with_all_keyframes_and_commands(walk: HeldWalk) -> None:
     for _ in range(20):
         walk.step()
-    walk.line.command(Overrule(Accept(0, 2)))
+    walk.line.command(ApplyEdit(Accept(0, 2)))
     walk.client.answered = 100
     walk.line.poll()
     walk.client.dead = True
@@ -137,7 +137,7 @@ def test_work_that_keeps_dying_is_given_up_and_frames_go_on(walk: HeldWalk) -> N
         walk.step()
     assert len(walk.clients) == MOST_DEATHS + 1
     assert any("stay as they are" in alarm for alarm in walk.line.take_alarms())
-    walk.line.command(Overrule(Accept(0, 2)))
+    walk.line.command(ApplyEdit(Accept(0, 2)))
     assert any(isinstance(answer, Failure) for answer in walk.line.take_answers())
 
 
@@ -178,22 +178,22 @@ def test_work_that_dies_at_the_end_of_the_walk_is_done_again(walk: HeldWalk, mom
 def test_what_the_user_asked_is_answered_by_whoever_comes_after_a_death(walk: HeldWalk) -> None:
     for _ in range(20):
         walk.step()
-    walk.line.command(Overrule(Accept(0, 2)))  # not answered yet
+    walk.line.command(ApplyEdit(Accept(0, 2)))  # not answered yet
     walk.client.dead = True
     walk.line.poll()
-    walk.line.command(Overrule(Accept(0, 3)))  # while the keyframes are handed over again
+    walk.line.command(ApplyEdit(Accept(0, 3)))  # while the keyframes are handed over again
     assert not walk.line.idle
     while not walk.line.idle:
         walk.client.answered = 100
         walk.line.poll()  # no frame need come for it
     assert walk.line.state is not None and walk.line.state.undo == (Accept(0, 2), Accept(0, 3))
-    asked = [request for request in walk.client.requests if isinstance(request, AddKeyframe | Overrule)]
-    assert asked[-2:] == [Overrule(Accept(0, 2)), Overrule(Accept(0, 3))], "once all keyframes are there"
+    asked = [request for request in walk.client.requests if isinstance(request, AddKeyframe | ApplyEdit)]
+    assert asked[-2:] == [ApplyEdit(Accept(0, 2)), ApplyEdit(Accept(0, 3))], "once all keyframes are there"
     assert walk.line.frame.newest[0, 3] == 7, "a command acts on all there is"
 
 
 def test_keyframes_handed_over_again_are_looked_at_with_the_parameters_of_then(walk: HeldWalk) -> None:
-    given = [Loops(min_time=10.0 + k) for k in range(10)]
+    given = [LoopsParams(min_time=10.0 + k) for k in range(10)]
     for frame in range(30):
         walk.step(given[frame // EVERY])
     walk.client.dead = True
@@ -242,7 +242,7 @@ ACTIONS = st.lists(
 @settings(max_examples=150, deadline=None)
 @given(ACTIONS)
 def test_whatever_happens_the_end_is_that_of_the_walk_and_no_command_is_lost(actions: list[str]) -> None:
-    walk, commands = HeldWalk(), list[Command]()
+    walk, commands = HeldWalk(), list[LoopEdit]()
     for number, action in enumerate(actions):
         match action:
             case "step":
@@ -260,7 +260,7 @@ def test_whatever_happens_the_end_is_that_of_the_walk_and_no_command_is_lost(act
                 walk.step()
             case "command":
                 commands.append(Accept(0, number + 1))
-                walk.line.command(Overrule(commands[-1]))
+                walk.line.command(ApplyEdit(commands[-1]))
     walk.line.finish()
     results = walk.line.results()
     assert results.g2o == f"graph of {len(walk.store)}"

@@ -3,6 +3,7 @@ import pytest
 
 from app.slam.loops.messages import (
     AddKeyframe,
+    ApplyEdit,
     AskG2o,
     AskResiduals,
     Failure,
@@ -13,7 +14,6 @@ from app.slam.loops.messages import (
     Inspected,
     LoadCommands,
     LoopState,
-    Overrule,
     Redo,
     Request,
     Residuals,
@@ -89,7 +89,7 @@ def test_questions_change_nothing(walked: Walked, service: LoopService) -> None:
 def test_overruling_is_answered_by_what_became_of_it(service: LoopService) -> None:
     before = state(service, Finish())
     edge = next(edge for edge in before.edges if edge.verdict is Verdict.ACCEPTED)
-    rejected = state(service, Overrule(Reject(*edge.pair)))
+    rejected = state(service, ApplyEdit(Reject(*edge.pair)))
     assert [(e.pair, e.verdict) for e in rejected.changed] == [(edge.pair, Verdict.REJECTED)]
     assert rejected.undo == (Reject(*edge.pair),)
     undone = state(service, Undo())
@@ -104,7 +104,7 @@ def test_overruling_is_answered_by_what_became_of_it(service: LoopService) -> No
 
 
 def test_a_command_that_waits_says_so(service: LoopService) -> None:
-    assert state(service, Overrule(Accept(1, 2))).notices == ("Accept 1-2 waits until there is such a loop.",)
+    assert state(service, ApplyEdit(Accept(1, 2))).notices == ("Accept 1-2 waits until there is such a loop.",)
     assert state(service, Undo()).notices == ()
     state(service, LoadCommands(()))
 
@@ -114,9 +114,9 @@ def test_what_can_not_be_done_is_said_and_nothing_has_changed(walked: Walked, se
     for request, text in [
         (GoTo(10_000), "knows"),
         (AddKeyframe(walked.keyframes[3], PARAMS), "can not follow"),
-        (Undo(), "no overruling to undo"),
-        (Redo(), "no overruling to redo"),
-        (Overrule(Add(9, 2)), "older and a newer"),
+        (Undo(), "no edit to undo"),
+        (Redo(), "no edit to redo"),
+        (ApplyEdit(Add(9, 2)), "older and a newer"),
         (LoadCommands((Accept(9, 2),)), "older and a newer"),
         (TryOut(Accept(1, 2)), "no loop candidate"),
         (Inspect(0, 10_000), "of the"),

@@ -9,10 +9,10 @@ import pytest
 from app.slam import lie
 from app.slam.loops import se3
 from app.slam.loops.backend import LoopBackend
+from app.slam.loops.edits import EditList, Entry
 from app.slam.loops.factors import Factor
 from app.slam.loops.judgement import FLOOR_M, FLOOR_RAD
 from app.slam.loops.measured import Evidence, Measured
-from app.slam.loops.overruling import Entry, Overrulings
 from app.slam.loops.pose_graph import optimise
 from app.slam.loops.solution import loop_factors
 from app.slam.loops.support import laid, placed
@@ -181,7 +181,7 @@ def ties(backend: LoopBackend) -> list[tuple[int, int]]:
 
 
 def test_no_loop_is_laid_on_one_that_the_user_made() -> None:
-    made = replace(loop(40), origin=Origin.USER, overruled=True)
+    made = replace(loop(40), origin=Origin.USER, edited=True)
     elsewhere = POSES.copy()
     elsewhere[TURN:, 1, 3] = 0.5
     (edge,) = placed([loop(34)], [made], POSES, elsewhere, HALF)
@@ -190,17 +190,17 @@ def test_no_loop_is_laid_on_one_that_the_user_made() -> None:
 
 def test_what_was_found_beside_a_loop_by_hand_counts_by_itself_once_that_is_undone() -> None:
     """Also if nothing else is in force, and whether it repeated the loop or was represented by it."""
-    made = replace(loop(40), origin=Origin.USER, overruled=True)
+    made = replace(loop(40), origin=Origin.USER, edited=True)
     beside = [replace(loop(38), represented_by=made.pair), replace(loop(34), repeats=made.pair)]
     found = {edge.pair: edge for edge in beside}
-    overrulings = Overrulings()
-    overrulings.give(Entry(Add(*made.pair), added=made))
-    laid_over = overrulings.lay_over(found, len(POSES))
+    edits = EditList()
+    edits.give(Entry(Add(*made.pair), added=made))
+    laid_over = edits.lay_over(found, len(POSES))
     assert laid_over[made.pair] is made
     assert laid_over[loop(38).pair].represented_by == made.pair and not laid_over[loop(38).pair].counts
     assert laid_over[loop(34).pair].repeats is None, "the user's word is not to be outvoted"
-    overrulings.undo()
-    undone = overrulings.lay_over(found, len(POSES))
+    edits.undo()
+    undone = edits.lay_over(found, len(POSES))
     assert all(edge.counts and edge.repeats is None for edge in undone.values())
     assert loop_factors(undone.values(), undone, POSES, window=0)
 
@@ -209,12 +209,12 @@ def test_who_stood_in_for_a_rejected_loop_hands_over_when_that_is_back() -> None
     """What was found meanwhile was placed by it."""
     first, second, third = loop(40), replace(loop(38), represented_by=loop(40).pair), loop(36)
     found = {edge.pair: edge for edge in (first, second, replace(third, represented_by=second.pair))}
-    overrulings = Overrulings()
-    overrulings.give(Entry(Reject(*first.pair)))
-    rejected = overrulings.lay_over(found, len(POSES))
+    edits = EditList()
+    edits.give(Entry(Reject(*first.pair)))
+    rejected = edits.lay_over(found, len(POSES))
     assert rejected[second.pair].counts and rejected[third.pair].represented_by == second.pair
-    overrulings.undo()
-    back = overrulings.lay_over(found, len(POSES))
+    edits.undo()
+    back = edits.lay_over(found, len(POSES))
     assert [edge.represented_by for _, edge in sorted(back.items())] == [first.pair, first.pair, None]
 
 

@@ -49,5 +49,5 @@ def test_what_was_not_accepted_says_nothing() -> None:
 
 def test_the_word_of_the_user_counts_however_little_it_moves() -> None:
     first, *others = loops(0.001)
-    for told in (replace(first, overruled=True), replace(first, origin=Origin.USER), replace(first, weight=2.0)):
+    for told in (replace(first, edited=True), replace(first, origin=Origin.USER), replace(first, weight=2.0)):
         assert worth_correcting([told, *others], POSES)

@@ -13,7 +13,7 @@ from app.sensors.simulator.trajectory import Walker, walk
 from app.slam import lie
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.types import LoopEdge
-from app.slam.params import Loops
+from app.slam.params import LoopsParams
 from app.slam.types import F64, NON_GROUND, Cloud, Keyframe
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -92,7 +92,7 @@ def take(scene: str | Scene, duration_s: float, spacing_m: float = 0.8, every_bl
 
 
 def drive(
-    keyframes: tuple[Keyframe, ...], params: Loops, watch: Callable[[LoopBackend], None] = lambda backend: None
+    keyframes: tuple[Keyframe, ...], params: LoopsParams, watch: Callable[[LoopBackend], None] = lambda backend: None
 ) -> LoopBackend:
     """A back end that has walked all keyframes; `watch` sees it after each."""
     backend = LoopBackend()

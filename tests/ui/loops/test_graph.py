@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from app.server.protocol import OverruleLoop, TryLoop, UndoLoop
+from app.server.protocol import EditLoop, TryLoop, UndoLoop
 from app.slam.loops.types import HUBER, Accept, FactorResidual, Preview, Solve
 from app.ui.loops.words import forecast
 from tests.ui.conftest import user_clicks
@@ -38,7 +38,7 @@ def test_all_is_solved_at_once_in_two_steps_with_cost_and_change_said_between(pa
     assert page.node("/map/ghost/path") is not None
     user_clicks(proposal._commit)
     page.draw()
-    assert page.engine.sent[1:] == [OverruleLoop(Solve()), TryLoop(None)]
+    assert page.engine.sent[1:] == [EditLoop(Solve()), TryLoop(None)]
     assert page.loops.chosen == GOOD, "it is of no loop in particular"
     assert solve._button.disabled
     assert page.loops._edits._undo.label == "Undo: solve all at once"

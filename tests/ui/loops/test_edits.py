@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from app.server.protocol import OverruleLoop, RedoLoop, TryLoop, UndoLoop
-from app.slam.loops import edits
+from app.server.protocol import EditLoop, RedoLoop, TryLoop, UndoLoop
+from app.slam.loops import edit_files
 from app.slam.loops.types import Accept, Add, Reject, SetWeight, Verdict
 from tests.ui.conftest import user_clicks, user_sets
 from tests.ui.loops.conftest import GOOD, WAITING, Page, rejected
@@ -25,7 +25,7 @@ def test_a_rejected_loop_is_accepted_in_two_steps_with_a_ghost_between(page: Pag
     assert page.edge(pair).verdict is Verdict.REJECTED
     user_clicks(page.loops._proposal._commit)
     page.draw()
-    assert page.engine.sent[1:3] == [OverruleLoop(Accept(*pair)), TryLoop(None)]
+    assert page.engine.sent[1:3] == [EditLoop(Accept(*pair)), TryLoop(None)]
     assert page.edge(pair).verdict is Verdict.ACCEPTED
     assert page.node("/map/ghost/path") is None
     assert page.node("/map/loops/by-hand-in/0") is None  # it is the chosen one, drawn in white
@@ -39,7 +39,7 @@ def test_cancelling_leaves_all_as_it_was(page: Page) -> None:
     page.draw()
     page.loops._proposal.cancel()
     page.draw()
-    assert not any(isinstance(command, OverruleLoop) for command in page.engine.sent)
+    assert not any(isinstance(command, EditLoop) for command in page.engine.sent)
     assert page.engine.sent[-1] == TryLoop(None)
     assert not page.loops._proposal._folder.visible and page.node("/map/ghost/path") is None
 
@@ -97,8 +97,8 @@ def test_choosing_another_loop_drops_what_was_being_considered(page: Page) -> No
 def test_undo_and_redo_say_what_they_would_do(page: Page) -> None:
     panel = page.loops._edits
     assert panel._undo.disabled and panel._redo.disabled and panel._save.disabled
-    page.engine.send(OverruleLoop(Reject(*GOOD)))
-    page.engine.send(OverruleLoop(Accept(*WAITING)))
+    page.engine.send(EditLoop(Reject(*GOOD)))
+    page.engine.send(EditLoop(Accept(*WAITING)))
     page.draw()
     assert panel._undo.label == "Undo: accept 34–112" and panel._redo.disabled
     user_clicks(panel._undo)
@@ -113,14 +113,14 @@ def test_undo_and_redo_say_what_they_would_do(page: Page) -> None:
 def test_edits_are_saved_and_given_again(page: Page) -> None:
     commands = (Reject(*GOOD), Accept(*WAITING), Add(20, 97), SetWeight(20, 97, 0.5))
     for command in commands:
-        page.engine.send(OverruleLoop(command))
+        page.engine.send(EditLoop(command))
     files: dict[str, bytes] = {}
     browser: Any = SimpleNamespace(send_file_download=lambda name, content, **_: files.update({name: content}))
     page.loops._edits._download(browser)
-    assert edits.read(files["edits.yaml"].decode()) == commands
+    assert edit_files.read(files["edits.yaml"].decode()) == commands
     page.engine.sent.clear()
     page.loops._edits._load(files["edits.yaml"], None)
-    assert page.engine.sent == [OverruleLoop(command) for command in commands]
+    assert page.engine.sent == [EditLoop(command) for command in commands]
 
 
 def test_a_file_that_can_not_be_used_changes_nothing_and_says_why(page: Page) -> None:

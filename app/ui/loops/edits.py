@@ -7,11 +7,10 @@ from typing import Any, Final
 import numpy as np
 import viser
 
-from app.server.protocol import Command, OverruleLoop, RedoLoop, Snapshot, TryLoop, UndoLoop
+from app.server.protocol import Command, EditLoop, RedoLoop, Snapshot, TryLoop, UndoLoop
 from app.slam.errors import HemislamError
-from app.slam.loops import edits
-from app.slam.loops.types import Accept, LoopEdge, Pair, Preview, Reject, SetWeight, Solve, Verdict
-from app.slam.loops.types import Command as Overrule
+from app.slam.loops import edit_files
+from app.slam.loops.types import Accept, LoopEdge, LoopEdit, Pair, Preview, Reject, SetWeight, Solve, Verdict
 from app.ui.html import box
 from app.ui.loops.kinds import say
 from app.ui.loops.overlay import Ghost
@@ -30,7 +29,7 @@ class Proposal:
         root: str,
         send: Callable[[Command], None],
         snapshot: Callable[[], Snapshot],
-        committed: Callable[[Overrule], None],
+        committed: Callable[[LoopEdit], None],
     ) -> None:
         gui = server.gui
         self._send, self._snapshot, self._committed = send, snapshot, committed
@@ -40,13 +39,13 @@ class Proposal:
             self._words = gui.add_html("")
             self._commit = gui.add_button("Commit", icon=viser.Icon.CHECK)
             cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
-        self.command: Overrule | None = None
+        self.command: LoopEdit | None = None
         self._last_notice = 0
         self._told: tuple[object, ...] = ()
         self._commit.on_click(by_user(lambda _, __: self.commit()))
         cancel.on_click(by_user(lambda _, __: self.cancel()))
 
-    def propose(self, command: Overrule) -> None:
+    def propose(self, command: LoopEdit) -> None:
         """Ask the engine what it would change."""
         notices = self._snapshot().notices
         self._last_notice = notices[-1].number if notices else 0
@@ -57,7 +56,7 @@ class Proposal:
         """Do it."""
         command, self.command = self.command, None
         if command is not None:
-            self._send(OverruleLoop(command))
+            self._send(EditLoop(command))
             self._send(TryLoop(None))
             self._committed(command)
 
@@ -84,7 +83,7 @@ class Proposal:
             self._words.content = self._forecast(command, preview, poses, snapshot, problem)
 
     def _forecast(
-        self, command: Overrule, preview: Preview | None, poses: Any, snapshot: Snapshot, problem: str
+        self, command: LoopEdit, preview: Preview | None, poses: Any, snapshot: Snapshot, problem: str
     ) -> str:
         return forecast(command, preview, poses, snapshot.loops.residuals, problem)
 
@@ -98,7 +97,7 @@ class VerdictPanel:
     """Accept, reject and weight of the chosen loop."""
 
     def __init__(
-        self, gui: viser.GuiApi, propose: Callable[[Overrule], None], now: Callable[[], float] = time.monotonic
+        self, gui: viser.GuiApi, propose: Callable[[LoopEdit], None], now: Callable[[], float] = time.monotonic
     ) -> None:
         self._propose, self._now = propose, now
         self._pair: Pair | None = None
@@ -142,7 +141,7 @@ class VerdictPanel:
 class SolvePanel:
     """All factors solved at once, on request."""
 
-    def __init__(self, gui: viser.GuiApi, propose: Callable[[Overrule], None]) -> None:
+    def __init__(self, gui: viser.GuiApi, propose: Callable[[LoopEdit], None]) -> None:
         self._button = gui.add_button(
             "Solve all at once …",
             icon=viser.Icon.MATH_FUNCTION,
@@ -163,7 +162,7 @@ class SolvePanel:
 
 
 class EditsPanel:
-    """Undo, redo, and the list of overrulings as a file."""
+    """Undo, redo, and the list of edits as a file."""
 
     def __init__(self, gui: viser.GuiApi, send: Callable[[Command], None], snapshot: Callable[[], Snapshot]) -> None:
         self._send, self._snapshot = send, snapshot
@@ -179,10 +178,10 @@ class EditsPanel:
         self._redo.on_click(by_user(lambda _, __: send(RedoLoop())))
         self._save.on_click(by_user(lambda _, client: self._download(client)))
         load.on_upload(lambda event: self._load(event.target.value.content, event.client))
-        gui.add_command("Undo the last overruling of a loop", hotkey="Z", modifier="cmd/ctrl").on_trigger(
+        gui.add_command("Undo the last edit of a loop", hotkey="Z", modifier="cmd/ctrl").on_trigger(
             lambda _: send(UndoLoop())
         )
-        gui.add_command("Redo the overruling undone last", hotkey="Z", modifier="cmd/ctrl+shift").on_trigger(
+        gui.add_command("Redo the edit undone last", hotkey="Z", modifier="cmd/ctrl+shift").on_trigger(
             lambda _: send(RedoLoop())
         )
 
@@ -203,15 +202,15 @@ class EditsPanel:
         self._save.disabled = not count
 
     def _download(self, client: viser.ClientHandle) -> None:
-        text = edits.write(self._snapshot().loops.undo)
+        text = edit_files.write(self._snapshot().loops.undo)
         client.send_file_download("edits.yaml", text.encode(), save_immediately=True)
 
     def _load(self, content: bytes, client: viser.ClientHandle | None) -> None:
         try:
-            commands = edits.read(content.decode(errors="replace"), "The file")
+            commands = edit_files.read(content.decode(errors="replace"), "The file")
         except HemislamError as error:
             if client is not None:
                 client.add_notification("Error", str(error), color="red", auto_close_seconds=None)
             return
         for command in commands:
-            self._send(OverruleLoop(command))
+            self._send(EditLoop(command))

@@ -1,0 +1,89 @@
+"""EditList as a file."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from app.slam.errors import HemislamError
+from app.slam.loops.edit_files import read, write
+from app.slam.loops.types import Accept, Add, LoopEdit, Reject, SetWeight, Solve, rows
+
+
+@st.composite
+def _commands(draw: st.DrawFn) -> LoopEdit:
+    older = draw(st.integers(0, 10_000))
+    newer = draw(st.integers(older + 1, 20_000))
+    weight = draw(st.floats(1e-9, 1e9))
+    guess = np.eye(4)
+    turn = draw(st.tuples(*(st.floats(-3, 3) for _ in range(3))))
+    guess[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    guess[:3, 3] = draw(st.tuples(*(st.floats(-1e4, 1e4) for _ in range(3))))
+    register = draw(st.booleans())
+    since = draw(st.integers(0, 20_000))
+    return draw(
+        st.sampled_from(
+            (
+                Accept(older, newer, since),
+                Reject(older, newer, since),
+                SetWeight(older, newer, weight, since),
+                Add(older, newer, None, register, since),
+                Add(older, newer, rows(guess), register, since),
+                Solve(since),
+            )
+        )
+    )
+
+
+@settings(deadline=None)
+@given(st.lists(_commands(), max_size=6))
+def test_what_is_written_is_read_again_to_the_last_digit(commands: list[LoopEdit]) -> None:
+    again = read(write(commands))
+    assert again == tuple(commands)
+    assert [command.since for command in again] == [command.since for command in commands]
+
+
+def test_a_list_written_by_hand_is_understood() -> None:
+    text = (
+        "- accept: [12, 340]\n- reject: [3, 40]\n- {weigh: [12, 340], weight: 2}\n- add: [5, 300]\n- solve: at once\n"
+    )
+    assert read(text) == (Accept(12, 340), Reject(3, 40), SetWeight(12, 340, 2.0), Add(5, 300), Solve())
+
+
+def test_an_empty_file_overrules_nothing() -> None:
+    assert read("") == read("# nothing yet\n") == read(write([])) == ()
+
+
+@pytest.mark.parametrize(
+    ("entry", "what"),
+    [
+        ("acept: [1, 2]", "accept, reject, weigh or add"),
+        ("{accept: [1, 2], reject: [1, 2]}", "accept, reject, weigh or add"),
+        ("accept: [2, 1]", "older one first"),
+        ("accept: [-1, 1]", "older one first"),
+        ("accept: [1, 2, 3]", "two keyframes"),
+        ("accept: [1.5, 2]", "two keyframes"),
+        ("{accept: [1, 2], weight: 3}", "weight means nothing to accept"),
+        ("{accept: [1, 2], since: -1}", "number of keyframes"),
+        ("weigh: [1, 2]", "weight is None"),
+        ("{weigh: [1, 2], weight: 0}", "greater than 0"),
+        ("{weigh: [1, 2], weight: .nan}", "greater than 0"),
+        ("{add: [1, 2], register: perhaps}", "true or false"),
+        ("{add: [1, 2], guess: [[1, 0], [0, 1]]}", "4x4"),
+        ("{add: [1, 2], guess: [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}", "no rigid transform"),
+        ("solve: twice", "at once"),
+        ("{solve: at once, accept: [1, 2]}", "solve: at once"),
+        ("12", "accept, reject, weigh or add"),
+    ],
+)
+def test_an_entry_that_can_not_be_used_is_named(entry: str, what: str) -> None:
+    with pytest.raises(HemislamError) as caught:
+        read(f"- accept: [1, 2]\n- {entry}\n", "edits.yaml")
+    assert str(caught.value).startswith("edits.yaml, entry 2: ") and what in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["a: [1", "accept: [1, 2]", "12"])
+def test_what_is_no_list_is_told_with_an_example(text: str) -> None:
+    with pytest.raises(HemislamError, match=r"edits\.yaml.*- accept: \[12, 340\]"):
+        read(text, "edits.yaml")
