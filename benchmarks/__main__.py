@@ -4,7 +4,7 @@ import os
 import sys
 from pathlib import Path
 
-from benchmarks import fed, frame, kill, latency, latency_page, live, loops, packets, page, replay, rewind, seek, walk
+from benchmarks import fed, frame, kill, latency, live, loops, packets, page, replay, rewind, seek, walk
 from benchmarks.record import show
 
 BENCHMARKS = {
@@ -12,7 +12,6 @@ BENCHMARKS = {
     "frame": frame.run,
     "kill": kill.run,
     "latency": latency.run,
-    "latency-page": latency_page.run,
     "live": live.run,
     "loops": loops.run,
     "packets": packets.run,

@@ -94,32 +94,10 @@ def _keyed(key: str) -> Iterator[None]:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-PLAIN_EDGES = """
-(() => {
-  const get = HTMLCanvasElement.prototype.getContext;
-  let slow;
-  const onProcessor = () => {
-    const gl = get.call(document.createElement('canvas'), 'webgl2');
-    const about = gl && gl.getExtension('WEBGL_debug_renderer_info');
-    return !!about && /swiftshader|llvmpipe|basic render/i.test(gl.getParameter(about.UNMASKED_RENDERER_WEBGL));
-  };
-  HTMLCanvasElement.prototype.getContext = function (kind, options) {
-    if (kind === 'webgl2') {
-      slow ??= onProcessor();
-      if (slow) options = {...options, antialias: false};
-    }
-    return get.call(this, kind, options);
-  };
-})();
-"""
-"""Where the processor draws what a graphics card should, smooth edges cost more than all points."""
-
-
 def page_html() -> str:
     """viser's client: one file that holds everything."""
     page = Path(viser.__file__).parent / "client" / "build" / "index.html"
-    html = page.read_text(encoding="utf-8").replace("<title>Viser</title>", "<title>hemislam</title>", 1)
-    return html.replace("<head>", f"<head><script>{PLAIN_EDGES}</script>", 1)
+    return page.read_text(encoding="utf-8").replace("<title>Viser</title>", "<title>hemislam</title>", 1)
 
 
 BADGE = (

@@ -36,7 +36,6 @@ from app.server.fork import Engine, Workspace
 from app.server.logs import log_notices
 from app.server.patience import PatientProtocol
 from app.server.setup import Setup
-from app.server.slow_page import quickened
 from app.server.viser_page import BUFFER_BYTES, Viser, bridge, page_html, start_viser, viewer_html
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
@@ -74,7 +73,7 @@ def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) ->
         redoc_url=None,
     )
     app.add_middleware(Guard, access=access)
-    page = quickened(page_html())
+    page = page_html()
     viewers_page = viewer_html(page)
     pages: Counter[bool] = Counter()  # that are open, of those who may look only and of others
 

@@ -7,7 +7,6 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from app.server.protocol import CompareWith, OpenRecording, Pause, Play, Seek, SetParams, StepFrame
-from app.server.viser_page import PLAIN_EDGES
 from tests.browser.conftest import Bench
 
 
@@ -206,13 +205,3 @@ def test_the_page_has_no_errors_and_reaches_out_to_nobody(bench: Bench, chromium
         assert hosts <= {Path(bench.url).name, bench.url.split("/")[2]}
     finally:
         page.close()
-
-
-def test_where_the_processor_draws_edges_are_plain(chromium: Browser) -> None:
-    """Chromium draws without a graphics card here, and smooth edges would cost more than all points."""
-    page = chromium.new_page()
-    smooth = "document.createElement('canvas').getContext('webgl2', {antialias: true}).getContextAttributes().antialias"
-    assert page.evaluate(smooth)
-    page.evaluate(PLAIN_EDGES)
-    assert not page.evaluate(smooth)
-    page.close()
