@@ -201,7 +201,12 @@ def simulate(
 
 @cli.command()
 def params(
-    preset: options.Preset = None, config: options.Config = None, assignments: options.Assignments = None
+    preset: options.Preset = None,
+    config: options.Config = None,
+    assignments: options.Assignments = None,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Print the reference of all parameters instead.")
+    ] = False,
 ) -> None:
     """Print all parameters as commented YAML.
 
@@ -213,6 +218,11 @@ def params(
       hemislam params --preset h2lid              what a preset sets
       hemislam params --set ground.alpha=30       check a value
     """
+    if markdown:
+        from app.slam.params import params_markdown
+
+        typer.echo(params_markdown(), nl=False)
+        return
     typer.echo(options.resolve(None, preset, config, assignments).to_yaml(), nl=False)
 
 

@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import yaml
-
 from app.slam.errors import HemislamError
 from app.slam.params import Params
+from app.slam.yaml_text import read_assignments
 
 LOOPS = "loops.enabled"
 
@@ -46,27 +45,18 @@ PAPER: tuple[Variant, ...] = (
 
 
 def parse_variant(text: str) -> Variant:
-    """`NAME:section.name=value,section.name=value`; values are YAML, commas in brackets belong to them.
+    """A variant from `NAME:section.name=value,section.name=value`. Values are YAML; lists in brackets may hold commas.
 
     Raises:
-        HemislamError: it is not written like that.
+        HemislamError: the text is not written like that.
     """
-    name, colon, rest = text.partition(":")
-    name = name.strip()
-    values: dict[str, Any] = {}
-    for part in re.split(r",(?![^\[]*\])", rest):
-        path, equals, value = part.partition("=")
-        if not (name and colon and equals):
-            raise HemislamError(
-                f"`--variant {text}` can not be understood;"
-                " write it as `--variant NAME:ground.sigma=0.03,ground.alpha=30`."
-            )
-        try:
-            values[path.strip()] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise HemislamError(f"`--variant {text}`: the value of {path.strip()} can not be read.") from None
+    name, colon, rest = (part.strip() for part in text.partition(":"))
+    example = "--variant NAME:ground.sigma=0.03,ground.alpha=30"
+    if not (name and colon):
+        raise HemislamError(f"`--variant {text}` has no name; write it as `{example}`.")
+    values = read_assignments(re.split(r",(?![^\[]*\])", rest), "--variant", example)
     if not re.fullmatch(r"[\w.+-]+", name) or name.startswith("."):
-        raise HemislamError(f"A variant can not be named `{name}`; use letters, digits, `-`, `_`, `.` and `+`.")
+        raise HemislamError(f"A variant cannot be named `{name}`; use letters, digits, `-`, `_`, `.` and `+`.")
     return Variant(name, values, ", ".join(f"{path} = {value}" for path, value in values.items()))
 
 

@@ -1,4 +1,4 @@
-"""SO(3), SE(3) and S² helpers on plain arrays.
+"""SO(3) and SE(3) helpers on plain arrays.
 
 Rotations are (..., 3, 3) matrices; tangent vectors are (..., 3), in radians. Perturbations act on
 the right: `R = R_hat @ exp(d)`, so that `d` is expressed in the body frame (Solà et al. 2018,
@@ -45,26 +45,6 @@ def log(R: F64) -> F64:
         n < 1e-9, 2.0 / np.where(np.abs(q[..., 3:]) < 0.5, 1.0, q[..., 3:]), angle / np.where(n < 1e-9, 1.0, n)
     )
     return np.asarray(q[..., :3] * scale)
-
-
-def right_jacobian(v: F64) -> F64:
-    """Right Jacobian of SO(3): exp(v + d) ~ exp(v) exp(Jr d). v: (3,); returns (3, 3)."""
-    t2 = float(v @ v)
-    K = hat(v)
-    if t2 < _SMALL:
-        return np.eye(3) - 0.5 * K + K @ K / 6.0
-    t = np.sqrt(t2)
-    return np.asarray(np.eye(3) - (1.0 - np.cos(t)) / t2 * K + (t - np.sin(t)) / (t2 * t) * (K @ K))
-
-
-def right_jacobian_inverse(v: F64) -> F64:
-    """Inverse of `right_jacobian`, for angles below 2 pi. v: (3,); returns (3, 3)."""
-    t2 = float(v @ v)
-    K = hat(v)
-    if t2 < _SMALL:
-        return np.eye(3) + 0.5 * K + K @ K / 12.0
-    t = np.sqrt(t2)
-    return np.asarray(np.eye(3) + 0.5 * K + (1.0 / t2 - (1.0 + np.cos(t)) / (2.0 * t * np.sin(t))) * (K @ K))
 
 
 def quaternion(R: F64) -> F64:
@@ -131,15 +111,3 @@ def inverse(T: F64) -> F64:
     out[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
     out[..., 3, 3] = 1.0
     return out
-
-
-def tangent_basis(g: F64) -> F64:
-    """(3, 2) orthonormal basis of the plane across `g` (3,): the two directions of S² at g.
-
-    Smooth but where |g_x| passes 0.8 |g|: not near the vertical, where gravity is.
-    """
-    u = g / np.linalg.norm(g)
-    e = np.eye(3)[0 if abs(u[0]) < 0.8 else 1]
-    b1 = np.cross(u, e)
-    b1 /= np.linalg.norm(b1)
-    return np.stack([b1, np.cross(u, b1)], axis=1)

@@ -23,6 +23,7 @@ from app.slam.sections import (
     Section,
     SensorParams,
 )
+from app.slam.yaml_text import read_assignments, read_yaml
 
 __all__ = [
     "Effect",
@@ -38,7 +39,11 @@ __all__ = [
     "ScanParams",
     "SensorParams",
     "leaves",
+    "params_markdown",
 ]
+
+WHEN: dict[Effect, str] = {"now": "at once", "frame": "from the next frame", "restart": "on restart"}
+"""When a change of a parameter takes effect, in words."""
 
 
 class Params(Section):
@@ -100,18 +105,7 @@ class Params(Section):
 
     def with_assignments(self, assignments: list[str]) -> "Params":
         """This, with command-line texts `section.name=value` applied; values are read as YAML."""
-        values: dict[str, Any] = {}
-        for text in assignments:
-            path, equals, value = text.partition("=")
-            if not equals:
-                raise HemislamError(f"`--set {text}` has no value; write it as `--set ground.alpha=30`.")
-            try:
-                values[path.strip()] = yaml.safe_load(value)
-            except yaml.YAMLError:
-                raise HemislamError(
-                    f"The value of `--set {text}` can not be read; write it as `--set ground.alpha=30`."
-                ) from None
-        return self.with_values(values)
+        return self.with_values(read_assignments(assignments, "--set", "--set ground.alpha=30"))
 
     def value(self, path: str) -> Any:
         """The value of a dotted name."""
@@ -125,31 +119,20 @@ class Params(Section):
         }
 
     def to_yaml(self, *, comments: bool = True) -> str:
-        """The whole tree as YAML that `parse_yaml` reads back to the same value."""
+        """The whole tree as YAML that `merged_yaml` reads back to the same value."""
         lines: list[str] = []
-        for section_name, section in self:
-            if comments:
-                lines.append(f"# {(type(section).__doc__ or '').strip().splitlines()[0]}")
-            lines.append(f"{section_name}:")
+        for name, section in self:
+            lines += [f"# {section.summary()}"] if comments else []
+            lines.append(f"{name}:")
             for leaf in leaves():
-                if leaf.section != section_name:
-                    continue
-                if comments:
-                    lines.append(f"  # {leaf.help}")
-                text = (
-                    yaml.safe_dump(_plain(self.value(leaf.path)), default_flow_style=True).removesuffix("...\n").strip()
-                )
-                lines.append(f"  {leaf.name}: {text}")
+                if leaf.section == name:
+                    lines += [f"  # {leaf.help}"] if comments else []
+                    lines.append(f"  {leaf.name}: {_yaml(self.value(leaf.path))}")
         return "\n".join(lines) + "\n"
 
     def merged_yaml(self, text: str, source: str = "the YAML text") -> "Params":
         """This, with a YAML text laid over it. Raises `HemislamError` naming `source`."""
-        try:
-            tree = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            where = getattr(error, "problem_mark", None)
-            line = f" in line {where.line + 1}" if where else ""
-            raise HemislamError(f"{source} is not valid YAML{line}; `hemislam params` prints an example.") from None
+        tree = read_yaml(text, source, "`hemislam params` prints an example")
         try:
             return self.merged({} if tree is None else tree)
         except HemislamError as error:
@@ -158,11 +141,10 @@ class Params(Section):
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """One parameter's declaration, flattened for those who generate from it."""
+    """The declaration of one parameter. `minimum` and `maximum` of a vector hold for each of its components."""
 
     section: str
     name: str
-    annotation: Any
     default: Any
     meaning: str
     unit: str
@@ -186,48 +168,44 @@ class Leaf:
             return "true or false"
         if isinstance(self.default, str):
             return "a text"
+        limits = f"from {self.minimum:g} to {self.maximum:g} {self.unit}".rstrip()
         if isinstance(self.default, tuple):
-            return f"{len(self.default)} numbers such as {list(self.default)}" + (
-                f" ({self.unit})" if self.unit else ""
-            )
-        kind = "a whole number" if isinstance(self.default, int) else "a number"
-        if self.minimum is not None and self.maximum is not None:
-            return f"{kind} from {self.minimum:g} to {self.maximum:g} {self.unit}".rstrip()
-        return f"{kind} ({self.unit})" if self.unit else kind
+            return f"{len(self.default)} numbers {limits}, such as {list(self.default)}"
+        return f"{'a whole number' if isinstance(self.default, int) else 'a number'} {limits}"
+
+    @property
+    def range(self) -> str:
+        """The values allowed, without the unit; "" for a text or a switch."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        return "" if self.minimum is None else f"{self.minimum:g} to {self.maximum:g}"
 
     @property
     def help(self) -> str:
         """Meaning, unit, range and when it takes effect, in one line."""
-        facts = [f"unit {self.unit}"] if self.unit else []
-        if self.minimum is not None and self.maximum is not None:
-            facts.append(f"{self.minimum:g} to {self.maximum:g}")
-        if self.choices:
-            facts.append("one of " + ", ".join(self.choices))
-        facts.append(
-            {"now": "acts at once", "frame": "acts from the next frame", "restart": "acts on restart"}[self.effect]
-        )
-        return f"{self.meaning} [{'; '.join(facts)}]"
+        facts = [f"unit {self.unit}" if self.unit else "", self.range, f"acts {WHEN[self.effect]}"]
+        return f"{self.meaning} [{'; '.join(fact for fact in facts if fact)}]"
 
 
 @cache
 def leaves() -> tuple[Leaf, ...]:
     """Every parameter, in the order of declaration."""
     found = []
-    for section, section_field in Params.model_fields.items():
-        section_type = section_field.annotation
+    for section, field in Params.model_fields.items():
+        section_type = field.annotation
         assert isinstance(section_type, type) and issubclass(section_type, Section)
         schema = section_type.model_json_schema()["properties"]
         for name, info in section_type.model_fields.items():
             entry = schema[name]
+            number = entry.get("prefixItems", [entry])[0]  # the components of a vector share one range
             leaf = Leaf(
                 section=section,
                 name=name,
-                annotation=info.annotation,
                 default=info.default,
                 meaning=info.description or "",
                 unit=entry["unit"],
-                minimum=entry.get("minimum"),
-                maximum=entry.get("maximum"),
+                minimum=number.get("minimum"),
+                maximum=number.get("maximum"),
                 step=entry["step"],
                 effect=entry["effect"],
                 symbol=entry["symbol"],
@@ -235,6 +213,27 @@ def leaves() -> tuple[Leaf, ...]:
             )
             found.append(leaf)
     return tuple(found)
+
+
+def params_markdown() -> str:
+    """All parameters as Markdown: one heading and one table per section, for the documentation."""
+    head = ("parameter", "symbol", "default", "range", "unit", "takes effect", "meaning")
+    lines: list[str] = []
+    for name, section in Params():
+        lines += [f"## {name}", "", section.summary(), ""]
+        lines += [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+        for leaf in leaves():
+            if leaf.section == name:
+                default = f"`{_yaml(leaf.default)}`"
+                cells = (f"`{leaf.path}`", leaf.symbol, default, leaf.range, leaf.unit, WHEN[leaf.effect], leaf.meaning)
+                lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _yaml(value: Any) -> str:
+    """A value on one line of YAML."""
+    return yaml.safe_dump(_plain(value), default_flow_style=True).removesuffix("...\n").strip()
 
 
 def _plain(value: Any) -> Any:
@@ -248,8 +247,8 @@ def _unknown(kind: str, name: str, known: Iterable[str], prefix: str = "") -> st
 
 
 def _explain(error: ValidationError, values: Mapping[str, Mapping[str, Any]]) -> str:
-    """The first thing that is wrong, in words that do not need pydantic's."""
+    """The first error in one sentence of our own."""
     section, name = (str(part) for part in error.errors()[0]["loc"][:2])
     leaf = next(leaf for leaf in leaves() if leaf.path == f"{section}.{name}")
     given = _plain(values[section][name])
-    return f"`{leaf.path}` can not be {given!r}: it must be {leaf.requirement}."
+    return f"`{leaf.path}` cannot be {given!r}: it must be {leaf.requirement}."

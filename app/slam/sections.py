@@ -1,31 +1,34 @@
-"""The one declaration of every parameter: sliders, flags, YAML, REST and documentation come from it.
+"""The one declaration of every parameter: sliders, flags, YAML, REST and documentation are generated from it.
 
-A parameter has a type, a default, a range, a step, a unit, one sentence of meaning, and says when a
-change takes effect: `now` (the current frame is done again at once), `frame` (from the next frame
-on) or `restart` (when the recording is opened again).
+A parameter has a type, a default, a range, a step, a unit and one sentence of meaning. Its effect says when a change
+takes effect: `now` (the current frame is segmented again at once), `frame` (from the next frame on) or `restart`
+(when the recording is opened again).
 """
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.config import JsonDict
 
 Effect = Literal["now", "frame", "restart"]
 
+Metres = Annotated[float, Field(ge=-100, le=100)]
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+
 
 def _param(
     default: Any,
     meaning: str,
+    limits: tuple[float, float] | None = None,
     *,
-    unit: str = "",
-    ge: float | None = None,
-    le: float | None = None,
     step: float | None = None,
+    unit: str = "",
     effect: Effect = "frame",
     symbol: str = "",
 ) -> Any:
+    low, high = limits or (None, None)
     extra: JsonDict = {"unit": unit, "step": step, "effect": effect, "symbol": symbol}
-    return Field(default, description=meaning, ge=ge, le=le, json_schema_extra=extra)
+    return Field(default, description=meaning, ge=low, le=high, json_schema_extra=extra)
 
 
 class Section(BaseModel):
@@ -34,307 +37,272 @@ class Section(BaseModel):
     @field_validator("*")
     @classmethod
     def _can_be_written(cls, value: Any) -> Any:
+        """Refuse text that UTF-8 cannot encode: JSON can hold half of a surrogate pair."""
         if isinstance(value, str):
-            value.encode()  # half of a character, as JSON can have it, raises
+            value.encode()
         return value
+
+    @classmethod
+    def summary(cls) -> str:
+        """What the section is about, in one line."""
+        return (cls.__doc__ or "").strip().splitlines()[0]
 
 
 class RecordingParams(Section):
-    """How a recording is read. `auto` lets the recording doctor decide and say so."""
+    """How a recording is read. `auto` lets the doctor decide and report its choice."""
 
     lidar_topic: str = _param(
-        "", "Topic of the point clouds; empty: the one of type PointCloud2 with most messages.", effect="restart"
+        "", "Topic of the point clouds. Empty: the PointCloud2 topic with the most messages.", effect="restart"
     )
-    imu_topic: str = _param("", "Topic of the IMU; empty: the one of type Imu with most messages.", effect="restart")
+    imu_topic: str = _param("", "Topic of the IMU. Empty: the Imu topic with the most messages.", effect="restart")
     time_field: str = _param(
-        "auto", "Name of the per-point time field; `none` derives the time from the azimuth.", effect="restart"
+        "auto", "Name of the per-point time field. `none` derives the time from the azimuth.", effect="restart"
     )
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = _param("auto", "Unit of the per-point time.", effect="restart")
     time_reference: Literal["auto", "absolute", "relative"] = _param(
-        "auto", "Whether the per-point time is absolute or counted from the scan's header stamp.", effect="restart"
+        "auto", "Whether the per-point time is absolute or relative to the scan's header stamp.", effect="restart"
     )
     header_stamp: Literal["auto", "first", "last"] = _param(
-        "auto", "Which point of a scan its header stamp belongs to.", effect="restart"
+        "auto", "Whether a scan's header stamp is the time of its first or its last point.", effect="restart"
     )
     acceleration_unit: Literal["auto", "m/s2", "g"] = _param("auto", "Unit of the accelerometer.", effect="restart")
     imu_time_offset: float = _param(
         0.0,
-        "Added to the IMU's stamps, for clocks that are not synchronised.",
-        unit="s",
+        "Time added to the IMU's stamps, if its clock differs from the LiDAR's.",
+        (-10, 10),
         step=0.001,
+        unit="s",
         effect="restart",
     )
     rotation_rate: float = _param(
         0.0,
-        "Revolutions per second, used only when points carry no time; 0: the rate of the clouds.",
-        unit="Hz",
-        ge=0,
-        le=100,
+        "Revolutions per second, used only if points carry no time. 0: the rate of the clouds.",
+        (0, 100),
         step=1,
+        unit="Hz",
         effect="restart",
     )
 
 
 class SensorParams(Section):
-    """Where the LiDAR sits on the IMU, and which returns are believed."""
+    """Where the LiDAR is mounted on the IMU, and which returns are used."""
 
-    translation: tuple[float, float, float] = _param(
-        (0.0, 0.0, 0.0), "Position of the LiDAR in the IMU frame (x, y, z).", unit="m", step=0.001, effect="restart"
+    translation: tuple[Metres, Metres, Metres] = _param(
+        (0.0, 0.0, 0.0), "Position of the LiDAR in the IMU frame (x, y, z).", step=0.001, unit="m", effect="restart"
     )
-    rotation: tuple[float, float, float] = _param(
+    rotation: tuple[Degrees, Degrees, Degrees] = _param(
         (0.0, 0.0, 0.0),
         "Orientation of the LiDAR in the IMU frame (roll, pitch, yaw; R = Rz Ry Rx).",
-        unit="deg",
         step=0.1,
+        unit="deg",
         effect="restart",
     )
     min_range: float = _param(
-        0.4, "Returns nearer than this are dropped (the person who carries it).", unit="m", ge=0, le=10, step=0.1
+        0.4, "Nearer returns are dropped: they hit the person who carries it.", (0, 10), step=0.1, unit="m"
     )
-    max_range: float = _param(100.0, "Returns farther than this are dropped.", unit="m", ge=1, le=300, step=1)
+    max_range: float = _param(100.0, "Farther returns are dropped.", (1, 300), step=1, unit="m")
 
 
 class GroundParams(Section):
     """Seed-point ground segmentation and ground downsampling (paper 2.2, eq. 1-3)."""
 
-    enabled: bool = _param(True, "Segment the ground and thin it before the filter.", effect="now")
+    enabled: bool = _param(True, "Segment the ground, and downsample it before the filter.", effect="now")
     scan_lines: int = _param(
-        8,
-        "Number of outermost scan lines on which seed points are looked for.",
-        ge=1,
-        le=128,
-        step=1,
-        effect="now",
-        symbol="M",
+        8, "Number of outermost scan lines on which seeds are searched.", (1, 128), step=1, effect="now", symbol="M"
     )
     alpha: float = _param(
         25.0,
-        "Largest angle between a seed point and the direction straight down.",
-        unit="deg",
-        ge=1,
-        le=90,
+        "Largest angle between a seed and the direction straight down.",
+        (1, 90),
         step=1,
+        unit="deg",
         effect="now",
         symbol="α",
     )
     sigma: float = _param(
         0.025,
-        "Distance to the plane below which a point is ground, per metre of range.",
-        unit="m/m",
-        ge=0.001,
-        le=0.2,
+        "A point is ground if it is nearer to the plane than this, per metre of range.",
+        (0.001, 0.2),
         step=0.001,
+        unit="m/m",
         effect="now",
         symbol="σ",
     )
     planarity: float = _param(
-        0.3, "The seeds form a plane if λ3/λ2 is below this.", ge=0.01, le=1, step=0.01, effect="now", symbol="λ3/λ2"
+        0.3, "The seeds form a plane if λ3/λ2 is below this.", (0.01, 1), step=0.01, effect="now", symbol="λ3/λ2"
     )
     max_slope: float = _param(
         40.0,
-        "A plane steeper than this is a wall or a stair's side, not ground.",
-        unit="deg",
-        ge=1,
-        le=90,
+        "A plane steeper than this is a wall or the side of a stair, not ground.",
+        (1, 90),
         step=1,
+        unit="deg",
         effect="now",
     )
     voxel_size: float = _param(
         0.5,
         "Edge of the voxels in which ground points are replaced by their centroid.",
-        unit="m",
-        ge=0.05,
-        le=5,
+        (0.05, 5),
         step=0.05,
+        unit="m",
         effect="now",
         symbol="voxel",
     )
 
 
 class ScanParams(Section):
-    """What the filter sees of a scan, after the ground was thinned."""
+    """What the filter gets of a scan, after the ground was downsampled."""
 
     voxel_size: float = _param(
         0.4,
-        "Edge of the voxels in which all points are thinned for the filter (FAST-LIO2's filter_size_surf).",
-        unit="m",
-        ge=0.05,
-        le=3,
+        "Edge of the voxels that downsample all points for the filter (FAST-LIO2's filter_size_surf).",
+        (0.05, 3),
         step=0.05,
+        unit="m",
     )
 
 
 class ImuParams(Section):
-    """The IMU's noise and how the filter starts."""
+    """Noise of the IMU, and how the filter starts."""
 
-    gyro_noise: float = _param(1.2e-3, "Gyroscope noise density.", unit="rad/s/√Hz", ge=1e-6, le=1, step=1e-4)
-    accel_noise: float = _param(1.3e-2, "Accelerometer noise density.", unit="m/s²/√Hz", ge=1e-6, le=10, step=1e-3)
-    gyro_bias_walk: float = _param(
-        2.5e-5, "Random walk of the gyroscope's bias.", unit="rad/s²/√Hz", ge=0, le=1, step=1e-5
-    )
+    gyro_noise: float = _param(1.2e-3, "Noise density of the gyroscope.", (1e-6, 1), step=1e-4, unit="rad/s/√Hz")
+    accel_noise: float = _param(1.3e-2, "Noise density of the accelerometer.", (1e-6, 10), step=1e-3, unit="m/s²/√Hz")
+    gyro_bias_walk: float = _param(2.5e-5, "Random walk of the gyroscope's bias.", (0, 1), step=1e-5, unit="rad/s²/√Hz")
     accel_bias_walk: float = _param(
-        1.0e-4, "Random walk of the accelerometer's bias.", unit="m/s³/√Hz", ge=0, le=1, step=1e-4
+        1.0e-4, "Random walk of the accelerometer's bias.", (0, 1), step=1e-4, unit="m/s³/√Hz"
     )
-    gravity: float = _param(9.81, "Local gravity.", unit="m/s²", ge=9.7, le=9.9, step=0.001, effect="restart")
+    gravity: float = _param(9.81, "Local gravity.", (9.7, 9.9), step=0.001, unit="m/s²", effect="restart")
     start_duration: float = _param(
         1.0,
-        "Time to stand still at the start, for the first biases and gravity.",
-        unit="s",
-        ge=0.1,
-        le=10,
+        "Time at rest that the start waits for, to measure biases and gravity.",
+        (0.1, 10),
         step=0.1,
+        unit="s",
         effect="restart",
     )
     max_gap: float = _param(
         0.1,
         "A longer gap between IMU samples is reported and bridged with a wide covariance.",
-        unit="s",
-        ge=0.005,
-        le=5,
+        (0.005, 5),
         step=0.005,
+        unit="s",
     )
 
 
 class FilterParams(Section):
-    """The iterated Kalman filter's update (paper 2.3, eq. 5-7)."""
+    """The update of the iterated Kalman filter (paper 2.3, eq. 5-7)."""
 
     point_noise: float = _param(
-        0.015,
-        "Standard deviation of a point-to-plane distance on a flat surface.",
-        unit="m",
-        ge=0.001,
-        le=1,
-        step=0.005,
+        0.015, "Standard deviation of a point-to-plane distance on a flat surface.", (0.001, 1), step=0.005, unit="m"
     )
     neighbours: int = _param(
-        5, "Map points that make a plane; more are taken where these lie along one line.", ge=4, le=20, step=1
+        5, "Map points that a plane is fitted to. More are taken if these lie along one line.", (4, 20), step=1
     )
     plane_tilt: float = _param(
         1.5,
-        "Most uncertainty of a plane's normal; neighbours along one scan line widen the patch until it is met.",
-        unit="deg",
-        ge=0.1,
-        le=20,
+        "Largest uncertainty of a plane's normal. A patch is widened until it is met, or refused.",
+        (0.1, 20),
         step=0.1,
+        unit="deg",
     )
     gate: float = _param(
-        0.11, "Residuals over this times √range are not used (FAST-LIO2's gate).", unit="m/√m", ge=0.01, le=1, step=0.01
+        0.11, "Residuals over this times √range are not used (FAST-LIO2's gate).", (0.01, 1), step=0.01, unit="m/√m"
     )
     max_points: int = _param(
-        1000,
-        "Most points of a scan, evenly over space, that are looked up in the map.",
-        ge=100,
-        le=20_000,
-        step=100,
+        1000, "Most points of a scan, evenly spread, that are looked up in the map.", (100, 20_000), step=100
     )
-    max_iterations: int = _param(5, "Most iterations of one update.", ge=1, le=20, step=1)
+    max_iterations: int = _param(5, "Most iterations of one update.", (1, 20), step=1)
     plane_threshold: float = _param(
-        0.1, "All neighbours must lie within this of their plane.", unit="m", ge=0.01, le=1, step=0.01
+        0.1, "All neighbours must be nearer to their plane than this.", (0.01, 1), step=0.01, unit="m"
     )
     neighbour_distance: float = _param(
-        1.0, "Neighbours farther than this from a point are not used.", unit="m", ge=0.2, le=5, step=0.1
+        1.0, "Map points farther than this from a point are not its neighbours.", (0.2, 5), step=0.1, unit="m"
     )
     estimate_extrinsics: bool = _param(False, "Estimate the LiDAR's pose on the IMU while mapping.")
 
 
 class MapParams(Section):
-    """The hashed voxel map that scans are registered to. Its memory is bounded."""
+    """The local map, a hash of voxels that scans are registered to. Its memory is bounded."""
 
     voxel_size: float = _param(
         1.0,
-        "Edge of a map voxel; neighbours are looked for within one edge at most.",
-        unit="m",
-        ge=0.1,
-        le=3,
+        "Edge of a map voxel. Neighbours are searched within one edge at most.",
+        (0.1, 3),
         step=0.05,
+        unit="m",
         effect="restart",
     )
     spacing: float = _param(
-        0.2,
-        "No two points of a voxel are nearer than this, so that standing still piles up nothing.",
-        unit="m",
-        ge=0.0,
-        le=1,
-        step=0.05,
+        0.2, "Least distance between two points of a voxel: at rest the map does not grow.", (0, 1), step=0.05, unit="m"
     )
-    points_per_voxel: int = _param(40, "Most points kept in one voxel.", ge=1, le=50, step=1, effect="restart")
-    radius: float = _param(
-        100.0, "Voxels farther than this from the sensor are dropped.", unit="m", ge=10, le=500, step=5
-    )
+    points_per_voxel: int = _param(40, "Most points in one voxel.", (1, 50), step=1, effect="restart")
+    radius: float = _param(100.0, "Voxels farther than this from the sensor are dropped.", (10, 500), step=5, unit="m")
     max_voxels: int = _param(
-        100_000,
-        "Most voxels kept; memory does not grow beyond them.",
-        ge=1000,
-        le=2_000_000,
-        step=1000,
-        effect="restart",
+        100_000, "Most voxels in the map; they bound its memory.", (1000, 2_000_000), step=1000, effect="restart"
     )
 
 
 class KeyframeParams(Section):
-    """Which frames are kept for the map."""
+    """Which frames become keyframes and make the map."""
 
-    distance: float = _param(0.5, "A new keyframe after walking this far.", unit="m", ge=0.05, le=20, step=0.05)
-    angle: float = _param(15.0, "A new keyframe after turning this far.", unit="deg", ge=1, le=180, step=1)
+    distance: float = _param(0.5, "Distance moved after which a frame is kept.", (0.05, 20), step=0.05, unit="m")
+    angle: float = _param(15.0, "Angle turned after which a frame is kept.", (1, 180), step=1, unit="deg")
 
 
 class LoopsParams(Section):
-    """Recognising places seen before, and the graph that they straighten (paper 2.4, eq. 8)."""
+    """Loop closure and the pose graph (paper 2.4, eq. 8)."""
 
-    enabled: bool = _param(True, "Look for loops and correct the map by them.", effect="restart")
-    min_time: float = _param(15.0, "Places left less long ago than this are no loops.", unit="s", ge=1, le=600, step=1)
+    enabled: bool = _param(True, "Search for loops, and correct the map with them.", effect="restart")
+    min_time: float = _param(15.0, "Least time between the two visits of a loop.", (1, 600), step=1, unit="s")
     candidates: int = _param(
-        10, "Nearest places by ring key whose Scan Contexts are compared.", ge=1, le=100, step=1, symbol="M"
+        10, "Nearest places by ring key whose Scan Contexts are compared.", (1, 100), step=1, symbol="M"
     )
-    verified: int = _param(2, "Best of these that are registered, for each keyframe.", ge=1, le=10, step=1)
+    verified: int = _param(2, "Best of these that are registered, for each keyframe.", (1, 10), step=1)
     context_distance: float = _param(
-        0.3, "Candidates whose Scan Contexts differ more than this are refused unregistered.", ge=0.01, le=1, step=0.01
+        0.3, "Candidates with a larger Scan Context distance are refused without registration.", (0.01, 1), step=0.01
     )
     submap_keyframes: int = _param(
-        8, "Keyframes before and after one that make its submap with it.", ge=0, le=50, step=1, effect="restart"
+        8, "Keyframes before and after a keyframe that make its submap with it.", (0, 50), step=1, effect="restart"
     )
     submap_voxel: float = _param(
-        0.25, "Edge of the voxels that thin submaps.", unit="m", ge=0.05, le=2, step=0.05, effect="restart"
+        0.25, "Edge of the voxels that downsample submaps.", (0.05, 2), step=0.05, unit="m", effect="restart"
     )
     min_overlap: float = _param(
-        0.3, "Least share of points near both keyframes that must have a partner.", ge=0, le=1, step=0.01
+        0.3, "Least share of the points near both keyframes that must have a partner.", (0, 1), step=0.01
     )
     max_residual: float = _param(
-        0.05, "Most residual, point to plane, of a registration (rms).", unit="m", ge=0.005, le=1, step=0.005
+        0.05, "Largest point-to-plane residual of a registration (RMS).", (0.005, 1), step=0.005, unit="m"
     )
     max_slide: float = _param(
         0.05,
-        "A registration pushed along its weakest direction must come back this close, or it slides.",
-        unit="m",
-        ge=0.005,
-        le=1,
+        "A registration pushed along its weakest direction must come back this close; otherwise it slides.",
+        (0.005, 1),
         step=0.005,
+        unit="m",
     )
     max_mahalanobis: float = _param(
-        3.5, "Most standard deviations from where odometry expects a loop.", unit="σ", ge=0.5, le=20, step=0.1
+        3.5, "Most standard deviations from where odometry expects a loop.", (0.5, 20), step=0.1, unit="σ"
     )
-    support: int = _param(2, "Candidates nearby that must agree before one is accepted.", ge=0, le=10, step=1)
+    support: int = _param(2, "Candidates nearby that must agree before one is accepted.", (0, 10), step=1)
     drift_translation: float = _param(
-        1.0, "Drift of odometry's position (standard deviation) per distance.", unit="%", ge=0.01, le=20, step=0.1
+        1.0, "Standard deviation of the drift in position, per distance moved.", (0.01, 20), step=0.1, unit="%"
     )
     drift_rotation: float = _param(
-        0.02, "Drift of odometry's heading (standard deviation) per distance.", unit="deg/m", ge=0.001, le=2, step=0.005
+        0.02, "Standard deviation of the drift in heading, per distance moved.", (0.001, 2), step=0.005, unit="deg/m"
     )
     latency: int = _param(
         20,
-        "Frames after a keyframe at which what was found with it takes effect; fixed, so that results never depend on"
-        " the machine's speed.",
-        ge=1,
-        le=1000,
+        "Frames after a keyframe at which its loops take effect. Fixed, so that results do not depend on the machine's"
+        " speed.",
+        (1, 1000),
         step=1,
         effect="restart",
     )
     window: int = _param(
         0,
-        "Newest keyframes whose poses are solved for, as in the paper; 0: all, so that late loops straighten the"
+        "Newest keyframes whose poses are solved for, as in the paper. 0: all, so that a late loop straightens the"
         " whole map.",
-        ge=0,
-        le=100_000,
+        (0, 100_000),
         step=10,
         effect="restart",
     )

@@ -48,6 +48,12 @@ def test_printed_parameters_are_read_back(hemislam: Call, tmp_path: Path) -> Non
     assert hemislam("params", "--config", tmp_path / "mine.yaml").out == printed.out
 
 
+def test_the_reference_of_all_parameters_is_printed_as_tables(hemislam: Call) -> None:
+    printed = hemislam("params", "--markdown")
+    assert printed.code == 0
+    assert "\n| `ground.alpha` | α | `25.0` | 1 to 90 | deg | at once |" in printed.out
+
+
 def test_a_preset_is_overruled_by_a_file_and_a_file_by_set(hemislam: Call, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("recording: {imu_topic: /other}\nground: {alpha: 50, sigma: 0.05}\n")
     printed = hemislam("params", "--preset", "h2lid", "--config", tmp_path / "mine.yaml", "--set", "ground.alpha=20")
@@ -60,18 +66,18 @@ def test_a_preset_is_overruled_by_a_file_and_a_file_by_set(hemislam: Call, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--set", "ground.alpha=300"], "`ground.alpha` can not be 300"),
+        (["--set", "ground.alpha=300"], "`ground.alpha` cannot be 300"),
         (["--set", "ground.alfa=30"], "did you mean `ground.alpha`"),
         (["--set", "gound.alpha=30"], "did you mean `ground`"),
-        (["--set", "ground.alpha"], "has no value"),
-        (["--set", "ground.alpha=steep"], "`ground.alpha` can not be 'steep'"),
-        (["--set", "ground.alpha=.nan"], "`ground.alpha` can not be nan"),
+        (["--set", "ground.alpha"], "needs a value"),
+        (["--set", "ground.alpha=steep"], "`ground.alpha` cannot be 'steep'"),
+        (["--set", "ground.alpha=.nan"], "`ground.alpha` cannot be nan"),
         (["--preset", "h2lib"], "no preset `h2lib`"),
         (["--config", "nowhere.yaml"], "nowhere.yaml"),
         (["--config", "README.md"], "README.md"),
     ],
 )
-def test_a_parameter_that_can_not_be_is_refused_by_name(hemislam: Call, arguments: list[str], says: str) -> None:
+def test_a_parameter_that_cannot_be_is_refused_by_name(hemislam: Call, arguments: list[str], says: str) -> None:
     assert says in hemislam("params", *arguments).refused()
 
 

@@ -167,7 +167,7 @@ def test_a_variant_is_a_name_and_parameters() -> None:
     [
         ("ground.sigma=0.03", "write it as"),
         ("x:ground.sigma", "write it as"),
-        ("a/b:ground.sigma=0.03", "can not be named `a/b`"),
+        ("a/b:ground.sigma=0.03", "cannot be named `a/b`"),
     ],
 )
 def test_a_variant_that_is_none_is_refused(text: str, says: str) -> None:

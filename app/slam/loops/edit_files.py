@@ -24,6 +24,7 @@ import yaml
 
 from app.slam.errors import HemislamError
 from app.slam.loops.types import Accept, Add, LoopEdit, Pair, Reject, SetWeight, Solve, rows
+from app.slam.yaml_text import read_yaml
 
 _FIELDS: Final[dict[str, frozenset[str]]] = {
     "accept": frozenset(),
@@ -51,12 +52,7 @@ def read(text: str, source: str = "the list of edits") -> tuple[LoopEdit, ...]:
     Raises:
         HemislamError: naming `source` and the entry that can not be used, counted from 1.
     """
-    try:
-        entries = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        where = getattr(error, "problem_mark", None)
-        line = f" in line {where.line + 1}" if where else ""
-        raise HemislamError(f"{source} is not valid YAML{line}; write entries such as `- accept: [12, 340]`.") from None
+    entries = read_yaml(text, source, "write entries such as `- accept: [12, 340]`")
     if entries is None:
         return ()
     if not isinstance(entries, list):
