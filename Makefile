@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 INSTALL := $(PIP) install --require-hashes --only-binary :all:
 
 .DEFAULT_GOAL := help
-.PHONY: help run install test check bench bench-peers lock clean
+.PHONY: help run install test check docs bench bench-peers lock clean
 
 help: ## List these targets.
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 20
@@ -30,6 +30,9 @@ check: $(VENV)/.installed-dev ## Check format, lint, types and the direction of 
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(VENV)/.installed-dev ## Build the documentation as a site in build/site/.
+	$(BIN)/mkdocs build --quiet
 
 bench: $(VENV)/.installed-dev ## Time the engine stage by stage and the page; adds to benchmarks/results.csv.
 	$(BIN)/python -m benchmarks

@@ -1,7 +1,7 @@
-"""Puts what `hemislam evaluate --suite paper` found beside the paper's own figures, into README.md.
+"""Writes the results of `hemislam evaluate --suite paper` beside the figures of the paper into the documentation.
 
 hemislam evaluate --suite paper --short --seed 0 --seed 1 --seed 2 --out runs/suite
-python -m benchmarks.readme runs/suite
+python -m benchmarks.suite_table runs/suite
 """
 
 import json
@@ -11,23 +11,23 @@ from typing import Any
 
 from app.evaluation import paper
 
-README = Path(__file__).resolve().parents[1] / "README.md"
-BEGIN, END = "<!-- suite: written by benchmarks/readme.py -->", "<!-- /suite -->"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "measured.md"
+BEGIN, END = "<!-- suite: written by benchmarks/suite_table.py -->", "<!-- /suite -->"
 SYSTEMS = ("FAST-LIO", "FAST-LIO-GD", "FAST-LIO-L", "Ours")
 
 
 def main() -> None:
     (folder,) = sys.argv[1:]
     results = json.loads((Path(folder) / "results.json").read_text(encoding="utf-8"))
-    README.write_text(with_section(README.read_text(encoding="utf-8"), section(results)), encoding="utf-8")
+    PAGE.write_text(with_section(PAGE.read_text(encoding="utf-8"), section(results)), encoding="utf-8")
 
 
-def with_section(readme: str, text: str) -> str:
-    """The README with what is between the marks replaced by `text`."""
-    before, mark, rest = readme.partition(BEGIN)
+def with_section(page: str, text: str) -> str:
+    """The page with the text between the marks replaced by `text`."""
+    before, mark, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (mark and end):
-        raise SystemExit(f"README.md has no `{BEGIN}` ... `{END}` to write between.")
+        raise SystemExit(f"PAGE.md has no `{BEGIN}` ... `{END}` to write between.")
     return f"{before}{BEGIN}\n{text}\n{END}{after}"
 
 

@@ -1,10 +1,10 @@
-"""The README's table of the suite, written from results.json."""
+"""The table of the suite in the documentation, written from results.json."""
 
 from typing import Any
 
 import pytest
 
-from benchmarks.readme import BEGIN, END, section, with_section
+from benchmarks.suite_table import BEGIN, END, section, with_section
 
 
 def results() -> dict[str, Any]:
@@ -56,8 +56,8 @@ def test_a_variant_that_failed_leaves_a_gap() -> None:
 
 
 def test_only_what_is_between_the_marks_is_replaced() -> None:
-    readme = f"before\n{BEGIN}\nold\n{END}\nafter\n"
-    assert with_section(readme, "new") == f"before\n{BEGIN}\nnew\n{END}\nafter\n"
-    assert with_section(with_section(readme, "x"), "new") == with_section(readme, "new")
+    page = f"before\n{BEGIN}\nold\n{END}\nafter\n"
+    assert with_section(page, "new") == f"before\n{BEGIN}\nnew\n{END}\nafter\n"
+    assert with_section(with_section(page, "x"), "new") == with_section(page, "new")
     with pytest.raises(SystemExit):
         with_section("no marks", "new")
