@@ -1,0 +1,25 @@
+"""An evaluation of two variants on one recording, with a report in FOLDER.
+
+    python examples/two_variants.py sample_data/museum.mcap FOLDER
+"""
+
+import sys
+from pathlib import Path
+
+from app.evaluation.evaluate import Plan, Subject, evaluate
+from app.evaluation.truth import read_truth
+from app.evaluation.variants import Variant
+from app.slam.params import Params
+
+if __name__ == "__main__":  # the runs have processes of their own, which import this file
+    recording, folder = Path(sys.argv[1]), Path(sys.argv[2])
+    params = Params().merged_yaml(recording.with_suffix(".params.yaml").read_text())
+    truth = read_truth(str(recording.with_name(f"{recording.stem}_truth.tum")))
+    variants = (
+        Variant("default", {}),
+        Variant("fine", {"scan.voxel_size": 0.2}, "finer voxels for the filter"),
+    )
+    subject = Subject(recording.stem, recording, params, truth)
+    findings, failed = evaluate(Plan((subject,), variants, folder, parallel=2, threads=1, duration_s=10.0))
+    print(*findings, *failed.values(), sep="\n")
+    print((folder / "report.md").read_text())
