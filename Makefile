@@ -32,7 +32,7 @@ check: $(VENV)/.installed-dev ## Check format, lint, types and the direction of 
 	$(BIN)/lint-imports
 
 docs: $(VENV)/.installed-dev ## Build the documentation as a site in build/site/.
-	$(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 bench: $(VENV)/.installed-dev ## Time the engine stage by stage and the page; adds to benchmarks/results.csv.
 	$(BIN)/python -m benchmarks
