@@ -1,6 +1,6 @@
 """The engine on plain arrays: a sensor moves 2 m through a room of 10 x 8 x 3 m. Everything is computed here.
 
-    python examples/engine_on_arrays.py
+python examples/engine_on_arrays.py
 """
 
 import numpy as np
@@ -22,7 +22,9 @@ def position(t: np.ndarray) -> np.ndarray:
 
 def scan(start_s: float) -> Scan:
     """One revolution of 0.1 s with 32 lines; each ray starts where the sensor is at its own time."""
-    azimuth, line = (grid.ravel() for grid in np.meshgrid(np.linspace(0, 2 * np.pi, 360, endpoint=False), np.arange(32)))
+    azimuth, line = (
+        grid.ravel() for grid in np.meshgrid(np.linspace(0, 2 * np.pi, 360, endpoint=False), np.arange(32))
+    )
     elevation, offset_s = np.radians(-45 + 3 * line), 0.1 * azimuth / (2 * np.pi)
     flat = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1) * np.cos(elevation)[:, None]
     rays, origin = np.column_stack([flat, np.sin(elevation)]), position(start_s + offset_s)
