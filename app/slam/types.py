@@ -11,20 +11,16 @@ Conventions (all of hemislam):
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from app.slam.loops.types import LoopEdge
-
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
-U8 = npt.NDArray[np.uint8]
-U16 = npt.NDArray[np.uint16]
+from app.slam.arrays import F32 as F32
+from app.slam.arrays import F64 as F64
+from app.slam.arrays import I32 as I32
+from app.slam.arrays import I64 as I64
+from app.slam.arrays import U8 as U8
+from app.slam.arrays import U16 as U16
+from app.slam.loops.types import LoopEdge
 
 NON_GROUND, GROUND, SEED = 0, 1, 2
 """Point labels. A seed is a ground point that also helped to fit the plane."""
@@ -282,7 +278,7 @@ class StepResult:
     points_filter: int
     timings_ms: dict[str, float]
     keyframe: Keyframe | None = None
-    loops: "tuple[LoopEdge, ...]" = ()
+    loops: tuple[LoopEdge, ...] = ()
     notices: tuple[str, ...] = field(default=())
     truth_ground: U8 | None = None
     imu_gap_s: float = 0.0

@@ -20,8 +20,7 @@ from app.server.session import Session
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
-from app.slam.loops.measured import Evidence, Measured
-from app.slam.loops.types import LoopEdge, Origin, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Measured, Origin, Verdict
 from app.slam.params import Params
 from app.slam.types import ImuSamples, Scan, StepResult
 
@@ -49,7 +48,7 @@ def frame(**changes: object) -> StepResult:
 
 
 def edge(verdict: Verdict, newer: int = 9) -> LoopEdge:
-    measured = Measured.of(np.eye(4), np.eye(6), Evidence())
+    measured = Measured(np.eye(4), np.eye(6), Evidence())
     return LoopEdge(2, newer, newer, measured, verdict, "overlap 0.2 is below 0.5")
 
 

@@ -7,14 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.server.edges import EdgesReceiver, EdgesSender
-from app.slam.loops.measured import Evidence, Measured
-from app.slam.loops.types import LoopEdge, Pair, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Measured, Pair, Verdict
 
 PAIRS = [(older, newer) for newer in range(8, 12) for older in range(3)]
 
 
 def edge(pair: Pair) -> LoopEdge:
-    measured = Measured.of(np.eye(4), np.eye(6), Evidence())
+    measured = Measured(np.eye(4), np.eye(6), Evidence())
     return LoopEdge(*pair, pair[1], measured, Verdict.ACCEPTED, "it fits")
 
 

@@ -10,8 +10,7 @@ from app.server.chunks import CANDIDATE_POINTS, FRAME_POINTS, KEYFRAME_POINTS, r
 from app.server.delta import Fold, Outbox
 from app.server.protocol import SERIES, LoopsView
 from app.server.setup import POINT_BUDGET
-from app.slam.loops.measured import Evidence, Measured
-from app.slam.loops.types import LoopEdge, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Measured, Verdict
 from app.slam.params import Params
 from tests.server.test_chunks import chunk, walk
 
@@ -60,7 +59,7 @@ def test_candidates_that_come_with_a_keyframe_are_counted_with_it_and_those_of_a
     outbox, fold = Outbox(Params()), Fold(point_budget=budget)
     for index in range(40):
         outbox.chunk(chunk(index))
-    measured = Measured.of(np.eye(4), np.eye(6), Evidence())
+    measured = Measured(np.eye(4), np.eye(6), Evidence())
     edges = tuple(LoopEdge(0, newer, newer, measured, Verdict.ACCEPTED, "") for newer in range(1, 401))
     outbox.put(keyframe_poses=walk(40), loops=LoopsView(edges=edges))
     shown = fold.apply(outbox.take()).chunks

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from app.slam import iekf
 from app.slam.iekf import boxminus, boxplus
 from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
-from app.slam.kernels.registration import HUBER, SHARED
+from app.slam.kernels.registration import RESIDUAL_HUBER, SHARED
 from app.slam.local_map import LocalMap
 from app.slam.params import FilterParams, MapParams
 from app.slam.types import NavState
@@ -273,14 +273,14 @@ def correlated_prior(scale: float) -> Belief:
 def test_one_iteration_is_the_textbook_kalman_update(room: LocalMap, extrinsics: bool) -> None:
     """K = P H^T (H P H^T + R)^-1 with a Jacobian by finite differences: the gain in its other form.
 
-    What is over HUBER standard deviations off counts as so much noisier that it pulls as one of HUBER would.
+    A residual over RESIDUAL_HUBER standard deviations counts as noisier, so that it pulls as one at that limit would.
     """
     params = FilterParams(max_iterations=1, estimate_extrinsics=extrinsics)
     prior, points = correlated_prior(5e-3), points_of(furnished_room())
     problem = Problem(room, prior, points, params)
     free = slice(0, DIM if extrinsics else 17)
     H, P = problem.jacobian(prior.state)[:, free], prior.covariance[free, free]
-    over = np.abs(problem.distances(prior.state)) / (HUBER * problem.sigma)
+    over = np.abs(problem.distances(prior.state)) / (RESIDUAL_HUBER * problem.sigma)
     assert 0.01 < (over > 1.0).mean() < 0.5
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(problem.sigma**2 * np.maximum(over, 1.0)))
     step = np.zeros(DIM)
@@ -295,7 +295,7 @@ def test_one_iteration_is_the_textbook_kalman_update(room: LocalMap, extrinsics:
 @pytest.mark.parametrize("strays", [0.0, 0.1], ids=["all on their planes", "some off them"])
 @pytest.mark.parametrize("extrinsics", [False, True], ids=["extrinsics fixed", "extrinsics estimated"])
 def test_the_iteration_ends_at_the_minimum_of_equation_7(room: LocalMap, extrinsics: bool, strays: float) -> None:
-    """SciPy's Levenberg-Marquardt on the same sum, from the same prior: squares, and beyond HUBER straight lines."""
+    """SciPy's Levenberg-Marquardt on the same sum, from the same prior: squares, straight lines beyond the limit."""
     params = FilterParams(max_iterations=20, estimate_extrinsics=extrinsics, gate=1.0)
     prior, points = correlated_prior(2e-4), points_of(furnished_room())
     moved = np.random.default_rng(4).random(len(points)) < strays
@@ -307,13 +307,13 @@ def test_the_iteration_ends_at_the_minimum_of_equation_7(room: LocalMap, extrins
     def residuals(d: np.ndarray) -> np.ndarray:
         x = boxplus(prior.state, np.concatenate([d, np.zeros(DIM - free)]))
         off = problem.distances(x) / problem.sigma
-        beyond = np.sqrt(2.0 * HUBER * np.maximum(np.abs(off), HUBER) - HUBER**2)
-        return np.concatenate([whiten @ d, np.where(np.abs(off) > HUBER, beyond, off)])
+        beyond = np.sqrt(2.0 * RESIDUAL_HUBER * np.maximum(np.abs(off), RESIDUAL_HUBER) - RESIDUAL_HUBER**2)
+        return np.concatenate([whiten @ d, np.where(np.abs(off) > RESIDUAL_HUBER, beyond, off)])
 
     best = least_squares(residuals, np.zeros(free), method="lm", xtol=1e-12, ftol=1e-12).x
     posterior, registration = iekf.update(prior, points, room, params)
     assert registration.converged
-    far = np.abs(problem.distances(posterior.state)) > HUBER * problem.sigma
+    far = np.abs(problem.distances(posterior.state)) > RESIDUAL_HUBER * problem.sigma
     assert (far.mean() > 0.05) == (strays > 0.0)
     np.testing.assert_allclose(boxminus(posterior.state, prior.state)[:free], best, atol=2e-6)
 

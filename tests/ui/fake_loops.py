@@ -26,8 +26,18 @@ from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops import scan_context
 from app.slam.loops import types as loops
-from app.slam.loops.measured import Evidence, Measured
-from app.slam.loops.types import Accept, Add, FactorResidual, LoopDetail, LoopEdge, Origin, Pair, Verdict
+from app.slam.loops.types import (
+    Accept,
+    Add,
+    Evidence,
+    FactorResidual,
+    LoopDetail,
+    LoopEdge,
+    Measured,
+    Origin,
+    Pair,
+    Verdict,
+)
 from tests.ui.fake_engine import START_NS, FakeEngine
 
 LAP = 76
@@ -224,7 +234,7 @@ class LoopEngine(FakeEngine):
             else:
                 verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
                 reason = f"{verdict} by hand; found {edges[pair].verdict}: {edges[pair].reason}"
-                edges[pair] = replace(edges[pair], verdict=verdict, edited=True, words=reason)
+                edges[pair] = replace(edges[pair], verdict=verdict, edited=True, reason=reason)
         return tuple(edges[pair] for pair in sorted(edges))
 
     def _poses(self, done: list[loops.LoopEdit]) -> np.ndarray:
@@ -251,7 +261,7 @@ class LoopEngine(FakeEngine):
 
 
 def _measured(T_older_newer: np.ndarray, evidence: Evidence = Evidence()) -> Measured:  # noqa: B008 - a value
-    return Measured.of(T_older_newer, 1e-4 * np.eye(6), evidence)
+    return Measured(T_older_newer, 1e-4 * np.eye(6), evidence)
 
 
 def _found(truth: np.ndarray, rng: np.random.Generator) -> dict[Pair, LoopEdge]:

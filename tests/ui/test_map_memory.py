@@ -14,8 +14,7 @@ from app.server import wire
 from app.server.chunks import CANDIDATE_POINTS, FRAME_POINTS, KEYFRAME_POINTS, coarser
 from app.server.edges import EdgesChange, EdgesReceiver
 from app.server.protocol import Chunk
-from app.slam.loops.measured import Evidence, Measured
-from app.slam.loops.types import LoopEdge, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Measured, Verdict
 from app.ui.chunks import MapChunks
 from app.ui.loops.edges import LoopEdges
 from app.ui.loops.kinds import Kind
@@ -106,7 +105,7 @@ def test_a_candidate_takes_no_more_than_the_map_gives_up_for_it(server: viser.Vi
 
 def candidate(older: int, newer: int) -> LoopEdge:
     """One of eight counts; every other one has words of its own."""
-    measured = Measured.of(np.eye(4), np.eye(6), Evidence(*np.random.default_rng(newer).random(9), 3))
+    measured = Measured(np.eye(4), np.eye(6), Evidence(*np.random.default_rng(newer).random(9), 3))
     first = (older + older % 8, newer - newer % 8) if newer % 8 else None
     verdict, words = Verdict.ACCEPTED, "{}; 3 others agree"
     if newer % 2:

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from app.server.protocol import SERIES, Chunk, LoopsView, OpenedRecording, Snapshot, Transport
 from app.slam import iekf
-from app.slam.loops.measured import Evidence, Measured
-from app.slam.loops.types import LoopEdge, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Measured, Verdict
 from app.ui import strips
 from app.ui.strips import COLUMNS, DEGENERATE_CM, STRIPS, History, limits, message, packed
 from tests.ui.fake_engine import START_NS
@@ -119,7 +118,7 @@ def test_another_session_forgets() -> None:
 
 
 def edge(newer: int, decided_at: int, verdict: Verdict) -> LoopEdge:
-    measured = Measured.of(np.eye(4), np.eye(6), Evidence())
+    measured = Measured(np.eye(4), np.eye(6), Evidence())
     return LoopEdge(0, newer, decided_at, measured, verdict, "fits")
 
 

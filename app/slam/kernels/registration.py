@@ -10,7 +10,7 @@ from app.slam.kernels.small import CHUNKS
 SHARED = 4.0
 """How much more than a point's own noise the scatter of a plane counts, as variance: points that meet the
 same patch share its error, so it does not average out between them."""
-HUBER = 2.0
+RESIDUAL_HUBER = 2.0
 """A residual over so many times its own standard deviation pulls no harder than one of just so many (Huber 1964):
 where a plane is wrong, one point of 400 could move the pose by millimetres."""
 
@@ -74,8 +74,8 @@ def normal_equations(
                 row[9], row[10], row[11] = ax, ay, az
             variance = noise * noise + SHARED * variances[j]
             w = 1.0 / variance
-            if d * d > HUBER * HUBER * variance:
-                w *= HUBER * math.sqrt(variance) / abs(d)
+            if d * d > RESIDUAL_HUBER * RESIDUAL_HUBER * variance:
+                w *= RESIDUAL_HUBER * math.sqrt(variance) / abs(d)
             residuals[j] = d
             s_part[chunk, 0] += 1.0
             s_part[chunk, 1] += d * d

@@ -20,7 +20,6 @@ from app.slam.loops.drift import Drift
 from app.slam.loops.edits import EditList, Entry, check, in_words
 from app.slam.loops.factors import Factor
 from app.slam.loops.history import History, Record
-from app.slam.loops.judgement import by_hand, worth_correcting
 from app.slam.loops.odometry import odometry_factor
 from app.slam.loops.pose_graph import g2o_text, optimise
 from app.slam.loops.search import Found, search
@@ -38,6 +37,7 @@ from app.slam.loops.types import (
     pair_of,
     rows,
 )
+from app.slam.loops.verdicts import by_hand, worth_correcting
 from app.slam.params import LoopsParams
 from app.slam.types import F64, Keyframe
 
@@ -99,7 +99,7 @@ class LoopBackend:
         if params.enabled:
             complete = len(self) - 1 - self._start.submap_keyframes
             found = self._look(max(complete, self._detector.described), complete + 1, params)
-        self._history.append(Record(params, found), odometry)
+        self._history.append(Record(params, found, odometry))
         self._learn(found)
         self._reach(self.known)
 
@@ -126,7 +126,7 @@ class LoopBackend:
             self._stand(count)
         elif count == len(self) + 1:  # as `_stand` would, but quicker
             found = self._history[len(self)].found
-            self._step(self._history.odometry_to(len(self)))
+            self._step(self._history[len(self)].odometry)
             self._detector.learn(found.contexts)
             self._learn(found)
         self._resolve()
@@ -137,7 +137,7 @@ class LoopBackend:
         if count == self.known:
             return
         half = self._start.submap_keyframes
-        self._history.cut(count)
+        self._history.truncate(count)
         self._detector.forget()
         self._edits.go_back(count, lambda pair: pair[1] + half >= count)
         self._stand(count)
@@ -356,7 +356,7 @@ class LoopBackend:
     def _edges(self, found: dict[Pair, LoopEdge], extra: Entry | None = None) -> dict[Pair, LoopEdge]:
         edges = self._edits.lay_over(found, len(self), extra)
         for pair in self._solution.broken & edges.keys():
-            edges[pair] = replace(edges[pair], verdict=Verdict.REJECTED, words="the solver failed with it")
+            edges[pair] = replace(edges[pair], verdict=Verdict.REJECTED, reason="the solver failed with it")
         return edges
 
     def _solve(self) -> None:

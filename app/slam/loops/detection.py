@@ -14,11 +14,10 @@ from scipy.spatial import KDTree
 from app.slam import lie
 from app.slam.loops import scan_context, verification
 from app.slam.loops.drift import Expectation
-from app.slam.loops.scan_context import Contexts, ScanContext
+from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.submap import Recent, Submap, Submaps
 from app.slam.loops.verification import Fit, Prepared
 from app.slam.params import LoopsParams
-from app.slam.rows import Rows
 from app.slam.types import F64, I64, Keyframe
 
 NEAR_M = 3.0
@@ -65,42 +64,6 @@ class Head:
         )
 
 
-class _Heads:
-    """Heads as rows of numbers: those of all keyframes there ever were are kept."""
-
-    def __init__(self) -> None:
-        self._stamps = Rows((), np.int64)
-        self._poses = Rows((4, 4), np.float64)
-        self._covariances = Rows((6, 6), np.float64)
-
-    def __len__(self) -> int:
-        return len(self._stamps)
-
-    def __getitem__(self, index: int) -> Head:
-        return Head(int(self._stamps.view()[index]), self.poses[index], self._covariances.view()[index])
-
-    @property
-    def stamps_ns(self) -> I64:
-        """(n,)."""
-        return self._stamps.view()
-
-    @property
-    def poses(self) -> F64:
-        """(n, 4, 4) T_odom_imu."""
-        return self._poses.view()
-
-    def append(self, head: Head) -> None:
-        self._stamps.append(head.stamp_ns)
-        self._poses.append(head.T_odom_imu)
-        self._covariances.append(head.covariance)
-
-    def cut(self, count: int) -> None:
-        """Keep the first `count`; views of all are as they were."""
-        self._stamps = self._stamps.rewound(count)
-        self._poses = self._poses.rewound(count)
-        self._covariances = self._covariances.rewound(count)
-
-
 class Detector:
     """Describes keyframes and compares them. What it answers follows from the keyframes it stands at alone.
 
@@ -118,7 +81,9 @@ class Detector:
         self._prepared: Recent[tuple[int, int], Prepared] = Recent(
             KEPT_PREPARED, lambda key: verification.prepare(self._around[key])
         )
-        self._heads = _Heads()
+        self._heads: list[Head] = []
+        self._poses = np.empty((0, 4, 4))
+        self._stamps = np.empty(0, np.int64)
         self.stand(0, ())
 
     def __len__(self) -> int:
@@ -136,17 +101,19 @@ class Detector:
     @property
     def poses(self) -> F64:
         """(k, 4, 4) T_odom_imu."""
-        return self._heads.poses[: len(self)]
+        return self._poses[: len(self)]
 
     def take(self, keyframe: Keyframe) -> None:
         """Store a keyframe that was never there before, with its cloud; `go_on` and `stand` go to it."""
         self._heads.append(Head.of(keyframe))
+        self._poses = np.concatenate([self._poses, keyframe.T_odom_imu[None]])
+        self._stamps = np.append(self._stamps, keyframe.stamp_ns)
         self._submaps.append(keyframe)
 
     def stand(self, count: int, contexts: Sequence[ScanContext]) -> None:
         """Be where the first `count` keyframes of those that were taken, and these contexts, are all there are."""
-        self._count, self._contexts = count, Contexts(contexts)
-        self._keys = Rows((scan_context.RINGS,), np.float32, (context.ring_key for context in contexts))
+        self._count, self._contexts = count, list(contexts)
+        self._keys = [context.ring_key for context in contexts]
 
     def go_on(self) -> None:
         """To the next keyframe that was taken."""
@@ -160,7 +127,8 @@ class Detector:
 
     def forget(self) -> None:
         """Forget the keyframes beyond where it stands."""
-        self._heads.cut(len(self))
+        del self._heads[len(self) :]
+        self._poses, self._stamps = self._poses[: len(self)], self._stamps[: len(self)]
         self._submaps.truncate(len(self))
         self._around.clear()
         self._prepared.clear()
@@ -188,7 +156,7 @@ class Detector:
         candidates = self._eligible(newer, expectation, p)
         if not len(candidates):
             return []
-        keys = self._keys.view()
+        keys = np.array(self._keys)
         ranks = np.arange(1, min(p.candidates, len(candidates)) + 1)
         _, nearest = KDTree(keys[candidates]).query(keys[newer], k=ranks)  # type: ignore[no-untyped-call]  # no types
         sightings = [self._compare(int(older), newer, expectation, p) for older in candidates[nearest]]
@@ -223,7 +191,7 @@ class Detector:
 
     def _eligible(self, newer: int, expectation: Expectation, params: LoopsParams) -> I64:
         """Keyframes left long enough ago, as near as drift may have brought them."""
-        stamps = self._heads.stamps_ns
+        stamps = self._stamps
         old = np.flatnonzero(stamps[: self.described] <= stamps[newer] - round(params.min_time * 1e9))
         away = np.linalg.norm(expectation.poses[old, :3, 3] - expectation.poses[newer, :3, 3], axis=1)
         reach = params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M

@@ -16,7 +16,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from app.slam import lie
-from app.slam.loops.measured import poses as measured_poses
 from app.slam.loops.types import LoopEdge
 from app.slam.types import F64
 
@@ -81,7 +80,7 @@ def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift) -> Ex
     p = poses[:, :3, 3]
     steps = np.linalg.norm(np.diff(p, axis=0), axis=1)
     pairs = np.array([loop.pair for loop in loops], dtype=np.int64).reshape(-1, 2)
-    measured = measured_poses(loop.measured for loop in loops)
+    measured = np.array([loop.T_older_newer for loop in loops]).reshape(-1, 4, 4)
     left = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]  # what the graph leaves of each loop
     missed = np.maximum(np.linalg.norm(left[:, :3, 3], axis=1) - POSITION_M, 0.0) / drift.translation
     turned = np.maximum(np.linalg.norm(lie.log(left[:, :3, :3]), axis=1) - ROTATION, 0.0) / drift.rotation

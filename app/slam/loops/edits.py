@@ -182,8 +182,8 @@ def _edited(edge: LoopEdge, command: LoopEdit) -> LoopEdge:
     verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
     if verdict is edge.verdict:
         return replace(edge, edited=True)
-    words = f"{verdict} by hand; found {edge.verdict}: {edge.words}"
-    return replace(edge, verdict=verdict, edited=True, words=words)
+    reason = f"{verdict} by hand; found {edge.verdict}: {edge.reason}"
+    return replace(edge, verdict=verdict, edited=True, reason=reason)
 
 
 def _standing(edge: LoopEdge, edges: Mapping[Pair, LoopEdge]) -> LoopEdge:

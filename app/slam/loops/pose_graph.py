@@ -20,8 +20,8 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops import se3
 from app.slam.loops.chain import Chain
-from app.slam.loops.factors import Factor, Step, Steps
-from app.slam.loops.types import HUBER
+from app.slam.loops.factors import Factor, Step
+from app.slam.loops.types import LOOP_HUBER
 from app.slam.rows import Rows
 from app.slam.types import F64
 
@@ -75,7 +75,7 @@ class PoseGraph:
         return tuple(failed for step in steps for failed in self._do(step))
 
     def _reset(self) -> None:
-        self._steps = Steps()
+        self._steps: list[Step] = []
         self._solver: _All | _Window = _Window(self._first, self._window) if self._window else _All(self._first)
 
     def _do(self, step: Step) -> tuple[Factor, ...]:
@@ -330,7 +330,7 @@ def _noise(factor: Factor, times: int = 1) -> gtsam.noiseModel.Base:
     noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
     if not factor.robust:
         return noise
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER * times**0.5), noise)
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(LOOP_HUBER * times**0.5), noise)
 
 
 def _between(factor: Factor, times: int = 1) -> gtsam.BetweenFactorPose3:

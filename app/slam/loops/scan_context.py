@@ -9,14 +9,11 @@ Differences from the paper, for a scanner that sees a hemisphere and walks indoo
   compared at once, by circular correlation.
 """
 
-import zlib
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from app.slam.rows import Rows
 from app.slam.types import F32, F64, U8
 
 RINGS, SECTORS = 20, 60
@@ -36,24 +33,13 @@ UNSEEN = 255
 _SHARES: F32 = np.sqrt(np.arange(_BINS + 1) / _BINS).astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ScanContext:
-    """Compressed, since every keyframe's is kept.
-
-    Attributes:
-        packed: `filled`, by zlib: some 300 bytes.
+    """Attributes:
+    filled: (RINGS, SECTORS) uint8, how many height bins are occupied; UNSEEN where nothing is known.
     """
 
-    packed: bytes
-
-    @classmethod
-    def of(cls, filled: U8) -> "ScanContext":
-        """(RINGS, SECTORS) uint8, how many height bins are occupied; UNSEEN where nothing is known."""
-        return cls(zlib.compress(filled.tobytes()))
-
-    @property
-    def filled(self) -> U8:
-        return np.frombuffer(zlib.decompress(self.packed), np.uint8).reshape(RINGS, SECTORS)
+    filled: U8
 
     @property
     def seen(self) -> npt.NDArray[np.bool_]:
@@ -63,39 +49,12 @@ class ScanContext:
     @property
     def cells(self) -> F32:
         """(RINGS, SECTORS), square root of the share of occupied height bins; 0 where unseen."""
-        filled = self.filled
-        return np.asarray(_SHARES[np.where(filled != UNSEEN, filled, 0)])
+        return np.asarray(_SHARES[np.where(self.seen, self.filled, 0)])
 
     @property
     def ring_key(self) -> F32:
-        """(RINGS,), mean of each ring's seen cells, the same however the place is turned."""
+        """(RINGS,), mean over each ring's seen cells; it does not depend on heading."""
         return np.asarray(self.cells.sum(axis=1) / np.maximum(self.seen.sum(axis=1), 1), dtype=np.float32)
-
-
-class Contexts:
-    """One after the other, on disk once they are many."""
-
-    def __init__(self, contexts: Iterable[ScanContext] = ()) -> None:
-        packed = [context.packed for context in contexts]
-        self._bytes, self._ends = Rows((), np.uint8), Rows((), np.int64)  # the latter: before the first, after each
-        self._bytes.extend(np.frombuffer(b"".join(packed), np.uint8))
-        self._ends.extend(np.cumsum([0, *map(len, packed)]))
-
-    def __len__(self) -> int:
-        return len(self._ends) - 1
-
-    def __getitem__(self, index: int) -> ScanContext:
-        begin, end = self._ends.view()[index : index + 2]
-        return ScanContext(self._bytes.view()[begin:end].tobytes())
-
-    def append(self, context: ScanContext) -> None:
-        self._bytes.extend(np.frombuffer(context.packed, np.uint8))
-        self._ends.append(len(self._bytes))
-
-    def cut(self, count: int) -> None:
-        """Keep the first `count`."""
-        self._ends.go_to(count + 1)
-        self._bytes.go_to(int(self._ends.view()[-1]))
 
 
 def describe(points: F32) -> ScanContext:
@@ -111,7 +70,7 @@ def describe(points: F32) -> ScanContext:
     filled = occupied.sum(axis=2)
     # a sector was looked through as far as its farthest return; behind that nothing is known
     seen = np.cumsum(filled[::-1], axis=0)[::-1] > 0
-    return ScanContext.of(np.where(seen, filled, UNSEEN).astype(np.uint8))
+    return ScanContext(np.where(seen, filled, UNSEEN).astype(np.uint8))
 
 
 def shift_distances(a: ScanContext, b: ScanContext) -> F64:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 from app.slam.loops.detection import Detector
 from app.slam.loops.drift import Drift, expect
-from app.slam.loops.judgement import judge
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.support import placed, settle
 from app.slam.loops.types import LoopEdge, Pair, Verdict
+from app.slam.loops.verdicts import judge
 from app.slam.params import LoopsParams
 from app.slam.types import F64
 

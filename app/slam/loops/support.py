@@ -13,13 +13,13 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops import se3
 from app.slam.loops.drift import Drift, agree
-from app.slam.loops.types import HUBER, SUMMARY, LoopEdge, Origin, Pair, Verdict
+from app.slam.loops.types import LOOP_HUBER, LoopEdge, Origin, Pair, Verdict
 from app.slam.params import LoopsParams
 from app.slam.types import F64
 
 NEIGHBOURHOOD_M = 15.0
 """Loops with farther to walk between their ends, on either side, say nothing of each other."""
-SAME = 2 * HUBER
+SAME = 2 * LOOP_HUBER
 """Standard deviations up to which a loop says what another near it says: by there the graph's loss halves its pull."""
 NO_NEWS = 1.0
 """The same beyond a submap's length. Of six numbers, few errors are as small; covariances of loops are generous."""
@@ -61,16 +61,16 @@ def settle(
         support = len({other.newer for other, yes in zip(others, verdicts, strict=True) if yes} - {edge.newer})
         against = verdicts.count(False)
         evidence = replace(edge.evidence, support=support)
-        measured = edge.measured.by(evidence)
+        measured = replace(edge.measured, evidence=evidence)
         if support >= params.support and support > 2 * against:
-            words = f"{SUMMARY}; {support} others agree"
+            reason = f"{evidence.summary}; {support} others agree"
             out[edge.pair] = replace(
-                edge, verdict=Verdict.ACCEPTED, words=words, measured=measured, decided_at=now, weight=1.0
+                edge, verdict=Verdict.ACCEPTED, reason=reason, measured=measured, decided_at=now, weight=1.0
             )
         elif edge.pair in out:
-            waits = f"{SUMMARY}; {support} of {params.support} others agree"
+            waits = f"{evidence.summary}; {support} of {params.support} others agree"
             contradicted = f", {against} contradict it" if against else ""
-            out[edge.pair] = replace(edge, words=waits + contradicted, measured=measured, weight=1.0)
+            out[edge.pair] = replace(edge, reason=waits + contradicted, measured=measured, weight=1.0)
     return list(out.values())
 
 

@@ -1,26 +1,20 @@
-"""Values of the loop back end: candidates with their verdicts, and the user's commands over them.
+"""Values of the loop back end: candidates with their verdicts, and the user's edits of them.
 
-A loop is named by the two keyframes it ties together, `(older, newer)`: the name stays the same
-whatever else is found, so that a list of edits can be replayed.
+A loop is named by the two keyframes that it ties, `(older, newer)`. The name does not depend on what else is found,
+so a list of edits can be replayed.
 """
 
-import sys
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import lru_cache
-from operator import attrgetter
-from typing import Any, Final
+from typing import NamedTuple
 
 import numpy as np
 
-from app.slam.loops.measured import Evidence, Measured
-from app.slam.types import F32, F64
+from app.slam.arrays import F32, F64
 
-HUBER = 1.345
+LOOP_HUBER = 1.345
 """Whitened error from which a loop pulls with constant force (95 % efficient for a Gaussian)."""
-
-SUMMARY: Final = "{}"
-"""In the words for a verdict: that of the evidence."""
 
 Pair = tuple[int, int]
 """(older, newer) keyframe."""
@@ -30,7 +24,7 @@ class Verdict(StrEnum):
     ACCEPTED = "accepted"
     REJECTED = "rejected"
     CANDIDATE = "candidate"
-    """Fits, but waits for others that agree with it. It is no factor of the graph."""
+    """It fits, but waits for others that agree. It is not a factor of the graph."""
 
 
 class Origin(StrEnum):
@@ -38,28 +32,80 @@ class Origin(StrEnum):
     USER = "user"
 
 
-@lru_cache(maxsize=1024)
-def _shared(older: int, newer: int) -> Pair:
-    """The same tuple for all that one loop stands for."""
-    return older, newer
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What speaks for and against one candidate; nan where it was not measured.
+
+    Attributes:
+        context_distance: of the two Scan Contexts at the best column shift, 0 (same) to 1.
+        context_yaw: rad, heading of the newer in the older's level frame by that shift.
+        overlap: share of points near both keyframes that have a partner in the other submap, 0-1.
+        residual_rms: m, point to plane, of those.
+        condition: smallest eigenvalue of the registration's translation information over its
+            largest, 0-1; near 0 the two submaps slide along each other.
+        slide: m, how far registrations from disturbed starts ended from one another.
+        rival_m: m to the nearest other alignment that fits as well and that odometry allows too; inf:
+            there is none.
+        mahalanobis: distance to what odometry predicts, in standard deviations.
+        gate_m: m, standard deviation of that prediction's position.
+        support: other candidates nearby that agree.
+    """
+
+    context_distance: float = float("nan")
+    context_yaw: float = float("nan")
+    overlap: float = float("nan")
+    residual_rms: float = float("nan")
+    condition: float = float("nan")
+    slide: float = float("nan")
+    rival_m: float = float("nan")
+    mahalanobis: float = float("nan")
+    gate_m: float = float("nan")
+    support: int = 0
+
+    @property
+    def ambiguous(self) -> bool:
+        return self.rival_m < float("inf")
+
+    @property
+    def summary(self) -> str:
+        """The numbers of a registered candidate, for its reason."""
+        return (
+            f"overlap {self.overlap:.2f}, residual {self.residual_rms * 1e3:.0f} mm, slide {self.slide * 1e3:.0f} mm, "
+            f"{self.mahalanobis:.1f} σ from odometry"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """What registration measured of a loop.
+
+    Attributes:
+        T_older_newer: (4, 4) of the IMU frames. covariance: (6, 6), rotation then translation, in the newer's IMU
+            frame (right perturbation).
+    """
+
+    T_older_newer: F64
+    covariance: F64
+    evidence: Evidence
+
+    def __post_init__(self) -> None:
+        self.T_older_newer.setflags(write=False)
+        self.covariance.setflags(write=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopEdge:
-    """One candidate loop, whatever became of it. The same only as itself, so that thousands are told apart at once.
+    """One loop candidate and its verdict. Compared by identity; `same` compares values.
 
     Attributes:
-        older, newer: the keyframes. decided_at: newest keyframe when it got its verdict; from then on
-            an accepted loop takes effect.
-        measured: T_older_newer of the IMU frames, its covariance, rotation then translation, in the
-            newer's IMU frame (right perturbation), which pickling leaves behind, and the evidence.
-        verdict, words: and why; `SUMMARY` in the words stands for that of the evidence, so that many share them.
+        older, newer: the keyframes. decided_at: the newest keyframe when the verdict fell.
+        verdict, reason: the reason in words and numbers.
         origin: who proposed it. edited: whether the verdict is the user's.
-        weight: the covariance is divided by it in the graph; that of no other, also of those that repeat it.
-        represented_by: a loop that is in the graph for both: next to it, so its submaps are most of the same points; or
-            the last one that ties poses, where the graph says the same as this one.
-        repeats: a loop up to a submap's length away that measured the same. In the graph this one is a further
-            measurement between that one's keyframes, and ties none of its own.
+        weight: divides the covariance in the graph; only of this loop, not of those that repeat it.
+        represented_by: the loop that is in the graph in place of this one: a neighbour whose submaps share most
+            points, or the last loop that ties poses if the graph already says the same.
+        repeats: a loop up to a submap's length away that measured the same. This one becomes a further measurement
+            between that loop's keyframes and ties no poses of its own.
     """
 
     older: int
@@ -67,35 +113,16 @@ class LoopEdge:
     decided_at: int
     measured: Measured
     verdict: Verdict
-    words: str
+    reason: str
     origin: Origin = Origin.DETECTED
     edited: bool = False
     weight: float = 1.0
     represented_by: Pair | None = None
     repeats: Pair | None = None
 
-    def __post_init__(self) -> None:
-        """What is the same of many is held once, also behind a pipe."""
-        if SUMMARY in self.words:
-            object.__setattr__(self, "words", sys.intern(self.words))
-        if self.weight == 1.0:
-            object.__setattr__(self, "weight", 1.0)
-        for name in ("represented_by", "repeats"):
-            if (pair := getattr(self, name)) is not None:
-                object.__setattr__(self, name, _shared(*pair))
-
-    def __reduce__(self) -> tuple[type["LoopEdge"], tuple[Any, ...]]:
-        """For pipes; what dataclasses have for slots leaves a tuple behind of each."""
-        return LoopEdge, _FIELDS(self)
-
     @property
     def pair(self) -> Pair:
         return self.older, self.newer
-
-    @property
-    def reason(self) -> str:
-        """For the verdict, in words and numbers."""
-        return self.words.replace(SUMMARY, self.evidence.summary) if SUMMARY in self.words else self.words
 
     @property
     def T_older_newer(self) -> F64:
@@ -104,7 +131,7 @@ class LoopEdge:
 
     @property
     def covariance(self) -> F64:
-        """(6, 6), read-only. Raises ValueError in another process than that where loops are looked for."""
+        """(6, 6), read-only."""
         return self.measured.covariance
 
     @property
@@ -116,8 +143,28 @@ class LoopEdge:
         """Whether it is a factor of the graph."""
         return self.verdict is Verdict.ACCEPTED and self.represented_by is None
 
+    def same(self, other: "LoopEdge") -> bool:
+        """Whether verdict, weight, reason, place in the graph and measurement are the same."""
+        return self is other or (
+            (self.pair, self.decided_at, self.verdict, self.reason, self.origin, self.edited, self.weight)
+            == (other.pair, other.decided_at, other.verdict, other.reason, other.origin, other.edited, other.weight)
+            and (self.represented_by, self.repeats) == (other.represented_by, other.repeats)
+            and np.array_equal(self.T_older_newer, other.T_older_newer)
+        )
 
-_FIELDS: Final = attrgetter(*(field.name for field in fields(LoopEdge)))
+
+class LoopChange(NamedTuple):
+    """What leads from one state of the loops to another: candidates that are new or differ, and those that are gone."""
+
+    changed: tuple[LoopEdge, ...]
+    gone: tuple[Pair, ...]
+
+
+def difference(before: Iterable[LoopEdge], after: Iterable[LoopEdge]) -> LoopChange:
+    """The change from the candidates `before` to those `after`, by pair."""
+    old, new = {edge.pair: edge for edge in before}, {edge.pair: edge for edge in after}
+    changed = tuple(edge for pair, edge in new.items() if pair not in old or not edge.same(old[pair]))
+    return LoopChange(changed, tuple(pair for pair in old if pair not in new))
 
 
 # --- the user's commands -------------------------------------------------------------------------
@@ -200,9 +247,9 @@ class FactorResidual:
     @property
     def cost(self) -> float:
         """What it adds to that which the solver minimises: the square of `sigmas`, of a loop by Huber's loss."""
-        if not self.loop or self.sigmas <= HUBER:
+        if not self.loop or self.sigmas <= LOOP_HUBER:
             return self.sigmas**2
-        return 2 * HUBER * self.sigmas - HUBER**2
+        return 2 * LOOP_HUBER * self.sigmas - LOOP_HUBER**2
 
 
 @dataclass(frozen=True, slots=True)

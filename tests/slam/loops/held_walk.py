@@ -7,7 +7,6 @@ import numpy as np
 
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.line import LoopLine
-from app.slam.loops.measured import Evidence, Measured
 from app.slam.loops.messages import (
     AddKeyframe,
     ApplyEdit,
@@ -21,7 +20,7 @@ from app.slam.loops.messages import (
     Reply,
     Request,
 )
-from app.slam.loops.types import LoopEdge, LoopEdit, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, LoopEdit, Measured, Verdict
 from app.slam.params import LoopsParams
 from app.slam.types import Cloud, Keyframe
 
@@ -97,7 +96,7 @@ def state(count: int, commands: tuple[LoopEdit, ...] = ()) -> LoopState:
 
 
 def edge(newer: int) -> LoopEdge:
-    measured = Measured.of(np.eye(4), np.eye(6), Evidence())
+    measured = Measured(np.eye(4), np.eye(6), Evidence())
     return LoopEdge(0, newer, newer, measured, Verdict.ACCEPTED, "it fits")
 
 

@@ -11,7 +11,7 @@ from app.slam.kernels import manifold
 from app.slam.loops import se3
 from app.slam.loops.factors import Factor, Step
 from app.slam.loops.inspection import residuals
-from app.slam.loops.pose_graph import HUBER, PoseGraph, g2o_text, optimise
+from app.slam.loops.pose_graph import LOOP_HUBER, PoseGraph, g2o_text, optimise
 from app.slam.types import F64
 
 
@@ -165,9 +165,9 @@ def test_a_robust_loop_pulls_with_bounded_force() -> None:
         graph = graph_of(straight(11, 0.1), [Factor(0, 10, along(x), np.eye(6) * 0.05**2, robust=robust)])
         return float(graph.poses[10, 0, 3])
 
-    # the chain is a spring of variance 10 x 0.1^2, the loop one of 0.05^2; far off, a constant force HUBER / sigma
+    # the chain is a spring of variance 10 x 0.1^2, the loop one of 0.05^2; far off, a constant force LOOP_HUBER / sigma
     assert last(10.3) == pytest.approx(10 + 0.3 * 0.1 / (0.1 + 0.0025), abs=1e-3)
-    assert last(30.0) == pytest.approx(10 + 10 * 0.1**2 * HUBER / 0.05, abs=0.02)
+    assert last(30.0) == pytest.approx(10 + 10 * 0.1**2 * LOOP_HUBER / 0.05, abs=0.02)
     assert last(30.0, robust=False) > 29.0, "without the loss it would follow"
 
 

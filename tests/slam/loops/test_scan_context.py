@@ -42,7 +42,7 @@ def test_what_was_never_seen_counts_for_neither_side() -> None:
     a, b = describe(place(0)), describe(place(0)[place(0)[:, 1] > 0])
     assert not b.seen[:, SECTORS // 2 :].any()
     filled = np.where(a.seen, b.filled % UNSEEN, UNSEEN)  # as if the empty half had been seen, and was empty
-    blind = ScanContext.of(filled.astype(np.uint8))
+    blind = ScanContext(filled.astype(np.uint8))
     assert shift_distances(a, b)[0] < 0.02 < 0.1 < shift_distances(a, blind)[0]
 
 

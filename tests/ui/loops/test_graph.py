@@ -3,7 +3,7 @@
 import numpy as np
 
 from app.server.protocol import EditLoop, TryLoop, UndoLoop
-from app.slam.loops.types import HUBER, Accept, FactorResidual, Preview, Solve
+from app.slam.loops.types import LOOP_HUBER, Accept, FactorResidual, Preview, Solve
 from app.ui.loops.words import forecast
 from tests.ui.conftest import user_clicks
 from tests.ui.fake_loops import KEYFRAMES
@@ -52,7 +52,7 @@ def test_poses_at_the_optimum_are_said_to_be_there() -> None:
     factors = (FactorResidual((0, 1), False, 0.1, 0.02, 1.5), FactorResidual((0, 1), True, 0.1, 0.02, 4.0))
     words = forecast(Solve(), Preview(poses, factors), poses, factors)
     assert "No keyframe would move" in words
-    assert f"cost stays at <b>{1.5**2 + 2 * HUBER * 4.0 - HUBER**2:.4g}</b>" in words
+    assert f"cost stays at <b>{1.5**2 + 2 * LOOP_HUBER * 4.0 - LOOP_HUBER**2:.4g}</b>" in words
     assert "cost stays" not in forecast(Accept(*WAITING), Preview(poses, factors), poses, factors)
 
 

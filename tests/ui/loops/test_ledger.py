@@ -61,7 +61,7 @@ def test_what_is_clicked_but_means_nothing_does_nothing(page: Page) -> None:
 
 
 def test_what_the_engine_says_is_text_and_never_html(page: Page) -> None:
-    edge = replace(page.edge(GOOD), words="<script>alert(1)</script>")
+    edge = replace(page.edge(GOOD), reason="<script>alert(1)</script>")
     page.engine.publish(loops=LoopsView(edges=(edge,)))
     page.choose(GOOD)
     assert "<script>" not in page.loops._ledger.content + page.loops._verdict._headline.content

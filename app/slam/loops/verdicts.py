@@ -8,11 +8,8 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops.detection import Detector, Sighting
 from app.slam.loops.drift import Expectation
-from app.slam.loops.measured import Evidence, Measured
-from app.slam.loops.measured import covariances as measured_covariances
-from app.slam.loops.measured import poses as measured_poses
 from app.slam.loops.rivals import rival
-from app.slam.loops.types import LoopEdge, Origin, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Measured, Origin, Verdict
 from app.slam.loops.verification import Fit
 from app.slam.params import LoopsParams
 from app.slam.types import F64
@@ -36,7 +33,7 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
 
     def edge(T_older_newer: F64, covariance: F64, evidence: Evidence, reason: str) -> LoopEdge:
         verdict = Verdict.REJECTED if reason else Verdict.CANDIDATE
-        return LoopEdge(older, newer, now, Measured.of(T_older_newer, covariance, evidence), verdict, reason)
+        return LoopEdge(older, newer, now, Measured(T_older_newer, covariance, evidence), verdict, reason)
 
     if sighting.distance > params.context_distance:
         reason = (
@@ -70,7 +67,7 @@ def by_hand(older: int, newer: int, detector: Detector, T_older_newer: F64, *, r
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
     reason = f"added by hand: overlap {fit.overlap:.2f}, residual {fit.residual_rms * 1e3:.0f} mm"
     T = _imu(detector, older, newer, fit.T_target_source) if register else T_older_newer
-    measured = Measured.of(T, covariance(detector, newer, fit), evidence)
+    measured = Measured(T, covariance(detector, newer, fit), evidence)
     return LoopEdge(older, newer, newer, measured, Verdict.ACCEPTED, reason, Origin.USER, edited=True)
 
 
@@ -134,9 +131,9 @@ def worth_correcting(edges: Iterable[LoopEdge], poses: F64) -> bool:
     if not loops:
         return False
     pairs = np.array([edge.pair for edge in loops])
-    measured = [edge.measured for edge in loops]
-    missed = lie.inverse(poses[pairs[:, 0]] @ measured_poses(measured)) @ poses[pairs[:, 1]]
-    covariances = measured_covariances(measured)
+    measured = np.array([edge.T_older_newer for edge in loops])
+    missed = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]
+    covariances = np.array([edge.covariance for edge in loops])
     turned = _mean_square(lie.log(missed[:, :3, :3]), covariances[:, :3, :3])
     moved = _mean_square(missed[:, :3, 3], covariances[:, 3:, 3:])
     return max(moved, turned) > 0.5**2

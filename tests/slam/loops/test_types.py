@@ -1,0 +1,43 @@
+"""Loop candidates as values, and the one difference between two states of them."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.slam.loops.types import Evidence, LoopEdge, Measured, Verdict, difference
+
+
+def edge(newer: int, verdict: Verdict = Verdict.CANDIDATE) -> LoopEdge:
+    return LoopEdge(0, newer, newer, Measured(np.eye(4), np.eye(6), Evidence(0.5)), verdict, "it fits")
+
+
+def test_a_measurement_is_read_only_and_survives_pickling() -> None:
+    rng = np.random.default_rng(0)
+    measured = Measured(rng.normal(size=(4, 4)), rng.normal(size=(6, 6)), Evidence(0.1, support=3))
+    with pytest.raises(ValueError, match="read-only"):
+        measured.T_older_newer[0, 3] = 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        measured.covariance[0, 0] = 2.0
+    other = pickle.loads(pickle.dumps(measured))
+    assert other.T_older_newer.tobytes() == measured.T_older_newer.tobytes()
+    assert other.covariance.tobytes() == measured.covariance.tobytes()
+    assert other.evidence.support == 3
+
+
+def test_the_difference_lists_new_changed_and_lost_candidates() -> None:
+    first, second, third = edge(10), edge(20), edge(30)
+    accepted = replace(second, verdict=Verdict.ACCEPTED)
+    assert difference((), (first, second)) == ((first, second), ())
+    assert difference((first, second), (first, accepted, third)) == ((accepted, third), ())
+    assert difference((first, second), (second,)) == ((), (first.pair,))
+    copied = pickle.loads(pickle.dumps((first, second)))
+    assert difference((first, second), copied) == ((), ()), "equal values are no change"
+
+
+def test_a_candidate_differs_if_its_place_in_the_graph_or_its_measurement_does() -> None:
+    one = edge(10)
+    moved = replace(one, measured=Measured(np.diag([2.0, 1.0, 1.0, 1.0]), np.eye(6), Evidence()))
+    for other in (replace(one, weight=2.0), replace(one, represented_by=(0, 9)), moved, replace(one, reason="other")):
+        assert difference((one,), (other,)) == ((other,), ())
