@@ -1,19 +1,24 @@
-"""Who may talk to the server: checked for every request and every WebSocket, before anything else.
+"""Who may talk to the server. Checked for every request and every WebSocket, before anything else.
 
 - A page of another site must not reach us through the user's browser: its Origin is refused.
 - On a loopback address there is no token, so the Host must be a loopback name (DNS rebinding).
-- On any other address a token is needed: in the link once, then in a cookie, or as a bearer token.
-- There is a second token for those who may look only. Their requests must be GET, and of what their page
-  sends the bridge lets through where their camera is (`viser_page.py`): everything else there is a command.
-- No request may be larger than what a sensible one is.
+- On any other address a token is needed: once in the link, then in a cookie, or as a bearer token.
+- A second token is view only. Its requests must be GET, and its page may send nothing but the position of its
+  camera (`bridge.py`).
+- A request has a limited size, and its body must arrive within a limited time.
+
+Against hosts that open many connections and send half requests, put a reverse proxy in front
+(`docs/reverse-proxy.md`).
 """
 
+import asyncio
 import hmac
 import ipaddress
 import logging
 import secrets
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
+from typing import Final
 from urllib.parse import parse_qsl, quote, urlencode, urlsplit
 
 from fastapi import HTTPException
@@ -21,37 +26,42 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-CONTENT_SECURITY_POLICY = "; ".join(
-    (
-        "default-src 'self'",
-        "script-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:",  # viser's page is one file that unpacks itself
-        "worker-src 'self' blob: data:",
-        "style-src 'self' 'unsafe-inline'",
-        "img-src 'self' data: blob:",
-        "font-src 'self' data:",
-        "connect-src 'self' data: blob:",  # the page would follow ?websocket= to any host
-        "object-src 'none'",
-        "base-uri 'none'",
-        "form-action 'self'",
-        "frame-ancestors 'self'",
-    )
-)
+RESPONSE_HEADERS: Final = {
+    "Content-Security-Policy": "; ".join(
+        (
+            "default-src 'self'",
+            "script-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:",  # viser's page is one self-unpacking file
+            "worker-src 'self' blob: data:",
+            "style-src 'self' 'unsafe-inline'",
+            "img-src 'self' data: blob:",
+            "font-src 'self' data:",
+            "connect-src 'self' data: blob:",  # the page would follow ?websocket= to any host
+            "object-src 'none'",
+            "base-uri 'none'",
+            "form-action 'self'",
+            "frame-ancestors 'self'",
+        )
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
 
-MOST_BYTES = 1 << 20
-"""Of a request's body, and of a file that is uploaded in the page: YAML of some kilobytes."""
-
-MOST_BYTES_AT_ONCE = 16 * MOST_BYTES
+MOST_BYTES: Final = 1 << 20
+"""Of a request's body, and of a file uploaded in the page: YAML of some kilobytes."""
+MOST_BYTES_AT_ONCE: Final = 16 * MOST_BYTES
 """Of the bodies of all requests that are being read or answered."""
+BODY_S: Final = 30.0
+"""A request's whole body must arrive within this time; the largest one at 35 kB/s."""
 
-VIEWER = "hemislam.viewer"
-"""Set in the scope of requests by those who may look only."""
+VIEWER: Final = "hemislam.viewer"
+"""Set in the scope of requests that came with the view-only token."""
+
+OPEN_PATHS: Final = ("/healthz",)
+"""Answered without a token: they say only whether the server works."""
 
 log = logging.getLogger(__name__)
 
-_TOO_LARGE = f"Nothing that is larger than {MOST_BYTES >> 10} kB is taken."
-
-OPEN_PATHS = ("/healthz",)
-"""Answered without a token: they say nothing but that the server is there."""
+_TOO_LARGE: Final = f"A request may have at most {MOST_BYTES >> 10} kB."
 
 
 def is_loopback(host: str) -> bool:
@@ -68,8 +78,8 @@ class Access:
     """The rules for one server.
 
     Attributes:
-        token: lets in; None on a loopback address. viewer_token: lets look only; None: there is no such link.
-        secure: whether it speaks TLS.
+        token: the owner's; None on a loopback address. viewer_token: the view-only one; None: there is none.
+        secure: the server speaks TLS.
     """
 
     port: int
@@ -79,18 +89,17 @@ class Access:
 
     @classmethod
     def on(cls, host: str, port: int, *, secure: bool = False) -> "Access":
-        """For a server bound to this address; makes new tokens where they are needed."""
+        """For a server bound to this address, with new tokens where they are needed."""
         if is_loopback(host):
             return cls(port, secure=secure)
         return cls(port, secrets.token_urlsafe(24), secrets.token_urlsafe(24), secure)
 
     @property
     def cookie(self) -> str:
-        """Cookies know no ports, so the name does."""
+        """The cookie's name. It has the port, because browsers send cookies to all ports of a host."""
         return f"hemislam-{self.port}"
 
-    def known(self, token: str) -> bool:
-        """Whether it is one of ours."""
+    def is_token(self, token: str) -> bool:
         return _same(token, self.token) or _same(token, self.viewer_token)
 
 
@@ -105,26 +114,33 @@ class Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
-            return
-        if refusal := self._refusal(scope, Headers(scope=scope)):
-            client = scope.get("client") or ("?", 0)
-            path = quote(scope["path"])  # it must not look like another line of the log
-            log.warning("Refused %s from %s: %s", path, client[0], refusal[1], extra={"status": refusal[0]})
-            await _refuse(scope, receive, send, *refusal)
-        elif token := self._linked(scope):
-            await self._keep(scope, token)(scope, receive, _with_headers(send))
+        elif refusal := self._refusal(scope, Headers(scope=scope)):
+            status, reason = refusal
+            client, _ = scope.get("client") or ("?", 0)
+            path = quote(scope["path"])  # quoted, it cannot forge a line of the log
+            log.warning("Refused %s from %s: %s", path, client, reason, extra={"status": status})
+            await _refuse(scope, receive, send, status, reason)
+        elif token := self._token_in_link(scope):
+            await self._set_cookie(scope, token)(scope, receive, _with_headers(send))
         elif scope["type"] == "http":
-            await self._take(scope, receive, _with_headers(send))
+            await self._pass_on(scope, receive, _with_headers(send))
         else:
             await self._app(scope, receive, send)
 
-    async def _take(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, but no body that is too large, whether or not its length was told, nor too many."""
+    async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, limiting the size and the time of its body, whether or not its length was announced."""
         received = 0
+        until: float | None = asyncio.get_running_loop().time() + BODY_S
 
-        async def receiver() -> Message:
-            nonlocal received
-            message = await receive()
+        async def limited() -> Message:
+            nonlocal received, until
+            try:
+                async with asyncio.timeout_at(until):
+                    message = await receive()
+            except TimeoutError:
+                raise HTTPException(408, "The request took too long.", {"Connection": "close"}) from None
+            if not message.get("more_body", False):
+                until = None  # from here on one waits only for the client to leave
             length = len(message.get("body", b""))
             received += length
             self._held += length
@@ -135,16 +151,16 @@ class Guard:
             return message
 
         try:
-            await self._app(scope, receiver, send)
+            await self._app(scope, limited, send)
         finally:
             self._held -= received
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
-        """Status and reason, if the request must not go on. Notes in its scope if it may look only."""
+        """Status and reason if the request must not go on. Marks view-only requests in their scope."""
         host = headers.get("host", "")
-        if any(_origin(origin) != host.lower() for origin in headers.getlist("origin")):
+        if any(_host_of(origin) != host.lower() for origin in headers.getlist("origin")):
             return 403, "This page belongs to another site and may not talk to hemislam."
-        if refusal := self._without_token(scope, headers, host):
+        if refusal := self._refusal_by_token(scope, headers, host):
             return refusal
         length = headers.get("content-length", "0")
         if not length.isdecimal():
@@ -153,41 +169,41 @@ class Guard:
             return 413, _TOO_LARGE
         return None
 
-    def _without_token(self, scope: Scope, headers: Headers, host: str) -> tuple[int, str] | None:
+    def _refusal_by_token(self, scope: Scope, headers: Headers, host: str) -> tuple[int, str] | None:
         if self._access.token is None:
-            return None if is_loopback(_name(host)) else (403, "Open hemislam as http://127.0.0.1 or http://localhost.")
-        given = self._given(scope, headers)
+            name = host[: host.rindex("]") + 1] if "]" in host else host.partition(":")[0]
+            return None if is_loopback(name) else (403, "Open hemislam as http://127.0.0.1 or http://localhost.")
+        given = self._given_tokens(scope, headers)
         if scope["path"] in OPEN_PATHS or any(_same(one, self._access.token) for one in given):
             return None
         if not any(_same(one, self._access.viewer_token) for one in given):
             return 401, "Open hemislam by the link that it printed when it started; the token in it is needed once."
         scope[VIEWER] = True
         if scope["type"] == "http" and scope["method"] not in ("GET", "HEAD"):
-            return 403, "This link is for looking only; the other one that hemislam printed lets you act."
+            return 403, "This link is view only; the other link that hemislam printed lets you control it."
         return None
 
-    def _given(self, scope: Scope, headers: Headers) -> list[str]:
-        """All tokens that came with the request."""
-        given = [value for name, value in _query(scope) if name == "token"] if scope["type"] == "http" else []
-        given.append(headers.get("authorization", "").removeprefix("Bearer "))
+    def _given_tokens(self, scope: Scope, headers: Headers) -> list[str]:
+        given = [headers.get("authorization", "").removeprefix("Bearer ")]
+        if scope["type"] == "http":
+            given += [value for name, value in _query(scope) if name == "token"]
         try:
             cookies = SimpleCookie(headers.get("cookie", ""))
         except CookieError:
             return given
-        if self._access.cookie in cookies:
-            given.append(cookies[self._access.cookie].value)
-        return given
+        return given + [cookie.value for name, cookie in cookies.items() if name == self._access.cookie]
 
-    def _linked(self, scope: Scope) -> str | None:
-        """The token in the address, if one of ours is: it moves into a cookie and out of sight."""
+    def _token_in_link(self, scope: Scope) -> str | None:
+        """A valid token in the address. It moves into a cookie and out of sight."""
         if self._access.token is None or scope["type"] != "http" or scope["method"] != "GET":
             return None
-        return next((value for name, value in _query(scope) if name == "token" and self._access.known(value)), None)
+        given = (value for name, value in _query(scope) if name == "token")
+        return next(filter(self._access.is_token, given), None)
 
-    def _keep(self, scope: Scope, token: str) -> RedirectResponse:
-        rest = urlencode([(name, value) for name, value in _query(scope) if name != "token"])
-        # Only a path of ours: "//elsewhere" would leave for another host.
-        response = RedirectResponse("/" + scope["path"].lstrip("/\\") + (f"?{rest}" if rest else ""), status_code=303)
+    def _set_cookie(self, scope: Scope, token: str) -> RedirectResponse:
+        query = urlencode([(name, value) for name, value in _query(scope) if name != "token"])
+        path = "/" + scope["path"].lstrip("/\\")  # "//elsewhere" would lead to another host
+        response = RedirectResponse(f"{path}?{query}" if query else path, status_code=303)
         response.set_cookie(self._access.cookie, token, httponly=True, samesite="lax", secure=self._access.secure)
         return response
 
@@ -196,17 +212,12 @@ def _query(scope: Scope) -> list[tuple[str, str]]:
     return parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
 
 
-def _origin(origin: str) -> str | None:
-    """Host and port of an Origin header; None: it names none."""
+def _host_of(origin: str) -> str | None:
+    """Host and port in an Origin header; None if it is malformed."""
     try:
         return urlsplit(origin).netloc.lower()
     except ValueError:
         return None
-
-
-def _name(host: str) -> str:
-    """The name in a Host header, without the port."""
-    return host[: host.rindex("]") + 1] if "]" in host else host.partition(":")[0]
 
 
 def _same(given: str, token: str | None) -> bool:
@@ -225,9 +236,7 @@ def _with_headers(send: Send) -> Send:
     async def sender(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
-            headers["Content-Security-Policy"] = CONTENT_SECURITY_POLICY
-            headers["X-Content-Type-Options"] = "nosniff"
-            headers["Referrer-Policy"] = "no-referrer"
+            headers.update(RESPONSE_HEADERS)
             headers.setdefault("Cache-Control", "no-store")
         await send(message)
 

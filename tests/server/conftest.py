@@ -12,7 +12,7 @@ import server_fakes as fakes
 from server_site import Site, engine_recording, serving
 
 from app.server.setup import Setup
-from app.server.viser_page import Viser, start_viser
+from app.server.viser_adapter import Viser, start_viser
 from app.server.worker import EngineProcess
 
 

@@ -1,4 +1,4 @@
-"""Requests that no well-behaved client makes: each is refused as what it is, and none is an error of the server."""
+"""Requests that no well-behaved client makes: each is refused with the right status, and none is a server error."""
 
 import socket
 from dataclasses import replace
@@ -10,7 +10,7 @@ import pytest
 from server_site import Site, serving
 
 from app.sensors.live.status import LiveState
-from app.server.viser_page import Viser
+from app.server.viser_adapter import Viser
 from tests.ui.fake_engine import FakeEngine
 
 JSON = {"Content-Type": "application/json"}
@@ -27,13 +27,13 @@ def answer(site: Site, head: str) -> int:
     "origins",
     ["Origin: http://[", "Origin: null", "Origin: ", "Origin: http://127.0.0.1:{port}\r\nOrigin: http://elsewhere"],
 )
-def test_an_origin_that_is_none_or_two_is_another_site(site: Site, origins: str) -> None:
+def test_a_malformed_or_second_origin_counts_as_another_site(site: Site, origins: str) -> None:
     host = f"Host: 127.0.0.1:{site.port}"
     assert answer(site, f"/api/state HTTP/1.1\r\n{host}\r\n{origins.format(port=site.port)}") == 403
     assert answer(site, f"/api/state HTTP/1.1\r\n{host}\r\nOrigin: http://127.0.0.1:{site.port}") == 200
 
 
-def test_a_refused_path_can_not_forge_a_line_of_the_log(site: Site, caplog: Any) -> None:
+def test_a_refused_path_cannot_forge_a_line_of_the_log(site: Site, caplog: Any) -> None:
     assert answer(site, "/%0aAll%20is%20well%1b[2J HTTP/1.1\r\nHost: elsewhere") == 403
     (record,) = [record for record in caplog.records if record.name == "app.server.access"]
     assert record.getMessage().isprintable()
@@ -58,23 +58,21 @@ def test_a_refused_path_can_not_forge_a_line_of_the_log(site: Site, caplog: Any)
         ("POST", "/api/truth", b'{"path": "\\ud800"}'),
     ],
 )
-def test_what_json_can_say_and_nobody_can_use_is_refused_as_such(
-    site: Site, method: str, path: str, body: bytes
-) -> None:
+def test_json_with_unusable_values_is_refused(site: Site, method: str, path: str, body: bytes) -> None:
     refused = httpx.request(method, site.url(path), content=body, headers=JSON)
     assert refused.status_code == 422
     assert refused.json()["detail"]
     assert httpx.get(site.url("/api/state")).status_code == 200
 
 
-def test_health_tells_when_nothing_will_be_received_any_more(tmp_path: Path) -> None:
+def test_health_is_503_when_the_live_source_has_ended(tmp_path: Path) -> None:
     engine = FakeEngine()
     with serving(engine, Viser(None, ""), tmp_path, None) as site:  # type: ignore[arg-type]
         engine.publish(live=LiveState())
         assert httpx.get(site.url("/healthz")).status_code == 200
         engine.publish(transport=replace(engine.snapshot.transport, finished=True))
-        told = httpx.get(site.url("/healthz"))
-        assert (told.status_code, told.json()) == (503, {"status": "live source down"})
+        health = httpx.get(site.url("/healthz"))
+        assert (health.status_code, health.json()) == (503, {"status": "live source down"})
         engine.publish(live=None)
-        assert httpx.get(site.url("/healthz")).status_code == 200, "a recording that is over is well"
+        assert httpx.get(site.url("/healthz")).status_code == 200, "a recording may end"
     engine.close()

@@ -13,7 +13,7 @@ from test_rewind import SAMPLE
 from app.server.access import Access
 from app.server.folders import Folders
 from app.server.setup import Setup
-from app.server.viser_page import Viser
+from app.server.viser_adapter import Viser
 from app.server.web import make_app
 from app.server.worker import EngineProcess
 from app.slam.params import Params

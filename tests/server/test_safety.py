@@ -1,4 +1,4 @@
-"""Who is refused what, over real sockets: those who may look only, and whatever is too large; https; the logs."""
+"""What is refused, over real sockets: commands of view-only pages, and all that is too large; https; the logs."""
 
 import asyncio
 import json
@@ -33,10 +33,12 @@ from app.sensors.live.feed import Pace, feed
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
 from app.server.access import MOST_BYTES, Access
+from app.server.address import links, listen
+from app.server.bridge import Gate, Refused
 from app.server.folders import Folders
 from app.server.setup import Setup
-from app.server.viser_page import Gate, Refused, Viser, start_viser
-from app.server.web import Tls, links, listen, make_app, make_server
+from app.server.viser_adapter import Viser, start_viser
+from app.server.web import Tls, make_app, make_server
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
 
@@ -72,6 +74,10 @@ def until(true: Any) -> None:
         time.sleep(0.01)
 
 
+def packed(**message: Any) -> bytes:
+    return msgspec.msgpack.encode(message)
+
+
 def page(site: Site, headers: dict[str, str]) -> ClientConnection:
     return site.socket(additional_headers=headers)
 
@@ -89,7 +95,7 @@ def shown(browser: ClientConnection, label: str) -> dict[str, Any]:
                 return found
 
 
-# --- looking only --------------------------------------------------------------------------------
+# --- view only ----------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("method", "path", "body"),
     [
@@ -100,21 +106,21 @@ def shown(browser: ClientConnection, label: str) -> dict[str, Any]:
         ("DELETE", "/api/state", None),
     ],
 )
-def test_who_may_look_only_changes_nothing_by_rest(site: Site, method: str, path: str, body: Any) -> None:
+def test_the_view_only_token_changes_nothing_by_rest(site: Site, method: str, path: str, body: Any) -> None:
     before = site.engine.snapshot.params
     answer = httpx.request(method, site.url(path), json=body, headers=VIEWER)
-    assert answer.status_code == 403 and "looking only" in answer.text
+    assert answer.status_code == 403 and "view only" in answer.text
     assert site.engine.snapshot.params == before
 
 
-def test_who_may_look_only_sees_the_state_and_the_page(site: Site) -> None:
+def test_the_view_only_token_sees_the_state_and_the_page(site: Site) -> None:
     for path in ("/api/state", "/api/params", "/api/openapi.json"):
         assert httpx.get(site.url(path), headers=VIEWER).status_code == 200
     seen, owned = (httpx.get(site.url(), headers=headers).text for headers in (VIEWER, OWNER))
-    assert "Looking only" in seen and "Looking only" not in owned
+    assert "View only" in seen and "View only" not in owned
 
 
-def test_in_the_page_a_viewers_controls_do_nothing_while_an_owners_do(site: Site) -> None:
+def test_in_a_view_only_page_the_controls_do_nothing(site: Site) -> None:
     gui = site.viser.server.gui
     pressed: list[str] = []
     slider = gui.add_slider("a slider here", min=0, max=10, step=1, initial_value=3)
@@ -157,8 +163,10 @@ CAMERA: dict[str, Any] = {
 }
 
 
-def packed(**message: Any) -> bytes:
-    return msgspec.msgpack.encode(message)
+@pytest.mark.parametrize("viewer", [False, True])
+@pytest.mark.parametrize("kind", ["ShareUrlRequest", "ShareUrlDisconnect"])
+def test_nobody_can_ask_for_visers_public_tunnel(kind: str, viewer: bool) -> None:
+    assert Gate(viewer=viewer).let(packed(type=kind)) is None
 
 
 def test_a_message_that_could_be_read_in_two_ways_reaches_viser_in_one() -> None:
@@ -170,8 +178,10 @@ def test_a_message_that_could_be_read_in_two_ways_reaches_viser_in_one() -> None
         assert let is None or (let.count(b"type") == 1 and b"GuiUpdate" not in let)
 
 
-@pytest.mark.parametrize("raw", [b"", b"\xc1", b"no message", b"\x93\x01\x02\x03", os.urandom(200)])
-def test_what_is_no_message_ends_the_connection_and_nothing_else(site: Site, raw: bytes) -> None:
+@pytest.mark.parametrize(
+    "raw", [b"", b"\xc1", b"no message", b"\x93\x01\x02\x03", packed(type=[1]), packed(), os.urandom(200)]
+)
+def test_a_malformed_message_ends_its_connection_and_nothing_else(site: Site, raw: bytes) -> None:
     with page(site, OWNER) as browser:
         browser.send(raw)
         with pytest.raises(ConnectionClosed):
@@ -180,7 +190,7 @@ def test_what_is_no_message_ends_the_connection_and_nothing_else(site: Site, raw
     assert httpx.get(site.url("/healthz")).status_code == 200
 
 
-def test_a_viewers_link_makes_nobody_an_owner(site: Site) -> None:
+def test_the_view_only_link_makes_nobody_an_owner(site: Site) -> None:
     with httpx.Client() as browser:
         answer = browser.get(site.url("/?token=for-viewers"))
         assert answer.status_code == 303 and "for-viewers" in answer.headers["set-cookie"]
@@ -192,7 +202,7 @@ def test_a_viewers_link_makes_nobody_an_owner(site: Site) -> None:
         assert browser.post(site.url("/api/transport"), json={"action": "pause"}).status_code == 202
 
 
-def test_a_viewers_token_does_not_open_the_door_to_another_site(site: Site) -> None:
+def test_the_view_only_token_does_not_let_another_site_in(site: Site) -> None:
     evil = "http://evil.example"
     assert httpx.get(site.url("/api/state"), headers=VIEWER | {"Origin": evil}).status_code == 403
     with pytest.raises(InvalidStatus):
@@ -201,27 +211,27 @@ def test_a_viewers_token_does_not_open_the_door_to_another_site(site: Site) -> N
         site.socket(additional_headers={"Authorization": "Bearer wrong"})
 
 
-def test_the_two_tokens_are_two_and_only_where_others_could_reach_us() -> None:
+def test_the_two_tokens_differ_and_exist_only_where_others_could_reach_us() -> None:
     public = Access.on("0.0.0.0", 1)
     assert public.token and public.viewer_token and public.token != public.viewer_token
     assert Access.on("127.0.0.1", 1).viewer_token is None
     assert all(public.token not in link for link in links("0.0.0.0", public, public.viewer_token))
 
 
-# --- too large -----------------------------------------------------------------------------------
-def test_a_body_that_is_too_large_is_refused_whether_its_length_is_told_or_not(site: Site) -> None:
+# --- size limits ---------------------------------------------------------------------------------
+def test_a_body_that_is_too_large_is_refused_with_or_without_its_length(site: Site) -> None:
     large = b" " * (MOST_BYTES + 1)
-    told = httpx.post(site.url("/api/transport"), content=large, headers=OWNER)
-    assert told.status_code == 413
+    announced = httpx.post(site.url("/api/transport"), content=large, headers=OWNER)
+    assert announced.status_code == 413
 
     def parts() -> Iterator[bytes]:
         for _ in range(4):
             yield large[: MOST_BYTES // 2]
 
-    untold = httpx.post(
+    chunked = httpx.post(
         site.url("/api/transport"), content=parts(), headers=OWNER | {"Content-Type": "application/json"}
     )
-    assert untold.status_code == 413
+    assert chunked.status_code == 413
 
 
 def upload(size: int, parts: list[bytes]) -> Iterator[bytes]:
@@ -241,7 +251,7 @@ def upload(size: int, parts: list[bytes]) -> Iterator[bytes]:
         # Closed while most of the message is still under way, so the reset may overtake the close frame.
         (1000, [b"x" * (3 * MOST_BYTES)], {1009, 1006}),
     ],
-    ids=["too large", "negative", "more than was told", "too large a message"],
+    ids=["too large", "negative", "more than announced", "too large a message"],
 )
 def test_a_file_that_is_too_large_ends_the_connection(
     site: Site, size: int, parts: list[bytes], codes: set[int]
@@ -324,7 +334,7 @@ async def _protocol(address: str, trust: ssl.SSLContext) -> str | None:
         return socket.subprotocol
 
 
-def test_a_certificate_that_can_not_be_used_is_told_at_once(certificate: Tls, tmp_path: Path) -> None:
+def test_a_certificate_that_cannot_be_used_is_refused_at_once(certificate: Tls, tmp_path: Path) -> None:
     (tmp_path / "no.pem").write_text("nothing")
     for bad in (Tls(tmp_path / "missing.pem"), Tls(tmp_path / "no.pem"), Tls(certificate.certificate)):
         with pytest.raises(HemislamError, match="--certificate and --key"):
@@ -341,7 +351,7 @@ def test_a_refusal_is_logged_as_one_line_of_json_without_the_token(site: Site, c
     assert "my-guess" not in line
 
 
-def test_health_tells_by_its_status_when_the_engine_has_ended_for_good() -> None:
+def test_health_is_503_when_the_engine_has_ended_for_good() -> None:
     listener = listen("127.0.0.1", 0)
     engine, target = EngineProcess(Setup(), main=fakes.fake_main), Viser(None, "")  # type: ignore[arg-type]
     server = make_server(make_app(engine, Folders([]), target, Access(listener.getsockname()[1])))
@@ -362,7 +372,7 @@ def test_health_tells_by_its_status_when_the_engine_has_ended_for_good() -> None
 
 
 # --- the end -------------------------------------------------------------------------------------
-def test_a_sigterm_to_the_whole_group_costs_nothing_that_was_received(tmp_path: Path) -> None:
+def test_a_sigterm_to_the_whole_group_loses_nothing_that_was_received(tmp_path: Path) -> None:
     """As a service manager sends it: to the server, the engine and the receiver at once."""
     msop, difop, imu_port = free_ports(3)
     packets, imu = f"rsbpearl://127.0.0.1:{msop},{difop}", f"imu-udp://127.0.0.1:{imu_port}"

@@ -1,4 +1,4 @@
-"""Clients that never end what they begin: they are let go, others are served meanwhile, and nothing piles up."""
+"""Clients that never finish: they are disconnected, others are served meanwhile, and nothing piles up."""
 
 import contextlib
 import socket
@@ -7,23 +7,24 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from server_site import PATIENCE_S, Site
+from server_site import PATIENCE_S, Site, serving
 from test_safety import CAMERA, packed, until
 from websockets.exceptions import InvalidStatus
 
-from app.server import access, api, patience, web
+from app.server import access, address, api, web
 from app.server.access import MOST_BYTES
-from app.server.patience import PatientProtocol
+from app.server.viser_adapter import Viser
+from app.server.worker import EngineProcess
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patience, "REQUEST_S", 1.0)
-    monkeypatch.setattr(patience, "READ_S", 1.0)
+def short_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access, "BODY_S", 1.0)
 
 
 @contextlib.contextmanager
@@ -42,85 +43,99 @@ def head(site: Site, length: int) -> bytes:
     return f"POST /api/notes HTTP/1.1\r\n{host}\r\nContent-Length: {length}\r\n\r\n".encode()
 
 
-def ended(peer: socket.socket) -> bool:
-    """Whether the server closed it without an answer."""
-    try:
-        return peer.recv(100) == b""
-    except ConnectionResetError:
-        return True
+def answer(peer: socket.socket) -> bytes:
+    """All that the server sends until it closes the connection."""
+    received = b""
+    while part := peer.recv(1000):
+        received += part
+    return received
 
 
-def test_whoever_says_nothing_or_half_of_it_is_let_go_and_others_are_served(site: Site) -> None:
-    with talking(site, b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: ", head(site, 1000) + b'{"text":') as peers:
+def test_a_body_that_does_not_arrive_in_time_is_refused_and_its_connection_closed(site: Site) -> None:
+    with talking(site, *([head(site, 1000) + b'{"text":'] * 3)) as peers:
         assert httpx.get(site.url("/healthz")).status_code == 200
-        assert all(map(ended, peers))
-    until(lambda: not PatientProtocol._waiting)
+        for peer in peers:
+            assert b" 408 " in answer(peer).splitlines()[0]
 
 
-def test_a_request_that_trickles_in_is_let_go_however_alive_it_looks(site: Site) -> None:
-    for beginning in (b"GET / HTTP/1.1\r\nX: ", head(site, 1000)):
-        with talking(site, beginning) as (peer,):
-            deadline = time.monotonic() + PATIENCE_S
-            with pytest.raises(OSError):  # a reset or a broken pipe
-                while True:
-                    assert time.monotonic() < deadline
-                    peer.sendall(b" ")
-                    time.sleep(0.05)
+def test_a_body_that_trickles_in_is_refused_too(site: Site) -> None:
+    with talking(site, head(site, 1000)) as (peer,):
+        deadline = time.monotonic() + PATIENCE_S
+        with pytest.raises(OSError):  # a reset or a broken pipe
+            while True:
+                assert time.monotonic() < deadline
+                peer.sendall(b" ")
+                time.sleep(0.05)
 
 
-def test_a_request_that_takes_its_time_is_answered_and_the_next_has_as_long(site: Site) -> None:
+def test_a_slow_request_is_answered_and_the_next_has_as_long(site: Site) -> None:
     body = b'{"text": "slow"}'
     with talking(site, b"") as (peer,):
         for _ in range(3):
             for part in (head(site, len(body)), body[:8], body[8:]):
                 time.sleep(0.2)
                 peer.sendall(part)
-            answer = b""
-            while not answer.endswith(b"\r\n\r\nnull"):
+            received = b""
+            while not received.endswith(b"\r\n\r\nnull"):
                 part = peer.recv(1000)
                 assert part
-                answer += part
-            assert b" 202 " in answer.splitlines()[0]
+                received += part
+            assert b" 202 " in received.splitlines()[0]
 
 
-def test_one_who_reads_nothing_is_let_go(site: Site) -> None:
-    ask = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{site.port}\r\n\r\n".encode()
-    with socket.socket() as peer:
+def test_an_idle_connection_is_closed_after_its_request(site: Site) -> None:
+    with talking(site, f"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1:{site.port}\r\n\r\n".encode()) as (peer,):
+        begin = time.monotonic()
+        assert b" 200 " in answer(peer).splitlines()[0]
+        assert 3.0 < time.monotonic() - begin < PATIENCE_S
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="the system has no limit for unread data")
+def test_a_client_that_reads_nothing_is_disconnected(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(address, "UNREAD_S", 1)
+    with serving(site.engine, site.viser, site.folder, None) as strict, socket.socket() as peer:
+        ask = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{strict.port}\r\n\r\n".encode()
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        peer.connect(("127.0.0.1", site.port))
-        peer.sendall(10 * ask)  # more than fits between the two
-        time.sleep(2.5)
+        peer.connect(("127.0.0.1", strict.port))
+        peer.sendall(10 * ask)  # the answers exceed all buffers on the way
+        time.sleep(4.0)
         peer.settimeout(PATIENCE_S)
         taken = 0
         with contextlib.suppress(ConnectionResetError):
             while part := peer.recv(1 << 20):
                 taken += len(part)
-    assert taken < 10 * len(httpx.get(site.url()).content)
+        assert taken < 10 * len(httpx.get(strict.url()).content)
 
 
-def test_no_part_of_an_answer_waits_until_the_one_before_is_acknowledged(site: Site) -> None:
-    """Else the second half of each comes 40 ms later, on a connection that stays open."""
-    with talking(site, b"GET / HT"):
-        until(lambda: PatientProtocol._waiting)
-        taken = next(iter(PatientProtocol._waiting)).transport.get_extra_info("socket")
-        assert taken.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+def test_small_answers_do_not_wait_for_acknowledgements(site: Site) -> None:
+    """With Nagle's algorithm, the second half of each answer comes 40 ms later on a connection that stays open."""
+    ask = f"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1:{site.port}\r\n\r\n".encode()
+    times = []
+    with talking(site, b"") as (peer,):
+        for _ in range(20):
+            begin = time.monotonic()
+            peer.sendall(ask)
+            received = b""
+            while not received.endswith(b"}"):
+                received += peer.recv(1000)
+            times.append(time.monotonic() - begin)
+    assert sorted(times)[len(times) // 4] < 0.03
 
 
-def test_a_page_stays_however_long_it_says_nothing(site: Site) -> None:
+def test_a_page_may_be_silent(site: Site) -> None:
     with site.socket() as page:
         time.sleep(1.6)
         assert page.ping().wait(PATIENCE_S)
-        assert not PatientProtocol._waiting
 
 
-def test_of_many_who_wait_the_oldest_makes_room(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patience, "REQUEST_S", 60.0)
-    monkeypatch.setattr(patience, "MOST_WAITING", 20)
-    with talking(site, *([b"GET"] * 60)) as peers:
-        assert all(map(ended, peers[:30]))
-        assert httpx.get(site.url("/healthz")).status_code == 200
-        assert len(PatientProtocol._waiting) <= 20
-    until(lambda: not PatientProtocol._waiting)
+def test_beyond_the_limit_of_connections_requests_are_turned_away(
+    engine: EngineProcess, target: Viser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(web, "MOST_CONNECTIONS", 20)
+    with serving(engine, target, tmp_path, None) as site:
+        with talking(site, *([b"GET"] * 30)):
+            until(lambda: httpx.get(site.url("/healthz")).status_code == 503)
+        until(lambda: httpx.get(site.url("/healthz")).status_code == 200)
 
 
 def test_a_head_without_end_is_refused(site: Site) -> None:
@@ -134,7 +149,7 @@ def test_a_head_without_end_is_refused(site: Site) -> None:
 def test_bodies_that_come_at_once_are_bounded_together_and_given_back(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patience, "REQUEST_S", 60.0)
+    monkeypatch.setattr(access, "BODY_S", 60.0)
     monkeypatch.setattr(access, "MOST_BYTES_AT_ONCE", 2 * MOST_BYTES)
     part = b" " * (MOST_BYTES - 1000)
     with talking(site, *([head(site, MOST_BYTES) + part] * 4)) as peers:
@@ -148,7 +163,7 @@ def test_bodies_that_come_at_once_are_bounded_together_and_given_back(
             return len(refused) >= 2
 
         until(some_are_refused)
-        assert all(b" 503 " in answer.splitlines()[0] for answer in refused)
+        assert all(b" 503 " in one.splitlines()[0] for one in refused)
     ask: dict[str, Any] = {"content": b" " * (MOST_BYTES - 20) + b'{"text": "large"}'}
     ask["headers"] = {"Content-Type": "application/json"}
     until(lambda: httpx.post(site.url("/api/notes"), **ask).status_code == 202)

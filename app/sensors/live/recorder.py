@@ -10,22 +10,15 @@ import os
 import struct
 import threading
 from collections import deque
-from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
-from typing import Final
 
-import numpy as np
-from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, Writer
 
 from app.sensors.live import messages
 from app.slam.errors import HemislamError
-from app.slam.rows import Rows
 from app.slam.types import Scan
 
 FLUSH_S = 0.5
-CHANNELS = 2
 MAX_SCANS, MAX_SAMPLES = 200, 100_000
 """What may wait for the disk, 20 s of scans: if there is more it is too slow, and the newest are left out."""
 
@@ -62,7 +55,6 @@ class Recorder:
                 raise HemislamError(f"{path} is there already; record into another file.") from None
             raise HemislamError(f"{path} can not be written ({error.strerror}); choose another place.") from None
         self._mcap = Writer(self._file, compression=CompressionType.ZSTD)
-        self._mcap._Writer__chunk_indices = _ChunkIndexes()  # type: ignore[attr-defined]  # it has no other way in
         self._mcap.start(profile="ros2")
         self._lidar = self._channel(messages.LIDAR_TOPIC, messages.CLOUD)
         self._imu = self._channel(messages.IMU_TOPIC, messages.IMU)
@@ -131,31 +123,3 @@ class Recorder:
             self._scans_waiting -= 1
             channel, data = self._lidar, messages.serialised(messages.cloud_message(scan), messages.CLOUD)
         self._mcap.add_message(channel, arrival_ns, data, publish_time=arrival_ns)
-
-
-class _ChunkIndexes:
-    """What the writer notes of every chunk until the end, as rows: as objects they take memory for as long as it runs,
-    450 bytes each, three of them a second."""
-
-    def __init__(self) -> None:
-        self._rows = Rows((len(_NUMBERS) + CHANNELS,), np.int64)
-        self._compression = ""
-
-    def append(self, index: ChunkIndex) -> None:
-        offsets = [index.message_index_offsets.get(channel, 0) for channel in range(1, 1 + CHANNELS)]
-        self._rows.append([*(getattr(index, name) for name in _NUMBERS), *offsets])
-        self._compression = index.compression
-
-    def __iter__(self) -> Iterator[ChunkIndex]:
-        for row in self._rows.view():
-            numbers, offsets = row[: len(_NUMBERS)].tolist(), row[len(_NUMBERS) :].tolist()
-            yield ChunkIndex(
-                **dict(zip(_NUMBERS, numbers, strict=True)),
-                message_index_offsets={channel: at for channel, at in enumerate(offsets, start=1) if at},
-                compression=self._compression,
-            )
-
-
-_NUMBERS: Final = tuple(
-    field.name for field in fields(ChunkIndex) if field.name not in ("message_index_offsets", "compression")
-)

@@ -1,0 +1,148 @@
+"""Passes messages between a browser's WebSocket on our port and viser's on its own."""
+
+import asyncio
+import contextlib
+import socket
+from typing import Any, Final
+
+import msgspec
+from starlette.websockets import WebSocket, WebSocketDisconnect
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.typing import Subprotocol
+
+from app.server.access import MOST_BYTES
+from app.server.viser_adapter import KEY_HEADER, Viser
+
+VIEWER_MESSAGES: Final = frozenset({"ViewerCameraMessage"})
+"""What a view-only page may send to viser: where its own camera is."""
+NEVER: Final = frozenset({"ShareUrlRequest", "ShareUrlDisconnect"})
+"""What no page may send: it would open viser's public tunnel to this machine."""
+
+MOST_UPLOADS: Final = 4
+"""At the same time, from one browser."""
+
+BUFFER_BYTES: Final = 1 << 20
+"""Of each socket on the way to the browser. The system's default would let tens of megabytes of old frames queue."""
+
+
+class Refused(Exception):
+    """A browser sent something that ends its connection. code: to close the WebSocket with."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
+        self.code, self.reason = code, reason
+
+
+class Gate:
+    """Decides which of a browser's messages reach viser. viewer: the browser has the view-only token."""
+
+    def __init__(self, *, viewer: bool) -> None:
+        self._viewer = viewer
+        self._uploads: dict[str, int] = {}
+
+    def let(self, raw: bytes) -> bytes | None:
+        """The message to pass on, or None to leave it out.
+
+        The message is encoded again, so that viser reads exactly what was checked here.
+
+        Raises:
+            Refused: it is not a message, or it belongs to an upload that is too large.
+        """
+        try:
+            message = msgspec.msgpack.decode(raw, type=dict[str, Any])
+            kind = msgspec.convert(message.get("type"), str)
+        except msgspec.MsgspecError:
+            raise Refused(1007, "This is not a message of the page.") from None
+        if kind in NEVER or (self._viewer and kind not in VIEWER_MESSAGES):
+            return None
+        if kind == "FileTransferStartUpload":
+            self._begin(message)
+        elif kind == "FileTransferPart" and not self._take(message):
+            return None
+        return msgspec.msgpack.encode(message)
+
+    def _begin(self, message: dict[str, Any]) -> None:
+        size = message.get("size_bytes")
+        if not isinstance(size, int) or not 0 <= size <= MOST_BYTES:
+            raise Refused(1009, f"A file may have at most {MOST_BYTES >> 10} kB.")
+        if len(self._uploads) >= MOST_UPLOADS:
+            raise Refused(1008, "Too many uploads at the same time.")
+        if size:
+            self._uploads[str(message.get("transfer_uuid"))] = size
+
+    def _take(self, message: dict[str, Any]) -> bool:
+        """Whether a part belongs to an upload. Together the parts must not exceed the announced size."""
+        name, content = str(message.get("transfer_uuid")), message.get("content")
+        if name not in self._uploads or not isinstance(content, bytes) or not content:
+            return False  # empty parts would pile up without limit
+        self._uploads[name] -= len(content)
+        if self._uploads[name] < 0:
+            raise Refused(1009, "The file is larger than announced.")
+        if self._uploads[name] == 0:
+            del self._uploads[name]
+        return True
+
+
+async def bridge(browser: WebSocket, target: Viser, *, viewer: bool = False) -> None:
+    """Pass messages between a browser and viser until either of them leaves.
+
+    Each direction reads a message only after the previous one was delivered. A slow browser therefore slows
+    viser down, which then sends it fewer and newer updates.
+    """
+    pipe = socket.socket(proto=socket.IPPROTO_TCP)  # asyncio turns Nagle's algorithm off only if the protocol is named
+    pipe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+    pipe.setblocking(False)
+    try:
+        await asyncio.get_running_loop().sock_connect(pipe, target.address)
+        upstream = await connect(
+            target.url,
+            sock=pipe,
+            subprotocols=[Subprotocol(name) for name in browser.scope["subprotocols"]] or None,
+            additional_headers={KEY_HEADER: target.key},
+            proxy=None,
+            compression=None,
+            max_size=None,
+            max_queue=1,
+            ping_interval=None,
+        )
+    except (OSError, InvalidHandshake, TimeoutError):
+        pipe.close()
+        await browser.close(1013, "The server of the page is not running.")
+        return
+    async with upstream:
+        await browser.accept(subprotocol=upstream.subprotocol)
+        ways = [
+            asyncio.create_task(_up(browser, upstream, Gate(viewer=viewer))),
+            asyncio.create_task(_down(browser, upstream)),
+        ]
+        try:
+            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for way in ways:
+                way.cancel()
+            await asyncio.gather(*ways, return_exceptions=True)
+
+
+async def _up(browser: WebSocket, upstream: ClientConnection, gate: Gate) -> None:
+    with contextlib.suppress(WebSocketDisconnect, ConnectionClosed):
+        try:
+            while True:
+                received = await browser.receive()
+                if received["type"] == "websocket.disconnect":
+                    return
+                if (message := gate.let(received.get("bytes") or b"")) is not None:
+                    await upstream.send(message)
+        except Refused as refused:
+            await browser.close(refused.code, refused.reason)
+
+
+async def _down(browser: WebSocket, upstream: ClientConnection) -> None:
+    with contextlib.suppress(WebSocketDisconnect):
+        try:
+            while True:
+                message = await upstream.recv(decode=False)
+                await browser.send_bytes(message)
+        except ConnectionClosed as closed:
+            code, reason = (closed.rcvd.code, closed.rcvd.reason) if closed.rcvd else (1001, "")
+            await browser.close(code if code not in (1005, 1006) else 1000, reason)

@@ -1,0 +1,100 @@
+"""Everything in app/ that depends on viser's internals.
+
+`tests/server/test_adapters.py` says which of them an upgrade of viser has changed, and that no other module uses any.
+"""
+
+import contextlib
+import io
+import secrets
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import viser
+import websockets.asyncio.server
+
+KEY_HEADER: Final = "X-Hemislam-Key"
+
+MOST_AT_ONCE: Final = 32
+"""Updates in one message to a page. viser would send 128, and each message is copied several times for every page."""
+
+CLIENT: Final = Path(viser.__file__).parent / "client" / "build" / "index.html"
+"""viser's page: one file that holds everything."""
+TITLE: Final = "<title>Viser</title>"
+BODY_END: Final = "</body>"
+
+BADGE: Final = (
+    '<div style="position:fixed;left:50%;top:8px;transform:translateX(-50%);z-index:9999;pointer-events:none;'
+    'padding:2px 12px;border-radius:12px;background:#ffb020;color:#10151c;font:600 12px system-ui,sans-serif">'
+    "View only: controls have no effect</div>"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Viser:
+    """A running viser server. Its port answers only requests that carry `key` in the header `KEY_HEADER`."""
+
+    server: viser.ViserServer
+    key: str
+
+    @property
+    def address(self) -> tuple[str, int]:
+        return "127.0.0.1", self.server.get_port()
+
+    @property
+    def url(self) -> str:
+        return "ws://{}:{}/".format(*self.address)
+
+    def stop(self) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints when it stops
+            self.server.stop()
+
+
+def start_viser() -> Viser:
+    """Start viser on a free loopback port that answers only to our bridge.
+
+    viser itself accepts every Origin, so any web page that the user has open could drive it.
+    """
+    key = secrets.token_urlsafe(24)
+    with _require_key(key), contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server._websock_server.get_message_buffer().max_window_size = MOST_AT_ONCE
+    return Viser(server, key)
+
+
+@contextlib.contextmanager
+def _require_key(key: str) -> Iterator[None]:
+    """While this is open, a WebSocket server that viser starts refuses requests without the key.
+
+    viser has no option for this, so websockets' `serve` is replaced until viser has called it. A browser cannot send
+    the header.
+    """
+    serve = websockets.asyncio.server.serve
+
+    def serve_with_key(handler: Any, *args: Any, **kwargs: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            if not secrets.compare_digest("".join(request.headers.get_all(KEY_HEADER)), key):
+                return connection.respond(403, "Only hemislam itself talks to this port.\n")
+            return None
+
+        if handler.__module__.startswith("viser."):
+            kwargs["process_request"] = check
+        return serve(handler, *args, **kwargs)
+
+    websockets.asyncio.server.serve = serve_with_key  # type: ignore[assignment,misc]  # mypy knows it as a class
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def page_html() -> str:
+    """viser's page under our title."""
+    return CLIENT.read_text(encoding="utf-8").replace(TITLE, "<title>hemislam</title>", 1)
+
+
+def viewer_html(page: str) -> str:
+    """The same page with a badge that says that it is view only."""
+    head, body_end, rest = page.rpartition(BODY_END)
+    return f"{head}{BADGE}{body_end}{rest}"
