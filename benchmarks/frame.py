@@ -11,8 +11,7 @@ from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.sensors.rsbpearl import BPEARL
 from app.slam.engine import Engine
-from app.slam.results import TIMINGS
-from app.slam.types import FrameStatus, Measurement, Scan
+from app.slam.types import TIMINGS, FrameStatus, Measurement, Scan
 from app.slam.warmup import compile_kernels
 from benchmarks.record import Line
 from benchmarks.scenes import SCENES, recording

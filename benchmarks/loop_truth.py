@@ -19,9 +19,9 @@ from app.sensors.presets import resolve_params
 from app.server.run import Run, open_run
 from app.slam import lie
 from app.slam.loops.types import LoopEdge, Verdict
-from app.slam.metrics import Trajectory, ate, interpolate
+from app.slam.metrics import ate, interpolate
 from app.slam.params import Params
-from app.slam.trajectory import read_tum, truth_beside
+from app.slam.trajectory import Trajectory, read_tum, truth_beside
 from app.slam.types import F64, I64
 from app.slam.warmup import compile_kernels
 

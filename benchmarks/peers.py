@@ -22,9 +22,9 @@ from app.sensors.recording import open_recording
 from app.slam import lie
 from app.slam.engine import Engine
 from app.slam.errors import HemislamError
-from app.slam.metrics import GroundScore, Trajectory, ate
+from app.slam.metrics import GroundScore, ate
 from app.slam.params import Params
-from app.slam.trajectory import truth_beside
+from app.slam.trajectory import Trajectory, truth_beside
 from app.slam.types import F64, Measurement
 from app.slam.warmup import compile_kernels
 from benchmarks.record import Line, show

@@ -50,13 +50,13 @@ def run(
 
     \b
     Writes into DIR:
-      trajectory.tum   pose of the IMU in the map at each scan's end: stamp x y z qx qy qz qw
-      trajectory_odometry.tum   the same before loops moved it
-      loops.csv        every loop that was thought of, its verdict, the numbers and the reason
-      graph.g2o        the pose graph of the keyframes
-      timings.csv      milliseconds of each stage, frame by frame; reading the file not counted
-      map.ply          the map: x y z intensity ground
-      report.json      parameters, frames processed and dropped, ground share, errors against truth
+      trajectory.tum           pose of the IMU in the map at each scan's end: stamp x y z qx qy qz qw
+      trajectory_odometry.tum  the same by odometry alone, without loops
+      loops.csv                every loop candidate: verdict, measurements and reason
+      graph.g2o                the pose graph of the keyframes
+      timings.csv              milliseconds of each stage in each frame, without reading the file
+      map.ply                  the map: x y z intensity ground
+      report.json              parameters, counts of frames, ground share, errors against truth
 
     \b
     Examples:
@@ -117,7 +117,8 @@ def save(work: "Run", folder: Path, info: "RunInfo", stop: BaseException | None,
     Raises:
         BaseException: `stop`, what ended the run early, once the frames so far are saved.
     """
-    from app.slam.results import save_results, summarise
+    from app.slam.report import summarise
+    from app.slam.results import save_results
 
     found = work.engine.loops.results() if work.engine.loops else None
     report = save_results(folder, work.log, work.engine.keyframes, info, found, replace=replace)

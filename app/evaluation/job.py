@@ -21,11 +21,11 @@ from app import __version__
 from app.evaluation import crops, fineness
 from app.sensors.recording import open_recording
 from app.slam.engine import Engine
-from app.slam.metrics import GroundScore, write_tum
+from app.slam.metrics import GroundScore
 from app.slam.params import Params
 from app.slam.provenance import describe_machine, peak_memory_mb
-from app.slam.results import TIMINGS, RunLog
-from app.slam.trajectory import Trajectory, stamp_text
+from app.slam.results import RunLog, timings_csv
+from app.slam.trajectory import Trajectory, write_tum
 from app.slam.types import F64, DroppedScan, FrameStatus, StepResult
 
 FORMAT = 1
@@ -164,7 +164,7 @@ def _write(job: Job, log: RunLog, engine: Engine, facts: dict[str, Any], cpu_ms:
     part.mkdir(parents=True, exist_ok=True)
     try:
         write_tum(part / "trajectory.tum", trajectory)
-        (part / "timings.csv").write_text(_timings(log, cpu_ms), encoding="utf-8")
+        (part / "timings.csv").write_text(timings_csv(log, {"cpu_ms": cpu_ms}), encoding="utf-8")
         centres = {place: _position_at(trajectory, share) for place, share in crops.PLACES.items()}
         np.savez_compressed(
             part / "crops.npz",
@@ -200,11 +200,3 @@ def _position_at(trajectory: Trajectory, share: float) -> F64:
     stamps = trajectory.stamps_ns
     wanted = stamps[0] + int(share * (stamps[-1] - stamps[0]))
     return np.asarray(trajectory.positions[int(np.argmin(np.abs(stamps - wanted)))])
-
-
-def _timings(log: RunLog, cpu_ms: list[float]) -> str:
-    lines = ["frame,stamp_s," + ",".join(f"{stage}_ms" for stage in TIMINGS) + ",cpu_ms"]
-    for frame, (stamp, row, cpu) in enumerate(zip(log.stamps_ns, log.timings_ms, cpu_ms, strict=True)):
-        values = ",".join(f"{value:.4f}" for value in (*row, cpu))
-        lines.append(f"{frame},{stamp_text(int(stamp))},{values}")
-    return "\n".join(lines) + "\n"

@@ -10,12 +10,11 @@ import numpy as np
 from app.evaluation.job import Job, finished
 from app.evaluation.truth import Matched, Truth, match
 from app.slam.errors import HemislamError
-from app.slam.metrics import GroundScore, Rpe, ate, paired, rpe
-from app.slam.results import RPE_METRES, TIMINGS
+from app.slam.metrics import GroundScore, ate, compare, paired
+from app.slam.report import spread
 from app.slam.trajectory import Trajectory, read_tum
-from app.slam.types import F64, U16
+from app.slam.types import F64, TIMINGS, U16
 
-RPE_OVER = ("1 frame", *(f"{metres:g} m" for metres in RPE_METRES))
 START_S = 5.0
 """The start: standing and walking off. A slip there moves all later poses against the few of the start."""
 BUDGETS_MS = (50.0, 100.0)
@@ -81,8 +80,8 @@ class Column:
             return None
         total = self.timings_ms[:, -1]
         return {
-            **{stage: _spread(self.timings_ms[:, index]) for index, stage in enumerate(TIMINGS)},
-            "cpu": _spread(self.cpu_ms),
+            **{stage: spread(self.timings_ms[:, index]) for index, stage in enumerate(TIMINGS)},
+            "cpu": spread(self.cpu_ms),
             **{f"under_{budget:g}_ms": float(np.mean(total < budget)) for budget in BUDGETS_MS},
             "peak_memory_mb": self.run["peak_memory_mb"],
             "threads": self.run["threads"],
@@ -167,32 +166,18 @@ def measure(columns: list[Column], truth: Truth | None) -> tuple[list[Column], M
 
 def _accuracy(estimate: Trajectory, matched: Matched) -> Accuracy:
     truth = matched.trajectory
-    absolute = ate(estimate, truth)
-    relative: dict[str, Rpe | None] = {RPE_OVER[0]: rpe(estimate, truth)}
-    relative |= {over: rpe(estimate, truth, metres=m) for over, m in zip(RPE_OVER[1:], RPE_METRES, strict=True)}
+    errors = compare(estimate, truth, rotations=matched.has_rotation)
+    doubt = errors.pop("ate_deg_withheld")
     ours, theirs = paired(estimate, truth)
-    T = absolute.T_truth_estimate
+    T = ate(estimate, truth).T_truth_estimate
     aligned = ours.positions @ T[:3, :3].T + T[:3, 3]
     return Accuracy(
-        ate_m=asdict(absolute.position),
-        ate_deg=asdict(absolute.rotation) if absolute.rotation and matched.has_rotation else None,
-        rpe={
-            over: {
-                "pairs": error.pairs,
-                "m": asdict(error.position),
-                "deg": asdict(error.rotation) if matched.has_rotation else None,
-            }
-            if error
-            else None
-            for over, error in relative.items()
-        },
-        poses=absolute.poses,
-        distance_m=absolute.distance,
+        **errors,
         times_s=(ours.stamps_ns - estimate.stamps_ns[0]) * 1e-9,
         errors_m=np.linalg.norm(aligned - theirs.positions, axis=1),
         aligned=aligned,
         later_m=_later(estimate, truth),
-        doubt=absolute.doubt if matched.has_rotation else "",
+        doubt=doubt or "",
     )
 
 
@@ -243,13 +228,4 @@ def as_json(column: Column) -> dict[str, Any]:
         if scores
         else None,
         **{name: run.get(name) for name in ("frames", "lost", "dropped", "distance_m", "ground_share", "parameters")},
-    }
-
-
-def _spread(values: F64) -> dict[str, float]:
-    return {
-        "mean": float(values.mean()),
-        "median": float(np.median(values)),
-        "p95": float(np.percentile(values, 95)),
-        "max": float(values.max()),
     }

@@ -17,7 +17,7 @@ from app.evaluation.measured import Evaluated, as_json
 from app.evaluation.tables import make_tables
 from app.slam.errors import HemislamError
 from app.slam.provenance import describe_machine
-from app.slam.results import finite
+from app.slam.report import finite
 
 
 def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:

@@ -10,9 +10,9 @@ import numpy as np
 
 from app.evaluation import paper
 from app.evaluation.job import GROUND_RANGES_M
-from app.evaluation.measured import RPE_OVER, START_S, Accuracy, Column, Evaluated
-from app.slam.metrics import GroundScore
-from app.slam.results import TIMINGS
+from app.evaluation.measured import START_S, Accuracy, Column, Evaluated
+from app.slam.metrics import RPE_OVER, GroundScore
+from app.slam.types import TIMINGS
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,21 +1,24 @@
 """The REST interface for scripts: state, parameters, transport, breakpoints, loops, notes, recordings, exports."""
 
 import math
+import re
 import shutil
 import tempfile
 import threading
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, BackgroundTasks, HTTPException
+from fastapi import Path as PathParam
 from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.server.breakpoints import Breakpoints
 from app.server.folders import Folders
 from app.server.fork import Engine
+from app.server.journal import SUFFIX
 from app.server.protocol import (
     AddNote,
     Command,
@@ -37,6 +40,7 @@ from app.server.protocol import (
 from app.server.views import LoopsState, Speed, StateView, loops_state, state_view
 from app.slam.loops.types import Accept, Add, Reject, SetWeight, Solve
 from app.slam.params import Params
+from app.slam.results import EXPORTS
 from app.slam.trajectory import truth_beside
 
 EXPORT_PATIENCE_S = 600.0
@@ -112,10 +116,9 @@ class CompareBody(BaseModel):
     path: str | None = Field(None, description="A TUM file in the folders given at the start; null: against nothing.")
 
 
-Export = Literal[
-    "trajectory.tum", "timings.csv", "map.ply", "report.json", "session.hemislam",
-    "trajectory_odometry.tum", "loops.csv", "graph.g2o",
-]  # fmt: skip
+EXPORTED: Final = (*(export.name for export in EXPORTS), f"session{SUFFIX}")
+_ANY_OF_THESE: Final = "|".join(f"^{re.escape(name)}$" for name in EXPORTED)
+ExportName = Annotated[str, PathParam(pattern=_ANY_OF_THESE, json_schema_extra={"enum": [*EXPORTED]})]
 
 
 def make_router(engine: Engine, folders: Folders) -> APIRouter:
@@ -197,7 +200,7 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
         _send(engine, CompareWith(folders.inside(body.path) if body.path else None))
 
     @router.get("/export/{name}", response_class=FileResponse)
-    def export(name: Export, background: BackgroundTasks) -> FileResponse:
+    def export(name: ExportName, background: BackgroundTasks) -> FileResponse:
         """What was processed so far, as `hemislam run` writes it."""
         if not exporting.acquire(blocking=False):
             raise HTTPException(503, "Enough is being exported at present; ask again in a moment.")

@@ -4,24 +4,26 @@ Errors follow Sturm et al. (IROS 2012, "A benchmark for the evaluation of RGB-D 
 equal those of the `evo` tool, except that truth is interpolated at our stamps.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
 from app.slam.errors import HemislamError
-from app.slam.trajectory import Trajectory, count_text, read_tum, write_tum
+from app.slam.trajectory import Trajectory, count_text
 from app.slam.types import F64, I64, NON_GROUND, U8
 
-__all__ = ["Ate", "Errors", "GroundScore", "Rpe", "Trajectory", "ate", "read_tum", "rpe", "write_tum"]
-
+RPE_METRES = (1.0, 10.0, 50.0)
+RPE_OVER = ("1 frame", *(f"{metres:g} m" for metres in RPE_METRES))
+"""Distances over which relative errors are reported, and their names."""
 MAX_TRUTH_GAP_S = 1.0
 """Truth is not interpolated between poses farther apart than this."""
 MAX_ALIGNMENT_DEG = 5.0
-"""If the alignment may be turned by more than this, a rotation error after it is told of nothing but the alignment."""
+"""Where the alignment is less certain than this, a rotation error after it would only show the alignment."""
 _FINEST_M = 1e-6
-"""Positions are never taken to be more exact: rounding alone would fix the rotation of a straight line."""
+"""Least position error assumed. Without it, rounding alone would fix the rotation of a straight line."""
 
 
 # --- association and alignment -------------------------------------------------------------------
@@ -75,7 +77,7 @@ def umeyama(source: F64, target: F64) -> F64:
     u, spread, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean) / len(source))
     if spread[1] <= np.finfo(np.float64).eps:
         raise HemislamError(
-            "The trajectory and its truth stand still or lie on one straight line, so they can not be aligned to each"
+            "The trajectory and its truth stand still or lie on one straight line, so they cannot be aligned to each"
             " other; compare a longer walk."
         )
     handed = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
@@ -193,6 +195,35 @@ def rpe(estimate: Trajectory, truth: Trajectory, *, frames: int = 1, metres: flo
         rotation=Errors.of(np.degrees((turned_theirs.inv() * turned_ours).magnitude())),
         pairs=len(i),
     )
+
+
+def compare(estimate: Trajectory, truth: Trajectory, *, rotations: bool = True) -> dict[str, Any]:
+    """ATE, and RPE over each of RPE_OVER, as a tree for JSON. Lengths in m, angles in degrees.
+
+    Args:
+        rotations: whether the truth's orientations are known in the IMU's axes; without, errors of rotation are None.
+
+    Raises:
+        HemislamError: as `ate`.
+    """
+    absolute = ate(estimate, truth)
+    relative = [rpe(estimate, truth), *(rpe(estimate, truth, metres=metres) for metres in RPE_METRES)]
+    return {
+        "poses": absolute.poses,
+        "distance_m": absolute.distance,
+        "ate_m": asdict(absolute.position),
+        "ate_deg": asdict(absolute.rotation) if absolute.rotation and rotations else None,
+        "ate_deg_withheld": (absolute.doubt if rotations else "") or None,
+        "rpe": {
+            over: error
+            and {
+                "pairs": error.pairs,
+                "m": asdict(error.position),
+                "deg": asdict(error.rotation) if rotations else None,
+            }
+            for over, error in zip(RPE_OVER, relative, strict=True)
+        },
+    }
 
 
 def _motion(trajectory: Trajectory, i: I64, j: I64) -> tuple[Rotation, F64]:

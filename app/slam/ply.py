@@ -1,4 +1,4 @@
-"""The map as a binary PLY file, written keyframe by keyframe, so that its size does not matter."""
+"""Binary PLY files: their header, and the map, written keyframe by keyframe so that memory does not grow with it."""
 
 from pathlib import Path
 from typing import Protocol
@@ -9,30 +9,39 @@ from app.slam.map_frame import MapFrame
 from app.slam.types import F64, NON_GROUND, Keyframe
 
 VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ground", "u1")])
+_KINDS = {"<f4": "float", "<u2": "ushort", "<i4": "int", "|u1": "uchar"}
 
 
 class Keyframes(Protocol):
-    """What a store of keyframes must offer to be exported."""
+    """Keyframes by index, as an export reads them."""
 
     def __len__(self) -> int: ...
     def __getitem__(self, index: int, /) -> Keyframe: ...
 
 
-def write_map(path: Path, keyframes: Keyframes, frame: MapFrame) -> int:
-    """Write all keyframes' points where `frame` has them in the map, and return their number.
+def header(vertex: np.dtype, count: int, *comments: str) -> bytes:
+    """The header of `count` vertices of a structured type. Its length does not depend on the count."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    lines.append(f"element vertex {count:012d}")
+    lines += [f"property {_KINDS[vertex[name].str]} {name}" for name in vertex.names or ()]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
-    Vertices are x y z (m), intensity (the sensor's scale) and ground (1 = ground). Only one
-    keyframe is held at a time; the number of points is written into the header at the end.
+
+def write_map(path: Path, keyframes: Keyframes, frame: MapFrame) -> int:
+    """Write the points of all keyframes where `frame` puts them in the map, and return their number.
+
+    Vertices are x y z (m), intensity (the sensor's scale) and ground (1 = ground). Only one keyframe is held at a
+    time; the number of points is written into the header at the end.
     """
-    count = 0
+    count, comment = 0, "hemislam map, metres, z up"
     with path.open("wb") as file:
-        file.write(_header(0))
+        file.write(header(VERTEX, 0, comment))
         for index in range(len(keyframes)):
             vertices = _vertices(keyframes[index], frame.at(index))
             file.write(vertices.tobytes())
             count += len(vertices)
         file.seek(0)
-        file.write(_header(count))
+        file.write(header(VERTEX, count, comment))
     return count
 
 
@@ -45,13 +54,3 @@ def _vertices(keyframe: Keyframe, T_map_odom: F64) -> np.ndarray:
     vertices["intensity"] = cloud.intensity
     vertices["ground"] = cloud.labels != NON_GROUND
     return vertices
-
-
-def _header(count: int) -> bytes:
-    """Of the same length whatever the count."""
-    kinds = {"<f4": "float", "|u1": "uchar"}
-    properties = "".join(f"property {kinds[VERTEX[name].str]} {name}\n" for name in VERTEX.names or ())
-    return (
-        f"ply\nformat binary_little_endian 1.0\ncomment hemislam map, metres, z up\n"
-        f"element vertex {count:012d}\n{properties}end_header\n"
-    ).encode("ascii")

@@ -1,42 +1,36 @@
-"""What a run leaves behind: trajectories, timings, map, loops and report.json in one folder.
+"""What a session leaves behind: one folder of result files. `EXPORTS` declares them.
 
-`RunLog` collects one small row a frame while the run goes on; `save_results` writes the files from
-it, at the end or at any moment in between.
+`RunLog` collects one small row per frame; `save_results` writes the files from it at any moment.
 """
 
 import copy
 import json
-import math
 import os
 from collections import Counter
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from app import __version__
+from app.slam import report
 from app.slam.errors import HemislamError
 from app.slam.loops.files import LoopResults, loops_csv
 from app.slam.loops.types import Verdict
 from app.slam.map_frame import MapFrame
-from app.slam.metrics import GroundScore, Trajectory, ate, rpe, write_tum
+from app.slam.metrics import GroundScore
 from app.slam.params import Params
 from app.slam.ply import Keyframes, write_map
-from app.slam.provenance import describe_machine, hash_input, peak_memory_mb
 from app.slam.rows import Rows
-from app.slam.trajectory import stamp_text
-from app.slam.types import F64, I64, NON_GROUND, STAGES, DroppedScan, FrameStatus, StepResult
+from app.slam.trajectory import Trajectory, stamp_text, write_tum
+from app.slam.types import F64, I64, NON_GROUND, TIMINGS, DroppedScan, FrameStatus, StepResult
 
-RESULT_FILES = ("trajectory.tum", "timings.csv", "map.ply", "report.json")
-LOOP_FILES = ("trajectory_odometry.tum", "loops.csv", "graph.g2o")
-"""Beside them, if loops were looked for."""
-TIMINGS = (*STAGES, "total")
-RPE_METRES = (1.0, 10.0, 50.0)
 MOST_NOTICES = 200
 _SUMS = ("statuses", "dropped", "notices", "points", "ground_points", "ground_score")
-"""Attributes of `RunLog` that are no rows."""
+"""Attributes of `RunLog` that are not rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +39,7 @@ class RunInfo:
 
     Attributes:
         recording: the input. params: as used last. start_s, duration_s: the part asked for.
-        truth: to compare with, and truth_path, its file.
+        truth: to compare with. truth_path: its file.
         stopped: why the run ended before the recording did, in a sentence; "" if it did not.
     """
 
@@ -166,13 +160,103 @@ class RunLog:
         return odometry
 
 
+@dataclass
+class Results:
+    """What the result files are written from.
+
+    Attributes:
+        loops: None if loops were not searched. report: what report.json holds; complete once it is written.
+    """
+
+    log: RunLog
+    keyframes: Keyframes
+    info: RunInfo
+    loops: LoopResults | None = None
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def frame(self) -> MapFrame:
+        return self.loops.frame if self.loops else MapFrame()
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """T_map_imu at every scan's end."""
+        return self.frame.trajectory(self.log.odometry)
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """One result file.
+
+    Attributes:
+        name: of the file. meaning: what it holds, for help texts and the documentation.
+        write: writes it to a path. of_loops: exists only if loops were searched.
+    """
+
+    name: str
+    meaning: str
+    write: Callable[[Path, Results], None]
+    of_loops: bool = False
+
+
+def _write_trajectory(path: Path, results: Results) -> None:
+    write_tum(path, results.trajectory)
+
+
+def _write_odometry(path: Path, results: Results) -> None:
+    write_tum(path, results.log.odometry)
+
+
+def _write_timings(path: Path, results: Results) -> None:
+    path.write_text(timings_csv(results.log), encoding="utf-8")
+
+
+def _write_map(path: Path, results: Results) -> None:
+    points = write_map(path, results.keyframes, results.frame)
+    results.report["map"] = {"keyframes": len(results.keyframes), "points": points}
+
+
+def _write_loops(path: Path, results: Results) -> None:
+    assert results.loops is not None
+    path.write_text(loops_csv(results.loops.edges, results.loops.stamps_ns), encoding="utf-8")
+
+
+def _write_graph(path: Path, results: Results) -> None:
+    assert results.loops is not None
+    path.write_text(results.loops.g2o, encoding="utf-8")
+
+
+def _write_report(path: Path, results: Results) -> None:
+    loops, info = results.loops, results.info
+    made = report.make_report(results.log, results.trajectory, info) | {"map": results.report.get("map")}
+    made["loops"] = {verdict.value: loops.count(verdict) for verdict in Verdict} if loops else None
+    if loops and info.truth is not None:
+        made["accuracy_odometry"] = report.accuracy(results.log.odometry, info)
+    results.report = report.finite(made)
+    path.write_text(json.dumps(results.report, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+EXPORTS = (
+    Export(
+        "trajectory.tum", "pose of the IMU in the map at each scan's end: stamp x y z qx qy qz qw", _write_trajectory
+    ),
+    Export("trajectory_odometry.tum", "the same by odometry alone, without loops", _write_odometry, of_loops=True),
+    Export("loops.csv", "every loop candidate: verdict, measurements and reason", _write_loops, of_loops=True),
+    Export("graph.g2o", "the pose graph of the keyframes", _write_graph, of_loops=True),
+    Export("timings.csv", "milliseconds of each stage in each frame, without reading the file", _write_timings),
+    Export("map.ply", "the map: x y z intensity ground", _write_map),
+    Export("report.json", "parameters, counts of frames, ground share, errors against truth", _write_report),
+)
+"""All result files, in the order in which they are written. report.json comes last: it counts the map's points."""
+
+
 def prepare_folder(folder: Path, *, replace: bool = False) -> None:
     """Make sure that results can be written to `folder`, creating it.
 
     Raises:
-        HemislamError: it holds results and `replace` is not set, or it can not be written to.
+        HemislamError: the folder holds results and `replace` is not set, or it is not writable.
     """
-    held = [name for name in (*RESULT_FILES, *LOOP_FILES) if (folder / name).exists()]
+    held = [export.name for export in EXPORTS if (folder / export.name).exists()]
     if held and not replace:
         raise HemislamError(
             f"{folder} already holds results ({', '.join(held)}); choose another folder or add --force."
@@ -180,9 +264,9 @@ def prepare_folder(folder: Path, *, replace: bool = False) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise HemislamError(f"The folder {folder} can not be made: {error.strerror}; choose another one.") from None
+        raise HemislamError(f"The folder {folder} cannot be made: {error.strerror}; choose another one.") from None
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise HemislamError(f"The folder {folder} can not be written to; choose another one.")
+        raise HemislamError(f"The folder {folder} is not writable; choose another one.")
 
 
 def save_results(
@@ -194,171 +278,37 @@ def save_results(
     *,
     replace: bool = False,
 ) -> dict[str, Any]:
-    """Write the result files and return what report.json holds.
+    """Write all result files and return what report.json holds.
 
     Older results in the folder stay until all new files are complete.
-
-    Args:
-        loops: what they made of it; None if none were looked for.
 
     Raises:
         HemislamError: as `prepare_folder`, or the disk is full or fails.
     """
     prepare_folder(folder, replace=replace)
-    frame = loops.frame if loops else MapFrame()
-    names = (*RESULT_FILES, *(LOOP_FILES if loops else ()))
-    parts = {name: folder / f".{name}.part" for name in names}
+    results = Results(log, keyframes, info, loops)
+    written = [export for export in EXPORTS if loops or not export.of_loops]
+    parts = {export.name: folder / f".{export.name}.part" for export in written}
     try:
-        trajectory = frame.trajectory(log.odometry)
-        write_tum(parts["trajectory.tum"], trajectory)
-        parts["timings.csv"].write_text(_timings_csv(log), encoding="utf-8")
-        map_points = write_map(parts["map.ply"], keyframes, frame)
-        report = make_report(log, trajectory, info)
-        report["map"] = {"keyframes": len(keyframes), "points": map_points}
-        report["loops"] = None
-        if loops:
-            write_tum(parts["trajectory_odometry.tum"], log.odometry)
-            parts["loops.csv"].write_text(loops_csv(loops.edges, loops.stamps_ns), encoding="utf-8")
-            parts["graph.g2o"].write_text(loops.g2o, encoding="utf-8")
-            report["loops"] = {verdict.value: loops.count(verdict) for verdict in Verdict}
-            if info.truth is not None:
-                report["accuracy_odometry"] = finite(_accuracy(log.odometry, info))
-        parts["report.json"].write_text(json.dumps(report, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-        for name, part in parts.items():
-            part.replace(folder / name)
-        for name in {*LOOP_FILES} - {*names}:
-            (folder / name).unlink(missing_ok=True)  # of an older run
+        for export in written:
+            export.write(parts[export.name], results)
+        for export in EXPORTS:
+            if export in written:
+                parts[export.name].replace(folder / export.name)
+            else:
+                (folder / export.name).unlink(missing_ok=True)  # of an older run
     except OSError as error:
-        raise HemislamError(f"Results can not be written to {folder}: {error.strerror}.") from error
+        raise HemislamError(f"Results cannot be written to {folder}: {error.strerror}.") from error
     finally:
         for part in parts.values():
             part.unlink(missing_ok=True)
-    return report
+    return results.report
 
 
-def summarise(report: dict[str, Any], folder: Path) -> str:
-    """The report in a few lines."""
-    frames, ground, accuracy = report["frames"], report["ground"], report["accuracy"]
-    total = report["timings_ms"]["total"]
-    lines = [
-        f"frames     {frames['processed']} processed, {frames['dropped']} dropped, {frames['lost']} lost;"
-        f" {report['distance_m']:.1f} m walked",
-        f"time       {total['median']:.1f} ms a frame (median), {total['p95']:.1f} ms (95 %),"
-        f" {total['max']:.1f} ms (max)",
-        f"map        {report['map']['points']:,} points in {report['map']['keyframes']} keyframes;"
-        f" {100 * (ground['share'] or 0):.0f} % ground",
-    ]
-    if report["loops"]:
-        found = report["loops"]
-        lines.append(
-            f"loops      {found['accepted']} accepted, {found['candidate']} undecided, {found['rejected']} rejected"
-        )
-    lines += [f"dropped    {count} x {reason}" for reason, count in frames["dropped_reasons"].items()]
-    if ground["f1"] is not None:
-        lines.append(
-            f"ground     precision {ground['precision'] or 0:.3f}, recall {ground['recall'] or 0:.3f},"
-            f" F1 {ground['f1']:.3f} against the recording's labels"
-        )
-    if accuracy and "error" in accuracy:
-        lines.append(f"error      not measured: {accuracy['error']}")
-    elif accuracy:
-        turned = f", {accuracy['ate_deg']['rmse']:.3f}°" if accuracy["ate_deg"] else ""
-        lines.append(
-            f"error      ATE {accuracy['ate_m']['rmse']:.4f} m (max {accuracy['ate_m']['max']:.4f}){turned}"
-            f" over {accuracy['poses']} poses"
-        )
-        if accuracy["ate_deg_withheld"]:
-            lines.append(f"           no rotation error: {accuracy['ate_deg_withheld']}")
-        if (before := report.get("accuracy_odometry")) and "ate_m" in before:
-            lines.append(f"           without loops ATE {before['ate_m']['rmse']:.4f} m")
-    lines += [f"memory     {report['peak_memory_mb']:.0f} MB at most", f"saved in   {folder}"]
-    return "\n".join(lines)
-
-
-def _timings_csv(log: RunLog) -> str:
-    lines = ["frame,stamp_s," + ",".join(f"{stage}_ms" for stage in TIMINGS)]
-    for frame, (stamp, row) in enumerate(zip(log.stamps_ns, log.timings_ms, strict=True)):
+def timings_csv(log: RunLog, more: dict[str, Sequence[float]] | None = None) -> str:
+    """One line per frame: milliseconds of each stage; `more` adds columns by name."""
+    columns = [log.timings_ms, *(np.asarray(values)[:, None] for values in (more or {}).values())]
+    lines = [",".join(["frame", "stamp_s", *(f"{stage}_ms" for stage in TIMINGS), *(more or {})])]
+    for frame, (stamp, row) in enumerate(zip(log.stamps_ns, np.hstack(columns), strict=True)):
         lines.append(f"{frame},{stamp_text(int(stamp))}," + ",".join(f"{value:.4f}" for value in row))
     return "\n".join(lines) + "\n"
-
-
-def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo) -> dict[str, Any]:
-    """What report.json holds; numbers that do not exist are null."""
-    score = log.ground_score
-    report = {
-        "hemislam": __version__,
-        "stopped_early": info.stopped or None,
-        "recording": {
-            "path": str(info.recording),
-            "sha256": hash_input(info.recording),
-            "start_s": info.start_s,
-            "duration_s": info.duration_s,
-        },
-        "frames": {
-            "processed": len(log),
-            **{status.value: log.statuses[status] for status in FrameStatus},
-            "dropped": log.dropped.total(),
-            "dropped_reasons": dict(log.dropped.most_common()),
-        },
-        "distance_m": trajectory.distance,
-        "ground": {
-            "share": log.ground_points / log.points if log.points else None,
-            "precision": score.precision if score else None,
-            "recall": score.recall if score else None,
-            "f1": score.f1 if score else None,
-        },
-        "accuracy": _accuracy(trajectory, info),
-        "timings_ms": _timing_summary(log),
-        "peak_memory_mb": peak_memory_mb(),
-        "notices": dict(log.notices.most_common()),
-        "machine": describe_machine(),
-        "parameters": info.params.model_dump(mode="json"),
-    }
-    valid: dict[str, Any] = finite(report)
-    return valid
-
-
-def _accuracy(trajectory: Trajectory, info: RunInfo) -> dict[str, Any] | None:
-    if info.truth is None:
-        return None
-    truth = {"truth": str(info.truth_path) if info.truth_path else None}
-    try:
-        absolute = ate(trajectory, info.truth)
-        relative = {"1 frame": rpe(trajectory, info.truth)}
-        relative |= {f"{metres:g} m": rpe(trajectory, info.truth, metres=metres) for metres in RPE_METRES}
-    except HemislamError as error:
-        return truth | {"error": str(error)}
-    return truth | {
-        "poses": absolute.poses,
-        "distance_m": absolute.distance,
-        "ate_m": asdict(absolute.position),
-        "ate_deg": asdict(absolute.rotation) if absolute.rotation else None,
-        "ate_deg_withheld": absolute.doubt or None,
-        "rpe": {
-            over: {"pairs": error.pairs, "m": asdict(error.position), "deg": asdict(error.rotation)} if error else None
-            for over, error in relative.items()
-        },
-    }
-
-
-def _timing_summary(log: RunLog) -> dict[str, dict[str, float]]:
-    if not len(log):
-        return {}
-    timings = log.timings_ms
-    return {
-        stage: {
-            "median": float(np.median(timings[:, column])),
-            "p95": float(np.percentile(timings[:, column], 95)),
-            "max": float(timings[:, column].max()),
-        }
-        for column, stage in enumerate(TIMINGS)
-    }
-
-
-def finite(value: Any) -> Any:
-    """The same tree with NaN and infinity as None, which JSON can hold."""
-    if isinstance(value, dict):
-        return {name: finite(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

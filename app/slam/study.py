@@ -1,4 +1,4 @@
-"""One frame under the glass: each point's numbers, a point's neighbours and their plane, files of all of it."""
+"""One frame in detail: the numbers of each point, a point's neighbours and their plane, and files of all of it."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from app.slam.lie import quaternion
+from app.slam.ply import header
 from app.slam.types import F32, F64, I64, StepResult
 
 VERTEX = np.dtype(
@@ -20,12 +21,12 @@ the map's plane, of the nearest point that the filter looked up; nan where its p
 such point within `MATCH_M`. residual_away: m to that point, nan without one: the filter sees a thinned scan."""
 
 MATCH_M = 0.5
-"""A point that the filter looked up tells of the points of the scan within so far of it."""
+"""A residual counts for the points of the scan within this distance of the point that the filter looked up."""
 
 
 @dataclass(frozen=True, slots=True)
 class PointNumbers:
-    """Of n points.
+    """Numbers of n points.
 
     Attributes:
         range: (n,) m. angle: (n,) rad between the point and "down".
@@ -38,7 +39,7 @@ class PointNumbers:
 
 
 def point_numbers(points: F32, result: StepResult) -> PointNumbers:
-    """Numbers of (n, 3) points in the LiDAR frame of a result, by its ground plane, accepted or not."""
+    """Numbers of (n, 3) points in the LiDAR frame of a result, from its ground plane, accepted or not."""
     exact, ground = points.astype(np.float64), result.ground
     reach = np.linalg.norm(exact, axis=1)
     cosine = exact @ ground.down / np.maximum(reach, 1e-9)
@@ -102,7 +103,7 @@ def nearest_match(points: F32, result: StepResult) -> tuple[I64, F64]:
 
 # --- files ---------------------------------------------------------------------------------------
 def vertices(result: StepResult) -> np.ndarray:
-    """All points of a frame with all they carry, as `VERTEX`."""
+    """All points of a frame with all their numbers, as `VERTEX`."""
     cloud = result.cloud
     numbers = point_numbers(cloud.points, result)
     table = np.empty(len(cloud), dtype=VERTEX)
@@ -117,23 +118,17 @@ def vertices(result: StepResult) -> np.ndarray:
     return table
 
 
-_PLY = {"<f4": "float", "<u2": "ushort", "<i4": "int", "|u1": "uchar"}
 _UNITS = (
     "x y z distance residual residual_away in m, offset in ns, angle in degrees; label 0 not ground, 1 ground, 2 seed"
 )
 
 
 def ply(result: StepResult) -> bytes:
-    """A frame as a binary PLY file, in the LiDAR frame; a comment tells its pose in the map."""
+    """A frame as a binary PLY file, in the LiDAR frame; a comment holds its pose in the map."""
     table = vertices(result)
-    properties = "".join(f"property {_PLY[table.dtype[name].str]} {name}\n" for name in table.dtype.names or ())
     pose = " ".join(f"{value:.9g}" for value in (result.T_map_imu @ result.state.T_imu_lidar)[:3].ravel())
-    header = (
-        f"ply\nformat binary_little_endian 1.0\ncomment hemislam frame {result.index}, {result.stamp_ns} ns\n"
-        f"comment {_UNITS}\ncomment T_map_lidar, rows: {pose}\n"
-        f"element vertex {len(table)}\n{properties}end_header\n"
-    )
-    return header.encode("ascii") + table.tobytes()
+    comments = (f"hemislam frame {result.index}, {result.stamp_ns} ns", _UNITS, f"T_map_lidar, rows: {pose}")
+    return header(VERTEX, len(table), *comments) + table.tobytes()
 
 
 def pcd(result: StepResult) -> bytes:
@@ -143,11 +138,11 @@ def pcd(result: StepResult) -> bytes:
     T = result.T_map_imu @ result.state.T_imu_lidar
     x, y, z, w = quaternion(T[:3, :3])
     viewpoint = " ".join(f"{value:.9g}" for value in (*T[:3, 3], w, x, y, z))
-    header = (
+    head = (
         f"# hemislam frame {result.index}, {result.stamp_ns} ns; {_UNITS}\n"
         f"VERSION 0.7\nFIELDS {' '.join(table.dtype.names or ())}\n"
         f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}\n"
         f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}\nCOUNT {' '.join('1' for _ in kinds)}\n"
         f"WIDTH {len(table)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {len(table)}\nDATA binary\n"
     )
-    return header.encode("ascii") + table.tobytes()
+    return head.encode("ascii") + table.tobytes()

@@ -245,7 +245,9 @@ class FrameStatus(StrEnum):
 
 
 STAGES = ("propagate", "deskew", "ground", "downsample", "update", "insert", "keyframe", "loops")
-"""Stages of `Engine.step`, in order; keys of `StepResult.timings_ms` beside "total"."""
+"""Stages of `Engine.step`, in order."""
+TIMINGS = (*STAGES, "total")
+"""Keys of `StepResult.timings_ms`."""
 
 
 @dataclass(frozen=True, slots=True)

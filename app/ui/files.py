@@ -9,8 +9,10 @@ from typing import Any, Final
 import viser
 
 from app.server.folders import RECORDINGS, TRAJECTORIES, Entry, Folders
+from app.server.journal import SUFFIX
 from app.server.protocol import Command, CompareWith, OpenRecording, Save, Snapshot
 from app.slam.errors import HemislamError
+from app.slam.results import EXPORTS
 from app.slam.trajectory import truth_beside
 from app.ui.html import box, code
 from app.ui.widgets import by_user
@@ -108,11 +110,11 @@ class FilesPanel:
             return
         gui = client.gui
         with gui.add_modal("Save results") as modal:
+            names = ", ".join(f"<b>{export.name}</b>" for export in EXPORTS)
             gui.add_html(
                 box(
-                    "Writes <b>trajectory.tum</b>, <b>timings.csv</b>, <b>map.ply</b>, <b>report.json</b>, of loops "
-                    "<b>loops.csv</b>, <b>graph.g2o</b> and <b>trajectory_odometry.tum</b>, and the session itself, "
-                    "<b>session.hemislam</b>, which can be opened again; all of what was processed so far, below ",
+                    f"Writes {names} of the frames processed so far, and <b>session{SUFFIX}</b>, which can be opened "
+                    "again. Files about loops exist only if loops are searched. All go into a folder below ",
                     code(str(self._results)),
                 )
             )

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from app.sensors.simulator.lidar import Returns
 from app.sensors.simulator.recording import RecordingWriter
-from app.slam.metrics import Trajectory, write_tum
+from app.slam.trajectory import Trajectory, write_tum
 
 ROOT = Path(__file__).resolve().parents[2]
 START_NS = 1_700_000_000_000_000_000

@@ -14,11 +14,19 @@ from app.sensors.presets import resolve_params
 from app.server.journal import Opened, SavedSession, State, size_of, write_session
 from app.server.run import Run
 from app.slam.errors import HemislamError
-from app.slam.metrics import Trajectory, ate, read_tum, write_tum
-from app.slam.results import LOOP_FILES, RESULT_FILES
+from app.slam.metrics import ate
+from app.slam.results import EXPORTS
+from app.slam.trajectory import Trajectory, read_tum, write_tum
 
 Call = Callable[..., Any]
-RESULTS = sorted((*RESULT_FILES, *LOOP_FILES))
+RESULTS = sorted(export.name for export in EXPORTS)
+
+
+def test_help_lists_every_result_file_with_its_meaning(hemislam: Call) -> None:
+    lines = [" ".join(line.split()) for line in hemislam("run", "--help").out.splitlines()]
+    assert [line for line in lines if any(line.startswith(f"{export.name} ") for export in EXPORTS)] == [
+        f"{export.name} {export.meaning}" for export in EXPORTS
+    ]
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from app.evaluation.measured import Column, measure
 from app.evaluation.truth import Truth
-from app.slam.metrics import Trajectory, read_tum
+from app.slam.trajectory import Trajectory, read_tum
 from tests.evaluation import walks
 
 EXACT = 1e-9

@@ -8,7 +8,7 @@ import pytest
 
 from app.evaluation.findings import findings
 from app.evaluation.measured import Accuracy, Column, Evaluated
-from app.slam.results import TIMINGS
+from app.slam.types import TIMINGS
 
 
 def column(name: str, ate_m: float, cpu_ms: float) -> Column:

@@ -12,7 +12,7 @@ import pytest
 
 from app.evaluation.measured import Accuracy, Column, Evaluated
 from app.evaluation.report import write_report
-from app.slam.results import TIMINGS
+from app.slam.types import TIMINGS
 
 LENGTH_M = 200.0
 

@@ -14,7 +14,8 @@ from app.evaluation.alignment import find_offset
 from app.evaluation.truth import Truth, check_overlap, match, read_truth
 from app.evaluation.truth_files import H2LID_LEVER
 from app.slam.errors import HemislamError
-from app.slam.metrics import Trajectory, ate, rpe, write_tum
+from app.slam.metrics import ate, rpe
+from app.slam.trajectory import Trajectory, write_tum
 from tests.evaluation import walks
 
 

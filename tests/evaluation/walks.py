@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from app.slam.metrics import Trajectory
+from app.slam.trajectory import Trajectory
 
 START_NS = 1_700_000_000_000_000_000
 R_BODY_IMU = Rotation.from_matrix([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from app.slam.engine import Engine
-from app.slam.metrics import Trajectory, read_tum, write_tum
+from app.slam.trajectory import Trajectory, read_tum, write_tum
 from tests.slam.scenes import Rig, Walk, furnished_room, measurements, mounted, params_for
 
 KEPT = Path(__file__).with_name("room_walk.tum")

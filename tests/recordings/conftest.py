@@ -12,8 +12,9 @@ import pytest
 from app.sensors.presets import PRESETS
 from app.sensors.recording import open_recording
 from app.slam.engine import Engine
-from app.slam.metrics import GroundScore, Trajectory, interpolate, read_tum
+from app.slam.metrics import GroundScore, interpolate
 from app.slam.params import Params
+from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import NON_GROUND, FrameStatus, Measurement
 
 H2LID_MOUNT = Params().merged(PRESETS["h2lid-mount"])

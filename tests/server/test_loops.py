@@ -31,9 +31,9 @@ from app.server.protocol import (
 from app.server.run import open_run
 from app.slam.loops import edit_files
 from app.slam.loops.types import Accept, LoopEdge, Reject, SetWeight, Verdict
-from app.slam.results import LOOP_FILES
+from app.slam.results import EXPORTS
 
-FILES = ("trajectory.tum", *LOOP_FILES)
+FILES = ("trajectory.tum", *(export.name for export in EXPORTS if export.of_loops))
 DRIFTING = (
     "filter.max_points=100", "filter.plane_tilt=20", "map.spacing=0.6", "map.points_per_voxel=10", "map.radius=12",
     "sensor.max_range=12",

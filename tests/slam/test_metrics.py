@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from app.slam.errors import HemislamError
-from app.slam.metrics import GroundScore, Trajectory, ate, interpolate, read_tum, rpe, write_tum
+from app.slam.metrics import GroundScore, ate, interpolate, rpe
+from app.slam.trajectory import Trajectory, read_tum, write_tum
 
 EXACT = 1e-9
 

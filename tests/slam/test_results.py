@@ -10,14 +10,16 @@ import pytest
 
 from app.slam.errors import HemislamError
 from app.slam.map_frame import MapFrame
-from app.slam.metrics import Trajectory, read_tum
 from app.slam.params import Params
 from app.slam.ply import VERTEX, write_map
-from app.slam.results import RESULT_FILES, TIMINGS, RunInfo, RunLog, save_results, summarise
+from app.slam.report import summarise
+from app.slam.results import EXPORTS, RunInfo, RunLog, save_results
+from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import (
     GROUND,
     NON_GROUND,
     SEED,
+    TIMINGS,
     Cloud,
     DroppedScan,
     FrameStatus,
@@ -133,7 +135,9 @@ def read_ply(path: Path) -> np.ndarray:
 def test_a_run_writes_its_four_files(tmp_path: Path, recording: Path) -> None:
     folder = tmp_path / "out"
     report = save_results(folder, logged(), [keyframe(0, [[1, 0, 0]], [GROUND])], RunInfo(recording, Params()))
-    assert sorted(path.name for path in folder.iterdir()) == sorted(RESULT_FILES)
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        export.name for export in EXPORTS if not export.of_loops
+    )
     assert json.loads((folder / "report.json").read_text()) == report
 
 
@@ -257,6 +261,6 @@ def test_older_results_survive_a_write_that_fails(tmp_path: Path, recording: Pat
 
 def test_a_file_in_the_place_of_the_folder_is_named(tmp_path: Path, recording: Path) -> None:
     (tmp_path / "out").write_text("mine")
-    with pytest.raises(HemislamError, match="out can not be made"):
+    with pytest.raises(HemislamError, match="out cannot be made"):
         save_results(tmp_path / "out", logged(), [], RunInfo(recording, Params()))
     assert (tmp_path / "out").read_text() == "mine"

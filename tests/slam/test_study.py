@@ -121,7 +121,7 @@ def test_a_ply_holds_every_point_with_all_it_carries() -> None:
     properties = re.findall(r"property (\w+) (\w+)", header)
     assert [name for _, name in properties] == list(VERTEX.names or ())
     assert sum(sizes[kind] for kind, _ in properties) == VERTEX.itemsize
-    assert f"element vertex {len(result.cloud)}" in header and len(table) == len(result.cloud)
+    assert f"element vertex {len(result.cloud):012d}" in header and len(table) == len(result.cloud)
     cloud = result.cloud
     assert np.array_equal(np.column_stack((table["x"], table["y"], table["z"])), cloud.points)
     for name, column in (("intensity", cloud.intensity), ("ring", cloud.ring), ("label", cloud.labels)):
