@@ -15,7 +15,8 @@ import numpy as np
 from tqdm import tqdm
 
 from app.sensors.presets import resolve_params
-from app.server.delta import Fold, Outbox
+from app.server.delta import Outbox
+from app.server.fold import Fold
 from app.server.protocol import Command, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
 from app.server.run import Run, open_run
 from app.server.session import Session

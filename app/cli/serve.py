@@ -105,7 +105,6 @@ def serve(
     start_logging(json_lines=log_json)
     processes.context()  # what is forked imports for as long as we do here, and beside it
     from app.evaluation.truth import read_poses
-    from app.memory import LARGE_OF_MAP, give_back
     from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording
     from app.server.folders import Folders
@@ -137,8 +136,6 @@ def serve(
         raise HemislamError(
             "--paused, --start, --duration and --truth belong to a recording; leave them out with --live."
         )
-    if live is not None:
-        give_back(LARGE_OF_MAP)
     session = read_session(recording) if recording is not None and recording.suffix == SUFFIX else None
     params = session.state.params if session else resolve_for(recording)
     if recording is not None:

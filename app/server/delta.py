@@ -1,26 +1,25 @@
-"""What changed between two snapshots: collected in the engine's process, folded in the reader's.
+"""What has changed since the reader last heard: collected in the engine's process.
 
-`Outbox` gathers changes until somebody takes them, however long that takes: fields that are
-replaced as a whole coalesce to their newest value, rows and chunks queue up. So a slow reader never
-holds up the engine and never misses anything, and nothing is kept here once it was taken.
+Fields of the snapshot that are replaced as a whole are sent in their newest value only. Frames are followed by a
+cursor, and the clouds of keyframes are read from disk when they are sent. So a slow reader never holds up the
+engine, misses nothing, and nothing piles up for it.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass, replace
+from bisect import bisect_left
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import numpy as np
-
-from app.server.chunks import room, with_same_mounting, within_budget
-from app.server.edges import EdgesChange, EdgesReceiver, EdgesSender
-from app.server.protocol import SERIES, Chunk, LoopsView, Notice, Snapshot
-from app.server.setup import POINT_BUDGET
-from app.server.transforms import Transforms
+from app.mapping.frames import Frame
+from app.mapping.log import Cursor, Log
+from app.server.chunks import thinned
+from app.server.edges import EdgesChange, EdgesSender
+from app.server.protocol import Chunk, LoopsView, Notice
+from app.slam.map_frame import MapFrame
 from app.slam.params import Params
-from app.slam.rows import table
-from app.slam.types import F64
+from app.slam.ply import Keyframes
 
-NOTICES_KEPT = 50
+CHUNKS_AT_ONCE = 20
+"""Most clouds in one delta, so that a reader far behind sees the map grow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,27 +27,17 @@ class Delta:
     """Changes since the delta before.
 
     Attributes:
-        session: of all that follows; a new number empties the scene first.
-        kept: how many frames are left of those that there were, before those that follow; None: all.
-        moved: frame and (m, 3) positions from it on, in place of those that there were.
-        replaced: new values of fields of `Snapshot`; `loops` without its edges.
-        edges: what has changed of those.
-        positions: (m, 3) and series: (m, len(SERIES)), rows of the frames since then.
-        chunks: new since then, each in place of the one that the reader has of its keyframe.
-        shown: how many of all these there are now; the reader keeps the others, since they come again
-            when one goes forth again.
+        replaced: new values of fields of `Snapshot`; `loops` without its edges. edges: what has changed of those.
+        keep: the reader keeps so many of its frames and appends `frames`.
+        chunks: of the next keyframes whose cloud the reader does not have.
         notices: new since then.
     """
 
-    session: int
-    kept: int | None
-    moved: tuple[int, F64] | None
     replaced: dict[str, Any]
     edges: EdgesChange | None
-    positions: F64
-    series: F64
+    keep: int
+    frames: tuple[Frame, ...]
     chunks: tuple[Chunk, ...]
-    shown: int
     notices: tuple[Notice, ...]
 
 
@@ -56,76 +45,50 @@ class Outbox:
     """Collects changes for the next `Delta`.
 
     Args:
-        session, notices, frames, chunks: what the reader has already, of a process before this one.
+        chunk_voxel: edge of the voxels (m) in which clouds are thinned.
+        session, notices, frames, chunks: how many the reader already has from an earlier process.
 
     Attributes:
-        urgent: asks for the next one at once, whatever the rate limit.
-        frames, chunks: how many the reader shows of this session once it has taken everything.
+        urgent: asks for the next delta at once, whatever the rate limit.
     """
 
-    def __init__(self, params: Params, *, session: int = 0, notices: int = 0, frames: int = 0, chunks: int = 0) -> None:
-        self._session = session
-        self._notices_given = notices
+    def __init__(
+        self,
+        params: Params,
+        *,
+        chunk_voxel: float = 0.05,
+        session: int = 0,
+        notices: int = 0,
+        frames: int = 0,
+        chunks: int = 0,
+    ) -> None:
+        self._session, self._notices_given, self._chunk_voxel = session, notices, chunk_voxel
         self._replaced: dict[str, Any] = {"params": params}
-        self._positions: list[F64] = []
-        self._rows: list[list[float]] = []
-        self._chunks: dict[int, Chunk] = {}  # by keyframe
-        self._held = chunks  # that the reader has once it has taken everything, shown or not
         self._edges = EdgesSender()
-        self._kept: int | None = None
-        self._moved: tuple[int, F64] | None = None
-        self.frames = frames
-        self.chunks = chunks
+        self._frames: Log[Frame] = Log()
+        self._cursor = Cursor(0, frames)
+        self._clouds: Keyframes = ()
+        self._keyframes: list[int] = []  # their frames, of the frames that the reader has
+        self._chunks = chunks  # that the reader has
         self._notices: list[Notice] = []
         self.urgent = True
 
-    def begin(self) -> None:
-        """Start a new session: what belonged to the old one and was not taken is dropped."""
-        self._session += 1
-        self.urgent = True
-        self._positions, self._rows, self._chunks, self._held = [], [], {}, 0
-        self._kept, self._moved, self.frames, self.chunks = None, None, 0, 0
-        self._replaced |= {"result": None, "keyframe_poses": None, "T_map_truth": None, "loops": LoopsView()}
+    def begin(self, frames: Log[Frame], keyframes: Keyframes) -> None:
+        """Follow another session, or, if it has frames already, the one that an earlier process began."""
+        self._frames, self._clouds = frames, keyframes
+        self._keyframes = [index for index, frame in enumerate(frames) if frame.keyframe]
+        if len(frames):
+            self._cursor = Cursor(0, min(self._cursor.length, len(frames)))
+            self._chunks = min(self._chunks, len(self._keyframes))
+        else:
+            self._session += 1
+            self._cursor, self._chunks = Cursor(), 0
+        self.put(urgent=True, session=self._session, result=None, corrections=MapFrame(), loops=LoopsView())
 
     def put(self, *, urgent: bool = False, **values: Any) -> None:
         """Set fields of the snapshot. Only the newest value of each is sent."""
         self._replaced |= values
         self.urgent |= urgent
-
-    def frame(self, position: F64, readouts: list[float]) -> None:
-        """Add a frame: its position (3,) in the map and its readouts in the order of SERIES."""
-        self._positions.append(position)
-        self._rows.append(readouts)
-        self.frames += 1
-
-    def chunk(self, chunk: Chunk) -> None:
-        """Add the next chunk, in place of the one that may have been gone back over."""
-        self._chunks[self.chunks] = chunk
-        self.chunks += 1
-        self._held = max(self._held, self.chunks)
-
-    def move(self, first: int, positions: F64) -> None:
-        """The frames from `first` on lie elsewhere now.
-
-        Args:
-            positions: (frames, 3) of all frames.
-        """
-        taken = self.frames - len(self._positions)
-        if first < taken:
-            first = min(first, self._moved[0]) if self._moved else first
-            self._moved = first, positions[first:taken]
-        self._positions = list(positions[taken:])
-
-    def go_to(self, frames: int, chunks: int) -> None:
-        """Show so many: frames are taken back, the newest first; chunks also come again that there were."""
-        frames, taken_frames = min(frames, self.frames), self.frames - len(self._rows)
-        if frames < taken_frames:
-            self._kept = frames
-        if self._moved:
-            first, moved = self._moved
-            self._moved = (first, moved[: frames - first]) if first < frames else None
-        del self._positions[max(frames - taken_frames, 0) :], self._rows[max(frames - taken_frames, 0) :]
-        self.frames, self.chunks = frames, min(chunks, self._held)
 
     def notice(self, level: Literal["info", "warning", "error"], text: str) -> None:
         self._notices_given += 1
@@ -135,7 +98,13 @@ class Outbox:
     @property
     def filled(self) -> bool:
         """Whether there is anything to take."""
-        return bool(self._replaced or self._rows or self._chunks or self._notices or self._kept or self._moved)
+        behind = self._frames.cursor != self._cursor or self._chunks < self._chunks_ready
+        return bool(self._replaced or self._notices or behind)
+
+    @property
+    def _chunks_ready(self) -> int:
+        """Keyframes whose cloud can be read. After a seek back, later ones can be read again once they are passed."""
+        return min(len(self._keyframes), len(self._clouds))
 
     def take(self) -> Delta:
         """All changes since the last call."""
@@ -144,113 +113,12 @@ class Outbox:
             loops: LoopsView = self._replaced["loops"]
             edges = self._edges.change(loops.edges)
             self._replaced["loops"] = replace(loops, edges=())
-        delta = Delta(
-            session=self._session,
-            kept=self._kept,
-            moved=self._moved,
-            replaced=self._replaced,
-            edges=edges,
-            positions=np.array(self._positions, dtype=np.float64).reshape(-1, 3),
-            series=np.array(self._rows, dtype=np.float64).reshape(-1, len(SERIES)),
-            chunks=tuple(self._chunks[index] for index in sorted(self._chunks)),
-            shown=self.chunks,
-            notices=tuple(self._notices),
-        )
-        self._replaced, self._positions, self._rows, self._chunks, self._notices = {}, [], [], {}, []
-        self._kept = self._moved = None
-        self.urgent = False
+        keep, frames, self._cursor = self._frames.since(self._cursor)
+        kept = bisect_left(self._keyframes, keep)
+        self._keyframes[kept:] = [keep + index for index, frame in enumerate(frames) if frame.keyframe]
+        self._chunks = first = min(self._chunks, kept)
+        self._chunks = max(first, min(self._chunks_ready, first + CHUNKS_AT_ONCE))
+        chunks = tuple(thinned(self._clouds[index], self._chunk_voxel) for index in range(first, self._chunks))
+        delta = Delta(self._replaced, edges, keep, frames, chunks, tuple(self._notices))
+        self._replaced, self._notices, self.urgent = {}, [], False
         return delta
-
-
-class Fold:
-    """Lays deltas over a snapshot, in their order. One thread writes; anybody may read `snapshot`.
-
-    Args:
-        point_budget: most points that all chunks together may have; fewer, as a long walk leaves less room.
-    """
-
-    def __init__(self, snapshot: Snapshot | None = None, point_budget: int = POINT_BUDGET) -> None:
-        self.snapshot = snapshot or Snapshot()
-        self._point_budget = point_budget
-        self._positions, self._series = table(3), table(len(SERIES))
-        self._chunks: tuple[Chunk, ...] = ()  # also those that were gone back over
-        self._points = 0  # of those that are shown
-        self._edges = EdgesReceiver()
-        self._poses = Transforms()
-
-    def apply(self, delta: Delta) -> Snapshot:
-        before, delta = self.snapshot, read_only(delta)
-        if delta.session != before.session:
-            self._positions, self._series, self._chunks = table(3), table(len(SERIES)), ()
-        if delta.kept is not None:
-            self._positions, self._series = self._positions.rewound(delta.kept), self._series.rewound(delta.kept)
-        if delta.moved is not None:
-            first, positions = delta.moved
-            self._positions = self._positions.rewound(first)
-            self._positions.extend(positions)
-        self._positions.extend(delta.positions)
-        self._series.extend(delta.series)
-        series = self._series.view()
-        if delta.edges is not None:
-            self._edges.take(delta.edges)
-        chunks = before.chunks
-        others = delta.chunks or delta.shown != len(chunks) or delta.session != before.session
-        if others or self._points > self._room(len(chunks)):
-            chunks = self._shown(delta)
-            self._points = sum(len(chunk.points) for chunk in chunks)
-        replaced = delta.replaced
-        if replaced.get("keyframe_poses") is not None:
-            replaced = {**replaced, "keyframe_poses": self._poses.hold(replaced["keyframe_poses"])}
-        if delta.edges is not None:
-            replaced = {**replaced, "loops": replace(replaced["loops"], edges=self._edges.edges)}
-        return self.edit(
-            session=delta.session,
-            chunks=chunks,
-            trajectory=self._positions.view(),
-            series={name: series[:, column] for column, name in enumerate(SERIES)},
-            notices=delta.notices,
-            **replaced,
-        )
-
-    def _shown(self, delta: Delta) -> tuple[Chunk, ...]:
-        """The chunks that there are with this delta, within the budget."""
-        poses = delta.replaced.get("keyframe_poses", self.snapshot.keyframe_poses)
-        result = delta.replaced.get("result", self.snapshot.result)
-        held = list(self._chunks)
-        for chunk in delta.chunks:
-            held[chunk.index : chunk.index + 1] = [with_same_mounting(chunk, held[chunk.index - 1]) if held else chunk]
-        shown, others = tuple(held[: delta.shown]), held[delta.shown :]
-        if poses is None or len(poses) < len(shown):
-            self._chunks = tuple(held)
-            return shown
-        sensor = result.T_map_imu[:3, 3] if result is not None else poses[-1, :3, 3]
-        shown = within_budget(shown, poses, sensor, self._room(len(shown)))
-        self._chunks = (*shown, *others)
-        return shown
-
-    def _room(self, keyframes: int) -> int:
-        """Most points that all chunks together may have now."""
-        return room(self._point_budget, len(self._positions), keyframes, len(self._edges.edges))
-
-    def edit(self, *, notices: Iterable[Notice] = (), **values: Any) -> Snapshot:
-        """Replace fields and add notices: the next revision."""
-        before = self.snapshot
-        kept = (*before.notices, *notices)[-NOTICES_KEPT:]
-        self.snapshot = replace(before, revision=before.revision + 1, notices=kept, **values)
-        return self.snapshot
-
-
-def read_only(value: Any) -> Any:
-    """The same value, with every array in it made read-only, through dataclasses, tuples and dictionaries."""
-    if isinstance(value, np.ndarray):
-        value.setflags(write=False)
-    elif isinstance(value, tuple):
-        for entry in value:
-            read_only(entry)
-    elif isinstance(value, dict):
-        for entry in value.values():
-            read_only(entry)
-    elif is_dataclass(value):
-        for field in fields(value):
-            read_only(getattr(value, field.name))
-    return value

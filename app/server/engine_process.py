@@ -128,7 +128,12 @@ def run_loop(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to a whole group; our parent says when to end
     outbox = Outbox(
-        setup.params, session=setup.session, notices=setup.notices, frames=setup.frames, chunks=setup.chunks
+        setup.params,
+        chunk_voxel=setup.chunk_voxel,
+        session=setup.session,
+        notices=setup.notices,
+        frames=setup.frames,
+        chunks=setup.chunks,
     )
     link = Link(commands, updates, outbox)
     session = Session(
@@ -136,7 +141,6 @@ def run_loop(
         setup.params,
         opener,
         resolve=setup.resolve,
-        chunk_voxel=setup.chunk_voxel,
         journals=setup.journals,
     )
     session.handle(SetSpeed(setup.speed))

@@ -6,13 +6,11 @@ import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from app.memory import tidy
 from app.sensors.findings import Finding
 from app.sensors.live.process import LiveAddress, LiveClient
 from app.sensors.live.status import LiveState, Status
 from app.server.loop_process import LoopProcess
 from app.server.protocol import LIVE, OpenedRecording
-from app.server.readouts import Readouts
 from app.server.run import Quiet, Run
 from app.slam.engine import Checkpoint, Engine
 from app.slam.errors import HemislamError
@@ -20,7 +18,7 @@ from app.slam.keyframes import KeyframeStore
 from app.slam.loops.types import LoopEdit
 from app.slam.params import Params
 from app.slam.results import LogState
-from app.slam.types import DroppedScan, Measurement, StepResult
+from app.slam.types import DroppedScan, Measurement
 
 POLL_S = 0.02
 """How long to wait for the next scan before looking for commands."""
@@ -28,8 +26,6 @@ POLL_S = 0.02
 
 EVERY = 10
 """Frames between two checkpoints; the receiving process can give six seconds of scans again."""
-TIDY_EVERY = 100
-"""Frames between two times at which memory is tidied up."""
 KEYFRAMES, CHECKPOINT, ROWS = "keyframes", "checkpoint", "rows"
 
 log = logging.getLogger(__name__)
@@ -52,7 +48,6 @@ class _Kept:
     history: tuple[tuple[int, Params], ...]
     opened: OpenedRecording
     log: LogState
-    readouts: Readouts
     edits: tuple[tuple[LoopEdit, ...], tuple[LoopEdit, ...]]
 
 
@@ -84,7 +79,6 @@ class LiveRun(Run):
         self._folder = folder
         self._rows_end = 0
         self._rows_kept = 0
-        self._readouts: list[list[float]] = []  # not yet kept
         if engine.loops is not None:
             engine.loops.never_go_back()
 
@@ -104,7 +98,6 @@ class LiveRun(Run):
 
     def _begin(self, start_ns: int) -> None:
         self.opened = replace(self.opened, start_ns=start_ns)
-        self.readouts = Readouts(start_ns)
 
     def grown(self) -> None:
         """What was opened has become longer."""
@@ -114,11 +107,6 @@ class LiveRun(Run):
     def state(self) -> LiveState:
         """How the source is doing. Raises HemislamError: it has ended."""
         return self._client.state()
-
-    def readout(self, result: StepResult) -> list[float]:
-        row = super().readout(result)
-        self._readouts.append(row)
-        return row
 
     def remember(self, *, near: bool = False) -> None:
         """Now and then put on disk what an engine that takes over needs. Going back is not possible."""
@@ -135,8 +123,6 @@ class LiveRun(Run):
             return
         with contextlib.suppress(HemislamError):  # it has ended, which is told when it is asked for the next scan
             self._client.kept()
-        if self.frame % TIDY_EVERY == 0:
-            tidy()
 
     def _state(self) -> _Kept:
         loops = self.engine.loops.state if self.engine.loops else None
@@ -149,7 +135,6 @@ class LiveRun(Run):
             history=self.history,
             opened=self.opened,
             log=self.log.checkpoint(),
-            readouts=self.readouts,
             edits=(loops.undo, loops.redo) if loops else ((), ()),
         )
 
@@ -162,26 +147,17 @@ class LiveRun(Run):
         with (self._folder / ROWS).open("r+b" if self._rows_end else "wb") as file:
             file.seek(self._rows_end)
             file.truncate()
-            pickle.dump((self.log.rows(self._rows_kept), self._readouts), file, protocol=5)
+            pickle.dump((self.log.rows(self._rows_kept), self.frames[self._rows_kept :]), file, protocol=5)
             end = file.tell()
-        self._rows_end, self._rows_kept, self._readouts = end, len(self.log), []
+        self._rows_end, self._rows_kept = end, len(self.log)
 
     def _read_rows(self, end: int) -> None:
         with (self._folder / ROWS).open("rb") as file:
             while file.tell() < end:
-                rows, _ = pickle.load(file)
+                rows, frames = pickle.load(file)
                 self.log.extend(rows)
+                self.frames.extend(frames)
         self._rows_end, self._rows_kept = end, len(self.log)
-
-    def readouts_from(self, frame: int) -> list[list[float]]:
-        """The readouts from this frame on, of those that are kept."""
-        first, found = 0, []
-        with (self._folder / ROWS).open("rb") as file:
-            while file.tell() < self._rows_end:
-                _, rows = pickle.load(file)
-                found += rows[max(frame - first, 0) :]
-                first += len(rows)
-        return found
 
     def revive(self) -> bool:
         """Go on where an engine that died was; whether there is anything to go on from."""
@@ -197,8 +173,8 @@ class LiveRun(Run):
         self.log.restore(kept.log)
         self.engine.restore(kept.engine)
         self.choose(kept.params)
-        self.frame = self.known = kept.frame
-        self.history, self.opened, self.readouts = kept.history, kept.opened, kept.readouts
+        self.frame = kept.frame
+        self.history, self.opened = kept.history, kept.opened
         if any(kept.edits):
             self.edit_loops(*kept.edits)
         self._client.place = kept.place

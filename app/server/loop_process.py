@@ -6,7 +6,6 @@ so that neither sending a keyframe nor a late reader makes anyone wait. When the
 pipe for requests ends and the process ends itself.
 """
 
-import itertools
 import os
 import queue
 import subprocess
@@ -14,28 +13,18 @@ import sys
 import threading
 from dataclasses import replace
 from multiprocessing.connection import Connection, Pipe
-from typing import Final, TypeAlias
-
-import numpy as np
+from typing import Final
 
 from app import processes
 from app.logs import process_logs
-from app.memory import give_back, tidy
 from app.server import wire
 from app.server.edges import EdgesChange, EdgesReceiver, EdgesSender
-from app.server.transforms import Transforms, TransformsChange
 from app.slam.loops.messages import LoopState, LoopWorkerDied, Reply, Request
 
 NICENESS: Final = 10
 """The frame loop comes first."""
-TIDIED: Final = 20
-"""Requests after which the holes in memory are given back; most are keyframes, which leave some."""
 _ALONE: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "NUMBA", "OPENBLAS", "MKL")}
 """More threads would fight the frame loop's for the cores."""
-_NONE: Final = np.empty((0, 4, 4))
-
-Changes: TypeAlias = tuple[EdgesChange, TransformsChange]
-"""What of a state travels in place of its candidates and corrections."""
 
 
 class LoopProcess:
@@ -123,16 +112,15 @@ class LoopProcess:
                     wire.send(self._requests, request)
                 except OSError:  # it has ended; the reader says so
                     return
-                del request  # a keyframe with its cloud, which would be kept until the next one
 
     def _read(self, replies: "Connection[object, object]") -> None:
-        edges, corrections = EdgesReceiver(), Transforms()
+        edges = EdgesReceiver()
 
-        def whole(reply: Reply, changes: Changes | None) -> Reply:
-            if not isinstance(reply, LoopState) or changes is None:
+        def whole(reply: Reply, change: EdgesChange | None) -> Reply:
+            if not isinstance(reply, LoopState) or change is None:
                 return reply
-            edges.take(changes[0])
-            return replace(reply, edges=edges.edges, corrections=corrections.take(changes[1]))
+            edges.take(change)
+            return replace(reply, edges=edges.edges)
 
         with replies:
             try:
@@ -148,26 +136,22 @@ def main() -> None:
     replies: Connection[object, object] = Connection(int(sys.argv[2]), readable=False)
     processes.begin("hemislam-loops")
     os.nice(NICENESS)
-    give_back()  # glibc would keep what was large once, here a third of all that is taken
     from app.slam.loops.service import LoopService  # the owner has no need of the solver
     from app.slam.loops.warmup import warm_up
 
     warm_up()
     service = LoopService()
-    edges, corrections = EdgesSender(), Transforms()
+    edges = EdgesSender()
 
-    def answer(request: Request) -> tuple[Reply, Changes | None]:
+    def answer(request: Request) -> tuple[Reply, EdgesChange | None]:
         reply = service.handle(request)
         if not isinstance(reply, LoopState):
             return reply, None
-        changes = edges.change(reply.edges), corrections.change(reply.corrections)
-        return replace(reply, edges=(), corrections=_NONE), changes
+        return replace(reply, edges=()), edges.change(reply.edges)
 
     try:
-        for number in itertools.count(1):
-            wire.send(replies, answer(wire.receive(requests)))  # without a name: nothing of it is kept meanwhile
-            if number % TIDIED == 0:
-                tidy()
+        while True:
+            wire.send(replies, answer(wire.receive(requests)))
     except (EOFError, OSError):  # the owner has gone, or wants no more
         return
 

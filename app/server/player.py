@@ -9,7 +9,7 @@ from typing import Literal
 from app.server.breakpoints import Breakpoints, Moment, reasons
 from app.server.checkpoints import NEAR
 from app.server.delta import Outbox
-from app.server.live import LiveRun, tells
+from app.server.live import tells
 from app.server.pacing import Pacer
 from app.server.protocol import Progress
 from app.server.publisher import Publisher
@@ -79,10 +79,7 @@ class Player:
         self.relabelling = self.page_behind = False
         self._moment = self._unseen = None
         run.remember()
-        if isinstance(run, LiveRun) and run.frame >= 0:
-            self._page.taken_over(run)
-        else:
-            self._page.opened(run)
+        self._page.opened(run)
         self._pacer.release()
         if run.frame < 0:
             self.go_to(0, -1)
@@ -219,7 +216,6 @@ class Player:
             self.fail(f"The frame after frame {run.frame} could not be processed and is left out", error)
             return None
         if again and journey is not None:
-            run.readouts.row(result)
             self.page_behind, self._unseen = True, result
             run.remember(near=journey.again_to - run.frame <= NEAR)
             if run.frame >= journey.again_to:
@@ -234,7 +230,10 @@ class Player:
 
     def _passed(self, run: Run, result: StepResult, *, played: bool) -> None:
         """Pause where a breakpoint holds, unless the frame is one on the way to another."""
-        before, self._moment = self._moment, Moment(result, run.readouts.error)
+        before, self._moment = self._moment, Moment(result)
+        if self.breakpoints.error is not None and before is not None and run.frame > 0:
+            errors = run.errors()
+            before, self._moment = replace(before, error=errors[-2]), replace(self._moment, error=errors[-1])
         if played and (why := reasons(self.breakpoints, before, self._moment)):
             self.halt()
             self._outbox.notice("info", f"Paused at frame {run.frame:,}. {' '.join(why)}")
@@ -245,7 +244,7 @@ class Player:
             run, result = self.run, self._unseen
             self.page_behind, self._unseen = False, None
             self._page.arrived(run, result)
-            self._moment = Moment(result, run.readouts.error) if result is not None else None
+            self._moment = Moment(result) if result is not None else None
             self.settle_labels(run)
 
     def settle_labels(self, run: Run) -> None:

@@ -8,10 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from app.mapping.frames import READOUTS
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
 from app.server.breakpoints import Breakpoints
 from app.slam.loops import types as loops
+from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import F32, F64, I64, U8, U16, StepResult
 
@@ -277,18 +279,9 @@ class LoopsView:
     tried: tuple[loops.LoopEdit, loops.Preview] | None = None
 
 
-SERIES = (
-    "stamp_s", "planarity", "seeds", "ground_share", "points_in", "points_reduced", "points_filter",
-    "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "loops_ms",
-    "total_ms",
-    "iterations", "used", "inliers", "residual_rms", "degeneracy", "imu_gap_s", "dropped",
-    "speed", "gyro_bias", "accel_bias", "distance", "error_m", "turn_x", "turn_y", "turn_z",
-)  # fmt: skip
-"""Per-frame readouts, one float64 array each, nan where there is none. `stamp_s` counts from the
-start of the recording; `used` points were looked up in the map; `degeneracy` is the smallest
-eigenvalue of the pose information; `imu_gap_s` and `dropped` as in `StepResult`; `speed` m/s; the
-biases are norms; `distance` m walked; `error_m` to the truth, aligned to the walk so far; `turn_*` is the
-rotation vector (rad) of R_odom_imu."""
+SERIES = ("stamp_s", "distance", "error_m", *READOUTS)
+"""Names of the arrays of numbers by frame. `stamp_s` counts from the start of the recording. `distance` is the length
+of the trajectory up to the frame (m). `error_m` is the distance to the truth (m), aligned to all frames shown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,6 +298,7 @@ class Snapshot:
         chunks: within a session appended, thinned, and taken away at the end when going back.
         keyframe_poses: (k, 4, 4) T_map_imu of each keyframe.
         trajectory: (n, 3) positions of the IMU in the map, every processed frame.
+        corrections: by which loops lay odometry in the map.
         loops: candidates, their verdicts and what was asked about them.
         series: (n,) arrays by SERIES name.
         T_map_truth: (4, 4) that lays the truth's positions over the map, None until the walk
@@ -328,6 +322,7 @@ class Snapshot:
     chunks: tuple[Chunk, ...] = ()
     keyframe_poses: F64 | None = None
     trajectory: F64 | None = None
+    corrections: MapFrame = field(default_factory=MapFrame)
     loops: LoopsView = LoopsView()
     series: dict[str, F64] = field(default_factory=dict)
     T_map_truth: F64 | None = None

@@ -5,6 +5,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
+from app.mapping import truth as compared
+from app.mapping.frames import Frame
+from app.mapping.log import Log
 from app.sensors.findings import Finding
 from app.sensors.live.status import Status
 from app.sensors.recording import Place, Recording, open_recording
@@ -12,7 +17,6 @@ from app.server.checkpoints import DEFAULT_BYTES, Checkpoints
 from app.server.journal import SUFFIX, SavedSession, write_session
 from app.server.loop_process import LoopProcess
 from app.server.protocol import OpenedRecording
-from app.server.readouts import Readouts, ReadoutsState
 from app.slam.engine import Checkpoint, Engine
 from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
@@ -34,7 +38,6 @@ class RunState:
     engine: Checkpoint
     place: Place
     log: LogState
-    readouts: ReadoutsState
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +55,12 @@ class Run:
 
     Attributes:
         opened: what the page is told of the recording. finished: whether all of it was processed.
-        frame: index of the newest frame, -1 before the first. known: of the last one that there is a way back to.
+        frame: index of the newest frame, -1 before the first.
+        frames: all that are known, also those after `frame` that the run went back over.
         params: for frames not yet processed; set them with `choose`.
         history: from which frame on which were in force, ascending.
         live: whether it goes on as it happens, and there is no going back.
-        checkpoints: to go back to; filled by `remember`. readouts, log: filled frame by frame.
+        checkpoints: to go back to; filled by `remember`. log: filled frame by frame.
     """
 
     live = False
@@ -86,11 +90,11 @@ class Run:
             truth=truth_path,
         )
         self.engine = engine
-        self.frame = self.known = -1
+        self.frame = -1
+        self.frames: Log[Frame] = Log()
         self.params = engine.params
         self.checkpoints = Checkpoints(checkpoint_bytes)
         self.history: tuple[tuple[int, Params], ...] = ()
-        self.readouts = Readouts(recording.start_ns, truth)
         self.log = RunLog()
         self._recording = recording
         self._truth = truth
@@ -120,9 +124,10 @@ class Run:
             self._waiting = entry
         return self._waiting
 
-    def readout(self, result: StepResult) -> list[float]:
-        """As `Readouts.row`, of the newest frame. Call it once."""
-        return self.readouts.row(result)
+    @property
+    def known(self) -> int:
+        """Index of the last frame that is known; -1 if there is none."""
+        return len(self.frames) - 1
 
     def _drop(self, scan: DroppedScan) -> None:
         self.log.drop(scan)
@@ -151,7 +156,8 @@ class Run:
             self.engine.params = self.params
         result = replace(result, notices=(*measurement.notices, *result.notices), dropped=self._dropped)
         self.frame, self._dropped = frame, 0
-        self.known = max(self.known, frame)
+        if frame == len(self.frames):
+            self.frames.append(Frame.of(result))
         if frame >= self.followed_to:
             self._followed = None
         self.log.add(result)
@@ -197,11 +203,8 @@ class Run:
             self.edit_loops(state.edits, state.undone)
         self._followed = saved if saved.frame > self.frame else None
 
-    def compare_with(self, path: Path | None) -> F64:
-        """Hold the walk against another trajectory, or none, from now on.
-
-        Returns:
-            (n,) m, distance of every frame that is known to it; nan where there is none.
+    def compare_with(self, path: Path | None) -> None:
+        """Compare the session with another trajectory, or none, from now on.
 
         Raises:
             HemislamError: it can not be read, or shares no time with the recording; nothing has changed.
@@ -217,8 +220,14 @@ class Run:
             truth_stamps_ns=truth.stamps_ns if truth else None,
             truth_positions=truth.positions if truth else None,
         )
-        walk = self.engine.map_frame.trajectory(self.log.odometry_of(self.known + 1))
-        return self.readouts.compare(truth, walk, self.frame + 1)
+
+    def errors(self) -> F64:
+        """(frame + 1,) m, distances of the frames so far to the truth, which is aligned to them; nan without truth."""
+        if self._truth is None:
+            return np.full(self.frame + 1, np.nan)
+        ours = self.engine.map_frame.trajectory(self.log.odometry)
+        there = compared.interpolated(self._truth.stamps_ns, self._truth.positions, ours.stamps_ns)
+        return compared.distances(compared.align(there, ours.positions), there, ours.positions)
 
     # --- going back ------------------------------------------------------------------------------
     def choose(self, params: Params) -> None:
@@ -241,7 +250,7 @@ class Run:
         self._forget_after(frame)
 
     def _forget_after(self, frame: int) -> None:
-        self.known = min(self.known, frame)
+        self.frames.truncate(frame + 1)
         if self.engine.loops:
             self.engine.loops.forget_after(frame)
         self.checkpoints.forget_after(frame)
@@ -255,7 +264,6 @@ class Run:
                 engine=self.engine.checkpoint(),
                 place=self._incoming.place(),
                 log=self.log.checkpoint(),
-                readouts=self.readouts.checkpoint(),
             )
             self.checkpoints.add(self.frame, state)
 
@@ -272,7 +280,6 @@ class Run:
         self.engine.restore(state.engine)
         self.engine.params = self.params
         self.log.restore(state.log)
-        self.readouts.restore(state.readouts, state.frame + 1)
         self.frame = state.frame
         self._incoming = self._recording.measurements(*self._part, after=state.place)
         self._waiting, self._dropped, self.finished = None, 0, False

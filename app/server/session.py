@@ -73,7 +73,6 @@ class Session:
         params: to begin with.
         open_run: opens a recording.
         resolve: parameters that a recording is opened with, before changes by hand; None: the present ones.
-        chunk_voxel: edge of the voxels (m) in which keyframe clouds are thinned for the page.
         journals: folder in which sessions are kept while they go on; None: nowhere.
         clock: monotonic seconds.
     """
@@ -85,12 +84,11 @@ class Session:
         open_run: OpenRun,
         *,
         resolve: Callable[[Path], Params] | None = None,
-        chunk_voxel: float = 0.05,
         journals: Path | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._outbox = outbox
-        self._page = Publisher(outbox, chunk_voxel)
+        self._page = Publisher(outbox)
         self._desk = LoopDesk(outbox)
         self._saver = Saver()
         self._player = Player(outbox, self._page, self._saver, clock)
@@ -191,7 +189,8 @@ class Session:
         run = self._need_run()
         if run.live:
             raise HemislamError("A live walk can not be compared with a trajectory; record it, and open the recording.")
-        self._page.compared(run, run.compare_with(path))
+        run.compare_with(path)
+        self._page.compared(run)
 
     def _set_breakpoints(self, breakpoints: Breakpoints) -> None:
         self._player.breakpoints = breakpoints

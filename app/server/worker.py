@@ -15,15 +15,13 @@ from typing import Any
 
 from app import processes
 from app.logs import process_logs
-from app.memory import give_back, tidy
 from app.server import wire
-from app.server.delta import Delta, Fold
+from app.server.delta import Delta
+from app.server.fold import Fold
 from app.server.protocol import LIVE, Command, Notice, OpenRecording, Progress, Restart, Shutdown, Snapshot
 from app.server.setup import Setup
 from app.server.wire import Pipe
 
-TIDIED = 20
-"""Keyframes of a live walk after which the holes are given back that thinned clouds leave in memory."""
 MOST_REVIVALS = 25
 """Deaths of the engine's process after which it is not started again by itself."""
 
@@ -37,8 +35,6 @@ def _run_engine(commands: Pipe, updates: Pipe, setup: Setup) -> None:
 
 
 def _logged(main: Main, commands: Pipe, updates: Pipe, setup: Setup) -> None:
-    if setup.live is not None:
-        give_back()
     processes.begin("hemislam-engine")
     with process_logs("engine"):
         main(commands, updates, setup)
@@ -138,7 +134,6 @@ class EngineProcess:
 
     def _read(self, updates: Pipe, commands: Pipe, process: multiprocessing.process.BaseProcess) -> None:
         """Fold what the process sends, until it ends."""
-        tidied = 0
         with contextlib.suppress(EOFError, OSError):
             while True:
                 delta: Delta = wire.receive(updates)
@@ -149,11 +144,6 @@ class EngineProcess:
                         break
                     self._fold.apply(delta)
                     self._changed.notify_all()
-                del delta  # clouds as they were before they were thinned, which would be kept until the next one
-                there = len(self.snapshot.chunks)
-                if self._setup.live is not None and abs(there - tidied) >= TIDIED:
-                    tidied = there
-                    tidy()
         updates.close()
         process.join()
         if process is self._process:

@@ -39,6 +39,15 @@ class Trajectory:
         rotations: Rotation = Rotation.from_quat(self.quaternions)
         return rotations
 
+    @property
+    def poses(self) -> F64:
+        """(n, 4, 4) T_world_imu."""
+        poses = np.tile(np.eye(4), (len(self), 1, 1))
+        if len(self):
+            poses[:, :3, :3] = self.rotations.as_matrix()
+        poses[:, :3, 3] = self.positions
+        return poses
+
     def chosen(self, which: npt.NDArray[np.bool_]) -> "Trajectory":
         """Only the poses where `which` (n,) is true."""
         return Trajectory(self.stamps_ns[which], self.positions[which], self.quaternions[which])

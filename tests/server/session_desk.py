@@ -4,7 +4,8 @@ from pathlib import Path
 
 import server_fakes as fakes
 
-from app.server.delta import Fold, Outbox
+from app.server.delta import Outbox
+from app.server.fold import Fold
 from app.server.protocol import Command, Snapshot
 from app.server.run import Run
 from app.server.session import Session

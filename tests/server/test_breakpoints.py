@@ -13,7 +13,8 @@ import pytest
 import server_fakes as fakes
 
 from app.server.breakpoints import Breakpoints, Moment, reasons
-from app.server.delta import Fold, Outbox
+from app.server.delta import Outbox
+from app.server.fold import Fold
 from app.server.protocol import Pause, Play, Restart, Seek, SetBreakpoints, SetSpeed, Snapshot, StepFrame
 from app.server.run import Run
 from app.server.session import Session

@@ -8,11 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from app.mapping.frames import READOUTS, Frame
+from app.mapping.log import Log
 from app.server import chunks as chunks_module
 from app.server.chunks import COARSEST_LEVEL, MOST_SHOWN, coarser, next_to_thin, voxel_of_level, within_budget
-from app.server.delta import Fold, Outbox
-from app.server.protocol import Chunk
+from app.server.delta import CHUNKS_AT_ONCE, Outbox
+from app.server.fold import Fold
+from app.server.protocol import Chunk, Transport
 from app.slam.params import Params
+from app.slam.types import Cloud, Keyframe
 
 ALONG_M = 2.0
 
@@ -74,39 +78,65 @@ def test_thinning_ends_where_nothing_is_left_to_thin() -> None:
     assert next_to_thin([], np.empty((0, 3)), np.zeros(3)) is None
 
 
+class Session:
+    """A session of keyframes along x, and a reader of it."""
+
+    def __init__(self, budget: int) -> None:
+        self.frames: Log[Frame] = Log()
+        self.keyframes: list[Keyframe] = []
+        self.outbox, self.fold = Outbox(Params()), Fold(point_budget=budget)
+        self.outbox.begin(self.frames, self.keyframes)
+
+    def add(self) -> None:
+        T = walk(len(self.frames) + 1)[-1]
+        one = chunk(len(self.keyframes))
+        cloud = Cloud(one.points, one.labels, one.intensity, one.ring, np.zeros(len(one.points), np.int32))
+        self.keyframes.append(Keyframe(one.index, one.frame, one.stamp_ns, T, np.eye(4), np.eye(6), cloud))
+        self.frames.append(Frame(one.stamp_ns, True, T[:3, 3], np.array([0.0, 0, 0, 1]), np.zeros(len(READOUTS))))
+
+    def show(self, frames: int) -> tuple[Chunk, ...]:
+        """Everything that the reader shows at this frame."""
+        self.outbox.put(transport=Transport(frame=frames - 1))
+        while self.outbox.filled:
+            self.fold.apply(self.outbox.take())
+        return self.fold.snapshot.chunks
+
+
 def test_a_reader_never_holds_more_points_than_its_budget() -> None:
-    budget, outbox = 50_000, Outbox(Params())
-    fold = Fold(point_budget=budget)
+    budget = 50_000
+    session = Session(budget)
     for index in range(300):
-        outbox.chunk(chunk(index))
-        outbox.put(keyframe_poses=walk(index + 1))
-        snapshot = fold.apply(outbox.take())
-        assert len(snapshot.chunks) == index + 1
-        assert sum(len(one.points) for one in snapshot.chunks) <= budget
-    levels = [one.level for one in snapshot.chunks]
+        session.add()
+        chunks = session.show(index + 1)
+        assert len(chunks) == index + 1
+        assert sum(len(one.points) for one in chunks) <= budget
+    levels = [one.level for one in chunks]
     assert levels[0] > 0
-    assert levels == sorted(levels, reverse=True)  # the walk went straight: the farther, the coarser
-    for one in snapshot.chunks[:5]:  # a thinned chunk does not hold on to the whole one
+    assert levels == sorted(levels, reverse=True)  # straight ahead: the farther, the coarser
+    for one in chunks[:5]:  # a thinned chunk does not hold on to the whole one
         assert one.points.base is None or one.points.base.nbytes == one.points.nbytes
 
 
-def test_keyframes_that_come_again_are_as_they_were_thinned_and_within_the_budget() -> None:
-    budget, outbox = 50_000, Outbox(Params())
-    fold = Fold(point_budget=budget)
-    for index in range(300):
-        outbox.chunk(chunk(index))
-    outbox.go_to(0, 120)
-    outbox.put(keyframe_poses=walk(120))
-    some = fold.apply(outbox.take()).chunks
-    outbox.go_to(0, 300)
-    outbox.put(keyframe_poses=walk(300))
-    every = fold.apply(outbox.take()).chunks
+def test_keyframes_that_are_shown_again_are_as_they_were_and_within_the_budget() -> None:
+    budget = 50_000
+    session = Session(budget)
+    for _ in range(300):
+        session.add()
+    some, every = session.show(120), session.show(300)
     assert (len(some), len(every)) == (120, 300)
-    for shown in (some, every):
-        assert sum(len(one.points) for one in shown) <= budget
-    outbox.go_to(0, 120)
-    outbox.put(keyframe_poses=walk(120))
-    assert fold.apply(outbox.take()).chunks == every[:120], "levels never fall"
+    assert sum(len(one.points) for one in every) <= budget
+    assert session.show(120) == every[:120], "levels never fall"
+
+
+def test_a_reader_far_behind_gets_some_clouds_at_a_time() -> None:
+    session = Session(10**9)
+    for _ in range(3 * CHUNKS_AT_ONCE):
+        session.add()
+    session.outbox.put(transport=Transport(frame=3 * CHUNKS_AT_ONCE - 1))
+    counts = []
+    while session.outbox.filled:
+        counts.append(len(session.fold.apply(session.outbox.take()).chunks))
+    assert counts == [CHUNKS_AT_ONCE, 2 * CHUNKS_AT_ONCE, 3 * CHUNKS_AT_ONCE]
 
 
 def drawn_with_all_points(keyframes: list[Chunk], poses: np.ndarray) -> tuple[Chunk, ...]:

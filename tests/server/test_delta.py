@@ -9,11 +9,14 @@ import server_fakes as fakes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from app.mapping.frames import READOUTS, Frame
+from app.mapping.log import Log
 from app.server.chunks import one_per_voxel
-from app.server.delta import Fold, Outbox
+from app.server.delta import Outbox
+from app.server.fold import Fold
 from app.server.protocol import (
-    SERIES,
     Command,
+    OpenedRecording,
     OpenRecording,
     Pause,
     Play,
@@ -23,10 +26,11 @@ from app.server.protocol import (
     SetSpeed,
     Snapshot,
     StepFrame,
+    Transport,
 )
 from app.server.session import Session
+from app.slam.map_frame import MapFrame
 from app.slam.params import Params
-from app.slam.rows import table
 
 COMMANDS: list[Command] = [
     Play(),
@@ -90,41 +94,73 @@ def test_a_reader_that_misses_updates_ends_with_the_same_snapshot(
     assert content(attentive) == content(lazy)
 
 
-def test_poses_that_stay_are_held_once_however_many_snapshots_there_are_of_them() -> None:
-    fold, outbox = Fold(), Outbox(Params())
+class Frames:
+    """Frames along x without clouds, and a reader of them."""
 
-    def told(poses: np.ndarray) -> np.ndarray:
-        outbox.put(keyframe_poses=poses.copy())
-        shown = fold.apply(outbox.take()).keyframe_poses
-        assert shown is not None
-        np.testing.assert_array_equal(shown, poses)
-        return shown
+    def __init__(self) -> None:
+        self.log: Log[Frame] = Log()
+        self.outbox, self.fold = Outbox(Params()), Fold()
+        self.outbox.begin(self.log, [])
 
-    walk = np.random.default_rng(0).normal(size=(102, 4, 4))
-    first, longer, corrected = told(walk[:100]), told(walk), told(walk + 1.0)
-    assert np.shares_memory(first, longer) and not np.shares_memory(longer, corrected)
-    np.testing.assert_array_equal(longer, walk, "what was shown stays as it was")
+    def add(self, count: int = 1, *, keyframes: bool = False) -> None:
+        for _ in range(count):
+            at = len(self.log)
+            position, turn = np.array([float(at), 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])
+            self.log.append(Frame(at, keyframes, position, turn, np.full(len(READOUTS), float(at))))
+
+    def see(self, **changes: Any) -> Snapshot:
+        self.outbox.put(transport=Transport(frame=len(self.log) - 1), **changes)
+        return self.fold.apply(self.outbox.take())
+
+
+def test_poses_that_stay_are_the_same_object() -> None:
+    """So that the page knows at once that no keyframe has moved."""
+    frames = Frames()
+    frames.add(5, keyframes=True)
+    poses = frames.see().keyframe_poses
+    frames.add(3)
+    assert frames.see().keyframe_poses is poses
+
+
+def test_a_loop_closure_sends_corrections_and_no_frame() -> None:
+    frames = Frames()
+    frames.add(10, keyframes=True)
+    before = frames.see()
+    up = np.tile(np.eye(4), (10, 1, 1))
+    up[:, 2, 3] = np.arange(10.0)
+    frames.outbox.put(corrections=MapFrame(np.arange(10), up))
+    delta = frames.outbox.take()
+    assert (delta.keep, delta.frames, delta.chunks) == (10, (), ())
+    after = frames.fold.apply(delta)
+    assert before.trajectory is not None and after.trajectory is not None and after.keyframe_poses is not None
+    np.testing.assert_allclose(after.trajectory[:, 2], np.arange(10.0), atol=1e-12)
+    np.testing.assert_allclose(after.keyframe_poses[:, 2, 3], np.arange(10.0), atol=1e-12)
+    assert not before.trajectory[:, 2].any(), "what was shown before stays as it was"
+
+
+def test_the_error_to_the_truth_follows_from_the_trajectory_that_is_shown() -> None:
+    frames, turn = Frames(), np.array([0.0, 0.0, 0.0, 1.0])
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.1]])
+    for stamp, position in enumerate(square):
+        frames.log.append(Frame(stamp, False, position, turn, np.zeros(len(READOUTS))))
+    theirs = square[:, [1, 0, 2]] * [-1, 1, 1] + 5.0  # turned and shifted
+    recording = OpenedRecording(Path("square.mcap"), 0, 4e-9, 4, (), np.arange(4), theirs)
+    seen = frames.see(recording=recording)
+    np.testing.assert_allclose(seen.series["error_m"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(seen.series["distance"][:3], [0.0, 1.0, 2.0])
+    assert seen.T_map_truth is not None
+    np.testing.assert_allclose(theirs @ seen.T_map_truth[:3, :3].T + seen.T_map_truth[:3, 3], square, atol=1e-9)
+    none = frames.see(recording=replace(recording, truth_stamps_ns=None, truth_positions=None))
+    assert none.T_map_truth is None and np.isnan(none.series["error_m"]).all()
 
 
 def test_nothing_is_kept_for_a_reader_that_has_it() -> None:
-    outbox = Outbox(Params())
-    outbox.frame(np.zeros(3), [0.0] * len(SERIES))
-    outbox.notice("info", "one")
-    outbox.take()
-    assert not outbox.filled and not outbox.urgent
-
-
-@given(st.lists(st.integers(0, 400), max_size=8))
-def test_views_of_a_growing_table_stay_as_they_were(lengths: list[int]) -> None:
-    rows, views, expected = table(2), [], np.zeros((0, 2))
-    for number, length in enumerate(lengths):
-        block = np.full((length, 2), float(number))
-        rows.extend(block)
-        expected = np.vstack([expected, block])
-        views.append((rows.view(), expected))
-    for view, then in views:
-        assert not view.flags.writeable
-        np.testing.assert_array_equal(view, then)
+    frames = Frames()
+    frames.add()
+    frames.outbox.notice("info", "one")
+    assert frames.outbox.filled
+    frames.see()
+    assert not frames.outbox.filled and not frames.outbox.urgent
 
 
 @given(seed=st.integers(0, 1000), size=st.sampled_from([0.05, 0.3, 1.0]), shift=st.floats(-500, 500))

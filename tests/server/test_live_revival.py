@@ -18,7 +18,8 @@ from app.sensors.live.source import Event
 from app.sensors.live.status import LiveState
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
-from app.server.delta import Fold, Outbox
+from app.server.delta import Outbox
+from app.server.fold import Fold
 from app.server.live import LiveRun, open_live_run
 from app.server.protocol import LIVE, Snapshot
 from app.server.session import Session

@@ -57,7 +57,8 @@ class KnownKeyframes:
         """All but the first `count`."""
         if count >= len(self):
             return
-        self._frames, self._stamps = self._frames.rewound(count), self._stamps.rewound(count)
+        self._frames.truncate(count)
+        self._stamps.truncate(count)
         del self._params[count:]
         self._keep({known: state for known, state in self.states.items() if known <= count})
 

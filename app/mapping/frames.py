@@ -1,0 +1,88 @@
+"""What the session keeps of every processed frame, and the numbers that are plotted of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from app.slam import lie
+from app.slam.types import F64, StepResult
+
+READOUTS = (
+    "planarity", "seeds", "ground_share", "points_in", "points_reduced", "points_filter",
+    "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "loops_ms",
+    "total_ms",
+    "iterations", "used", "inliers", "residual_rms", "degeneracy", "imu_gap_s", "dropped",
+    "speed", "gyro_bias", "accel_bias", "turn_x", "turn_y", "turn_z",
+)  # fmt: skip
+"""Numbers of one frame, nan where there is none. `used` points were looked up in the map. `degeneracy` is the smallest
+eigenvalue of the pose information. `imu_gap_s` and `dropped` are as in `StepResult`. `speed` is in m/s. The biases are
+norms. `turn_*` is the rotation vector (rad) of R_odom_imu."""
+
+FRAME = np.dtype(
+    [
+        ("stamp_ns", "i8"),
+        ("keyframe", "?"),
+        ("position", "f8", 3),
+        ("quaternion", "f8", 4),
+        ("readouts", "f8", len(READOUTS)),
+    ]
+)
+"""A `Frame` as a row of a table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A processed frame.
+
+    Attributes:
+        stamp_ns: end of its scan. keyframe: whether it became a keyframe.
+        position: (3,) and quaternion: (4,), x, y, z, w, of T_odom_imu. readouts: (len(READOUTS),).
+    """
+
+    stamp_ns: int
+    keyframe: bool
+    position: F64
+    quaternion: F64
+    readouts: F64
+
+    @classmethod
+    def of(cls, result: StepResult) -> "Frame":
+        T_odom_imu = result.state.T_odom_imu
+        return cls(
+            stamp_ns=result.stamp_ns,
+            keyframe=result.keyframe is not None,
+            position=T_odom_imu[:3, 3].copy(),
+            quaternion=Rotation.from_matrix(T_odom_imu[:3, :3]).as_quat(),
+            readouts=_readouts(result),
+        )
+
+
+def as_table(frames: Sequence[Frame]) -> np.ndarray:
+    """(n,) of type `FRAME`."""
+    return np.array([(f.stamp_ns, f.keyframe, f.position, f.quaternion, f.readouts) for f in frames], dtype=FRAME)
+
+
+def _readouts(result: StepResult) -> F64:
+    state, ground, registration = result.state, result.ground, result.registration
+    values = {
+        "planarity": ground.planarity,
+        "seeds": ground.seeds,
+        "ground_share": ground.share,
+        "points_in": result.points_in,
+        "points_reduced": result.points_reduced,
+        "points_filter": result.points_filter,
+        "iterations": registration.iterations,
+        "used": registration.used,
+        "inliers": registration.inliers,
+        "residual_rms": registration.residual_rms,
+        "degeneracy": registration.eigenvalues[0] if len(registration.eigenvalues) else np.nan,
+        "imu_gap_s": result.imu_gap_s,
+        "dropped": result.dropped,
+        "speed": np.linalg.norm(state.v_odom_imu),
+        "gyro_bias": np.linalg.norm(state.b_gyro),
+        "accel_bias": np.linalg.norm(state.b_accel),
+        **dict(zip(("turn_x", "turn_y", "turn_z"), lie.log(state.R_odom_imu), strict=True)),
+    } | {f"{stage}_ms": ms for stage, ms in result.timings_ms.items()}
+    return np.array([values.get(name, np.nan) for name in READOUTS], dtype=np.float64)
