@@ -1,19 +1,25 @@
-"""The REST interface for scripts: state, parameters, transport, breakpoints, loops, notes, recordings, exports."""
+"""The REST interface for scripts: state, parameters, transport, breakpoints, loops, notes, recordings, exports.
 
+A new action is one entry in `TRANSPORT` or `LOOPS`.
+"""
+
+import functools
 import math
+import operator
 import re
 import shutil
 import tempfile
 import threading
 import time
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, BackgroundTasks, HTTPException
 from fastapi import Path as PathParam
 from fastapi.responses import FileResponse, PlainTextResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
 from app.server.breakpoints import Breakpoints
 from app.server.folders import Folders
@@ -38,38 +44,87 @@ from app.server.protocol import (
     UndoLoop,
 )
 from app.server.views import LoopsState, Speed, StateView, loops_state, state_view
-from app.slam.loops.types import Accept, Add, Reject, SetWeight, Solve
+from app.slam.loops.types import Accept, Add, LoopEdit, Reject, SetWeight, Solve
 from app.slam.params import Params
 from app.slam.results import EXPORTS
 from app.slam.trajectory import truth_beside
 
-EXPORT_PATIENCE_S = 600.0
+EXPORT_TIMEOUT_S = 600.0
 MOST_EXPORTS = 4
-"""At once: each keeps one of the threads that answer, of which there are forty."""
+"""At the same time. Each holds one of the forty threads that answer requests."""
 
 
-class Simple(BaseModel):
-    action: Literal["play", "pause", "restart"]
+# --- actions -------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Action:
+    """What `{"action": NAME, ...}` in a request's body sends to the engine.
+
+    Attributes:
+        command: makes the command of the fields. fields: as `pydantic.create_model` takes them.
+    """
+
+    command: Callable[..., Command]
+    fields: Mapping[str, Any] = field(default_factory=dict)
 
 
-class StepBody(BaseModel):
-    action: Literal["step"]
-    frames: int = Field(1, ge=1)
+def _edit(kind: Callable[..., LoopEdit]) -> Callable[..., Command]:
+    return lambda **fields: EditLoop(kind(**fields))
 
 
-class SeekBody(BaseModel):
-    action: Literal["seek"]
-    frame: int = Field(ge=0)
+Replay = Annotated[Speed, AfterValidator(lambda speed: math.inf if speed == "max" else speed)]
+Index = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+Weight = Annotated[float, Field(gt=0, description="Divides the loop's covariance.")]
+Registered = Annotated[bool, Field(description="Register the two submaps; false ties them where the graph has them.")]
+PAIR = {"older": (Index, ...), "newer": (Index, ...)}
+
+TRANSPORT = {
+    "play": Action(Play),
+    "pause": Action(Pause),
+    "restart": Action(Restart),
+    "step": Action(StepFrame, {"frames": (Count, 1)}),
+    "seek": Action(Seek, {"frame": (Index, ...)}),
+    "speed": Action(SetSpeed, {"factor": (Replay, ...)}),
+}
+LOOPS = {
+    "accept": Action(_edit(Accept), PAIR),
+    "reject": Action(_edit(Reject), PAIR),
+    "weigh": Action(_edit(SetWeight), PAIR | {"weight": (Weight, 1.0)}),
+    "add": Action(_edit(Add), PAIR | {"register": (Registered, True)}),
+    "solve": Action(_edit(Solve)),
+    "undo": Action(UndoLoop),
+    "redo": Action(RedoLoop),
+}
 
 
-class SpeedBody(BaseModel):
-    action: Literal["speed"]
-    factor: Speed
+class _Body(BaseModel):
+    """Its fields end in `_`, which requests do not see: `register` is a name that pydantic uses itself."""
+
+    model_config = ConfigDict(alias_generator=lambda name: name.removesuffix("_"))
 
 
-Action = Annotated[Simple | StepBody | SeekBody | SpeedBody, Field(discriminator="action")]
+def _bodies(actions: Mapping[str, Action]) -> Any:
+    """The type of a body that names one of the actions."""
+    models = []
+    for name, action in actions.items():
+        fields: dict[str, Any] = {f"{field}_": definition for field, definition in action.fields.items()}
+        fields["action"] = (Literal[name], ...)
+        models.append(create_model(f"{name.title()}Action", __base__=_Body, **fields))
+    return Annotated[functools.reduce(operator.or_, models), Field(discriminator="action")]
 
 
+def _add_actions(router: APIRouter, path: str, engine: Engine, actions: Mapping[str, Action], summary: str) -> None:
+    """A route that sends the engine the command of the action named in the body."""
+
+    def post(body: Any) -> None:
+        fields = body.model_dump(by_alias=True)
+        _send(engine, actions[fields.pop("action")].command(**fields))
+
+    post.__annotations__["body"] = _bodies(actions)
+    router.add_api_route(path, post, methods=["POST"], status_code=202, name=path.strip("/"), description=summary)
+
+
+# --- other bodies --------------------------------------------------------------------------------
 class BreakpointsBody(BaseModel):
     """Where playing pauses. A limit pauses where it is exceeded; left out or null it does not."""
 
@@ -84,23 +139,6 @@ class BreakpointsBody(BaseModel):
     residual: float | None = Field(None, ge=0, description="RMS of the filter's update, m.")
     frame_ms: float | None = Field(None, ge=0, description="Time that the engine took for the frame, ms.")
     error: float | None = Field(None, ge=0, description="To the truth, m.")
-
-
-class EditBody(BaseModel):
-    """The user's word on the loop of two keyframes."""
-
-    action: Literal["accept", "reject", "weigh", "add"]
-    older: int = Field(ge=0)
-    newer: int = Field(ge=0)
-    weight: float = Field(1.0, gt=0, description="Of `weigh`: divides the loop's covariance.")
-    register_: bool = Field(True, alias="register", description="Of `add`: register the two, or tie them as they are.")
-
-
-class GraphBody(BaseModel):
-    action: Literal["undo", "redo", "solve"]
-
-
-LoopAction = Annotated[EditBody | GraphBody, Field(discriminator="action")]
 
 
 class NoteBody(BaseModel):
@@ -143,7 +181,7 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
 
     @router.patch("/params")
     def change(tree: dict[str, dict[str, Any]]) -> Params:
-        """Change some, for example {"ground": {"alpha": 30}}. One that can not be used refuses them all."""
+        """Change some, for example {"ground": {"alpha": 30}}. If one of them cannot be used, none is changed."""
         before = engine.snapshot.params
         after = before.merged(tree)
         _send(
@@ -152,10 +190,13 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
         )
         return after
 
-    @router.post("/transport", status_code=202)
-    def transport(action: Action) -> None:
-        """Play, pause, step, seek, set the speed ("max": as fast as it can), start again."""
-        _send(engine, _command(action))
+    _add_actions(
+        router,
+        "/transport",
+        engine,
+        TRANSPORT,
+        'Play, pause, step, seek, set the speed ("max": no limit), start again.',
+    )
 
     @router.get("/breakpoints")
     def breakpoints() -> BreakpointsBody:
@@ -164,46 +205,49 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
 
     @router.put("/breakpoints")
     def set_breakpoints(body: BreakpointsBody) -> BreakpointsBody:
-        """Pause where one of these holds, in place of those before. Why it paused, the notices in the state tell."""
+        """Replace the breakpoints. The notices in the state say why playing paused."""
         _send(engine, SetBreakpoints(Breakpoints(**body.model_dump())))
         return body
 
     @router.get("/loops")
     def loops() -> LoopsState:
-        """Loop candidates with their verdicts, and the user's word on them."""
+        """Loop candidates with their verdicts, and the user's edits."""
         return loops_state(engine.snapshot.loops)
 
-    @router.post("/loops", status_code=202)
-    def edit_loops(body: LoopAction) -> None:
-        """Accept, reject, weigh or add a loop; solve all factors at once (Levenberg-Marquardt); undo or redo that."""
-        _send(engine, _loop_command(body))
+    _add_actions(
+        router,
+        "/loops",
+        engine,
+        LOOPS,
+        "Accept, reject, weigh or add a loop; solve all factors at once (Levenberg-Marquardt); undo or redo an edit.",
+    )
 
     @router.post("/notes", status_code=202)
     def add_note(body: NoteBody) -> None:
-        """Keep a remark on the present frame in the session; the state lists them."""
+        """Add a note on the current frame to the session; the state lists them."""
         _send(engine, AddNote(body.text))
 
     @router.get("/recordings")
     def recordings() -> list[str]:
-        """What can be opened."""
+        """The recordings and sessions that can be opened."""
         return [str(path) for path in folders.recordings()]
 
     @router.post("/recordings", status_code=202)
     def open_recording(body: OpenBody) -> None:
-        """Open one. Whether that worked, the notices in the state tell."""
+        """Open one. The notices in the state say whether that worked."""
         path = folders.openable(body.path)
         _send(engine, OpenRecording(path, folders.inside(body.truth) if body.truth else truth_beside(path)))
 
     @router.post("/truth", status_code=202)
     def compare_with(body: CompareBody) -> None:
-        """Hold the walk against another trajectory, also what there is of it already."""
+        """Compare the trajectory, from its start, with another one."""
         _send(engine, CompareWith(folders.inside(body.path) if body.path else None))
 
     @router.get("/export/{name}", response_class=FileResponse)
     def export(name: ExportName, background: BackgroundTasks) -> FileResponse:
         """What was processed so far, as `hemislam run` writes it."""
         if not exporting.acquire(blocking=False):
-            raise HTTPException(503, "Enough is being exported at present; ask again in a moment.")
+            raise HTTPException(503, "Too many exports are running; ask again in a moment.")
         try:
             return _exported(engine, name, background)
         finally:
@@ -218,47 +262,13 @@ def _send(engine: Engine, command: Command) -> None:
     engine.send(command)
 
 
-def _command(action: Simple | StepBody | SeekBody | SpeedBody) -> Command:
-    match action:
-        case StepBody(frames=frames):
-            return StepFrame(frames)
-        case SeekBody(frame=frame):
-            return Seek(frame)
-        case SpeedBody(factor=factor):
-            return SetSpeed(math.inf if factor == "max" else factor)
-        case Simple(action="play"):
-            return Play()
-        case Simple(action="pause"):
-            return Pause()
-        case _:
-            return Restart()
-
-
-def _loop_command(body: EditBody | GraphBody) -> Command:
-    match body:
-        case EditBody(action="accept", older=older, newer=newer):
-            return EditLoop(Accept(older, newer))
-        case EditBody(action="reject", older=older, newer=newer):
-            return EditLoop(Reject(older, newer))
-        case EditBody(action="weigh", older=older, newer=newer):
-            return EditLoop(SetWeight(older, newer, body.weight))
-        case EditBody(older=older, newer=newer):
-            return EditLoop(Add(older, newer, register=body.register_))
-        case GraphBody(action="solve"):
-            return EditLoop(Solve())
-        case GraphBody(action="undo"):
-            return UndoLoop()
-        case _:
-            return RedoLoop()
-
-
 def _exported(engine: Engine, name: str, background: BackgroundTasks) -> FileResponse:
     folder = Path(tempfile.mkdtemp(prefix="hemislam-export-"))
     background.add_task(shutil.rmtree, folder, ignore_errors=True)
     try:
         _save(engine, folder, trajectory_only=name == "trajectory.tum")
         if not (folder / name).exists():
-            raise HTTPException(404, f"There is no {name}, since loops are not looked for; set loops.enabled.")
+            raise HTTPException(404, f"There is no {name}, because the loop search is off; set loops.enabled.")
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -266,12 +276,12 @@ def _exported(engine: Engine, name: str, background: BackgroundTasks) -> FileRes
 
 
 def _save(engine: Engine, folder: Path, *, trajectory_only: bool) -> None:
-    """Let the engine save into a folder and wait for it."""
+    """Let the engine save into a folder, and wait until it has."""
     snapshot = engine.snapshot
     if snapshot.transport.frame < 0:
-        raise HTTPException(409, "No frame was processed yet; open a recording and play it first.")
+        raise HTTPException(409, "No frame has been processed yet; open a recording and play it first.")
     _send(engine, Save(folder, trajectory_only))
-    deadline = time.monotonic() + EXPORT_PATIENCE_S
+    deadline = time.monotonic() + EXPORT_TIMEOUT_S
     while time.monotonic() < deadline:
         for saved in snapshot.saved:
             if saved.folder == folder:
@@ -279,6 +289,6 @@ def _save(engine: Engine, folder: Path, *, trajectory_only: bool) -> None:
                     raise HTTPException(500, saved.error)
                 return
         if not snapshot.engine_alive:
-            raise HTTPException(503, "The engine's process has ended while it was saving.")
+            raise HTTPException(503, "The engine's process ended while it was saving.")
         snapshot = engine.wait(snapshot.revision, timeout=1.0)
-    raise HTTPException(504, f"Saving took longer than {EXPORT_PATIENCE_S:.0f} s.")
+    raise HTTPException(504, f"Saving took longer than {EXPORT_TIMEOUT_S:.0f} s.")

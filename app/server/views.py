@@ -1,39 +1,46 @@
-"""The session's state as the REST interface sends it."""
+"""The session's state as the REST interface sends it.
+
+Fields are read from the values that `Snapshot` holds, by name; what has another name or unit there is converted.
+"""
 
 import math
-from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
-from app.sensors.live.status import LiveState
-from app.server.protocol import LoopsView, OpenedRecording, Snapshot
+from app.sensors.findings import Finding
+from app.sensors.live.counters import Counters
+from app.server.protocol import LoopsView, Note, Notice, Snapshot
 from app.slam.loops import edit_files
 from app.slam.types import StepResult
 
+
+def _finite(value: float | None) -> float | None:
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+Finite = Annotated[float | None, BeforeValidator(_finite)]
+"""null where there is no number; JSON knows neither nan nor infinity."""
 Speed = Annotated[float, Field(ge=0.1)] | Literal["max"]
-"""Times real time; JSON knows no infinity."""
+"""Times real time."""
 
 
-class FindingView(BaseModel):
-    subject: str
-    verdict: str
-    text: str
-    option: str
+class View(BaseModel):
+    model_config = ConfigDict(from_attributes=True)
 
 
-class RecordingView(BaseModel):
-    path: str
+class RecordingView(View):
+    path: Annotated[str, BeforeValidator(str)]
     duration_s: float
     frames: int
-    findings: list[FindingView]
+    findings: list[Finding]
 
 
-class TransportView(BaseModel):
+class TransportView(View):
     playing: bool
-    speed: Speed
+    speed: Annotated[Speed, BeforeValidator(lambda speed: "max" if math.isinf(speed) else speed)]
     frame: int
     stamp_ns: int
     finished: bool
@@ -41,7 +48,7 @@ class TransportView(BaseModel):
     dropped: int
 
 
-class FrameView(BaseModel):
+class FrameView(View):
     """The newest frame, without its points."""
 
     index: int
@@ -52,29 +59,23 @@ class FrameView(BaseModel):
     velocity: list[float] = Field(description="m/s, odometry frame.")
     ground_found: bool
     ground_reason: str
-    planarity: float | None
+    planarity: Finite
     seeds: int
-    ground_share: float | None
+    ground_share: Finite
     inliers: int
-    residual_rms: float | None
+    residual_rms: Finite
     degenerate: bool
     timings_ms: dict[str, float]
-    distance: float | None = Field(description="Walked, m.")
-    error: float | None = Field(description="To the truth, aligned to the walk so far, m.")
+    distance: Finite = Field(description="Length of the trajectory so far, m.")
+    error: Finite = Field(description="To the truth, aligned to the trajectory so far, m.")
 
 
-class NoticeView(BaseModel):
-    number: int
-    level: str
-    text: str
-
-
-class ProgressView(BaseModel):
+class ProgressView(View):
     title: str
-    fraction: float | None
+    fraction: Finite
 
 
-class LiveView(BaseModel):
+class LiveView(View):
     """How the live source is doing."""
 
     lidar_hz: float
@@ -83,18 +84,15 @@ class LiveView(BaseModel):
     imu_age_s: float | None
     backlog: int = Field(description="Scans that wait for the engine.")
     clock: str = Field(description='Whose time is used: "sensor", "host", or "" while that is not settled.')
-    imu_lag_s: float | None = Field(description="By how much the IMU's stamps lag behind the LiDAR's.")
+    imu_lag_s: float | None = Field(
+        validation_alias="offset_s", description="By how much the IMU's stamps lag behind the LiDAR's."
+    )
     sensor: str
     recorded: int | None = Field(description="Bytes written; null if nothing is recorded.")
-    counters: dict[str, int]
+    counters: Counters
 
 
-class NoteView(BaseModel):
-    frame: int
-    text: str
-
-
-class LoopView(BaseModel):
+class LoopView(View):
     """A loop candidate, by keyframes."""
 
     older: int
@@ -102,21 +100,21 @@ class LoopView(BaseModel):
     verdict: str
     reason: str
     origin: str
-    edited: bool = Field(description="Whether the verdict is the user's.")
+    edited: bool = Field(description="The verdict is the user's.")
     weight: float
-    represented_by: tuple[int, int] | None = Field(description="A loop that is in the graph for both.")
+    represented_by: tuple[int, int] | None = Field(description="The loop that is in the graph for both.")
     repeats: tuple[int, int] | None = Field(
-        description="A loop near it that measured the same; both are between its keyframes."
+        description="A loop nearby that measured the same; both tie the keyframes of that one."
     )
 
 
 class LoopsState(BaseModel):
     loops: list[LoopView]
-    edits: list[dict[str, Any]] = Field(description="The user's word on loops, in order, as in a file of edits.")
-    undone: list[dict[str, Any]] = Field(description="That can be done again, the next one last.")
+    edits: list[dict[str, Any]] = Field(description="The user's edits, in order, as in a file of edits.")
+    undone: list[dict[str, Any]] = Field(description="Undone edits that can be redone, the next one last.")
 
 
-class StateView(BaseModel):
+class StateView(View):
     session: int
     revision: int
     engine_alive: bool
@@ -126,84 +124,28 @@ class StateView(BaseModel):
     keyframes: int
     progress: ProgressView | None
     pending_restart: list[str]
-    notices: list[NoticeView]
+    notices: list[Notice]
     live: LiveView | None
-    journal: str | None = Field(description="File in which the session is kept; opening it goes on from there.")
-    notes: list[NoteView]
+    journal: str | None = Field(description="The session file; opening it continues the session.")
+    notes: list[Note]
 
 
 def loops_state(view: LoopsView) -> LoopsState:
     return LoopsState(
-        loops=[
-            LoopView(
-                older=edge.older,
-                newer=edge.newer,
-                verdict=edge.verdict,
-                reason=edge.reason,
-                origin=edge.origin,
-                edited=edge.edited,
-                weight=edge.weight,
-                represented_by=edge.represented_by,
-                repeats=edge.repeats,
-            )
-            for edge in view.edges
-        ],
+        loops=[LoopView.model_validate(edge) for edge in view.edges],
         edits=yaml.safe_load(edit_files.write(view.undo)),
         undone=yaml.safe_load(edit_files.write(view.redo)),
     )
 
 
 def state_view(snapshot: Snapshot) -> StateView:
-    recording, transport, progress = snapshot.recording, snapshot.transport, snapshot.progress
-    return StateView(
-        session=snapshot.session,
-        revision=snapshot.revision,
-        engine_alive=snapshot.engine_alive,
-        recording=_recording(recording) if recording else None,
-        transport=TransportView(
-            playing=transport.playing,
-            speed="max" if math.isinf(transport.speed) else transport.speed,
-            frame=transport.frame,
-            stamp_ns=transport.stamp_ns,
-            finished=transport.finished,
-            frames_per_second=transport.frames_per_second,
-            dropped=transport.dropped,
-        ),
-        frame=_frame(snapshot.result, snapshot) if snapshot.result else None,
-        keyframes=len(snapshot.chunks),
-        progress=ProgressView(title=progress.title, fraction=_finite(progress.fraction)) if progress else None,
-        pending_restart=list(snapshot.pending_restart),
-        notices=[NoticeView(number=n.number, level=n.level, text=n.text) for n in snapshot.notices],
-        live=_live(snapshot.live) if snapshot.live else None,
-        journal=str(snapshot.journal) if snapshot.journal else None,
-        notes=[NoteView(frame=note.frame, text=note.text) for note in snapshot.notes],
-    )
-
-
-def _live(state: LiveState) -> LiveView:
-    return LiveView(
-        lidar_hz=state.lidar_hz,
-        imu_hz=state.imu_hz,
-        lidar_age_s=state.lidar_age_s,
-        imu_age_s=state.imu_age_s,
-        backlog=state.backlog,
-        clock=state.clock,
-        imu_lag_s=state.offset_s,
-        sensor=state.sensor,
-        recorded=state.recorded,
-        counters=asdict(state.counters),
-    )
-
-
-def _recording(recording: OpenedRecording) -> RecordingView:
-    return RecordingView(
-        path=str(recording.path),
-        duration_s=recording.duration_s,
-        frames=recording.frames,
-        findings=[
-            FindingView(subject=f.subject, verdict=f.verdict, text=f.text, option=f.option) for f in recording.findings
-        ],
-    )
+    computed = {
+        "frame": _frame(snapshot.result, snapshot) if snapshot.result else None,
+        "keyframes": len(snapshot.chunks),
+        "journal": str(snapshot.journal) if snapshot.journal else None,
+    }
+    taken = {name: getattr(snapshot, name) for name in StateView.model_fields if name not in computed}
+    return StateView.model_validate(taken | computed)
 
 
 def _frame(result: StepResult, snapshot: Snapshot) -> FrameView:
@@ -218,17 +160,13 @@ def _frame(result: StepResult, snapshot: Snapshot) -> FrameView:
         velocity=result.state.v_odom_imu.tolist(),
         ground_found=ground.found,
         ground_reason=ground.reason,
-        planarity=_finite(ground.planarity),
+        planarity=ground.planarity,
         seeds=ground.seeds,
-        ground_share=_finite(ground.share),
+        ground_share=ground.share,
         inliers=registration.inliers,
-        residual_rms=_finite(registration.residual_rms),
+        residual_rms=registration.residual_rms,
         degenerate=registration.degenerate,
         timings_ms=result.timings_ms,
-        distance=_finite(newest.get("distance", math.nan)),
-        error=_finite(newest.get("error_m", math.nan)),
+        distance=newest.get("distance"),
+        error=newest.get("error_m"),
     )
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

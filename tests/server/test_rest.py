@@ -65,7 +65,7 @@ def test_exports_by_rest(site: Site) -> None:
     assert f"element vertex {5 * fakes.POINTS:012d}".encode() in cloud
     assert httpx.get(site.url("/api/export/passwd")).status_code == 422
     without_loops = httpx.get(site.url("/api/export/graph.g2o"), timeout=PATIENCE_S)
-    assert without_loops.status_code == 404 and "loops are not looked for" in without_loops.json()["detail"]
+    assert without_loops.status_code == 404 and "loop search is off" in without_loops.json()["detail"]
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../../../../etc/passwd", "missing.mcap"])
