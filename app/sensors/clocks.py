@@ -48,7 +48,7 @@ def clock_finding(offset_s: float, applied_s: float, logged_apart: bool) -> Find
             f"LiDAR and IMU stamps agree within {abs(offset_s) * 1e3:.0f} ms, judged by when they were logged{applied}"
         )
         if not logged_apart:
-            text = f"log times are copies of the stamps: whether the two clocks agree can not be told{applied}"
+            text = f"log times are copies of the stamps: whether the two clocks agree cannot be told{applied}"
         return Finding("clocks", "fine", text)
     text = (
         f"the IMU's stamps are {abs(offset_s):.3f} s {'behind' if offset_s > 0 else 'ahead of'} the LiDAR's, judged by "

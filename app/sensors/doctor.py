@@ -33,7 +33,7 @@ def examine(
         progress: told the fraction read, 0-1, now and then.
 
     Raises:
-        HemislamError: the recording can not be opened. Damage further on is a finding.
+        HemislamError: the recording cannot be opened. Damage further on is a finding.
     """
     with open_recording(path, params) as recording:
         census = _Census(Sequencer(params.imu.max_gap))

@@ -1,7 +1,7 @@
-"""How a recording is to be read: each `auto` decided from its first messages, with the evidence.
+"""How a recording is read: each `auto` is settled from its first messages.
 
-`settle_cloud` for the point clouds, `settle_imu` for the IMU. Every decision is a `Finding` that
-states its evidence and names the option that overrules it.
+`settle_cloud` does it for the point clouds, `settle_imu` for the IMU. Every decision is a `Finding` that states its
+evidence and names the option that changes it.
 """
 
 from dataclasses import dataclass, replace
@@ -11,29 +11,17 @@ import numpy as np
 import numpy.typing as npt
 
 from app.sensors.azimuth import sense_of_rotation, settle_spin
+from app.sensors.cloud_types import POINT_CLOUD_2, CloudMessage, CloudType, Probe
 from app.sensors.findings import Finding
-from app.sensors.pointcloud import CloudLayout, CloudMessage, valid_points
-from app.sensors.rings import Sample, settle_rings
-from app.sensors.timing import Clocked, Timing, may_be_time, settle_timing
+from app.sensors.pointcloud import CloudLayout
+from app.sensors.rings import settle_rings
+from app.sensors.timing import Timing, settle_timing
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.params import Params, RecordingParams
 from app.slam.types import F32, F64, I64, U16
 
-INTENSITY_NAMES = ("intensity", "intensities", "reflectivity", "reflectance", "i")
 STANDARD_GRAVITY = 9.80665
-
-
-@dataclass(frozen=True, slots=True)
-class Probe:
-    """One cloud of the first few: when it was logged, and what it holds.
-
-    `stamped` is False if its header carries no time, and `cloud.stamp_ns` is the log time.
-    """
-
-    log_ns: int
-    cloud: CloudMessage
-    stamped: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +34,13 @@ class ImuProbe:
     accel: F64
 
 
-def settle_cloud(probes: list[Probe], chosen: RecordingParams, where: str) -> tuple[CloudLayout, list[Finding]]:
-    """Decide a topic's layout from its first clouds, each with at least one valid point.
+def settle_cloud(
+    probes: list[Probe], chosen: RecordingParams, where: str, kind: CloudType = POINT_CLOUD_2
+) -> tuple[CloudLayout, list[Finding]]:
+    """Decide the layout of topic `where` from its first clouds, each with at least one valid point.
 
     Raises:
-        HemislamError: the clouds have no x, y, z, or the time field that was asked for.
+        HemislamError: the clouds have no x, y, z, or not the time field that was asked for.
     """
     fields = probes[0].cloud.fields
     names = {name.lower(): name for name in reversed(fields)}
@@ -59,26 +49,16 @@ def settle_cloud(probes: list[Probe], chosen: RecordingParams, where: str) -> tu
             f"The clouds of {where} have no field `{chosen.time_field}` for the time; they have "
             f"{', '.join(fields)}: choose one by --set recording.time_field=NAME, or `none`."
         )
-    samples, clocked = [], []
-    for probe in probes:
-        points, index = valid_points(probe.cloud.xyz())
-        index = np.arange(len(probe.cloud)) if index is None else index
-        samples.append(Sample(probe.cloud, points, index))
-        columns = {
-            name: probe.cloud.column(name)[index] for name in fields if may_be_time(name) or name == chosen.time_field
-        }
-        clocked.append(Clocked(probe.log_ns, probe.cloud.stamp_ns, columns, probe.stamped))
-    findings = [_fields_finding(probes[0].cloud)]
-    timing, time_findings = settle_timing(clocked, chosen)
-    rings, ring_finding = settle_rings(samples, names)
-    clouds = [(s.points, rings.of(s.cloud, s.points, s.index)) for s in samples]
+    timing, time_findings = settle_timing(probes, kind, chosen)
+    rings, ring_finding = settle_rings(probes, kind, names)
+    clouds = [(probe.points, rings.of(probe.cloud, probe.points, probe.index)) for probe in probes]
     spin = None
     if timing.field is None:
         spin = settle_spin(clouds, timing.period_ns / 1e9)
         if spin.start is None:  # then only the cloud's own first or last point can be at the header stamp
             timing = replace(timing, anchor="last" if timing.shift_ns else "first", shift_ns=0)
     else:
-        time_findings.append(_rotation_finding(clouds[-1], clocked[-1].columns[timing.field], timing))
+        time_findings.append(_rotation_finding(clouds[-1], probes[-1].column(timing.field), timing))
     layout = CloudLayout(
         time_field=timing.field,
         unit_ns=timing.unit_ns,
@@ -86,10 +66,12 @@ def settle_cloud(probes: list[Probe], chosen: RecordingParams, where: str) -> tu
         shift_ns=timing.shift_ns,
         rings=rings,
         spin=spin,
-        intensity_field=next((names[name] for name in INTENSITY_NAMES if name in names), None),
+        intensity_field=next((names[name] for name in kind.intensities if name in names), None),
         ground_field=names.get("ground"),
+        kind=kind,
+        stamped=probes[0].stamped,
     )
-    return layout, [*findings, *time_findings, ring_finding]
+    return layout, [_fields_finding(probes[0].cloud), *time_findings, ring_finding]
 
 
 def settle_imu(probe: ImuProbe, chosen: RecordingParams) -> tuple[float, list[Finding]]:
@@ -102,7 +84,8 @@ def settle_imu(probe: ImuProbe, chosen: RecordingParams) -> tuple[float, list[Fi
         finding = Finding(
             "IMU units",
             "fine" if good else "needs you",
-            f"{chosen.acceleration_unit}, as you set it; {text}" + ("" if good else ", which is no gravity in it"),
+            f"{chosen.acceleration_unit}, as you set it; {text}"
+            + ("" if good else ", which is not gravity in this unit"),
             "" if good else "--set recording.acceleration_unit=auto",
         )
     elif 0.8 < norm < 1.25:
@@ -143,7 +126,7 @@ def gravity_findings(probe: ImuProbe, scale: float, params: Params) -> list[Find
         text = f"down is {off:.0f} deg from the LiDAR's {name} axis ({values})"
         moving = float(np.linalg.norm(gyro.std(axis=0))) > 0.05 or float(np.linalg.norm(accel.std(axis=0))) > 0.5
         if moving:
-            text += f"; the device moves during the first {params.imu.start_duration:g} s, so that is rough"
+            text += f"; the device moves during the first {params.imu.start_duration:g} s, so this is rough"
         findings.append(Finding("gravity", "corrected" if moving else "fine", text))
     if not any(params.sensor.translation + params.sensor.rotation):
         findings.append(
@@ -174,7 +157,7 @@ def _rotation_finding(cloud: tuple[F32, U16], time: npt.NDArray[Any], timing: Ti
         return Finding("rotation", "fine", text)
     text = (
         "the points' times do not follow their azimuth: either the sensor does not rotate, or the times are made up "
-        "and the azimuth should tell them"
+        "and should be derived from the azimuth"
     )
     return Finding("rotation", "needs you", text, "--set recording.time_field=none")
 

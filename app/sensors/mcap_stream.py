@@ -1,4 +1,4 @@
-"""Reads an MCAP from front to back, for those that rosbags refuses: cut off, or without a ROS 2 profile."""
+"""Reads an MCAP from front to back, for files that rosbags refuses: cut off, or without a ROS 2 profile."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,24 +7,26 @@ from typing import Any
 from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Footer, Message, Schema
 from mcap.stream_reader import StreamReader
-from rosbags.typesys import Stores, get_typestore
 
-_DECODERS = {"cdr", "ros1"}
+from app.sensors.findings import Finding
+from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type
 
 
 class McapStream:
-    """Topics and messages of a file, as far as it reaches.
-
-    Opening reads the file once, to count. Needs no index, no summary and no end.
+    """Topics and messages of a file, as far as it reaches. Needs no index, no summary and no end.
 
     Attributes:
-        counts: topic -> (type as rosbags spells it, number of messages). start_ns, end_ns: log times.
-        complete: whether the file has its end.
+        counts: topic -> (type as in ROS 2, number of messages). start_ns, end_ns: log times.
+        complete: whether the file has its end. findings: none; whoever opens the file knows why.
     """
 
+    by_log_time = False
+    findings: tuple[Finding, ...] = ()
+
     def __init__(self, path: Path) -> None:
+        """Reads the file once, to count."""
         self._path = path
-        self._ros2, self._ros1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+        self._deserialiser = Deserialiser()
         self.counts: dict[str, tuple[str, int]] = {}
         self.complete = False
         times: tuple[int, int] | None = None
@@ -41,10 +43,7 @@ class McapStream:
         """
         for topic, kind, log_ns, encoding, data in self._records():
             if topic in topics and start_ns <= log_ns < stop_ns:
-                if encoding == "ros1":
-                    yield topic, log_ns, self._ros1.deserialize_ros1(data, kind)
-                else:
-                    yield topic, log_ns, self._ros2.deserialize_cdr(data, kind)
+                yield topic, log_ns, self._deserialiser.read(data, kind, encoding)
         if not self.complete and stop_ns > self.end_ns:
             raise EndOfFile("the file ends here, in the middle of a record")
 
@@ -53,8 +52,8 @@ class McapStream:
 
     def _records(self) -> Iterator[tuple[str, str, int, str, bytes]]:
         """(topic, type, log time, encoding, bytes) up to the end or to where the file is cut."""
-        types: dict[int, str] = {}
-        channels: dict[int, Channel] = {}
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, tuple[Channel, str]] = {}
         with self._path.open("rb") as file:
             records = iter(StreamReader(file, validate_crcs=False, record_size_limit=1 << 30).records)
             while True:
@@ -66,17 +65,14 @@ class McapStream:
                     self.complete = True
                     return
                 if isinstance(record, Schema):
-                    types[record.id] = ros2_type(record.name)
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Message):
-                    channel = channels.get(record.channel_id)
-                    if channel is not None and channel.message_encoding in _DECODERS:
-                        kind = types.get(channel.schema_id, "")
-                        yield channel.topic, kind, record.log_time, channel.message_encoding, record.data
-
-
-def ros2_type(name: str) -> str:
-    """`sensor_msgs/Imu` of ROS 1 as `sensor_msgs/msg/Imu`."""
-    package, slash, rest = name.partition("/")
-    return f"{package}/msg/{rest}" if slash and not rest.startswith("msg/") else name
+                    schemas[record.id] = record
+                elif isinstance(record, Channel) and record.message_encoding in ENCODINGS:
+                    schema = schemas.get(record.schema_id)
+                    kind = ros2_type(schema.name) if schema else ""
+                    if schema:
+                        text = schema.data.decode(errors="replace")
+                        self._deserialiser.learn(kind, text, record.message_encoding)
+                    channels[record.id] = record, kind
+                elif isinstance(record, Message) and record.channel_id in channels:
+                    channel, kind = channels[record.channel_id]
+                    yield channel.topic, kind, record.log_time, channel.message_encoding, record.data

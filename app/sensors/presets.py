@@ -52,5 +52,5 @@ def _with_file(params: Params, path: Path) -> Params:
         raise HemislamError(f"There is no parameter file {path}; `hemislam params > {path.name}` writes one.") from None
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise HemislamError(f"The parameter file {path} can not be read ({why}); check the path.") from None
+        raise HemislamError(f"The parameter file {path} cannot be read ({why}); check the path.") from None
     return params.merged_yaml(text, str(path))

@@ -1,8 +1,8 @@
-"""A recording on disk as a stream of measurements: open, look, read. Constant memory throughout."""
+"""A recording on disk as a stream of measurements, read in constant memory."""
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -10,10 +10,12 @@ from typing import Any, Self
 import numpy as np
 
 from app.sensors.clocks import clock_finding, clock_offset_s
+from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
 from app.sensors.findings import Finding
-from app.sensors.layout import ImuProbe, Probe, gravity_findings, settle_cloud, settle_imu
-from app.sensors.pointcloud import CloudError, CloudMessage, decode, stamp_ns
+from app.sensors.layout import ImuProbe, gravity_findings, settle_cloud, settle_imu
+from app.sensors.pointcloud import decode, read_scan
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu
+from app.sensors.ros import Vector, stamp_ns
 from app.sensors.sequencer import Sequencer
 from app.sensors.source import SUFFIXES, Mark, Source
 from app.slam.errors import HemislamError
@@ -21,7 +23,7 @@ from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement, Scan
 
 LOG_MARGIN_NS = 2_000_000_000
-"""How much later or earlier than usual a message may have been logged and still be found by time."""
+"""How much later or earlier than usual a message may be logged and is still found by time."""
 IMU_BEFORE_NS = 200_000_000
 """IMU samples given from before `start_s`."""
 
@@ -41,8 +43,8 @@ class ImuEntry:
 
     log_ns: int
     stamp_ns: int
-    gyro: tuple[float, float, float]
-    accel: tuple[float, float, float]
+    gyro: Vector
+    accel: Vector
 
 
 class Recording:
@@ -60,12 +62,13 @@ class Recording:
         self.path = source.path
         self.topics = source.topics
         chosen = params.recording
-        self.lidar_topic, lidar_finding = choose_topic(source, "lidar", chosen.lidar_topic)
-        self.imu_topic, imu_finding = choose_topic(source, "imu", chosen.imu_topic)
-        self.scan_count = sum(topic.messages for topic in source.topics if topic.name == self.lidar_topic)
+        lidar, lidar_finding = choose_topic(source, "lidar", chosen.lidar_topic)
+        imu_topic, imu_finding = choose_topic(source, "imu", chosen.imu_topic)
+        self.lidar_topic, self.imu_topic = lidar.name, imu_topic.name
+        self.scan_count = lidar.messages
 
-        probes, self._lidar_stamped, probe_findings = probe_clouds(source, self.lidar_topic)
-        self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic)
+        probes, probe_findings = probe_clouds(source, lidar)
+        self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic, CLOUD_TYPES[lidar.type])
         imu, self._imu_stamped, imu_probe_findings = probe_imu(source, self.imu_topic, chosen.imu_time_offset)
         self._accel_scale, imu_findings = settle_imu(imu, chosen)
         probes, scans = self._decode_probes(probes, cloud_findings)
@@ -87,7 +90,7 @@ class Recording:
 
     @property
     def max_imu_gap_s(self) -> float:
-        """The longest interval between IMU samples that is no gap."""
+        """The longest interval between IMU samples that does not count as a gap."""
         return self._params.imu.max_gap
 
     def measurements(
@@ -96,7 +99,7 @@ class Recording:
         """Scans that begin within [start_s, start_s + duration_s) after `start_ns`, with their IMU samples.
 
         Args:
-            after: a place where an earlier reading of the same part was; this one goes on exactly as that did.
+            after: where an earlier reading of the same part was; this one goes on exactly as that one did.
         """
         return Measurements(self, start_s, duration_s, after)
 
@@ -116,23 +119,15 @@ class Recording:
         log_stop = None if stop_ns is None else stop_ns + offset + LOG_MARGIN_NS
         topics = (self.lidar_topic, self.imu_topic)
         for topic, log_ns, message in self._source.messages(topics, log_first, log_stop, after):
-            yield self._scan_entry(message, log_ns) if topic == self.lidar_topic else self._imu_entry(message, log_ns)
+            if topic == self.lidar_topic:
+                yield ScanEntry(log_ns, *read_scan(message, log_ns, self._layout))
+            else:
+                yield self._imu_entry(message, log_ns)
 
     def fraction_at(self, log_ns: int) -> float:
         """Share of the recording, 0-1, that was logged before."""
         length = self._source.end_ns - self._source.start_ns
         return min(max((log_ns - self._source.start_ns) / length, 0.0), 1.0) if length > 0 else 1.0
-
-    def _scan_entry(self, message: Any, log_ns: int) -> ScanEntry:
-        cloud = None
-        try:
-            cloud = CloudMessage.from_ros(message)
-            if not self._lidar_stamped:
-                cloud = replace(cloud, stamp_ns=log_ns)
-            return ScanEntry(log_ns, cloud, decode(cloud, self._layout))
-        except CloudError as error:
-            stamp = stamp_ns(message.header.stamp) if self._lidar_stamped else log_ns
-            return ScanEntry(log_ns, cloud, DroppedScan(stamp, str(error)))
 
     def _imu_entry(self, message: Any, log_ns: int) -> ImuEntry:
         stamp = stamp_ns(message.header.stamp) if self._imu_stamped else log_ns
@@ -141,7 +136,7 @@ class Recording:
         return ImuEntry(log_ns, stamp + offset, (w.x, w.y, w.z), (k * a.x, k * a.y, k * a.z))
 
     def _decode_probes(self, probes: list[Probe], findings: list[Finding]) -> tuple[list[Probe], list[Scan]]:
-        """The probes that make scans, and these. Raises HemislamError if none does (a wrong time unit, say)."""
+        """The probes that make scans, and the scans. Raises HemislamError if none does (a wrong time unit, say)."""
         decoded, reason = [], ""
         for probe in probes:
             try:
@@ -165,6 +160,7 @@ class Recording:
         return clock_finding(offset, self._params.recording.imu_time_offset, not copied)
 
     def nothing_usable(self, reasons: Counter[str], start_s: float, duration_s: float | None) -> str:
+        """Why a reading gave no measurement, in a sentence; `reasons` of the scans that were left out."""
         if not reasons:
             until = "" if duration_s is None else f" and before {start_s + duration_s:g} s"
             return f"{self.path} has no scan after {start_s:g} s{until}; it lasts {self.duration_s:.1f} s."
@@ -184,7 +180,7 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a reading is, between two measurements: the last message read, and what pairing remembers."""
+    """Where a reading is, between two measurements: the last message read, and the state of pairing."""
 
     message: Mark | None
     sequencer: Sequencer
@@ -249,7 +245,7 @@ def open_recording(path: Path, params: Params) -> Recording:
     """Open and look at the first messages.
 
     Raises:
-        HemislamError: the file can not be read, has no LiDAR or IMU, or nothing usable on them.
+        HemislamError: the file cannot be read, has no LiDAR or IMU, or nothing usable on them.
     """
     source = Source(path)
     try:
@@ -262,7 +258,7 @@ def open_recording(path: Path, params: Params) -> Recording:
 def find_recordings(folder: Path) -> list[Path]:
     """Recordings below a folder: .bag, .mcap, .db3 files, and ROS 2 folders as one entry each, sorted.
 
-    Hidden entries, links to folders (they may lead in circles) and what can not be read are passed over.
+    Hidden entries, links to folders (they may form circles) and what cannot be read are skipped.
     """
     found: list[Path] = []
     try:

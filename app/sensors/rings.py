@@ -1,34 +1,21 @@
 """Which scan line a point belongs to: the rank of the line's elevation, 0 = lowest = outermost cone.
 
-The ring comes from a field (put in order of elevation where the driver numbers otherwise), from the
-place of a point in the message, or, failing both, from the elevation itself.
+The ring comes from a field (put in order of elevation where the driver numbers in another order), from a point's
+place in the message, or, if neither helps, from its elevation.
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from app.sensors.cloud_types import CloudMessage, CloudType, Probe
 from app.sensors.findings import Finding
 from app.slam.types import F32, F64, I64, U16
 
-RING_NAMES = ("ring", "line", "channel", "laser_id", "laser")
 _ENOUGH = 50_000
-"""Points that are enough to tell the lines apart."""
+"""Points that suffice to separate the lines."""
 _COMMON_LINES = (16, 32, 40, 64, 80, 128)
-
-
-class Columns(Protocol):
-    """What is needed of a point cloud message."""
-
-    @property
-    def height(self) -> int: ...
-
-    @property
-    def width(self) -> int: ...
-
-    def column(self, name: str) -> npt.NDArray[Any]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,29 +37,20 @@ class Rings:
     bounds: F64 | None = None
     centre: tuple[float, float] = (0.0, 0.0)
 
-    def of(self, cloud: Columns, points: F32, index: npt.NDArray[np.intp] | None) -> U16:
-        """(n,) uint16 ring of the kept points; `index` tells which of the message they are."""
+    def of(self, cloud: CloudMessage, points: F32, index: npt.NDArray[np.intp] | None) -> U16:
+        """(n,) uint16 ring of the kept points, whose places in the message are `index`."""
         if self.field is not None:
             raw = cloud.column(self.field)
             raw = (raw if index is None else raw.take(index)).astype(np.uint16)
         elif self.place is not None:
             step, lines = self.place
-            where = np.arange(cloud.height * cloud.width) if index is None else index
+            where = np.arange(len(cloud)) if index is None else index
             raw = (where // step % lines).astype(np.uint16)
         elif self.bounds is not None:
             return np.searchsorted(self.bounds, elevation(points, self.centre)).astype(np.uint16)
         else:
             return np.zeros(len(points), np.uint16)
         return raw if self.rank is None else self.rank.take(np.minimum(raw, len(self.rank) - 1))
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """Valid points of one probed message: (n, 3) float32 m and their (n,) index in the message."""
-
-    cloud: Columns
-    points: F32
-    index: npt.NDArray[np.intp]
 
 
 def elevation(points: F32, centre: tuple[float, float] = (0.0, 0.0)) -> F32:
@@ -83,19 +61,19 @@ def elevation(points: F32, centre: tuple[float, float] = (0.0, 0.0)) -> F32:
     return angle
 
 
-def settle_rings(samples: list[Sample], names: dict[str, str]) -> tuple[Rings, Finding]:
+def settle_rings(probes: list[Probe], kind: CloudType, names: dict[str, str]) -> tuple[Rings, Finding]:
     """Decide where the ring comes from; `names` maps lower-case field names to the real ones."""
-    field = next((names[name] for name in RING_NAMES if name in names), None)
-    points = np.concatenate([sample.points for sample in samples])
+    field = next((names[name] for name in kind.rings if name in names), None)
+    points = np.concatenate([probe.points for probe in probes])
     far = _far(points)
     if field is not None:
-        raw = np.concatenate([sample.cloud.column(field)[sample.index] for sample in samples]).astype(np.int64)
+        raw = np.concatenate([probe.column(field) for probe in probes]).astype(np.int64)
         if raw.min() >= 0 and raw.max() < 4096 and raw.max() > raw.min():
             return _settle_field(field, raw[far], elevation(points[far]), int(raw.max()) + 1)
         why = f"field `{field}` is always {raw[0]}" if raw.max() == raw.min() else f"field `{field}` is no line number"
     else:
         why = "the clouds have no ring field"
-    by_place = _settle_place(samples)
+    by_place = _settle_place(probes)
     if by_place is not None:
         rings, lines = by_place
         return rings, Finding(
@@ -103,14 +81,14 @@ def settle_rings(samples: list[Sample], names: dict[str, str]) -> tuple[Rings, F
         )
     bounds, centre = _settle_elevation(points)
     lines = len(bounds) + 1
-    text = f"{why}; {lines} scan lines were told apart by their elevation"
+    text = f"{why}; {lines} scan lines were separated by their elevation"
     if lines < 4:
         text += ", too few for seed points: the ground needs `ring` or clearly separate lines"
     return Rings(bounds=bounds, centre=centre), Finding("ring order", "corrected" if lines >= 4 else "needs you", text)
 
 
 def _far(points: F32) -> npt.NDArray[np.intp]:
-    """Indices of the farther half: there the beams' different origins hardly show in the elevation."""
+    """Indices of the farther half: there the beams' different origins hardly change the elevation."""
     distance = np.linalg.norm(points, axis=1)
     far = np.flatnonzero(distance >= np.median(distance))
     return far[:: max(1, len(far) // _ENOUGH)]
@@ -127,25 +105,25 @@ def _settle_field(field: str, raw: I64, angles: F32, lines: int) -> tuple[Rings,
         )
     if share <= 0.1:
         rank = np.arange(lines - 1, -1, -1, dtype=np.uint16)
-        text = f"`{field}` counts {lines} scan lines from the highest elevation down ({span}); turned round"
+        text = f"`{field}` counts {lines} scan lines from the highest elevation down ({span}); reversed"
         return Rings(field, rank=rank), Finding("ring order", "corrected", text)
     text = f"`{field}` numbers {lines} scan lines in no order of elevation ({span}); ranked by elevation"
     return Rings(field, rank=_ranked(present, medians, lines)), Finding("ring order", "corrected", text)
 
 
-def _settle_place(samples: list[Sample]) -> tuple[Rings, int] | None:
+def _settle_place(probes: list[Probe]) -> tuple[Rings, int] | None:
     """Row-major rows, or lines interleaved in firing order, if either explains the elevations."""
-    first = samples[0].cloud
-    total = first.height * first.width
+    first = probes[0].cloud
+    total = len(first)
     layouts = [(first.width, first.height), (1, first.height)] if 4 <= first.height <= 256 else []
     layouts += [(1, lines) for lines in _COMMON_LINES if total % lines == 0 and (1, lines) not in layouts]
     for step, lines in layouts:
-        shapes = {(s.cloud.height, s.cloud.width) for s in samples}
+        shapes = {(s.cloud.height, s.cloud.width) for s in probes}
         if step != 1 and len(shapes) > 1:
             continue
-        far = [_far(sample.points) for sample in samples]
-        raw = np.concatenate([s.index[f] // step % lines for s, f in zip(samples, far, strict=True)])
-        angles = np.concatenate([elevation(s.points[f]) for s, f in zip(samples, far, strict=True)])
+        far = [_far(probe.points) for probe in probes]
+        raw = np.concatenate([s.index[f] // step % lines for s, f in zip(probes, far, strict=True)])
+        angles = np.concatenate([elevation(s.points[f]) for s, f in zip(probes, far, strict=True)])
         present, medians = _line_medians(raw, angles)
         if len(present) < max(3, lines // 2):
             continue
@@ -194,7 +172,7 @@ def _line_medians(raw: I64, angles: F32) -> tuple[I64, F64]:
 
 
 def _ranked(present: I64, medians: F64, lines: int) -> U16:
-    """(lines,) rank of each line; a line that the probe never saw comes last, where no seed is looked for."""
+    """(lines,) rank of each line; a line that the probe never saw comes last, where no seeds are searched."""
     rank = np.full(lines, len(present), np.uint16)
     rank[present[np.argsort(medians)]] = np.arange(len(present), dtype=np.uint16)
     return rank

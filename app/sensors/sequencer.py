@@ -1,30 +1,34 @@
-"""Pairs each scan with the IMU samples that cover it; nothing is integrated over silently.
+"""Pairs each scan with the IMU samples that cover it, and with the samples of any other sensor.
 
-Push-wise, so that a recording and a live source use it alike: `add_imu` and `add_scan` in the order
-of arrival, then `ready()` gives what is complete. Pairing is by measurement time, never by arrival.
+A recording and a live source use it alike: they call `add_imu`, `add_scan` and `add` in the order of arrival, and
+`ready()` gives what is complete. Pairing goes by the time of measurement, never by arrival. Gaps, repeated samples and
+steps back in time are detected, counted and reported.
 """
 
 import bisect
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
-from app.slam.types import DroppedScan, ImuSamples, Measurement, Scan
+from app.sensors.ros import Vector
+from app.slam.types import DroppedScan, ImuSamples, Measurement, Samples, Scan
 
 OUTAGE_NS = 1_000_000_000
 """A sample that comes more than this after the one before must be confirmed by the next."""
 
-Vector = tuple[float, float, float]
-
 MAX_WAITING = 64
 """Scans that may wait for IMU samples; bounds the memory when the IMU falls silent."""
+
+MAX_HELD = 10_000
+"""Samples of another sensor that may wait for a scan; the oldest go first."""
 
 
 @dataclass(slots=True)
 class Counts:
-    """What pairing met so far."""
+    """What the sequencer met so far."""
 
     imu_samples: int = 0
     imu_duplicates: int = 0
@@ -51,6 +55,7 @@ class Sequencer:
     _stamps: list[int] = field(default_factory=list)
     _values: list[tuple[float, ...]] = field(default_factory=list)
     _waiting: list[Scan | DroppedScan] = field(default_factory=list)
+    _held: dict[type[Samples], Samples] = field(default_factory=dict)
     _notices: list[str] = field(default_factory=list)
     _last_stamp_ns: int | None = None
     _last_end_ns: int | None = None
@@ -60,19 +65,20 @@ class Sequencer:
     """A sample stamped far ahead of the one before: a wrong stamp, unless the next one goes on from there."""
 
     def copy(self) -> "Sequencer":
-        """Another one that goes on from here by itself. Scans are shared: they never change."""
+        """An independent copy in the same state. Scans and samples are shared: they never change."""
         return replace(
             self,
             counts=replace(self.counts),
             _stamps=self._stamps.copy(),
             _values=self._values.copy(),
             _waiting=self._waiting.copy(),
+            _held=self._held.copy(),
             _notices=self._notices.copy(),
             _intervals_ns=self._intervals_ns.copy(),
         )
 
     def tail(self) -> "Sequencer":
-        """What another one needs to notice what is missing between this one's last scan and its own first."""
+        """A sequencer that takes over after this one's last scan, and notices what is missing in between."""
         return Sequencer(
             self.max_gap_s,
             replace(self.counts),
@@ -123,12 +129,21 @@ class Sequencer:
         self._stamps.append(stamp_ns)
         self._values.append(values)
 
+    def add(self, samples: Samples) -> None:
+        """Samples of any other sensor. Each goes out once, with the first measurement that ends at or after it.
+
+        A sample that arrives too late for that goes out with the next one.
+        """
+        kind = type(samples)
+        held = _joined(self._held[kind], samples) if kind in self._held else samples
+        self._held[kind] = _rows(held, slice(-MAX_HELD, None))
+
     def add_scan(self, scan: Scan | DroppedScan) -> None:
         """One scan, or the news that one could not be read (it keeps its place in the sequence)."""
         bisect.insort(self._waiting, scan, key=lambda waiting: waiting.stamp_ns)
 
     def ready(self) -> Iterator[Measurement | DroppedScan]:
-        """Whatever the samples so far complete, in order of time."""
+        """What the samples so far complete, in order of time."""
         while self._waiting:
             scan = self._waiting[0]
             end_ns = scan.end_ns if isinstance(scan, Scan) else scan.stamp_ns
@@ -156,7 +171,7 @@ class Sequencer:
         imu = self._samples(first, last + 1)
         gaps = np.diff(imu.stamps_ns) / 1e9
         self._notices += [f"no IMU sample for {gap:.3f} s" for gap in gaps[gaps > self.max_gap_s]]
-        measurement = Measurement(scan, imu, tuple(self._notices))
+        measurement = Measurement(scan, imu, tuple(self._notices), self._take_streams(end_ns))
         self._notices.clear()
         self._last_stamp_ns, self._last_end_ns = scan.stamp_ns, end_ns
         keep = max(bisect.bisect_right(self._stamps, end_ns) - 1, 0)
@@ -164,8 +179,17 @@ class Sequencer:
         self.counts.paired += 1
         return measurement
 
+    def _take_streams(self, end_ns: int) -> Mapping[type[Samples], Samples]:
+        """The held samples of other sensors up to this time, sorted by time."""
+        taken: dict[type[Samples], Samples] = {}
+        for kind, held in self._held.items():
+            order = np.argsort(held.stamps_ns, kind="stable")
+            count = int(np.searchsorted(held.stamps_ns[order], end_ns, side="right"))
+            taken[kind], self._held[kind] = _rows(held, order[:count]), _rows(held, order[count:])
+        return {kind: samples for kind, samples in taken.items() if len(samples)}
+
     def _objection(self, scan: Scan) -> str:
-        """Why a scan can not be used; "" if it can. Without numbers, so that equal reasons can be counted."""
+        """Why a scan cannot be used; "" if it can. Without numbers, so that equal reasons can be counted."""
         begin_ns, end_ns = scan.stamp_ns, scan.end_ns
         if self._last_stamp_ns is not None and self._last_end_ns is not None:
             if begin_ns == self._last_stamp_ns:
@@ -207,3 +231,17 @@ class Sequencer:
     def _count(self, name: str, notice: str) -> None:
         setattr(self.counts, name, getattr(self.counts, name) + 1)
         self._notices.append(notice)
+
+
+def _joined(first: Samples, second: Samples) -> Samples:
+    """Samples of one sensor after earlier ones of the same type."""
+    both = ((getattr(first, column.name), getattr(second, column.name)) for column in fields(first))
+    return type(first)(*map(np.concatenate, both))
+
+
+def _rows(samples: Samples, chosen: slice | np.ndarray[Any, Any]) -> Samples:
+    """The chosen samples, in that order and read-only."""
+    columns = [getattr(samples, column.name)[chosen] for column in fields(samples)]
+    for column in columns:
+        column.setflags(write=False)
+    return type(samples)(*columns)

@@ -1,11 +1,11 @@
-"""Recording files as a stream of messages, and every failure of theirs as one clear sentence."""
+"""Recording files as a stream of messages, and each of their failures as one clear sentence."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -41,7 +41,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A message that was read: how many there were until then, its log time, and how many of them had just that."""
+    """A message that was read: how many were read up to it, its log time, and how many of them share that time."""
 
     read: int
     log_ns: int
@@ -55,8 +55,54 @@ class Mark:
         return cls(mark.read + 1, log_ns, mark.at_log_ns + 1 if mark.log_ns == log_ns else 1)
 
 
+class Stream(Protocol):
+    """One kind of file, opened.
+
+    Attributes:
+        counts: topic -> (type, number of messages). start_ns, end_ns: log times of the first and last message.
+        findings: what is unusual about the file. by_log_time: whether messages come sorted by log time.
+    """
+
+    by_log_time: bool
+    counts: dict[str, tuple[str, int]]
+    findings: tuple[Finding, ...]
+    start_ns: int
+    end_ns: int
+
+    def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]: ...
+
+    def close(self) -> None: ...
+
+
+class RosbagsStream:
+    """What the rosbags library reads: a ROS 1 bag, a ROS 2 folder or single file. See `Stream`."""
+
+    by_log_time = True
+    findings: tuple[Finding, ...] = ()
+
+    def __init__(self, files: list[Path]) -> None:
+        """Raises whatever the library raises for a file that it cannot read."""
+        self._reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        self._reader.open()
+        self.counts: dict[str, tuple[str, int]] = {}
+        for connection in self._reader.connections:
+            _, before = self.counts.get(connection.topic, ("", 0))
+            self.counts[connection.topic] = (connection.msgtype, before + connection.msgcount)
+        self.start_ns, self.end_ns = int(self._reader.start_time), int(self._reader.end_time)
+
+    def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
+        connections = [connection for connection in self._reader.connections if connection.topic in topics]
+        if not connections:  # which rosbags would take for all of them
+            return
+        for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
+            yield connection.topic, log_ns, self._reader.deserialize(raw, connection.msgtype)
+
+    def close(self) -> None:
+        self._reader.close()
+
+
 class Source:
-    """A recording opened for reading: its topics, and its messages by log time.
+    """A recording opened for reading: its topics and its messages. A context manager.
 
     Attributes:
         path: as given. topics: by name. start_ns, end_ns: log times of the first and last message.
@@ -70,19 +116,9 @@ class Source:
             HemislamError: missing, empty, cut, foreign, corrupt or unindexed file.
         """
         self.path = path
-        self.findings: tuple[Finding, ...] = ()
-        files = _recording_files(path)
-        self._reader: AnyReader | McapStream | CaptureStream = self._open(files)
-        if isinstance(self._reader, McapStream | CaptureStream):
-            counts = self._reader.counts
-            self.start_ns, self.end_ns = self._reader.start_ns, self._reader.end_ns
-        else:
-            counts = {}
-            for connection in self._reader.connections:
-                _, before = counts.get(connection.topic, ("", 0))
-                counts[connection.topic] = (connection.msgtype, before + connection.msgcount)
-            self.start_ns, self.end_ns = int(self._reader.start_time), int(self._reader.end_time)
-        self.topics = tuple(Topic(name, kind, count) for name, (kind, count) in sorted(counts.items()))
+        self._stream, self.findings = _open(path)
+        self.start_ns, self.end_ns = self._stream.start_ns, self._stream.end_ns
+        self.topics = tuple(Topic(name, *content) for name, content in sorted(self._stream.counts.items()))
         if not any(topic.messages for topic in self.topics):
             self.close()
             raise HemislamError(f"{path} is a recording without a single message; record it again.")
@@ -97,24 +133,16 @@ class Source:
         """(topic, log time ns, deserialised message) of these topics, logged within [start, stop).
 
         Args:
-            after: where an earlier call with the same arguments was; this one goes on from there.
+            after: the last message of an earlier call with the same arguments; this one goes on from there.
 
         Raises:
             HemislamError: the file is damaged here; everything before was given.
         """
-        first, stop = 0 if start_ns is None else start_ns, _FOREVER if stop_ns is None else stop_ns
-        stream: Iterator[tuple[str, int, Any]]
-        if isinstance(self._reader, McapStream):  # in the order of the file, whatever the log times
-            stream = self._reader.messages(topics, first, stop)
-            known = after.read if after else 0
-        else:
-            known = after.at_log_ns if after else 0
-            first = after.log_ns if after else first
-            if isinstance(self._reader, CaptureStream):
-                stream = self._reader.messages(topics, first, stop)
-            else:
-                stream = self._rosbags_messages(self._reader, topics, first, stop)
-        stream = islice(stream, known, None)
+        first, stop = start_ns or 0, _FOREVER if stop_ns is None else stop_ns
+        known = 0
+        if after is not None:
+            known, first = (after.at_log_ns, after.log_ns) if self._stream.by_log_time else (after.read, first)
+        stream = islice(self._stream.messages(topics, first, stop), known, None)
         log_ns = self.start_ns
         while True:
             try:
@@ -132,77 +160,8 @@ class Source:
             log_ns = entry[1]
             yield entry
 
-    @staticmethod
-    def _rosbags_messages(
-        reader: AnyReader, topics: tuple[str, ...], start_ns: int, stop_ns: int
-    ) -> Iterator[tuple[str, int, Any]]:
-        connections = [connection for connection in reader.connections if connection.topic in topics]
-        if not connections:  # which rosbags would take for all of them
-            return
-        for connection, log_ns, raw in reader.messages(connections, start=start_ns, stop=stop_ns):
-            yield connection.topic, log_ns, reader.deserialize(raw, connection.msgtype)
-
-    def _open(self, files: list[Path]) -> AnyReader | McapStream | CaptureStream:
-        if self.path.suffix in CAPTURES:
-            return self._open_capture()
-        reader = None
-        try:
-            reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            reader.open()
-        except Exception as error:  # as above
-            salvaged = self._salvage(files, _brief(error))
-            if salvaged is not None:
-                return salvaged
-            raise HemislamError(self._refusal(error)) from error
-        if self.path.is_dir() and files != [self.path]:
-            text = f"the folder has no metadata.yaml; its {len(files)} {files[0].suffix} file(s) were read without it"
-            self.findings = (Finding("file", "corrected", text),)
-        return reader
-
-    def _open_capture(self) -> CaptureStream:
-        try:
-            stream = CaptureStream(self.path)
-        except CaptureError as error:
-            raise HemislamError(f"{self.path} is no capture of a network ({error}); {_KINDS} can be read.") from None
-        if not stream.counts:
-            raise HemislamError(
-                f"{self.path} holds no packets of an RS-Bpearl and no imu-udp datagrams; capture its UDP ports, mostly "
-                "6699 and 7788."
-            )
-        self.findings = stream.findings
-        return stream
-
-    def _salvage(self, files: list[Path], why: str) -> McapStream | None:
-        """A single MCAP read from front to back, if that yields anything."""
-        inner = sorted(self.path.glob("*.mcap")) if files == [self.path] and self.path.is_dir() else files
-        if len(inner) != 1 or inner[0].suffix != ".mcap":
-            return None
-        try:
-            stream = McapStream(inner[0])
-        except Exception:  # whatever a damaged file may cause: the first error is the one to report
-            return None
-        if not stream.counts:
-            return None
-        if stream.complete:
-            text = f"read from front to back, since its index can not be used ({why})"
-        else:
-            length = (stream.end_ns - stream.start_ns) / 1e9
-            text = f"the file is cut off {length:.1f} s after its start ({why}); what comes before is used"
-        self.findings = (Finding("file", "corrected" if stream.complete else "needs you", text),)
-        return stream
-
-    def _refusal(self, error: Exception) -> str:
-        path, brief = self.path, _brief(error)
-        if isinstance(error, PermissionError):
-            return f"{path} can not be opened (permission denied); change its permissions or copy it."
-        if path.is_dir() and "metadata" in brief.lower():
-            return f"The metadata.yaml of {path} can not be understood; {_REPAIR[''].format(path=path)}."
-        if "not indexed" in brief:
-            return f"{path} has no index, as after a recorder that was stopped hard; {_repair(path)}."
-        return f"{path} is cut off or damaged ({brief}); {_repair(path)}."
-
     def close(self) -> None:
-        self._reader.close()
+        self._stream.close()
 
     def __enter__(self) -> Self:
         return self
@@ -211,8 +170,71 @@ class Source:
         self.close()
 
 
+def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
+    """The file as a stream, and what is unusual about it."""
+    files = _recording_files(path)
+    if path.suffix in CAPTURES:
+        capture = _open_capture(path)
+        return capture, capture.findings
+    try:
+        reader = RosbagsStream(files)
+    except Exception as error:  # as above
+        salvaged = _salvage(path, files, _brief(error))
+        if salvaged is None:
+            raise HemislamError(_refusal(path, error)) from error
+        return salvaged
+    if path.is_dir() and files != [path]:
+        text = f"the folder has no metadata.yaml; its {len(files)} {files[0].suffix} file(s) were read without it"
+        return reader, (Finding("file", "corrected", text),)
+    return reader, ()
+
+
+def _open_capture(path: Path) -> CaptureStream:
+    try:
+        stream = CaptureStream(path)
+    except CaptureError as error:
+        raise HemislamError(f"{path} is no capture of a network ({error}); {_KINDS} can be read.") from None
+    if not stream.counts:
+        raise HemislamError(
+            f"{path} holds no packets of an RS-Bpearl and no imu-udp datagrams; capture its UDP ports, usually "
+            "6699 and 7788."
+        )
+    return stream
+
+
+def _salvage(path: Path, files: list[Path], why: str) -> tuple[Stream, tuple[Finding, ...]] | None:
+    """A single MCAP read from front to back, if that yields anything."""
+    inner = sorted(path.glob("*.mcap")) if files == [path] and path.is_dir() else files
+    if len(inner) != 1 or inner[0].suffix != ".mcap":
+        return None
+    try:
+        stream = McapStream(inner[0])
+    except Exception:  # whatever a damaged file may cause: the first error is the one to report
+        return None
+    if not stream.counts:
+        return None
+    if stream.complete:
+        return stream, (
+            Finding("file", "corrected", f"read from front to back, since its index cannot be used ({why})"),
+        )
+    length = (stream.end_ns - stream.start_ns) / 1e9
+    text = f"the file is cut off {length:.1f} s after its start ({why}); what comes before is used"
+    return stream, (Finding("file", "needs you", text),)
+
+
+def _refusal(path: Path, error: Exception) -> str:
+    brief = _brief(error)
+    if isinstance(error, PermissionError):
+        return f"{path} cannot be opened (permission denied); change its permissions or copy it."
+    if path.is_dir() and "metadata" in brief.lower():
+        return f"The metadata.yaml of {path} cannot be understood; {_REPAIR[''].format(path=path)}."
+    if "not indexed" in brief:
+        return f"{path} has no index, as after a recorder that was killed; {_repair(path)}."
+    return f"{path} is cut off or damaged ({brief}); {_repair(path)}."
+
+
 def _recording_files(path: Path) -> list[Path]:
-    """What to hand to rosbags for this path; refuses what is clearly no recording."""
+    """The files that rosbags is given for this path; refuses what is clearly no recording."""
     try:
         if not path.exists():
             raise HemislamError(f"There is no recording {path}; check the path.")
@@ -226,7 +248,7 @@ def _recording_files(path: Path) -> list[Path]:
             start = file.read(16)
     except OSError as error:
         raise HemislamError(
-            f"{path} can not be opened ({error.strerror}); check the path and its permissions."
+            f"{path} cannot be opened ({error.strerror}); check the path and its permissions."
         ) from error
     if path.suffix in CAPTURES:
         return [path]

@@ -9,6 +9,7 @@ Conventions (all of hemislam):
 - Units are SI; angles are radians in code and degrees where a person sets them.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -56,21 +57,30 @@ class Scan:
 
 
 @dataclass(frozen=True, slots=True)
-class ImuSamples:
-    """Consecutive IMU samples, strictly increasing in time.
+class Samples:
+    """Consecutive stamped samples of one sensor. A kind of sensor is a subclass that adds arrays of k rows.
 
     Attributes:
         stamps_ns: (k,) int64.
+    """
+
+    stamps_ns: I64
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSamples(Samples):
+    """Consecutive IMU samples, strictly increasing in time.
+
+    Attributes:
         gyro: (k, 3) float64, rad/s, IMU frame.
         accel: (k, 3) float64, specific force in m/s^2, IMU frame (+9.81 upwards at rest).
     """
 
-    stamps_ns: I64
     gyro: F64
     accel: F64
-
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +90,14 @@ class Measurement:
     `imu` runs from the last sample at or before the previous scan's end (for the first scan: from
     the first sample there is) to the first sample at or after this scan's end, so that both ends
     can be interpolated. `notices` tells what pairing met on the way (gaps, back-steps).
+    `streams` holds the samples of other sensors (satellite fixes, wheel odometry, images) by their
+    type: those up to this scan's end that no earlier measurement holds, in order of time.
     """
 
     scan: Scan
     imu: ImuSamples
     notices: tuple[str, ...] = ()
+    streams: Mapping[type[Samples], Samples] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

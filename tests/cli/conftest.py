@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from app.sensors.simulator.lidar import Returns
-from app.sensors.simulator.recording import RecordingWriter
+from app.sensors.ros import RecordingWriter
 from app.slam.trajectory import Trajectory, write_tum
+from app.slam.types import Scan
 
 ROOT = Path(__file__).resolve().parents[2]
 START_NS = 1_700_000_000_000_000_000
@@ -36,7 +36,7 @@ def accelerations(seconds: np.ndarray) -> np.ndarray:
     return moving * np.hstack(second)
 
 
-def sweep(start_s: float, seed: int) -> Returns:
+def sweep(start_s: float, seed: int) -> Scan:
     """One revolution in a box-shaped room, every ray from where the sensor is at its own time."""
     azimuth, elevation = np.meshgrid(np.arange(0, 360, 2.0), np.linspace(2.3, 89.5, 32), indexing="ij")
     seconds = start_s + azimuth.ravel() / 360 * 0.1
@@ -47,12 +47,14 @@ def sweep(start_s: float, seed: int) -> Returns:
         to_walls = np.maximum((ROOM[0] - origins) / directions, (ROOM[1] - origins) / directions)
     hit = to_walls.argmin(axis=1)
     ranges = to_walls.min(axis=1) + np.random.default_rng(seed).normal(scale=0.005, size=len(rays))
-    return Returns(
-        stamps_ns=START_NS + np.rint(seconds * 1e9).astype(np.int64),
+    stamps = np.rint(seconds * 1e9).astype(np.int64)
+    return Scan(
+        stamp_ns=START_NS + int(stamps.min()),
+        offsets_ns=(stamps - stamps.min()).astype(np.int32),
         points=(rays * ranges[:, None]).astype(np.float32),
         intensity=np.full(len(rays), 50, dtype=np.float32),
         ring=np.tile(np.arange(32, dtype=np.uint16), 180),
-        ground=((hit == 2) & (directions[:, 2] < 0)).astype(np.uint8),
+        truth_ground=((hit == 2) & (directions[:, 2] < 0)).astype(np.uint8),
     )
 
 
@@ -65,17 +67,23 @@ def write_walk(path: Path, *, duration_s: float = DURATION_S, imu_until_s: float
     )
     gyro = rng.normal(scale=0.001, size=(len(imu_s), 3))
     ends: list[int] = []
-    with RecordingWriter(path) as recording:
-        sample = 0
-        for index in range(round(duration_s * 10) - 1):
-            returns = sweep(0.05 + index / 10, index)
-            ends.append(int(returns.stamps_ns.max()))
-            while sample < len(imu_s) and START_NS + imu_s[sample] * 1e9 <= ends[-1]:
-                recording.add_imu(START_NS + round(imu_s[sample] * 1e9), gyro[sample], accel[sample])
+    with path.open("wb") as file:
+        recording, sample = RecordingWriter(file), 0
+
+        def add_imu_until(end_ns: float) -> None:
+            nonlocal sample
+            while sample < len(imu_s) and START_NS + imu_s[sample] * 1e9 <= end_ns:
+                stamp = START_NS + round(imu_s[sample] * 1e9)
+                recording.add_imu(stamp, gyro[sample], accel[sample], stamp)
                 sample += 1
-            recording.add_cloud(returns, ends[-1])
-        for k in range(sample, len(imu_s)):
-            recording.add_imu(START_NS + round(imu_s[k] * 1e9), gyro[k], accel[k])
+
+        for index in range(round(duration_s * 10) - 1):
+            scan = sweep(0.05 + index / 10, index)
+            ends.append(scan.end_ns)
+            add_imu_until(scan.end_ns)
+            recording.add_scan(scan, scan.end_ns + 4_000_000)
+        add_imu_until(np.inf)
+        recording.finish()
     stamps = np.array(ends)
     turned = np.tile(Rotation.from_matrix(LOOKING_FORWARD).as_quat(), (len(ends), 1))
     truth = Trajectory(stamps, positions((stamps - START_NS) * 1e-9), turned)

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from app.evaluation.paper import SEQUENCES
 from app.sensors.simulator.scenes import build_scene
-from app.sensors.simulator.simulate import walk_through
+from app.sensors.simulator.simulate import trajectory_through
 from app.sensors.simulator.suite import PAPER, Twin, find_suite, fitting_speed, make_twin
 from app.sensors.simulator.trajectory import Walker
 from app.slam.errors import HemislamError
@@ -19,7 +19,7 @@ TWINS = {twin.scene: twin for twin in PAPER}
 
 def walked(twin: Twin, seed: int = 0) -> np.ndarray:
     """True positions at 10 Hz of the whole walk."""
-    trajectory = walk_through(
+    trajectory = trajectory_through(
         build_scene(twin.scene, seed), twin.duration_s, seed, Walker(speed=fitting_speed(twin, seed))
     )
     return trajectory.poses(np.arange(0.05, twin.duration_s, 0.1))[0]

@@ -1,4 +1,4 @@
-"""What can not be used is refused in one sentence that says what, where and what to do."""
+"""What cannot be used is refused in one sentence that says what, where and what to do."""
 
 import sqlite3
 from pathlib import Path

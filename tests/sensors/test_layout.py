@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from app.sensors.cloud_types import Probe, read_point_cloud_2
 from app.sensors.findings import Finding
-from app.sensors.layout import ImuProbe, Probe, gravity_findings, settle_cloud, settle_imu
-from app.sensors.pointcloud import CloudLayout, CloudMessage, decode
+from app.sensors.layout import ImuProbe, gravity_findings, settle_cloud, settle_imu
+from app.sensors.pointcloud import CloudLayout, decode
 from app.slam.errors import HemislamError
 from app.slam.params import Params, RecordingParams
 from tests.sensors import rig
@@ -18,9 +19,7 @@ FIRING_NS = rig.PERIOD_NS // 160
 def clouds(layout: rig.Layout, *, log_delay_ns: int = 3_000_000, turns: int = 4, **how: object) -> list[Probe]:
     """Revolutions of 160 firings, logged so long after their end."""
     made = [rig.turn(number, columns=20, **how) for number in range(turns)]
-    return [
-        Probe(m.begin_ns + rig.PERIOD_NS + log_delay_ns, CloudMessage.from_ros(rig.message(m, layout))) for m in made
-    ]
+    return [Probe(m.begin_ns + rig.PERIOD_NS + log_delay_ns, read_point_cloud_2(rig.message(m, layout))) for m in made]
 
 
 def settle(probes: list[Probe], **chosen: object) -> tuple[CloudLayout, dict[str, Finding]]:
@@ -93,7 +92,7 @@ def test_a_simulator_clock_that_starts_at_zero_is_absolute() -> None:
         made = rig.turn(number, columns=20)
         message = rig.message(made, layout)
         message.header = rig.header(made.begin_ns + rig.PERIOD_NS - rig.START_NS, 2)
-        probes.append(Probe(made.begin_ns + rig.PERIOD_NS - rig.START_NS, CloudMessage.from_ros(message)))
+        probes.append(Probe(made.begin_ns + rig.PERIOD_NS - rig.START_NS, read_point_cloud_2(message)))
     settled, findings = settle(probes)
     scan = decode(probes[2].cloud, settled)
     assert abs(scan.stamp_ns - 2 * rig.PERIOD_NS) < 1_000
@@ -115,7 +114,7 @@ def test_a_time_field_that_is_all_zero_is_not_believed() -> None:
         made = rig.turn(number, columns=20)
         made.nothing = np.zeros(len(made))  # type: ignore[attr-defined]
         message = rig.message(made, rig.Layout([*XYZ, RING, ("time", "f4", "nothing")]))
-        probes.append(Probe(made.begin_ns + rig.PERIOD_NS + 3_000_000, CloudMessage.from_ros(message)))
+        probes.append(Probe(made.begin_ns + rig.PERIOD_NS + 3_000_000, read_point_cloud_2(message)))
     settled, findings = settle(probes)
     assert settled.time_field is None
     assert "the same for all points" in findings["point time"].text
@@ -139,7 +138,7 @@ def test_made_up_times_that_ignore_the_rotation_are_noticed() -> None:
         made = rig.turn(number, columns=20)
         made = made.only(np.random.default_rng(number).permutation(len(made)))
         made.offsets_ns = np.sort(made.offsets_ns)
-        probes.append(Probe(made.begin_ns + rig.PERIOD_NS, CloudMessage.from_ros(rig.message(made))))
+        probes.append(Probe(made.begin_ns + rig.PERIOD_NS, read_point_cloud_2(rig.message(made))))
     _, findings = settle(probes)
     assert findings["rotation"].verdict == "needs you"
     assert findings["rotation"].option == "--set recording.time_field=none"
@@ -162,9 +161,7 @@ def test_a_line_that_sees_nothing_for_most_of_a_turn_still_gets_its_times() -> N
     made = rig.turn(0, columns=20)
     blind = (made.ring == 3) & (made.offsets_ns > 15_000_000) & (made.offsets_ns < 85_000_000)
     turns = [rig.turn(number, columns=20).only(~blind) for number in range(3)]
-    probes = [
-        Probe(t.begin_ns + rig.PERIOD_NS + 3_000_000, CloudMessage.from_ros(rig.message(t, layout))) for t in turns
-    ]
+    probes = [Probe(t.begin_ns + rig.PERIOD_NS + 3_000_000, read_point_cloud_2(rig.message(t, layout))) for t in turns]
     settled, _ = settle(probes)
     scan = decode(probes[0].cloud, settled)
     truth = made.only(~blind)
@@ -184,7 +181,7 @@ def test_rings_counted_from_the_top_are_turned_round() -> None:
     for number in range(3):
         made = rig.turn(number, columns=20)
         truth, made.ring = made.ring, 7 - made.ring
-        probes.append(Probe(made.begin_ns, CloudMessage.from_ros(rig.message(made))))
+        probes.append(Probe(made.begin_ns, read_point_cloud_2(rig.message(made))))
     layout, findings = settle(probes)
     np.testing.assert_array_equal(decode(probes[0].cloud, layout).ring, truth)
     assert findings["ring order"].verdict == "corrected"
@@ -196,7 +193,7 @@ def test_rings_in_firing_order_are_ranked_by_elevation() -> None:
     for number in range(3):
         made = rig.turn(number, columns=20)
         truth, made.ring = made.ring, shuffled[made.ring]
-        probes.append(Probe(made.begin_ns, CloudMessage.from_ros(rig.message(made))))
+        probes.append(Probe(made.begin_ns, read_point_cloud_2(rig.message(made))))
     layout, findings = settle(probes)
     np.testing.assert_array_equal(decode(probes[0].cloud, layout).ring, truth)
     assert "in no order of elevation" in findings["ring order"].text
@@ -213,7 +210,7 @@ def test_without_a_ring_field_the_rings_are_derived(rows: int) -> None:
         else:  # returns lost here and there, so that the place in the message tells nothing
             made = made.only(np.random.default_rng(number).random(len(made)) > 0.2)
         message = rig.message(made, rig.Layout([*XYZ, time], rows=rows))
-        probes.append((Probe(made.begin_ns, CloudMessage.from_ros(message)), made.ring))
+        probes.append((Probe(made.begin_ns, read_point_cloud_2(message)), made.ring))
     layout, findings = settle([probe for probe, _ in probes])
     for probe, truth in probes:
         np.testing.assert_array_equal(decode(probe.cloud, layout).ring, truth)
@@ -232,7 +229,7 @@ def test_lines_are_told_apart_although_the_beams_start_above_the_origin() -> Non
     points = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), height]).astype(np.float32)
     made = rig.Turn(rig.START_NS, points, np.arange(6000) * 16_000, ring, ring, ring)
     layout = rig.Layout([*XYZ, ("timestamp", "f8", "time")])
-    probes = [Probe(rig.START_NS + rig.PERIOD_NS, CloudMessage.from_ros(rig.message(made, layout)))] * 2
+    probes = [Probe(rig.START_NS + rig.PERIOD_NS, read_point_cloud_2(rig.message(made, layout)))] * 2
     settled, _ = settle(probes)
     decoded = decode(probes[0].cloud, settled).ring
     assert (decoded == ring).mean() > 0.98

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from app.sensors.layout import Probe, settle_cloud
-from app.sensors.pointcloud import CloudError, CloudLayout, CloudMessage, decode
+from app.sensors.cloud_types import CloudError, Probe, read_point_cloud_2
+from app.sensors.layout import settle_cloud
+from app.sensors.pointcloud import CloudLayout, decode
 from app.slam.params import RecordingParams
 from tests.sensors import rig
 
@@ -20,7 +21,7 @@ def settle(layout: rig.Layout, lost: tuple[int, ...] = ()) -> tuple[list[Probe],
     probes = []
     for number in range(3):
         made = rig.turn(number, columns=20)
-        cloud = CloudMessage.from_ros(rig.message(made, layout, lost=lost))
+        cloud = read_point_cloud_2(rig.message(made, layout, lost=lost))
         probes.append(Probe(made.begin_ns + rig.PERIOD_NS + 3_000_000, cloud))
     return probes, settle_cloud(probes, RecordingParams(), "/points")[0]
 
@@ -30,7 +31,7 @@ def layouts(draw: st.DrawFn) -> rig.Layout:
     """Any order, types, padding and byte order of the fields, and any encoding of time."""
     time_name = draw(st.sampled_from(["timestamp", "time", "t", "offset_time", "time_stamp", "Timestamp"]))
     absolute = draw(st.booleans())
-    # A float32 can not hold absolute time, nor a 4-byte integer absolute nanoseconds.
+    # A float32 cannot hold absolute time, nor a 4-byte integer absolute nanoseconds.
     kind = "f8" if absolute else draw(st.sampled_from(["f8", "f4", "i4"]))
     unit = draw(st.sampled_from(["s", "ms", "us", "ns"] if kind[0] == "f" else ["us", "ns"]))
     coordinates = draw(st.sampled_from(["f4", "f8"]))
@@ -89,13 +90,13 @@ def test_nan_infinite_and_zero_points_are_no_returns() -> None:
     made.points[9] = (1.0, np.nan, 1.0)
     made.points[11] = (0.0, 0.0, 2.0)  # straight up is a return
     _, settled = settle(rig.Layout())
-    scan = decode(CloudMessage.from_ros(rig.message(made)), settled)
+    scan = decode(read_point_cloud_2(rig.message(made)), settled)
     keep = ~np.isin(np.arange(len(made)), [3, 7, 9])
     np.testing.assert_array_equal(scan.points, made.points[keep])
     np.testing.assert_array_equal(scan.ring, made.ring[keep])
 
 
-def test_a_decoded_scan_can_not_be_written_to() -> None:
+def test_a_decoded_scan_cannot_be_written_to() -> None:
     probes, settled = settle(rig.Layout())
     scan = decode(probes[0].cloud, settled)
     for array in (scan.points, scan.offsets_ns, scan.intensity, scan.ring):
@@ -106,7 +107,7 @@ def test_a_decoded_scan_can_not_be_written_to() -> None:
 def test_nanoseconds_as_unsigned_64_bit_integers_lose_no_digit() -> None:
     layout = rig.Layout()
     made = rig.turn(2, columns=20)
-    cloud = CloudMessage.from_ros(rig.message(made, layout))
+    cloud = read_point_cloud_2(rig.message(made, layout))
     stamps = (made.begin_ns + made.offsets_ns).astype(np.uint64)
     offset = cloud.fields["timestamp"][0]
     data = cloud.data.reshape(-1, cloud.point_step).copy()
@@ -131,13 +132,13 @@ def test_a_cloud_whose_sizes_contradict_each_other_is_refused(spoil: object, sai
     message = rig.message(rig.turn(0, columns=5), rig.Layout(rows=2))
     spoil(message)  # type: ignore[operator]
     with pytest.raises(CloudError, match=said):
-        CloudMessage.from_ros(message)
+        read_point_cloud_2(message)
 
 
 def test_empty_and_all_nan_clouds_say_so() -> None:
     _, settled = settle(rig.Layout())
     made = rig.turn(0, columns=5)
     with pytest.raises(CloudError, match="no points"):
-        decode(CloudMessage.from_ros(rig.message(made.only(np.zeros(len(made), bool)))), settled)
+        decode(read_point_cloud_2(rig.message(made.only(np.zeros(len(made), bool)))), settled)
     with pytest.raises(CloudError, match="NaN"):
-        decode(CloudMessage.from_ros(rig.message(made, lost=range(len(made)))), settled)
+        decode(read_point_cloud_2(rig.message(made, lost=range(len(made)))), settled)

@@ -1,13 +1,14 @@
 """A scan is given with the IMU samples that cover it, or dropped with the reason; nothing good is lost."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.sensors.sequencer import MAX_WAITING, Sequencer
-from app.slam.types import DroppedScan, Measurement, Scan
+from app.sensors.sequencer import MAX_HELD, MAX_WAITING, Sequencer
+from app.slam.types import F64, I64, DroppedScan, Measurement, Samples, Scan
 
 MS = 1_000_000
 PERIOD, IMU_STEP = 100 * MS, 10 * MS
@@ -224,3 +225,67 @@ def test_a_scan_that_could_not_be_read_keeps_its_place() -> None:
     out, _ = feed(samples(0, 320), [scan(0), DroppedScan(100 * MS, "all its points are NaN"), scan(200)])
     assert dropped(out) == [(100, "all its points are NaN")]
     assert isinstance(out[1], DroppedScan) and stamps(out[2])[0] == 100
+
+
+@dataclass(frozen=True, slots=True)
+class GnssFixes(Samples):
+    """A sensor that the program does not know: satellite fixes, (k, 3) degrees and m, and (k,) how many satellites."""
+
+    positions: F64
+    satellites: I64
+
+
+def fix(at_ms: int) -> GnssFixes:
+    return GnssFixes(np.array([at_ms * MS]), np.array([[48.0, 11.0, float(at_ms)]]), np.array([at_ms // 50]))
+
+
+def fix_times(entry: Measurement | DroppedScan) -> list[int]:
+    """Times of a measurement's fixes, ms, whose rows must have stayed together."""
+    assert isinstance(entry, Measurement)
+    if GnssFixes not in entry.streams:
+        return []
+    fixes = entry.streams[GnssFixes]
+    assert isinstance(fixes, GnssFixes)
+    times = (fixes.stamps_ns // MS).tolist()
+    assert fixes.positions[:, 2].tolist() == times and fixes.satellites.tolist() == [at // 50 for at in times]
+    assert not fixes.positions.flags.writeable
+    return times
+
+
+def test_samples_of_another_sensor_come_once_with_the_scan_that_they_fall_into() -> None:
+    sequencer, out = Sequencer(max_gap_s=0.1), []
+    for at in samples(0, 410):
+        push(sequencer, at)
+        if at % 50 == 0:
+            sequencer.add(fix(at))
+        if at % 100 == 0 and at:
+            sequencer.add_scan(scan(at - 100))
+            out += sequencer.ready()
+    assert [fix_times(entry) for entry in out] == [[0, 50, 100], [150, 200], [250, 300], [350, 400]]
+
+
+def test_a_late_sample_of_another_sensor_comes_with_the_next_scan_and_covers_nothing() -> None:
+    sequencer = Sequencer(max_gap_s=0.1)
+    for at in samples(0, 310):
+        push(sequencer, at)
+    sequencer.add_scan(scan(0))
+    out = list(sequencer.ready())  # a scan does not wait for other sensors
+    assert fix_times(out[0]) == [] and out[0].streams == {}  # type: ignore[union-attr]  # fix_times asserts it
+    for at in (150, 60, 220):
+        sequencer.add(fix(at))
+    before = sequencer.copy()
+    sequencer.add_scan(scan(100))
+    sequencer.add_scan(scan(200))
+    assert [fix_times(entry) for entry in sequencer.ready()] == [[60, 150], [220]]
+    before.add_scan(scan(100))
+    assert [fix_times(entry) for entry in before.ready()] == [[60, 150]]
+
+
+def test_a_sensor_without_scans_does_not_fill_the_memory() -> None:
+    sequencer = Sequencer(max_gap_s=0.1)
+    many = np.arange(2 * MAX_HELD) * MS
+    sequencer.add(GnssFixes(many, np.zeros((2 * MAX_HELD, 3)), np.zeros(2 * MAX_HELD, np.int64)))
+    for at in samples(0, 110):
+        push(sequencer, at)
+    sequencer.add_scan(scan(0))
+    assert fix_times(next(sequencer.ready())) == []  # the oldest were given up

@@ -4,31 +4,33 @@ import numpy as np
 import pytest
 
 from app.sensors.rsbpearl import BPEARL, BPV4, RINGS
-from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, Returns, firing_pattern
+from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
 from app.sensors.simulator.mesh import Mesh, MeshBuilder
 from app.sensors.simulator.raycast import Mover, Raycaster
 from app.sensors.simulator.scenes import SCENES, build_scene
 from app.sensors.simulator.scenes.plan import rectangle
 from app.sensors.simulator.scenes.props import pedestrian
-from app.sensors.simulator.trajectory import R_BODY_IMU, Trajectory, Walker, seconds, walk
+from app.sensors.simulator.trajectory import R_BODY_IMU, SmoothTrajectory, Walker, seconds, walk
 from app.slam.errors import HemislamError
-from app.slam.types import F64
+from app.slam.types import F64, I64, Scan
 
 EPOCH_NS = 1_700_000_000_000_000_000
 COARSE = firing_pattern(every_block=12)
 
 
-def still(yaw: float = 0.0) -> Trajectory:
+def still(yaw: float = 0.0) -> SmoothTrajectory:
     """The IMU at (0, 0, 1.25), looking along +x turned by yaw."""
     t = np.linspace(-1.0, 2.0, 31)
-    return Trajectory(t, np.tile([0.0, 0.0, 1.25, yaw, 0.0, 0.0], (31, 1)))
+    return SmoothTrajectory(t, np.tile([0.0, 0.0, 1.25, yaw, 0.0, 0.0], (31, 1)))
 
 
-def hurried() -> Trajectory:
+def hurried() -> SmoothTrajectory:
     """2 m/s forward, 1.5 rad/s of yaw, nodding."""
     t = np.linspace(-1.0, 2.0, 151)
     zero = np.zeros_like(t)
-    return Trajectory(t, np.column_stack([2 * t, zero, 1.25 + zero, 1.5 * t, 0.2 * np.sin(6 * t), 0.1 * np.cos(5 * t)]))
+    return SmoothTrajectory(
+        t, np.column_stack([2 * t, zero, 1.25 + zero, 1.5 * t, 0.2 * np.sin(6 * t), 0.1 * np.cos(5 * t)])
+    )
 
 
 def wall_at(x: float, reflectivity: float = 0.6) -> Mesh:
@@ -37,13 +39,18 @@ def wall_at(x: float, reflectivity: float = 0.6) -> Mesh:
     return mesh.build()
 
 
-def fire(lidar: Lidar, mesh: Mesh, trajectory: Trajectory, *movers: Mover, seed: int = 0) -> Returns:
+def fire(lidar: Lidar, mesh: Mesh, trajectory: SmoothTrajectory, *movers: Mover, seed: int = 0) -> Scan:
     return lidar.turn(Raycaster(mesh, movers), trajectory, 0.05, EPOCH_NS, np.random.default_rng(seed))
 
 
-def in_world(returns: Returns, trajectory: Trajectory, stamps_ns: np.ndarray | None = None) -> F64:
+def stamps(scan: Scan) -> I64:
+    """(n,) absolute ns of each point."""
+    return scan.stamp_ns + scan.offsets_ns.astype(np.int64)
+
+
+def in_world(returns: Scan, trajectory: SmoothTrajectory, stamps_ns: np.ndarray | None = None) -> F64:
     """Points by the true pose at `stamps_ns`, by default each point's own."""
-    positions, rotations = trajectory.poses(seconds((returns.stamps_ns if stamps_ns is None else stamps_ns) - EPOCH_NS))
+    positions, rotations = trajectory.poses(seconds((stamps(returns) if stamps_ns is None else stamps_ns) - EPOCH_NS))
     return positions + np.einsum("nij,nj->ni", rotations, returns.points + P_IMU_LIDAR)
 
 
@@ -109,7 +116,7 @@ def test_points_of_a_hurried_turn_lie_on_the_wall_by_their_own_poses_only(rate_h
     returns = fire(lidar, wall_at(5.0), trajectory)
     assert len(returns.points) > 1000
     assert np.abs(in_world(returns, trajectory)[:, 0] - 5.0).max() < 0.003
-    end = np.full(len(returns.points), returns.stamps_ns.max())
+    end = np.full(len(returns.points), returns.end_ns)
     assert np.abs(in_world(returns, trajectory, end)[:, 0] - 5.0).max() > 0.1
 
 
@@ -146,7 +153,7 @@ def test_a_moving_plate_is_hit_where_it_is_at_each_firing() -> None:
     x = in_world(returns, trajectory)[:, 0]
     struck = x < 6.0
     assert struck.sum() > 1000
-    expected = 5.0 - 8.0 * seconds(returns.stamps_ns[struck] - EPOCH_NS)
+    expected = 5.0 - 8.0 * seconds(stamps(returns)[struck] - EPOCH_NS)
     assert np.ptp(expected) > 0.7
     assert np.abs(x[struck] - expected).max() < 0.003
 
@@ -171,7 +178,7 @@ def test_the_floor_is_labelled_ground_and_nothing_else_is() -> None:
     lidar = Lidar(COARSE, range_noise=0.0)
     returns = lidar.turn(Raycaster(scene.mesh, scene.movers), trajectory, 3.0, EPOCH_NS, np.random.default_rng(0))
     z = in_world(returns, trajectory)[:, 2]
-    ground = returns.ground == 1
+    ground = returns.truth_ground == 1
     assert 0.1 < ground.mean() < 0.6
     assert np.abs(z[ground]).max() < 0.01
     assert (z[~ground] > -0.01).all() and np.quantile(z[~ground], 0.05) > 0.03

@@ -5,18 +5,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from app.sensors.simulator.imu import PERFECT, RATE_HZ, ImuNoise, measure
-from app.sensors.simulator.trajectory import Trajectory, Walker, walk
+from app.sensors.simulator.trajectory import SmoothTrajectory, Walker, walk
 
 PATH = np.array([(0.0, 0.0), (8.0, 0.0), (8.0, 5.0), (0.0, 5.0)])
 DURATION_S = 20.0
 
 
 @pytest.fixture(scope="module")
-def trajectory() -> Trajectory:
+def trajectory() -> SmoothTrajectory:
     return walk(PATH, DURATION_S, np.random.default_rng(3), walker=Walker(), height=lambda xy: 0.1 * xy[:, 0])
 
 
-def test_a_perfect_imu_integrates_back_to_the_true_walk(trajectory: Trajectory) -> None:
+def test_a_perfect_imu_integrates_back_to_the_true_walk(trajectory: SmoothTrajectory) -> None:
     stamps = np.arange(0, 20_000_000_000 + 1, 1_000_000_000 // RATE_HZ)
     imu = measure(trajectory, stamps, 0, PERFECT, np.random.default_rng(0))
     dt = 1.0 / RATE_HZ
@@ -37,7 +37,7 @@ def test_a_perfect_imu_integrates_back_to_the_true_walk(trajectory: Trajectory) 
     assert (R.inv() * Rotation.from_matrix(rotations[-1])).magnitude() < 1e-4
 
 
-def test_rates_and_forces_are_the_derivatives_of_the_poses(trajectory: Trajectory) -> None:
+def test_rates_and_forces_are_the_derivatives_of_the_poses(trajectory: SmoothTrajectory) -> None:
     t = np.linspace(0.5, DURATION_S - 0.5, 300)
     h = 1e-3
     rate, force = trajectory.motion(t)
@@ -48,7 +48,7 @@ def test_rates_and_forces_are_the_derivatives_of_the_poses(trajectory: Trajector
     np.testing.assert_allclose(force, felt, atol=1e-3)
 
 
-def test_at_rest_the_specific_force_is_g_upwards_which_is_the_imus_minus_x(trajectory: Trajectory) -> None:
+def test_at_rest_the_specific_force_is_g_upwards_which_is_the_imus_minus_x(trajectory: SmoothTrajectory) -> None:
     t = np.linspace(0.0, 2.4, 50)
     rate, force = trajectory.motion(t)
     _, R_world_imu = trajectory.poses(t)
@@ -57,7 +57,7 @@ def test_at_rest_the_specific_force_is_g_upwards_which_is_the_imus_minus_x(traje
     assert (force[:, 0] < -9.7).all()
 
 
-def test_the_walker_stands_still_then_walks_at_the_height_and_speed_asked_for(trajectory: Trajectory) -> None:
+def test_the_walker_stands_still_then_walks_at_the_height_and_speed_asked_for(trajectory: SmoothTrajectory) -> None:
     still, _ = trajectory.poses(np.linspace(0.0, 2.4, 20))
     assert np.ptp(still, axis=0).max() < 1e-3
     t = np.linspace(5.0, DURATION_S, 400)
@@ -70,7 +70,7 @@ def test_the_walker_stands_still_then_walks_at_the_height_and_speed_asked_for(tr
     assert np.degrees(np.arccos(np.clip((forward * course).sum(axis=1), -1, 1))).mean() < 25.0
 
 
-def test_hand_and_steps_move_the_sensor(trajectory: Trajectory) -> None:
+def test_hand_and_steps_move_the_sensor(trajectory: SmoothTrajectory) -> None:
     t = np.linspace(6.0, DURATION_S, 2000)
     rate, _ = trajectory.motion(t)
     assert 0.1 < rate.std() < 1.0
@@ -87,7 +87,7 @@ def test_an_open_path_is_walked_to_its_end_and_no_further() -> None:
     assert np.linalg.norm(positions[1] - positions[0]) < 0.1
 
 
-def test_noise_and_biases_have_the_size_they_are_said_to_have(trajectory: Trajectory) -> None:
+def test_noise_and_biases_have_the_size_they_are_said_to_have(trajectory: SmoothTrajectory) -> None:
     stamps = np.arange(0, 20_000_000_000, 5_000_000)
     truth = measure(trajectory, stamps, 0, PERFECT, np.random.default_rng(0))
     noise = ImuNoise()

@@ -146,14 +146,14 @@ def test_coordinates_can_be_rounded(tmp_path: Path) -> None:
     [
         ({"scene": "moon"}, "no scene `moon`; there are corridor"),
         ({"rate_hz": 15}, "turns at 10 or 20 Hz, not 15"),
-        ({"duration_s": 0.0}, "duration_s can not be 0; choose 0.5"),
-        ({"every_block": 0}, "every_block can not be 0; choose 1 to 90"),
-        ({"range_noise": float("nan")}, "range_noise can not be nan"),
+        ({"duration_s": 0.0}, "duration_s cannot be 0; choose 0.5"),
+        ({"every_block": 0}, "every_block cannot be 0; choose 1 to 90"),
+        ({"range_noise": float("nan")}, "range_noise cannot be nan"),
         ({"out": "walk.bag"}, r"must be named \*\.mcap, not `walk\.bag`"),
         ({"out": "absent/walk.mcap"}, "absent does not exist"),
     ],
 )
-def test_what_can_not_be_simulated_is_said_in_a_sentence(
+def test_what_cannot_be_simulated_is_said_in_a_sentence(
     tmp_path: Path, arguments: dict[str, Any], sentence: str
 ) -> None:
     given = {"scene": "room", "out": "walk.mcap", "duration_s": 1.0} | arguments

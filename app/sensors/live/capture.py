@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from app.sensors import ros
 from app.sensors.clocks import TOLERANCE_S
 from app.sensors.findings import Finding
-from app.sensors.live import messages
 from app.sensors.live.clock import ClockMap
 from app.sensors.live.counters import Counters
 from app.sensors.live.difop import DIFOP_ID, Difop, read_angles, read_difop
@@ -60,6 +60,8 @@ class CaptureStream:
         complete: whether the file has its end. findings: what the packets are, and what was lost of them.
     """
 
+    by_log_time = True
+
     def __init__(self, path: Path) -> None:
         """Raises CaptureError: the file is no capture. HemislamError: the angles beside it are none."""
         from app.sensors.live.decoder import Decoder
@@ -83,24 +85,24 @@ class CaptureStream:
             if log_ns >= stop_ns:
                 return
             if isinstance(content, ImuSample):
-                if log_ns >= start_ns and messages.IMU_TOPIC in topics:
+                if log_ns >= start_ns and ros.IMU_TOPIC in topics:
                     stamp_ns = content.stamp_ns + self._imu_shift(log_ns)
-                    yield messages.IMU_TOPIC, log_ns, messages.imu_message(stamp_ns, content.gyro, content.accel)
+                    yield ros.IMU_TOPIC, log_ns, ros.imu_message(stamp_ns, content.gyro, content.accel)
                 continue
             number = max(number, 0)
             begin, shift_ns = self._begins[number], self._lidar_shifts[number]
             number += 1
-            if log_ns < start_ns or messages.LIDAR_TOPIC not in topics:
+            if log_ns < start_ns or ros.LIDAR_TOPIC not in topics:
                 continue
             if begin.device != device and self._devices:
                 device = begin.device
                 self._decoder.configure(self._devices[device])
             scan = self._decoder.decode(content)
             if isinstance(scan, Scan):
-                message = messages.cloud_message(replace(scan, stamp_ns=scan.stamp_ns + shift_ns), exact=True)
+                message = ros.cloud_message(replace(scan, stamp_ns=scan.stamp_ns + shift_ns), exact=True)
             else:
-                message = messages.empty_cloud(scan.stamp_ns + shift_ns)
-            yield messages.LIDAR_TOPIC, log_ns, message
+                message = ros.empty_cloud(scan.stamp_ns + shift_ns)
+            yield ros.LIDAR_TOPIC, log_ns, message
 
     def close(self) -> None:
         """Nothing stays open between two readings."""
@@ -117,12 +119,12 @@ class CaptureStream:
                 imu.extend((content.stamp_ns, log_ns))
             self.start_ns = self.start_ns or log_ns
             self.end_ns = log_ns
-        self.counts = {}
+        self.counts: dict[str, tuple[str, int]] = {}
         frames, samples = np.array(lidar, np.int64).reshape(-1, 2), np.array(imu, np.int64).reshape(-1, 2)
         if len(frames):
-            self.counts[messages.LIDAR_TOPIC] = (messages.CLOUD, len(frames))
+            self.counts[ros.LIDAR_TOPIC] = (ros.CLOUD, len(frames))
         if len(samples):
-            self.counts[messages.IMU_TOPIC] = (messages.IMU, len(samples))
+            self.counts[ros.IMU_TOPIC] = (ros.IMU, len(samples))
         self._settle_clocks(frames, samples)
 
     def _settle_clocks(self, frames: Any, samples: Any) -> None:
@@ -151,7 +153,7 @@ class CaptureStream:
         wrong = counters.lost or counters.truncated or counters.late or counters.imu_lost or not self.complete
         text = counters.describe() + ("" if self.complete else "; the file is cut off there")
         found = [Finding("packets", "corrected" if wrong else "fine", text)]
-        if messages.LIDAR_TOPIC in self.counts:
+        if ros.LIDAR_TOPIC in self.counts:
             device = self._devices[0] if self._devices else None
             model = self._begins[0].model.name
             changed = f"; set to other values {len(self._devices) - 1} times" if len(self._devices) > 1 else ""

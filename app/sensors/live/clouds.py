@@ -1,18 +1,20 @@
-"""Point cloud messages as they come, read by the same rules as a recording's."""
+"""Point-cloud messages as they arrive, read by the same rules as those of a recording."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
+from app.sensors.cloud_types import CloudError, CloudType, Probe, stamped
 from app.sensors.findings import Finding
-from app.sensors.layout import Probe, settle_cloud
-from app.sensors.pointcloud import CloudError, CloudLayout, CloudMessage, decode, stamp_ns, valid_points
+from app.sensors.layout import settle_cloud
+from app.sensors.pointcloud import CloudLayout, read_scan
 from app.sensors.probe import PROBED_CLOUDS
+from app.sensors.ros import stamp_ns
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan
 
 _GIVE_UP = 100
-"""Clouds without a usable point among them, before that is told."""
+"""So many clouds without a usable point are reported."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,65 +26,55 @@ class Arrived:
 
 
 class CloudReader:
-    """Looks at the first clouds of a topic before it decodes any, and again if their fields change.
+    """Examines the first clouds of a topic before it decodes any, and again if their fields change.
 
     Attributes:
-        findings: how they are read; new ones each time that was decided.
+        findings: how the clouds are read; replaced each time that was settled.
     """
 
-    def __init__(self, params: Params, topic: str) -> None:
+    def __init__(self, params: Params, topic: str, kind: CloudType) -> None:
         self.findings: list[Finding] = []
-        self._params, self._topic = params, topic
+        self._params, self._topic, self._kind = params, topic, kind
         self._layout: CloudLayout | None = None
-        self._stamped = True
         self._fields: dict[str, Any] = {}
-        self._waiting: list[tuple[CloudMessage, int, int]] = []
+        self._waiting: list[tuple[Any, Probe, int]] = []
         self._unusable = 0
 
     def add(self, message: Any, log_ns: int, arrival_ns: int) -> list[Arrived]:
         """The scans that this message completes: none at first, then those that waited, then one each.
 
         Args:
-            message: a deserialised PointCloud2. log_ns: when its sender passed it on.
+            message: deserialised. log_ns: when its sender passed it on.
 
         Raises:
-            HemislamError: such clouds can not be read at all, and why.
+            HemislamError: such clouds cannot be read at all, and why.
         """
+        if self._layout is not None:
+            cloud, scan = read_scan(message, log_ns, self._layout)
+            if cloud is None or cloud.fields == self._fields:
+                return [Arrived(scan, arrival_ns)]
+            self._layout = None
         try:
-            cloud = CloudMessage.from_ros(message)
+            probe = Probe(log_ns, self._kind.read(message))
         except CloudError as error:
             return [Arrived(DroppedScan(stamp_ns(message.header.stamp), str(error)), arrival_ns)]
-        if self._layout is not None and cloud.fields != self._fields:
-            self._layout = None
-        if self._layout is not None:
-            return [Arrived(self._decoded(cloud, log_ns, self._layout), arrival_ns)]
-        if self._waiting and cloud.fields != self._waiting[-1][0].fields:
+        cloud = probe.cloud
+        if cloud.fields != self._fields:
             self._waiting.clear()
+            self._fields = cloud.fields
         if not {"x", "y", "z"} <= cloud.fields.keys():
             raise HemislamError(f"The clouds on {self._topic} have no x, y, z, but {', '.join(cloud.fields)}.")
-        if not len(valid_points(cloud.xyz())[0]):
+        if not len(probe.points):
             self._unusable += 1
             if self._unusable == _GIVE_UP:
                 raise HemislamError(f"None of the clouds on {self._topic} has a usable point; check the LiDAR.")
             return [Arrived(DroppedScan(cloud.stamp_ns, "none of its points is a return"), arrival_ns)]
-        self._waiting.append((cloud, log_ns, arrival_ns))
+        self._waiting.append((message, probe, arrival_ns))
         return self._settle() if len(self._waiting) == PROBED_CLOUDS else []
 
     def _settle(self) -> list[Arrived]:
         waiting, self._waiting = self._waiting, []
-        self._stamped = len({cloud.stamp_ns for cloud, _, _ in waiting}) > 1
-        probes = [
-            Probe(log_ns, cloud if self._stamped else replace(cloud, stamp_ns=log_ns), self._stamped)
-            for cloud, log_ns, _ in waiting
-        ]
-        layout, self.findings = settle_cloud(probes, self._params.recording, self._topic)
-        self._layout, self._fields = layout, waiting[-1][0].fields
-        return [Arrived(self._decoded(cloud, log_ns, layout), arrival) for cloud, log_ns, arrival in waiting]
-
-    def _decoded(self, cloud: CloudMessage, log_ns: int, layout: CloudLayout) -> Scan | DroppedScan:
-        if not self._stamped:
-            cloud = replace(cloud, stamp_ns=log_ns)
-        try:
-            return decode(cloud, layout)
-        except CloudError as error:
-            return DroppedScan(cloud.stamp_ns, str(error))
+        probes = stamped([probe for _, probe, _ in waiting])
+        layout, self.findings = settle_cloud(probes, self._params.recording, self._topic, self._kind)
+        self._layout = layout
+        return [Arrived(read_scan(message, probe.log_ns, layout)[1], at) for message, probe, at in waiting]

@@ -117,14 +117,14 @@ def read_angles(path: Path) -> Calibration:
     """A calibration from CSV: 32 lines by channel, `elevation, horizontal correction` in degrees.
 
     Raises:
-        HemislamError: the file can not be read, or holds something else.
+        HemislamError: the file cannot be read, or holds something else.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = [tuple(map(float, row[:2])) for row in csv.reader(file) if row]
         table = np.array(rows, np.float64)
     except OSError as error:
-        raise HemislamError(f"The angles {path} can not be read ({error.strerror}); check the path.") from None
+        raise HemislamError(f"The angles {path} cannot be read ({error.strerror}); check the path.") from None
     except (ValueError, UnicodeDecodeError):
         table = np.empty((0, 0))
     if table.shape != (CHANNELS, 2) or not np.isfinite(table).all() or np.abs(table[:, 0]).max() > 91.0:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from app.sensors.live import messages
+from app.sensors import ros
 from app.sensors.live.difop import NOMINAL, Calibration, Difop, read_angles, write_difop
 from app.sensors.live.firings import firings_of, fit_angles, rate_of
 from app.sensors.live.foxglove_server import FoxgloveServer, Offer
@@ -118,7 +118,7 @@ def feed(
         wait_s: a Foxglove server waits so long for somebody who wants to receive.
 
     Raises:
-        HemislamError: the recording can not be read, or not be played out so; nobody came.
+        HemislamError: the recording cannot be read, or not be played out so; nobody came.
     """
     params = params.with_values({"recording.imu_time_offset": 0.0})  # the receiver applies it
     pace = pace or Pace()
@@ -153,8 +153,7 @@ def _feed_foxglove(
     path: Path, topics: tuple[str, str], to: Address, pace: Pace, duration_s: float | None, wait_s: float
 ) -> int:
     offers = [
-        Offer(topic, kind, messages.definition(kind))
-        for topic, kind in zip(topics, (messages.CLOUD, messages.IMU), strict=True)
+        Offer(topic, kind, ros.definition(kind)) for topic, kind in zip(topics, (ros.CLOUD, ros.IMU), strict=True)
     ]
     count = 0
     with Source(path) as source, FoxgloveServer(to.host or "127.0.0.1", to.ports[0], offers) as server:
@@ -173,10 +172,8 @@ def _feed_foxglove(
 
 def _messages_of(source: Source, topics: tuple[str, str], duration_s: float | None) -> Iterator[Sent]:
     stop_ns = None if duration_s is None else source.start_ns + round(duration_s * 1e9)
-    kinds = {topics[0]: (0, messages.CLOUD), topics[1]: (1, messages.IMU)}
     for number, (topic, log_ns, message) in enumerate(source.messages(topics, None, stop_ns)):
-        channel, kind = kinds[topic]
-        yield Sent(log_ns, number, channel, messages.serialised(message, kind))
+        yield Sent(log_ns, number, topics.index(topic), ros.serialised(message))
 
 
 def _ahead(items: Iterator[Sent], stop: threading.Event) -> Iterator[Sent]:

@@ -1,7 +1,7 @@
 """A client of foxglove_bridge: any ROS 1 or ROS 2 robot, without ROS here.
 
-The protocol: JSON texts announce channels and ask for them; a binary message is 0x01, the number of the
-subscription (u32), a log time (u64 ns), little-endian, and the ROS message as it is (CDR or ROS 1).
+The protocol: JSON texts announce channels and subscribe to them. A binary message is 0x01, the subscription's number
+(u32), a log time (u64 ns), little-endian, and the ROS message as it is (CDR or ROS 1).
 """
 
 import json
@@ -9,19 +9,18 @@ import struct
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
-from rosbags.typesys import Stores, get_typestore
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
+from app.sensors.cloud_types import CLOUD_TYPES
 from app.sensors.live.clouds import CloudReader
 from app.sensors.live.intake import Intake
-from app.sensors.mcap_stream import ros2_type
-from app.sensors.pointcloud import stamp_ns
-from app.sensors.probe import TYPES
+from app.sensors.probe import usable_types
+from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type, stamp_ns
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 
@@ -29,7 +28,6 @@ SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.
 MAX_MESSAGE = 256 << 20
 RETRY_S = 1.0
 MESSAGE = struct.Struct("<BIQ")
-_ENCODINGS = ("cdr", "ros1")
 
 Sensor = Literal["lidar", "imu"]
 NAMES: dict[Sensor, Literal["LiDAR", "IMU"]] = {"lidar": "LiDAR", "imu": "IMU"}
@@ -37,12 +35,13 @@ NAMES: dict[Sensor, Literal["LiDAR", "IMU"]] = {"lidar": "LiDAR", "imu": "IMU"}
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """What a server announces. type: as rosbags spells it."""
+    """What a server announces. type: as in ROS 2. definition: the type's text."""
 
     id: int
     topic: str
     encoding: str
     type: str
+    definition: str
 
 
 class FoxgloveReceiver:
@@ -58,7 +57,9 @@ class FoxgloveReceiver:
         self._params = params
         chosen = params.recording
         self._topics: dict[Sensor, str] = {"lidar": chosen.lidar_topic, "imu": chosen.imu_topic}
-        self._ros2, self._ros1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+        self._deserialiser = Deserialiser()
+        self._channels: dict[int, Channel] = {}
+        self._subscribed: dict[int, tuple[Sensor, Channel]] = {}
         self._reader: CloudReader | None = None
         self._told = ""
 
@@ -74,93 +75,82 @@ class FoxgloveReceiver:
                     connected = True
                     self._told = ""
                     intake.put_status("connected", "source", f"connected to {self._url}")
-                    self._session(connection, intake, stop)
+                    self._listen(connection, intake, stop)
             except (OSError, WebSocketException, TimeoutError) as error:
                 text = f"no connection to {self._url} ({_brief(error)}); trying again"
                 self._tell("disconnected", text, intake)
             stop.wait(RETRY_S)
 
-    def _session(self, connection: Connection, intake: Intake, stop: threading.Event) -> None:
-        channels: dict[int, Channel] = {}
-        subscribed: dict[int, tuple[Sensor, Channel]] = {}
+    def _listen(self, connection: Connection, intake: Intake, stop: threading.Event) -> None:
+        """One connection, until it ends."""
+        self._channels, self._subscribed = {}, {}
         begun = time.monotonic()
         while not stop.is_set():
             try:
                 message = connection.recv(timeout=0.1)
             except TimeoutError:
-                if not channels and time.monotonic() - begun > RETRY_S:
+                if not self._channels and time.monotonic() - begun > RETRY_S:
                     self._tell("configuration", f"{self._url} offers no topic at all; waiting for one", intake)
                 continue
             if isinstance(message, str):
-                if self._read_text(message, channels, subscribed):
-                    self._subscribe(connection, channels, subscribed, intake)
+                if self._note(message):
+                    self._subscribe(connection, intake)
             elif len(message) >= MESSAGE.size and message[0] == 1:
                 _, number, log_ns = MESSAGE.unpack_from(message)
-                if number in subscribed:
-                    sensor, channel = subscribed[number]
-                    self._receive(sensor, channel, message[MESSAGE.size :], log_ns, intake)
+                if number in self._subscribed:
+                    self._receive(*self._subscribed[number], message[MESSAGE.size :], log_ns, intake)
 
-    def _read_text(self, text: str, channels: dict[int, Channel], subscribed: dict[int, Any]) -> bool:
-        """Take note of the channels that come and go; whether any did."""
+    def _note(self, text: str) -> bool:
+        """Take note of channels that come and go; whether any did."""
         try:
             said = json.loads(text)
             operation = said["op"]
             if operation == "advertise":
                 for channel in said["channels"]:
-                    kind = ros2_type(str(channel["schemaName"]))
-                    found = Channel(int(channel["id"]), str(channel["topic"]), str(channel["encoding"]), kind)
-                    channels[found.id] = found
+                    kind, definition = ros2_type(str(channel["schemaName"])), str(channel.get("schema", ""))
+                    found = Channel(
+                        int(channel["id"]), str(channel["topic"]), str(channel["encoding"]), kind, definition
+                    )
+                    self._channels[found.id] = found
             elif operation == "unadvertise":
-                gone = {int(number) for number in said["channelIds"]}
-                for number in gone:
-                    channels.pop(number, None)
-                for number in [n for n, (_, channel) in subscribed.items() if channel.id in gone]:
-                    del subscribed[number]
-            else:
-                return False
+                for gone in map(int, said["channelIds"]):
+                    self._channels.pop(gone, None)
+                    self._subscribed.pop(gone, None)
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):  # not of the protocol
             return False
-        return True
+        return operation in ("advertise", "unadvertise")
 
-    def _subscribe(
-        self,
-        connection: Connection,
-        channels: dict[int, Channel],
-        subscribed: dict[int, tuple[Sensor, Channel]],
-        intake: Intake,
-    ) -> None:
+    def _subscribe(self, connection: Connection, intake: Intake) -> None:
+        """Subscribe to what is wanted and not subscribed yet. A subscription has its channel's number."""
         missing = []
         for sensor in self._wanted:
-            if any(sensor == known for known, _ in subscribed.values()):
+            if any(sensor == known for known, _ in self._subscribed.values()):
                 continue
-            usable = [c for c in channels.values() if c.type == TYPES[sensor] and c.encoding in _ENCODINGS]
-            wanted = self._topics[sensor]
+            kinds, wanted = usable_types(sensor), self._topics[sensor]
+            usable = [c for c in self._channels.values() if c.type in kinds and c.encoding in ENCODINGS]
             found = next((c for c in usable if not wanted or c.topic == wanted), None)
             if found is None:
-                there = ", ".join(c.topic for c in usable) or ", ".join(sorted(c.topic for c in channels.values()))
-                missing.append(f"no topic {wanted or f'of type {TYPES[sensor]}'} (it has {there or 'none'})")
+                there = ", ".join(c.topic for c in usable or sorted(self._channels.values(), key=lambda c: c.topic))
+                lacking = wanted or f"of type {' or '.join(kinds)}"
+                missing.append(f"no topic {lacking} (it has {there or 'none'})")
                 continue
-            number = found.id
-            subscribed[number] = (sensor, found)
-            request = {"op": "subscribe", "subscriptions": [{"id": number, "channelId": found.id}]}
+            self._subscribed[found.id] = (sensor, found)
+            self._deserialiser.learn(found.type, found.definition, found.encoding)
+            request = {"op": "subscribe", "subscriptions": [{"id": found.id, "channelId": found.id}]}
             connection.send(json.dumps(request))
             others = [c.topic for c in usable if c is not found]
             hint = f"; there are also {', '.join(others)}" if others and not wanted else ""
             intake.put_status("connected", NAMES[sensor], f"{NAMES[sensor]} on {found.topic}{hint}")
             if sensor == "lidar":
-                self._reader = CloudReader(self._params, found.topic)
+                self._reader = CloudReader(self._params, found.topic, CLOUD_TYPES[found.type])
                 intake.sensor = f"{found.topic} from {self._url}"
         if missing:
             self._tell("configuration", f"{self._url} offers {'; '.join(missing)}; waiting for it", intake)
 
     def _receive(self, sensor: Sensor, channel: Channel, data: bytes, log_ns: int, intake: Intake) -> None:
         arrival = time.time_ns()
-        message: Any
         try:
-            if channel.encoding == "ros1":
-                message = self._ros1.deserialize_ros1(data, channel.type)
-            else:
-                message = self._ros2.deserialize_cdr(data, channel.type)
+            message = self._deserialiser.read(data, channel.type, channel.encoding)
         except Exception:  # rosbags lets those of struct, numpy and asserts through
             intake.counters.unreadable += 1
             return
@@ -187,7 +177,7 @@ class FoxgloveReceiver:
                     intake.put_status("configuration", "LiDAR", text)
 
     def _tell(self, kind: Literal["disconnected", "configuration"], text: str, intake: Intake) -> None:
-        """Once, however often it is tried."""
+        """Report it once, however often it happens."""
         if text != self._told:
             self._told = text
             intake.put_status(kind, "source", text)

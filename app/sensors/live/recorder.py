@@ -1,8 +1,7 @@
-"""A live session as a ROS 2 recording, written while it runs: readable by `ros2 bag`, and by `open_recording`.
+"""A live session as a ROS 2 recording, written while it runs: readable by `ros2 bag` and by `open_recording`.
 
-On a thread of its own, so that a slow disk delays nothing. Twice a second a chunk is ended and handed to
-the disk: a crash costs less than the last second, and a missing end is no obstacle to reading
-(`mcap_stream.py`).
+It has a thread of its own, so that a slow disk delays nothing. Twice a second it ends a chunk and syncs it to the disk:
+a crash costs less than the last second, and a file without an end can be read (`mcap_stream.py`).
 """
 
 import itertools
@@ -12,9 +11,7 @@ import threading
 from collections import deque
 from pathlib import Path
 
-from mcap.writer import CompressionType, Writer
-
-from app.sensors.live import messages
+from app.sensors.ros import RecordingWriter, Vector
 from app.slam.errors import HemislamError
 from app.slam.types import Scan
 
@@ -22,13 +19,12 @@ FLUSH_S = 0.5
 MAX_SCANS, MAX_SAMPLES = 200, 100_000
 """What may wait for the disk, 20 s of scans: if there is more it is too slow, and the newest are left out."""
 
-Vector = tuple[float, float, float]
 _Scan = tuple[Scan, int]
 _Imu = tuple[int, Vector, Vector, int]
 
 
 def further(path: Path) -> Path:
-    """Where to go on when `path` can not be gone on with: `walk-2.mcap` for `walk.mcap`, or the next that is free."""
+    """Where to go on when `path` cannot be gone on with: `walk-2.mcap` for `walk.mcap`, or the next that is free."""
     names = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
     return next(name for name in names if not name.exists())
 
@@ -40,24 +36,21 @@ class Recorder:
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises HemislamError: the file is there already, or can not be made."""
+        """Raises HemislamError: the file is there already, or cannot be made."""
         self.path = path
         self.bytes_written = 0
         self.left_out = 0
         self.failure = ""
         if path.suffix != ".mcap":
-            raise HemislamError(f"{path} can not be recorded into; name a file that ends in .mcap, as it will be one.")
+            raise HemislamError(f"{path} cannot be recorded into; name a file that ends in .mcap, as it will be one.")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("xb")
         except OSError as error:
             if isinstance(error, FileExistsError) and path.exists():
                 raise HemislamError(f"{path} is there already; record into another file.") from None
-            raise HemislamError(f"{path} can not be written ({error.strerror}); choose another place.") from None
-        self._mcap = Writer(self._file, compression=CompressionType.ZSTD)
-        self._mcap.start(profile="ros2")
-        self._lidar = self._channel(messages.LIDAR_TOPIC, messages.CLOUD)
-        self._imu = self._channel(messages.IMU_TOPIC, messages.IMU)
+            raise HemislamError(f"{path} cannot be written ({error.strerror}); choose another place.") from None
+        self._mcap = RecordingWriter(self._file)
         self._waiting: deque[_Scan | _Imu] = deque()
         self._scans_waiting = 0
         self._wake = threading.Event()
@@ -97,29 +90,22 @@ class Recorder:
                     while self._waiting:
                         try:
                             self._write(self._waiting.popleft())
-                        except (struct.error, OverflowError):  # a time that ROS can not express
+                        except (struct.error, OverflowError):  # a time that ROS cannot express
                             self.left_out += 1
                     if closing:
-                        self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
+                        self._mcap.finish()
                     else:
-                        self._mcap.flush()  # type: ignore[no-untyped-call]
+                        self._mcap.flush()
                     self._file.flush()
                     os.fsync(self._file.fileno())
                     self.bytes_written = self._file.tell()
         except (OSError, ValueError) as error:
-            self.failure = f"{self.path} can not be written any more ({getattr(error, 'strerror', None) or error})"
+            self.failure = f"{self.path} cannot be written any more ({getattr(error, 'strerror', None) or error})"
             self._waiting.clear()
-
-    def _channel(self, topic: str, msgtype: str) -> int:
-        schema = self._mcap.register_schema(msgtype, "ros2msg", messages.definition(msgtype).encode())
-        return self._mcap.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
 
     def _write(self, message: _Scan | _Imu) -> None:
         if len(message) == 4:
-            stamp_ns, gyro, accel, arrival_ns = message
-            channel, data = self._imu, messages.serialised(messages.imu_message(stamp_ns, gyro, accel), messages.IMU)
+            self._mcap.add_imu(*message)
         else:
-            scan, arrival_ns = message
             self._scans_waiting -= 1
-            channel, data = self._lidar, messages.serialised(messages.cloud_message(scan), messages.CLOUD)
-        self._mcap.add_message(channel, arrival_ns, data, publish_time=arrival_ns)
+            self._mcap.add_scan(*message)

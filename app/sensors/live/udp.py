@@ -42,7 +42,7 @@ def open_socket(host: str, port: int) -> socket.socket:
     except OSError as error:
         made.close()
         raise HemislamError(
-            f"UDP port {port} on {host or 'all addresses'} can not be opened ({error.strerror}); "
+            f"UDP port {port} on {host or 'all addresses'} cannot be opened ({error.strerror}); "
             "is another program receiving there?"
         ) from None
     force = getattr(socket, "SO_RCVBUFFORCE", 33)
@@ -83,7 +83,7 @@ class RsbpearlReceiver:
     """The sensor's own packets. Sockets are open once it is made, so that what comes then is kept.
 
     Raises:
-        HemislamError: a port can not be opened.
+        HemislamError: a port cannot be opened.
     """
 
     def __init__(self, host: str, msop_port: int, difop_port: int, angles: Calibration | None = None) -> None:
@@ -191,7 +191,7 @@ class RsbpearlReceiver:
 
 
 class ImuReceiver:
-    """IMU samples from datagrams (see `imu_udp.py`). Raises HemislamError: the port can not be opened."""
+    """IMU samples from datagrams (see `imu_udp.py`). Raises HemislamError: the port cannot be opened."""
 
     def __init__(self, host: str, port: int) -> None:
         self._socket = open_socket(host, port)

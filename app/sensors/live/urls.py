@@ -101,7 +101,7 @@ def open_live(
         before: what a source that this one takes the place of had found out.
 
     Raises:
-        HemislamError: an address can not be understood, a port not opened, a file not written.
+        HemislamError: an address cannot be understood, a port not opened, a file not written.
     """
     address = parse_address(lidar)
     beside = parse_address(imu) if imu else None

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.sensors.simulator.trajectory import Trajectory, seconds
+from app.sensors.simulator.trajectory import SmoothTrajectory, seconds
 from app.slam.types import F64, I64, ImuSamples
 
 RATE_HZ = 200
@@ -32,7 +32,7 @@ PERFECT = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def measure(
-    trajectory: Trajectory, stamps_ns: I64, start_ns: int, noise: ImuNoise, rng: np.random.Generator
+    trajectory: SmoothTrajectory, stamps_ns: I64, start_ns: int, noise: ImuNoise, rng: np.random.Generator
 ) -> ImuSamples:
     """Read the IMU at `stamps_ns`; the trajectory's time 0 is `start_ns`."""
     t = seconds(stamps_ns - start_ns)

@@ -16,8 +16,8 @@ from app.sensors.rsbpearl import (
     Model,
 )
 from app.sensors.simulator.raycast import Raycaster
-from app.sensors.simulator.trajectory import Trajectory, seconds
-from app.slam.types import F32, F64, I64, U8, U16
+from app.sensors.simulator.trajectory import SmoothTrajectory, seconds
+from app.slam.types import F32, F64, I64, U16, Scan
 
 P_IMU_LIDAR: F64 = np.array([0.0175, 0.0276, -0.1083])
 """m, the LiDAR's place on H2LID's IMU; their axes agree."""
@@ -61,22 +61,6 @@ def firing_pattern(model: Model = BPEARL, rate_hz: int = 10, every_block: int = 
 
 
 @dataclass(frozen=True, slots=True)
-class Returns:
-    """The points of one revolution, in firing order, as the sensor reports them.
-
-    Attributes:
-        stamps_ns: (n,) absolute. points: (n, 3) m, LiDAR frame at each point's own time.
-        intensity: (n,) 0-255, whole numbers. ring: (n,). ground: (n,) truth, 1 = floor or terrain.
-    """
-
-    stamps_ns: I64
-    points: F32
-    intensity: F32
-    ring: U16
-    ground: U8
-
-
-@dataclass(frozen=True, slots=True)
 class Lidar:
     """Attributes:
     range_noise: m, spread of a distance before it is rounded to `range_step` (m, 0 = not rounded).
@@ -90,9 +74,12 @@ class Lidar:
     lossless: bool = False
 
     def turn(
-        self, scene: Raycaster, trajectory: Trajectory, start_s: float, epoch_ns: int, rng: np.random.Generator
-    ) -> Returns:
-        """One revolution that starts `start_s` after `epoch_ns` (the trajectory's time 0)."""
+        self, scene: Raycaster, trajectory: SmoothTrajectory, start_s: float, epoch_ns: int, rng: np.random.Generator
+    ) -> Scan:
+        """One revolution that starts `start_s` after `epoch_ns` (the trajectory's time 0).
+
+        The points come in firing order; the intensity is a whole number, the truth of the ground is given.
+        """
         pattern = self.pattern
         start_ns = round(start_s * 1e9)
         origins, directions = self._rays(trajectory, start_ns)
@@ -113,15 +100,18 @@ class Lidar:
         points = pattern.levers[kept] + distance[kept, None] * pattern.directions[kept]
         if self.coordinate_step > 0:
             points = np.rint(points / self.coordinate_step) * self.coordinate_step
-        return Returns(
-            epoch_ns + start_ns + pattern.offsets_ns[kept],
+        offsets_ns = pattern.offsets_ns[kept]
+        first_ns = int(offsets_ns.min()) if len(kept) else 0
+        return Scan(
+            epoch_ns + start_ns + first_ns,
             points.astype(np.float32),
+            (offsets_ns - first_ns).astype(np.int32),
             np.clip(np.rint(brightness[kept]), 0, 255).astype(np.float32),
             pattern.ring[kept],
             hits.ground[kept],
         )
 
-    def _rays(self, trajectory: Trajectory, start_ns: int) -> tuple[F64, F64]:
+    def _rays(self, trajectory: SmoothTrajectory, start_ns: int) -> tuple[F64, F64]:
         """Every firing's ray in the world, from the pose at its own time.
 
         Poses are taken at both ends of each block and interpolated between: over 55 us a hand's

@@ -26,6 +26,21 @@ class Mover:
 
 
 @dataclass(frozen=True, slots=True)
+class SimulatedScene:
+    """Attributes:
+    mesh: everything that stands still, world frame. movers: bodies that move.
+    path: (n, 2) waypoints of the trajectory in plan, m. closed: whether it is repeated lap by lap.
+    height: the ground's z at (n, 2) points; None is z = 0.
+    """
+
+    mesh: Mesh
+    movers: tuple[Mover, ...]
+    path: F64
+    closed: bool = True
+    height: Callable[[F64], F64] | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Hits:
     """What each of n rays met. Rays that met nothing have infinite distance.
 
@@ -44,7 +59,7 @@ class Raycaster:
     """Casts rays at a scene, each at its own time."""
 
     def __init__(self, mesh: Mesh, movers: tuple[Mover, ...] = ()) -> None:
-        """Raises HemislamError, naming the system packages, where open3d can not be loaded."""
+        """Raises HemislamError, naming the system packages, where open3d cannot be loaded."""
         self._still = _Target(mesh)
         self._movers = [(mover, _Target(mover.mesh), *_sphere(mover.mesh)) for mover in movers]
 
@@ -97,7 +112,7 @@ def _open3d() -> tuple[Any, Any]:
         from open3d.t.geometry import RaycastingScene
     except (ImportError, OSError) as error:
         raise HemislamError(
-            f"The simulator needs open3d, which can not be loaded here ({error}); "
+            f"The simulator needs open3d, which cannot be loaded here ({error}); "
             "on Debian or Ubuntu: apt-get install libusb-1.0-0 libegl1 libgl1."
         ) from error
     return open3d.core, RaycastingScene

@@ -1,4 +1,4 @@
-"""One walk through one scene, measured and written to disk."""
+"""One trajectory through one scene, measured and written to disk."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,24 +8,27 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from app.sensors.ros import RecordingWriter
 from app.sensors.rsbpearl import BPEARL, ROTATION_RATES_HZ
 from app.sensors.simulator import imu as imu_model
 from app.sensors.simulator.imu import ImuNoise
 from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
-from app.sensors.simulator.raycast import Raycaster
-from app.sensors.simulator.recording import TRANSPORT_NS, RecordingWriter
-from app.sensors.simulator.scenes import Scene, build_scene
-from app.sensors.simulator.trajectory import Trajectory, Walker, seconds, walk
+from app.sensors.simulator.raycast import Raycaster, SimulatedScene
+from app.sensors.simulator.scenes import build_scene
+from app.sensors.simulator.trajectory import SmoothTrajectory, Walker, seconds, walk
 from app.slam.errors import HemislamError
 from app.slam.types import I64
 
 START_NS = 1_700_000_000_000_000_000
 """Every recording starts at this moment."""
 
+TRANSPORT_NS = 4_000_000
+"""A cloud reaches the recorder this long after its last point."""
+
 _FIRST_TURN_S = 0.05
 _IMU_PERIOD_NS = 1_000_000_000 // imu_model.RATE_HZ
 
-_WALK, _IMU, _LIDAR = 1, 2, 3
+_TRAJECTORY, _IMU, _LIDAR = 1, 2, 3
 """Streams of random numbers that do not disturb one another (0 is the scene's)."""
 
 
@@ -35,7 +38,7 @@ class SimulationSummary:
 
     Attributes:
         recording, truth, params: the three files. scans, points, imu_samples: how many.
-        duration_s, distance_m: of the walk. bytes: size of the recording.
+        duration_s, distance_m: of the trajectory. bytes: size of the recording.
     """
 
     recording: Path
@@ -68,13 +71,13 @@ def simulate(
 
     Beside `out` (`<stem>.mcap`, streamed scan by scan) it writes the truth `<stem>_truth.tum`
     (T_world_imu at every scan's end, absolute seconds, exact; the world's z is up) and
-    `<stem>.params.yaml` (the sensor's mounting, loaded by itself with the recording). The same
+    `<stem>.params.yaml` (the sensor's mounting, loaded with the recording). The same
     arguments give the same measurements. Existing files are replaced once all is written.
 
     Args:
         scene: a name in SCENES. out: ends in .mcap; its folder must exist.
         duration_s: of the recording, the still start (walker.still) included.
-        seed: of everything random: the scene's details, the walk, noise and biases.
+        seed: of everything random: the scene's details, the trajectory, noise and biases.
         rate_hz: 10 or 20 revolutions a second. every_block: fire every k-th azimuth block only,
             so that a scan has 57,632 / k firings at 10 Hz and the file is small.
         range_step: m, rounding of distances: 0.005, or 0.0025 for a newer unit; 0 = none.
@@ -85,8 +88,8 @@ def simulate(
         progress: called with (scans done, scans in all).
 
     Raises:
-        HemislamError: unknown scene, an argument out of range, a file that can not be written,
-            or open3d that can not be loaded.
+        HemislamError: unknown scene, an argument out of range, a file that cannot be written,
+            or open3d that cannot be loaded.
     """
     out = Path(out)
     _check(
@@ -100,7 +103,7 @@ def simulate(
     )
     walker = walker or Walker()
     place = build_scene(scene, seed)
-    trajectory = walk_through(place, duration_s, seed, walker)
+    trajectory = trajectory_through(place, duration_s, seed, walker)
     caster = Raycaster(place.mesh, place.movers)
     lidar = Lidar(firing_pattern(BPEARL, rate_hz, every_block), range_noise, range_step, coordinate_step)
     imu_stamps = START_NS + np.arange(round(duration_s * imu_model.RATE_HZ) + 1, dtype=np.int64) * _IMU_PERIOD_NS
@@ -113,27 +116,33 @@ def simulate(
     unfinished = out.with_name(out.name + ".part")
     ends: list[int] = []
     try:
-        with RecordingWriter(unfinished) as recording:
+        with unfinished.open("wb") as file:
+            recording = RecordingWriter(file)
+
+            def add_imu_until(received_ns: float) -> None:
+                nonlocal next_imu
+                while next_imu < len(imu) and imu.stamps_ns[next_imu] <= received_ns:
+                    stamp = int(imu.stamps_ns[next_imu])
+                    recording.add_imu(stamp, imu.gyro[next_imu], imu.accel[next_imu], stamp)
+                    next_imu += 1
+
             for index in range(total):
                 start_s = _FIRST_TURN_S + index / rate_hz
-                returns = lidar.turn(caster, trajectory, start_s, START_NS, _random(seed, _LIDAR, index))
-                if not len(returns.points):
+                scan = lidar.turn(caster, trajectory, start_s, START_NS, _random(seed, _LIDAR, index))
+                if not len(scan):
                     continue
-                points += len(returns.points)
-                ends.append(int(returns.stamps_ns.max()))
-                received = ends[-1] + TRANSPORT_NS
-                while next_imu < len(imu) and imu.stamps_ns[next_imu] <= received:
-                    recording.add_imu(int(imu.stamps_ns[next_imu]), imu.gyro[next_imu], imu.accel[next_imu])
-                    next_imu += 1
-                recording.add_cloud(returns, ends[-1])
+                points += len(scan)
+                ends.append(scan.end_ns)
+                add_imu_until(scan.end_ns + TRANSPORT_NS)
+                recording.add_scan(scan, scan.end_ns + TRANSPORT_NS)
                 progress(index + 1, total)
-            for k in range(next_imu, len(imu)):
-                recording.add_imu(int(imu.stamps_ns[k]), imu.gyro[k], imu.accel[k])
+            add_imu_until(np.inf)
+            recording.finish()
         truth.write_text(_tum(trajectory, np.array(ends, np.int64)))
         params.write_text(_SIDECAR + yaml.safe_dump({"sensor": {"translation": P_IMU_LIDAR.tolist()}}))
         unfinished.replace(out)
     except OSError as error:
-        raise HemislamError(f"{out} can not be written ({error.strerror}); choose another place.") from error
+        raise HemislamError(f"{out} cannot be written ({error.strerror}); choose another place.") from error
     finally:
         unfinished.unlink(missing_ok=True)
 
@@ -151,9 +160,9 @@ def simulate(
     )
 
 
-def walk_through(place: Scene, duration_s: float, seed: int, walker: Walker) -> Trajectory:
-    """The walk that `simulate` simulates."""
-    rng = _random(seed, _WALK)
+def trajectory_through(place: SimulatedScene, duration_s: float, seed: int, walker: Walker) -> SmoothTrajectory:
+    """The trajectory that `simulate` follows."""
+    rng = _random(seed, _TRAJECTORY)
     return walk(place.path, duration_s, rng, walker=walker, closed=place.closed, height=place.height)
 
 
@@ -164,7 +173,7 @@ def _random(seed: int, *stream: int) -> np.random.Generator:
     return np.random.default_rng([seed, *stream])
 
 
-def _tum(trajectory: Trajectory, stamps_ns: I64) -> str:
+def _tum(trajectory: SmoothTrajectory, stamps_ns: I64) -> str:
     """TUM lines: absolute seconds, x y z, quaternion x y z w."""
     positions, rotations = trajectory.poses(seconds(stamps_ns - START_NS))
     quaternions = Rotation.from_matrix(rotations).as_quat()
@@ -194,4 +203,4 @@ def _check(out: Path, rate_hz: int, **numbers: float) -> None:
     for name, value in numbers.items():
         low, high, unit = _LIMITS[name]
         if not low <= value <= high:
-            raise HemislamError(f"The simulator's {name} can not be {value:g}; choose {low:g} to {high:g} {unit}.")
+            raise HemislamError(f"The simulator's {name} cannot be {value:g}; choose {low:g} to {high:g} {unit}.")

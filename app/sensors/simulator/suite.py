@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from app.sensors.simulator.scenes import build_scene
-from app.sensors.simulator.simulate import simulate, walk_through
+from app.sensors.simulator.simulate import simulate, trajectory_through
 from app.sensors.simulator.trajectory import Walker
 from app.slam.errors import HemislamError
 
@@ -52,7 +52,7 @@ SUITES = {"paper": PAPER}
 @dataclass(frozen=True, slots=True)
 class Made:
     """Attributes:
-    recording: the file. new: whether it was simulated now. distance_m: walked.
+    recording: the file. new: whether it was simulated now. distance_m: of the trajectory.
     """
 
     recording: Path
@@ -71,7 +71,7 @@ def make_twin(
 ) -> Made:
     """Simulate one sequence into `folder`, unless the same is there already.
 
-    The walker's speed is chosen so that the length of the whole walk is the paper's.
+    The walker's speed is chosen so that the whole trajectory is as long as the paper's.
 
     Args:
         every_block: fire every k-th azimuth only; None: all, or every SHORT_EVERY_BLOCK-th if short.
@@ -103,12 +103,12 @@ def make_twin(
 
 
 def fitting_speed(twin: Twin, seed: int) -> float:
-    """m/s, with which the whole walk is as long as the paper's, to a centimetre or so."""
+    """m/s, with which the whole trajectory is as long as the paper's, to a centimetre or so."""
     place = build_scene(twin.scene, seed)
     times = np.arange(0.0, twin.duration_s, 1 / RATE_HZ)
     speed = twin.length_m / (twin.duration_s - 4.0)
     for _ in range(6):
-        path = walk_through(place, twin.duration_s, seed, Walker(speed=speed)).poses(times)[0]
+        path = trajectory_through(place, twin.duration_s, seed, Walker(speed=speed)).poses(times)[0]
         length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
         speed *= twin.length_m / length
     return speed

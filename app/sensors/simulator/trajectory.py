@@ -28,7 +28,7 @@ def seconds(ns: I64) -> F64:
     return ns.astype(np.float64) * 1e-9
 
 
-class Trajectory:
+class SmoothTrajectory:
     """Where the IMU is, at any time. Times are seconds from the recording's start, (n,) arrays."""
 
     def __init__(self, times: F64, samples: F64) -> None:
@@ -92,7 +92,7 @@ def walk(
     walker: Walker,
     closed: bool = True,
     height: Callable[[F64], F64] | None = None,
-) -> Trajectory:
+) -> SmoothTrajectory:
     """Walk along waypoints, as often around a closed path as time allows; stop at the end of an open one.
 
     Args:
@@ -138,7 +138,7 @@ def walk(
             rng.normal(scale=np.deg2rad(1.0)) + awake * walker.roll * _wander(t, rng, (0.2, 1.0)),
         ]
     )
-    return Trajectory(t, samples)
+    return SmoothTrajectory(t, samples)
 
 
 def _rotation(angles: F64) -> F64:

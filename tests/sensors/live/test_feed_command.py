@@ -1,4 +1,4 @@
-"""`hemislam feed` explains itself, and refuses what can not be in one sentence."""
+"""`hemislam feed` explains itself, and refuses what cannot be in one sentence."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def test_it_plays_packets_to_whoever_listens_or_nobody() -> None:
         (["--to", "foxglove://127.0.0.1:1", "--imu-to", "imu-udp://127.0.0.1:1"], "belongs to packets"),
     ],
 )
-def test_what_can_not_be_is_refused(arguments: list[str], words: str) -> None:
+def test_what_cannot_be_is_refused(arguments: list[str], words: str) -> None:
     done = CliRunner().invoke(cli, ["feed", MUSEUM, *arguments])
     assert done.exit_code == 2
     assert words in done.output

@@ -168,5 +168,5 @@ def test_our_server_offers_both_names_and_survives_clients_that_leave() -> None:
                 assert client.recv(timeout=5.0) == b"\x01" + struct.pack("<IQ", 5, 77) + b"data"
         time.sleep(0.05)
         server.publish(1, 78, b"to nobody")
-        with pytest.raises(HemislamError, match="can not be opened"):
+        with pytest.raises(HemislamError, match="cannot be opened"):
             FoxgloveServer("127.0.0.1", server.port, offers)

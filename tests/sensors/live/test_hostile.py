@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from websockets.sync.server import ServerConnection, serve
 
-from app.sensors.live import messages
+from app.sensors import ros
+from app.sensors.cloud_types import POINT_CLOUD_2
 from app.sensors.live.clouds import CloudReader
 from app.sensors.live.foxglove import SUBPROTOCOLS
 from app.sensors.live.intake import MAX_HELD, Intake
@@ -107,10 +108,10 @@ def test_a_clock_that_is_set_back_at_the_start_piles_up_nothing() -> None:
 
 
 def _odd_cloud(luck: random.Random, number: int) -> Any:
-    field = messages.STORE.types["sensor_msgs/msg/PointField"]
     names = (["x", "y", "z"] if luck.random() < 0.8 else []) + luck.choices(["t", "x", "ring", "", "é"], k=3)
     fields = [
-        field(
+        ros.new(
+            "sensor_msgs/msg/PointField",
             name=name,
             offset=luck.choice([4 * at, 4 * at, 0, 3, 2**31, 2**32 - 1]),
             datatype=luck.choice([7, 7, 0, 2, 8, 255]),
@@ -119,8 +120,9 @@ def _odd_cloud(luck: random.Random, number: int) -> Any:
         for at, name in enumerate(names)
     ]
     step = luck.choice([0, 1, 24, 24, 2**31])
-    return messages.STORE.types[messages.CLOUD](
-        header=messages._header(sensor.START_NS + number * 100_000_000, "lidar"),
+    return ros.new(
+        ros.CLOUD,
+        header=ros.header(sensor.START_NS + number * 100_000_000, "lidar"),
         height=luck.choice([1, 1, 2, 0, 2**31]),
         width=luck.choice([100, 100, 0, 2**31]),
         fields=fields,
@@ -137,18 +139,16 @@ def test_clouds_that_contradict_themselves_are_told_and_take_no_memory() -> None
     """Billions of points of no bytes each once took all there is."""
     luck = random.Random(0)
     for _ in range(60):
-        reader = CloudReader(Params(), "/points")
+        reader = CloudReader(Params(), "/points", POINT_CLOUD_2)
         for number in range(30):
             try:
                 arrived = reader.add(_odd_cloud(luck, number), sensor.START_NS, sensor.START_NS)
             except HemislamError:
                 continue
             assert all(isinstance(one.scan, DroppedScan) or len(one.scan) <= 2400 for one in arrived)
-    nothing = messages.cloud_message(
-        Scan(0, np.ones((5, 3), np.float32), *(np.zeros(5, k) for k in ("i4", "f4", "u2")))
-    )
+    nothing = ros.cloud_message(Scan(0, np.ones((5, 3), np.float32), *(np.zeros(5, k) for k in ("i4", "f4", "u2"))))
     nothing.point_step, nothing.width = 0, 2_000_000_000
-    (arrived,) = CloudReader(Params(), "/points").add(nothing, 0, 0)
+    (arrived,) = CloudReader(Params(), "/points", POINT_CLOUD_2).add(nothing, 0, 0)
     assert isinstance(arrived.scan, DroppedScan) and "of 0 bytes" in arrived.scan.reason
 
 

@@ -292,11 +292,11 @@ def test_angles_are_waited_for_but_not_forever() -> None:
         ("rsbpearl://0.0.0.0:a,b", "imu-udp://:1", "no ports"),
         ("rsbpearl://0.0.0.0?speed=2", "imu-udp://:1", "no option `speed`"),
         ("rsbpearl://0.0.0.0?clock=moon", "imu-udp://:1", "`auto`, `sensor` or `host`"),
-        ("rsbpearl://0.0.0.0?angles=/none.csv", "imu-udp://:1", "can not be read"),
+        ("rsbpearl://0.0.0.0?angles=/none.csv", "imu-udp://:1", "cannot be read"),
         ("imu-udp://:1", None, "gives no point clouds"),
     ],
 )
-def test_an_address_that_can_not_be_is_refused_in_one_sentence(lidar: str, imu: str | None, words: str) -> None:
+def test_an_address_that_cannot_be_is_refused_in_one_sentence(lidar: str, imu: str | None, words: str) -> None:
     with pytest.raises(HemislamError, match=words):
         open_live(lidar, Params(), imu)
 
@@ -316,7 +316,7 @@ def test_a_port_in_use_is_said() -> None:
     wire = Wire()
     with (
         open_live(wire.url, Params(), wire.imu_url),
-        pytest.raises(HemislamError, match=f"UDP port {wire.imu} .* can not be opened"),
+        pytest.raises(HemislamError, match=f"UDP port {wire.imu} .* cannot be opened"),
     ):
         open_live(wire.url, Params(), wire.imu_url)
 

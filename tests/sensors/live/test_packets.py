@@ -116,7 +116,7 @@ def test_angles_come_from_a_file_the_device_or_the_data_sheet(tmp_path: Path) ->
         file.write_text(text)
         with pytest.raises(HemislamError, match=r"angles\.csv is no calibration"):
             read_angles(file)
-    with pytest.raises(HemislamError, match="can not be read"):
+    with pytest.raises(HemislamError, match="cannot be read"):
         read_angles(tmp_path / "none.csv")
 
 

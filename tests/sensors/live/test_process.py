@@ -35,7 +35,7 @@ def test_an_engine_that_dies_is_followed_by_one_that_misses_nothing(tmp_path: Pa
     wire, record = Wire(), tmp_path / "session.mcap"
     packets = sensor.turns(60)
     with LiveProcess(wire.url, Params(), wire.imu_url, record) as process:
-        with pytest.raises(HemislamError, match="can not be opened"):
+        with pytest.raises(HemislamError, match="cannot be opened"):
             LiveProcess(wire.url, Params(), wire.imu_url)
         wire.send(wire.device, sensor.difop())
         feeder = threading.Thread(target=wire.turns, args=(0, packets))

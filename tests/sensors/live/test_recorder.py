@@ -150,15 +150,15 @@ def scans_before_the_end(path: Path) -> list[Scan]:
 
 def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "session.mcap")
-    recorder._file.close()  # what comes next can not be written
+    recorder._file.close()  # what comes next cannot be written
     record(recorder, range(3))
     recorder.close()
-    assert "can not be written any more" in recorder.failure
+    assert "cannot be written any more" in recorder.failure
 
 
 def test_no_place_to_write_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(HemislamError, match="can not be written"):
+    with pytest.raises(HemislamError, match="cannot be written"):
         Recorder(tmp_path / "file" / "session.mcap")
 
 

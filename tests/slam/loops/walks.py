@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 
 from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
-from app.sensors.simulator.raycast import Raycaster
-from app.sensors.simulator.scenes import Scene, build_scene
+from app.sensors.simulator.raycast import Raycaster, SimulatedScene
+from app.sensors.simulator.scenes import build_scene
 from app.sensors.simulator.trajectory import Walker, walk
 from app.slam import lie
 from app.slam.loops.backend import LoopBackend
@@ -54,7 +54,9 @@ class Walk:
         return tuple(out)
 
 
-def take(scene: str | Scene, duration_s: float, spacing_m: float = 0.8, every_block: int = 12, seed: int = 0) -> Walk:
+def take(
+    scene: str | SimulatedScene, duration_s: float, spacing_m: float = 0.8, every_block: int = 12, seed: int = 0
+) -> Walk:
     """A keyframe every `spacing_m` of a walk round the scene's path."""
     place = build_scene(scene, seed) if isinstance(scene, str) else scene
     path = walk(

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from app.sensors.simulator.raycast import SimulatedScene
 from app.sensors.simulator.scenes.building import building
 from app.sensors.simulator.scenes.corridor import corridor
 from app.sensors.simulator.scenes.identical import identical
@@ -12,10 +13,9 @@ from app.sensors.simulator.scenes.museum import museum
 from app.sensors.simulator.scenes.outdoor import outdoor
 from app.sensors.simulator.scenes.paper import indoor_1, indoor_2, outdoor_1, outdoor_2, outdoor_3, outdoor_4
 from app.sensors.simulator.scenes.room import room
-from app.sensors.simulator.scenes.scene import Scene
 from app.slam.errors import HemislamError
 
-_BUILDERS: dict[str, Callable[[np.random.Generator], Scene]] = {
+_BUILDERS: dict[str, Callable[[np.random.Generator], SimulatedScene]] = {
     builder.__name__: builder
     for builder in (
         *(corridor, room, outdoor, museum, building, identical),
@@ -27,13 +27,10 @@ SCENES: dict[str, str] = {name: (builder.__doc__ or "").splitlines()[0] for name
 """Name and one-line description of every scene."""
 
 
-def build_scene(name: str, seed: int) -> Scene:
+def build_scene(name: str, seed: int) -> SimulatedScene:
     """The scene, the same for the same seed. Raises HemislamError, naming the scenes there are."""
     if name not in _BUILDERS:
         near = difflib.get_close_matches(name, _BUILDERS, n=1)
         hint = f"did you mean `{near[0]}`?" if near else f"there are {', '.join(_BUILDERS)}."
         raise HemislamError(f"There is no scene `{name}`; {hint}")
     return _BUILDERS[name](np.random.default_rng([seed, 0]))
-
-
-__all__ = ["SCENES", "Scene", "build_scene"]

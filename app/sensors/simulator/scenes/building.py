@@ -3,16 +3,16 @@
 import numpy as np
 
 from app.sensors.simulator.mesh import MeshBuilder
+from app.sensors.simulator.raycast import SimulatedScene
 from app.sensors.simulator.scenes import props
 from app.sensors.simulator.scenes.corridor import HEIGHT, WIDTH, inner_wall, outer_wall
 from app.sensors.simulator.scenes.plan import level, rectangle, tiled
-from app.sensors.simulator.scenes.scene import Scene
 
 LENGTH, DEPTH = 42.0, 15.0
 _LOBBY = 6.0
 
 
-def building(rng: np.random.Generator) -> Scene:
+def building(rng: np.random.Generator) -> SimulatedScene:
     """Two wings of office corridors that share one, 138 m a lap: one lap, a turn in the lobby, and all of it back."""
     mesh = MeshBuilder()
     reach = 4.2  # rooms behind the outer walls
@@ -48,7 +48,7 @@ def building(rng: np.random.Generator) -> Scene:
     turn = [(middle - 0.3, -1.6), (middle - 1.2, -2.9), (middle, -4.2), (middle + 1.2, -2.9), (middle + 0.3, -1.6)]
     someone = props.pedestrian(rectangle(1.85, 1.85, middle - 1.85, DEPTH - 1.85)[::-1], 1.1)
     # down the shared corridor twice, once from either wing; then the same lap the other way
-    return Scene(mesh.build(), (someone,), np.array([*lap, *turn, *lap[::-1][:-1]]))
+    return SimulatedScene(mesh.build(), (someone,), np.array([*lap, *turn, *lap[::-1][:-1]]))
 
 
 def _lobby(mesh: MeshBuilder, middle: float, rng: np.random.Generator) -> None:

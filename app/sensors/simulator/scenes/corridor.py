@@ -3,16 +3,16 @@
 import numpy as np
 
 from app.sensors.simulator.mesh import MeshBuilder
+from app.sensors.simulator.raycast import SimulatedScene
 from app.sensors.simulator.scenes import props
 from app.sensors.simulator.scenes.plan import level, rectangle, tiled
-from app.sensors.simulator.scenes.scene import Scene
 from app.slam.types import F64
 
 HEIGHT = 2.7
 WIDTH = 2.4
 
 
-def corridor(rng: np.random.Generator) -> Scene:
+def corridor(rng: np.random.Generator) -> SimulatedScene:
     """A 24 x 14 m loop of office corridors: doors, open rooms, pillars, ceiling lamps, a person walking."""
     length, depth = 24.0, 14.0
     mesh = MeshBuilder()
@@ -47,7 +47,7 @@ def corridor(rng: np.random.Generator) -> Scene:
     start = np.array([[middle + 4.0, middle]])
     walk = np.vstack([start, path[1:], path[:1]])
     someone = props.pedestrian(rectangle(1.85, 1.85, length - 1.85, depth - 1.85)[::-1], 1.1)
-    return Scene(mesh.build(), (someone,), walk)
+    return SimulatedScene(mesh.build(), (someone,), walk)
 
 
 def outer_wall(

@@ -3,9 +3,9 @@
 import numpy as np
 
 from app.sensors.simulator.mesh import MeshBuilder
+from app.sensors.simulator.raycast import SimulatedScene
 from app.sensors.simulator.scenes import props
 from app.sensors.simulator.scenes.plan import level, rectangle, tiled
-from app.sensors.simulator.scenes.scene import Scene
 
 HEIGHT, WIDTH = 2.6, 2.0
 PITCH, CORRIDORS = 6.0, 5
@@ -14,7 +14,7 @@ BAY, BAYS = 4.0, 4
 """Distance from door to door along a corridor, m, and how many there are on either side."""
 
 
-def identical(rng: np.random.Generator) -> Scene:
+def identical(rng: np.random.Generator) -> SimulatedScene:
     """Five identical corridors side by side, each with eight identical rooms, walked one after the other."""
     mesh = MeshBuilder()
     width = (CORRIDORS - 1) * PITCH
@@ -39,7 +39,7 @@ def identical(rng: np.random.Generator) -> Scene:
         x, ends = c * PITCH, (0.0, far)
         path += [(x, y) for y in (ends if c % 2 == 0 else ends[::-1])]
     # the last corridor ends in the north: back along the north aisle and down the first corridor
-    return Scene(mesh.build(), (), np.array([*path, (0.0, far)]))
+    return SimulatedScene(mesh.build(), (), np.array([*path, (0.0, far)]))
 
 
 def _room(mesh: MeshBuilder, x: float, side: float, y: float) -> None:

@@ -3,9 +3,9 @@
 import numpy as np
 
 from app.sensors.simulator.mesh import MeshBuilder
+from app.sensors.simulator.raycast import SimulatedScene
 from app.sensors.simulator.scenes import props
 from app.sensors.simulator.scenes.plan import level, tiled
-from app.sensors.simulator.scenes.scene import Scene
 from app.slam.types import F64
 
 HALL = (-9.0, 9.0, 6.0, 15.0)
@@ -15,7 +15,7 @@ DOORS = (-5.4, 5.4)
 EAVES = 5.2
 
 
-def museum(rng: np.random.Generator) -> Scene:
+def museum(rng: np.random.Generator) -> SimulatedScene:
     """Indoors and out: round a sloping court with trees, cars and a fountain, through a museum's pillared hall."""
     mesh = MeshBuilder()
     _court(mesh, rng)
@@ -28,7 +28,7 @@ def museum(rng: np.random.Generator) -> Scene:
         props.pedestrian([(-3.0, 12.9), (3.0, 12.9), (3.6, 13.5), (-3.0, 13.6)], 0.7, 1.0, None, 1.65),
         props.pedestrian([(-16.0, -15.6), (16.0, -15.4), (16.0, -16.6), (-16.0, -16.8)], 1.3, 20.0, _terrain),
     )
-    return Scene(mesh.build(), people, path, height=_terrain)
+    return SimulatedScene(mesh.build(), people, path, height=_terrain)
 
 
 def _terrain(xy: F64) -> F64:

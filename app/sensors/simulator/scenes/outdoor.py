@@ -3,15 +3,15 @@
 import numpy as np
 
 from app.sensors.simulator.mesh import MeshBuilder
+from app.sensors.simulator.raycast import SimulatedScene
 from app.sensors.simulator.scenes import props
 from app.sensors.simulator.scenes.plan import distance_to_path
-from app.sensors.simulator.scenes.scene import Scene
 from app.slam.types import F64
 
 ASPHALT, GRASS = 0.18, 0.42
 
 
-def outdoor(rng: np.random.Generator) -> Scene:
+def outdoor(rng: np.random.Generator) -> SimulatedScene:
     """A campus with slopes, buildings, trees, hedges, parked cars and people who walk about."""
     mesh = MeshBuilder()
     path = np.array(
@@ -74,4 +74,4 @@ def outdoor(rng: np.random.Generator) -> Scene:
         props.pedestrian(path[::-1] * 0.94, 1.3, 25.0, height, 1.65),
         props.pedestrian([(-8.0, 17.5), (8.0, 18.0), (9.0, 19.5), (-8.0, 19.0)], 1.2, 0.0, height, 1.8),
     )
-    return Scene(mesh.build(), people, path, height=height)
+    return SimulatedScene(mesh.build(), people, path, height=height)

@@ -11,10 +11,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from app.sensors.simulator.mesh import MeshBuilder
-from app.sensors.simulator.raycast import Mover
+from app.sensors.simulator.raycast import Mover, SimulatedScene
 from app.sensors.simulator.scenes import props
 from app.sensors.simulator.scenes.plan import level, rectangle, tiled
-from app.sensors.simulator.scenes.scene import Scene
 from app.slam.types import F64
 
 _ASPHALT, _GRASS = 0.18, 0.42
@@ -24,7 +23,7 @@ _EDGE = 45.0
 Path = Sequence[tuple[float, float]]
 
 
-def indoor_1(rng: np.random.Generator) -> Scene:
+def indoor_1(rng: np.random.Generator) -> SimulatedScene:
     """A parking garage of 44 x 26 m: pillars, beams, rows of cars, two lanes and a cross lane, 232 m a lap."""
     length, depth, height = 44.0, 26.0, 2.6
     mesh = MeshBuilder()
@@ -56,10 +55,10 @@ def indoor_1(rng: np.random.Generator) -> Scene:
     small = [(5.0, 7.0), (17.0, 7.0), (17.0, 19.0), (5.0, 19.0), (5.0, 7.0)]
     rest = [(39.0, 7.0), (39.0, 19.0), (5.0, 19.0), (5.0, 7.0), (17.0, 7.0), (17.0, 19.0), (39.0, 19.0), (39.0, 7.0)]
     someone = props.pedestrian(rectangle(20.0, 6.0, 41.0, 20.2), 1.1)
-    return Scene(mesh.build(), (someone,), np.array([*small, *rest]))
+    return SimulatedScene(mesh.build(), (someone,), np.array([*small, *rest]))
 
 
-def indoor_2(rng: np.random.Generator) -> Scene:
+def indoor_2(rng: np.random.Generator) -> SimulatedScene:
     """An open-plan office of 14 x 10 m: islands of desks, chairs at all angles, shelves, sofas, 24 m a lap."""
     length, depth, height = 14.0, 10.0, 2.8
     mesh = MeshBuilder()
@@ -92,10 +91,10 @@ def indoor_2(rng: np.random.Generator) -> Scene:
             mesh.box((x, y, height - 0.03), (1.2, 0.6, 0.06), 0.9)
     path = np.array(rectangle(2.4, 2.3, 9.6, 7.3))
     pacing = props.pedestrian(rectangle(10.4, 1.5, 11.6, 8.5), 0.7)
-    return Scene(mesh.build(), (pacing,), path)
+    return SimulatedScene(mesh.build(), (pacing,), path)
 
 
-def outdoor_1(rng: np.random.Generator) -> Scene:
+def outdoor_1(rng: np.random.Generator) -> SimulatedScene:
     """Streets of a campus: round a small block, then round the large one, 290 m a lap."""
     return _streets(
         rng,
@@ -106,7 +105,7 @@ def outdoor_1(rng: np.random.Generator) -> Scene:
     )
 
 
-def outdoor_2(rng: np.random.Generator) -> Scene:
+def outdoor_2(rng: np.random.Generator) -> SimulatedScene:
     """Streets of a campus: a figure of eight after a small block, 440 m a lap."""
     return _streets(
         rng,
@@ -117,7 +116,7 @@ def outdoor_2(rng: np.random.Generator) -> Scene:
     )
 
 
-def outdoor_3(rng: np.random.Generator) -> Scene:
+def outdoor_3(rng: np.random.Generator) -> SimulatedScene:
     """An open campus with wide lawns, 950 m a lap through three rounds that share streets."""
     return _streets(
         rng,
@@ -130,14 +129,14 @@ def outdoor_3(rng: np.random.Generator) -> Scene:
     )
 
 
-def outdoor_4(rng: np.random.Generator) -> Scene:
+def outdoor_4(rng: np.random.Generator) -> SimulatedScene:
     """One long winding road, 640 m, that never comes back."""
     x = np.arange(0.0, 520.0, 10.0)
     path = np.column_stack([x, 38.0 * np.sin(x / 34.0) + 12.0 * np.sin(x / 71.0)])
     return _streets(rng, [(float(a), float(b)) for a, b in path], closed=False, built=0.5)
 
 
-def _streets(rng: np.random.Generator, way: Path, *, closed: bool = True, built: float = 0.7) -> Scene:
+def _streets(rng: np.random.Generator, way: Path, *, closed: bool = True, built: float = 0.7) -> SimulatedScene:
     """Rolling ground with buildings (where `built`, 0-1, has them), trees, cars and people along a path."""
     mesh, path = MeshBuilder(), np.array(way)
     phase = rng.uniform(0, 2 * np.pi, 4)
@@ -197,7 +196,7 @@ def _streets(rng: np.random.Generator, way: Path, *, closed: bool = True, built:
             props.lamp_post(mesh, at(x, y))
         else:
             props.bench(mesh, at(x, y), headings[k])
-    return Scene(mesh.build(), _people(rng, places, headings, height), path, closed, height)
+    return SimulatedScene(mesh.build(), _people(rng, places, headings, height), path, closed, height)
 
 
 def _people(rng: np.random.Generator, places: F64, headings: F64, height: Callable[[F64], F64]) -> tuple[Mover, ...]:

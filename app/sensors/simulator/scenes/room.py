@@ -3,14 +3,14 @@
 import numpy as np
 
 from app.sensors.simulator.mesh import MeshBuilder
+from app.sensors.simulator.raycast import SimulatedScene
 from app.sensors.simulator.scenes import props
 from app.sensors.simulator.scenes.plan import level, rectangle, tiled
-from app.sensors.simulator.scenes.scene import Scene
 
 HEIGHT = 2.8
 
 
-def room(rng: np.random.Generator) -> Scene:
+def room(rng: np.random.Generator) -> SimulatedScene:
     """A furnished room of 12 x 9 m: tables, chairs, shelves, sofas, windows, someone pacing at the far end."""
     length, depth = 12.0, 9.0
     mesh = MeshBuilder()
@@ -56,4 +56,4 @@ def room(rng: np.random.Generator) -> Scene:
 
     path = np.array([(3.5, 2.1), (7.4, 2.1), (8.2, 4.4), (7.4, 6.9), (3.2, 6.9), (2.0, 4.4)])
     pacing = props.pedestrian(rectangle(9.8, 2.0, 11.0, 7.0), 0.8)
-    return Scene(mesh.build(), (pacing,), path)
+    return SimulatedScene(mesh.build(), (pacing,), path)

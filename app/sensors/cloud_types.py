@@ -1,0 +1,183 @@
+"""The types of point-cloud message that can be read: one entry in `CLOUD_TYPES` and one function each.
+
+A type's function turns a deserialised message into a `CloudMessage`, which is the same for all types: named columns of
+numbers, as the sensor sent them. What the columns mean is settled once for a recording (`layout.py`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from app.sensors.ros import stamp_ns
+from app.slam.types import F32, U8
+
+Column = npt.NDArray[Any]
+
+
+class CloudError(ValueError):
+    """One point-cloud message cannot be read; the text says why, fit for `DroppedScan.reason`."""
+
+
+@dataclass(frozen=True, slots=True)
+class CloudMessage:
+    """A cloud with its columns as views of the message's bytes.
+
+    Attributes:
+        stamp_ns: header stamp. height, width: as in the message; firing order is row-major.
+        fields: name -> (offset in bytes, numpy dtype with byte order). data: (bytes,) uint8.
+    """
+
+    stamp_ns: int
+    height: int
+    width: int
+    point_step: int
+    row_step: int
+    fields: dict[str, tuple[int, np.dtype[Any]]]
+    data: U8
+
+    def __len__(self) -> int:
+        return self.height * self.width
+
+    def column(self, name: str) -> Column:
+        """(n,) values of one field in its own type, native byte order. Raises CloudError if absent."""
+        if name not in self.fields:
+            raise CloudError(f"the cloud has no field `{name}` (it has {', '.join(self.fields) or 'none'})")
+        offset, dtype = self.fields[name]
+        if not len(self):
+            return np.empty(0, dtype.newbyteorder("="))
+        view: Column = np.ndarray(
+            (self.height, self.width), dtype, self.data.data, offset, (self.row_step, self.point_step)
+        )
+        return view.reshape(-1).astype(dtype.newbyteorder("="), copy=False)
+
+    def xyz(self) -> F32:
+        """(n, 3) float32 m, as stored: NaN and zeros included."""
+        offsets = [self.fields.get(name, (-1, np.dtype("V1"))) for name in "xyz"]
+        first, dtype = offsets[0]
+        if dtype == np.dtype("<f4") and len(self) and offsets == [(first + 4 * i, dtype) for i in range(3)]:
+            strides = (self.row_step, self.point_step, 4)
+            view: F32 = np.ndarray((self.height, self.width, 3), dtype, self.data.data, first, strides)
+            return view.reshape(-1, 3)
+        return np.stack([self.column(name).astype(np.float32) for name in "xyz"], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class CloudType:
+    """One type of point-cloud message, and the names that its writers usually give to fields.
+
+    Attributes:
+        name: as in ROS 2; the type of ROS 1 with the same name is read as well.
+        read: of a deserialised message. Raises CloudError if its content contradicts itself.
+        times, rings, intensities: lower-case names of fields, the most usual first.
+        time_unit: of the points' times where the type fixes it; "auto" where it is judged by the data.
+    """
+
+    name: str
+    read: Callable[[Any], CloudMessage]
+    times: tuple[str, ...]
+    rings: tuple[str, ...]
+    intensities: tuple[str, ...]
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
+
+    def may_be_time(self, field: str) -> bool:
+        """Whether a field may hold the points' times, judged by its name."""
+        return field.lower() in self.times or "time" in field.lower() or "stamp" in field.lower()
+
+
+_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
+"""PointField.datatype as numpy's; 9 and 10 (64-bit integers) are an extension that some drivers use."""
+
+
+def read_point_cloud_2(message: Any) -> CloudMessage:
+    """sensor_msgs/PointCloud2 of ROS 1 or ROS 2: any order, type, padding and byte order of the fields."""
+    order = ">" if message.is_bigendian else "<"
+    fields = {
+        field.name: (int(field.offset), np.dtype(order + _DATATYPES[field.datatype]))
+        for field in message.fields
+        if field.datatype in _DATATYPES
+    }
+    height, width, point_step = int(message.height), int(message.width), int(message.point_step)
+    row_step = int(message.row_step)
+    data = np.asarray(message.data, dtype=np.uint8)
+    if height <= 1 or row_step == 0:  # many writers leave row_step unset; one row needs none
+        row_step = width * point_step
+    needed = (height - 1) * row_step + width * point_step if height and width else 0
+    if height and width and point_step < 1:  # any number of points fits into no bytes
+        raise CloudError(f"the cloud states {height}x{width} points of {point_step} bytes")
+    if needed > data.size:
+        raise CloudError(f"the cloud states {height}x{width} points, {needed} bytes, but holds {data.size}")
+    if row_step < width * point_step:
+        raise CloudError(f"the cloud's row_step {row_step} is shorter than its {width} points")
+    for name, (offset, dtype) in fields.items():
+        if offset + dtype.itemsize > point_step and needed:
+            raise CloudError(f"field `{name}` ends after the point_step of {point_step} bytes")
+    return CloudMessage(stamp_ns(message.header.stamp), height, width, point_step, row_step, fields, data)
+
+
+POINT_CLOUD_2 = CloudType(
+    name="sensor_msgs/msg/PointCloud2",
+    read=read_point_cloud_2,
+    times=("timestamp", "time", "t", "offset_time", "time_stamp", "timeoffset", "time_offset", "stamp", "ts"),
+    rings=("ring", "line", "channel", "laser_id", "laser"),
+    intensities=("intensity", "intensities", "reflectivity", "reflectance", "i"),
+)
+
+CLOUD_TYPES: dict[str, CloudType] = {kind.name: kind for kind in (POINT_CLOUD_2,)}
+"""Every type that can be read, by name."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One of the first clouds of a topic, from which is decided how all of them are read.
+
+    Attributes:
+        log_ns: when it was logged. cloud: its content.
+        stamped: False if its header carries no time, and `cloud.stamp_ns` is the log time.
+    """
+
+    log_ns: int
+    cloud: CloudMessage
+    stamped: bool = True
+
+    @cached_property
+    def _valid(self) -> tuple[F32, npt.NDArray[np.intp]]:
+        points, index = valid_points(self.cloud.xyz())
+        return points, np.arange(len(self.cloud)) if index is None else index
+
+    @property
+    def points(self) -> F32:
+        """(n, 3) float32 m, the valid points."""
+        return self._valid[0]
+
+    @property
+    def index(self) -> npt.NDArray[np.intp]:
+        """(n,) places of the valid points in the message."""
+        return self._valid[1]
+
+    def column(self, name: str) -> Column:
+        """(n,) values of a field at the valid points."""
+        return self.cloud.column(name)[self.index]
+
+
+def stamped(probes: list[Probe]) -> list[Probe]:
+    """The same, or stamped by their log times where all headers carry the same time, which is none."""
+    if len({probe.cloud.stamp_ns for probe in probes}) > 1:
+        return probes
+    return [Probe(probe.log_ns, replace(probe.cloud, stamp_ns=probe.log_ns), stamped=False) for probe in probes]
+
+
+def valid_points(xyz: F32, time: Column | None = None) -> tuple[F32, npt.NDArray[np.intp] | None]:
+    """Points with a return (finite, not all zero, with a finite time), and their indices; None if all are valid."""
+    x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
+    # An overflow is not finite either, so one sum tests all three.
+    valid = np.isfinite(x + y + z) & ((x != 0) | (y != 0) | (z != 0))
+    if time is not None and time.dtype.kind == "f":
+        valid &= np.isfinite(time)
+    if valid.all():
+        return np.ascontiguousarray(xyz), None
+    index = np.flatnonzero(valid)
+    return xyz.take(index, axis=0), index

@@ -1,0 +1,176 @@
+"""ROS messages without ROS: read from bytes, made of scans and IMU samples, written to .mcap files.
+
+Clouds are made in the vendor's layout: x, y, z, intensity (f32), ring (u16), `ground` (u8, only where the truth is
+known) and the absolute time of each point. Their stamp is that of the last point.
+"""
+
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from app.slam.types import Scan
+
+LIDAR_TOPIC, IMU_TOPIC = "/rslidar_points", "/imu/data"
+CLOUD, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
+ENCODINGS: Final = {"cdr": "ros2msg", "ros1": "ros1msg"}
+"""Encodings of messages that can be read, and how their definitions are written."""
+
+Vector = tuple[float, float, float]
+
+_ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+_DATATYPES = {"<f4": 7, "<f8": 8, "<u2": 4, "|u1": 2, "<i8": 9}
+
+
+class Deserialiser:
+    """Reads messages of the standard types, and of those whose definitions it was given."""
+
+    def __init__(self) -> None:
+        self._stores = {"cdr": get_typestore(Stores.ROS2_HUMBLE), "ros1": get_typestore(Stores.ROS1_NOETIC)}
+
+    def learn(self, kind: str, definition: str, encoding: str) -> None:
+        """Read messages of this type too; a definition that makes no sense is ignored."""
+        store = self._stores.get(encoding)
+        if store is None or kind in store.types or not definition:
+            return
+        try:
+            found = get_types_from_msg(definition, kind)
+            store.register({name: fields for name, fields in found.items() if name not in store.types})
+        except Exception:  # the parser lets its own errors and those of Python through
+            return
+
+    def read(self, data: bytes, kind: str, encoding: str) -> Any:
+        """The message. Raises whatever the library raises for bytes that are no such message."""
+        store = self._stores[encoding]
+        return store.deserialize_ros1(data, kind) if encoding == "ros1" else store.deserialize_cdr(data, kind)
+
+
+def ros2_type(name: str) -> str:
+    """`sensor_msgs/Imu` of ROS 1 as `sensor_msgs/msg/Imu`."""
+    package, slash, rest = name.partition("/")
+    return f"{package}/msg/{rest}" if slash and not rest.startswith("msg/") else name
+
+
+def stamp_ns(stamp: Any) -> int:
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def new(kind: str, **fields: Any) -> Any:
+    """A message of a standard type."""
+    return _ROS2.types[kind](**fields)
+
+
+def cloud_message(scan: Scan, *, exact: bool = False) -> Any:
+    """A PointCloud2 with the points' absolute times in `timestamp`, in f64 seconds as drivers write them.
+
+    Args:
+        exact: the times in int64 ns instead, which loses nothing but is no standard type of a field.
+    """
+    point = _point_type("<i8" if exact else "<f8", scan.truth_ground is not None)
+    points = np.zeros(len(scan), point)
+    points["x"], points["y"], points["z"] = scan.points.T
+    points["intensity"], points["ring"] = scan.intensity, scan.ring
+    if scan.truth_ground is not None:
+        points["ground"] = scan.truth_ground
+    stamps = scan.stamp_ns + scan.offsets_ns.astype(np.int64)
+    points["timestamp"] = stamps if exact else stamps * 1e-9
+    columns: dict[str, Any] = dict(point.fields or {})
+    return new(
+        CLOUD,
+        header=header(scan.end_ns, "rslidar"),
+        height=1,
+        width=len(points),
+        fields=[
+            new("sensor_msgs/msg/PointField", name=name, offset=at, datatype=_DATATYPES[kind.str], count=1)
+            for name, (kind, at, *_) in columns.items()
+        ],
+        is_bigendian=False,
+        point_step=points.itemsize,
+        row_step=points.nbytes,
+        data=points.view(np.uint8),
+        is_dense=True,
+    )
+
+
+def empty_cloud(stamp_ns: int) -> Any:
+    """A PointCloud2 without a point, for a revolution that saw nothing."""
+    nothing = np.empty(0)
+    scan = Scan(stamp_ns, np.empty((0, 3), np.float32), *(nothing.astype(kind) for kind in ("i4", "f4", "u2")))
+    return cloud_message(scan, exact=True)
+
+
+def imu_message(stamp_ns: int, gyro: Vector, accel: Vector) -> Any:
+    """An Imu in rad/s and m/s^2, without orientation."""
+    unknown = np.zeros(9)
+    return new(
+        IMU,
+        header=header(stamp_ns, "imu"),
+        orientation=new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=np.array([-1.0] + [0.0] * 8),
+        angular_velocity=_vector(gyro),
+        angular_velocity_covariance=unknown,
+        linear_acceleration=_vector(accel),
+        linear_acceleration_covariance=unknown,
+    )
+
+
+def header(stamp_ns: int, frame: str) -> Any:
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    stamp = new("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return new("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def serialised(message: Any) -> bytes:
+    """As CDR, which ROS 2 sends and records."""
+    return bytes(_ROS2.serialize_cdr(message, message.__msgtype__))
+
+
+def definition(kind: str) -> str:
+    """The type's text, with the types that it contains."""
+    return str(_ROS2.generate_msgdef(kind)[0])
+
+
+class RecordingWriter:
+    """A ROS 2 recording of one LiDAR and one IMU as a bare .mcap, written in the order of the calls."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._mcap = Writer(file, compression=CompressionType.ZSTD)
+        self._mcap.start(profile="ros2")
+        self._lidar = self._channel(LIDAR_TOPIC, CLOUD)
+        self._imu = self._channel(IMU_TOPIC, IMU)
+
+    def add_scan(self, scan: Scan, log_ns: int) -> None:
+        self._add(self._lidar, cloud_message(scan), log_ns)
+
+    def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, log_ns: int) -> None:
+        self._add(self._imu, imu_message(stamp_ns, gyro, accel), log_ns)
+
+    def flush(self) -> None:
+        """End a chunk, so that what was written can be read even if the end of the file never comes."""
+        self._mcap.flush()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
+
+    def finish(self) -> None:
+        """Write the index and the end of the file."""
+        self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
+
+    def _channel(self, topic: str, kind: str) -> int:
+        schema = self._mcap.register_schema(kind, "ros2msg", definition(kind).encode())
+        return self._mcap.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
+
+    def _add(self, channel: int, message: Any, log_ns: int) -> None:
+        self._mcap.add_message(channel, log_ns, serialised(message), publish_time=log_ns)
+
+
+def _vector(values: Vector) -> Any:
+    x, y, z = map(float, values)
+    return new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def _point_type(timestamp: str, ground: bool) -> np.dtype[Any]:
+    columns = {"x": ("<f4", 0), "y": ("<f4", 4), "z": ("<f4", 8), "intensity": ("<f4", 12), "ring": ("<u2", 16)}
+    if ground:
+        columns["ground"] = ("u1", 18)
+    columns["timestamp"] = (timestamp, 20 if ground else 18)
+    formats, offsets = zip(*columns.values(), strict=True)
+    return np.dtype({"names": [*columns], "formats": [*formats], "offsets": [*offsets], "itemsize": offsets[-1] + 8})
