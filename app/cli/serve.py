@@ -99,11 +99,11 @@ def serve(
       hemislam serve --live foxglove://robot:8765 --preset rslidar
       hemislam serve walk.mcap --host 0.0.0.0            from other computers, by the printed link
     """
-    from app import processes
+    from app.child import fork_context
     from app.logs import start_logging
 
     start_logging(json_lines=log_json)
-    processes.context()  # what is forked imports for as long as we do here, and beside it
+    fork_context()  # it imports the engine while this process imports the rest
     from app.evaluation.truth import read_poses
     from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording

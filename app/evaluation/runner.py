@@ -1,135 +1,105 @@
 """Runs jobs side by side, each in a process of its own, with a progress bar for each.
 
-A process a job: its peak memory is the job's own, a crash is one column's, and a parent that is
-killed takes its children with it, since they can no longer report to it.
+With a process for each job, its peak memory is its own, and a crash costs one column only.
 """
 
-import multiprocessing
-import os
-import signal
-from collections.abc import Iterable
-from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
+from collections.abc import Iterator
 from pathlib import Path
 from time import monotonic
 from typing import NoReturn
 
 from tqdm import tqdm
 
+from app.child import Child, ChildDied, Link
 from app.evaluation.job import Job, clear_remains, finished, run_job
 from app.slam.errors import HemislamError
 
 REPORT_EVERY_S = 0.2
+_POLL_S = 0.02
 
 
-@dataclass(slots=True)
 class _Running:
-    job: Job
-    process: BaseProcess
-    connection: Connection
-    slot: int
-    bar: "tqdm[NoReturn]"
-    error: str = ""
+    """A job at work. slot: the line of its progress bar."""
+
+    def __init__(self, job: Job, slot: int) -> None:
+        self.job, self.slot = job, slot
+        self.error = ""
+        self._child = Child(_work, job, name="job", title="Its process", grace_s=0.0)
+        self._bar: tqdm[NoReturn] = tqdm(
+            desc=f"{job.name}, {job.variant}", unit=" frames", leave=False, disable=None, position=slot
+        )
+
+    def ended(self) -> bool:
+        """Show how far it is. Returns whether it has ended, `error` being why it failed."""
+        try:
+            message = self._child.receive(_POLL_S)
+        except ChildDied as death:
+            if not self.error and finished(self.job) is None:
+                self.error = str(death)
+            self.close()
+            return True
+        if isinstance(message, str):
+            self.error = message
+        elif message is not None:
+            done, self._bar.total = message
+            self._bar.update(done - self._bar.n)
+        return False
+
+    def close(self) -> None:
+        self._child.close()
+        self._bar.close()
 
 
 def run_jobs(jobs: list[Job], parallel: int, folder: Path) -> dict[tuple[str, str], str]:
-    """Run all that are not finished yet, `parallel` at a time.
+    """Run all jobs that are not finished yet, `parallel` at a time.
 
     Returns:
-        Why runs failed, by (recording, variant); those that are not named are finished.
+        Why jobs failed, by (recording, variant); those not named are finished.
     """
     clear_remains(folder)
-    waiting = []
-    for job in jobs:
-        if finished(job) is None:
-            waiting.append(job)
-        else:
-            tqdm.write(f"{job.name}, {job.variant}: finished before")
+    waiting = iter([job for job in jobs if not _finished_before(job)])
     failures: dict[tuple[str, str], str] = {}
-    slots = list(range(parallel))
-    running: dict[Connection, _Running] = {}
+    running: list[_Running] = []
     try:
-        while waiting or running:
-            while waiting and slots:
-                started = _start(waiting.pop(0), slots.pop(0))
-                running[started.connection] = started
-            for connection in _ready(running):
-                worker = running[connection]
-                if _listen(worker):
-                    continue
-                del running[connection]
-                slots.append(worker.slot)
-                error = _end(worker)
-                if error:
-                    failures[worker.job.name, worker.job.variant] = error
-                tqdm.write(f"{worker.job.name}, {worker.job.variant}: {error or 'finished'}")
+        running += _started(waiting, range(parallel))
+        while running:
+            for one in [one for one in running if one.ended()]:
+                if one.error:
+                    failures[one.job.name, one.job.variant] = one.error
+                tqdm.write(f"{one.job.name}, {one.job.variant}: {one.error or 'finished'}")
+                running.remove(one)
+                running += _started(waiting, [one.slot])
     finally:
-        for worker in running.values():
-            worker.process.terminate()
-            worker.process.join()
-            worker.bar.close()
+        for one in running:
+            one.close()
     return failures
 
 
-def _ready(running: dict[Connection, _Running]) -> Iterable[Connection]:
-    return [connection for connection in wait(list(running)) if isinstance(connection, Connection)]
-
-
-def _start(job: Job, slot: int) -> _Running:
-    context = multiprocessing.get_context("spawn")  # a forked OpenMP pool hangs
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(job, theirs), daemon=True)
-    process.start()
-    theirs.close()
-    bar = tqdm(desc=f"{job.name}, {job.variant}", unit=" frames", leave=False, disable=None, position=slot)
-    return _Running(job, process, ours, slot, bar)
-
-
-def _listen(worker: _Running) -> bool:
-    """Take in one message; whether more may come."""
-    try:
-        message = worker.connection.recv()
-    except (EOFError, OSError):
+def _finished_before(job: Job) -> bool:
+    if finished(job) is None:
         return False
-    if isinstance(message, str):
-        worker.error = message
-    else:
-        done, worker.bar.total = message
-        worker.bar.update(done - worker.bar.n)
+    tqdm.write(f"{job.name}, {job.variant}: finished before")
     return True
 
 
-def _end(worker: _Running) -> str:
-    worker.process.join()
-    worker.connection.close()
-    worker.bar.close()
-    if worker.error:
-        return worker.error
-    if finished(worker.job) is None:
-        return f"its process ended before it was done (exit code {worker.process.exitcode})"
-    return ""
+def _started(waiting: Iterator[Job], slots: "list[int] | range") -> Iterator[_Running]:
+    for slot, job in zip(slots, waiting, strict=False):
+        yield _Running(job, slot)
 
 
-def _work(job: Job, connection: Connection) -> None:
+def _work(owner: Link, job: Job) -> None:
     """The process of a job."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends it
     last = 0.0
 
     def progress(done: int, total: int) -> None:
         nonlocal last
         if monotonic() - last > REPORT_EVERY_S or done == total:
             last = monotonic()
-            try:
-                connection.send((done, total))
-            except OSError:
-                os._exit(1)  # nobody waits for this any more
+            owner.send((done, total))
 
     try:
         run_job(job, progress)
     except HemislamError as error:
-        connection.send(str(error))
+        owner.send(str(error))
     except OSError as error:
-        connection.send(f"results can not be written to {job.folder}: {error.strerror}")
-    finally:
-        connection.close()
+        owner.send(f"results cannot be written to {job.folder}: {error.strerror}")

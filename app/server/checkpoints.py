@@ -6,9 +6,8 @@ Which ones are kept follows from frame numbers and sizes alone, never from the c
 import logging
 from dataclasses import dataclass
 
-from app.server import wire
+from app.packing import Parts, pack, unpack
 from app.server.spill import Slot, Spill
-from app.server.wire import Parts
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +62,7 @@ class Checkpoints:
 
     def add(self, frame: int, state: object) -> None:
         """Keep a state; what is in it must never change. Others may be put on disk or let go of."""
-        parts = wire.pack(state)
+        parts = pack(state)
         self._entries[frame] = _Entry(parts, sum(memoryview(part).nbytes for part in parts))
         self.memory += self._entries[frame].nbytes
         self._thin(frame)
@@ -77,9 +76,9 @@ class Checkpoints:
         """The state after a frame of `frames`. Raises OSError if it is on a disk that fails."""
         entry = self._entries[frame]
         if entry.parts is not None:
-            return wire.unpack(entry.parts)
+            return unpack(entry.parts)
         assert entry.slot is not None
-        return wire.unpack(self._spill.get(entry.slot))
+        return unpack(self._spill.get(entry.slot))
 
     def forget_after(self, frame: int) -> None:
         """Let go of all states of later frames."""

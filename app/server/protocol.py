@@ -19,6 +19,8 @@ from app.slam.types import F32, F64, I64, U8, U16, StepResult
 
 LIVE = Path("live")
 """Stands for the live source wherever a recording is named."""
+ACKNOWLEDGED = "acknowledged"
+"""Sent to the engine in answer to each delta: the next one may come."""
 
 
 # --- commands ------------------------------------------------------------------------------------
@@ -149,11 +151,6 @@ class InspectLoop:
     pair: loops.Pair | None
 
 
-@dataclass(frozen=True, slots=True)
-class Shutdown:
-    """End the engine's process cleanly."""
-
-
 LoopCommand = EditLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop
 Command = (
     Play
@@ -170,7 +167,6 @@ Command = (
     | Restart
     | Save
     | LoopCommand
-    | Shutdown
 )
 
 

@@ -32,7 +32,6 @@ from app.server.protocol import (
     SetBreakpoints,
     SetParams,
     SetSpeed,
-    Shutdown,
     StepFrame,
     TryLoop,
     UndoLoop,
@@ -50,7 +49,7 @@ POLL_S = 0.02
 MOST_NOTES = 1000
 """Of a session: every page and every state by REST has them all."""
 
-_AT_ONCE = OpenRecording | Restart | SetSpeed | SetBreakpoints | Shutdown
+_AT_ONCE = OpenRecording | Restart | SetSpeed | SetBreakpoints
 """Commands that do not wait until what is being opened is open."""
 _FOR_THE_FRAME = EditLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop | AddNote | CompareWith | Save
 
@@ -138,7 +137,7 @@ class Session:
                 if self._need_run().finished:
                     self._handle(Restart())
                 self._player.play()
-            case Pause() | Shutdown():
+            case Pause():
                 self._player.halt()
             case StepFrame(frames):
                 self._player.step(self._need_run(), frames)

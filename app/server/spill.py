@@ -6,7 +6,7 @@ import tempfile
 from dataclasses import dataclass
 from typing import IO
 
-from app.server.wire import Parts
+from app.packing import Parts
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -22,7 +22,7 @@ class Slot:
 
 
 class Spill:
-    """An unnamed temporary file of packed values (`app.server.wire.pack`); space given back is used again."""
+    """An unnamed temporary file of packed values (`app.packing.pack`); space given back is used again."""
 
     def __init__(self) -> None:
         self._file: IO[bytes] | None = None

@@ -1,43 +1,30 @@
 """The engine in a process of its own, started and watched from here.
 
-Two pipes join the processes. Commands go down; deltas come up, one at a time: the next is sent when
-the one before was acknowledged, so that neither side ever waits for the other. When the upper
-process dies, however, the pipe for commands ends and the engine's process ends itself.
+Commands go down; deltas come up, one at a time: the next is sent when the one before was acknowledged. So a slow
+reader gets few large deltas instead of many small ones.
 """
 
-import contextlib
 import math
-import multiprocessing.process
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
-from app import processes
-from app.logs import process_logs
-from app.server import wire
-from app.server.delta import Delta
+from app.child import Child, ChildDied, Link, RestartLimit
 from app.server.fold import Fold
-from app.server.protocol import LIVE, Command, Notice, OpenRecording, Progress, Restart, Shutdown, Snapshot
+from app.server.protocol import ACKNOWLEDGED, LIVE, Command, Notice, OpenRecording, Progress, Restart, Snapshot
 from app.server.setup import Setup
-from app.server.wire import Pipe
 
-MOST_REVIVALS = 25
-"""Deaths of the engine's process after which it is not started again by itself."""
+MOST_RESTARTS: Final = 25
+"""Deaths of the engine's process after which it is started again without being asked."""
 
-Main = Callable[[Pipe, Pipe, Setup], None]
-
-
-def _run_engine(commands: Pipe, updates: Pipe, setup: Setup) -> None:
-    from app.server.engine_process import main  # the parent has no need of the engine and its compiler
-
-    main(commands, updates, setup)
+Main = Callable[[Link, Setup], None]
 
 
-def _logged(main: Main, commands: Pipe, updates: Pipe, setup: Setup) -> None:
-    processes.begin("hemislam-engine")
-    with process_logs("engine"):
-        main(commands, updates, setup)
+def _run_engine(owner: Link, setup: Setup) -> None:
+    from app.server.engine_process import main  # this process has no need of the engine and its compiler
+
+    main(owner, setup)
 
 
 class EngineProcess:
@@ -52,13 +39,10 @@ class EngineProcess:
         self._main = main
         self._fold = Fold(Snapshot(params=setup.params), setup.point_budget)
         self._changed = threading.Condition()
-        self._sending = threading.Lock()
-        self._commands: Pipe | None = None
-        self._process: multiprocessing.process.BaseProcess | None = None
-        self._revivals = 0
+        self._restarts = RestartLimit(MOST_RESTARTS)
+        self._child: Child | None = None
         self._start(setup)
 
-    # --- for its users ---------------------------------------------------------------------------
     @property
     def snapshot(self) -> Snapshot:
         """The newest one."""
@@ -66,7 +50,8 @@ class EngineProcess:
 
     @property
     def pid(self) -> int | None:
-        return self._process.pid if self._process else None
+        child = self._child
+        return child.pid if child else None
 
     def wait(self, after_revision: int, timeout: float | None = None) -> Snapshot:
         """The newest snapshot, once it is newer than `after_revision` or the time (s) is over."""
@@ -75,132 +60,94 @@ class EngineProcess:
             return self.snapshot
 
     def send(self, command: Command) -> None:
-        """Enqueue a command. A dead engine is started again by Restart and OpenRecording; others are lost on it."""
+        """Enqueue a command. Restart and OpenRecording start a dead engine again; other commands to it are lost."""
         if not self.snapshot.engine_alive and isinstance(command, Restart | OpenRecording):
             self.restart(command)
-            return
-        with self._sending, contextlib.suppress(OSError):
-            if self._commands is not None:
-                self._commands.send(command)
+        elif (child := self._child) is not None:
+            child.send(command)
 
     def restart(self, command: Restart | OpenRecording | None = None) -> None:
-        """A new process in place of this one, with the newest parameters, at the first frame.
+        """Start a new process in place of this one, with the newest parameters, at the first frame.
 
-        It opens what was open, or what the command names.
+        It opens the recording that was open, or the one that the command names.
         """
-        self._end(timeout=0)
-        last, setup = self.snapshot, self._setup
+        self.close(timeout=0)
+        last, setup = self.snapshot, self._next_setup(play=False)
         if isinstance(command, OpenRecording):
             setup = replace(setup, recording=command.path, truth=command.truth)
         elif last.recording is not None:
             setup = replace(setup, recording=last.recording.path, truth=last.recording.truth)
         if setup.recording != self._setup.recording:
             setup = replace(setup, start_s=0.0, duration_s=None)
-        self._start(
-            replace(
-                setup,
-                params=last.params,
-                play=False,
-                speed=last.transport.speed,
-                breakpoints=last.breakpoints,
-                session=last.session,
-                notices=last.notices[-1].number if last.notices else 0,
-            )
-        )
+        self._start(setup)
         self._edit(engine_alive=True)
 
-    def close(self, timeout: float = 10.0) -> None:
-        """Let the process finish what it is writing and end; end it by force after the time (s)."""
-        self._end(timeout)
+    def close(self, timeout: float | None = None) -> None:
+        """Let the process finish what it is writing and end; kill it after the time (s)."""
+        child, self._child = self._child, None  # from now on its end is expected
+        if child is not None:
+            child.close(timeout)
 
-    # --- the process -----------------------------------------------------------------------------
     def _start(self, setup: Setup) -> None:
-        self._running = setup
-        context = processes.context()
-        commands_in, commands_out = context.Pipe(duplex=False)
-        updates_in, updates_out = context.Pipe(duplex=False)
-        wire.widen(updates_out)
-        process = context.Process(
-            target=_logged, args=(self._main, commands_in, updates_out, setup), name="hemislam engine", daemon=True
-        )
-        with processes.sigint_blocked():
-            process.start()
-        commands_in.close()
-        updates_out.close()
-        self._commands, self._process = commands_out, process
-        threading.Thread(
-            target=self._read, args=(updates_in, commands_out, process), name="engine updates", daemon=True
-        ).start()
+        self._started_with = setup
+        self._child = child = Child(self._main, setup, name="engine", title="The engine's process", fork=True)
+        threading.Thread(target=self._follow, args=(child,), name="engine updates", daemon=True).start()
 
-    def _read(self, updates: Pipe, commands: Pipe, process: multiprocessing.process.BaseProcess) -> None:
+    def _follow(self, child: Child) -> None:
         """Fold what the process sends, until it ends."""
-        with contextlib.suppress(EOFError, OSError):
+        try:
             while True:
-                delta: Delta = wire.receive(updates)
-                with self._sending:
-                    commands.send(None)  # acknowledged: the next one may come
+                delta = child.receive()
+                child.send(ACKNOWLEDGED)
                 with self._changed:
-                    if process is not self._process:  # another one has taken over
-                        break
+                    if child is not self._child:  # another one has taken over
+                        return
                     self._fold.apply(delta)
                     self._changed.notify_all()
-        updates.close()
-        process.join()
-        if process is self._process:
-            last = self.snapshot
-            number = last.notices[-1].number + 1 if last.notices else 1
-            code = process.exitcode or 0
-            how = f"signal {-code}" if code < 0 else f"exit code {code}"
-            place = last.journal or (LIVE if last.live is not None else None)
-            if place is not None and self._revivals < MOST_REVIVALS:
-                self._revivals += 1
-                text = (
-                    f"The engine's process has ended unexpectedly ({how}); it is started again and goes where it was."
-                )
-                self._edit(
-                    notices=(Notice(number, "error", text),), progress=Progress("Starting the engine again", math.nan)
-                )
-                on_the_way = last.progress is not None or last.transport.frame < 0  # to where the one before was
-                self._start(
-                    replace(
-                        self._setup,
-                        recording=place,
-                        params=last.params,
-                        play=self._running.play if on_the_way else last.transport.playing,
-                        speed=last.transport.speed,
-                        breakpoints=last.breakpoints,
-                        revive=True,
-                        session=last.session,
-                        notices=number,
-                        frames=0 if last.trajectory is None else len(last.trajectory),
-                        chunks=len(last.chunks),
-                    )
-                )
-                return
-            text = f"The engine's process has ended unexpectedly ({how}); restart it to begin again at the first frame."
-            self._edit(
-                engine_alive=False,
-                progress=None,
-                transport=replace(last.transport, playing=False, frames_per_second=0.0),
-                notices=(Notice(number, "error", text),),
-            )
+        except ChildDied as death:
+            if child is self._child:
+                self._died(death)
+
+    def _died(self, death: ChildDied) -> None:
+        """Say so, and start the process again if there is something that it can go on with."""
+        last = self.snapshot
+        place = last.journal or (LIVE if last.live is not None else None)
+        restarts = place is not None and self._restarts.allows()
+        then = (
+            "It is started again and returns to where it was."
+            if restarts
+            else "Restart it to begin again at the first frame."
+        )
+        notices = (Notice(_number(last) + 1, "error", f"{death} {then}"),)
+        if not restarts:
+            transport = replace(last.transport, playing=False, frames_per_second=0.0)
+            self._edit(engine_alive=False, progress=None, transport=transport, notices=notices)
+            return
+        self._edit(notices=notices, progress=Progress("Starting the engine again", math.nan))
+        on_the_way = last.progress is not None or last.transport.frame < 0  # to where the one before was
+        setup = self._next_setup(play=self._started_with.play if on_the_way else last.transport.playing)
+        frames = 0 if last.trajectory is None else len(last.trajectory)
+        self._start(replace(setup, recording=place, revive=True, frames=frames, chunks=len(last.chunks)))
+
+    def _next_setup(self, *, play: bool) -> Setup:
+        """What the next process starts with: parameters and settings as they are now."""
+        last = self.snapshot
+        return replace(
+            self._setup,
+            params=last.params,
+            play=play,
+            speed=last.transport.speed,
+            breakpoints=last.breakpoints,
+            session=last.session,
+            notices=_number(last),
+        )
 
     def _edit(self, **values: Any) -> None:
         with self._changed:
             self._fold.edit(**values)
             self._changed.notify_all()
 
-    def _end(self, timeout: float) -> None:
-        process, self._process = self._process, None  # from now on its end is expected
-        if process is None:
-            return
-        if timeout:
-            self.send(Shutdown())
-            process.join(timeout)
-        if process.is_alive():
-            process.kill()
-        process.join()
-        with self._sending, contextlib.suppress(OSError):
-            if self._commands is not None:
-                self._commands.close()
-                self._commands = None
+
+def _number(snapshot: Snapshot) -> int:
+    """The number of the newest notice, 0 if there is none."""
+    return snapshot.notices[-1].number if snapshot.notices else 0

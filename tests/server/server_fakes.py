@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from app.child import Link
 from app.sensors.findings import Finding
 from app.server.engine_process import run_loop
 from app.server.run import Run
 from app.server.setup import Setup
-from app.server.wire import Pipe
 from app.slam.errors import HemislamError
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
@@ -193,11 +193,11 @@ def open_fake(path: Path, truth: Path | None, params: Params, part: tuple[float,
     return Run(recording, engine, truth_path=truth)  # type: ignore[arg-type]
 
 
-def fake_main(commands: Pipe, updates: Pipe, setup: Setup) -> None:
-    run_loop(commands, updates, setup, open_fake)
+def fake_main(owner: Link, setup: Setup) -> None:
+    run_loop(owner, setup, open_fake)
 
 
-def failing_main(commands: Pipe, updates: Pipe, setup: Setup) -> None:
+def failing_main(owner: Link, setup: Setup) -> None:
     """Says a word of warning, loses a thread and ends."""
     warnings.warn("somewhat odd", stacklevel=1)
     thread = threading.Thread(target=lambda: [][1], name="side work")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.server import wire
+from app.packing import pack, unpack
 from app.server.checkpoints import DISK_SHARE, EVERY, NEAR, START, Checkpoints
 from app.server.spill import Spill
 
@@ -104,13 +104,13 @@ def test_the_same_walk_keeps_the_same_frames() -> None:
 def test_values_on_disk_never_overlap_and_their_space_is_used_again(sizes: list[int], released: set[int]) -> None:
     spill = Spill()
     values = [np.full(size, number, dtype=np.uint8) for number, size in enumerate(sizes)]
-    slots = {number: spill.put(wire.pack(value)) for number, value in enumerate(values)}
+    slots = {number: spill.put(pack(value)) for number, value in enumerate(values)}
     end = max(slot.end for slot in slots.values())
     for number in released & slots.keys():
         spill.release(slots[number])
-        slots[number] = spill.put(wire.pack(values[number]))
+        slots[number] = spill.put(pack(values[number]))
     assert max(slot.end for slot in slots.values()) <= end
     for number, slot in slots.items():
-        assert np.array_equal(wire.unpack(spill.get(slot)), values[number])
+        assert np.array_equal(unpack(spill.get(slot)), values[number])
     assert spill.nbytes == sum(slot.end - slot.begin for slot in slots.values())
     spill.close()

@@ -257,7 +257,7 @@ def test_an_engine_killed_at_any_moment_goes_on_to_the_same_end(tmp_path: Path) 
             ends.append(_until(engine, lambda s: s.transport.finished))
         finally:
             engine.close()
-    assert any("goes where it was" in notice.text for notice in ends[1].notices)
+    assert any("returns to where it was" in notice.text for notice in ends[1].notices)
     assert ends[0].trajectory is not None and ends[1].trajectory is not None
     np.testing.assert_array_equal(ends[0].trajectory, ends[1].trajectory)
 

@@ -58,5 +58,5 @@ def test_whoever_dies_the_walk_goes_on_in_the_same_map(params: Params, tmp_path:
     assert end.trajectory is not None and len(end.trajectory) == end.transport.frame + 1
     assert (np.diff(end.series["stamp_s"]) > 0.05).all(), "no scan twice, and none before another"
     told = [notice.text for notice in end.notices]
-    assert sum("was started again, nothing was received for" in text for text in told) == 2
-    assert sum("goes where it was" in text for text in told) == 1
+    assert sum("was started again; nothing was received for" in text for text in told) == 2
+    assert sum("returns to where it was" in text for text in told) == 1

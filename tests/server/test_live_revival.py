@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from test_rewind import SAMPLE
 
-from app.sensors.live import process
-from app.sensors.live.process import Desk, LiveAddress
+from app.sensors.live import receiver
+from app.sensors.live.process import LiveAddress
+from app.sensors.live.receiver import ScanServer
 from app.sensors.live.source import Event
 from app.sensors.live.status import LiveState
 from app.sensors.presets import resolve_params
@@ -110,10 +111,10 @@ def events(params: Params) -> list[Event]:
 @contextmanager
 def given(events: list[Event], folder: Path) -> Iterator[LiveAddress]:
     """Where these can be polled."""
-    address = LiveAddress(str(folder / "desk"), secrets.token_bytes(16))
-    desk = Desk(Script(events))  # type: ignore[arg-type]
+    address = LiveAddress(str(folder / "live"), secrets.token_bytes(16))
+    server = ScanServer(Script(events))  # type: ignore[arg-type]
     with Listener(address.path, authkey=address.key) as listener:
-        threading.Thread(target=process.accept, args=(listener, desk), daemon=True).start()
+        threading.Thread(target=receiver.accept, args=(listener, server), daemon=True).start()
         yield address
 
 
@@ -165,7 +166,7 @@ def test_scans_that_are_too_many_to_be_had_again_are_counted_as_dropped(
     params: Params, tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Should there be no checkpoint for long, the disk being full."""
-    monkeypatch.setattr(process, "HISTORY", 5)
+    monkeypatch.setattr(receiver, "HISTORY", 5)
     with given(events, tmp_path) as address:
         bench = Bench(address, params, tmp_path)
         while bench.run is None or bench.run.frame < 9:  # one before the second checkpoint
@@ -173,5 +174,5 @@ def test_scans_that_are_too_many_to_be_had_again_are_counted_as_dropped(
         bench.kill(asking=False)
         bench.begin()
         page = walked(bench, events)
-    assert bench.run.log.dropped[process.LOST] == 4
+    assert bench.run.log.dropped[receiver.LOST] == 4
     assert page.series["dropped"].sum() == page.transport.dropped

@@ -197,7 +197,7 @@ def test_an_engine_that_is_killed_is_followed_by_one_that_goes_on_in_the_same_ma
     end = live.until_all_is_mapped()
     assert end.transport.dropped == 0
     assert apart(end, from_file) < 0.001
-    assert any("goes where it was" in notice.text for notice in end.notices)
+    assert any("returns to where it was" in notice.text for notice in end.notices)
 
 
 def test_scans_that_an_engine_is_too_slow_for_are_dropped_counted_and_told(live: Live) -> None:

@@ -1,7 +1,6 @@
 """One format for the log lines of all processes."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,12 +11,6 @@ import pytest
 
 def entries(err: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in err.splitlines()]
-
-
-@pytest.fixture
-def as_json(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For processes that are started."""
-    monkeypatch.setenv("HEMISLAM_LOG_JSON", "1")
 
 
 OWNER = """
@@ -45,15 +38,25 @@ def test_what_ends_the_engine_is_one_line_of_json() -> None:
     assert {entry["process"] for entry in (warned, thread, ended)} == {"engine"}
 
 
-def test_so_it_is_of_the_process_that_looks_for_loops(as_json: None) -> None:
-    requests, writer = os.pipe()
-    os.write(writer, (8).to_bytes(4, "big") + bytes(4) + b"junk")  # no arrays, and no pickle
-    command = [sys.executable, "-m", "app.server.loop_process", str(requests), str(writer)]
-    done = subprocess.run(command, pass_fds=(requests, writer), capture_output=True, text=True, timeout=120)
-    os.close(requests)
-    os.close(writer)
+LOOPS = """
+import pytest
+from app.logs import start_logging
+from app.server.loop_process import LoopProcess
+from app.slam.loops.messages import LoopWorkerDied
+
+start_logging(json_lines=True)
+loops = LoopProcess()
+loops.send("no request")
+with pytest.raises(LoopWorkerDied, match="exit code 1"):
+    loops.receive(60.0)
+"""
+
+
+def test_so_is_what_ends_the_process_that_looks_for_loops() -> None:
+    code = f"import sys; sys.path[:0] = [{str(Path(__file__).resolve().parents[2])!r}]\n{LOOPS}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
     (ended,) = entries(done.stderr)
-    assert done.returncode == 1
     assert (ended["level"], ended["process"]) == ("critical", "loops") and "Traceback" in ended["traceback"]
 
 

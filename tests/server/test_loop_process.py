@@ -1,16 +1,15 @@
 """The loop back end in a process of its own. The walks are short: what is found is tested in tests/slam/loops."""
 
-import multiprocessing
 import os
 import signal
 import time
 from collections.abc import Iterator
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from app.child import Child, Link
 from app.server.loop_process import LoopProcess
 from app.slam import lie
 from app.slam.loops.messages import AddKeyframe, ApplyEdit, Finish, GoTo, LoopState, LoopWorkerDied, Request, Undo
@@ -92,7 +91,7 @@ def test_it_answers_as_one_in_this_process_would(process: LoopProcess) -> None:
     assert process.receive() is None, "nothing is pending"
 
 
-def test_sending_does_not_wait_for_a_process_that_stands_still(process: LoopProcess) -> None:
+def test_sending_does_not_wait_for_a_stopped_process(process: LoopProcess) -> None:
     """Stopped, it takes nothing: far more than a pipe holds is handed over all the same, and answered afterwards."""
     os.kill(process.pid, signal.SIGSTOP)
     many = keyframes(12, points=60_000)  # 27 bytes each
@@ -107,7 +106,7 @@ def test_sending_does_not_wait_for_a_process_that_stands_still(process: LoopProc
         assert reply.count == count
 
 
-def test_a_process_that_is_killed_is_noticed_and_another_one_can_take_over(process: LoopProcess) -> None:
+def test_a_killed_process_is_noticed_and_another_one_can_take_over(process: LoopProcess) -> None:
     walk = keyframes(4)
     process.send(AddKeyframe(walk[0], PARAMS))
     assert process.receive(PATIENCE_S) is not None
@@ -128,29 +127,24 @@ def test_a_process_that_is_killed_is_noticed_and_another_one_can_take_over(proce
     assert not alive(second.pid)
 
 
-def _owner(out: "Connection[object, object]") -> None:
+def _owner(owner: Link) -> None:
     process = LoopProcess()
     process.send(AddKeyframe(keyframes(1)[0], PARAMS))
     reply = process.receive(PATIENCE_S)
-    out.send((process.pid, reply.count if isinstance(reply, LoopState) else -1))
+    owner.send((process.pid, reply.count if isinstance(reply, LoopState) else -1))
     time.sleep(10 * PATIENCE_S)
 
 
-def test_it_can_belong_to_a_daemon_of_multiprocessing_and_dies_with_it() -> None:
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    owner = context.Process(target=_owner, args=(theirs,), daemon=True)
-    owner.start()
-    assert ours.poll(PATIENCE_S)
-    pid, count = ours.recv()
+def test_a_child_can_own_it_and_it_ends_when_that_child_is_killed() -> None:
+    owner = Child(_owner, name="owner", title="The owner")
+    pid, count = owner.receive(PATIENCE_S)
     assert count == 1
     assert alive(pid)
-    owner.kill()
-    owner.join()
+    owner.close(timeout=0)
     until_gone(pid)
 
 
-def test_closing_ends_it_even_at_work(process: LoopProcess) -> None:
+def test_closing_ends_it_even_while_it_works(process: LoopProcess) -> None:
     for keyframe in keyframes(12, points=60_000):
         process.send(AddKeyframe(keyframe, PARAMS))
     process.close()

@@ -69,16 +69,20 @@ def test_an_engine_that_dies_is_followed_by_one_that_misses_nothing(tmp_path: Pa
         LiveClient(process.address)
 
 
-def test_it_ends_cleanly_with_sigterm_and_says_that_it_did(tmp_path: Path) -> None:
+def test_signals_to_the_whole_group_leave_it_to_its_owner_to_end_the_recording(tmp_path: Path) -> None:
     wire, record = Wire(), tmp_path / "session.mcap"
     with LiveProcess(wire.url, Params(), wire.imu_url, record) as process:
         client = LiveClient(process.address)
-        assert process.pid is not None and process.alive
-        os.kill(process.pid, signal.SIGTERM)
+        pid = process.pid
+        assert pid is not None and process.alive
+        for number in (signal.SIGINT, signal.SIGTERM):
+            os.kill(pid, number)
+        for _ in range(5):
+            client.poll(0.1)
+        assert process.pid == pid and client.state().counters.restarts == 0
+        process.close()
         with pytest.raises(HemislamError, match="has ended"):
-            for _ in range(100):
-                client.poll(0.1)
+            client.poll(0.1)
         client.close()
-        process._watcher.join(5.0)
         assert not process.alive
     assert record.read_bytes().endswith(b"\x89MCAP0\r\n")

@@ -161,7 +161,7 @@ def test_scans_that_waited_for_the_engine_when_it_died_are_told(tmp_path: Path) 
 
 
 def test_a_receiver_that_keeps_dying_is_given_up_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_process, "MOST_DEATHS", 3)
+    monkeypatch.setattr(live_process, "MOST_RESTARTS", 2)
     with walking(tmp_path / "walk.mcap") as (process, _, walk):
         for _ in range(3):
             kill(process)
@@ -174,7 +174,7 @@ def test_a_receiver_that_keeps_dying_is_given_up_and_says_why(tmp_path: Path, mo
 
 
 def test_deaths_far_from_one_another_are_no_reason_to_give_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_process, "MOST_DEATHS", 2)
+    monkeypatch.setattr(live_process, "MOST_RESTARTS", 1)
     monkeypatch.setattr(live_process, "WITHIN_S", 0.0)
     with walking(tmp_path / "walk.mcap") as (process, client, _):
         for count in (1, 2):

@@ -1,0 +1,291 @@
+"""One way to run a function in a process of its own.
+
+The owner makes a `Child`; the function there gets a `Link` to its owner. Both ends send messages without waiting
+and receive them with a timeout.
+
+Signals: a child ignores SIGINT and SIGTERM, even while it starts. Terminals and service managers send them to all
+processes of a group; only the first process of the program acts on them, and ends its children in order. A child
+whose owner dies ends by itself.
+"""
+
+import atexit
+import contextlib
+import logging
+import math
+import multiprocessing
+import os
+import queue
+import signal
+import struct
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from multiprocessing import forkserver, resource_tracker
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerContext, SpawnContext
+from pathlib import Path
+from typing import Any, Final
+
+from app.logs import process_logs
+from app.packing import pack, unpack
+from app.slam.errors import HemislamError
+
+PRELOADED: Final = ("app.server.engine_process", "app.fork_server")
+"""What the fork server imports, so that its forks need not: importing the engine takes seconds."""
+GRACE_S: Final = 10.0
+"""How long a child may take to finish its work after its owner died or asked it to end."""
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+_END: Final = object()
+"""Sent as an empty message, which asks the other end to end."""
+
+log = logging.getLogger(__name__)
+
+
+class LinkClosed(Exception):
+    """No more messages will come: the other end is gone, or asks this one to end."""
+
+
+class ChildDied(HemislamError):
+    """A child has ended although its owner did not ask it to.
+
+    Attributes:
+        how: "signal 9, SIGKILL" or "exit code 1". exit_code: as of `multiprocessing.Process`.
+    """
+
+    def __init__(self, title: str, exit_code: int) -> None:
+        self.exit_code = exit_code
+        self.how = f"exit code {exit_code}"
+        if exit_code < 0:
+            known = {member.value: member.name for member in signal.Signals}
+            self.how = f"signal {-exit_code}, {known.get(-exit_code, 'unknown')}"
+        super().__init__(f"{title} ended unexpectedly ({self.how}).")
+
+
+class RestartLimit:
+    """How often a child may be started again after it died: `most` times within any `within_s` seconds."""
+
+    def __init__(self, most: int, within_s: float = math.inf) -> None:
+        self.most = most
+        self._within_s = within_s
+        self._deaths: deque[float] = deque(maxlen=most + 1)
+
+    def allows(self) -> bool:
+        """Count one death, now. Returns whether the child may be started again."""
+        self._deaths.append(time.monotonic())
+        return len(self._deaths) <= self.most or self._deaths[-1] - self._deaths[0] >= self._within_s
+
+
+class Link:
+    """One end of the connection between an owner and its child. Any thread may send; one at a time may receive."""
+
+    def __init__(self, connection: "Connection[Any, Any]") -> None:
+        self._connection = connection
+        self._unsent: queue.SimpleQueue[object] = queue.SimpleQueue()  # None: no more
+        self._writer = threading.Thread(target=self._write, name="messages", daemon=True)
+        self._writer.start()
+
+    def send(self, message: object) -> None:
+        """Send a message, whose arrays must not change any more. Never waits; lost if the other end is gone."""
+        self._unsent.put(message)
+
+    def receive(self, timeout: float | None = None) -> Any:
+        """The next message; None if none comes within the time (s). Large arrays in it are read-only.
+
+        Raises:
+            LinkClosed: there will be none.
+        """
+        try:
+            if not self._connection.poll(timeout):
+                return None
+            head = self._connection.recv_bytes()
+            if not head:
+                raise LinkClosed
+            (arrays,) = struct.unpack_from("<I", head)
+            return unpack([memoryview(head)[4:], *(self._connection.recv_bytes() for _ in range(arrays))])
+        except (EOFError, OSError):
+            raise LinkClosed from None
+
+    def ask_to_end(self) -> None:
+        """Have the other end's `receive` raise `LinkClosed` once it has received everything before."""
+        self._unsent.put(_END)
+
+    def finish(self, *, wait: bool) -> None:
+        """Send nothing after what was sent before. wait: until the other end has taken that, or is gone."""
+        self._unsent.put(None)
+        if wait:
+            self._writer.join()
+
+    def _write(self) -> None:
+        try:
+            while (message := self._unsent.get()) is not None:
+                if message is _END:
+                    self._connection.send_bytes(b"")
+                    continue
+                body, *arrays = pack(message)
+                self._connection.send_bytes(struct.pack("<I", len(arrays)) + body)
+                for array in arrays:
+                    self._connection.send_bytes(array)
+        except OSError:
+            pass  # the other end is gone, which `receive` reports
+        except BaseException:
+            log.critical("A message cannot be sent", exc_info=True)
+            if multiprocessing.parent_process() is not None:
+                os._exit(1)  # the owner reports it
+
+
+class Child:
+    """A function that runs in a process of its own, and ends with its owner at the latest.
+
+    Args:
+        main: called there with a `Link` to this process and `args`; all must be picklable. Let it return when
+            the link raises `LinkClosed`, or let that exception pass.
+        name: for `ps` ("hemislam-NAME", 15 characters) and the log. title: what it is called in messages.
+        fork: start as a fork of a process that has imported the engine already, where the system can: this
+            takes 20 ms. Otherwise a new interpreter starts.
+        environment: additional variables of a new interpreter.
+        grace_s: how long it may go on working when its owner dies or asks it to end.
+    """
+
+    def __init__(
+        self,
+        main: Callable[..., None],
+        *args: Any,
+        name: str,
+        title: str,
+        fork: bool = False,
+        environment: Mapping[str, str] | None = None,
+        grace_s: float = GRACE_S,
+    ) -> None:
+        self.title = title
+        context = fork_context() if fork else multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        self._process = context.Process(target=_run, args=(theirs, name, grace_s, main, args), name=f"hemislam {name}")
+        with _signals_blocked(), _environment(environment or {}):
+            self._process.start()
+        theirs.close()
+        self._link, self._grace_s = Link(ours), grace_s
+        self._reaping = threading.Lock()
+        _owned.add(self)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid or 0
+
+    def send(self, message: object) -> None:
+        """Send a message, whose arrays must not change any more. Never waits; lost if the child is dead."""
+        self._link.send(message)
+
+    def receive(self, timeout: float | None = None) -> Any:
+        """The next message; None if none comes within the time (s). Large arrays in it are read-only.
+
+        Raises:
+            ChildDied: there will be none.
+        """
+        try:
+            return self._link.receive(timeout)
+        except LinkClosed:
+            raise ChildDied(self.title, self._exit_code()) from None
+
+    def close(self, timeout: float | None = None) -> None:
+        """Ask the child to end; kill it if it has not ended after the time (s; None: its grace), or at once if 0."""
+        timeout = self._grace_s if timeout is None else timeout
+        if timeout:
+            self._link.ask_to_end()
+        if not wait([self._process.sentinel], timeout):
+            self._process.kill()
+        self._exit_code()
+        self._link.finish(wait=False)
+
+    def _exit_code(self) -> int:
+        wait([self._process.sentinel])
+        with self._reaping:  # the exit code can be read only once
+            self._process.join()
+            _owned.discard(self)
+            return self._process.exitcode or 0
+
+
+_owned: set[Child] = set()
+
+
+@atexit.register
+def _end_children() -> None:
+    """End the children that are left; multiprocessing would wait for them without a limit."""
+    for child in tuple(_owned):
+        child.close()
+
+
+def _run(connection: "Connection[Any, Any]", name: str, grace_s: float, main: Callable[..., None], args: Any) -> None:
+    """The process."""
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    multiprocessing.set_start_method("spawn", force=True)  # so that numba makes no semaphore, which a kill would leak
+    show_as(f"hemislam-{name}")
+    threading.Thread(target=_end_with_owner, args=(grace_s,), name="owner", daemon=True).start()
+    owner = Link(connection)
+    with process_logs(name):
+        try:
+            with contextlib.suppress(LinkClosed):
+                main(owner, *args)
+        finally:
+            _end_children()
+            owner.finish(wait=True)
+
+
+def _end_with_owner(grace_s: float) -> None:
+    owner = multiprocessing.parent_process()
+    assert owner is not None
+    owner.join()
+    time.sleep(grace_s)
+    os._exit(1)
+
+
+def fork_context() -> ForkServerContext | SpawnContext:
+    """The context of `multiprocessing` that forks the process that has imported already, where the system can.
+
+    The first call starts that process and returns at once; it has the environment of then. It runs a single thread,
+    since a fork of a pool of threads hangs.
+    """
+    if sys.platform != "linux":  # macOS cannot fork a process that has used its frameworks
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(PRELOADED))
+    with _signals_blocked():
+        forkserver.ensure_running()
+    return context
+
+
+@contextlib.contextmanager
+def _signals_blocked() -> Iterator[None]:
+    """A process started meanwhile never sees SIGINT and SIGTERM: it inherits the mask."""
+    if os.name != "posix":
+        yield
+        return
+    resource_tracker.ensure_running()  # its start unblocks them
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """A process started meanwhile inherits these variables."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def show_as(name: str) -> None:
+    """Have `ps` and `top` show this process by a name of at most 15 characters; does nothing except on Linux."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/comm").write_text(name, encoding="ascii")

@@ -1,0 +1,163 @@
+"""What runs in the process that receives live data (`app.sensors.live.process`)."""
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import threading
+import time
+from collections import deque
+from multiprocessing.connection import Connection, Listener
+from pathlib import Path
+from typing import Any, Final
+
+from app.child import Link
+from app.sensors.live.process import LiveAddress
+from app.sensors.live.source import Event, Known, LiveSource
+from app.sensors.live.urls import open_live
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import DroppedScan, Measurement
+
+log = logging.getLogger(__name__)
+
+HISTORY = 60
+"""Scans that can be given again: six seconds of them. An engine makes a checkpoint every second."""
+MOST_GIVEN = 100_000
+"""The same including dropped scans, of which only the time is kept."""
+LOST: Final = "it was lost with the engine that had it"
+_REPORT_S = 0.2
+"""How often the owner is sent what is known."""
+_NUMBERS = 1 << 40
+"""Scan numbers reserved for each process, so that the next one does not use those of one that died."""
+
+
+def receive(
+    owner: Link, address: LiveAddress, lidar: str, params: Params, imu: str | None,
+    record: Path | None, death: str, known: Known,
+) -> None:  # fmt: skip
+    """Receive until the owner ends this process. The first message is "", or why the source cannot be opened.
+
+    Args:
+        death: how the process before died, "" if there was none. known: what that one knew.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        os.nice(-5)  # packets do not wait; only root may do this
+    try:
+        source = open_live(lidar, params, imu, record, known)
+    except HemislamError as error:
+        owner.send(str(error))
+        return
+    log.info("Receiving from %s", ", ".join(filter(None, (lidar, imu))))
+    if death:
+        source.tell("restarted", _restarted(death, known, record))
+    server = ScanServer(source, known.counters.restarts * _NUMBERS)
+    source.set_absent(True)
+    Path(address.path).unlink(missing_ok=True)  # of the process before
+    with source, Listener(address.path, authkey=address.key) as listener:
+        threading.Thread(target=accept, args=(listener, server), daemon=True).start()
+        owner.send("")
+        while owner.receive(_REPORT_S) is None:
+            owner.send(server.known())
+
+
+def _restarted(death: str, known: Known, record: Path | None) -> str:
+    silent = f"the receiving process died ({death}) and was started again; nothing was received for "
+    silent += f"{(time.time_ns() - known.at_ns) * 1e-9:.1f} s"
+    lost = f"; scans lost that waited for the engine: {known.waiting} by the last count" if known.waiting else ""
+    into = f"; the recording continues in {record}" if record else ""
+    return f"{silent}{lost}{into}"
+
+
+def accept(listener: Listener, server: "ScanServer") -> None:
+    """Serve all clients, each on a thread of its own, until the process ends."""
+    while True:
+        try:
+            connection = listener.accept()
+        except (OSError, EOFError, multiprocessing.AuthenticationError):
+            time.sleep(0.05)
+            continue
+        threading.Thread(target=server.serve, args=(connection,), daemon=True).start()
+
+
+class ScanServer:
+    """Answers the requests of `LiveClient`.
+
+    Scans and dropped scans are numbered from 1 as they are given, and a client says which one it had last. So a scan
+    that an engine took just before it died is given again to the next one.
+
+    Args:
+        first: number of the first one, less one.
+    """
+
+    def __init__(self, source: LiveSource, first: int = 0) -> None:
+        self._source = source
+        self._lock = threading.Lock()
+        self._given: dict[int, Measurement | DroppedScan] = {}  # without a gap
+        self._scans: deque[int] = deque()  # which of them are scans that were not dropped
+        self._last = first
+        self._polling = 0
+
+    def serve(self, connection: "Connection[Any, Any]") -> None:
+        """Answer a client until it leaves or dies."""
+        polls = False
+        try:
+            with connection:
+                while True:
+                    request = connection.recv()
+                    if request[0] == "poll" and not polls:
+                        polls = True
+                        self._count(1)
+                    connection.send(self._answer(*request))
+        except (OSError, EOFError):
+            return
+        finally:
+            if polls:
+                self._count(-1)
+
+    def known(self) -> Known:
+        """What the source knows."""
+        with self._lock:
+            return self._source.known()
+
+    def _count(self, change: int) -> None:
+        with self._lock:
+            self._polling += change
+            self._source.set_absent(self._polling == 0)
+
+    def _answer(self, what: str, place: int = 0, timeout_s: float = 0.0) -> Any:
+        if what == "state":
+            return self._source.state()
+        with self._lock:
+            if what == "poll":
+                return self._next(place, timeout_s)
+            if what == "kept":
+                self._forget(place)
+            return self._last
+
+    def _next(self, place: int, timeout_s: float) -> tuple[int, Event | None]:
+        """The event after that place, and its own place."""
+        if self._given and place < self._last:
+            place = max(place + 1, next(iter(self._given)))
+            return place, self._given[place]
+        event = self._source.poll(timeout_s)
+        if isinstance(event, Measurement | DroppedScan):
+            self._last += 1
+            self._given[self._last] = event
+        if isinstance(event, Measurement):
+            self._scans.append(self._last)
+        if len(self._scans) > HISTORY:
+            oldest = self._scans.popleft()
+            self._given[oldest] = DroppedScan(_stamp(self._given[oldest]), LOST)
+        self._forget(self._last - MOST_GIVEN)
+        return self._last, event
+
+    def _forget(self, place: int) -> None:
+        while self._given and (first := next(iter(self._given))) <= place:
+            del self._given[first]
+        while self._scans and self._scans[0] <= place:
+            self._scans.popleft()
+
+
+def _stamp(event: Measurement | DroppedScan) -> int:
+    return event.scan.stamp_ns if isinstance(event, Measurement) else event.stamp_ns
