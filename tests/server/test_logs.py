@@ -46,7 +46,10 @@ from app.slam.loops.messages import LoopWorkerDied
 
 start_logging(json_lines=True)
 loops = LoopProcess()
-loops.send("no request")
+class Unknown:
+    """Nothing that the other process knows."""
+
+loops.send(Unknown())
 with pytest.raises(LoopWorkerDied, match="exit code 1"):
     loops.receive(60.0)
 """
