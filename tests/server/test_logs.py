@@ -46,8 +46,7 @@ from app.slam.loops.messages import LoopWorkerDied
 
 start_logging(json_lines=True)
 loops = LoopProcess()
-class Unknown:
-    """Nothing that the other process knows."""
+class Unknown: pass
 
 loops.send(Unknown())
 with pytest.raises(LoopWorkerDied, match="exit code 1"):
