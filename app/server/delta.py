@@ -12,8 +12,8 @@ from typing import Any, Literal
 from app.mapping.frames import Frame
 from app.mapping.log import Cursor, Log
 from app.server.chunks import thinned
-from app.server.edges import EdgesChange, EdgesSender
 from app.server.protocol import Chunk, LoopsView, Notice
+from app.slam.loops.types import LoopChange, LoopEdge, difference
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.ply import Keyframes
@@ -27,14 +27,16 @@ class Delta:
     """Changes since the delta before.
 
     Attributes:
-        replaced: new values of fields of `Snapshot`; `loops` without its edges. edges: what has changed of those.
+        replaced: new values of fields of `Snapshot`; `loops` without its edges. With `session`, another session
+            begins: the reader drops its edges.
+        edges: what has changed of the loops' edges.
         keep: the reader keeps so many of its frames and appends `frames`.
         chunks: of the next keyframes whose cloud the reader does not have.
         notices: new since then.
     """
 
     replaced: dict[str, Any]
-    edges: EdgesChange | None
+    edges: LoopChange | None
     keep: int
     frames: tuple[Frame, ...]
     chunks: tuple[Chunk, ...]
@@ -64,7 +66,7 @@ class Outbox:
     ) -> None:
         self._session, self._notices_given, self._chunk_voxel = session, notices, chunk_voxel
         self._replaced: dict[str, Any] = {"params": params}
-        self._edges = EdgesSender()
+        self._edges: tuple[LoopEdge, ...] = ()  # that the reader has
         self._frames: Log[Frame] = Log()
         self._cursor = Cursor(0, frames)
         self._clouds: Keyframes = ()
@@ -75,7 +77,7 @@ class Outbox:
 
     def begin(self, frames: Log[Frame], keyframes: Keyframes) -> None:
         """Follow another session, or, if it has frames already, the one that an earlier process began."""
-        self._frames, self._clouds = frames, keyframes
+        self._frames, self._clouds, self._edges = frames, keyframes, ()
         self._keyframes = [index for index, frame in enumerate(frames) if frame.keyframe]
         if len(frames):
             self._cursor = Cursor(0, min(self._cursor.length, len(frames)))
@@ -111,7 +113,7 @@ class Outbox:
         edges = None
         if "loops" in self._replaced:
             loops: LoopsView = self._replaced["loops"]
-            edges = self._edges.change(loops.edges)
+            edges, self._edges = difference(self._edges, loops.edges), loops.edges
             self._replaced["loops"] = replace(loops, edges=())
         keep, frames, self._cursor = self._frames.since(self._cursor)
         kept = bisect_left(self._keyframes, keep)

@@ -14,9 +14,9 @@ from app.mapping import truth
 from app.mapping.frames import FRAME, READOUTS, as_table
 from app.server.chunks import within_budget
 from app.server.delta import Delta
-from app.server.edges import EdgesReceiver
 from app.server.protocol import Chunk, Notice, OpenedRecording, Snapshot
 from app.server.setup import POINT_BUDGET
+from app.slam.loops.types import changed_by
 from app.slam.map_frame import MapFrame
 from app.slam.rows import Rows
 from app.slam.trajectory import Trajectory
@@ -37,14 +37,15 @@ class Fold:
         self._point_budget = point_budget
         self._frames = _Frames()
         self._chunks: tuple[Chunk, ...] = ()  # of all known keyframes, also those after the present frame
-        self._edges = EdgesReceiver()
 
     def apply(self, delta: Delta) -> Snapshot:
         before = self.snapshot
         now = replace(before, **read_only(delta.replaced))
         if delta.edges is not None:
-            self._edges.take(delta.edges)
-            now = replace(now, loops=replace(now.loops, edges=self._edges.edges))
+            edges = before.loops.edges if "session" not in delta.replaced else ()
+            if any(delta.edges):
+                edges = changed_by(delta.edges, edges)
+            now = replace(now, loops=replace(now.loops, edges=edges))
         if now.result is not None and now.corrections is not before.corrections:
             now = replace(now, result=replace(now.result, T_map_odom=now.corrections.newest))
         frames = self._frames

@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import Final
 
 from app.child import Child, ChildDied, Link
-from app.server.edges import EdgesChange, EdgesReceiver, EdgesSender
 from app.slam.loops.messages import LoopState, LoopWorkerDied, Reply, Request
+from app.slam.loops.types import LoopChange, LoopEdge, changed_by, difference
 
 NICENESS: Final = 10
 """The frame loop comes first."""
@@ -22,7 +22,7 @@ class LoopProcess:
             main, name="loops", title="The process that looks for loops", environment=_ONE_THREAD, grace_s=0.0
         )
         self._pending = 0
-        self._edges = EdgesReceiver()
+        self._edges: tuple[LoopEdge, ...] = ()
 
     @property
     def pid(self) -> int:
@@ -49,7 +49,7 @@ class LoopProcess:
         if not self._pending:
             return None
         try:
-            message: tuple[Reply, EdgesChange | None] | None = self._child.receive(timeout)
+            message: tuple[Reply, LoopChange | None] | None = self._child.receive(timeout)
         except ChildDied as death:
             raise LoopWorkerDied(str(death)) from None
         if message is None:
@@ -58,8 +58,9 @@ class LoopProcess:
         reply, change = message
         if not isinstance(reply, LoopState) or change is None:
             return reply
-        self._edges.take(change)
-        return replace(reply, edges=self._edges.edges)
+        if any(change):
+            self._edges = changed_by(change, self._edges)
+        return replace(reply, edges=self._edges)
 
     def close(self) -> None:
         """End the process; pending requests are dropped."""
@@ -76,10 +77,11 @@ def main(owner: Link) -> None:
 
     warm_up()
     service = LoopService()
-    edges = EdgesSender()
+    edges: tuple[LoopEdge, ...] = ()
     while True:
         reply = service.handle(owner.receive())
         if isinstance(reply, LoopState):
-            owner.send((replace(reply, edges=()), edges.change(reply.edges)))
+            change, edges = difference(edges, reply.edges), reply.edges
+            owner.send((replace(reply, edges=()), change))
         else:
             owner.send((reply, None))

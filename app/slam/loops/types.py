@@ -167,6 +167,14 @@ def difference(before: Iterable[LoopEdge], after: Iterable[LoopEdge]) -> LoopCha
     return LoopChange(changed, tuple(pair for pair in old if pair not in new))
 
 
+def changed_by(change: LoopChange, before: Iterable[LoopEdge]) -> tuple[LoopEdge, ...]:
+    """The candidates, by pair, that a change makes of those `before`: the inverse of `difference`."""
+    edges = {edge.pair: edge for edge in (*before, *change.changed)}
+    for pair in change.gone:
+        del edges[pair]
+    return tuple(edges[pair] for pair in sorted(edges))
+
+
 # --- the user's commands -------------------------------------------------------------------------
 # `since` of each: how many keyframes the walk had when it was given, one more after its end. The first
 # time round a command acts from there on, so that a session given again goes as it went; 0: from the start.

@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from app.slam.loops.types import Evidence, LoopEdge, Measured, Verdict, difference
+from app.slam.loops.types import Evidence, LoopEdge, Measured, Verdict, changed_by, difference
 
 
 def edge(newer: int, verdict: Verdict = Verdict.CANDIDATE) -> LoopEdge:
@@ -41,3 +43,14 @@ def test_a_candidate_differs_if_its_place_in_the_graph_or_its_measurement_does()
     moved = replace(one, measured=Measured(np.diag([2.0, 1.0, 1.0, 1.0]), np.eye(6), Evidence()))
     for other in (replace(one, weight=2.0), replace(one, represented_by=(0, 9)), moved, replace(one, reason="other")):
         assert difference((one,), (other,)) == ((other,), ())
+
+
+@given(st.lists(st.dictionaries(st.integers(1, 9), st.sampled_from(Verdict)), max_size=6))
+def test_a_reader_that_applies_every_difference_holds_the_same_candidates(states: list[dict[int, Verdict]]) -> None:
+    sent: tuple[LoopEdge, ...] = ()
+    held: tuple[LoopEdge, ...] = ()
+    for state in states:
+        edges = tuple(edge(newer, verdict) for newer, verdict in sorted(state.items()))
+        held, sent = changed_by(difference(sent, edges), held), edges
+        assert [one.pair for one in held] == [one.pair for one in edges]
+        assert difference(held, edges) == ((), ())
