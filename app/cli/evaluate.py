@@ -10,7 +10,7 @@ from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic,
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
-    from app.evaluation.truth import Truth
+    from app.evaluation.truth import TruePoses
     from app.slam.trajectory import Trajectory
 
 _TRUTH_HELP = (
@@ -62,7 +62,7 @@ def evaluate(
     start: Start = 0.0,
     duration: Duration = None,
 ) -> None:
-    """Measure accuracy, time and fineness: the paper's ablation, and yours.
+    """Measure accuracy, time and map sharpness: the paper's ablation, and yours.
 
     Each recording is run with FAST-LIO (no ground downsampling, no loops), FAST-LIO-GD, FAST-LIO-L
     and Ours, and with each --variant. A run that is finished is not run again: what was
@@ -86,7 +86,7 @@ def evaluate(
     from app.cli.suite import make_suite
     from app.evaluation.evaluate import Plan, Subject
     from app.evaluation.evaluate import evaluate as run_evaluation
-    from app.evaluation.truth import read_truth
+    from app.evaluation.truth_sources import read_truth
     from app.evaluation.variants import choose_variants, parse_variant
 
     if suite is None and (short or seeds):
@@ -103,7 +103,7 @@ def evaluate(
     arm = _lever(lever)
     subjects = []
     for path, name, text in zip(paths, names, _truth_texts(paths, truths or []), strict=True):
-        truth: Truth | None = read_truth(text, path, arm) if text else None
+        truth: TruePoses | None = read_truth(text, path, arm) if text else None
         params = resolve(path, preset, config, assignments, lidar_topic, imu_topic)
         subjects.append(Subject(name, path, params, truth, tuple(others[name])))
     for variant in chosen:

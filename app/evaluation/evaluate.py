@@ -1,4 +1,4 @@
-"""Everything that `hemislam evaluate` does: plan the runs, run them, measure them, report."""
+"""What `hemislam evaluate` does: plan the runs, run them, measure them, report."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from app.evaluation.job import Job
-from app.evaluation.measured import Column, Evaluated, load, measure
+from app.evaluation.measured import Evaluated, Outcome, load, measure
 from app.evaluation.report import write_report
 from app.evaluation.runner import run_jobs
-from app.evaluation.truth import Truth, check_overlap
+from app.evaluation.truth import TruePoses, check_overlap
 from app.evaluation.variants import Variant
 from app.sensors.recording import open_recording
 from app.slam.errors import HemislamError
@@ -32,7 +32,7 @@ class Subject:
     name: str
     recording: Path
     params: Params
-    truth: Truth | None = None
+    truth: TruePoses | None = None
     compared: tuple[tuple[str, Trajectory], ...] = ()
 
 
@@ -58,7 +58,7 @@ def evaluate(plan: Plan) -> tuple[list[str], dict[tuple[str, str], str]]:
         The findings, and why runs failed, by (recording, variant).
 
     Raises:
-        HemislamError: a recording, truth or parameter can not be used; found out before anything runs.
+        HemislamError: a recording, truth or parameter cannot be used. This is checked before anything runs.
     """
     jobs: dict[tuple[str, str], Job] = {}
     hashes: dict[str, str] = {}
@@ -68,7 +68,7 @@ def evaluate(plan: Plan) -> tuple[list[str], dict[tuple[str, str], str]]:
                 check_overlap(subject.truth, recording.start_ns, recording.duration_s)
         digest = hash_input(subject.recording)
         if digest is None:
-            raise HemislamError(f"{subject.recording} can not be read; check its permissions.")
+            raise HemislamError(f"{subject.recording} cannot be read; check its permissions.")
         hashes[subject.name] = digest
         for variant in plan.variants:
             jobs[subject.name, variant.name] = Job(
@@ -94,36 +94,35 @@ def _evaluated(
     failures: dict[tuple[str, str], str],
     sha256: str,
 ) -> Evaluated:
-    columns: list[Column] = []
+    outcomes: list[Outcome] = []
     for variant in plan.variants:
         which = (subject.name, variant.name)
         if missing := failures.get(which, ""):
-            columns.append(Column(variant.name, variant.meaning, missing=missing))
+            outcomes.append(Outcome(variant.name, variant.meaning, missing=missing))
         else:
-            columns.append(load(jobs[which], variant.meaning))
-    columns += [Column(name, "a trajectory from elsewhere", trajectory=other) for name, other in subject.compared]
-    columns, matched, problem = measure(columns, subject.truth)
+            outcomes.append(load(jobs[which], variant.meaning))
+    outcomes += [Outcome(name, "a trajectory from elsewhere", trajectory=other) for name, other in subject.compared]
     truth = subject.truth
-    notes = () if truth is None else (matched.notes if matched else (problem,))
+    outcomes, matched, problem = measure(outcomes, truth)
     return Evaluated(
         name=subject.name,
         recording=subject.recording,
         sha256=sha256,
-        columns=tuple(columns),
+        outcomes=tuple(outcomes),
         truth="" if truth is None else _described(truth),
-        notes=notes,
-        truth_path=_path(matched.trajectory, columns) if matched else None,
+        notes=() if truth is None else (matched.notes if matched else (problem,)),
+        truth_path=_path(matched.trajectory, outcomes) if matched else None,
     )
 
 
-def _described(truth: Truth) -> str:
-    """What it is; where a lever arm is taken off, the notes tell it."""
+def _described(truth: TruePoses) -> str:
+    """What it is. A lever arm that was taken off is in the notes."""
     point = "" if any(truth.lever) else " of a point taken as the IMU's own (no lever arm)"
     return f"{truth.source}: {truth.kind}, {len(truth)} poses{point}."
 
 
-def _path(truth: Trajectory, columns: Sequence[Column]) -> F64:
-    """The truth from above, (n, 2), while something was measured against it."""
-    stamps = np.concatenate([c.trajectory.stamps_ns for c in columns if c.accuracy and c.trajectory is not None])
+def _path(truth: Trajectory, outcomes: Sequence[Outcome]) -> F64:
+    """The truth from above, (n, 2) m, over the time that was compared."""
+    stamps = np.concatenate([o.trajectory.stamps_ns for o in outcomes if o.accuracy and o.trajectory is not None])
     inside = (truth.stamps_ns >= stamps.min()) & (truth.stamps_ns <= stamps.max())
     return np.asarray(truth.positions[inside, :2])

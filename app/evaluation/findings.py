@@ -1,16 +1,16 @@
-"""What the tables say, in sentences: where they bear the paper out, where they go against it."""
+"""What the tables show, in sentences: where they confirm the paper and where they contradict it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from app.evaluation.measured import START_S, Column, Evaluated
+from app.evaluation.measured import START_S, Evaluated, Outcome
 
 LIKE = 0.02
-"""Closer than this share of one another, two values are the same."""
+"""Two values that differ by less than this share count as equal."""
 MOST_NAMED = 4
-"""Recordings that go the other way; of more, the number is told and the tables show which."""
+"""Most recordings that are named when they differ; of more, only the number is given."""
 CHANCE = 2.0
 """A mean difference of fewer standard errors than this, over the recordings, may be chance."""
 
@@ -23,55 +23,52 @@ _CLAIMS = (
 
 def findings(recordings: Sequence[Evaluated]) -> list[str]:
     """One sentence each; the claims of the paper first, then what is missing or went wrong."""
-    said = []
+    found = []
     for name, base, what in _CLAIMS:
         for metric in _METRICS:
             chosen = [recording for recording in recordings if recording.name.startswith(metric.where)]
-            sentence = _claim(chosen, name, base, what, metric)
-            said += [sentence] if sentence else []
+            found.append(_claim(chosen, name, base, what, metric))
     missing: dict[str, list[str]] = {}
     for recording in recordings:
-        for column in recording.columns:
-            if column.missing:
-                missing.setdefault(f"{column.name}: {column.missing}", []).append(recording.name)
-            elif column.unmeasured:
-                said.append(f"{recording.name}, {column.name}: the error can not be told. {column.unmeasured}")
-            elif column.accuracy and column.accuracy.doubt:
-                said.append(f"{recording.name}, {column.name}: no rotation error. {column.accuracy.doubt}")
-            run = column.run or {}
+        for outcome in recording.outcomes:
+            who, run = f"{recording.name}, {outcome.name}", outcome.run or {}
+            if outcome.missing:
+                missing.setdefault(f"{outcome.name}: {outcome.missing}", []).append(recording.name)
+            elif outcome.unmeasured:
+                found.append(f"{who}: the error cannot be measured. {outcome.unmeasured}")
+            elif outcome.accuracy and outcome.accuracy.doubt:
+                found.append(f"{who}: no rotation error. {outcome.accuracy.doubt}")
             if run.get("lost"):
-                said.append(f"{recording.name}, {column.name}: lost in {run['lost']} of {run['frames']} frames.")
+                found.append(f"{who}: lost in {run['lost']} of {run['frames']} frames.")
             if run.get("dropped"):
-                said.append(f"{recording.name}, {column.name}: {sum(run['dropped'].values())} scans were dropped.")
-    said += [
-        f"{text}." if len(names) == len(recordings) else f"{', '.join(names)}: {text}."
-        for text, names in missing.items()
-    ]
-    return said
+                found.append(f"{who}: {sum(run['dropped'].values())} scans were dropped.")
+    for text, names in missing.items():
+        found.append(f"{text}." if len(names) == len(recordings) else f"{', '.join(names)}: {text}.")
+    return [sentence for sentence in found if sentence]
 
 
-def _ate(column: Column) -> float | None:
-    return column.accuracy.ate_m["rmse"] if column.accuracy else None
+def _ate(outcome: Outcome) -> float | None:
+    return outcome.accuracy.ate_m["rmse"] if outcome.accuracy else None
 
 
-def _later(column: Column) -> float | None:
-    return column.accuracy.later_m if column.accuracy else None
+def _later(outcome: Outcome) -> float | None:
+    return outcome.accuracy.later_m if outcome.accuracy else None
 
 
-def _time(column: Column) -> float | None:
+def _time(outcome: Outcome) -> float | None:
     """CPU time, which other programs on the machine disturb least."""
-    return float(column.runtime["cpu"]["mean"]) if column.runtime else None
+    return float(outcome.runtime["cpu"]["mean"]) if outcome.runtime else None
 
 
 @dataclass(frozen=True, slots=True)
 class _Metric:
     """Attributes:
-    where: recordings whose name begins so; the paper says something about these.
-    promised: whether the paper found that it falls.
+    where: how the names of the recordings begin that the paper speaks of.
+    promised: whether the paper found that the value falls.
     """
 
     name: str
-    value: Callable[[Column], float | None]
+    value: Callable[[Outcome], float | None]
     unit: str
     digits: str
     where: str = ""
@@ -82,9 +79,9 @@ _METRICS = (
     _Metric("error (ATE)", _ate, "m", ".3g"),
     _Metric("error (ATE) outdoors", _ate, "m", ".3g", where="outdoor"),
     _Metric(f"error (ATE) without the first {START_S:g} s", _later, "m", ".3g"),
-    _Metric("CPU time a frame", _time, "ms", ".2f", promised=False),
+    _Metric("CPU time per frame", _time, "ms", ".2f", promised=False),
     # Table 3: outdoors, where much is ground, thinning it should make up for most of what it costs
-    _Metric("CPU time a frame outdoors", _time, "ms", ".2f", where="outdoor", promised=False),
+    _Metric("CPU time per frame outdoors", _time, "ms", ".2f", where="outdoor", promised=False),
 )
 
 
@@ -92,9 +89,9 @@ def _claim(recordings: Sequence[Evaluated], name: str, base: str, what: str, met
     """`name` against `base`, over all recordings that have both; "" if none has."""
     pairs = []
     for recording in recordings:
-        columns = {column.name: column for column in recording.columns}
-        if name in columns and base in columns:
-            ours, theirs = metric.value(columns[name]), metric.value(columns[base])
+        outcomes = {outcome.name: outcome for outcome in recording.outcomes}
+        if name in outcomes and base in outcomes:
+            ours, theirs = metric.value(outcomes[name]), metric.value(outcomes[base])
             if ours is not None and theirs is not None:
                 pairs.append((recording.name, ours, theirs))
     if not pairs:
@@ -113,7 +110,7 @@ def _claim(recordings: Sequence[Evaluated], name: str, base: str, what: str, met
 
 
 def _certainty(pairs: Sequence[tuple[str, float, float]]) -> str:
-    """How well the recordings tell the mean difference, in words."""
+    """How certain the mean difference is, in words."""
     if len(pairs) < 3:
         return ""
     differences = np.array([ours - theirs for _, ours, theirs in pairs])

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from app import __version__
-from app.evaluation import crops, fineness
+from app.evaluation import crops, map_sharpness
 from app.sensors.recording import open_recording
 from app.slam.engine import Engine
 from app.slam.metrics import GroundScore
@@ -38,7 +38,7 @@ def code_digest() -> str:
     """Hash of the code that results depend on: a version that changes between releases is another one."""
     root = Path(__file__).parents[1]
     files = [*(root / "slam").rglob("*.py"), *(root / "sensors").glob("*.py")]
-    files += [root / "evaluation" / name for name in ("job.py", "fineness.py", "crops.py")]
+    files += [root / "evaluation" / name for name in ("job.py", "map_sharpness.py", "crops.py")]
     digest = hashlib.sha256()
     for path in sorted(files):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
@@ -157,8 +157,8 @@ def _write(job: Job, log: RunLog, engine: Engine, facts: dict[str, Any], cpu_ms:
     """All files beside their places, then moved there, run.json last: a kill in between leaves no result."""
     trajectory = engine.map_frame.trajectory(log.odometry)
     poses = engine.map_frame.poses(np.array([keyframe.T_odom_imu for keyframe in engine.keyframes]).reshape(-1, 4, 4))
-    measured = fineness.measure(fineness.collect(engine.keyframes, poses))
-    facts["fineness"] = {name: value if np.isfinite(value) else None for name, value in asdict(measured).items()}
+    measured = map_sharpness.measure(map_sharpness.collect(engine.keyframes, poses))
+    facts["map_sharpness"] = {name: value if np.isfinite(value) else None for name, value in asdict(measured).items()}
 
     part = job.folder.with_name(f"{job.folder.name}.part-{os.getpid()}")
     part.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What a finished run is worth: its files read back and measured against the truth."""
+"""What a finished run achieved: its files read back and measured against the truth."""
 
 import csv
 from dataclasses import asdict, dataclass, field, replace
@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from app.evaluation.job import Job, finished
-from app.evaluation.truth import Matched, Truth, match
+from app.evaluation.truth import TruePoses
+from app.evaluation.truth_match import Matched, match
 from app.slam.errors import HemislamError
 from app.slam.metrics import GroundScore, ate, compare, paired
 from app.slam.report import spread
@@ -16,21 +17,21 @@ from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import F64, TIMINGS, U16
 
 START_S = 5.0
-"""The start: standing and walking off. A slip there moves all later poses against the few of the start."""
+"""The start: rest and the first steps. A slip there moves all later poses against the few of the start."""
 BUDGETS_MS = (50.0, 100.0)
-"""A frame at 20 Hz and at 10 Hz."""
+"""Time for a frame at 20 Hz and at 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """Errors against truth; those of rotation are None where the truth has no orientations or they mean nothing.
+    """Errors against truth. Errors of rotation are None if the truth has no orientations or does not fix them.
 
     Attributes:
         ate_m, ate_deg, rpe[over]["m" | "deg"]: {"rmse", "mean", "max"}. distance_m: true length.
-        times_s, errors_m: (n,) the position error of each pose after the alignment.
+        times_s, errors_m: (n,) position error of each pose after the alignment.
         aligned: (n, 3) the estimate in the truth's world. poses: compared.
         later_m: RMSE of the positions after START_S, aligned without those before; None if there are too few.
-        doubt: why the ATE of rotation is withheld, in a sentence; "" if it is not.
+        doubt: why the rotation error is withheld, in a sentence; "" if it is not.
     """
 
     ate_m: dict[str, float]
@@ -45,7 +46,7 @@ class Accuracy:
     doubt: str = ""
 
     def errors(self) -> dict[tuple[str, str], dict[str, float] | None]:
-        """All of them by ("ATE" | "RPE over ...", "m" | "deg"), each {"rmse", "mean", "max"}."""
+        """All errors by ("ATE" | "RPE over ...", "m" | "deg"), each {"rmse", "mean", "max"}."""
         found: dict[tuple[str, str], dict[str, float] | None] = {("ATE", "m"): self.ate_m, ("ATE", "deg"): self.ate_deg}
         for over, error in self.rpe.items():
             found |= {(f"RPE over {over}", unit): error[unit] if error else None for unit in ("m", "deg")}
@@ -53,7 +54,7 @@ class Accuracy:
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class Outcome:
     """One variant, or another system's trajectory, on one recording.
 
     Attributes:
@@ -75,7 +76,7 @@ class Column:
 
     @property
     def runtime(self) -> dict[str, Any] | None:
-        """Milliseconds a frame by stage, and shares of frames within BUDGETS_MS."""
+        """Milliseconds per frame by stage, and shares of frames within BUDGETS_MS."""
         if self.timings_ms is None or self.cpu_ms is None or self.run is None or not len(self.timings_ms):
             return None
         total = self.timings_ms[:, -1]
@@ -90,7 +91,7 @@ class Column:
 
     @property
     def ground(self) -> list[GroundScore] | None:
-        """By range; None where points carry no label or this variant segments no ground."""
+        """Scores by range; None if points carry no labels or the variant segments no ground."""
         if self.run is None or self.run["ground"] is None or not self.run["parameters"]["ground"]["enabled"]:
             return None
         return [GroundScore(**score) for score in self.run["ground"]]
@@ -101,20 +102,20 @@ class Evaluated:
     """One recording with all that was run on it.
 
     Attributes:
-        truth: what it is, in words; "" without. notes: what was assumed of it. truth_path: (n, 2),
-            from above, where the truth was measured.
+        truth: what it is, in words; "" without one. notes: what was assumed about it.
+        truth_path: (n, 2) m from above, of the poses that were compared.
     """
 
     name: str
     recording: Path
     sha256: str
-    columns: tuple[Column, ...]
+    outcomes: tuple[Outcome, ...]
     truth: str = ""
     notes: tuple[str, ...] = ()
     truth_path: F64 | None = None
 
 
-def load(job: Job, meaning: str) -> Column:
+def load(job: Job, meaning: str) -> Outcome:
     """The files of a finished job."""
     run = finished(job)
     assert run is not None
@@ -123,7 +124,7 @@ def load(job: Job, meaning: str) -> Column:
     table = np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, len(TIMINGS) + 1)
     with np.load(job.folder / "crops.npz") as stored:
         crops = {name: stored[name] for name in stored.files}
-    return Column(
+    return Outcome(
         name=job.variant,
         meaning=meaning,
         trajectory=_trajectory(job.folder / "trajectory.tum"),
@@ -135,33 +136,30 @@ def load(job: Job, meaning: str) -> Column:
 
 
 def _trajectory(path: Path) -> Trajectory | None:
-    """None where there are too few poses to compare anything."""
+    """None if there are too few poses to compare anything."""
     try:
         return read_tum(path)
     except HemislamError:
         return None
 
 
-def measure(columns: list[Column], truth: Truth | None) -> tuple[list[Column], Matched | None, str]:
-    """The columns with their errors; the truth as matched to the first; why it could not be, in words."""
+def measure(outcomes: list[Outcome], truth: TruePoses | None) -> tuple[list[Outcome], Matched | None, str]:
+    """The outcomes with their errors; the truth as matched to the first of them; why none could be matched."""
     if truth is None:
-        return columns, None, ""
+        return outcomes, None, ""
     first: Matched | None = None
-    problem = ""
-    measured = []
-    for column in columns:
-        if column.trajectory is None:
-            measured.append(column)
-            continue
-        try:
-            matched = match(truth, column.trajectory, first.offset_s if first else None)
-            accuracy = _accuracy(column.trajectory, matched)
-            first = first or matched
-            measured.append(replace(column, accuracy=accuracy))
-        except HemislamError as error:
-            problem = problem or str(error)
-            measured.append(replace(column, unmeasured=str(error)))
-    return measured, first, problem if first is None else ""
+    problem, measured = "", []
+    for outcome in outcomes:
+        if outcome.trajectory is not None:
+            try:
+                matched = match(truth, outcome.trajectory, first.offset_s if first else None)
+                outcome = replace(outcome, accuracy=_accuracy(outcome.trajectory, matched))
+                first = first or matched
+            except HemislamError as error:
+                problem = problem or str(error)
+                outcome = replace(outcome, unmeasured=str(error))
+        measured.append(outcome)
+    return measured, first, "" if first else problem
 
 
 def _accuracy(estimate: Trajectory, matched: Matched) -> Accuracy:
@@ -189,43 +187,42 @@ def _later(estimate: Trajectory, truth: Trajectory) -> float | None:
         return None
 
 
-def as_json(column: Column) -> dict[str, Any]:
-    """What results.json holds of a column."""
-    accuracy = column.accuracy
-    run = column.run or {}
-    scores = column.ground
+def as_json(outcome: Outcome) -> dict[str, Any]:
+    """What results.json holds of an outcome."""
+    run, scores = outcome.run or {}, outcome.ground
     return {
-        "variant": column.name,
-        "meaning": column.meaning,
-        "missing": column.missing or None,
-        "accuracy": None
-        if accuracy is None
-        else {
-            "ate_m": accuracy.ate_m,
-            "ate_deg": accuracy.ate_deg,
-            "ate_deg_withheld": accuracy.doubt or None,
-            "ate_after_start_m": accuracy.later_m,
-            "ate_ratio": accuracy.ate_m["rmse"] / accuracy.distance_m,
-            "rpe": accuracy.rpe,
-            "ate_ratio_deg_per_m": accuracy.ate_deg["rmse"] / accuracy.distance_m if accuracy.ate_deg else None,
-            "rpe_ratio": {
-                over: error["m"]["rmse"] / accuracy.distance_m if error else None
-                for over, error in accuracy.rpe.items()
-            },
-            "rpe_ratio_deg_per_m": {
-                over: error["deg"]["rmse"] / accuracy.distance_m if error and error["deg"] else None
-                for over, error in accuracy.rpe.items()
-            },
-            "poses": accuracy.poses,
-            "distance_m": accuracy.distance_m,
-        },
-        "unmeasured": column.unmeasured or None,
-        "runtime_ms": column.runtime,
-        "fineness": run.get("fineness"),
+        "variant": outcome.name,
+        "meaning": outcome.meaning,
+        "missing": outcome.missing or None,
+        "accuracy": _accuracy_json(outcome.accuracy) if outcome.accuracy else None,
+        "unmeasured": outcome.unmeasured or None,
+        "runtime_ms": outcome.runtime,
+        "map_sharpness": run.get("map_sharpness"),
         "ground": [
             {**asdict(score), "precision": score.precision, "recall": score.recall, "f1": score.f1} for score in scores
         ]
         if scores
         else None,
         **{name: run.get(name) for name in ("frames", "lost", "dropped", "distance_m", "ground_share", "parameters")},
+    }
+
+
+def _accuracy_json(accuracy: Accuracy) -> dict[str, Any]:
+    """Errors, and their RMSE as ratios to the length of the true path."""
+
+    def ratio(error: dict[str, float] | None) -> float | None:
+        return error["rmse"] / accuracy.distance_m if error else None
+
+    return {
+        "ate_m": accuracy.ate_m,
+        "ate_deg": accuracy.ate_deg,
+        "ate_deg_withheld": accuracy.doubt or None,
+        "ate_after_start_m": accuracy.later_m,
+        "ate_ratio": ratio(accuracy.ate_m),
+        "rpe": accuracy.rpe,
+        "ate_ratio_deg_per_m": ratio(accuracy.ate_deg),
+        "rpe_ratio": {over: error and ratio(error["m"]) for over, error in accuracy.rpe.items()},
+        "rpe_ratio_deg_per_m": {over: error and ratio(error["deg"]) for over, error in accuracy.rpe.items()},
+        "poses": accuracy.poses,
+        "distance_m": accuracy.distance_m,
     }

@@ -1,4 +1,4 @@
-"""Writes what was measured: report.html, report.md, results.json and the CSV tables."""
+"""Write what was measured: report.html, report.md, results.json and the CSV tables."""
 
 import csv
 import io
@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from app import __version__
+from app.evaluation.figures import render
 from app.evaluation.findings import findings
-from app.evaluation.html import html
 from app.evaluation.job import GROUND_RANGES_M, code_digest
-from app.evaluation.markdown import markdown
 from app.evaluation.measured import Evaluated, as_json
+from app.evaluation.pictures import CROP_NOTE, colours, pictures
 from app.evaluation.tables import make_tables
 from app.slam.errors import HemislamError
 from app.slam.provenance import describe_machine
@@ -24,18 +24,25 @@ def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
     """Write all files, each whole or not at all, and return the findings.
 
     Raises:
-        HemislamError: the folder can not be written to.
+        HemislamError: the folder cannot be written to.
     """
-    machine = describe_machine()
-    said, tables = findings(recordings), make_tables(recordings)
-    made_by = (
-        f"hemislam {__version__} on {machine['processor']}, {machine['cores']} cores, {machine['system']};"
-        f" {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
-    )
-    results = _results(recordings, machine, said)
+    machine, found = describe_machine(), findings(recordings)
+    results = _results(recordings, machine, found)
+    outcomes = [outcome for recording in recordings for outcome in recording.outcomes]
+    colour = colours(recordings)
+    shown = {
+        "made_by": f"hemislam {__version__} on {machine['processor']}, {machine['cores']} cores, {machine['system']};"
+        f" {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        "findings": found,
+        "tables": make_tables(recordings),
+        "recordings": recordings,
+        "variants": {o.name: o.missing or o.meaning or "as given" for o in outcomes},
+        "pictures": {recording.name: pictures(recording, colour) for recording in recordings},
+        "crop_note": CROP_NOTE,
+    }
     texts = {
-        "report.html": html(recordings, tables, said, made_by),
-        "report.md": markdown(recordings, tables, said, made_by),
+        "report.html": render("report.html", **shown),
+        "report.md": render("report.md", **shown),
         "results.json": json.dumps(results, indent=2, ensure_ascii=False) + "\n",
         **{f"{name}.csv": _csv(rows) for name, rows in _flat(results).items()},
     }
@@ -45,16 +52,16 @@ def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
             part.write_text(text, encoding="utf-8")
             part.replace(folder / name)
     except OSError as error:
-        raise HemislamError(f"The report can not be written to {folder}: {error.strerror}.") from error
-    return said
+        raise HemislamError(f"The report cannot be written to {folder}: {error.strerror}.") from error
+    return found
 
 
-def _results(recordings: Sequence[Evaluated], machine: dict[str, Any], said: list[str]) -> dict[str, Any]:
+def _results(recordings: Sequence[Evaluated], machine: dict[str, Any], found: list[str]) -> dict[str, Any]:
     results = {
         "hemislam": __version__,
         "code": code_digest(),
         "machine": machine,
-        "findings": said,
+        "findings": found,
         "recordings": [
             {
                 "name": recording.name,
@@ -62,7 +69,7 @@ def _results(recordings: Sequence[Evaluated], machine: dict[str, Any], said: lis
                 "sha256": recording.sha256,
                 "truth": recording.truth or None,
                 "notes": list(recording.notes),
-                "variants": [as_json(column) for column in recording.columns],
+                "variants": [as_json(outcome) for outcome in recording.outcomes],
             }
             for recording in recordings
         ],
@@ -72,15 +79,15 @@ def _results(recordings: Sequence[Evaluated], machine: dict[str, Any], said: lis
 
 
 def _flat(results: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """One row for each variant on each recording (and, for ground, each range)."""
-    tables: dict[str, list[dict[str, Any]]] = {"accuracy": [], "runtime": [], "fineness": [], "ground": []}
+    """Rows of each CSV table: one per variant and recording, and for ground one per range."""
+    tables: dict[str, list[dict[str, Any]]] = {"accuracy": [], "runtime": [], "map_sharpness": [], "ground": []}
     for recording in results["recordings"]:
         for variant in recording["variants"]:
             who = {"recording": recording["name"], "variant": variant["variant"]}
             for name, entry in (
                 ("accuracy", variant["accuracy"]),
                 ("runtime", variant["runtime_ms"]),
-                ("fineness", variant["fineness"]),
+                ("map_sharpness", variant["map_sharpness"]),
             ):
                 if entry is not None:
                     tables[name].append(who | dict(_leaves(entry)))

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from app.evaluation.measured import Column, measure
-from app.evaluation.truth import Truth
+from app.evaluation.measured import Outcome, measure
+from app.evaluation.truth import TruePoses
 from app.slam.trajectory import Trajectory, read_tum
 from tests.evaluation import walks
 
@@ -40,8 +40,8 @@ def as_evo(trajectory: Trajectory) -> PoseTrajectory3D:
 
 def check_against_evo(estimate: Trajectory, truth: Trajectory) -> bool:
     """Whether there is a rotation error after the alignment."""
-    given_truth = Truth("The truth", "TUM", truth.stamps_ns, truth.positions, truth.quaternions)
-    columns, _, problem = measure([Column("ours", trajectory=estimate)], given_truth)
+    given_truth = TruePoses("The truth", "TUM", truth.stamps_ns, truth.positions, truth.quaternions)
+    columns, _, problem = measure([Outcome("ours", trajectory=estimate)], given_truth)
     accuracy = columns[0].accuracy
     assert problem == "" and accuracy is not None
     aligned = as_evo(estimate)
@@ -79,8 +79,8 @@ def test_a_slip_at_the_start_is_told_from_the_errors_after_it() -> None:
     truth = walks.wandering(walks.frames(), 1)
     slipped = truth.positions + np.where(np.arange(len(truth)) < 30, 0.05, 0.0)[:, None] * [1.0, 0.0, 0.0]
     estimate = Trajectory(truth.stamps_ns, slipped, truth.quaternions)
-    given_truth = Truth("The truth", "TUM", truth.stamps_ns, truth.positions, truth.quaternions)
-    (column,), _, _ = measure([Column("ours", trajectory=estimate)], given_truth)
+    given_truth = TruePoses("The truth", "TUM", truth.stamps_ns, truth.positions, truth.quaternions)
+    (column,), _, _ = measure([Outcome("ours", trajectory=estimate)], given_truth)
     assert column.accuracy is not None and column.accuracy.later_m is not None
     assert column.accuracy.ate_m["rmse"] > 0.005
     assert column.accuracy.later_m < 1e-9

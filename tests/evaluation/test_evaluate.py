@@ -23,7 +23,15 @@ from app.slam.params import Params
 from app.slam.trajectory import read_tum, write_tum
 from tests.cli.conftest import ROOT, write_walk
 
-REPORT_FILES = ("report.html", "report.md", "results.json", "accuracy.csv", "runtime.csv", "fineness.csv", "ground.csv")
+REPORT_FILES = (
+    "report.html",
+    "report.md",
+    "results.json",
+    "accuracy.csv",
+    "runtime.csv",
+    "map_sharpness.csv",
+    "ground.csv",
+)
 VARIANT = "coarse:scan.voxel_size=0.8,ground.alpha=30"
 
 
@@ -74,7 +82,7 @@ def test_every_variant_is_measured(evaluated: Path) -> None:
             entry["accuracy"]["ate_m"]["rmse"] / entry["accuracy"]["distance_m"]
         )
         assert entry["runtime_ms"]["total"]["median"] <= entry["runtime_ms"]["total"]["max"]
-        assert entry["fineness"]["thickness"] < 0.02
+        assert entry["map_sharpness"]["thickness"] < 0.02
     assert there["coarse"]["parameters"]["ground"]["alpha"] == 30
     assert there["FAST-LIO"]["ground"] is None  # it segments none
     assert sum(scores["true_positive"] for scores in there["FAST-LIO-GD"]["ground"]) > 1000
@@ -91,7 +99,7 @@ def test_the_page_needs_nothing_else(evaluated: Path) -> None:
     page = (evaluated / "report.html").read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!#|data:)[^"']*""", page)
     assert "http" not in page.replace("http-equiv", "")
-    for text in ("Trajectory accuracy", "Run time per frame", "Fineness of the map", "From above", "Perfect"):
+    for text in ("Trajectory accuracy", "Run time per frame", "Map sharpness", "From above", "Perfect"):
         assert text in page
 
 

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from app.evaluation.findings import findings
-from app.evaluation.measured import Accuracy, Column, Evaluated
+from app.evaluation.measured import Accuracy, Evaluated, Outcome
 from app.slam.types import TIMINGS
 
 
-def column(name: str, ate_m: float, cpu_ms: float) -> Column:
+def column(name: str, ate_m: float, cpu_ms: float) -> Outcome:
     none = np.zeros(0)
     accuracy = Accuracy(
         {"rmse": ate_m, "mean": ate_m, "max": ate_m}, None, {}, 10, 10.0, none, none, np.zeros((0, 3)), ate_m
     )
     run = {"peak_memory_mb": 100.0, "threads": 1, "load": 0.5}
     times = np.full((10, len(TIMINGS)), cpu_ms)
-    return Column(name, run=run, timings_ms=times, cpu_ms=times[:, 0], accuracy=accuracy)
+    return Outcome(name, run=run, timings_ms=times, cpu_ms=times[:, 0], accuracy=accuracy)
 
 
 def said(where: str, ours: list[float], theirs: list[float], cpu: tuple[float, float] = (3.0, 3.0)) -> list[str]:
@@ -60,7 +60,7 @@ def test_an_error_that_falls_and_one_that_rises_are_told_apart(
 def test_time_outdoors_is_told_either_way_and_the_paper_promised_nothing(
     ours: float, theirs: float, verdict: str
 ) -> None:
-    text = about(said("outdoor", [1.0], [1.0], (ours, theirs)), "CPU time a frame outdoors")
+    text = about(said("outdoor", [1.0], [1.0], (ours, theirs)), "CPU time per frame outdoors")
     assert verdict in text and "against what the paper" not in text
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.evaluation.measured import Accuracy, Column, Evaluated
+from app.evaluation.measured import Accuracy, Evaluated, Outcome
 from app.evaluation.report import write_report
 from app.slam.types import TIMINGS
 
@@ -21,7 +21,7 @@ def spread(rmse: float) -> dict[str, float]:
     return {"rmse": rmse, "mean": 0.8 * rmse, "max": 3 * rmse}
 
 
-def column(name: str, size: float, *, bent: bool = True) -> Column:
+def column(name: str, size: float, *, bent: bool = True) -> Outcome:
     """Errors of position and of rotation, all different; the walk is too short for pairs 50 m apart."""
     rpe: dict[str, dict[str, Any] | None] = {
         over: {"pairs": 9, "m": spread(size * k), "deg": spread(10 * size * k)}
@@ -41,9 +41,9 @@ def column(name: str, size: float, *, bent: bool = True) -> Column:
     )
     run = {
         "peak_memory_mb": 100.0, "threads": 1, "load": 0.5, "ground": None, "parameters": {},
-        "fineness": dict.fromkeys(("entropy", "thickness", "revisit_median", "revisit_p95")),
+        "map_sharpness": dict.fromkeys(("entropy", "thickness", "revisit_median", "revisit_p95")),
     }  # fmt: skip
-    return Column(name, run=run, timings_ms=np.ones((2, len(TIMINGS))), cpu_ms=np.ones(2), accuracy=accuracy)
+    return Outcome(name, run=run, timings_ms=np.ones((2, len(TIMINGS))), cpu_ms=np.ones(2), accuracy=accuracy)
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +111,6 @@ def test_the_same_ratios_are_in_the_files_for_machines(folder: Path) -> None:
 
 def test_it_is_said_that_cpu_time_is_of_whole_frames(folder: Path) -> None:
     page = (folder / "report.md").read_text()
-    assert rows(page, "Run time per frame")["CPU time a frame, mean (ms)"] == ["1.00"] * 3
+    assert rows(page, "Run time per frame")["CPU time per frame, mean (ms)"] == ["1.00"] * 3
     assert "CPU time is measured over whole frames" in page.split("## Run time per frame")[1].split("## ")[0]
     assert "CPU time is measured over whole frames" in page.split("## Stages")[1].split("## ")[0]

@@ -1,4 +1,4 @@
-"""Truth of every format gives the same poses; truth that can not be used is refused in one sentence."""
+"""Truth of every format gives the same poses; truth that cannot be used is refused in one sentence."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +11,9 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from app.evaluation.alignment import find_offset
-from app.evaluation.truth import Truth, check_overlap, match, read_truth
-from app.evaluation.truth_files import H2LID_LEVER
+from app.evaluation.truth import TruePoses, check_overlap
+from app.evaluation.truth_match import match
+from app.evaluation.truth_sources import H2LID_LEVER, read_truth
 from app.slam.errors import HemislamError
 from app.slam.metrics import ate, rpe
 from app.slam.trajectory import Trajectory, write_tum
@@ -214,7 +215,7 @@ def test_axes_that_a_straight_walk_does_not_tell_are_not_guessed() -> None:
     at, true_at = (way + rng.normal(scale=scale, size=way.shape) for scale in (0.003, 0.001))
     estimate = seen_elsewhere(Trajectory(walk.stamps_ns, at, walk.quaternions))
     body = (walk.rotations * walks.R_BODY_IMU.inv()).as_quat()
-    matched = match(Truth("The truth", "odometry", walk.stamps_ns, true_at, body, own_axes=True), estimate)
+    matched = match(TruePoses("The truth", "odometry", walk.stamps_ns, true_at, body, own_axes=True), estimate)
     assert not matched.has_rotation
     assert any("does not tell the rotation between them" in note for note in matched.notes)
     moved = rpe(estimate, matched.trajectory, metres=1)

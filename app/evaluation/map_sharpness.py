@@ -1,12 +1,11 @@
-"""How fine a map is, in numbers that need no truth (the paper's Figure 7 shows it in pictures).
+"""How sharp a map is, in numbers that need no truth (the paper's fineness, shown in pictures in its Figure 7).
 
-- Mean map entropy: of the spread of points in a small ball, in nats; lower is crisper
+- Mean map entropy: of the spread of points in a small ball, in nats; lower is sharper
   (Droeschel & Behnke, ICRA 2014; Razlaw et al., ECMR 2015).
 - Plane thickness: spread of points across the planes that they form, m.
 - Revisit gap: distance between two passes over the same surface, along its normal, m.
 
-A map of the same walk in another quality is what these compare; between different walks, or other
-densities of points, they say little.
+Compare maps of the same recording only. Between different trajectories or densities of points the numbers say little.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,18 +18,18 @@ from scipy.spatial import KDTree
 from app.slam.types import F64, I64, Keyframe
 
 MAX_RANGE_M = 20.0
-"""Points farther from the sensor are too sparse to tell."""
+"""Points farther from the sensor are too sparse to be used."""
 POINTS_PER_KEYFRAME = 4000
 BALL_M = 0.3
 BALLS = 5000
 MIN_POINTS = 12
 PATCH_M = 0.5
 PASS_S, PASS_M = 20.0, 20.0
-"""A surface is seen in another pass if so much time went by and so much way was walked between."""
+"""Least time and least path between two passes over a surface."""
 
 
 @dataclass(frozen=True, slots=True)
-class Fineness:
+class MapSharpness:
     """Attributes:
     entropy: mean, nats. thickness: median over planes, m; nan if there are none.
     revisit_median, revisit_p95: of the gaps, m; nan without a revisit. revisits: surfaces compared.
@@ -79,10 +78,10 @@ def collect(keyframes: Iterable[Keyframe], poses: F64) -> MapPoints:
     return MapPoints(table[:, :3], table[:, 3:6], table[:, 6], table[:, 7])
 
 
-def measure(cloud: MapPoints) -> Fineness:
+def measure(cloud: MapPoints) -> MapSharpness:
     entropy, thickness = _crispness(cloud.points)
     gaps = revisit_gaps(cloud)
-    return Fineness(
+    return MapSharpness(
         entropy=entropy,
         thickness=thickness,
         revisit_median=float(np.median(gaps)) if len(gaps) else float("nan"),
@@ -107,7 +106,7 @@ def _crispness(points: F64) -> tuple[float, float]:
             values.append(np.asarray(np.linalg.eigvalsh(covariances), np.float64))
     if not values:
         return float("nan"), float("nan")
-    eigenvalues = np.maximum(np.vstack(values), 1e-9)  # ascending; no surface is known to under 0.03 mm
+    eigenvalues = np.maximum(np.vstack(values), 1e-9)  # ascending; at least 0.03 mm, squared
     entropy = 0.5 * (3 * np.log(2 * np.pi * np.e) + np.log(eigenvalues).sum(axis=1))
     flat = (eigenvalues[:, 0] < 0.1 * eigenvalues[:, 1]) & (eigenvalues[:, 1] > (0.2 * BALL_M) ** 2)
     thickness = np.sqrt(eigenvalues[flat, 0])
@@ -118,8 +117,8 @@ def revisit_gaps(cloud: MapPoints) -> F64:
     """Distances (k,) m along the normal between patches of a surface seen in two passes.
 
     A patch is what one window of time saw in a voxel of PATCH_M. It is compared with the older patch
-    that faces the same way, lies at most PATCH_M beside it and 2 PATCH_M above or below: a gap
-    beyond that is not recognised as the same surface.
+    that faces the same way, at most PATCH_M beside it and 2 PATCH_M above or below it. A larger gap
+    is not recognised as the same surface.
     """
     patches = list(_patches(cloud))
     if not patches:
@@ -141,9 +140,9 @@ def revisit_gaps(cloud: MapPoints) -> F64:
         along = np.einsum("nki,nki->nk", apart, normals[old][index])
         beside = np.sqrt(np.maximum(distance**2 - along**2, 0, where=found, out=np.full_like(along, np.inf)))
         facing = np.einsum("nki,ni->nk", normals[old][index], normals[new]) > np.cos(np.radians(20))
-        apart_in_way = walked[new][:, None] - walked[old][index] >= PASS_M
+        apart_in_path = walked[new][:, None] - walked[old][index] >= PASS_M
         apart_in_time = times[new][:, None] - times[old][index] >= PASS_S
-        fits = found & facing & (beside < PATCH_M) & apart_in_way & apart_in_time
+        fits = found & facing & (beside < PATCH_M) & apart_in_path & apart_in_time
         best = np.argmin(np.where(fits, beside, np.inf), axis=1)
         rows = np.flatnonzero(fits[np.arange(len(best)), best])
         gaps.append(np.abs(along[rows, best[rows]]))
@@ -151,7 +150,7 @@ def revisit_gaps(cloud: MapPoints) -> F64:
 
 
 def _patches(cloud: MapPoints) -> Iterator[tuple[F64, F64, F64, F64]]:
-    """Centres, normals towards the sensor, times and way of the flat patches, window of time by window."""
+    """Centres, normals towards the sensor, times and walked distances of the flat patches, by windows of time."""
     if not len(cloud):
         return
     window = np.floor((cloud.times - cloud.times.min()) / (PASS_S / 2)).astype(np.int64)

@@ -1,9 +1,9 @@
-"""Fineness on maps made of exact walls: what is known beforehand must be measured."""
+"""Map sharpness on maps made of exact walls: what is known beforehand must be measured."""
 
 import numpy as np
 import pytest
 
-from app.evaluation.fineness import MapPoints, collect, measure, revisit_gaps
+from app.evaluation.map_sharpness import MapPoints, collect, measure, revisit_gaps
 from app.slam.types import Cloud, Keyframe
 
 
@@ -75,6 +75,6 @@ def test_keyframes_are_collected_in_the_map_frame() -> None:
     assert set(made.times) == {5.0}
 
 
-def test_an_empty_map_has_no_fineness() -> None:
+def test_an_empty_map_has_no_sharpness() -> None:
     nothing = measure(MapPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0)))
     assert np.isnan(nothing.entropy) and nothing.revisits == 0

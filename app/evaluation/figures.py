@@ -1,0 +1,144 @@
+"""Small charts as inline SVG and images as inline PNG, so that a report is one file."""
+
+import base64
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
+from PIL import Image
+
+from app.slam.types import F64, U16
+
+PALETTE = ("#2563eb", "#ea580c", "#16a34a", "#9333ea", "#dc2626", "#0891b2", "#ca8a04", "#db2777")
+TRUTH = "#111827"
+_MOST_POINTS = 700
+_WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 560, 56, 14, 12, 40
+_TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).with_name("templates")),
+    autoescape=select_autoescape(("html", "svg")),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
+
+
+def render(template: str, **values: Any) -> str:
+    """A file of the folder `templates`, filled in."""
+    return _TEMPLATES.get_template(template).render(**values)
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line of a chart through (n,) points x, y."""
+
+    name: str
+    colour: str
+    x: F64
+    y: F64
+    dashed: bool = False
+
+
+def chart(
+    lines: Sequence[Line],
+    x_label: str,
+    y_label: str,
+    *,
+    equal: bool = False,
+    from_zero: bool = False,
+    height: int = 300,
+) -> Markup:
+    """Lines over axes. `equal`: the same scale on both axes, as for a map. `from_zero`: the y axis begins at 0."""
+    x0, x1 = _range([line.x for line in lines])
+    y0, y1 = _range([line.y for line in lines], from_zero=from_zero)
+    right, bottom = _WIDTH - _RIGHT, height - _BOTTOM
+    if equal:
+        scale = max((x1 - x0) / (right - _LEFT), (y1 - y0) / (bottom - _TOP))
+        half_x, half_y = scale * (right - _LEFT) / 2, scale * (bottom - _TOP) / 2
+        x0, x1 = (x0 + x1) / 2 - half_x, (x0 + x1) / 2 + half_x
+        y0, y1 = (y0 + y1) / 2 - half_y, (y0 + y1) / 2 + half_y
+
+    def at_x(x: F64 | float) -> F64:
+        return np.asarray(_LEFT + (x - x0) / (x1 - x0) * (right - _LEFT)).round(1)
+
+    def at_y(y: F64 | float) -> F64:
+        return np.asarray(bottom - (y - y0) / (y1 - y0) * (bottom - _TOP)).round(1)
+
+    drawn = []
+    for line in lines:
+        step = max(1, len(line.x) // _MOST_POINTS)
+        chosen = np.unique(np.r_[np.arange(0, len(line.x), step), len(line.x) - 1])
+        points = zip(at_x(line.x[chosen]), at_y(line.y[chosen]), strict=True)
+        drawn.append((line, " ".join(f"{x:g},{y:g}" for x, y in points)))
+    xs, ys = _ticks(x0, x1, 7), _ticks(y0, y1, 5)
+    return Markup(
+        render(
+            "chart.svg",
+            width=_WIDTH,
+            height=height,
+            left=_LEFT,
+            right=right,
+            top=_TOP,
+            bottom=bottom,
+            x_ticks=[(float(at_x(x)), f"{x:g}") for x in xs],
+            y_ticks=[(float(at_y(y)), f"{y:g}") for y in ys],
+            lines=drawn,
+            x_label=x_label,
+            y_label=y_label,
+        )
+    )
+
+
+def histogram(name: str, colour: str, values: F64, edges: F64) -> Line:
+    """The outline of a histogram, as shares in per cent."""
+    counts = np.histogram(values, edges)[0] * (100 / max(len(values), 1))
+    return Line(name, colour, np.repeat(edges, 2), np.r_[0.0, np.repeat(counts, 2), 0.0])
+
+
+def stacked(rows: Sequence[tuple[str, Sequence[float]]], parts: Sequence[str], unit: str) -> Markup:
+    """Horizontal bars, one per row, of several parts each."""
+    longest = max((sum(values) for _, values in rows), default=0.0) or 1.0
+    left, scale = 110.0, 390 / longest
+    drawn = []
+    for name, values in rows:
+        ends = left + scale * np.cumsum(values)
+        bars = [
+            (part, f"{value:.2f} {unit}", colour, f"{end - value * scale:.1f}", f"{max(value * scale, 0):.1f}")
+            for part, value, colour, end in zip(parts, values, cycle(PALETTE), ends, strict=False)
+        ]
+        drawn.append((name, bars, f"{ends[-1] + 6:.1f}", f"{sum(values):.2f} {unit}"))
+    return Markup(render("bars.svg", rows=drawn))
+
+
+def density_image(counts: U16, brightest: float) -> str:
+    """Points per pixel as a PNG in a data URL, dark to bright on a logarithmic scale up to `brightest`."""
+    level = np.log1p(counts.astype(np.float64)) / np.log1p(max(brightest, 1.0))
+    level = np.where(counts > 0, 0.25 + 0.75 * level, 0.0)  # a single point is visible too
+    stops = np.array([[13, 17, 33], [46, 69, 140], [72, 166, 180], [190, 227, 150], [255, 255, 240]])
+    ramp = [np.interp(np.linspace(0, 1, 256), np.linspace(0, 1, 5), stops[:, channel]) for channel in range(3)]
+    image = Image.fromarray(np.rint(255 * level.clip(0, 1)).astype(np.uint8))
+    image.putpalette(np.rint(ramp).astype(np.uint8).T.tobytes())
+    file = io.BytesIO()
+    image.save(file, "PNG", optimize=True)
+    return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def _range(values: Iterable[F64], *, from_zero: bool = False) -> tuple[float, float]:
+    joined = np.concatenate([*values])
+    low, high = (0.0 if from_zero else float(joined.min())), float(joined.max())
+    room = 0.04 * (high - low) or 1.0
+    return (low if from_zero else low - room), high + room
+
+
+def _ticks(low: float, high: float, count: int) -> list[float]:
+    """Round numbers, about `count` of them."""
+    raw = (high - low) / count
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = float(next(m * power for m in (1, 2, 5, 10) if m * power >= raw))
+    return [round(value, 10) + 0.0 for value in np.arange(np.ceil(low / step) * step, high + step * 1e-6, step)]

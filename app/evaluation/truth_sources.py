@@ -1,0 +1,226 @@
+"""True poses from files (TUM, KITTI, the GNSS/INS table of H2LID) and from topics of the recording."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from app.evaluation.truth import TruePoses, check
+from app.sensors.source import Source
+from app.slam.errors import HemislamError
+from app.slam.trajectory import Trajectory, read_tum
+from app.slam.types import F64, I64
+
+GNSS_COLUMNS = 13
+H2LID_LEVER = (-0.034, -0.283, 0.342)
+"""m from the IMU to the GNSS antenna; x right, y forward, z up (README of the data set)."""
+_FORMATS = (
+    "TUM has 8 columns (stamp x y z qx qy qz qw), KITTI 12 (a 3x4 matrix), the GNSS/INS table of H2LID 13"
+    " (GPSTime Easting Northing Height Heading Pitch Roll Latitude Longitude VEast VNorth VUp Q)"
+)
+_EARTH_A, _EARTH_E2 = 6_378_137.0, 6.694379990141316e-3
+"""WGS84: m, and squared eccentricity."""
+
+_POSES: dict[str, Callable[[Any], Any]] = {
+    "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
+    "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
+}
+_FIX = "sensor_msgs/msg/NavSatFix"
+TYPES = (*_POSES, _FIX)
+
+
+def read_truth(text: str, recording: Path | None = None, lever: tuple[float, float, float] | None = None) -> TruePoses:
+    """Read a file, or `topic:/name` in the recording; `lever` overrules what the format implies.
+
+    Raises:
+        HemislamError: it cannot be read, is not what it should be, or jumps.
+    """
+    if text.startswith("topic:"):
+        if recording is None:
+            raise HemislamError(f"`--truth {text}` names a topic, but there is no recording to read it from.")
+        truth = _read_topic(recording, text.removeprefix("topic:"))
+    else:
+        truth = _read_file(Path(text))
+    if lever is not None:
+        truth = replace(truth, lever=lever)
+    check(truth)
+    return truth
+
+
+def read_poses(path: Path) -> Trajectory:
+    """Poses of the IMU itself, as TUM, where no other truth is taken. Raises HemislamError as `read_truth`."""
+    poses = read_tum(path)
+    check(TruePoses(f"The truth {path}", "TUM", poses.stamps_ns, poses.positions, poses.quaternions))
+    return poses
+
+
+def _read_file(path: Path) -> TruePoses:
+    """Read a truth file; its format is told by the number of columns.
+
+    Raises:
+        HemislamError: it cannot be read, or is none of the formats, or holds NaN.
+    """
+    rows = _rows(path, _FORMATS)
+    if rows and rows[0][1][0].lower().startswith("gpstime"):
+        rows = rows[1:]  # the table's heading
+    if not rows:
+        raise HemislamError(f"The truth {path} holds no poses; {_FORMATS}.")
+    columns = len(rows[0][1])
+    if columns == 8:
+        trajectory = read_tum(path)
+        return TruePoses(f"The truth {path}", "TUM", trajectory.stamps_ns, trajectory.positions, trajectory.quaternions)
+    if columns == 12:
+        return _kitti(path, _numbers(path, rows, 12))
+    if columns == GNSS_COLUMNS:
+        return _gnss(path, _numbers(path, rows, GNSS_COLUMNS))
+    raise HemislamError(f"{path}, line {rows[0][0]} has {columns} columns; {_FORMATS}.")
+
+
+def _rows(path: Path, should: str) -> list[tuple[int, list[str]]]:
+    """Number and words of each line that is not empty, less comments.
+
+    Args:
+        should: how such a file is to be, for the sentence about one that is no text.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise HemislamError(f"The truth {path} is not a text file; {should}.") from None
+    except OSError as error:
+        raise HemislamError(f"The truth {path} cannot be read: {error.strerror}; check the path.") from None
+    rows = [(number, line.partition("#")[0].split()) for number, line in enumerate(lines, 1)]
+    return [(number, words) for number, words in rows if words]
+
+
+def _numbers(path: Path, rows: list[tuple[int, list[str]]], columns: int) -> F64:
+    """(n, columns). Raises HemislamError naming the line that is not so many finite numbers."""
+    table = np.empty((len(rows), columns))
+    for index, (number, words) in enumerate(rows):
+        if len(words) != columns:
+            raise HemislamError(f"{path}, line {number} has {len(words)} columns, the first has {columns}; mend it.")
+        try:
+            table[index] = [float(word) for word in words]
+        except ValueError:
+            raise HemislamError(f"{path}, line {number} holds something that is not a number; remove it.") from None
+        if not np.isfinite(table[index]).all():
+            raise HemislamError(f"{path}, line {number} holds NaN or infinity; remove the line.")
+    return table
+
+
+def _kitti(path: Path, table: F64) -> TruePoses:
+    """Rows of a 3x4 matrix T_world_body; their times from `times.txt` or `<stem>_times.txt` beside, if there."""
+    poses = table.reshape(-1, 3, 4)
+    rotations = poses[:, :, :3]
+    odd = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 0.01
+    odd |= np.linalg.det(rotations) < 0
+    if odd.any():
+        raise HemislamError(
+            f"{path}, pose {int(np.argmax(odd)) + 1}: the left 3x3 of its 3x4 matrix is no rotation; KITTI's rows are"
+            " r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz."
+        )
+    stamps = None
+    for beside in (path.with_name(f"{path.stem}_times.txt"), path.with_name("times.txt")):
+        if beside.is_file():
+            stamps = _times(beside, len(poses))
+            break
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    # Times that count from zero are no date: the clock is the truth's own.
+    own = stamps is not None and bool(stamps[0] < 1e17)
+    return TruePoses(f"The truth {path}", "KITTI", stamps, poses[:, :, 3].copy(), quaternions, own_clock=own)
+
+
+def _times(path: Path, poses: int) -> I64:
+    should = "it holds one time a line, in seconds"
+    rows = _rows(path, should)
+    if odd := next((number for number, words in rows if len(words) != 1), None):
+        raise HemislamError(f"{path}, line {odd} is no time; {should}.")
+    seconds = _numbers(path, rows, 1)[:, 0]
+    if len(seconds) != poses:
+        raise HemislamError(f"{path} holds {len(seconds)} times for {poses} poses; there must be one a pose.")
+    return np.rint(seconds * 1e9).astype(np.int64)
+
+
+def _gnss(path: Path, table: F64) -> TruePoses:
+    """Seconds of the GPS week, grid coordinates, and heading (clockwise from north), pitch, roll in degrees.
+
+    The body has x right, y forward, z up; the world is east, north, up.
+    """
+    seconds, positions, (heading, pitch, roll) = table[:, 0], table[:, 1:4], table[:, 4:7].T
+    if (seconds < 0).any() or (seconds > 604_800).any():
+        raise HemislamError(f"The first column of {path} is not in seconds of the GPS week (0 to 604800).")
+    rotations = Rotation.from_euler("ZXY", np.column_stack([-heading, pitch, roll]), degrees=True)
+    return TruePoses(
+        f"The truth {path}",
+        "GNSS/INS (seconds of the GPS week, grid coordinates)",
+        np.rint(seconds * 1e9).astype(np.int64),
+        positions - positions[0],  # grid coordinates are millions of metres
+        rotations.as_quat(),
+        own_clock=True,
+        own_axes=True,
+        lever=H2LID_LEVER,
+    )
+
+
+def _read_topic(recording: Path, topic: str) -> TruePoses:
+    """All poses of a topic.
+
+    Raises:
+        HemislamError: there is no such topic, or it holds no poses.
+    """
+    with Source(recording) as source:
+        kinds = {entry.name: entry.type for entry in source.topics}
+        if topic not in kinds:
+            usable = [name for name, kind in kinds.items() if kind in TYPES]
+            hint = f"it has {', '.join(usable)}" if usable else "none of its topics holds poses or fixes"
+            raise HemislamError(f"{recording} has no topic {topic} to take as truth; {hint}.")
+        kind = kinds[topic]
+        if kind not in TYPES:
+            raise HemislamError(
+                f"Topic {topic} is of type {kind}, which is no truth; use one of type {', '.join(TYPES)}."
+            )
+        stamps, rows = [], []
+        for _, _, message in source.messages((topic,)):
+            row = _fix(message) if kind == _FIX else _pose(_POSES[kind](message))
+            if row is not None:
+                stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+                rows.append(row)
+    table = np.array(rows, dtype=np.float64)
+    stamps_ns = np.array(stamps, dtype=np.int64)
+    name = f"Topic {topic}"
+    if not len(table):
+        raise HemislamError(f"Topic {topic} of {recording} holds no usable pose.")
+    if kind == _FIX:
+        return TruePoses(name, "satellite fixes", stamps_ns, _east_north_up(table), None)
+    lengths = np.linalg.norm(table[:, 3:], axis=1)
+    if not (np.abs(lengths - 1) <= 0.01).all():  # nan is none either
+        raise HemislamError(
+            f"Topic {topic} holds orientations that are no unit quaternions; it cannot be used as truth."
+        )
+    return TruePoses(name, "poses of a topic", stamps_ns, table[:, :3], table[:, 3:], own_axes=True)
+
+
+def _pose(pose: Any) -> list[float]:
+    p, q = pose.position, pose.orientation
+    return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+
+
+def _fix(message: Any) -> list[float] | None:
+    """Latitude and longitude in degrees, height in m; None if there was no fix."""
+    row = [message.latitude, message.longitude, message.altitude]
+    return row if message.status.status >= 0 and np.isfinite(row).all() else None
+
+
+def _east_north_up(fixes: F64) -> F64:
+    """Geodetic (n, 3) degrees, degrees, m on WGS84 to metres east, north, up of the first."""
+    latitude, longitude = np.radians(fixes[:, 0]), np.radians(fixes[:, 1])
+    radius = _EARTH_A / np.sqrt(1 - _EARTH_E2 * np.sin(latitude) ** 2)
+    flat = (radius + fixes[:, 2]) * np.cos(latitude)
+    z = (radius * (1 - _EARTH_E2) + fixes[:, 2]) * np.sin(latitude)
+    earth = np.column_stack([flat * np.cos(longitude), flat * np.sin(longitude), z])
+    s, c, sl, cl = np.sin(latitude[0]), np.cos(latitude[0]), np.sin(longitude[0]), np.cos(longitude[0])
+    R_enu_earth = np.array([[-sl, cl, 0.0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
+    return np.asarray((earth - earth[0]) @ R_enu_earth.T)
