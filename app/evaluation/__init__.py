@@ -1,1 +1,1 @@
-"""Measures the engine against truth and against itself: variants, errors, times, fineness, reports."""
+"""Measure the engine against truth and against itself: variants, errors, times, map sharpness, reports."""
