@@ -3,7 +3,7 @@
 #   docker build -t hemislam .
 #   docker run --rm -p 8080:8080 -v "$PWD:/recordings" hemislam
 #
-# Outside 127.0.0.1 the page asks for a token: open the link that is printed.
+# Outside 127.0.0.1 the page asks for a token: open the link that is printed. `make image-test` builds and runs this.
 FROM python:3.11-slim
 
 # libgomp1: OpenMP for the kernels. The others: open3d, which only `hemislam simulate` loads.
@@ -11,14 +11,18 @@ RUN apt-get update \
  && apt-get install -y --no-install-recommends make libgomp1 libusb-1.0-0 libegl1 libgl1 \
  && rm -rf /var/lib/apt/lists/*
 
-RUN useradd --create-home hemislam && install -d -o hemislam -g hemislam /recordings /hemislam
-USER hemislam
 WORKDIR /hemislam
-COPY --chown=hemislam:hemislam . .
+COPY . .
 RUN make install PYTHON=python3
+
+# Whoever runs it (`--user 12345`) may write results and compiled kernels, but not the program.
+RUN useradd --create-home hemislam \
+ && install -d -m 1777 /recordings /hemislam/runs /var/cache/hemislam
+ENV NUMBA_CACHE_DIR=/var/cache/hemislam
+ENV PATH="/hemislam/.venv/bin:$PATH"
+USER hemislam
 
 EXPOSE 8080
 VOLUME /recordings
-ENV PATH="/hemislam/.venv/bin:$PATH"
 ENTRYPOINT ["hemislam"]
 CMD ["serve", "--host", "0.0.0.0", "--no-browser", "--folder", "/recordings", "--folder", "sample_data"]

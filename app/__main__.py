@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from app import __version__
+from app import TEMPORARY_KERNEL_CACHE, __version__
 from app.cli import options
 from app.cli.evaluate import evaluate
 from app.cli.feed import feed
@@ -228,6 +228,12 @@ def params(
 
 def main() -> None:
     """The console script."""
+    if TEMPORARY_KERNEL_CACHE:
+        typer.echo(
+            f"hemislam: Compiled kernels are kept in {TEMPORARY_KERNEL_CACHE}, since neither the program's folder nor a"
+            " cache in your home folder can be written to; set NUMBA_CACHE_DIR to choose another place.",
+            err=True,
+        )
     cli(prog_name="hemislam")
 
 

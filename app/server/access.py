@@ -8,7 +8,7 @@
 - A request has a limited size, and its body must arrive within a limited time.
 
 Against hosts that open many connections and send half requests, put a reverse proxy in front
-(`docs/reverse-proxy.md`).
+(`docs/guide/serving.md`).
 """
 
 import asyncio
