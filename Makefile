@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 INSTALL := $(PIP) install --require-hashes --only-binary :all:
 
 .DEFAULT_GOAL := help
-.PHONY: help run install test check docs bench bench-peers lock clean
+.PHONY: help run install test check docs bench bench-peers image-test lock clean
 
 help: ## List these targets.
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 20
@@ -42,6 +42,9 @@ bench-peers: $(VENV)/.installed-dev ## Time and error of other odometries from P
 	$(BIN)/python -m benchmarks.peers
 # In a folder of their own: some want other versions of what hemislam uses.
 PEERS := 'kiss-icp>=1.3' 'rko_lio>=0.4' 'pypatchworkpp>=1.4'
+
+image-test: ## Build the Docker image with buildah and run it; needs root, buildah and debootstrap.
+	tests/image/build_and_run.sh
 
 lock: $(VENV)/.installed-dev ## Resolve the dependencies again and write the hashed requirements*.txt.
 	$(PIP) install --quiet uv

@@ -1,0 +1,87 @@
+#!/usr/bin/env bash
+# Builds the image and runs it, as its own user and as another one. Needs no Docker daemon: buildah builds on a Debian
+# root that debootstrap makes and that stands for the Dockerfile's base. Needs root and Debian's buildah and debootstrap.
+#
+#   make image-test
+#
+# IMAGE_TEST_BASE: pull the base from a registry instead, for example docker.io/library/python:3.11-slim.
+# IMAGE_TEST_VOLUMES: HOST:CONTAINER:ro ..., for the build, such as pip's configuration for a mirror.
+# IMAGE_TEST_FOLDER: where everything is kept between runs; else it is removed at the end.
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+
+base=$(sed -n 's/^FROM //p' Dockerfile)
+if [ -n "${IMAGE_TEST_FOLDER:-}" ]; then
+  folder=$IMAGE_TEST_FOLDER
+  mkdir -p "$folder"
+else
+  folder=$(mktemp -d)
+  trap 'rm -rf "$folder"' EXIT
+fi
+storage=(--storage-driver vfs --root "$folder/storage" --runroot "$folder/run")
+volumes=()
+for volume in ${IMAGE_TEST_VOLUMES:-}; do volumes+=(--volume "$volume"); done
+
+say() { printf '\n=== %s\n' "$*"; }
+buildah() { command buildah "${storage[@]}" "$@"; }
+
+if [ -n "${IMAGE_TEST_BASE:-}" ]; then
+  say "base: $IMAGE_TEST_BASE"
+  buildah pull "$IMAGE_TEST_BASE"
+  buildah tag "$IMAGE_TEST_BASE" "$base"
+elif ! buildah inspect --type image "$base" >/dev/null 2>&1; then
+  say "base: Debian 12 by debootstrap, tagged $base"
+  [ -d "$folder/root/etc" ] ||
+    debootstrap --variant=minbase --include=python3,python3-venv,ca-certificates bookworm "$folder/root"
+  scratch=$(buildah from scratch)
+  buildah add --quiet "$scratch" "$folder/root" /
+  buildah config --env PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin "$scratch"
+  buildah commit --quiet --rm "$scratch" "$base"
+fi
+
+say "build"
+buildah build --isolation chroot --pull=never --network host "${volumes[@]}" --tag hemislam-test .
+container=$(buildah from --pull=never hemislam-test)
+
+# run USER COMMAND...: as `docker run --user USER` does, "" for the image's own. A user without an entry has HOME=/.
+run() {
+  local user=()
+  if [ -n "$1" ]; then user=(--user "$1" --env HOME=/); fi
+  shift
+  buildah run --isolation chroot --network host "${user[@]}" "$container" -- "$@"
+}
+
+# served USER: whether the server answers as long as it runs, and ends in order.
+served() {
+  local out="$folder/serve.txt" pid address
+  run "$1" hemislam serve sample_data/museum.mcap --port 0 --no-browser --paused >"$out" 2>&1 &
+  pid=$!
+  for _ in $(seq 300); do
+    address=$(sed -n 's/^hemislam is at \(\S*\).*/\1/p' "$out")
+    if [ -n "$address" ] || ! kill -0 "$pid" 2>/dev/null; then break; fi
+    sleep 0.2
+  done
+  [ -n "$address" ] || { cat "$out"; echo "hemislam serve printed no address"; return 1; }
+  python3 - "$address" <<'PYTHON'
+import json, sys, urllib.request
+with urllib.request.urlopen(sys.argv[1] + "healthz", timeout=30) as answer:
+    assert answer.status == 200 and json.load(answer) == {"status": "ok"}
+with urllib.request.urlopen(sys.argv[1], timeout=30) as answer:
+    assert b"<title>hemislam</title>" in answer.read()
+PYTHON
+  pkill -INT -P "$pid" -f "hemislam serve" || kill -INT "$pid"
+  wait "$pid" || true
+  cat "$out"
+}
+
+for user in "" 12345; do
+  say "as ${user:-the image's user}: info"
+  run "$user" hemislam info sample_data/museum.mcap
+  say "as ${user:-the image's user}: run"
+  run "$user" hemislam run sample_data/museum.mcap --duration 10 --out "runs/image-test-${user:-own}"
+  run "$user" test -s "runs/image-test-${user:-own}/trajectory.tum"
+  say "as ${user:-the image's user}: serve"
+  served "$user"
+done
+buildah rm "$container" >/dev/null
+say "the image works"
