@@ -14,6 +14,7 @@ import logging
 import math
 import multiprocessing
 import os
+import pickle
 import queue
 import signal
 import struct
@@ -38,7 +39,7 @@ GRACE_S: Final = 10.0
 """How long a child may take to finish its work after its owner died or asked it to end."""
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 _END: Final = object()
-"""Sent as an empty message, which asks the other end to end."""
+"""Sent as an empty message, the last one."""
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +83,7 @@ class Link:
 
     def __init__(self, connection: "Connection[Any, Any]") -> None:
         self._connection = connection
-        self._unsent: queue.SimpleQueue[object] = queue.SimpleQueue()  # None: no more
+        self._unsent: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._writer = threading.Thread(target=self._write, name="messages", daemon=True)
         self._writer.start()
 
@@ -107,26 +108,22 @@ class Link:
         except (EOFError, OSError):
             raise LinkClosed from None
 
-    def ask_to_end(self) -> None:
-        """Have the other end's `receive` raise `LinkClosed` once it has received everything before."""
+    def close(self) -> None:
+        """Have the other end's `receive` raise `LinkClosed` once it has received everything sent before."""
         self._unsent.put(_END)
 
-    def finish(self, *, wait: bool) -> None:
-        """Send nothing after what was sent before. wait: until the other end has taken that, or is gone."""
-        self._unsent.put(None)
-        if wait:
-            self._writer.join()
+    def flush(self) -> None:
+        """Wait until the other end has received everything sent before `close`, or is gone."""
+        self._writer.join()
 
     def _write(self) -> None:
         try:
-            while (message := self._unsent.get()) is not None:
-                if message is _END:
-                    self._connection.send_bytes(b"")
-                    continue
+            while (message := self._unsent.get()) is not _END:
                 body, *arrays = pack(message)
                 self._connection.send_bytes(struct.pack("<I", len(arrays)) + body)
                 for array in arrays:
                     self._connection.send_bytes(array)
+            self._connection.send_bytes(b"")
         except OSError:
             pass  # the other end is gone, which `receive` reports
         except BaseException:
@@ -139,8 +136,8 @@ class Child:
     """A function that runs in a process of its own, and ends with its owner at the latest.
 
     Args:
-        main: called there with a `Link` to this process and `args`; all must be picklable. Let it return when
-            the link raises `LinkClosed`, or let that exception pass.
+        main: called there with a `Link` to this process and `args`; all must be picklable. It ends by returning,
+            or by `LinkClosed`.
         name: for `ps` ("hemislam-NAME", 15 characters) and the log. title: what it is called in messages.
         fork: start as a fork of a process that has imported the engine already, where the system can: this
             takes 20 ms. Otherwise a new interpreter starts.
@@ -161,8 +158,9 @@ class Child:
         self.title = title
         context = fork_context() if fork else multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
-        self._process = context.Process(target=_run, args=(theirs, name, grace_s, main, args), name=f"hemislam {name}")
-        with _signals_blocked(), _environment(environment or {}):
+        call = pickle.dumps((main, args))  # to be loaded once the variables are set, since that imports numpy
+        self._process = context.Process(target=_run, args=(theirs, name, grace_s, dict(environment or {}), call))
+        with _signals_blocked():
             self._process.start()
         theirs.close()
         self._link, self._grace_s = Link(ours), grace_s
@@ -190,13 +188,10 @@ class Child:
 
     def close(self, timeout: float | None = None) -> None:
         """Ask the child to end; kill it if it has not ended after the time (s; None: its grace), or at once if 0."""
-        timeout = self._grace_s if timeout is None else timeout
-        if timeout:
-            self._link.ask_to_end()
-        if not wait([self._process.sentinel], timeout):
+        self._link.close()
+        if not wait([self._process.sentinel], self._grace_s if timeout is None else timeout):
             self._process.kill()
         self._exit_code()
-        self._link.finish(wait=False)
 
     def _exit_code(self) -> int:
         wait([self._process.sentinel])
@@ -216,8 +211,11 @@ def _end_children() -> None:
         child.close()
 
 
-def _run(connection: "Connection[Any, Any]", name: str, grace_s: float, main: Callable[..., None], args: Any) -> None:
+def _run(
+    connection: "Connection[Any, Any]", name: str, grace_s: float, environment: dict[str, str], call: bytes
+) -> None:
     """The process."""
+    os.environ.update(environment)
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     multiprocessing.set_start_method("spawn", force=True)  # so that numba makes no semaphore, which a kill would leak
@@ -226,11 +224,13 @@ def _run(connection: "Connection[Any, Any]", name: str, grace_s: float, main: Ca
     owner = Link(connection)
     with process_logs(name):
         try:
+            main, args = pickle.loads(call)
             with contextlib.suppress(LinkClosed):
                 main(owner, *args)
         finally:
             _end_children()
-            owner.finish(wait=True)
+            owner.close()
+            owner.flush()
 
 
 def _end_with_owner(grace_s: float) -> None:
@@ -268,21 +268,6 @@ def _signals_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextlib.contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """A process started meanwhile inherits these variables."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def show_as(name: str) -> None:

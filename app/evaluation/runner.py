@@ -3,7 +3,9 @@
 With a process for each job, its peak memory is its own, and a crash costs one column only.
 """
 
-from collections.abc import Iterator
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import NoReturn
@@ -15,39 +17,6 @@ from app.evaluation.job import Job, clear_remains, finished, run_job
 from app.slam.errors import HemislamError
 
 REPORT_EVERY_S = 0.2
-_POLL_S = 0.02
-
-
-class _Running:
-    """A job at work. slot: the line of its progress bar."""
-
-    def __init__(self, job: Job, slot: int) -> None:
-        self.job, self.slot = job, slot
-        self.error = ""
-        self._child = Child(_work, job, name="job", title="Its process", grace_s=0.0)
-        self._bar: tqdm[NoReturn] = tqdm(
-            desc=f"{job.name}, {job.variant}", unit=" frames", leave=False, disable=None, position=slot
-        )
-
-    def ended(self) -> bool:
-        """Show how far it is. Returns whether it has ended, `error` being why it failed."""
-        try:
-            message = self._child.receive(_POLL_S)
-        except ChildDied as death:
-            if not self.error and finished(self.job) is None:
-                self.error = str(death)
-            self.close()
-            return True
-        if isinstance(message, str):
-            self.error = message
-        elif message is not None:
-            done, self._bar.total = message
-            self._bar.update(done - self._bar.n)
-        return False
-
-    def close(self) -> None:
-        self._child.close()
-        self._bar.close()
 
 
 def run_jobs(jobs: list[Job], parallel: int, folder: Path) -> dict[tuple[str, str], str]:
@@ -57,34 +26,41 @@ def run_jobs(jobs: list[Job], parallel: int, folder: Path) -> dict[tuple[str, st
         Why jobs failed, by (recording, variant); those not named are finished.
     """
     clear_remains(folder)
-    waiting = iter([job for job in jobs if not _finished_before(job)])
-    failures: dict[tuple[str, str], str] = {}
-    running: list[_Running] = []
-    try:
-        running += _started(waiting, range(parallel))
-        while running:
-            for one in [one for one in running if one.ended()]:
-                if one.error:
-                    failures[one.job.name, one.job.variant] = one.error
-                tqdm.write(f"{one.job.name}, {one.job.variant}: {one.error or 'finished'}")
-                running.remove(one)
-                running += _started(waiting, [one.slot])
-    finally:
-        for one in running:
-            one.close()
-    return failures
+    stop = threading.Event()
+    with ThreadPoolExecutor(parallel) as pool:
+        try:
+            errors = list(pool.map(partial(_run, stop), jobs))
+        except BaseException:  # Ctrl-C
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return {(job.name, job.variant): error for job, error in zip(jobs, errors, strict=True) if error}
 
 
-def _finished_before(job: Job) -> bool:
-    if finished(job) is None:
-        return False
-    tqdm.write(f"{job.name}, {job.variant}: finished before")
-    return True
-
-
-def _started(waiting: Iterator[Job], slots: "list[int] | range") -> Iterator[_Running]:
-    for slot, job in zip(slots, waiting, strict=False):
-        yield _Running(job, slot)
+def _run(stop: threading.Event, job: Job) -> str:
+    """Run a job in a process until it ends or `stop` is set. Returns why it failed, "" if it did not."""
+    title, error = f"{job.name}, {job.variant}", ""
+    if finished(job) is not None:
+        tqdm.write(f"{title}: finished before")
+        return ""
+    child = Child(_work, job, name="job", title="Its process", grace_s=0.0)
+    bar: tqdm[NoReturn]
+    with tqdm(desc=title, unit=" frames", leave=False, disable=None) as bar:
+        try:
+            while not stop.is_set():
+                message = child.receive(REPORT_EVERY_S)
+                if isinstance(message, str):
+                    error = message
+                elif message is not None:
+                    done, bar.total = message
+                    bar.update(done - bar.n)
+        except ChildDied as death:
+            if not error and finished(job) is None:
+                error = str(death)
+        finally:
+            child.close()
+    tqdm.write(f"{title}: {error or 'finished'}")
+    return error
 
 
 def _work(owner: Link, job: Job) -> None:
