@@ -6,10 +6,10 @@ import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from app.mapping.loop_process import LoopProcess
 from app.sensors.findings import Finding
 from app.sensors.live.process import LiveAddress, LiveClient
 from app.sensors.live.status import LiveState, Status
-from app.server.loop_process import LoopProcess
 from app.server.protocol import LIVE, OpenedRecording
 from app.server.run import Quiet, Run
 from app.slam.engine import Checkpoint, Engine

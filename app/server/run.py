@@ -10,12 +10,12 @@ import numpy as np
 from app.mapping import truth as compared
 from app.mapping.frames import Frame
 from app.mapping.log import Log
+from app.mapping.loop_process import LoopProcess
 from app.sensors.findings import Finding
 from app.sensors.live.status import Status
 from app.sensors.recording import Place, Recording, open_recording
 from app.server.checkpoints import DEFAULT_BYTES, Checkpoints
 from app.server.journal import SUFFIX, SavedSession, write_session
-from app.server.loop_process import LoopProcess
 from app.server.protocol import OpenedRecording
 from app.slam.engine import Checkpoint, Engine
 from app.slam.errors import HemislamError

@@ -13,8 +13,8 @@ from test_rewind import SAMPLE, Desk
 from typer.testing import CliRunner
 
 from app.__main__ import cli
+from app.mapping.loop_process import LoopProcess
 from app.sensors.presets import resolve_params
-from app.server.loop_process import LoopProcess
 from app.server.protocol import (
     EditLoop,
     InspectLoop,

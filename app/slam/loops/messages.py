@@ -171,7 +171,7 @@ class LoopWorkerDied(HemislamError):
 
 
 class LoopClient(Protocol):
-    """Whoever answers: `app.slam.loops.service.InlineLoops`, or a process of its own (`app.server.loop_process`)."""
+    """Whoever answers: `app.slam.loops.service.InlineLoops`, or a process of its own (`app.mapping.loop_process`)."""
 
     @property
     def pending(self) -> int:

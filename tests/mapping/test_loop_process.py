@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from app.child import Child, Link
-from app.server.loop_process import LoopProcess
+from app.mapping.loop_process import LoopProcess
 from app.slam import lie
 from app.slam.loops.messages import AddKeyframe, ApplyEdit, Finish, GoTo, LoopState, LoopWorkerDied, Request, Undo
 from app.slam.loops.service import InlineLoops
