@@ -5,6 +5,7 @@ takes effect: `now` (the current frame is segmented again at once), `frame` (fro
 (when the recording is opened again).
 """
 
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -17,18 +18,24 @@ Degrees = Annotated[float, Field(ge=-360, le=360)]
 
 
 def _param(
+    effect: Effect,
     default: Any,
     meaning: str,
-    limits: tuple[float, float] | None = None,
+    slider: tuple[float, float, float] | None = None,
+    unit: str = "",
     *,
     step: float | None = None,
-    unit: str = "",
-    effect: Effect = "frame",
     symbol: str = "",
 ) -> Any:
-    low, high = limits or (None, None)
+    """A parameter. `slider`: least value, greatest value and step of a number; a vector has only a step."""
+    least, greatest, step = slider or (None, None, step)
     extra: JsonDict = {"unit": unit, "step": step, "effect": effect, "symbol": symbol}
-    return Field(default, description=meaning, ge=low, le=high, json_schema_extra=extra)
+    return Field(default, description=meaning, ge=least, le=greatest, json_schema_extra=extra)
+
+
+_at_once = partial(_param, "now")
+_next_frame = partial(_param, "frame")
+_on_restart = partial(_param, "restart")
 
 
 class Section(BaseModel):
@@ -51,101 +58,71 @@ class Section(BaseModel):
 class RecordingParams(Section):
     """How a recording is read. `auto` lets the doctor decide and report its choice."""
 
-    lidar_topic: str = _param(
-        "", "Topic of the point clouds. Empty: the PointCloud2 topic with the most messages.", effect="restart"
+    lidar_topic: str = _on_restart(
+        "", "Topic of the point clouds. Empty: the PointCloud2 topic with the most messages."
     )
-    imu_topic: str = _param("", "Topic of the IMU. Empty: the Imu topic with the most messages.", effect="restart")
-    time_field: str = _param(
-        "auto", "Name of the per-point time field. `none` derives the time from the azimuth.", effect="restart"
+    imu_topic: str = _on_restart("", "Topic of the IMU. Empty: the Imu topic with the most messages.")
+    time_field: str = _on_restart("auto", "Name of the per-point time field. `none` derives the time from the azimuth.")
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] = _on_restart("auto", "Unit of the per-point time.")
+    time_reference: Literal["auto", "absolute", "relative"] = _on_restart(
+        "auto", "Whether the per-point time is absolute or relative to the scan's header stamp."
     )
-    time_unit: Literal["auto", "s", "ms", "us", "ns"] = _param("auto", "Unit of the per-point time.", effect="restart")
-    time_reference: Literal["auto", "absolute", "relative"] = _param(
-        "auto", "Whether the per-point time is absolute or relative to the scan's header stamp.", effect="restart"
+    header_stamp: Literal["auto", "first", "last"] = _on_restart(
+        "auto", "Whether a scan's header stamp is the time of its first or its last point."
     )
-    header_stamp: Literal["auto", "first", "last"] = _param(
-        "auto", "Whether a scan's header stamp is the time of its first or its last point.", effect="restart"
+    acceleration_unit: Literal["auto", "m/s2", "g"] = _on_restart("auto", "Unit of the accelerometer.")
+    imu_time_offset: float = _on_restart(
+        0.0, "Time added to the IMU's stamps, if its clock differs from the LiDAR's.", (-10, 10, 0.001), "s"
     )
-    acceleration_unit: Literal["auto", "m/s2", "g"] = _param("auto", "Unit of the accelerometer.", effect="restart")
-    imu_time_offset: float = _param(
-        0.0,
-        "Time added to the IMU's stamps, if its clock differs from the LiDAR's.",
-        (-10, 10),
-        step=0.001,
-        unit="s",
-        effect="restart",
-    )
-    rotation_rate: float = _param(
-        0.0,
-        "Revolutions per second, used only if points carry no time. 0: the rate of the clouds.",
-        (0, 100),
-        step=1,
-        unit="Hz",
-        effect="restart",
+    rotation_rate: float = _on_restart(
+        0.0, "Revolutions per second, used only if points carry no time. 0: the rate of the clouds.", (0, 100, 1), "Hz"
     )
 
 
 class SensorParams(Section):
     """Where the LiDAR is mounted on the IMU, and which returns are used."""
 
-    translation: tuple[Metres, Metres, Metres] = _param(
-        (0.0, 0.0, 0.0), "Position of the LiDAR in the IMU frame (x, y, z).", step=0.001, unit="m", effect="restart"
+    translation: tuple[Metres, Metres, Metres] = _on_restart(
+        (0.0, 0.0, 0.0), "Position of the LiDAR in the IMU frame (x, y, z).", step=0.001, unit="m"
     )
-    rotation: tuple[Degrees, Degrees, Degrees] = _param(
+    rotation: tuple[Degrees, Degrees, Degrees] = _on_restart(
         (0.0, 0.0, 0.0),
         "Orientation of the LiDAR in the IMU frame (roll, pitch, yaw; R = Rz Ry Rx).",
         step=0.1,
         unit="deg",
-        effect="restart",
     )
-    min_range: float = _param(
-        0.4, "Nearer returns are dropped: they hit the person who carries it.", (0, 10), step=0.1, unit="m"
+    min_range: float = _next_frame(
+        0.4, "Nearer returns are dropped: they hit the person who carries it.", (0, 10, 0.1), "m"
     )
-    max_range: float = _param(100.0, "Farther returns are dropped.", (1, 300), step=1, unit="m")
+    max_range: float = _next_frame(100.0, "Farther returns are dropped.", (1, 300, 1), "m")
 
 
 class GroundParams(Section):
     """Seed-point ground segmentation and ground downsampling (paper 2.2, eq. 1-3)."""
 
-    enabled: bool = _param(True, "Segment the ground, and downsample it before the filter.", effect="now")
-    scan_lines: int = _param(
-        8, "Number of outermost scan lines on which seeds are searched.", (1, 128), step=1, effect="now", symbol="M"
+    enabled: bool = _at_once(True, "Segment the ground, and downsample it before the filter.")
+    scan_lines: int = _at_once(
+        8, "Number of outermost scan lines on which seeds are searched.", (1, 128, 1), symbol="M"
     )
-    alpha: float = _param(
-        25.0,
-        "Largest angle between a seed and the direction straight down.",
-        (1, 90),
-        step=1,
-        unit="deg",
-        effect="now",
-        symbol="α",
+    alpha: float = _at_once(
+        25.0, "Largest angle between a seed and the direction straight down.", (1, 90, 1), "deg", symbol="α"
     )
-    sigma: float = _param(
+    sigma: float = _at_once(
         0.025,
         "A point is ground if it is nearer to the plane than this, per metre of range.",
-        (0.001, 0.2),
-        step=0.001,
-        unit="m/m",
-        effect="now",
+        (0.001, 0.2, 0.001),
+        "m/m",
         symbol="σ",
     )
-    planarity: float = _param(
-        0.3, "The seeds form a plane if λ3/λ2 is below this.", (0.01, 1), step=0.01, effect="now", symbol="λ3/λ2"
+    planarity: float = _at_once(0.3, "The seeds form a plane if λ3/λ2 is below this.", (0.01, 1, 0.01), symbol="λ3/λ2")
+    max_slope: float = _at_once(
+        40.0, "A plane steeper than this is a wall or the side of a stair, not ground.", (1, 90, 1), "deg"
     )
-    max_slope: float = _param(
-        40.0,
-        "A plane steeper than this is a wall or the side of a stair, not ground.",
-        (1, 90),
-        step=1,
-        unit="deg",
-        effect="now",
-    )
-    voxel_size: float = _param(
+    voxel_size: float = _at_once(
         0.5,
         "Edge of the voxels in which ground points are replaced by their centroid.",
-        (0.05, 5),
-        step=0.05,
-        unit="m",
-        effect="now",
+        (0.05, 5, 0.05),
+        "m",
         symbol="voxel",
     )
 
@@ -153,156 +130,127 @@ class GroundParams(Section):
 class ScanParams(Section):
     """What the filter gets of a scan, after the ground was downsampled."""
 
-    voxel_size: float = _param(
+    voxel_size: float = _next_frame(
         0.4,
         "Edge of the voxels that downsample all points for the filter (FAST-LIO2's filter_size_surf).",
-        (0.05, 3),
-        step=0.05,
-        unit="m",
+        (0.05, 3, 0.05),
+        "m",
     )
 
 
 class ImuParams(Section):
     """Noise of the IMU, and how the filter starts."""
 
-    gyro_noise: float = _param(1.2e-3, "Noise density of the gyroscope.", (1e-6, 1), step=1e-4, unit="rad/s/√Hz")
-    accel_noise: float = _param(1.3e-2, "Noise density of the accelerometer.", (1e-6, 10), step=1e-3, unit="m/s²/√Hz")
-    gyro_bias_walk: float = _param(2.5e-5, "Random walk of the gyroscope's bias.", (0, 1), step=1e-5, unit="rad/s²/√Hz")
-    accel_bias_walk: float = _param(
-        1.0e-4, "Random walk of the accelerometer's bias.", (0, 1), step=1e-4, unit="m/s³/√Hz"
+    gyro_noise: float = _next_frame(1.2e-3, "Noise density of the gyroscope.", (1e-6, 1, 1e-4), "rad/s/√Hz")
+    accel_noise: float = _next_frame(1.3e-2, "Noise density of the accelerometer.", (1e-6, 10, 1e-3), "m/s²/√Hz")
+    gyro_bias_walk: float = _next_frame(2.5e-5, "Random walk of the gyroscope's bias.", (0, 1, 1e-5), "rad/s²/√Hz")
+    accel_bias_walk: float = _next_frame(1.0e-4, "Random walk of the accelerometer's bias.", (0, 1, 1e-4), "m/s³/√Hz")
+    gravity: float = _on_restart(9.81, "Local gravity.", (9.7, 9.9, 0.001), "m/s²")
+    start_duration: float = _on_restart(
+        1.0, "Time at rest that the start waits for, to measure biases and gravity.", (0.1, 10, 0.1), "s"
     )
-    gravity: float = _param(9.81, "Local gravity.", (9.7, 9.9), step=0.001, unit="m/s²", effect="restart")
-    start_duration: float = _param(
-        1.0,
-        "Time at rest that the start waits for, to measure biases and gravity.",
-        (0.1, 10),
-        step=0.1,
-        unit="s",
-        effect="restart",
-    )
-    max_gap: float = _param(
-        0.1,
-        "A longer gap between IMU samples is reported and bridged with a wide covariance.",
-        (0.005, 5),
-        step=0.005,
-        unit="s",
+    max_gap: float = _next_frame(
+        0.1, "A longer gap between IMU samples is reported and bridged with a wide covariance.", (0.005, 5, 0.005), "s"
     )
 
 
 class FilterParams(Section):
     """The update of the iterated Kalman filter (paper 2.3, eq. 5-7)."""
 
-    point_noise: float = _param(
-        0.015, "Standard deviation of a point-to-plane distance on a flat surface.", (0.001, 1), step=0.005, unit="m"
+    point_noise: float = _next_frame(
+        0.015, "Standard deviation of a point-to-plane distance on a flat surface.", (0.001, 1, 0.005), "m"
     )
-    neighbours: int = _param(
-        5, "Map points that a plane is fitted to. More are taken if these lie along one line.", (4, 20), step=1
+    neighbours: int = _next_frame(
+        5, "Map points that a plane is fitted to. More are taken if these lie along one line.", (4, 20, 1)
     )
-    plane_tilt: float = _param(
+    plane_tilt: float = _next_frame(
         1.5,
         "Largest uncertainty of a plane's normal. A patch is widened until it is met, or refused.",
-        (0.1, 20),
-        step=0.1,
-        unit="deg",
+        (0.1, 20, 0.1),
+        "deg",
     )
-    gate: float = _param(
-        0.11, "Residuals over this times √range are not used (FAST-LIO2's gate).", (0.01, 1), step=0.01, unit="m/√m"
+    gate: float = _next_frame(
+        0.11, "Residuals over this times √range are not used (FAST-LIO2's gate).", (0.01, 1, 0.01), "m/√m"
     )
-    max_points: int = _param(
-        1000, "Most points of a scan, evenly spread, that are looked up in the map.", (100, 20_000), step=100
+    max_points: int = _next_frame(
+        1000, "Most points of a scan, evenly spread, that are looked up in the map.", (100, 20_000, 100)
     )
-    max_iterations: int = _param(5, "Most iterations of one update.", (1, 20), step=1)
-    plane_threshold: float = _param(
-        0.1, "All neighbours must be nearer to their plane than this.", (0.01, 1), step=0.01, unit="m"
+    max_iterations: int = _next_frame(5, "Most iterations of one update.", (1, 20, 1))
+    plane_threshold: float = _next_frame(
+        0.1, "All neighbours must be nearer to their plane than this.", (0.01, 1, 0.01), "m"
     )
-    neighbour_distance: float = _param(
-        1.0, "Map points farther than this from a point are not its neighbours.", (0.2, 5), step=0.1, unit="m"
+    neighbour_distance: float = _next_frame(
+        1.0, "Map points farther than this from a point are not its neighbours.", (0.2, 5, 0.1), "m"
     )
-    estimate_extrinsics: bool = _param(False, "Estimate the LiDAR's pose on the IMU while mapping.")
+    estimate_extrinsics: bool = _next_frame(False, "Estimate the LiDAR's pose on the IMU while mapping.")
 
 
 class MapParams(Section):
     """The local map, a hash of voxels that scans are registered to. Its memory is bounded."""
 
-    voxel_size: float = _param(
-        1.0,
-        "Edge of a map voxel. Neighbours are searched within one edge at most.",
-        (0.1, 3),
-        step=0.05,
-        unit="m",
-        effect="restart",
+    voxel_size: float = _on_restart(
+        1.0, "Edge of a map voxel. Neighbours are searched within one edge at most.", (0.1, 3, 0.05), "m"
     )
-    spacing: float = _param(
-        0.2, "Least distance between two points of a voxel: at rest the map does not grow.", (0, 1), step=0.05, unit="m"
+    spacing: float = _next_frame(
+        0.2, "Least distance between two points of a voxel: at rest the map does not grow.", (0, 1, 0.05), "m"
     )
-    points_per_voxel: int = _param(40, "Most points in one voxel.", (1, 50), step=1, effect="restart")
-    radius: float = _param(100.0, "Voxels farther than this from the sensor are dropped.", (10, 500), step=5, unit="m")
-    max_voxels: int = _param(
-        100_000, "Most voxels in the map; they bound its memory.", (1000, 2_000_000), step=1000, effect="restart"
-    )
+    points_per_voxel: int = _on_restart(40, "Most points in one voxel.", (1, 50, 1))
+    radius: float = _next_frame(100.0, "Voxels farther than this from the sensor are dropped.", (10, 500, 5), "m")
+    max_voxels: int = _on_restart(100_000, "Most voxels in the map; they bound its memory.", (1000, 2_000_000, 1000))
 
 
 class KeyframeParams(Section):
     """Which frames become keyframes and make the map."""
 
-    distance: float = _param(0.5, "Distance moved after which a frame is kept.", (0.05, 20), step=0.05, unit="m")
-    angle: float = _param(15.0, "Angle turned after which a frame is kept.", (1, 180), step=1, unit="deg")
+    distance: float = _next_frame(0.5, "Distance moved after which a frame is kept.", (0.05, 20, 0.05), "m")
+    angle: float = _next_frame(15.0, "Angle turned after which a frame is kept.", (1, 180, 1), "deg")
 
 
 class LoopsParams(Section):
     """Loop closure and the pose graph (paper 2.4, eq. 8)."""
 
-    enabled: bool = _param(True, "Search for loops, and correct the map with them.", effect="restart")
-    min_time: float = _param(15.0, "Least time between the two visits of a loop.", (1, 600), step=1, unit="s")
-    candidates: int = _param(
-        10, "Nearest places by ring key whose Scan Contexts are compared.", (1, 100), step=1, symbol="M"
+    enabled: bool = _on_restart(True, "Search for loops, and correct the map with them.")
+    min_time: float = _next_frame(15.0, "Least time between the two visits of a loop.", (1, 600, 1), "s")
+    candidates: int = _next_frame(
+        10, "Nearest places by ring key whose Scan Contexts are compared.", (1, 100, 1), symbol="M"
     )
-    verified: int = _param(2, "Best of these that are registered, for each keyframe.", (1, 10), step=1)
-    context_distance: float = _param(
-        0.3, "Candidates with a larger Scan Context distance are refused without registration.", (0.01, 1), step=0.01
+    verified: int = _next_frame(2, "Best of these that are registered, for each keyframe.", (1, 10, 1))
+    context_distance: float = _next_frame(
+        0.3, "Candidates with a larger Scan Context distance are refused without registration.", (0.01, 1, 0.01)
     )
-    submap_keyframes: int = _param(
-        8, "Keyframes before and after a keyframe that make its submap with it.", (0, 50), step=1, effect="restart"
+    submap_keyframes: int = _on_restart(
+        8, "Keyframes before and after a keyframe that make its submap with it.", (0, 50, 1)
     )
-    submap_voxel: float = _param(
-        0.25, "Edge of the voxels that downsample submaps.", (0.05, 2), step=0.05, unit="m", effect="restart"
+    submap_voxel: float = _on_restart(0.25, "Edge of the voxels that downsample submaps.", (0.05, 2, 0.05), "m")
+    min_overlap: float = _next_frame(
+        0.3, "Least share of the points near both keyframes that must have a partner.", (0, 1, 0.01)
     )
-    min_overlap: float = _param(
-        0.3, "Least share of the points near both keyframes that must have a partner.", (0, 1), step=0.01
+    max_residual: float = _next_frame(
+        0.05, "Largest point-to-plane residual of a registration (RMS).", (0.005, 1, 0.005), "m"
     )
-    max_residual: float = _param(
-        0.05, "Largest point-to-plane residual of a registration (RMS).", (0.005, 1), step=0.005, unit="m"
-    )
-    max_slide: float = _param(
+    max_slide: float = _next_frame(
         0.05,
         "A registration pushed along its weakest direction must come back this close; otherwise it slides.",
-        (0.005, 1),
-        step=0.005,
-        unit="m",
+        (0.005, 1, 0.005),
+        "m",
     )
-    max_mahalanobis: float = _param(
-        3.5, "Most standard deviations from where odometry expects a loop.", (0.5, 20), step=0.1, unit="σ"
+    max_mahalanobis: float = _next_frame(
+        3.5, "Most standard deviations from where odometry expects a loop.", (0.5, 20, 0.1), "σ"
     )
-    support: int = _param(2, "Candidates nearby that must agree before one is accepted.", (0, 10), step=1)
-    drift_translation: float = _param(
-        1.0, "Standard deviation of the drift in position, per distance moved.", (0.01, 20), step=0.1, unit="%"
+    support: int = _next_frame(2, "Candidates nearby that must agree before one is accepted.", (0, 10, 1))
+    drift_translation: float = _next_frame(
+        1.0, "Standard deviation of the drift in position, per distance moved.", (0.01, 20, 0.1), "%"
     )
-    drift_rotation: float = _param(
-        0.02, "Standard deviation of the drift in heading, per distance moved.", (0.001, 2), step=0.005, unit="deg/m"
+    drift_rotation: float = _next_frame(
+        0.02, "Standard deviation of the drift in heading, per distance moved.", (0.001, 2, 0.005), "deg/m"
     )
-    latency: int = _param(
+    latency: int = _on_restart(
         20,
-        "Frames after a keyframe at which its loops take effect. Fixed, so that results do not depend on the machine's"
-        " speed.",
-        (1, 1000),
-        step=1,
-        effect="restart",
+        "Frames after a keyframe at which its loops take effect. Fixed, so that speed does not change results.",
+        (1, 1000, 1),
     )
-    window: int = _param(
+    window: int = _on_restart(
         0,
-        "Newest keyframes whose poses are solved for, as in the paper. 0: all, so that a late loop straightens the"
-        " whole map.",
-        (0, 100_000),
-        step=10,
-        effect="restart",
+        "Newest keyframes whose poses are solved for, as in the paper. 0: all of them, the whole map.",
+        (0, 100_000, 10),
     )
