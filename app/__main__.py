@@ -1,4 +1,4 @@
-"""The command line. The only place that wires the rooms together; it imports them when needed."""
+"""The command line: the only place that wires the rooms together. It imports them when they are needed."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +17,7 @@ from app.slam.errors import HemislamError
 
 
 class _Commands(TyperGroup):
-    """Ends a command with one sentence on stderr, not a traceback, when the user can mend it."""
+    """Ends a command with one sentence on stderr instead of a traceback when the user can correct the cause."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -52,7 +52,7 @@ def hemislam(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Map with a handheld hemispherical LiDAR and an IMU: in the browser, or from the command line.
+    """Map with a handheld hemispherical LiDAR and an IMU, in the browser or from the command line.
 
     \b
     Try:
@@ -80,15 +80,15 @@ def info(
     lidar_topic: options.LidarTopic = None,
     imu_topic: options.ImuTopic = None,
 ) -> None:
-    """Examine a recording: what is in it, what is wrong.
+    """Examine a recording and report what is wrong.
 
-    Topics, rates, time fields, units, gaps, clocks, gravity; each with what was done about it.
+    Topics, rates, time fields, units, gaps, clocks, gravity; each with what hemislam does about it.
 
     \b
     Each finding has a verdict:
       fine        nothing to do
-      corrected   hemislam settles it by itself and says how
-      needs you   only you can know; the option that settles it stands below
+      corrected   hemislam corrects it and says how
+      needs you   only you can decide; the option to use is printed below
 
     \b
     Examples:
@@ -123,32 +123,33 @@ def info(
 def simulate(
     ctx: typer.Context,
     out: Annotated[
-        Path, typer.Option("--out", metavar="FILE.mcap", help="The recording to write; of a suite a folder.")
+        Path, typer.Option("--out", metavar="FILE.mcap", help="The recording to write; with --suite a folder.")
     ],
     scene: Annotated[str | None, typer.Argument(metavar="SCENE", help="corridor, room, outdoor, museum, ...")] = None,
     suite: Annotated[
-        str | None, typer.Option("--suite", metavar="paper", help="Twins of the paper's six sequences, not one SCENE.")
+        str | None, typer.Option("--suite", metavar="paper", help="Simulated versions of the paper's six sequences.")
     ] = None,
-    short: Annotated[bool, typer.Option("--short", help="The first 60 s of each of the suite.")] = False,
-    duration: Annotated[float, typer.Option("--duration", metavar="SECONDS", help="Of the walk.")] = 60.0,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed, another walk.")] = 0,
-    rate: Annotated[int, typer.Option("--rate", metavar="HZ", help="Revolutions a second, 10 or 20.")] = 10,
+    short: Annotated[bool, typer.Option("--short", help="Only the first 60 s of each sequence of the suite.")] = False,
+    duration: Annotated[float, typer.Option("--duration", metavar="SECONDS", help="Length of the recording.")] = 60.0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed gives another trajectory.")] = 0,
+    rate: Annotated[int, typer.Option("--rate", metavar="HZ", help="Revolutions per second, 10 or 20.")] = 10,
     every_block: Annotated[
         int | None, typer.Option("--every-block", metavar="K", help="Fire every K-th azimuth only, for a small file.")
     ] = None,
     coordinate_step: Annotated[
-        float, typer.Option("--coordinate-step", metavar="METRES", help="Round x, y, z, for a smaller file; 0: do not.")
+        float, typer.Option("--coordinate-step", metavar="METRES", help="Round x, y, z for a smaller file; 0: do not.")
     ] = 0.0,
     range_step: Annotated[
-        float, typer.Option("--range-step", metavar="METRES", help="Of distances; 0.0025 for a newer unit, 0: none.")
+        float,
+        typer.Option("--range-step", metavar="METRES", help="Step of distances; 0.0025 for a newer unit, 0: none."),
     ] = 0.005,
-    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
 ) -> None:
-    """Make a recording of a walk through a modelled scene.
+    """Simulate a recording in a modelled scene.
 
-    A person carries an RS-Bpearl and an IMU through it, standing still for the first seconds.
-    Beside FILE.mcap it writes FILE_truth.tum, the true poses, and FILE.params.yaml, where the LiDAR
-    sits on the IMU. The points carry their true label in the field `ground`.
+    A person carries an RS-Bpearl and an IMU through it and stands still for the first seconds.
+    FILE_truth.tum has the true poses, FILE.params.yaml has the pose of the LiDAR on the IMU, both
+    beside FILE.mcap. Each point has its true label in the field `ground`.
 
     \b
     Examples:
@@ -163,19 +164,19 @@ def simulate(
     from app.sensors.simulator import SCENES, simulate
 
     if (scene is not None) if suite is not None else short:
-        raise HemislamError("A SCENE takes --duration, --suite takes --short; give one of SCENE and --suite.")
+        raise HemislamError("SCENE takes --duration, --suite takes --short; give either SCENE or --suite.")
     if suite is not None:
         only = ("duration", "rate", "coordinate_step", "range_step", "force")
         sources = {name: ctx.get_parameter_source(name) for name in only}
         if given := [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]:
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-            raise HemislamError(f"A suite does not take {names}; leave that out, or name a SCENE.")
+            raise HemislamError(f"--suite does not take {names}; leave them out, or name a SCENE.")
         make_suite(suite, out, [seed], short=short, every_block=every_block)
         return
     if scene is None:
         raise HemislamError(f"Name a SCENE, one of {', '.join(SCENES)}, or use --suite paper.")
     if out.exists() and not force:
-        raise HemislamError(f"{out} is there already; choose another --out or add --force to replace it.")
+        raise HemislamError(f"{out} exists already; choose another --out, or add --force to replace it.")
     with tqdm(desc="Simulating", unit=" scans", leave=False, disable=None) as bar:
 
         def show(done: int, total: int) -> None:
@@ -208,9 +209,9 @@ def params(
         bool, typer.Option("--markdown", help="Print the reference of all parameters instead.")
     ] = False,
 ) -> None:
-    """Print all parameters as commented YAML.
+    """Print all parameters as YAML, with meaning, unit and range.
 
-    With meaning, unit and range; --config reads it back.
+    --config reads it back.
 
     \b
     Examples:

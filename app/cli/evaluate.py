@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from app.slam.trajectory import Trajectory
 
 _TRUTH_HELP = (
-    "True poses: a TUM or KITTI file, the GNSS/INS table of H2LID, or topic:/NAME in the recording. Repeatable, in the"
-    " order of the recordings; `none` for none; else RECORDING_truth.tum beside it."
+    "True poses: a TUM or KITTI file, the GNSS/INS table of H2LID, or topic:/NAME in the recording; `none` for none."
+    " Repeatable, in the order of the recordings. Default: RECORDING_truth.tum beside the recording."
 )
 
 
@@ -24,7 +24,7 @@ def evaluate(
         list[Path] | None, typer.Argument(metavar="RECORDING...", help="One or more recordings.")
     ] = None,
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Where to write; runs found there are reused.")
+        Path, typer.Option("--out", metavar="DIR", help="Where to write. Finished runs found there are reused.")
     ] = Path("runs/evaluation"),
     truths: Annotated[list[str] | None, typer.Option("--truth", metavar="TRUTH", help=_TRUTH_HELP)] = None,
     lever: Annotated[
@@ -43,16 +43,16 @@ def evaluate(
         typer.Option(
             "--compare",
             metavar="NAME=FILE.tum",
-            help="Another system's trajectory as one more column; NAME@RECORDING=FILE among several recordings.",
+            help="Another system's trajectory as one more column; with several recordings NAME@RECORDING=FILE.",
         ),
     ] = None,
     suite: Annotated[
         str | None, typer.Option("--suite", metavar="paper", help="The simulated twins of the paper's six sequences.")
     ] = None,
-    short: Annotated[bool, typer.Option("--short", help="The first 60 s of each sequence of the suite.")] = False,
-    seeds: Annotated[list[int] | None, typer.Option("--seed", min=0, help="Of the suite. Repeatable.")] = None,
+    short: Annotated[bool, typer.Option("--short", help="Only the first 60 s of each sequence of the suite.")] = False,
+    seeds: Annotated[list[int] | None, typer.Option("--seed", min=0, help="Seed of the suite. Repeatable.")] = None,
     jobs: Annotated[
-        int | None, typer.Option("--jobs", min=1, metavar="N", help="Runs side by side; else one a core.")
+        int | None, typer.Option("--jobs", min=1, metavar="N", help="Parallel runs. Default: one per core.")
     ] = None,
     preset: Preset = None,
     config: Config = None,
@@ -65,8 +65,8 @@ def evaluate(
     """Measure accuracy, time and map sharpness: the paper's ablation, and yours.
 
     Each recording is run with FAST-LIO (no ground downsampling, no loops), FAST-LIO-GD, FAST-LIO-L
-    and Ours, and with each --variant. A run that is finished is not run again: what was
-    interrupted goes on where it was when started again.
+    and Ours, and with each --variant. Finished runs are reused, so an interrupted evaluation
+    continues where it was.
 
     \b
     Writes into DIR:
@@ -97,7 +97,7 @@ def evaluate(
     if suite is not None:
         paths += make_suite(suite, out / "recordings", seeds or [0], short=short)
     if not paths:
-        raise HemislamError("There is nothing to evaluate; name a RECORDING or use --suite paper.")
+        raise HemislamError("Nothing to evaluate; name a RECORDING or use --suite paper.")
     names = _names(paths)
     others = _compared(compare or [], names, [variant.name for variant in chosen])
     arm = _lever(lever)
@@ -107,7 +107,7 @@ def evaluate(
         params = resolve(path, preset, config, assignments, lidar_topic, imu_topic)
         subjects.append(Subject(name, path, params, truth, tuple(others[name])))
     for variant in chosen:
-        variant.applied(subjects[0].params)  # refuses what is misspelt before anything runs
+        variant.applied(subjects[0].params)  # raises for a misspelt parameter before anything runs
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     parallel = max(1, min(jobs or cores, len(chosen) * len(subjects)))
     compile_behind_bar()
@@ -134,11 +134,11 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise HemislamError(f"The folder {folder} can not be made: {error.strerror}; choose another one.") from None
+        raise HemislamError(f"The folder {folder} cannot be created: {error.strerror}; choose another one.") from None
 
 
 def _names(paths: list[Path]) -> list[str]:
-    """The recordings' own names, numbered where two share one."""
+    """The recordings' names, numbered where two are the same."""
     names: list[str] = []
     for path in paths:
         stem = path.resolve().stem
@@ -151,7 +151,9 @@ def _truth_texts(paths: list[Path], given: list[str]) -> list[str | None]:
     from app.slam.trajectory import truth_beside
 
     if len(given) > len(paths):
-        raise HemislamError(f"There are {len(given)} --truth for {len(paths)} recordings; give one for each, in order.")
+        raise HemislamError(
+            f"{len(given)} --truth options for {len(paths)} recordings; give at most one for each, in order."
+        )
     texts: list[str | None] = [None if text == "none" else text for text in given]
     beside = [truth_beside(path) for path in paths[len(given) :]]
     return texts + [str(path) if path else None for path in beside]
@@ -168,7 +170,7 @@ def _lever(text: str | None) -> tuple[float, float, float] | None:
 
 
 def _compared(texts: list[str], names: list[str], variants: list[str]) -> dict[str, list[tuple[str, "Trajectory"]]]:
-    """By recording: names, which are columns beside the variants', and trajectories."""
+    """By recording: the names of the further columns and their trajectories."""
     from app.slam.trajectory import read_tum
 
     found: dict[str, list[tuple[str, Trajectory]]] = {name: [] for name in names}
@@ -176,13 +178,15 @@ def _compared(texts: list[str], names: list[str], variants: list[str]) -> dict[s
         who, equals, file = text.partition("=")
         system, at, recording = who.partition("@")
         if not (system and equals and file):
-            raise HemislamError(f"`--compare {text}` can not be understood; write it as --compare NAME=FILE.tum.")
+            raise HemislamError(f"`--compare {text}` is malformed; write it as --compare NAME=FILE.tum.")
         if not at and len(names) > 1:
-            raise HemislamError(f"`--compare {text}`: of which recording? Write {system}@{names[0]}={file}.")
+            raise HemislamError(f"`--compare {text}` does not name a recording; write {system}@{names[0]}={file}.")
         recording = recording if at else names[0]
         if recording not in found:
-            raise HemislamError(f"`--compare {text}`: there is no recording {recording}; there are {', '.join(names)}.")
+            raise HemislamError(
+                f"`--compare {text}`: there is no recording {recording}; choose from {', '.join(names)}."
+            )
         if system in variants or any(system == name for name, _ in found[recording]):
-            raise HemislamError(f"`--compare {text}`: there is a column {system} already; give it another name.")
+            raise HemislamError(f"`--compare {text}`: a column {system} exists already; choose another name.")
         found[recording].append((system, read_tum(Path(file))))
     return found

@@ -17,19 +17,19 @@ def serve(
     recording: Annotated[
         Path | None,
         typer.Argument(
-            metavar="RECORDING", help="What to open first, a session file too; another one can be chosen in the page."
+            metavar="RECORDING", help="A recording or a session file to open first. The page can open others."
         ),
     ] = None,
-    host: Annotated[str, typer.Option("--host", metavar="ADDRESS", help="0.0.0.0: all, by a link with a token.")] = (
-        "127.0.0.1"
-    ),
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, metavar="PORT", help="0: a free one.")] = 8080,
+    host: Annotated[
+        str, typer.Option("--host", metavar="ADDRESS", help="0.0.0.0 lets other computers in, by a link with a token.")
+    ] = ("127.0.0.1"),
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, metavar="PORT", help="0 picks a free one.")] = 8080,
     folder: Annotated[
         list[Path] | None,
         typer.Option(
             "--folder",
             metavar="DIR",
-            help="The page may open recordings below DIR. Repeatable; else the recording's folder or the present one.",
+            help="The page may open recordings below DIR. Repeatable. Default: that of RECORDING, or the current one.",
         ),
     ] = None,
     point_budget: Annotated[
@@ -38,10 +38,10 @@ def serve(
             "--point-budget",
             min=10_000,
             metavar="N",
-            help="Most map points that the page draws; hours of walking leave room for fewer, half of them at least.",
+            help="Most map points that the page draws. After hours of recording it draws fewer, at least half as many.",
         ),
     ] = 3_000_000,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the address.")] = False,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address only.")] = False,
     paused: Annotated[bool, typer.Option("--paused", help="Wait for Play instead of starting at once.")] = False,
     checkpoint_memory: Annotated[
         int,
@@ -49,7 +49,7 @@ def serve(
             "--checkpoint-memory",
             min=16,
             metavar="MB",
-            help="For going back to any frame; what is beyond it goes to temporary files, up to four times as much.",
+            help="Memory for going back to any frame. Up to four times as much goes to temporary files.",
         ),
     ] = 1024,
     live: Annotated[
@@ -57,23 +57,23 @@ def serve(
         typer.Option(
             "--live",
             metavar="URL",
-            help="Map what a sensor sends: rsbpearl://0.0.0.0:6699,7788 or foxglove://HOST:8765.",
+            help="Map live from a sensor: rsbpearl://0.0.0.0:6699,7788 or foxglove://HOST:8765.",
         ),
     ] = None,
     imu: Annotated[
         str | None,
-        typer.Option("--imu", metavar="URL", help="Where IMU samples come from: imu-udp://:6700, foxglove://..."),
+        typer.Option("--imu", metavar="URL", help="Where IMU samples come from: imu-udp://:6700 or foxglove://..."),
     ] = None,
     record: Annotated[
-        Path | None, typer.Option("--record", metavar="FILE", help="Write what comes live into this .mcap.")
+        Path | None, typer.Option("--record", metavar="FILE", help="Record the live data into this .mcap.")
     ] = None,
     certificate: Annotated[
-        Path | None, typer.Option("--certificate", metavar="PEM", help="Speak https by this certificate.")
+        Path | None, typer.Option("--certificate", metavar="PEM", help="Serve https with this certificate.")
     ] = None,
     key: Annotated[
-        Path | None, typer.Option("--key", metavar="PEM", help="Of the certificate, if it is not in its file.")
+        Path | None, typer.Option("--key", metavar="PEM", help="The certificate's key, if it is in a file of its own.")
     ] = None,
-    log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr, one JSON object a line.")] = False,
+    log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr, one JSON object per line.")] = False,
     preset: Preset = None,
     config: Config = None,
     assignments: Assignments = None,
@@ -85,15 +85,14 @@ def serve(
 ) -> None:
     """Open the workbench in the browser.
 
-    Replays a recording and shows the map as it grows; every parameter can be changed meanwhile.
-    In the page, space plays and pauses, the arrow keys step one frame
-    back or on. Ctrl-C here ends it.
+    Replays a recording and shows the map as it grows. Every parameter can be changed while it runs.
+    In the page, space plays and pauses, and the arrow keys step one frame. Ctrl-C ends it.
 
     \b
     Examples:
       hemislam serve walk.mcap
       hemislam serve indoor1.bag --preset h2lid --paused
-      hemislam serve runs/sessions/walk-20261121-101500.hemislam     goes on where that session ended
+      hemislam serve runs/sessions/walk-20261121-101500.hemislam     continues that session
       hemislam serve --folder ~/recordings --port 8081
       hemislam serve --live rsbpearl://0.0.0.0:6699,7788 --imu imu-udp://:6700 --record walk.mcap
       hemislam serve --live foxglove://robot:8765 --preset rslidar
@@ -124,14 +123,14 @@ def serve(
         imu_topic=imu_topic,
     )
     if key is not None and certificate is None:
-        raise HemislamError("--key belongs to --certificate; give both.")
+        raise HemislamError("--key needs --certificate; give both.")
     tls = Tls(certificate, key) if certificate else None
     if tls is not None:
         tls.check()
     if live is not None and recording is not None:
         raise HemislamError("Give a recording or --live, not both.")
     if live is None and (imu or record):
-        raise HemislamError("--imu and --record belong to --live; say with it where scans come from.")
+        raise HemislamError("--imu and --record need --live, which says where scans come from.")
     if live is not None and (paused or start or duration is not None or truth is not None):
         raise HemislamError(
             "--paused, --start, --duration and --truth belong to a recording; leave them out with --live."
@@ -140,13 +139,13 @@ def serve(
     params = session.state.params if session else resolve_for(recording)
     if recording is not None:
         opened = session.opened.recording if session else recording
-        open_recording(opened, params).close()  # so that a mistake is told here and not in the page
+        open_recording(opened, params).close()  # a mistake is reported here, not in the page
     if truth is not None:
         read_poses(truth)
     elif recording is not None:
         truth = truth_beside(recording)
     gc.collect()
-    gc.freeze()  # what is imported stays; going through all of it again would keep every page waiting for 0.08 s
+    gc.freeze()  # imported objects stay; collecting them again would stop every page for 0.08 s
     with (
         TemporaryDirectory(prefix="hemislam-") as folder_live,
         LiveProcess(live, params, imu, record) if live else nullcontext() as source,

@@ -1,4 +1,4 @@
-"""The paper's suite of simulated recordings, made with a progress bar; for `simulate` and `evaluate`."""
+"""Makes the paper's suite of simulated recordings behind a progress bar, for `simulate` and `evaluate`."""
 
 from pathlib import Path
 
@@ -10,10 +10,10 @@ from app.slam.errors import HemislamError
 def make_suite(
     name: str, folder: Path, seeds: list[int], *, short: bool = False, every_block: int | None = None
 ) -> list[Path]:
-    """Make what is not there yet and return all recordings.
+    """Make the recordings that do not exist yet, and return all of them.
 
     Raises:
-        HemislamError: there is no such suite, or the recordings can not be made.
+        HemislamError: there is no such suite, or the recordings cannot be written.
     """
     from tqdm import tqdm
 
@@ -23,7 +23,7 @@ def make_suite(
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise HemislamError(f"The folder {folder} can not be made: {error.strerror}; choose another one.") from None
+        raise HemislamError(f"The folder {folder} cannot be created: {error.strerror}; choose another one.") from None
     recordings = []
     for seed in seeds:
         for twin in twins:
@@ -34,7 +34,7 @@ def make_suite(
                     bar.update(done - bar.n)
 
                 made = make_twin(twin, folder, seed=seed, short=short, every_block=every_block, progress=show)
-            state = "made" if made.new else "there already"
+            state = "made" if made.new else "exists already"
             typer.echo(f"{made.recording}: {made.distance_m:.1f} m walked, {state}")
             recordings.append(made.recording)
     return recordings

@@ -9,22 +9,22 @@ from app.server.journal import SUFFIX, read_session
 from app.slam.errors import HemislamError
 
 RECORDINGS = (*SUFFIXES, SUFFIX)
-"""What can be opened, sessions among them; a ROS 2 folder can as well."""
+"""Files that can be opened, session files included. A ROS 2 folder can be opened too."""
 TRAJECTORIES = (".tum",)
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A line of the file browser: something to choose, or a folder to look into."""
+    """A line of the file browser: a file to choose, or a folder to look into."""
 
     path: Path
     is_choice: bool
     size: int = 0
-    """Bytes, of a choice."""
+    """Bytes of what can be chosen."""
 
 
 class Folders:
-    """Folders given on the command line. Nothing outside of them is listed or opened, whatever links say.
+    """Folders given on the command line. Nothing outside them is listed or opened, also not through links.
 
     Raises:
         HemislamError: one of them is not a folder.
@@ -40,8 +40,8 @@ class Folders:
         """The real path behind `path`, relative to the first folder if it is not absolute.
 
         Raises:
-            HemislamError: it does not exist, or lies outside. Both in the same words, so that the
-                answer tells nothing about what is outside.
+            HemislamError: it does not exist or lies outside. Both have the same message, which therefore says nothing
+                about files outside.
         """
         try:
             real = (self.roots[0] / path if self.roots else Path(path)).resolve(strict=True)
@@ -49,33 +49,33 @@ class Folders:
             real = None
         if real is None or not self._holds(real):
             raise HemislamError(
-                f"There is no {path} in the folders that hemislam was started for; start it with the folder given."
+                f"There is no {path} in the folders that hemislam may open; start it with --folder to add one."
             )
         return real
 
     def openable(self, path: Path | str) -> Path:
-        """As `inside`, and if it is a session file, its recording must be inside as well. Raises as `inside`."""
+        """As `inside`; the recording of a session file must be inside too. Raises as `inside`."""
         real = self.inside(path)
         if real.suffix == SUFFIX:
             self.inside(read_session(real).opened.recording)
         return real
 
     def listing(self, folder: Path | str, suffixes: tuple[str, ...] = RECORDINGS) -> list[Entry]:
-        """What is in a folder inside: first its folders, then the files that may be chosen, each by name.
+        """The contents of a folder inside: first its folders, then the files that may be chosen, each sorted by name.
 
         Raises:
-            HemislamError: as `inside`, or it can not be read.
+            HemislamError: as `inside`, or the folder cannot be read.
         """
         place = self.inside(folder)
         try:
             seen = [path for path in place.iterdir() if not path.name.startswith(".") and self._holds(path.resolve())]
             found = [entry for path in seen if (entry := _entry(path, suffixes))]
         except OSError as error:
-            raise HemislamError(f"The folder {place} can not be read: {error.strerror}.") from None
+            raise HemislamError(f"The folder {place} cannot be read: {error.strerror}.") from None
         return sorted(found, key=lambda entry: (entry.is_choice, entry.path.name.casefold()))
 
     def recordings(self) -> list[Path]:
-        """All recordings in all folders and theirs, by path."""
+        """All recordings below all folders, sorted by path."""
         found: list[Path] = []
         waiting = list(self.roots)
         seen = set(waiting)

@@ -86,9 +86,9 @@ def test_a_parameter_that_cannot_be_is_refused_by_name(hemislam: Call, arguments
     [
         (["serve", "--live", "rsbpearl://:0,0", "--imu", "imu-udp://:0", "--paused"], "--paused"),
         (["serve", "--live", "rsbpearl://:0,0", "--imu", "imu-udp://:0", "--truth", "walk.tum"], "--truth"),
-        (["serve", "--record", "walk.mcap"], "belong to --live"),
+        (["serve", "--record", "walk.mcap"], "need --live"),
         (["simulate", "room", "--short", "--out", "nowhere/room.mcap"], "--suite takes --short"),
-        (["simulate", "room", "--suite", "paper", "--out", "nowhere"], "give one of SCENE and --suite"),
+        (["simulate", "room", "--suite", "paper", "--out", "nowhere"], "give either SCENE or --suite"),
         (["simulate", "--suite", "paper", "--rate", "20", "--force", "--out", "nowhere"], "not take --rate, --force"),
     ],
 )

@@ -51,36 +51,37 @@ run() {
   buildah run --isolation chroot --network host "${user[@]}" "$container" -- "$@"
 }
 
-# served USER: whether the server answers as long as it runs, and ends in order.
+# served USER: the server answers while it runs, and ends with status 0 on SIGINT.
 served() {
-  local out="$folder/serve.txt" pid address
-  run "$1" hemislam serve sample_data/museum.mcap --port 0 --no-browser --paused >"$out" 2>&1 &
+  local out="$folder/serve.txt" pid address=""
+  run "$1" timeout --signal=INT --preserve-status 30 \
+    hemislam serve sample_data/museum.mcap --port 0 --no-browser --paused >"$out" 2>&1 &
   pid=$!
-  for _ in $(seq 300); do
-    address=$(sed -n 's/^hemislam is at \(\S*\).*/\1/p' "$out")
-    if [ -n "$address" ] || ! kill -0 "$pid" 2>/dev/null; then break; fi
+  while [ -z "$address" ] && kill -0 "$pid" 2>/dev/null; do
     sleep 0.2
+    address=$(sed -n 's/^hemislam is at \([^ ]*\).*/\1/p' "$out")
   done
-  [ -n "$address" ] || { cat "$out"; echo "hemislam serve printed no address"; return 1; }
-  python3 - "$address" <<'PYTHON'
+  if [ -n "$address" ]; then
+    python3 - "$address" <<'PYTHON'
 import json, sys, urllib.request
-with urllib.request.urlopen(sys.argv[1] + "healthz", timeout=30) as answer:
+with urllib.request.urlopen(sys.argv[1] + "healthz", timeout=20) as answer:
     assert answer.status == 200 and json.load(answer) == {"status": "ok"}
-with urllib.request.urlopen(sys.argv[1], timeout=30) as answer:
+with urllib.request.urlopen(sys.argv[1], timeout=20) as answer:
     assert b"<title>hemislam</title>" in answer.read()
 PYTHON
-  pkill -INT -P "$pid" -f "hemislam serve" || kill -INT "$pid"
-  wait "$pid" || true
+  fi
+  wait "$pid" || { cat "$out"; echo "hemislam serve failed"; return 1; }
   cat "$out"
 }
 
 for user in "" 12345; do
-  say "as ${user:-the image's user}: info"
+  name=${user:-hemislam}
+  say "as $name: info"
   run "$user" hemislam info sample_data/museum.mcap
-  say "as ${user:-the image's user}: run"
-  run "$user" hemislam run sample_data/museum.mcap --duration 10 --out "runs/image-test-${user:-own}"
-  run "$user" test -s "runs/image-test-${user:-own}/trajectory.tum"
-  say "as ${user:-the image's user}: serve"
+  say "as $name: run"
+  run "$user" hemislam run sample_data/museum.mcap --duration 10 --out "runs/image-test-$name"
+  run "$user" test -s "runs/image-test-$name/trajectory.tum"
+  say "as $name: serve"
   served "$user"
 done
 buildah rm "$container" >/dev/null

@@ -42,7 +42,7 @@ OUTSIDE = (
 
 @pytest.mark.parametrize("path", OUTSIDE)
 def test_nothing_outside_is_reached_and_the_answer_tells_nothing(disk: Path, path: str) -> None:
-    with pytest.raises(HemislamError, match=r"There is no .* in the folders that hemislam was started for"):
+    with pytest.raises(HemislamError, match=r"There is no .* in the folders that hemislam may open"):
         Folders([disk / "open"]).inside(path)
 
 
