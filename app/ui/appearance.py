@@ -4,29 +4,29 @@ from typing import Final
 
 import viser
 
-from app.ui.colours import ColourBy, Limits
-from app.ui.html import box, legend
+from app.ui.colours import COLOUR_BY, Limits, legend
+from app.ui.html import panel
 from app.ui.view import View
 from app.ui.widgets import show
 
 _LAYERS: Final = (
-    ("ceilings", "ceilings", "Without them one looks into a building from above. Ceilings labelled ground stay."),
-    ("map", "map", "Keyframes' points."),
+    ("ceilings", "ceilings", "Hidden, you can look into a building from above. Ceilings labelled ground stay."),
+    ("map", "map", "Points of the keyframes."),
     ("scan", "scan", "Points of the newest frame."),
     ("wedge", "seed wedge", "Where seeds are looked for: within α of straight down, on the M outermost lines."),
     ("plane", "ground plane", "The plane through the seeds."),
-    ("path", "path, truth", "Where the sensor walked, and the truth when it is loaded."),
+    ("path", "path, truth", "The sensor's trajectory, and the truth when it is loaded."),
     ("grid", "grid", "1 m cells on the ground below the sensor."),
 )
 
 
 class AppearancePanel:
-    """Widgets whose values are the `View`; nothing here reaches the engine."""
+    """Widgets whose values are the `View`; the engine does not know of them."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         default = View()
         self._colour_by = gui.add_dropdown(
-            "colour by", tuple(ColourBy), initial_value=default.colour_by, hint="What colours mean. C goes to the next."
+            "colour by", COLOUR_BY, initial_value=default.colour_by, hint="What colours mean. C: the next."
         )
         self._legend = gui.add_html(legend(default.colour_by, None))
         self._follow = gui.add_checkbox(
@@ -43,30 +43,27 @@ class AppearancePanel:
         gui.add_command("Follow the sensor or look freely", hotkey="F").on_trigger(
             lambda _: show(self._follow, not self._follow.value)
         )
-        gui.add_command("Next colouring", hotkey="C").on_trigger(lambda _: self._next_colouring())
+        gui.add_command("Next colour mode", hotkey="C").on_trigger(lambda _: self._next_colouring())
 
     @property
     def view(self) -> View:
         """As the widgets say now."""
         return View(
-            colour_by=ColourBy(self._colour_by.value),
+            colour_by=self._colour_by.value,
             point_size=self._point_size.value / 100,
             follow=self._follow.value,
             **{name: layer.value for name, layer in self._layers.items()},
         )
 
     def look_freely(self) -> None:
-        """Follow no more, so that a camera stays where it is put."""
+        """Stop following, so that a camera stays where it is put."""
         show(self._follow, False)
 
     def draw(self, view: View, limits: Limits | None, points: int, budget: int) -> None:
         """Explain the colours as drawn and say how many points the page holds."""
         self._legend.content = legend(view.colour_by, limits)
-        self._count.content = box(
-            f'<span class="hs-note">{points:,} map points in the page, at most {budget:,}, and fewer '
-            "the longer the walk; the whole map stays with the engine.</span>"
-        )
+        words = f"{points:,} map points in the page, at most {budget:,}, and fewer the longer the trajectory."
+        self._count.content = panel("note", f"{words} The engine keeps the whole map.")
 
     def _next_colouring(self) -> None:
-        order = list(ColourBy)
-        show(self._colour_by, order[(order.index(ColourBy(self._colour_by.value)) + 1) % len(order)])
+        show(self._colour_by, COLOUR_BY[(COLOUR_BY.index(self._colour_by.value) + 1) % len(COLOUR_BY)])

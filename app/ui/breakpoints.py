@@ -1,20 +1,17 @@
 """Where playing is to pause: a switch for each condition, and a limit where there is one."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-import viser
-
 from app.server.breakpoints import Breakpoints
-from app.server.protocol import Command, SetBreakpoints, Snapshot
-from app.ui.widgets import as_set, show
+from app.server.protocol import SetBreakpoints, Snapshot
+from app.ui.widgets import Page, as_set, show
 
 _SWITCHES: Final = (
     ("loop_found", "loop found", "A loop was accepted."),
-    ("loop_rejected", "loop rejected", "A loop was looked at and turned down."),
+    ("loop_rejected", "loop rejected", "A loop candidate was rejected."),
     ("no_ground", "no ground", "The seeds gave no plane; the notice says why."),
-    ("degenerate", "degenerate", "One direction is not held by the scan."),
+    ("degenerate", "degenerate", "The scan does not constrain one direction."),
     ("dropped", "scan dropped", "A scan was left out."),
 )
 
@@ -35,16 +32,17 @@ class _Limit:
 _LIMITS: Final = (
     _Limit("planarity", "λ3/λ2 over", "", 1.0, 0.3, 0.01, "The seeds are less flat than this."),
     _Limit("residual", "residual over", "mm", 1000.0, 50.0, 1.0, "RMS distance of the points to the map's planes."),
-    _Limit("frame_ms", "frame over", "ms", 1.0, 100.0, 1.0, "Time that the engine took for the frame."),
+    _Limit("frame_ms", "frame over", "ms", 1.0, 100.0, 1.0, "Time the engine took for the frame."),
     _Limit("error", "error over", "cm", 100.0, 50.0, 1.0, "Distance to the truth, where there is one."),
 )
 
 
 class BreakpointPanel:
-    """The controls in the caller's container; `tick` shows what is in force."""
+    """The controls in the caller's container; `tick` shows what is set."""
 
-    def __init__(self, gui: viser.GuiApi, send: Callable[[Command], None]) -> None:
-        self._send = send
+    def __init__(self, page: Page) -> None:
+        gui = page.gui
+        self._send = page.send
         self._shown = Breakpoints()
         self._switches = {name: gui.add_checkbox(text, False, hint=hint) for name, text, hint in _SWITCHES}
         self._limits = {}
@@ -59,7 +57,7 @@ class BreakpointPanel:
     def tick(self, snapshot: Snapshot) -> None:
         """Called by the drawing thread, often."""
         now = snapshot.breakpoints
-        if now == self._shown:  # what somebody has just set is not set back while the engine is still to hear of it
+        if now == self._shown:  # a control just set stays until the engine has heard of it
             return
         self._shown = now
         for name, switch in self._switches.items():

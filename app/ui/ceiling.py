@@ -16,9 +16,9 @@ _MARGIN_M: Final = 0.25
 
 
 def below_ceiling(points: F32, labels: U8, up: F64) -> npt.NDArray[np.bool_] | None:
-    """Which points stay when the ceiling is taken off; None where nothing flat is overhead.
+    """Which points stay when the ceiling is hidden; None where nothing flat is overhead.
 
-    Points labelled ground always stay: a ceiling taken for ground is something to be seen.
+    Points labelled ground always stay: a ceiling mistaken for ground must be visible.
 
     Args:
         points: (n, 3) m, LiDAR frame. labels: (n,). up: (3,) unit, LiDAR frame.

@@ -1,16 +1,14 @@
-"""Colours of points: by label, or by a number through a perceptually uniform map.
+"""Colours of points: by label, or by a number through a perceptually uniform map. `MODES` declares every mode."""
 
-Pure functions on arrays; the scene decides what to colour, the legend explains it.
-"""
-
+from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from app.slam.types import GROUND, NON_GROUND, SEED, U8
+from app.slam.types import F32, F64, GROUND, NON_GROUND, SEED, U8, U16
+from app.ui.html import panel
 
 Rgb = tuple[int, int, int]
 
@@ -19,44 +17,17 @@ LABEL_COLOURS: Final[dict[int, Rgb]] = {
     GROUND: (52, 199, 170),
     SEED: (255, 205, 80),
 }
-"""Blue-grey, teal and amber: told apart by every kind of colour vision, and by lightness too."""
+"""Blue-grey, teal and amber: every kind of colour vision tells them apart, and so does lightness alone."""
 
 LABEL_NAMES: Final[dict[int, str]] = {GROUND: "ground", NON_GROUND: "not ground", SEED: "seed"}
 
-
-class ColourBy(StrEnum):
-    LABEL = "label"
-    HEIGHT = "height"
-    INTENSITY = "intensity"
-    RING = "ring"
-    TIME = "time"
-
-
 _ANCHORS: Final[dict[str, str]] = {
     # Evenly spaced colours of matplotlib's maps (CC0, van der Walt and Smith), which are uniform in CAM02-UCS.
-    # Their dark ends are left out: they would vanish on the page's dark ground.
+    # Their dark ends are left out: they would vanish on the dark page.
     "viridis": "3b518b 2c718e 21908d 27ad81 5cc863 aadc32 fde725",
     "plasma": "7e03a8 a92395 cc4778 e56b5d f89540 fdc527 f0f921",
     "magma": "812581 b5367a e55964 fb8761 fec287 fcfdbf",
 }
-
-MAP_OF: Final[dict[ColourBy, str]] = {
-    ColourBy.HEIGHT: "viridis",
-    ColourBy.INTENSITY: "magma",
-    ColourBy.RING: "viridis",
-    ColourBy.TIME: "plasma",
-}
-
-UNIT_OF: Final[dict[ColourBy, str]] = {
-    ColourBy.LABEL: "",
-    ColourBy.HEIGHT: "m",
-    ColourBy.INTENSITY: "sensor's scale",
-    ColourBy.RING: "0 = outermost line",
-    ColourBy.TIME: "s",
-}
-
-_ROUNDING: Final[dict[ColourBy, float]] = {ColourBy.HEIGHT: 1.0, ColourBy.INTENSITY: 16.0}
-"""Limits that are read from the data grow in steps, so that the map is rarely coloured anew."""
 
 
 def _table(anchors: str) -> U8:
@@ -80,6 +51,79 @@ class Limits:
     high: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PointSet:
+    """What a colour mode may colour points by.
+
+    Attributes:
+        points: (n, 3) m, LiDAR frame. labels, intensity, ring: (n,). T_map_lidar: (4, 4).
+        seconds: of the scan, since the recording's start.
+    """
+
+    points: F32
+    labels: U8
+    intensity: F32
+    ring: U16
+    T_map_lidar: F64
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class ColourMode:
+    """One way to colour points.
+
+    Attributes:
+        legend: the unit, or what the numbers mean. table: of `TABLES`.
+        values: (n,) the number of each point. step: limits that are read from the data grow by it, so that the map is
+            rarely coloured again. share: percent of the values that the limits leave out at each end.
+        fixed: limits known beforehand, from the recording's duration in s; None: read from the data.
+    """
+
+    name: str
+    legend: str
+    table: str
+    values: Callable[[PointSet], npt.NDArray[np.floating]]
+    step: float = 1.0
+    share: float = 0.0
+    fixed: Callable[[float], Limits] | None = None
+
+
+def _height(cloud: PointSet) -> F64:
+    return np.asarray(cloud.points @ cloud.T_map_lidar[2, :3] + cloud.T_map_lidar[2, 3], dtype=np.float64)
+
+
+LABEL: Final = "label"
+"""The mode without numbers: each label has its colour."""
+HEIGHT: Final = "height"
+"""The mode whose colours change when a pose does."""
+
+MODES: Final[dict[str, ColourMode]] = {
+    mode.name: mode
+    for mode in (
+        ColourMode(HEIGHT, "m", "viridis", _height, share=1.0),
+        ColourMode("intensity", "sensor's scale", "magma", lambda cloud: cloud.intensity, step=16.0, share=1.0),
+        ColourMode("ring", "0 = outermost line", "viridis", lambda cloud: cloud.ring.astype(np.float32)),
+        ColourMode(
+            "time",
+            "s",
+            "plasma",
+            lambda cloud: np.full(len(cloud.points), cloud.seconds),
+            fixed=lambda duration: Limits(0.0, max(duration, 1.0)),
+        ),
+    )
+}
+"""Every other mode, in the order shown."""
+
+COLOUR_BY: Final = (LABEL, *MODES)
+
+
+def colours(cloud: PointSet, by: str, limits: Limits | None) -> U8:
+    """(n, 3) colours of points. limits: ends of the colour map; not used for labels."""
+    if by == LABEL or limits is None:
+        return label_colours(cloud.labels)
+    return value_colours(MODES[by].values(cloud), limits, TABLES[MODES[by].table])
+
+
 def label_colours(labels: U8) -> U8:
     """(n,) labels -> (n, 3) colours. Labels unknown to this version are drawn as not ground."""
     known = np.where(labels < len(_LABEL_TABLE), labels, NON_GROUND)
@@ -89,23 +133,30 @@ def label_colours(labels: U8) -> U8:
 def value_colours(values: npt.ArrayLike, limits: Limits, table: U8) -> U8:
     """(n,) numbers -> (n, 3) colours; values beyond the limits take the colour of the nearer end."""
     scaled = (np.asarray(values, dtype=np.float32) - limits.low) * (255.0 / (limits.high - limits.low))
-    colours: U8 = table[np.nan_to_num(np.clip(scaled, 0.0, 255.0), nan=0.0).astype(np.uint8)]
-    return colours
+    found: U8 = table[np.nan_to_num(np.clip(scaled, 0.0, 255.0), nan=0.0).astype(np.uint8)]
+    return found
 
 
-def grown(limits: Limits | None, by: ColourBy, values: npt.ArrayLike) -> Limits | None:
-    """`limits` widened to hold nearly all of `values` (percentiles 1 to 99), rounded outwards.
+def grown(limits: Limits | None, mode: ColourMode, values: npt.ArrayLike) -> Limits | None:
+    """`limits` widened to hold nearly all of `values`, rounded outwards.
 
-    Limits never shrink: colours that a user has learnt to read stay, and what is drawn is seldom
-    coloured anew.
+    Limits never shrink: a colour that a user has learnt to read keeps its meaning.
     """
     finite = np.asarray(values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]
     if finite.size == 0:
         return limits
-    step = _ROUNDING.get(by, 1.0)
-    low, high = np.percentile(finite, (1.0, 99.0)) if by in _ROUNDING else (finite.min(), finite.max())
-    low, high = float(np.floor(low / step) * step), float(np.ceil(high / step) * step)
+    low, high = np.percentile(finite, (mode.share, 100.0 - mode.share))
+    low, high = float(np.floor(low / mode.step) * mode.step), float(np.ceil(high / mode.step) * mode.step)
     if limits is not None:
         low, high = min(low, limits.low), max(high, limits.high)
-    return Limits(low, max(high, low + step))
+    return Limits(low, max(high, low + mode.step))
+
+
+def legend(by: str, limits: Limits | None) -> str:
+    """What the colours mean, with units."""
+    if by == LABEL:
+        return panel("keys", [(LABEL_COLOURS[label], name) for label, name in LABEL_NAMES.items()])
+    mode = MODES[by]
+    low, high = ("", "") if limits is None else (f"{limits.low:g}", f"{limits.high:g}")
+    return panel("colour_bar", TABLES[mode.table][::32], low, f"{mode.name} · {mode.legend}", high)

@@ -1,9 +1,8 @@
 """Two settings side by side: fork the session, see what differs, then swap, keep or discard.
 
-`Sides` decides which of the two the parameters act on; `ComparePanel` shows both.
+`Sides` decides which of the two the parameters belong to; `ComparePanel` shows both.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -17,25 +16,25 @@ from app.server.follower import same_recording
 from app.server.fork import Workspace
 from app.server.protocol import Command, Snapshot
 from app.slam.errors import HemislamError
-from app.slam.types import U8, StepResult
-from app.ui.compare_maths import A_COLOUR, B_COLOUR, Difference, Ground, difference, ground_difference, thinned
-from app.ui.compare_scene import CompareScene
-from app.ui.compare_words import legend, numbers, status
-from app.ui.html import box, css, heading
-from app.ui.readouts import plot
+from app.slam.types import F64, U8, StepResult
+from app.ui import compare_maths as maths
+from app.ui.geometry import wxyz
+from app.ui.html import css, heading, panel
+from app.ui.paths import Trajectory
+from app.ui.sensor import SCAN_POINT_SCALE, shown_of
 from app.ui.view import View
-from app.ui.widgets import by_user, same, show, unchanged
+from app.ui.widgets import ROOT, Page, by_user, chart, show, unchanged
 
 _SCENE_PERIOD_S: Final = 1 / 15
 _PANEL_PERIOD_S: Final = 1 / 4
 _RECENT: Final = 16
-"""Frames of A that are kept for B to come to."""
+"""Frames of A that are kept until B reaches them."""
 _SWAP, _KEEP, _DISCARD = "swap", "keep", "discard"
 _NO_POINTS: Final[U8] = np.empty(0, dtype=np.uint8)
 
 
 class Sides:
-    """The choice, in the caller's container, whose parameters are seen and set; unseen while there is no fork."""
+    """The choice of whose parameters are shown and set; hidden while there is no fork."""
 
     def __init__(self, gui: viser.GuiApi, forks: Workspace) -> None:
         self._forks = forks
@@ -53,11 +52,11 @@ class Sides:
         show(self._choice, side)
 
     def tick(self, b: Snapshot | None) -> None:
-        if self._choice.visible != (b is not None):
-            self._choice.visible = b is not None
+        """Show the choice while there is a fork."""
+        self._choice.visible = b is not None
 
     def tuned(self, a: Snapshot) -> Snapshot:
-        """The snapshot whose parameters are to be seen."""
+        """The snapshot whose parameters are shown."""
         other = self._forks.other
         return other if other is not None and self.on_b else a
 
@@ -72,26 +71,62 @@ class Sides:
         self.choose("A" if self._choice.value == "B" or self._forks.other is None else "B")
 
 
+class CompareScene:
+    """B's trajectory and sensor, and A's scan coloured by who calls its points ground; below the map's node."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._path = Trajectory(scene, f"{ROOT}/compare_path", maths.B_COLOUR)
+        self._marker = scene.add_icosphere(
+            f"{ROOT}/compare_sensor",
+            radius=0.07,
+            color=maths.B_COLOUR,
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=False,
+        )
+        self._lidar = scene.add_frame(f"{ROOT}/compare_lidar", show_axes=False, visible=False)
+        self._cloud = scene.add_point_cloud(
+            f"{ROOT}/compare_lidar/scan",
+            np.zeros((1, 3), np.float32),
+            np.zeros((1, 3), np.uint8),
+            point_size=0.04,
+            point_shape="circle",
+            point_shading="flat",
+        )
+
+    def draw_b(self, positions: F64, at: F64 | None, visible: bool) -> None:
+        """B's trajectory since the fork, (n, 3), and where its sensor is, (3,); None hides it."""
+        self._path.draw(positions, visible)
+        self._marker.visible = visible and at is not None
+        if at is not None:
+            self._marker.position = at
+
+    def draw_ground(self, result: StepResult | None, ground: U8, size: float) -> None:
+        """A's frame, its points coloured by (n,) `Labelled`; None hides it."""
+        self._lidar.visible = result is not None
+        if result is None:
+            return
+        T = result.T_map_imu @ result.state.T_imu_lidar
+        self._lidar.wxyz, self._lidar.position = wxyz(T[:3, :3]), T[:3, 3]
+        shown = shown_of(len(result.cloud))
+        self._cloud.points = result.cloud.points[shown].astype(np.float16)
+        self._cloud.colors = maths.GROUND_COLOURS[ground[shown]]
+        self._cloud.point_size = size * SCAN_POINT_SCALE
+
+
 class ComparePanel:
     """Everything about the fork in the caller's container, and what differs in space.
 
     Args:
-        root: the map's scene node. sides: told which side a new fork's parameters are on. now: monotonic seconds.
+        sides: told which side a new fork's parameters are on.
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        root: str,
-        forks: Workspace,
-        sides: Sides,
-        now: Callable[[], float] = time.monotonic,
-    ) -> None:
-        gui = server.gui
+    def __init__(self, page: Page, forks: Workspace, sides: Sides) -> None:
+        gui = page.gui
         self._forks = forks
         self._sides = sides
-        self._now = now
-        self._scene = CompareScene(server.scene, root)
+        self._now: Callable[[], float] = page.now
+        self._scene = CompareScene(page.scene)
         self._recent: dict[tuple[int, int], StepResult] = {}
         self._pair: tuple[StepResult, StepResult] | None = None
         self._covering = False
@@ -100,10 +135,12 @@ class ComparePanel:
         self._in_panel: tuple[Any, ...] = ()
         self._scene_at = self._panel_at = -1e9
 
-        self._status = gui.add_html(status(None, None, ("", ""), -1))
-        self._name = gui.add_text("name", "", hint="Of the fork, and of its file when it is kept.")
+        self._status = gui.add_html(maths.status(None, None, ("", ""), -1))
+        self._name = gui.add_text("name", "", hint="Of the fork, and of its file when you keep it.")
         self._fork = gui.add_button(
-            "Fork here", icon=viser.Icon.GIT_BRANCH, hint="Go on from this frame with other parameters, side by side."
+            "Fork here",
+            icon=viser.Icon.GIT_BRANCH,
+            hint="Continue from this frame with other parameters, side by side.",
         )
         self._open = gui.add_button(
             "Open as B…", icon=viser.Icon.FOLDER_OPEN, color="gray", hint="A kept fork or an older session, beside A."
@@ -112,12 +149,13 @@ class ComparePanel:
             "fork", (_SWAP, _KEEP, _DISCARD), visible=False, hint="X swaps. Keep: as a file that can be opened again."
         )
         self._by_ground = gui.add_checkbox(
-            "ground: A against B", True, visible=False, hint="Colours the scan by who calls its points ground."
+            "ground: A against B", True, visible=False, hint="Colour the scan by who calls its points ground."
         )
-        self._legend = gui.add_html(legend(), visible=False)
+        self._legend = gui.add_html(maths.legend(), visible=False)
         self._numbers = gui.add_html("", visible=False)
-        a, b, both = (css(A_COLOUR), 1.5, ""), (css(B_COLOUR), 1.5, ""), ("#b8c0cc", 1.5, "")
-        nothing = (np.zeros(1), np.zeros(1))
+        a, b, both = (
+            {"stroke": colour, "width": 1.5} for colour in (css(maths.A_COLOUR), css(maths.B_COLOUR), "#b8c0cc")
+        )
         self._plots: list[tuple[viser.GuiHtmlHandle, viser.GuiUplotHandle]] = []
         for title, lines in (
             ("A to B, cm", [both]),
@@ -126,20 +164,20 @@ class ComparePanel:
             ("Position error to truth, cm", [a, b]),
         ):
             named = gui.add_html(heading(title), visible=False)
-            chart = plot(gui, (*nothing, *nothing[1:] * (len(lines) - 1)), lines)
-            chart.visible = False
-            self._plots.append((named, chart))
+            plot = chart(gui, (np.zeros(1),) * (1 + len(lines)), lines)
+            plot.visible = False
+            self._plots.append((named, plot))
         self._fork.on_click(by_user(lambda _, client: self._act("", client)))
         self._open.on_click(by_user(lambda _, client: self._choose(client)))
         self._what.on_click(by_user(self._act))
         gui.add_command("Swap A and its fork B", hotkey="X").on_trigger(lambda _: self._swap_if_any())
 
     def seen(self, view: View) -> View:
-        """The view less the scan, while it is drawn here in other colours."""
+        """The view without the scan, while it is drawn here in other colours."""
         return replace(view, scan=False) if self._covering else view
 
     def tick(self, a: Snapshot, view: View) -> None:
-        """Called by the drawing thread, often, with the view that all others leave."""
+        """Called by the drawing thread, often, with the view that all other panels leave."""
         now, b = self._now(), self._forks.other
         self._show_controls(b)
         if b is None:
@@ -148,61 +186,58 @@ class ComparePanel:
             self._recent[(a.session, a.result.index)] = a.result
             while len(self._recent) > _RECENT:
                 del self._recent[next(iter(self._recent))]
-        look = (view.point_size, view.scan, view.path, self._by_ground.value)
-        if not same(self._in_scene, (a, b, look), 2) and (now - self._scene_at >= _SCENE_PERIOD_S or b is None):
-            self._in_scene, self._scene_at = (a, b, look), now
+        look = (a, b, view.point_size, view.scan, view.path, self._by_ground.value)
+        if not unchanged(self._in_scene, look) and (now - self._scene_at >= _SCENE_PERIOD_S or b is None):
+            self._in_scene, self._scene_at = look, now
             self._draw_scene(a, b, view)
         told = (a, b, self._scene_at)  # the scene finds the frame that both have, maybe after the panel was drawn
-        if not same(self._in_panel, told, 2) and (now - self._panel_at >= _PANEL_PERIOD_S or b is None):
+        if not unchanged(self._in_panel, told) and (now - self._panel_at >= _PANEL_PERIOD_S or b is None):
             self._in_panel, self._panel_at = told, now
             self._draw_panel(a, b)
 
     # --- what is drawn ---------------------------------------------------------------------------
     def _draw_scene(self, a: Snapshot, b: Snapshot | None, view: View) -> None:
-        comparable = b is not None and same_recording(a, b)
-        positions = b.trajectory if b is not None and comparable else None
-        at = positions[-1] if positions is not None and len(positions) else None
-        part = positions[max(self._forks.forked_at, 0) :] if positions is not None else None
-        self._scene.draw_b(part, at, view.path)
-        pair = self._matching(a, b) if b is not None and comparable else None
+        if b is None or not same_recording(a, b):
+            b = None
+        positions: F64 = b.trajectory if b is not None and b.trajectory is not None else np.empty((0, 3))
+        at = positions[-1] if len(positions) else None
+        self._scene.draw_b(positions[max(self._forks.forked_at, 0) :], at, view.path)
+        pair = self._matching(a, b) if b is not None else None
         if pair is not None and not unchanged(self._pair or (), pair):
-            self._ground = ground_difference(pair[0].cloud, pair[1].cloud)
+            self._ground = maths.ground_difference(pair[0].cloud, pair[1].cloud)
         self._pair = pair
         self._covering = pair is not None and view.scan and bool(self._by_ground.value) and len(pair[0].cloud) > 0
         self._scene.draw_ground(pair[0] if pair and self._covering else None, self._ground, view.point_size)
 
     def _matching(self, a: Snapshot, b: Snapshot) -> tuple[StepResult, StepResult] | None:
-        """The newest frame that both have: A's own, or while it plays one of a moment ago."""
+        """The newest frame that both have: A's present one, or one of a moment ago while it plays."""
         if b.result is None:
             return None
         ours = self._recent.get((a.session, b.result.index))
         return (ours, b.result) if ours is not None and ours.stamp_ns == b.result.stamp_ns else None
 
     def _draw_panel(self, a: Snapshot, b: Snapshot | None) -> None:
-        self._status.content = status(a, b, self._forks.names, self._forks.forked_at)
+        self._status.content = maths.status(a, b, self._forks.names, self._forks.forked_at)
         if b is None or not same_recording(a, b):
             self._numbers.content = ""
             self._show_plots([None] * 4)
             return
-        found = difference(a, b, self._forks.forked_at)
-        counts = np.bincount(self._ground, minlength=len(Ground)) if self._pair is not None else None
-        self._numbers.content = numbers(found, counts)
+        found = maths.difference(a, b, self._forks.forked_at)
+        counts = np.bincount(self._ground, minlength=len(maths.Labelled)) if self._pair is not None else None
+        self._numbers.content = maths.numbers(found, counts)
         self._show_plots(_curves(found))
 
     def _show_plots(self, curves: "list[tuple[Any, ...] | None]") -> None:
-        for (title, chart), curve in zip(self._plots, curves, strict=True):
-            if chart.visible != (curve is not None):
-                title.visible = chart.visible = curve is not None
+        for (title, plot), curve in zip(self._plots, curves, strict=True):
+            title.visible = plot.visible = curve is not None
             if curve is not None:
-                chart.data = curve
+                plot.data = curve
 
     def _show_controls(self, b: Snapshot | None) -> None:
         self._sides.tick(b)
-        forked = b is not None
-        if self._what.visible != forked:
-            self._fork.visible = self._open.visible = not forked
-            for control in (self._what, self._by_ground, self._legend, self._numbers):
-                control.visible = forked
+        self._fork.visible = self._open.visible = b is None
+        for control in (self._what, self._by_ground, self._legend, self._numbers):
+            control.visible = b is not None
 
     # --- what is asked for -----------------------------------------------------------------------
     def _act(self, what: Any, client: viser.ClientHandle) -> None:
@@ -224,11 +259,11 @@ class ComparePanel:
             client.add_notification("Error", str(error), color="red", auto_close_seconds=None)
 
     def _choose(self, client: viser.ClientHandle) -> None:
-        """A dialog with the sessions that B can be opened on."""
+        """A dialog with the sessions that can be opened as B."""
         kept = self._forks.kept()
         with client.gui.add_modal("Open a session as B") as modal:
             if not kept:
-                client.gui.add_html(box("There is no other session of this recording yet; fork, and keep it."))
+                client.gui.add_html(panel("text", "This recording has no other session yet; fork, then keep the fork."))
             buttons = [(path, client.gui.add_button(path.stem, color="gray")) for path in kept]
             cancel = client.gui.add_button("Cancel", color="gray")
         cancel.on_click(lambda _: modal.close())
@@ -248,12 +283,12 @@ class ComparePanel:
                 return  # B has no frame yet: its status says so
 
 
-def _curves(found: Difference) -> "list[tuple[Any, ...] | None]":
+def _curves(found: maths.Difference) -> "list[tuple[Any, ...] | None]":
     """Of the plots in their order; None for one that has nothing to show."""
     (ms_a, ms_b), (error_a, error_b) = found.total_ms, found.error_m
-    if len(found):  # the first frames' peaks would leave nothing of all others
+    if len(found):  # the first frames' peaks would flatten all others
         most = 4 * np.nanmedian(np.concatenate(found.total_ms))
         ms_a, ms_b = np.minimum(ms_a, most), np.minimum(ms_b, most)
     columns = [(100 * found.position_m,), (found.turn_deg,), (ms_a, ms_b), (100 * error_a, 100 * error_b)]
-    curves = [thinned(found.stamps_s, *column) for column in columns]
+    curves = [maths.thinned(found.stamps_s, *column) for column in columns]
     return [curve if len(curve[0]) > 1 else None for curve in curves]

@@ -1,4 +1,4 @@
-"""What differs between two runs of one recording: pure functions on snapshots and clouds."""
+"""What differs between two runs of one recording, in numbers and in words: pure functions on snapshots and clouds."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -6,22 +6,24 @@ from typing import Final
 
 import numpy as np
 
+from app.server.follower import same_recording
 from app.server.protocol import Snapshot
 from app.slam import lie
 from app.slam.types import F64, I64, NON_GROUND, U8, Cloud
 from app.ui.colours import LABEL_COLOURS, Rgb
+from app.ui.html import BAD, WARN, Tile, number, panel
 from app.ui.paths import PATH_COLOUR
 
 A_COLOUR: Final[Rgb] = PATH_COLOUR
 B_COLOUR: Final[Rgb] = (77, 163, 255)
-"""Pink and blue: told apart by every kind of colour vision, and from the labels' teal and amber."""
+"""Pink and blue: every kind of colour vision tells them apart, and from the labels' teal and amber."""
 
 COLUMNS: Final = 600
-"""Most values of a plot; of frames that share one, the largest is shown."""
+"""Most values of a plot; where frames share one, the largest is shown."""
 
 
-class Ground(IntEnum):
-    """What two runs say of a point. ALONE: it is in one of the two clouds only."""
+class Labelled(IntEnum):
+    """Who calls a point ground. ALONE: the point is in one of the two clouds only."""
 
     NEITHER = 0
     BOTH = 1
@@ -33,7 +35,7 @@ class Ground(IntEnum):
 GROUND_COLOURS: Final[U8] = np.array(
     [LABEL_COLOURS[NON_GROUND], LABEL_COLOURS[1], A_COLOUR, B_COLOUR, (74, 82, 96)], dtype=np.uint8
 )
-"""By `Ground`."""
+"""By `Labelled`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +44,8 @@ class Difference:
 
     Attributes:
         stamps_s: since the start of the recording. position_m: between the positions in the map; both
-            begin at the same pose, so nothing is aligned. turn_deg: between the orientations in odom.
-        total_ms, error_m: of A and of B; the latter nan without truth.
+            start at the same pose, so nothing is aligned. turn_deg: between the orientations in odom.
+        total_ms, error_m: of A and of B; the error is nan without truth.
     """
 
     stamps_s: F64
@@ -57,7 +59,7 @@ class Difference:
 
 
 def common_frames(a: F64, b: F64) -> tuple[I64, I64]:
-    """Where two ascending series of stamps hold the same ones: indices into each."""
+    """Indices into two ascending series of stamps at which they hold the same ones."""
     n = min(len(a), len(b))
     if np.array_equal(a[:n], b[:n]):
         return np.arange(n), np.arange(n)
@@ -95,8 +97,8 @@ def turn(a: F64, b: F64) -> F64:
 
 
 def ground_difference(a: Cloud, b: Cloud) -> U8:
-    """(n,) `Ground` of the points of `a`, found in `b` by the moment and line at which they were measured."""
-    found = np.full(len(a), Ground.ALONE, dtype=np.uint8)
+    """(n,) `Labelled` of the points of `a`, found in `b` by the moment and line at which they were measured."""
+    found = np.full(len(a), Labelled.ALONE, dtype=np.uint8)
     if len(a) == len(b) and np.array_equal(a.offsets_ns, b.offsets_ns) and np.array_equal(a.ring, b.ring):
         in_a = in_b = np.arange(len(a))
     else:
@@ -104,8 +106,8 @@ def ground_difference(a: Cloud, b: Cloud) -> U8:
     ground_a, ground_b = a.labels[in_a] != NON_GROUND, b.labels[in_b] != NON_GROUND
     found[in_a] = np.where(
         ground_a,
-        np.where(ground_b, Ground.BOTH, Ground.ONLY_A),
-        np.where(ground_b, Ground.ONLY_B, Ground.NEITHER),
+        np.where(ground_b, Labelled.BOTH, Labelled.ONLY_A),
+        np.where(ground_b, Labelled.ONLY_B, Labelled.NEITHER),
     )
     return found
 
@@ -122,3 +124,69 @@ def thinned(stamps: F64, *columns: F64) -> tuple[F64, ...]:
         return tuple(np.zeros(1) for _ in range(1 + len(columns)))
     starts = np.unique(np.arange(COLUMNS) * len(stamps) // COLUMNS)
     return (stamps[starts], *(np.maximum.reduceat(column, starts) for column in columns))
+
+
+# --- words ---------------------------------------------------------------------------------------
+def status(a: Snapshot | None, b: Snapshot | None, names: tuple[str, str], forked_at: int) -> str:
+    """Who A and B are, and how B is doing; without a fork, what one is for."""
+    if a is None or b is None:
+        return panel("no_fork")
+    return panel("fork", names, forked_at, (A_COLOUR, B_COLOUR), *how(a, b))
+
+
+def how(a: Snapshot, b: Snapshot) -> tuple[str, str]:
+    """How B is doing, in a sentence, and its colour."""
+    if not b.engine_alive:
+        return "B's engine has stopped; A is not affected. Keep what B has, or discard it.", BAD
+    if b.progress is not None:
+        share = b.progress.fraction
+        return b.progress.title + (f" · {100 * share:.0f} %" if np.isfinite(share) else " …"), WARN
+    if b.recording is None:
+        return "B is starting …", WARN
+    if not same_recording(a, b):
+        return "A has opened another recording; B stays where it is.", WARN
+    behind = a.transport.frame - b.transport.frame
+    trouble = next((notice.text for notice in reversed(b.notices) if notice.level == "error"), "")
+    if abs(behind) > 1:
+        return f"B is {abs(behind):,} frames {'behind' if behind > 0 else 'ahead'}. {trouble}".strip(), WARN
+    return (f"B: {trouble}", BAD) if trouble else ("", "")
+
+
+def legend() -> str:
+    """Of the scan's colours."""
+    names = ("ground only in A", "only in B", "both", "neither")
+    return panel("keys", list(zip((A_COLOUR, B_COLOUR, LABEL_COLOURS[1], LABEL_COLOURS[0]), names, strict=True)), True)
+
+
+def numbers(found: Difference, counts: I64 | None) -> str:
+    """The newest common frame: how far apart, whose ground, how long and how wrong.
+
+    Args:
+        counts: points by `Labelled`; None while there is no frame that both have.
+    """
+    if not len(found):
+        return ""
+    turned = found.turn_deg[np.isfinite(found.turn_deg)]
+    farthest = f"at most {number(100 * float(found.position_m.max()), 1)} cm"
+    most = f"at most {number(float(turned.max()) if len(turned) else np.nan)}°"
+    apart = [
+        Tile("A to B", number(100 * float(found.position_m[-1]), 1), "cm", farthest, width="half"),
+        Tile("turned", number(float(found.turn_deg[-1])), "°", most, width="half"),
+    ]
+    ground = []
+    if counts is not None:
+        alone = counts[Labelled.ALONE]
+        ground = [
+            Tile("only in A", f"{counts[Labelled.ONLY_A]:,}"),
+            Tile("only in B", f"{counts[Labelled.ONLY_B]:,}"),
+            Tile("in both", f"{counts[Labelled.BOTH]:,}", "", f"{alone:,} points of A are not in B" if alone else ""),
+        ]
+    means = []
+    (ms_a, ms_b), (error_a, error_b) = found.total_ms, found.error_m
+    if (known := np.isfinite(ms_a) & np.isfinite(ms_b)).any():
+        a, b = (number(float(ms[known].mean()), 1) for ms in (ms_a, ms_b))
+        means.append(Tile("frame, mean of A → B", f"{a} → {b}", "ms", width="wide"))
+    if (known := np.isfinite(error_a) & np.isfinite(error_b)).any():
+        a, b = (number(100 * float(np.sqrt(np.mean(error[known] ** 2))), 1) for error in (error_a, error_b))
+        means.append(Tile("error to truth, RMS of A → B", f"{a} → {b}", "cm", width="wide"))
+    return panel("comparison", apart, ground, means)

@@ -1,4 +1,4 @@
-"""Opening a recording and saving results. The page sees the folders that the command line allowed, no others."""
+"""Opening a recording and saving results. The page sees only the folders that the command line allowed."""
 
 from collections.abc import Callable
 from datetime import datetime
@@ -10,12 +10,12 @@ import viser
 
 from app.server.folders import RECORDINGS, TRAJECTORIES, Entry, Folders
 from app.server.journal import SUFFIX
-from app.server.protocol import Command, CompareWith, OpenRecording, Save, Snapshot
+from app.server.protocol import CompareWith, OpenRecording, Save, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.results import EXPORTS
 from app.slam.trajectory import truth_beside
-from app.ui.html import box, code
-from app.ui.widgets import by_user
+from app.ui.html import panel
+from app.ui.widgets import Page, by_user
 
 _MOST_ENTRIES: Final = 60
 
@@ -43,26 +43,19 @@ class FilesPanel:
         results: folder below which results are saved.
     """
 
-    def __init__(
-        self,
-        gui: viser.GuiApi,
-        folders: Folders,
-        results: Path,
-        send: Callable[[Command], None],
-        snapshot: Callable[[], Snapshot],
-    ) -> None:
+    def __init__(self, page: Page, folders: Folders, results: Path) -> None:
+        gui = page.gui
+        self._page = page
         self._folders = folders
         self._results = results
-        self._send = send
-        self._snapshot = snapshot
         self._open = gui.add_button("Open a recording…", icon=viser.Icon.FOLDER_OPEN, color="gray")
         self._compare = gui.add_button(
             "Compare with a trajectory…",
             icon=viser.Icon.ROUTE,
             color="gray",
             disabled=True,
-            hint="Draw the truth, or what another run or program made of this recording, beside the walk, and plot the "
-            "distance to it.",
+            hint="Draw the truth, or what another run or program made of this recording, beside the trajectory, and "
+            "plot the distance to it.",
         )
         self._save = gui.add_button("Save results…", icon=viser.Icon.DEVICE_FLOPPY, color="gray", disabled=True)
         self._saved = gui.add_html("", visible=False)
@@ -71,23 +64,23 @@ class FilesPanel:
         self._save.on_click(by_user(lambda _, client: self._ask_where(client)))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Offer what there is something for; say where the newest results are."""
+        """Enable what is possible now; say where the newest results are."""
         self._save.disabled = snapshot.result is None
         self._compare.disabled = snapshot.recording is None or snapshot.live is not None
         done = [saved.folder for saved in snapshot.saved if not saved.error]
         self._saved.visible = bool(done)
         if done:
-            self._saved.content = box('<span class="hs-quiet">Saved in ', code(str(done[-1])), "</span>")
+            self._saved.content = panel("path", "Saved in ", str(done[-1]))
 
     def _browse(self, _: Any, client: viser.ClientHandle) -> None:
         browser = FileBrowser(client, self._folders, "Open a recording")
         with_truth = browser.checkbox(
-            "with truth", "Load the trajectory (.tum) that lies beside the recording, if there is one."
+            "with truth", "Also load the trajectory (.tum) beside the recording, if there is one."
         )
 
         def choose(path: Path) -> None:
             path = self._folders.openable(path)
-            self._send(OpenRecording(path, truth_beside(path) if with_truth.value else None))
+            self._page.send(OpenRecording(path, truth_beside(path) if with_truth.value else None))
 
         browser.show(RECORDINGS, "No recordings (.bag, .mcap, .db3, .pcap, ROS 2 folders) or sessions here.", choose)
 
@@ -95,31 +88,25 @@ class FilesPanel:
         results = [self._results] if self._results.is_dir() else []
         folders = Folders([*self._folders.roots, *results])
         browser = FileBrowser(client, folders, "Compare with a trajectory")
-        recording = self._snapshot().recording
+        recording = self._page.snapshot().recording
         if recording is not None and recording.truth is not None:
-            browser.button(f"Not with {recording.truth.name} any more", lambda: self._send(CompareWith(None)))
+            browser.button(f"Stop comparing with {recording.truth.name}", lambda: self._page.send(CompareWith(None)))
         browser.show(
             TRAJECTORIES,
-            "No trajectories (.tum) here; “Save results…” writes one, and so do most SLAM programs.",
-            lambda path: self._send(CompareWith(folders.inside(path))),
+            "No trajectories (.tum) here. “Save results…” writes one, as most SLAM programs do.",
+            lambda path: self._page.send(CompareWith(folders.inside(path))),
         )
 
     def _ask_where(self, client: viser.ClientHandle) -> None:
-        recording = self._snapshot().recording
+        recording = self._page.snapshot().recording
         if recording is None:
             return
         gui = client.gui
         with gui.add_modal("Save results") as modal:
-            names = ", ".join(f"<b>{export.name}</b>" for export in EXPORTS)
-            gui.add_html(
-                box(
-                    f"Writes {names} of the frames processed so far, and <b>session{SUFFIX}</b>, which can be opened "
-                    "again. Files about loops exist only if loops are searched. All go into a folder below ",
-                    code(str(self._results)),
-                )
-            )
+            names = [export.name for export in EXPORTS]
+            gui.add_html(panel("save", names, f"session{SUFFIX}", str(self._results)))
             name = gui.add_text("folder", result_folder_name(recording.path, datetime.now()))
-            everything = gui.add_checkbox("all files", True, hint="Without: trajectory.tum only, which takes no time.")
+            everything = gui.add_checkbox("all files", True, hint="Off: only trajectory.tum, which takes no time.")
             problem = gui.add_html("", visible=False)
             save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
             cancel = gui.add_button("Cancel", color="gray")
@@ -127,10 +114,10 @@ class FilesPanel:
         def confirmed(_: object) -> None:
             chosen = Path(name.value.strip())
             if not name.value.strip() or chosen.name != str(chosen) or chosen.name in (".", ".."):
-                problem.content = box("The folder needs a plain name, without / and not empty.")
+                problem.content = panel("text", "The folder needs a name without /.")
                 problem.visible = True
                 return
-            self._send(Save(self._results / chosen, trajectory_only=not everything.value))
+            self._page.send(Save(self._results / chosen, trajectory_only=not everything.value))
             modal.close()
 
         save.on_click(confirmed)
@@ -138,7 +125,7 @@ class FilesPanel:
 
 
 class FileBrowser:
-    """A dialog in one browser: goes through folders until a file is chosen. What it asks beside is added first."""
+    """A dialog in one browser to go through folders and choose a file. Add further controls before `show`."""
 
     def __init__(self, client: viser.ClientHandle, folders: Folders, title: str) -> None:
         self._gui = client.gui
@@ -171,8 +158,8 @@ class FileBrowser:
         """List the folders.
 
         Args:
-            suffixes: of the files that may be chosen. nothing: what to say of a folder that is empty.
-            choose: is given the file; it may raise HemislamError, which is shown.
+            suffixes: of the files that may be chosen. nothing: shown for a folder without such files.
+            choose: called with the file; a HemislamError that it raises is shown.
         """
         self._suffixes, self._nothing, self._choose = suffixes, nothing, choose
         self.button("Cancel", lambda: None)
@@ -186,15 +173,15 @@ class FileBrowser:
         self._shown.clear()
         with self._list:
             if folder is None:
-                self._here.content = box("Folders that this server was started with:")
+                self._here.content = panel("text", "Folders that this server was started with:")
                 for root in self._folders.roots:
                     self._button(str(root), viser.Icon.FOLDER, partial(self._go, root))
                 return
-            self._here.content = box(code(str(folder)))
+            self._here.content = panel("path", "", str(folder))
             try:
                 entries = self._folders.listing(folder, self._suffixes)
             except HemislamError as error:
-                self._shown.append(self._gui.add_html(box(code(str(error)))))
+                self._shown.append(self._gui.add_html(panel("path", "", str(error))))
                 entries = []
             at_root = folder in self._folders.roots
             if not at_root or len(self._folders.roots) > 1:
@@ -202,10 +189,10 @@ class FileBrowser:
             for entry in entries[:_MOST_ENTRIES]:
                 self._entry(entry)
             if not entries:
-                self._shown.append(self._gui.add_html(box(self._nothing)))
+                self._shown.append(self._gui.add_html(panel("text", self._nothing)))
             if len(entries) > _MOST_ENTRIES:
                 more = f"{len(entries) - _MOST_ENTRIES} more are not shown; name the file on the command line."
-                self._shown.append(self._gui.add_html(box(more)))
+                self._shown.append(self._gui.add_html(panel("text", more)))
 
     def _entry(self, entry: Entry) -> None:
         path = entry.path
@@ -223,6 +210,6 @@ class FileBrowser:
         try:
             self._choose(path)
         except HemislamError as error:
-            self._here.content = box(code(str(error)))
+            self._here.content = panel("path", "", str(error))
             return
         self._modal.close()

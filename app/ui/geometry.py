@@ -4,12 +4,16 @@ All in the LiDAR frame and metres unless said otherwise; pure functions of array
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from app.slam.lie import quaternion
 from app.slam.types import F32, F64, U16
+
+STILL_M: Final = 1e-3
+"""Nothing is drawn again for a move up to this: each loop moves most of the map by hundredths of a millimetre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +64,7 @@ def seed_wedge(elevations: F64, down: F64, alpha: float, reach: float, samples: 
         elevations: (m,) rad, of the outermost lines. down: (3,) unit. samples: points along an arc.
 
     Returns:
-        None when no line comes that near to "down".
+        None when no line comes so near to straight down.
     """
     arcs = []
     for elevation in np.sort(elevations[np.isfinite(elevations)]):
@@ -116,7 +120,7 @@ def disc(radius: float, samples: int = 64) -> tuple[F32, npt.NDArray[np.uint32],
 
 
 def foot(centroid: F64, normal: F64, down: F64) -> F64:
-    """Where the ray from the sensor along `down` meets the plane; its nearest point if it never does."""
+    """Where the ray from the sensor along `down` meets the plane, or the plane's nearest point if it never does."""
     along = float(down @ normal)
     height = float(centroid @ normal)
     if along * height <= 1e-6:
@@ -133,5 +137,5 @@ def rotation_to(normal: F64) -> F64:
 
 
 def wxyz(rotation: F64) -> F64:
-    """Rotation matrix to the scene's order of quaternion."""
+    """(3, 3) rotation to a quaternion in the scene's order: w, x, y, z."""
     return quaternion(rotation)[[3, 0, 1, 2]]

@@ -1,26 +1,23 @@
-"""Remarks on frames: kept in the session, marked in the timeline."""
-
-from collections.abc import Callable
-from html import escape
+"""Notes on frames: kept in the session, marked in the timeline."""
 
 import viser
 
-from app.server.protocol import AddNote, Command, Note, Snapshot
-from app.ui.html import box
-from app.ui.widgets import by_user
+from app.server.protocol import AddNote, Note, Snapshot
+from app.ui.html import panel
+from app.ui.widgets import Page, by_user
 
 _SHOWN = 30
 
 
 class NotesPanel:
-    """A field for a remark on the present frame, and those made so far."""
+    """A field for a note on the present frame, and the notes made so far."""
 
-    def __init__(self, gui: viser.GuiApi, send: Callable[[Command], None]) -> None:
-        self._send = send
+    def __init__(self, page: Page) -> None:
+        self._send = page.send
         self._drawn: tuple[Note, ...] = ()
-        self._text = gui.add_text("note", "", hint="On the frame that is shown; kept in the session.")
-        self._add = gui.add_button("Note it", icon=viser.Icon.NOTE, color="gray")
-        self._list = gui.add_html("", visible=False)
+        self._text = page.gui.add_text("note", "", hint="On the frame that is shown; kept in the session.")
+        self._add = page.gui.add_button("Add note", icon=viser.Icon.NOTE, color="gray")
+        self._list = page.gui.add_html("", visible=False)
         self._add.on_click(by_user(lambda _value, _client: self._note()))
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -28,11 +25,10 @@ class NotesPanel:
         if snapshot.notes == self._drawn:
             return
         self._drawn = snapshot.notes
-        rows = (f"<div><b>{note.frame:,}</b> {escape(note.text)}</div>" for note in reversed(snapshot.notes[-_SHOWN:]))
-        self._list.content = box(*rows)
+        self._list.content = panel("notes", snapshot.notes[-_SHOWN:][::-1])
         self._list.visible = bool(snapshot.notes)
 
     def _note(self) -> None:
         if self._text.value.strip():
             self._send(AddNote(self._text.value))
-            self._text.value = ""  # type: ignore[misc]
+            self._text.value = ""  # type: ignore[misc]  # mypy overlooks viser's setter

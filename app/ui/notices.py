@@ -1,12 +1,11 @@
-"""What the engine has to tell: a notification in every browser, and a log for those who come later."""
+"""The engine's notices: a notification in every browser, and a log for those that connect later."""
 
-from html import escape
 from typing import Final, Literal
 
 import viser
 
 from app.server.protocol import Notice, Snapshot
-from app.ui.html import BAD, QUIET, WARN, box
+from app.ui.html import BAD, QUIET, WARN, panel
 
 _LOG_LINES: Final = 20
 _BORDER: Final = {"info": QUIET, "warning": WARN, "error": BAD}
@@ -18,14 +17,7 @@ _SECONDS: Final = {"info": 6.0, "warning": 12.0, "error": None}
 
 def log_html(notices: tuple[Notice, ...]) -> str:
     """The newest notices, newest first."""
-    if not notices:
-        return box('<span class="hs-quiet">Nothing to tell yet.</span>')
-    return box(
-        *(
-            f'<div class="hs-item" style="border-color:{_BORDER[notice.level]}">{escape(notice.text)}</div>'
-            for notice in reversed(notices[-_LOG_LINES:])
-        )
-    )
+    return panel("log", [(notice.text, _BORDER[notice.level]) for notice in reversed(notices[-_LOG_LINES:])])
 
 
 class NoticePanel:
@@ -37,7 +29,7 @@ class NoticePanel:
         self._told: set[int] = set()
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Tell every browser the notices that are new since the call before."""
+        """Notify every browser of what is new since the call before."""
         new = [notice for notice in snapshot.notices if notice.number not in self._told]
         if not new:
             return

@@ -1,11 +1,12 @@
-"""The parameter panel, generated from the one declaration in `app.slam.params`.
+"""The parameter panel, generated from the one declaration (`app.slam.params.leaves`).
 
-Browsers and the engine may both change a value. What a user set is sent as a command; what the
-snapshot says flows back, except into a control that was touched a moment ago: otherwise the
-snapshot's older value would pull the slider from under the hand that moves it.
+Every number with a range has a slider with that range; a number without one has a box. M, α, σ and the voxel size
+come first, the others in a folder per section.
+
+Browsers and the engine may both change a value. What a user set is sent as a command; the snapshot's value flows back,
+except into a control that was touched a moment ago: an older snapshot must not move the slider under the hand.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -13,19 +14,19 @@ from typing import Any, Final
 import viser
 
 from app.server.fork import engine_number
-from app.server.protocol import Command, LoadParams, Restart, SetParams, Snapshot
+from app.server.protocol import LoadParams, Restart, SetParams, Snapshot
 from app.slam.params import Effect, Leaf, Params, leaves
-from app.ui.html import box
-from app.ui.widgets import as_set, by_user, show
+from app.ui.html import panel
+from app.ui.widgets import Page, as_set, by_user, show
 
 PRIMARY: Final = ("ground.scan_lines", "ground.alpha", "ground.sigma", "ground.voxel_size")
-"""The paper's sliders, above all others."""
+"""The paper's parameters, above all others."""
 
 MARK: Final[dict[Effect, str]] = {"now": "", "frame": " ▸", "restart": " ↻"}
 _TYPING_S: Final = 0.5
-"""A typed value is sent when the keys have rested for so long: "0.05" begins with "0"."""
+"""A value that can be typed is sent after this long without a change: "0.05" begins with "0"."""
 _HOLD_S: Final = 1.0
-"""A control that was touched shows what the user set for so long, whatever older snapshots say."""
+"""A control shows what the user set for this long, whatever older snapshots say."""
 
 TITLES: Final = {
     "recording": "Recording",
@@ -70,14 +71,14 @@ def add_control(gui: viser.GuiApi, leaf: Leaf, value: Any) -> Control:
         return gui.add_vector3(text, value, step=leaf.step, hint=hint)
     kind = type(leaf.default)
     low, high, step = (None if limit is None else kind(limit) for limit in (leaf.minimum, leaf.maximum, leaf.step))
-    if leaf.path in PRIMARY and low is not None and high is not None and step is not None:
+    if low is not None and high is not None and step is not None:
         return gui.add_slider(text, low, high, step, value, hint=hint)
     return gui.add_number(text, value, min=low, max=high, step=step, hint=hint)
 
 
 @dataclass(slots=True)
 class _Edit:
-    """A value that a user set, when that was, and whether the engine was told."""
+    """A value that a user set, when, and whether it was sent to the engine."""
 
     value: Any
     at: float
@@ -85,23 +86,12 @@ class _Edit:
 
 
 class ParameterPanel:
-    """Controls for every parameter; `tick` sends what was typed and takes in what the snapshot says.
+    """A control for every parameter; `tick` sends what was typed and shows what the snapshot says."""
 
-    Args:
-        send: enqueues a command for the engine.
-        now: monotonic seconds.
-    """
-
-    def __init__(
-        self,
-        gui: viser.GuiApi,
-        params: Params,
-        send: Callable[[Command], None],
-        now: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._gui = gui
-        self._send = send
-        self._now = now
+    def __init__(self, page: Page, params: Params) -> None:
+        gui = self._gui = page.gui
+        self._send = page.send
+        self._now = page.now
         self._edits: dict[str, _Edit] = {}
         self._engine = 0
         self._controls: dict[str, Control] = {}
@@ -121,12 +111,12 @@ class ParameterPanel:
                 for leaf in self._sections[section].values():
                     self._add(leaf, params)
                 self._add_reset(section)
-        gui.add_html(box('<span class="hs-quiet">▸ acts from the next frame · ↻ acts on restart</span>'))
+        gui.add_html(panel("quiet", "▸ acts from the next frame · ↻ acts on restart"))
 
     def tick(self, snapshot: Snapshot) -> None:
-        """Called by the drawing thread, often: sends typed values that have rested, shows the snapshot's."""
+        """Called by the drawing thread, often: send typed values that no longer change, show the snapshot's."""
         now = self._now()
-        if engine_number(snapshot) != self._engine:  # what was set was meant for the other one
+        if engine_number(snapshot) != self._engine:  # what was set was meant for the other engine
             self._engine = engine_number(snapshot)
             self._edits.clear()
         for path, edit in list(self._edits.items()):
@@ -150,18 +140,19 @@ class ParameterPanel:
 
     def _add(self, leaf: Leaf, params: Params) -> None:
         control = add_control(self._gui, leaf, params.value(leaf.path))
-        typed = not isinstance(control, viser.GuiSliderHandle | viser.GuiCheckboxHandle | viser.GuiDropdownHandle)
+        # The four primary sliders answer while they are dragged. The other sliders have boxes to type into as well.
+        at_once = leaf.path in PRIMARY or isinstance(control, viser.GuiCheckboxHandle | viser.GuiDropdownHandle)
         self._controls[leaf.path] = control
 
         def changed(value: Any, _: viser.ClientHandle) -> None:
-            self._edits[leaf.path] = _Edit(value, self._now(), sent=not typed)
-            if not typed:
+            self._edits[leaf.path] = _Edit(value, self._now(), sent=at_once)
+            if at_once:
                 self._send(SetParams({leaf.path: value}))
 
         control.on_update(as_set(changed))
 
     def _add_reset(self, group: str) -> None:
-        """A button for every parameter of the group that is not at its default, and one for all."""
+        """A button for each parameter of the group that is not at its default, and one for all."""
         buttons = self._gui.add_button_group("default", ("all",), visible=False, hint="Back to the default value.")
         self._resets[group] = buttons
 
@@ -188,28 +179,25 @@ class ParameterPanel:
     def _show_pending(self, pending: tuple[str, ...]) -> None:
         self._pending.visible = self._restart.visible = bool(pending)
         if pending:
-            names = ", ".join(f"<code>{path}</code>" for path in pending)
-            self._pending.content = box(f"Waiting for a restart: {names}")
+            self._pending.content = panel("pending", pending)
 
 
 def _short(name: str) -> str:
     return name.replace("_", " ")
 
 
-def add_yaml_buttons(gui: viser.GuiApi, params: Callable[[], Params], send: Callable[[Command], None]) -> None:
-    """Buttons that show the parameters as YAML to copy or download, and that take YAML in."""
-    copy = gui.add_button("Copy as YAML", icon=viser.Icon.COPY, color="gray")
-    load = gui.add_button("Load YAML", icon=viser.Icon.CLIPBOARD_TEXT, color="gray")
+def add_yaml_buttons(page: Page, params: Callable[[], Params]) -> None:
+    """Buttons that show the parameters as YAML to copy or download, and that load YAML."""
+    copy = page.gui.add_button("Copy as YAML", icon=viser.Icon.COPY, color="gray")
+    load = page.gui.add_button("Load YAML", icon=viser.Icon.CLIPBOARD_TEXT, color="gray")
     copy.on_click(by_user(lambda _, client: _show_yaml(client, params())))
-    load.on_click(by_user(lambda _, client: _load_yaml(client, send)))
+    load.on_click(by_user(lambda _, client: _load_yaml(client, page)))
 
 
 def _show_yaml(client: viser.ClientHandle, params: Params) -> None:
     text = params.to_yaml()
     with client.gui.add_modal("Parameters as YAML") as modal:
-        client.gui.add_html(
-            box("Select all and copy, or download; <code>--config FILE</code> of hemislam's commands reads it.")
-        )
+        client.gui.add_html(panel("yaml_out"))
         client.gui.add_text("yaml", text, multiline=True)
         download = client.gui.add_button("Download", icon=viser.Icon.DOWNLOAD)
         close = client.gui.add_button("Close", color="gray")
@@ -217,9 +205,9 @@ def _show_yaml(client: viser.ClientHandle, params: Params) -> None:
     close.on_click(lambda _: modal.close())
 
 
-def _load_yaml(client: viser.ClientHandle, send: Callable[[Command], None]) -> None:
+def _load_yaml(client: viser.ClientHandle, page: Page) -> None:
     with client.gui.add_modal("Load parameters") as modal:
-        client.gui.add_html(box("Paste YAML or choose a file. Names that are left out go back to their defaults."))
+        client.gui.add_html(panel("text", "Paste YAML or choose a file. Parameters it omits return to their defaults."))
         text = client.gui.add_text("yaml", "", multiline=True)
         upload = client.gui.add_upload_button("Choose a file", icon=viser.Icon.UPLOAD, mime_type=".yaml,.yml,text/yaml")
         apply = client.gui.add_button("Apply", icon=viser.Icon.CHECK)
@@ -229,7 +217,7 @@ def _load_yaml(client: viser.ClientHandle, send: Callable[[Command], None]) -> N
         show(text, upload.value.content.decode("utf-8", errors="replace"))
 
     def applied(_: Any) -> None:
-        send(LoadParams(text.value))
+        page.send(LoadParams(text.value))
         modal.close()
 
     upload.on_upload(uploaded)

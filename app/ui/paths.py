@@ -1,4 +1,4 @@
-"""Lines over the map: where the sensor walked, and where the truth says it did."""
+"""Lines over the map: where the sensor went, and where the truth says it did."""
 
 from typing import Final
 
@@ -7,13 +7,12 @@ import viser
 
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
-from app.ui.geometry import wxyz
-from app.ui.view import STILL_M
+from app.ui.geometry import STILL_M, wxyz
 
 PATH_COLOUR: Final = (255, 92, 141)
 TRUTH_COLOUR: Final = (240, 244, 250)
 BLOCK: Final = 256
-"""Segments per node: as the walk goes on, only the newest node is sent again."""
+"""Segments per node: a new frame sends only the newest node again, not an hour's path."""
 _MOST_TRUTH_POINTS: Final = 4000
 
 
@@ -31,13 +30,6 @@ class Trajectory:
         self._colour = colour
         self._blocks: list[viser.LineSegmentsHandle] = []
         self._drawn: list[F32] = []
-
-    def clear(self) -> None:
-        """Take the path away; its names are used again."""
-        for block in self._blocks:
-            block.remove()
-        self._blocks.clear()
-        self._drawn.clear()
 
     def draw(self, positions: F64, visible: bool) -> None:
         """Draw (n, 3) positions, sending the blocks that differ from what is drawn."""
@@ -68,22 +60,18 @@ class Truth:
         self._line: viser.LineSegmentsHandle | None = None
         self._loaded: F64 | None = None
 
-    def load(self, positions: F64 | None) -> None:
-        """Replace the line unless it is of these (m, 3) positions; None or fewer than two take it away."""
-        if positions is self._loaded:
-            return
-        self._loaded = positions
-        if self._line is not None:
-            self._line.remove()
-            self._line = None
-        if positions is not None and len(positions) >= 2:
-            some = positions[:: max(1, len(positions) // _MOST_TRUTH_POINTS)]
-            self._line = self._scene.add_line_segments(
-                self._root, segments(some), TRUTH_COLOUR, thickness=1.5, thickness_units="screen", visible=False
-            )
-
-    def draw(self, T_map_truth: F64 | None, visible: bool) -> None:
-        """Show the line where `T_map_truth` (4, 4) lays it; hidden while that is unknown."""
+    def draw(self, positions: F64 | None, T_map_truth: F64 | None, visible: bool) -> None:
+        """Show (m, 3) positions where `T_map_truth` (4, 4) lays them; hidden while that is unknown."""
+        if positions is not self._loaded:
+            self._loaded = positions
+            if self._line is not None:
+                self._line.remove()
+                self._line = None
+            if positions is not None and len(positions) >= 2:
+                some = positions[:: max(1, len(positions) // _MOST_TRUTH_POINTS)]
+                self._line = self._scene.add_line_segments(
+                    self._root, segments(some), TRUTH_COLOUR, thickness=1.5, thickness_units="screen", visible=False
+                )
         if self._line is None:
             return
         self._line.visible = visible and T_map_truth is not None

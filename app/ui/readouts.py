@@ -1,4 +1,4 @@
-"""What the newest frame measured: tiles for now, plots of the last few hundred frames or of all."""
+"""What the newest frame measured, as tiles; the last few hundred frames, or all, as plots."""
 
 from typing import Any, Final
 
@@ -8,7 +8,8 @@ import viser
 from app.server.protocol import Snapshot
 from app.slam.types import F64, I64, STAGES, StepResult
 from app.ui.colours import Rgb
-from app.ui.html import BAD, GOOD, WARN, css, dot, heading, number, tile, tiles
+from app.ui.html import BAD, GOOD, WARN, Tile, css, heading, number, panel
+from app.ui.widgets import chart
 
 HISTORY: Final = 300
 """Most frames in a plot."""
@@ -25,92 +26,63 @@ STAGE_COLOURS: Final[dict[str, Rgb]] = {
 }
 
 
-def ground_tiles(result: StepResult, limit: float) -> str:
+def ground_tiles(result: StepResult, limit: float) -> list[Tile]:
     """Ground segmentation of the newest frame."""
     ground = result.ground
     flat = ground.found and ground.planarity < limit
-    return tiles(
-        (
-            tile("λ3/λ2", number(ground.planarity, 3), f"< {limit:g}", colour=GOOD if flat else BAD),
-            tile("seeds", f"{ground.seeds:,}"),
-            tile("ground", number(100 * ground.share, 1), "%"),
-            tile(
-                "points: scan → ground thinned → filter",
-                f"{result.points_in:,} → {result.points_reduced:,} → {result.points_filter:,}",
-                note=ground.reason,
-                width="wide",
-            ),
-        )
-    )
+    counts = f"{result.points_in:,} → {result.points_reduced:,} → {result.points_filter:,}"
+    return [
+        Tile("λ3/λ2", number(ground.planarity, 3), f"< {limit:g}", colour=GOOD if flat else BAD),
+        Tile("seeds", f"{ground.seeds:,}"),
+        Tile("ground", number(100 * ground.share, 1), "%"),
+        Tile("points: scan → ground thinned → filter", counts, "", ground.reason, width="wide"),
+    ]
 
 
-def filter_tiles(result: StepResult) -> str:
+def filter_tiles(result: StepResult) -> list[Tile]:
     """How the filter's update went."""
     update = result.registration
     share = update.inliers / update.used if update.used else np.nan
     smallest = float(update.eigenvalues[0]) if len(update.eigenvalues) else np.nan
     information = f"least information {smallest:.3g}" if np.isfinite(smallest) else ""
-    return tiles(
-        (
-            tile("iterations", str(update.iterations), "" if update.converged else "not conv.",
-                 colour="" if update.converged else WARN),
-            tile("residual", number(1000 * update.residual_rms, 1), "mm"),
-            tile("inliers", number(100 * share, 0), f"% of {update.used:,}"),
-            tile(
-                "degeneracy",
-                "degenerate" if update.degenerate else "none",
-                information,
-                colour=WARN if update.degenerate else "",
-                note=update.reason,
-                width="wide",
-            ),
-        )
-    )  # fmt: skip
+    converged = ("", "") if update.converged else ("not conv.", WARN)
+    degenerate = ("degenerate", WARN) if update.degenerate else ("none", "")
+    return [
+        Tile("iterations", str(update.iterations), converged[0], colour=converged[1]),
+        Tile("residual", number(1000 * update.residual_rms, 1), "mm"),
+        Tile("inliers", number(100 * share, 0), f"% of {update.used:,}"),
+        Tile("degeneracy", degenerate[0], information, update.reason, degenerate[1], "wide"),
+    ]
 
 
-def state_tiles(snapshot: Snapshot, result: StepResult) -> str:
+def state_tiles(snapshot: Snapshot, result: StepResult) -> list[Tile]:
     """Motion, biases and the error to truth."""
     state, series = result.state, snapshot.series
     speed = float(np.linalg.norm(state.v_odom_imu))
     gyro, accel = 1000 * state.b_gyro, 1000 * state.b_accel
-    parts = [
-        tile("velocity", number(speed), "m/s", note=_vector(state.v_odom_imu, 2), width="half"),
-        tile("walked", number(_last(series, "distance"), 1), "m", width="half"),
-        tile("gyroscope bias", number(float(np.linalg.norm(gyro))), "mrad/s", note=_vector(gyro, 2), width="half"),
-        tile(
-            "acceleration bias", number(float(np.linalg.norm(accel)), 1), "mm/s²", note=_vector(accel, 1), width="half"
-        ),
+    gyro_norm, accel_norm = number(float(np.linalg.norm(gyro))), number(float(np.linalg.norm(accel)), 1)
+    tiles = [
+        Tile("velocity", number(speed), "m/s", _vector(state.v_odom_imu, 2), width="half"),
+        Tile("distance", number(_last(series, "distance"), 1), "m", width="half"),
+        Tile("gyroscope bias", gyro_norm, "mrad/s", _vector(gyro, 2), width="half"),
+        Tile("acceleration bias", accel_norm, "mm/s²", _vector(accel, 1), width="half"),
     ]
     errors = series.get("error_m", np.empty(0))
     if np.isfinite(errors).any():
-        rms = float(np.sqrt(np.nanmean(errors**2)))
-        parts.append(
-            tile(
-                "position error to truth",
-                number(100 * float(errors[-1]), 1),
-                f"cm · RMS {100 * rms:.1f} cm",
-                width="wide",
-            )
-        )
-    return tiles(parts)
+        rms = f"cm · RMS {100 * float(np.sqrt(np.nanmean(errors**2))):.1f} cm"
+        tiles.append(Tile("position error to truth", number(100 * float(errors[-1]), 1), rms, width="wide"))
+    return tiles
 
 
-def time_tiles(snapshot: Snapshot, result: StepResult) -> str:
-    """Milliseconds per stage, as the legend of the plot below."""
-    total = result.timings_ms.get("total", float("nan"))
-    stages = "".join(
-        dot(STAGE_COLOURS[stage], f"{stage} {number(result.timings_ms.get(stage, float('nan')), 1)}")
-        for stage in STAGES
-    )
-    return (
-        tiles(
-            (
-                tile("frame", number(total, 1), "ms"),
-                tile("dropped", f"{snapshot.transport.dropped:,}", "scans"),
-            )
-        )
-        + f'<div class="hs"><div class="hs-keys hs-note">{stages}</div></div>'
-    )
+def times_html(snapshot: Snapshot, result: StepResult) -> str:
+    """Milliseconds per stage, which is also the legend of the plot below."""
+    took = result.timings_ms
+    tiles = [
+        Tile("frame", number(took.get("total", np.nan), 1), "ms"),
+        Tile("dropped", f"{snapshot.transport.dropped:,}", "scans"),
+    ]
+    stages = [(STAGE_COLOURS[stage], f"{stage} {number(took.get(stage, np.nan), 1)}") for stage in STAGES]
+    return panel("times", tiles, stages)
 
 
 def _last(series: dict[str, F64], name: str) -> float:
@@ -128,7 +100,7 @@ def recent(series: dict[str, F64], *names: str) -> tuple[F64, ...]:
 
 
 def worst(series: dict[str, F64], by: str, *names: str) -> tuple[F64, ...]:
-    """As `recent`, but of all frames: `HISTORY` that are spread evenly, each the one of its part with the most `by`."""
+    """As `recent`, but from all frames: `HISTORY` of them, each the one with the greatest `by` in its part."""
     count = len(series.get("stamp_s", ()))
     if count <= HISTORY:
         return recent(series, *names)
@@ -147,7 +119,7 @@ def _chosen(series: dict[str, F64], frames: slice | I64, names: tuple[str, ...])
 def stacked_stages(series: dict[str, F64], *, whole: bool = False) -> tuple[F64, ...]:
     """Stamps, then running sums of the stages' milliseconds from the highest down, for filled areas.
 
-    Peaks are cut at four times the median: the first frame's would leave nothing of all others.
+    Peaks are cut at four times the median: the first frame's would flatten all others.
     """
     names = [f"{stage}_ms" for stage in STAGES]
     stamps, *stages = worst(series, "total_ms", *names) if whole else recent(series, *names)
@@ -162,49 +134,46 @@ class ReadoutPanel:
     def __init__(self, gui: viser.GuiApi) -> None:
         self._tiles = gui.add_html("")
         self._time = gui.add_html("")
-        layers = [(css(STAGE_COLOURS[stage]), 0.0, css(STAGE_COLOURS[stage])) for stage in reversed(STAGES)]
+        colours = [css(STAGE_COLOURS[stage]) for stage in reversed(STAGES)]
         self._whole = gui.add_checkbox(
-            "all frames", False, hint="In the plots. Where frames share a place, the worst is drawn. Else the last 300."
+            "all frames", False, hint="In the plots; where frames share a place, the worst is drawn. Off: the last 300."
         )
         self._drawn_whole = False
         gui.add_html(heading("Frame time by stage, ms (peaks cut)"))
-        self._stages = plot(gui, stacked_stages({}), layers)
+        layers = [{"stroke": colour, "width": 0, "fill": colour} for colour in colours]
+        self._stages = chart(gui, stacked_stages({}), layers)
         gui.add_html(heading("λ3/λ2 of the seeds and its limit"))
-        self._planarity = plot(
-            gui, (*recent({}, "planarity"), np.zeros(1)), [("#3ecf9a", 1.5, ""), ("#ff6b6b", 1.0, "")]
-        )
+        nothing = recent({}, "planarity")
+        limit: dict[str, Any] = {"stroke": "#ff6b6b", "width": 1.0}
+        self._planarity = chart(gui, (*nothing, np.zeros(1)), [{"stroke": "#3ecf9a", "width": 1.5}, limit])
         gui.add_html(heading("Residual (RMS), mm"))
-        self._residual = plot(gui, recent({}, "residual_rms"), [("#40b8f0", 1.5, "")])
+        self._residual = chart(gui, nothing, [{"stroke": "#40b8f0", "width": 1.5}])
         self._error_title = gui.add_html(heading("Position error to truth, cm"), visible=False)
-        self._error = plot(gui, recent({}, "error_m"), [("#ff5c8d", 1.5, "")])
+        self._error = chart(gui, nothing, [{"stroke": "#ff5c8d", "width": 1.5}])
         self._error.visible = False
 
     @property
     def stale(self) -> bool:
-        """Whether the plots are to be drawn otherwise than they are."""
+        """Whether the user has asked for other plots than are drawn."""
         return self._whole.value != self._drawn_whole
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the snapshot's numbers. Called a few times a second at most: they are not read faster."""
+        """Show the snapshot's numbers and plots."""
         result = snapshot.result
         if result is None:
-            self._tiles.content = '<div class="hs hs-quiet">Numbers appear with the first frame.</div>'
+            self._tiles.content = panel("quiet", "Numbers appear with the first frame.")
             self._time.content = ""
         else:
-            limit = snapshot.params.ground.planarity
-            self._tiles.content = (
-                heading("Ground")
-                + ground_tiles(result, limit)
-                + heading("Filter")
-                + filter_tiles(result)
-                + heading("Motion")
-                + state_tiles(snapshot, result)
-                + heading("Time")
-            )
-            self._time.content = time_tiles(snapshot, result)
+            sections = [
+                ("Ground", ground_tiles(result, snapshot.params.ground.planarity)),
+                ("Filter", filter_tiles(result)),
+                ("Motion", state_tiles(snapshot, result)),
+            ]
+            self._tiles.content = panel("readouts", sections, "Time")
+            self._time.content = times_html(snapshot, result)
+        self._draw_plots(snapshot)
 
-    def draw_plots(self, snapshot: Snapshot) -> None:
-        """Show the snapshot's plots, of which a browser draws each point anew."""
+    def _draw_plots(self, snapshot: Snapshot) -> None:
         series = snapshot.series
         whole = self._drawn_whole = self._whole.value
 
@@ -219,21 +188,3 @@ class ReadoutPanel:
         stamps, error = curve("error_m")
         self._error.visible = self._error_title.visible = bool(np.isfinite(error).any() and len(error) > 1)
         self._error.data = (stamps, 100 * error)
-
-
-def plot(gui: viser.GuiApi, data: tuple[F64, ...], looks: list[tuple[str, float, str]]) -> viser.GuiUplotHandle:
-    """A small chart over seconds; per line its colour, width and fill ("" for none)."""
-    lines: list[Any] = [{"label": "s"}]
-    for colour, width, fill in looks:
-        lines.append({"stroke": colour, "width": width, "points": {"show": False}, **({"fill": fill} if fill else {})})
-    axes: Any = tuple({"font": "10px sans-serif", "ticks": {"size": 3}, "gap": 2, "size": size} for size in (22, 38))
-    return gui.add_uplot(
-        data,
-        tuple(lines),
-        scales={"x": {"time": False}},
-        axes=axes,
-        legend={"show": False},
-        cursor={"show": False},
-        height=110,
-        padding=(6, 10, 0, 0),
-    )

@@ -1,7 +1,7 @@
 """The scene: everything of a snapshot that is drawn in space, z up, in metres.
 
 All nodes hang below one frame. To follow the sensor, that frame is shifted so that the sensor stays
-at the origin: the camera of every page is left to its user, who may orbit and zoom while following.
+at the origin: the camera of every browser is left to its user, who may orbit and zoom while following.
 """
 
 from typing import Final
@@ -12,17 +12,19 @@ import viser
 from app.server.protocol import Snapshot
 from app.slam.types import F64
 from app.ui.chunks import MapChunks
-from app.ui.colours import ColourBy, Limits
+from app.ui.colours import Limits
 from app.ui.paths import Trajectory, Truth
-from app.ui.sensor import Sensor
+from app.ui.sensor import SensorScene
 from app.ui.view import View
+from app.ui.widgets import ROOT
 
-ROOT: Final = "/map"
 _FOLLOWED_M: Final = 1e-3
 _FOLLOW_RATE: Final = 0.3
-"""Share of the way to the sensor that the view goes per drawing: the walker's sway is not the viewer's."""
+"""Share of the way to the sensor that the view moves per drawing, so that a person's sway does not shake it."""
 _FOLLOW_JUMP_M: Final = 4.0
 _GROUND_BEFORE_SEEN_M: Final = -1.2
+_GRID_STEP_M: Final = 0.03
+_NO_POSES: Final[F64] = np.empty((0, 4, 4))
 
 
 class Scene:
@@ -32,7 +34,7 @@ class Scene:
         scene = server.scene
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
-        scene.configure_default_lights(cast_shadow=False)  # nothing here throws one, and they cost every frame
+        scene.configure_default_lights(cast_shadow=False)
         self._server = server
         self._root = scene.add_frame(ROOT, show_axes=False)
         self._grid = scene.add_grid(
@@ -48,19 +50,16 @@ class Scene:
             position=(0.0, 0.0, _GROUND_BEFORE_SEEN_M),
         )
         self._chunks = MapChunks(scene, f"{ROOT}/keyframes")
-        self._sensor = Sensor(scene, f"{ROOT}/sensor")
+        self._sensor = SensorScene(scene, f"{ROOT}/sensor")
         self._trajectory = Trajectory(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
-        # The page compiles the shader of points anew, for a tenth of a second, whenever colours change and
-        # no other cloud that is drawn uses it. This one always does: two points that are too small to see.
-        scene.add_point_cloud("/shader", np.zeros((2, 3), np.float32), np.zeros((2, 3), np.uint8), point_size=1e-6)
         server.initial_camera.position = (-4.0, -4.0, 9.0)  # high enough to look into a corridor without its ceiling
         server.initial_camera.look_at = (0.3, 0.2, -0.6)
         server.initial_camera.fov = float(np.radians(60.0))
 
     @property
     def offset(self) -> F64:
-        """(3,) m where the map's origin is in the scene: moved against the sensor while that is followed."""
+        """(3,) m, where the map's origin is in the scene: moved against the sensor while that is followed."""
         return np.array(self._root.position)
 
     @property
@@ -68,26 +67,24 @@ class Scene:
         """Map points in the page."""
         return self._chunks.points
 
-    def limits(self, by: ColourBy) -> Limits | None:
+    def limits(self, by: str) -> Limits | None:
         """Ends of a colour map as drawn; None for labels and before there is anything to colour."""
         return self._chunks.limits.get(by)
 
     def draw(self, previous: Snapshot | None, current: Snapshot, view: View, previous_view: View | None) -> None:
         """Make the scene show `current` seen as `view`, given that it shows `previous` seen as `previous_view`."""
         with self._server.atomic():
-            fresh = previous is None or previous.session != current.session
-            if fresh:
-                self._clear(current)
-            before = None if fresh or previous is None else previous
-            poses = current.keyframe_poses if current.keyframe_poses is not None else np.empty((0, 4, 4))
-            result = current.result
-            position = result.T_map_imu[:3, 3] if result is not None else np.zeros(3)
+            before = previous if previous is not None and previous.session == current.session else None
+            recording, result = current.recording, current.result
+            start_ns = recording.start_ns if recording else 0
+            if before is None:
+                self._chunks.clear(start_ns, recording.duration_s if recording else 1.0)
+                self._sensor.clear()
+            poses = current.keyframe_poses if current.keyframe_poses is not None else _NO_POSES
             limits_before = self.limits(view.colour_by)
             self._chunks.draw(current.chunks[: len(poses)], poses, view)
-            if current.trajectory is not None:
-                self._trajectory.draw(current.trajectory, view.path)
-            self._truth.load(current.recording.truth_positions if current.recording else None)
-            self._truth.draw(current.T_map_truth, view.path)
+            self._trajectory.draw(current.trajectory if current.trajectory is not None else np.empty((0, 3)), view.path)
+            self._truth.draw(recording.truth_positions if recording else None, current.T_map_truth, view.path)
             self._grid.visible = view.grid
             if result is None:
                 return
@@ -100,26 +97,14 @@ class Scene:
                 and limits == limits_before
             )
             if not unchanged:
-                drawn = before.result if before is not None else None
-                self._sensor.draw(drawn, result, current.params, view, limits)
-            self._level_grid()
+                self._sensor.draw(
+                    before.result if before is not None else None, result, current.params, view, limits, start_ns
+                )
+            z = self._sensor.ground_z
+            if z is not None and abs(z - self._grid.position[2]) > _GRID_STEP_M:  # smaller steps would make it shiver
+                self._grid.position = (0.0, 0.0, z)
             if view.follow:
-                self._follow(position, jump=before is None or before.result is None)
-
-    def _clear(self, current: Snapshot) -> None:
-        recording = current.recording
-        self._chunks.clear(
-            recording.start_ns if recording else 0,
-            recording.duration_s if recording else 1.0,
-        )
-        self._trajectory.clear()
-        self._sensor.clear()
-
-    def _level_grid(self) -> None:
-        """Lay the grid on the ground below the sensor; steps under 3 cm are left out, so it does not shiver."""
-        z = self._sensor.ground_z
-        if z is not None and abs(z - self._grid.position[2]) > 0.03:
-            self._grid.position = (0.0, 0.0, z)
+                self._follow(result.T_map_imu[:3, 3], jump=before is None or before.result is None)
 
     def _follow(self, position: F64, jump: bool) -> None:
         behind = -position - self._root.position

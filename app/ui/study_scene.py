@@ -7,10 +7,9 @@ import viser
 
 from app.slam.types import F64, StepResult
 from app.ui.geometry import disc, rotation_to, wxyz
-from app.ui.sensor import MOST_SCAN_POINTS
-from app.ui.study_colours import StudyBy, points_shown, study_colours
-from app.ui.study_point import Picked
-from app.ui.thinning import strided
+from app.ui.sensor import shown_of
+from app.ui.study_maths import AS_MAP, RESIDUAL, STUDY_MODES, Picked, study_colours
+from app.ui.widgets import ROOT
 
 _POINT: Final = (255, 255, 255)
 _NEIGHBOURS: Final = (255, 92, 141)
@@ -19,30 +18,30 @@ _LEAST_RADIUS_M: Final = 0.1
 
 
 class StudyScene:
-    """Nodes below the scene node `root`, which is the map's."""
+    """Nodes below the map's."""
 
-    def __init__(self, scene: viser.SceneApi, root: str) -> None:
+    def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
-        self._map = f"{root}/study"
+        self._map = f"{ROOT}/study"
         self._lidar = scene.add_frame(self._map, show_axes=False)
         self._cloud: viser.PointCloudHandle | None = None
         self._marks: list[Any] = []
 
-    def draw_cloud(self, result: StepResult | None, by: StudyBy, size: float) -> None:
-        """The frame coloured by a number; nothing for `StudyBy.MAP`."""
-        points = points_shown(result, by) if result is not None and by is not StudyBy.MAP else ()
+    def draw_cloud(self, result: StepResult | None, by: str, size: float) -> None:
+        """The frame coloured by a number; nothing for `AS_MAP`."""
+        points = STUDY_MODES[by].points(result) if result is not None and by != AS_MAP else ()
         if result is None or len(points) == 0:
             if self._cloud is not None:
                 self._cloud.remove()
                 self._cloud = None
             return
         self._place(result)
-        shown = strided(len(points), MOST_SCAN_POINTS)
+        shown = shown_of(len(points))
         self._cloud = self._scene.add_point_cloud(
             f"{self._map}/cloud",
             np.asarray(points)[shown],
             study_colours(result, by)[shown],
-            point_size=size * (2.2 if by is StudyBy.RESIDUAL else 1.3),
+            point_size=size * (2.2 if by == RESIDUAL else 1.3),
             point_shape="circle",
             point_shading="flat",
         )

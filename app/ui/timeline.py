@@ -1,85 +1,60 @@
 """Why did it drift: strips of what was measured at every frame of the recording; a click goes there."""
 
 import json
-import time
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
-import viser
-
-from app.server.protocol import Command, Seek, Snapshot
-from app.ui.loops.bridge import Bridge
+from app.server.protocol import Seek, Snapshot
+from app.ui.html import BAD, GOOD, QUIET, panel, source
 from app.ui.strips import History, limits, message
-from app.ui.timeline_script import STYLE, data, shell
+from app.ui.viser_adapter import Bridge
+from app.ui.widgets import Page, unchanged
 
 _PERIOD_S: Final = 0.5
+_WIDE_FROM_PX: Final = 700
+"""Where the scene is at least this wide, the strips lie along its lower edge; else under the transport."""
 
 
 class TimelinePanel:
-    """The strips in the caller's container.
+    """The strips in the caller's container."""
 
-    Args:
-        send: enqueues a command. snapshot: the newest one. now: monotonic seconds.
-    """
-
-    def __init__(
-        self,
-        gui: viser.GuiApi,
-        send: Callable[[Command], None],
-        snapshot: Callable[[], Snapshot],
-        now: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._send = send
-        self._snapshot = snapshot
-        self._now = now
+    def __init__(self, page: Page) -> None:
+        gui = page.gui
+        self._page = page
         self._history = History()
-        self._drawn: Snapshot | None = None
+        self._drawn: tuple[Any, ...] = ()
         self._latest: Snapshot | None = None
         self._drawn_at = -1e9
-        self._bridge = Bridge(gui, lambda word, _: self._said(word))
-        gui.add_html(STYLE + self._bridge.live(shell()))
-        self._data = gui.add_html(data(""))
-        gui.add_command("Go to the next trouble", hotkey="N").on_trigger(lambda _: self._jump(1))
-        gui.add_command("Go to the trouble before", hotkey="B").on_trigger(lambda _: self._jump(-1))
+        self._bridge = Bridge(gui, "timeline", lambda word, _: self._asked(word))
+        colours = {"bad": BAD, "good": GOOD, "quiet": QUIET}
+        gui.add_html(self._bridge.live(panel("timeline", colours, _WIDE_FROM_PX, source("timeline.js"))))
+        self._data = gui.add_html(panel("timeline_data", ""))
+        gui.add_command("Go to the next problem", hotkey="N").on_trigger(lambda _: self._jump(1))
+        gui.add_command("Go to the previous problem", hotkey="B").on_trigger(lambda _: self._jump(-1))
 
     def draw(self, snapshot: Snapshot) -> None:
         """Called often; sends what changed, at most twice a second."""
-        now, drawn, latest = self._now(), self._drawn, self._latest
+        now, latest = self._page.now(), self._latest
         if latest is not None and snapshot.transport.frame < latest.transport.frame:
             self._history.see(latest)  # the last frames before going back
         self._latest = snapshot
-        if now - self._drawn_at < _PERIOD_S or (drawn is not None and not _differs(drawn, snapshot)):
+        shown = (snapshot.result, snapshot.loops.edges, snapshot.notes, snapshot.recording, snapshot.params.imu)
+        if now - self._drawn_at < _PERIOD_S or unchanged(self._drawn, shown):
             return
-        self._drawn = replace(snapshot, trajectory=None, keyframe_poses=None, chunks=())  # large, and not compared
-        self._drawn_at = now
+        self._drawn, self._drawn_at = shown, now
         self._history.see(snapshot)
-        if snapshot.result is None:
-            self._data.content = data("")
-        else:
-            self._data.content = data(json.dumps(message(self._history, snapshot), separators=(",", ":")))
+        text = json.dumps(message(self._history, snapshot), separators=(",", ":")) if snapshot.result else ""
+        self._data.content = panel("timeline_data", text)
 
-    def _said(self, word: str) -> None:
-        """What the page's script says: "seek 812"."""
+    def _asked(self, word: str) -> None:
+        """What the page's script sends: "seek 812"."""
         verb, _, frame = word.partition(" ")
         if verb == "seek" and frame.isdecimal():
-            self._send(Seek(int(frame)))
+            self._page.send(Seek(int(frame)))
 
     def _jump(self, by: int) -> None:
-        """To the next frame on, or back, where something begins to be bad."""
-        snapshot = self._snapshot()
+        """To the next frame, or the one before, at which a problem begins."""
+        snapshot = self._page.snapshot()
         here, frames = snapshot.transport.frame, self._history.troubles(limits(snapshot))
         there = next((frame for frame in frames[::by] if (frame - here) * by > 0), None)
         if there is not None:
-            self._send(Seek(there))
-
-
-def _differs(drawn: Snapshot, current: Snapshot) -> bool:
-    """Whether there is anything else to draw."""
-    return (
-        drawn.result is not current.result
-        or drawn.loops.edges is not current.loops.edges
-        or drawn.notes != current.notes
-        or drawn.recording is not current.recording
-        or drawn.params.imu != current.params.imu
-    )
+            self._page.send(Seek(there))

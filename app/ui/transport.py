@@ -1,16 +1,14 @@
 """Play, pause, step, speed and the time slider; the same by keyboard."""
 
 import math
-import time
-from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any, Final
 
 import viser
 
 from app.server.protocol import Command, Pause, Play, Restart, Seek, SetSpeed, Snapshot, StepFrame
-from app.ui.html import box, number
-from app.ui.widgets import as_set, by_user, show
+from app.ui.html import number, panel
+from app.ui.widgets import Page, as_set, by_user, show
 
 SPEEDS: Final = {
     "0.1×": 0.1,
@@ -25,35 +23,26 @@ SPEEDS: Final = {
 _BACK, _STEP, _RESTART = "◂ back", "step ▸", "from start ↺"
 _FRAME_COMMANDS: Final[dict[str, Command]] = {_BACK: StepFrame(-1), _STEP: StepFrame(), _RESTART: Restart()}
 _DRAG_REST_S: Final = 0.2
-"""The slider seeks when the hand has rested for so long: some frames on the way may have to be processed."""
+"""The slider seeks after resting this long: frames on the way may have to be processed."""
 _SEEK_HOLD_S: Final = 1.0
 _PLAYING_PERIOD_S: Final = 1 / 4
-"""How often the slider and the numbers follow what plays: a browser lays the page out anew for each of them."""
+"""How often the slider and the numbers follow while playing."""
 
 
 class TransportPanel:
-    """The controls; `tick` seeks to where the slider was dragged and shows where the engine is.
+    """The controls; `tick` seeks to where the slider was dragged and shows where the engine is."""
 
-    Args:
-        send: enqueues a command. snapshot: the newest one. now: monotonic seconds.
-    """
-
-    def __init__(
-        self,
-        gui: viser.GuiApi,
-        send: Callable[[Command], None],
-        snapshot: Callable[[], Snapshot],
-        now: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._send = send
-        self._snapshot = snapshot
-        self._now = now
+    def __init__(self, page: Page) -> None:
+        gui, send = page.gui, page.send
+        self._send = page.send
+        self._snapshot = page.snapshot
+        self._now = page.now
         self._dragged: tuple[int, float] | None = None
         self._sought: tuple[int, float] | None = None
         self._followed_at = -1e9
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY_FILLED, hint="space")
         self._frames = gui.add_button_group("frame", (_BACK, _STEP, _RESTART), hint="← and → step one frame.")
-        self._slider = gui.add_slider("time (frame)", 0, 1, 1, 0, hint="Drag to go to a frame, back or on.")
+        self._slider = gui.add_slider("time (frame)", 0, 1, 1, 0, hint="Drag to go to a frame, back or forward.")
         self._where = gui.add_html("")
         self._speed = gui.add_dropdown(
             "speed", tuple(SPEEDS), initial_value="1×", hint="Times real time; the engine never skips a frame."
@@ -67,7 +56,7 @@ class TransportPanel:
         gui.add_command("Step one frame back", hotkey="arrowleft").on_trigger(lambda _: send(StepFrame(-1)))
 
     def toggle(self) -> None:
-        """Play, or pause what plays; at the end, play from the beginning."""
+        """Play or pause; at the end, play from the beginning."""
         transport = self._snapshot().transport
         if transport.finished and not transport.playing:
             self._send(Restart())
@@ -94,7 +83,7 @@ class TransportPanel:
             self._where.content = where(snapshot)
         live = snapshot.live is not None
         self._play.disabled = snapshot.recording is None
-        # A live source has no past, and its own pace. viser can not disable a group of buttons.
+        # A live source has no past and its own pace. viser cannot disable a group of buttons.
         self._slider.disabled = self._speed.disabled = live or snapshot.recording is None
         self._frames.visible = not live
         playing = transport.playing
@@ -116,36 +105,22 @@ def speed_name(factor: float) -> str:
 
 
 def where(snapshot: Snapshot) -> str:
-    """Frame, seconds into the recording, and the stamp in UTC."""
+    """Frame, seconds into the recording, and the stamp in UTC; of a live source, why there is no way back."""
     recording, transport = snapshot.recording, snapshot.transport
     if recording is None:
-        return box('<span class="hs-quiet">No recording is open.</span>')
+        return panel("quiet", "No recording is open.")
+    frame, stamp, rate = f"{transport.frame:,}", _utc(transport.stamp_ns), number(transport.frames_per_second, 1)
     if snapshot.live is not None:
-        return _where_live(snapshot)
+        forward = "A live session only goes forward. To go back, record it (--record) and open the file."
+        if transport.frame < 0:
+            return panel("quiet", f"Waiting for the first scan. {forward}")
+        dropped = f"{transport.dropped:,} scans dropped" if transport.dropped else "no scan dropped"
+        return panel("where", frame, ", live", "", dropped, stamp, rate, forward)
     if transport.frame < 0:
-        return box(f'<span class="hs-quiet">{recording.frames:,} frames, {recording.duration_s:.1f} s</span>')
-    seconds = (transport.stamp_ns - recording.start_ns) * 1e-9
-    return box(
-        f'<div class="hs-row"><span>frame <b>{transport.frame:,}</b> of {recording.frames:,}</span>'
-        f"<span><b>{number(seconds)}</b> of {number(recording.duration_s, 1)} s</span></div>",
-        f'<div class="hs-row hs-note"><span>{_utc(transport.stamp_ns)}</span>'
-        f"<span>{number(transport.frames_per_second, 1)} frames/s</span></div>",
-    )
-
-
-def _where_live(snapshot: Snapshot) -> str:
-    """The same of a live source, and why there is no way back."""
-    transport = snapshot.transport
-    quiet = "Live goes on only. Record it (--record) and open the file to go back."
-    if transport.frame < 0:
-        return box(f'<span class="hs-quiet">Waiting for the first scan. {quiet}</span>')
-    dropped = f"{transport.dropped:,} scans dropped" if transport.dropped else "no scan dropped"
-    return box(
-        f'<div class="hs-row"><span>frame <b>{transport.frame:,}</b>, live</span><span>{dropped}</span></div>',
-        f'<div class="hs-row hs-note"><span>{_utc(transport.stamp_ns)}</span>'
-        f"<span>{number(transport.frames_per_second, 1)} frames/s</span></div>",
-        f'<div class="hs-note">{quiet}</div>',
-    )
+        return panel("quiet", f"{recording.frames:,} frames, {recording.duration_s:.1f} s")
+    seconds = number((transport.stamp_ns - recording.start_ns) * 1e-9)
+    of, duration = f" of {recording.frames:,}", f" of {number(recording.duration_s, 1)} s"
+    return panel("where", frame, of, seconds, duration, stamp, rate)
 
 
 def _utc(stamp_ns: int) -> str:

@@ -1,23 +1,18 @@
-"""How the session is looked at: what every page of it shares and the engine never hears of."""
+"""How the session is looked at: shared by every browser, unknown to the engine."""
 
 from dataclasses import dataclass
-from typing import Final
 
-from app.ui.colours import ColourBy
-
-STILL_M: Final = 1e-3
-"""What moves by no more since it was drawn is not drawn anew: each loop moves most of a walk by some hundredths of a
-millimetre."""
+from app.ui.colours import LABEL
 
 
 @dataclass(frozen=True, slots=True)
 class View:
     """Attributes:
-    colour_by: what colours mean. point_size: m. follow: keep the sensor in the middle of the page.
-    ceilings: draw them too, where a keyframe lies below one. map, scan, wedge, plane, path, grid: whether shown.
+    colour_by: a name of `app.ui.colours.COLOUR_BY`. point_size: m. follow: keep the sensor in the middle of the page.
+    ceilings: show points above the ceiling too. map, scan, wedge, plane, path, grid: whether shown.
     """
 
-    colour_by: ColourBy = ColourBy.LABEL
+    colour_by: str = LABEL
     point_size: float = 0.02
     follow: bool = True
     ceilings: bool = False

@@ -11,6 +11,8 @@ import pytest
 import viser
 from viser._messages import GuiUpdateMessage
 
+from app.server.protocol import Command, Snapshot
+from app.ui.widgets import Page
 from tests.ui.fake_engine import FakeEngine
 
 
@@ -106,6 +108,16 @@ def engine() -> Iterator[FakeEngine]:
 
 SOMEONE = object()
 """Stands for a browser."""
+
+
+def page_of(
+    server: viser.ViserServer,
+    send: Callable[[Command], None] = lambda _: None,
+    snapshot: Callable[[], Snapshot] = Snapshot,
+    **more: Any,
+) -> Page:
+    """What a panel under test is on."""
+    return Page(server, send, snapshot, **more)
 
 
 class Clock:

@@ -14,8 +14,17 @@ from app.server.folders import Folders
 from app.server.fork import Workspace
 from app.server.protocol import Notice, Progress, Seek, SetParams, StepFrame
 from app.slam.types import GROUND, NON_GROUND, SEED, Cloud
-from app.ui.compare_maths import A_COLOUR, B_COLOUR, COLUMNS, Ground, common_frames, ground_difference, thinned, turn
-from app.ui.compare_words import how
+from app.ui.compare_maths import (
+    A_COLOUR,
+    B_COLOUR,
+    COLUMNS,
+    Labelled,
+    common_frames,
+    ground_difference,
+    how,
+    thinned,
+    turn,
+)
 from app.ui.paths import PATH_COLOUR
 from app.ui.workbench import Workbench
 from tests.ui.conftest import Clock, Wire, user_clicks, user_sets
@@ -52,10 +61,10 @@ def cloud(labels: list[int], offsets: list[int]) -> Cloud:
 def test_a_seed_is_ground_and_points_are_found_by_their_moment() -> None:
     a = cloud([NON_GROUND, GROUND, GROUND, NON_GROUND], [0, 1, 2, 3])
     b = cloud([NON_GROUND, SEED, NON_GROUND, SEED], [0, 1, 2, 3])
-    expected = [Ground.NEITHER, Ground.BOTH, Ground.ONLY_A, Ground.ONLY_B]
+    expected = [Labelled.NEITHER, Labelled.BOTH, Labelled.ONLY_A, Labelled.ONLY_B]
     assert ground_difference(a, b).tolist() == expected
     nearer = cloud([SEED, NON_GROUND, SEED], [3, 2, 1])
-    assert ground_difference(a, nearer).tolist() == [Ground.ALONE, *expected[1:]]
+    assert ground_difference(a, nearer).tolist() == [Labelled.ALONE, *expected[1:]]
 
 
 def test_a_spike_stays_however_long_the_walk_and_what_is_unknown_is_left_out() -> None:
@@ -273,7 +282,7 @@ def test_how_b_gets_on_is_said(page: Page) -> None:
     a = page.engine.snapshot
     recording = a.recording
     assert recording is not None and how(a, a) == ("", "")
-    assert "is not touched" in how(a, replace(a, engine_alive=False))[0]
+    assert "is not affected" in how(a, replace(a, engine_alive=False))[0]
     assert how(a, replace(a, progress=Progress("Going to frame 20", 0.5)))[0] == "Going to frame 20 · 50 %"
     assert "starting" in how(a, replace(a, recording=None))[0]
     assert "another recording" in how(replace(a, recording=replace(recording, path=Path("/x.mcap"))), a)[0]

@@ -8,10 +8,10 @@ from hypothesis.extra import numpy as hnp
 
 from app.slam.types import GROUND, NON_GROUND
 from app.ui.ceiling import below_ceiling
-from app.ui.colours import TABLES, ColourBy, Limits, grown, label_colours, value_colours
+from app.ui.colours import HEIGHT, MODES, TABLES, Limits, grown, label_colours, value_colours
 from app.ui.geometry import field_of_view, foot, ring_elevations, rotation_to, seed_wedge, wxyz
 from app.ui.paths import BLOCK, segments
-from app.ui.thinning import strided
+from app.ui.sensor import MOST_SCAN_POINTS, shown_of
 
 clouds = hnp.arrays(np.float32, st.tuples(st.integers(1, 200), st.just(3)), elements=st.floats(-50, 50, width=32))
 units = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.1)
@@ -62,7 +62,7 @@ def test_values_beyond_the_limits_take_the_end_colours(low: float, span: float) 
 def test_limits_never_shrink_and_hold_nearly_everything(parts: list[np.ndarray]) -> None:
     limits = None
     for values in parts:
-        wider = grown(limits, ColourBy.HEIGHT, values)
+        wider = grown(limits, MODES[HEIGHT], values)
         assert wider is not None and wider.low < wider.high
         if limits is not None:
             assert wider.low <= limits.low and wider.high >= limits.high
@@ -71,14 +71,13 @@ def test_limits_never_shrink_and_hold_nearly_everything(parts: list[np.ndarray])
 
 
 def test_limits_of_nothing_are_unknown() -> None:
-    assert grown(None, ColourBy.HEIGHT, [np.nan]) is None
+    assert grown(None, MODES[HEIGHT], [np.nan]) is None
 
 
-@given(st.integers(0, 200_000), st.integers(1, 40_000))
-def test_a_stride_keeps_the_limit_and_wastes_less_than_half(count: int, most: int) -> None:
-    left = len(range(count)[strided(count, most)])
-    assert left <= most
-    assert left >= min(count, most // 2)
+@given(st.integers(0, 300_000))
+def test_of_a_scan_at_most_the_limit_is_sent_and_at_least_half_of_it(count: int) -> None:
+    left = len(range(count)[shown_of(count)])
+    assert min(count, MOST_SCAN_POINTS // 2) <= left <= MOST_SCAN_POINTS
 
 
 def room(height: float, rng: np.random.Generator) -> np.ndarray:

@@ -7,7 +7,7 @@ import viser
 
 from app.server.protocol import AddNote, Command, Note, Snapshot
 from app.ui.notes import _SHOWN, NotesPanel
-from tests.ui.conftest import BusyThreads, Wire, browser_sends, user_clicks, user_sets
+from tests.ui.conftest import BusyThreads, Wire, browser_sends, page_of, user_clicks, user_sets
 
 
 class Notes:
@@ -15,7 +15,7 @@ class Notes:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.sent: list[Command] = []
-        self.panel = NotesPanel(server.gui, self.sent.append)
+        self.panel = NotesPanel(page_of(server, self.sent.append))
         self.snapshot = Snapshot()
 
     def write(self, text: str) -> None:

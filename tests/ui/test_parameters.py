@@ -14,7 +14,7 @@ from app.server.protocol import (
 )
 from app.slam.params import Params, leaves
 from app.ui.parameters import PRIMARY, ParameterPanel
-from tests.ui.conftest import BusyThreads, Clock, browser_sends, user_clicks, user_sets
+from tests.ui.conftest import BusyThreads, Clock, browser_sends, page_of, user_clicks, user_sets
 
 
 class Parameters:
@@ -23,7 +23,7 @@ class Parameters:
     def __init__(self, server: viser.ViserServer) -> None:
         self.sent: list[Command] = []
         self.clock = Clock()
-        self.panel = ParameterPanel(server.gui, Params(), self.sent.append, self.clock)
+        self.panel = ParameterPanel(page_of(server, self.sent.append, now=self.clock), Params())
         self.params = Params()
 
     def control(self, path: str) -> Any:

@@ -6,7 +6,6 @@ import viser
 
 from app.server.protocol import StepFrame
 from app.slam import lie
-from app.ui.colours import ColourBy
 from app.ui.view import View
 from tests.ui.conftest import Wire
 from tests.ui.fake_engine import FakeEngine
@@ -20,7 +19,7 @@ def drawn(server: viser.ViserServer, engine: FakeEngine) -> Drawn:
     """A walk of three keyframes, coloured by height."""
     drawn = Drawn(server, engine)
     engine.send(StepFrame(14))
-    drawn.draw(View(colour_by=ColourBy.HEIGHT))
+    drawn.draw(View(colour_by="height"))
     return drawn
 
 
@@ -69,22 +68,3 @@ def test_heights_that_change_little_by_little_are_coloured_anew(
     coloured = [m for m in wire.messages if type(m).__name__ == "SceneNodeUpdateMessage" and "colors" in m.updates]
     assert {m.name for m in coloured if m.name.startswith("/map/keyframes/")} == set(chunk_nodes(server))
     assert 3 <= len(coloured) / len(chunk_nodes(server)) <= 8  # of 8 mm
-
-
-def test_what_was_hidden_a_hair_off_comes_again_as_it_was_drawn(
-    drawn: Drawn, server: viser.ViserServer, wire: Wire, engine: FakeEngine
-) -> None:
-    poses, chunks = engine.snapshot.keyframe_poses, engine.snapshot.chunks
-    assert poses is not None and len(chunks) > 2
-    near = poses.copy()
-    near[:, :3, 3] += 4e-4
-    drawn.draw(keyframe_poses=near)
-    wire.clear()
-    for there in (1, len(chunks), 1, len(chunks)):
-        drawn.draw(keyframe_poses=near[:there], chunks=chunks[:there])
-    sent = {type(m).__name__ for m in wire.messages if getattr(m, "name", "").startswith("/map/keyframes/")}
-    assert sent == {"SetSceneNodeVisibilityMessage"}
-    wire.clear()
-    near[:, :3, 3] += 8e-4  # 1.2 mm from where they are drawn
-    drawn.draw(keyframe_poses=near)
-    assert set(wire.nodes("SetPositionMessage")) >= set(chunk_nodes(server))

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,16 +87,6 @@ def test_frames_gone_back_over_stay_until_they_are_processed_anew() -> None:
     history.see(snapshot(20, 60, total_ms=np.full(20, 7.0)))
     took = history.columns().high["took"]
     assert took[19] == 7.0 and took[20] == 5.0
-
-
-def test_of_frames_that_a_snapshot_tells_nothing_is_kept_beside_it() -> None:
-    long = snapshot(HOUR, HOUR)
-    history = seen(snapshot(1, HOUR))
-    tracemalloc.start()
-    history.see(long)
-    kept = tracemalloc.get_traced_memory()[0]
-    tracemalloc.stop()
-    assert history.present == HOUR - 1 and kept < HOUR
 
 
 def test_frames_gone_back_over_twice_stay_and_another_truth_makes_their_errors_unknown() -> None:

@@ -14,11 +14,22 @@ from app.slam.params import Params
 from app.slam.study import vertices
 from app.slam.types import Matches, StepResult
 from app.ui.study import StudyPanel
-from app.ui.study_colours import NOTHING, StudyBy, points_shown, study_colours, study_legend, study_values
-from app.ui.study_curve import HEADROOM, MOST_POINTS, curve
-from app.ui.study_point import describe, nearest_to_ray, pick
+from app.ui.study_maths import (
+    AS_MAP,
+    HEADROOM,
+    MOST_POINTS,
+    NOTHING,
+    RESIDUAL,
+    STUDY_MODES,
+    curve,
+    describe,
+    nearest_to_ray,
+    pick,
+    study_colours,
+    study_legend,
+)
 from app.ui.view import View
-from tests.ui.conftest import SOMEONE, Clock, Wire, user_sets
+from tests.ui.conftest import SOMEONE, Clock, Wire, page_of, user_sets
 from tests.ui.fake_engine import HEIGHT, FakeEngine
 
 ENGINE = FakeEngine(columns=40)
@@ -42,32 +53,32 @@ MATCHED = with_matches(FRAME)
 
 # --- colours -------------------------------------------------------------------------------------
 def test_numbers_are_in_the_unit_of_the_legend() -> None:
-    ring = study_values(FRAME, StudyBy.RING)
+    ring = STUDY_MODES["ring"].values(FRAME)
     assert ring.min() == 0 and ring.max() == 31
     down = FRAME.ground.down
     lowest = int(np.argmax(FRAME.cloud.points @ down / np.linalg.norm(FRAME.cloud.points, axis=1)))
-    assert np.argmin(study_values(FRAME, StudyBy.ANGLE)) == lowest
+    assert np.argmin(STUDY_MODES["angle to down"].values(FRAME)) == lowest
     floor = FRAME.cloud.labels > 0
-    assert np.median(study_values(FRAME, StudyBy.DISTANCE)[floor]) < 5  # cm: the corridor's floor is flat
-    assert np.nanmax(study_values(MATCHED, StudyBy.RESIDUAL)) == pytest.approx(20.0)
-    for by, unit in ((StudyBy.ANGLE, "°"), (StudyBy.DISTANCE, "cm"), (StudyBy.RESIDUAL, "mm")):
+    assert np.median(STUDY_MODES["distance to plane"].values(FRAME)[floor]) < 5  # cm: the corridor's floor is flat
+    assert np.nanmax(STUDY_MODES[RESIDUAL].values(MATCHED)) == pytest.approx(20.0)
+    for by, unit in (("angle to down", "°"), ("distance to plane", "cm"), (RESIDUAL, "mm")):
         assert unit in study_legend(FRAME, by)
 
 
-@pytest.mark.parametrize("by", [by for by in StudyBy if by is not StudyBy.MAP])
-def test_every_point_shown_has_a_colour(by: StudyBy) -> None:
+@pytest.mark.parametrize("by", STUDY_MODES)
+def test_every_point_shown_has_a_colour(by: str) -> None:
     colours = study_colours(MATCHED, by)
-    assert colours.shape == (len(points_shown(MATCHED, by)), 3)
+    assert colours.shape == (len(STUDY_MODES[by].points(MATCHED)), 3)
     assert len(np.unique(colours, axis=0)) > 1
 
 
 def test_points_without_a_plane_are_grey() -> None:
-    colours = study_colours(MATCHED, StudyBy.RESIDUAL)
+    colours = study_colours(MATCHED, RESIDUAL)
     assert (colours[:8] == NOTHING).all() and (colours[8:] != NOTHING).any(axis=1).all()
 
 
 def test_before_the_map_there_are_no_residuals_to_show() -> None:
-    assert len(points_shown(FRAME, StudyBy.RESIDUAL)) == 0 == len(study_colours(FRAME, StudyBy.RESIDUAL))
+    assert len(STUDY_MODES[RESIDUAL].points(FRAME)) == 0 == len(study_colours(FRAME, RESIDUAL))
 
 
 # --- the threshold -------------------------------------------------------------------------------
@@ -148,7 +159,9 @@ class Bench:
         self.clock, self.engine, self.server = Clock(), engine, server
         self.offset = np.array([5.0, -2.0, 1.0])
         server.scene.add_frame("/map", position=self.offset)
-        self.panel = StudyPanel(server, "/map", lambda: engine.snapshot, lambda: self.offset, self.clock)
+        self.panel = StudyPanel(
+            page_of(server, snapshot=lambda: engine.snapshot, now=self.clock, offset=lambda: self.offset)
+        )
 
     def draw(self, seconds: float = 1.0) -> None:
         self.clock.now += seconds
@@ -179,13 +192,13 @@ def bench(server: viser.ViserServer, engine: FakeEngine) -> Bench:
 
 def test_the_frame_is_drawn_in_place_of_the_scan_while_it_has_colours_of_its_own(bench: Bench) -> None:
     assert bench.nodes == set() and bench.panel.seen(View()) == View()
-    user_sets(bench.panel._by, StudyBy.ANGLE)
+    user_sets(bench.panel._by, "angle to down")
     bench.draw()
     assert bench.nodes == {CLOUD}
     assert bench.panel.seen(View()) == View(scan=False)
     user_sets(bench.panel._alone, True)
     assert bench.panel.seen(View()) == View(scan=False, map=False)
-    user_sets(bench.panel._by, StudyBy.MAP)
+    user_sets(bench.panel._by, AS_MAP)
     bench.draw()
     assert bench.nodes == set()
 
@@ -231,7 +244,7 @@ def test_the_curve_waits_for_a_pause(bench: Bench) -> None:
 
 
 def test_at_rest_nothing_is_sent(bench: Bench, wire: Wire) -> None:
-    user_sets(bench.panel._by, StudyBy.DISTANCE)
+    user_sets(bench.panel._by, "distance to plane")
     bench.click(300)
     bench.draw()
     wire.clear()

@@ -15,7 +15,7 @@ from app.server.protocol import Command, Seek, SetBreakpoints, SetParams, Snapsh
 from app.ui.breakpoints import BreakpointPanel
 from app.ui.timeline import TimelinePanel
 from app.ui.workbench import Workbench
-from tests.ui.conftest import Clock, Wire, user_sets
+from tests.ui.conftest import Clock, Wire, page_of, user_sets
 from tests.ui.fake_engine import FakeEngine
 
 
@@ -23,7 +23,7 @@ class Bench:
     def __init__(self, server: viser.ViserServer, engine: FakeEngine) -> None:
         self.clock, self.engine = Clock(), engine
         self.sent: list[Command] = []
-        self.panel = TimelinePanel(server.gui, self.sent.append, lambda: engine.snapshot, self.clock)
+        self.panel = TimelinePanel(page_of(server, self.sent.append, lambda: engine.snapshot, now=self.clock))
 
     def draw(self, seconds: float = 1.0) -> None:
         self.clock.now += seconds
@@ -121,7 +121,7 @@ def test_a_moved_slider_reaches_the_scene_before_the_curve(
 # --- breakpoints ---------------------------------------------------------------------------------
 def test_switches_and_limits_are_sent_in_si_units(server: viser.ViserServer) -> None:
     sent: list[Command] = []
-    panel = BreakpointPanel(server.gui, sent.append)
+    panel = BreakpointPanel(page_of(server, sent.append))
     user_sets(panel._switches["no_ground"], True)
     assert sent[-1] == SetBreakpoints(Breakpoints(no_ground=True))
     switch, number = panel._limits["residual"]
@@ -134,7 +134,7 @@ def test_switches_and_limits_are_sent_in_si_units(server: viser.ViserServer) -> 
 
 def test_what_another_page_chose_is_shown_and_not_sent_back(server: viser.ViserServer) -> None:
     sent: list[Command] = []
-    panel = BreakpointPanel(server.gui, sent.append)
+    panel = BreakpointPanel(page_of(server, sent.append))
     panel.tick(Snapshot(breakpoints=Breakpoints(dropped=True, error=0.25)))
     switch, number = panel._limits["error"]
     assert panel._switches["dropped"].value and switch.value and number.visible and number.value == 25.0
@@ -142,7 +142,7 @@ def test_what_another_page_chose_is_shown_and_not_sent_back(server: viser.ViserS
 
 
 def test_a_switch_stays_while_the_engine_has_not_heard_of_it(server: viser.ViserServer) -> None:
-    panel = BreakpointPanel(server.gui, lambda _: None)
+    panel = BreakpointPanel(page_of(server))
     user_sets(panel._switches["no_ground"], True)
     panel.tick(Snapshot())
     assert panel._switches["no_ground"].value

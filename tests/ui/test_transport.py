@@ -14,14 +14,14 @@ from app.server.protocol import (
     StepFrame,
 )
 from app.ui.transport import SPEEDS, TransportPanel, speed_name, where
-from tests.ui.conftest import BusyThreads, Clock, browser_sends, user_clicks, user_sets
+from tests.ui.conftest import BusyThreads, Clock, browser_sends, page_of, user_clicks, user_sets
 from tests.ui.fake_engine import FakeEngine
 
 
 class Transporting:
     def __init__(self, server: viser.ViserServer, engine: FakeEngine) -> None:
         self.engine, self.clock = engine, Clock()
-        self.panel = TransportPanel(server.gui, engine.send, lambda: engine.snapshot, self.clock)
+        self.panel = TransportPanel(page_of(server, engine.send, lambda: engine.snapshot, now=self.clock))
 
     def tick(self, seconds: float = 0.0) -> None:
         self.clock.now += seconds

@@ -15,10 +15,11 @@ from app.server.protocol import (
     StepFrame,
     Transport,
 )
+from app.ui.colours import LABEL, Limits, legend
 from app.ui.doctor import findings_html, verdicts
 from app.ui.files import result_folder_name, size_text
 from app.ui.header import title
-from app.ui.html import legend, tile
+from app.ui.html import Tile, panel
 from app.ui.notices import log_html
 from app.ui.readouts import HISTORY, recent, stacked_stages, worst
 from tests.ui.fake_engine import FINDINGS, FakeEngine
@@ -28,7 +29,7 @@ def test_what_needs_the_user_comes_first_with_its_option() -> None:
     text = findings_html(FINDINGS)
     assert text.index("needs you") < text.index("corrected") < text.index("fine")
     assert "<code>--set imu.max_gap=0.4</code>" in text
-    assert "needs you 1" in verdicts(FINDINGS) and "fine 2" in verdicts(FINDINGS)
+    assert [text for text, _ in verdicts(FINDINGS)] == ["✓ fine 2", "↻ corrected 1", "! needs you 1"]
 
 
 @pytest.mark.parametrize(
@@ -36,7 +37,7 @@ def test_what_needs_the_user_comes_first_with_its_option() -> None:
     [
         lambda text: findings_html((replace(FINDINGS[0], subject=text, text=text, option=text),)),
         lambda text: log_html((Notice(1, "error", text),)),
-        lambda text: tile(text, text, text, note=text),
+        lambda text: panel("tile_grid", [Tile(text, text, text, text)]),
         lambda text: title(Snapshot(recording=replace(FakeEngine(frames=2).snapshot.recording, path=Path(text)))),  # type: ignore[type-var]
     ],
 )
@@ -52,11 +53,9 @@ def test_a_live_run_waits_for_its_first_scan_and_asks_for_no_button() -> None:
 
 
 def test_the_legend_names_limits_and_unit() -> None:
-    from app.ui.colours import ColourBy, Limits
-
-    text = legend(ColourBy.HEIGHT, Limits(-2.0, 3.0))
+    text = legend("height", Limits(-2.0, 3.0))
     assert ">-2<" in text and ">3<" in text and "height · m" in text
-    assert all(name in legend(ColourBy.LABEL, None) for name in ("ground", "not ground", "seed"))
+    assert all(name in legend(LABEL, None) for name in ("ground", "not ground", "seed"))
 
 
 def test_result_folders_sort_and_need_no_quoting() -> None:

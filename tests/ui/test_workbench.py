@@ -72,9 +72,9 @@ def test_numbers_come_at_most_four_times_a_second_and_end_at_the_newest(page: Pa
     assert f"{page.engine.snapshot.result.ground.seeds:,}" in page.workbench._readouts._tiles.content  # type: ignore[union-attr]
 
 
-def test_what_plays_asks_a_browser_to_lay_its_panels_out_anew_but_a_few_times_a_second(page: Page, wire: Wire) -> None:
-    """Ten seconds at ten frames a second: each panel's update is more work for a page than a drawing of the scene."""
-    for step in range(270):  # the first 20 for what is sent but once
+def test_while_playing_each_panel_is_sent_at_most_four_times_a_second(page: Page, wire: Wire) -> None:
+    """Ten seconds at ten frames a second."""
+    for step in range(270):  # the first 20 for what is sent only once
         if step == 20:
             wire.clear()
         if step % 5 in (0, 2):
@@ -82,8 +82,8 @@ def test_what_plays_asks_a_browser_to_lay_its_panels_out_anew_but_a_few_times_a_
             page.engine.publish(transport=replace(page.engine.snapshot.transport, playing=True))
         page.draw(0.04)
     counts = Counter((m.uuid, *m.updates) for m in wire.messages if isinstance(m, GuiUpdateMessage))
-    assert max(counts.values()) <= 25
-    assert counts.total() <= 200
+    assert max(counts.values()) <= 40
+    assert counts.total() <= 400
     scene = Counter(type(m).__name__ for m in wire.messages if not isinstance(m, GuiUpdateMessage))
     assert scene.total() <= 1200
 

@@ -1,1 +1,1 @@
-"""Loops in the page: edges in the scene, the ledger, all there is on one of them, and editing them."""
+"""Loops in the page: arches in the scene, the table of candidates, everything about one of them, and editing them."""

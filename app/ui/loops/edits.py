@@ -1,39 +1,70 @@
-"""The user's word on a loop: proposed first, shown as a ghost, then committed or not; undo, redo, files."""
+"""Editing loops: an edit is proposed, shown as a ghost, then committed or cancelled; undo, redo, files."""
 
-import time
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import viser
 
-from app.server.protocol import Command, EditLoop, RedoLoop, Snapshot, TryLoop, UndoLoop
+from app.server.protocol import EditLoop, RedoLoop, Snapshot, TryLoop, UndoLoop
 from app.slam.errors import HemislamError
 from app.slam.loops import edit_files
-from app.slam.loops.types import Accept, LoopEdge, LoopEdit, Pair, Preview, Reject, SetWeight, Solve, Verdict
-from app.ui.html import box
-from app.ui.loops.kinds import say
-from app.ui.loops.overlay import Ghost
+from app.slam.loops.types import Accept, LoopEdge, LoopEdit, Pair, Reject, SetWeight, Solve, Verdict
+from app.slam.types import F32, F64
+from app.ui.colours import Rgb
+from app.ui.html import panel
+from app.ui.loops.kinds import describe_edit
 from app.ui.loops.words import forecast, headline
-from app.ui.widgets import by_user, show, unchanged
+from app.ui.paths import segments
+from app.ui.widgets import ROOT, Page, by_user, show, unchanged
 
 _REST_S: Final = 0.3
+_GHOST: Final[Rgb] = (206, 176, 255)
+_STICK: Final[Rgb] = (140, 120, 180)
+_MOVED_M: Final = 0.02
+
+
+class Ghost:
+    """The trajectory as an edit would make it, tied by sticks to the present one."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        self._nodes: list[viser.LineSegmentsHandle] = []
+        self._drawn: tuple[object, ...] = ()
+
+    def draw(self, tried: F64 | None, present: F64) -> None:
+        """Show (k, 4, 4) poses `tried` beside the present ones; None removes them."""
+        drawn = (tried, present if tried is not None else None)
+        if unchanged(self._drawn, drawn):
+            return
+        self._drawn = drawn
+        for node in self._nodes:
+            node.remove()
+        self._nodes.clear()
+        if tried is None or len(tried) < 2:
+            return
+        there = tried[:, :3, 3]
+        self._add("path", segments(there), _GHOST, 3.0)
+        here = present[: len(tried), :3, 3]
+        sticks = np.stack((here, there[: len(here)]), axis=1).astype(np.float32)
+        sticks = sticks[np.linalg.norm(sticks[:, 1] - sticks[:, 0], axis=1) > _MOVED_M]
+        if len(sticks):
+            self._add("moves", sticks, _STICK, 1.0)
+
+    def _add(self, name: str, lines: F32, colour: Rgb, width: float) -> None:
+        node = f"{ROOT}/ghost/{name}"
+        self._nodes.append(
+            self._scene.add_line_segments(node, lines, colour, thickness=width, thickness_units="screen")
+        )
 
 
 class Proposal:
-    """What would change by the command that is being considered, with Commit and Cancel."""
+    """What the edit under consideration would change, with Commit and Cancel."""
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        root: str,
-        send: Callable[[Command], None],
-        snapshot: Callable[[], Snapshot],
-        committed: Callable[[LoopEdit], None],
-    ) -> None:
-        gui = server.gui
-        self._send, self._snapshot, self._committed = send, snapshot, committed
-        self._ghost = Ghost(server.scene, root)
+    def __init__(self, page: Page, committed: Callable[[LoopEdit], None]) -> None:
+        gui = page.gui
+        self._send, self._snapshot, self._committed = page.send, page.snapshot, committed
+        self._ghost = Ghost(page.scene)
         self._folder = gui.add_folder("Before you decide", visible=False)
         with self._folder:
             self._words = gui.add_html("")
@@ -53,7 +84,7 @@ class Proposal:
         self._send(TryLoop(command))
 
     def commit(self) -> None:
-        """Do it."""
+        """Make the edit."""
         command, self.command = self.command, None
         if command is not None:
             self._send(EditLoop(command))
@@ -61,7 +92,7 @@ class Proposal:
             self._committed(command)
 
     def cancel(self) -> None:
-        """Leave it."""
+        """Drop the proposal."""
         if self.command is not None:
             self.command = None
             self._send(TryLoop(None))
@@ -80,15 +111,10 @@ class Proposal:
         self._folder.visible = command is not None
         if command is not None:
             self._commit.disabled = preview is None
-            self._words.content = self._forecast(command, preview, poses, snapshot, problem)
-
-    def _forecast(
-        self, command: LoopEdit, preview: Preview | None, poses: Any, snapshot: Snapshot, problem: str
-    ) -> str:
-        return forecast(command, preview, poses, snapshot.loops.residuals, problem)
+            self._words.content = forecast(command, preview, poses, snapshot.loops.residuals, problem)
 
     def _problem(self, snapshot: Snapshot) -> str:
-        """What the engine had to say against it since it was proposed."""
+        """The engine's newest error since the edit was proposed."""
         told = [n.text for n in snapshot.notices if n.number > self._last_notice and n.level == "error"]
         return told[-1] if told else ""
 
@@ -96,24 +122,23 @@ class Proposal:
 class VerdictPanel:
     """Accept, reject and weight of the chosen loop."""
 
-    def __init__(
-        self, gui: viser.GuiApi, propose: Callable[[LoopEdit], None], now: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._propose, self._now = propose, now
+    def __init__(self, page: Page, propose: Callable[[LoopEdit], None]) -> None:
+        gui = page.gui
+        self._propose, self._now = propose, page.now
         self._pair: Pair | None = None
         self._dragged: tuple[float, float] | None = None
         self._headline = gui.add_html("")
         self._accept = gui.add_button("Accept it …", icon=viser.Icon.THUMB_UP, color="teal")
         self._reject = gui.add_button("Reject it …", icon=viser.Icon.THUMB_DOWN, color="red")
         self._weight = gui.add_slider(
-            "weight", 0.1, 10.0, 0.1, 1.0, hint="Divides its covariance in the graph; 1 is what registration said."
+            "weight", 0.1, 10.0, 0.1, 1.0, hint="Divides its covariance in the graph; 1 is as registered."
         )
-        self._accept.on_click(by_user(lambda _, __: self._say(Accept)))
-        self._reject.on_click(by_user(lambda _, __: self._say(Reject)))
-        self._weight.on_update(by_user(self._drag))
+        self._accept.on_click(by_user(lambda _, __: self._propose_for_pair(Accept)))
+        self._reject.on_click(by_user(lambda _, __: self._propose_for_pair(Reject)))
+        self._weight.on_update(by_user(lambda weight, _: self._drag(weight)))
 
     def draw(self, edge: LoopEdge | None, weighing: float | None) -> None:
-        """Show how the loop stands. weighing: the weight that is being considered."""
+        """Show the loop's verdict. weighing: the weight under consideration."""
         self._pair = edge.pair if edge is not None else None
         if edge is None:
             self._dragged = None
@@ -130,32 +155,32 @@ class VerdictPanel:
             self._dragged = None
             self._propose(SetWeight(edge.older, edge.newer, dragged[0]))
 
-    def _drag(self, weight: float, _: Any) -> None:
+    def _drag(self, weight: float) -> None:
         self._dragged = (weight, self._now())
 
-    def _say(self, verb: type[Accept] | type[Reject]) -> None:
+    def _propose_for_pair(self, verb: type[Accept] | type[Reject]) -> None:
         if self._pair is not None:
             self._propose(verb(*self._pair))
 
 
 class SolvePanel:
-    """All factors solved at once, on request."""
+    """Solves for all factors at once, on request."""
 
     def __init__(self, gui: viser.GuiApi, propose: Callable[[LoopEdit], None]) -> None:
         self._button = gui.add_button(
             "Solve all at once …",
             icon=viser.Icon.MATH_FUNCTION,
             color="gray",
-            hint="Levenberg-Marquardt over all factors, instead of one keyframe after the other; first see what it"
+            hint="Levenberg-Marquardt over all factors, instead of one keyframe after the other. You first see what it"
             " would change.",
         )
         self._where = gui.add_html(
-            box("What it would change stands further up, under <b>Before you decide</b>."), visible=False
+            panel("text", "What it would change is shown above, under “Before you decide”."), visible=False
         )
         self._button.on_click(by_user(lambda _, __: propose(Solve())))
 
     def draw(self, snapshot: Snapshot, considered: bool) -> None:
-        """Nothing to ask for where it is so already, or where there is no loop. considered: it is being decided."""
+        """Disable it when it was the last edit, or there is no loop. considered: whether it is proposed now."""
         loops = snapshot.loops
         self._where.visible = considered
         self._button.disabled = Solve() in loops.undo or not any(edge.counts for edge in loops.edges)
@@ -164,8 +189,9 @@ class SolvePanel:
 class EditsPanel:
     """Undo, redo, and the list of edits as a file."""
 
-    def __init__(self, gui: viser.GuiApi, send: Callable[[Command], None], snapshot: Callable[[], Snapshot]) -> None:
-        self._send, self._snapshot = send, snapshot
+    def __init__(self, page: Page) -> None:
+        gui, send = page.gui, page.send
+        self._send, self._snapshot = send, page.snapshot
         self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray", hint="Ctrl Z")
         self._redo = gui.add_button("Redo", icon=viser.Icon.ARROW_FORWARD_UP, color="gray", hint="Ctrl Shift Z")
         self._save = gui.add_button(
@@ -191,14 +217,11 @@ class EditsPanel:
             (self._undo, "Undo", snapshot.loops.undo),
             (self._redo, "Redo", snapshot.loops.redo),
         ):
-            label = f"{verb}: {say(commands[-1])}" if commands else verb
-            if button.label != label:
-                button.label = label
+            label = f"{verb}: {describe_edit(commands[-1])}" if commands else verb
+            button.label = label
             button.disabled = not commands
         count = len(snapshot.loops.undo)
-        label = f"Save edits ({count})" if count else "Save edits"
-        if self._save.label != label:
-            self._save.label = label
+        self._save.label = f"Save edits ({count})" if count else "Save edits"
         self._save.disabled = not count
 
     def _download(self, client: viser.ClientHandle) -> None:

@@ -1,4 +1,4 @@
-"""A browser's camera on its way to a place."""
+"""Moving a browser's camera to a place."""
 
 import time
 from typing import Final
@@ -11,11 +11,11 @@ from app.slam.types import F64
 _STEPS: Final = 14
 _STEP_S: Final = 0.03
 _LEAST_SLOPE: Final = 0.9
-"""Looking down at least so steeply (z over the horizontal), to see into a building."""
+"""Least steepness of the view downwards (z over the horizontal), to see into a building."""
 
 
 def stand(position: F64, look_at: F64, target: F64, distance: float) -> F64:
-    """(3,) where the camera stands to see `target` from `distance` (m), from the side it looked from before."""
+    """(3,) where the camera must be to see `target` from `distance` (m), on the side it looked from before."""
     back = position - look_at
     flat = back[:2] if np.linalg.norm(back[:2]) > 1e-6 else np.array([-1.0, -1.0])
     flat = flat / np.linalg.norm(flat)
@@ -25,7 +25,7 @@ def stand(position: F64, look_at: F64, target: F64, distance: float) -> F64:
 
 
 def fly(client: viser.ClientHandle, target: F64, distance: float) -> None:
-    """Take the camera of one browser to `target` (3,), in the scene's frame, within half a second."""
+    """Move one browser's camera to `target` (3,), in the scene's frame, within half a second."""
     camera = client.camera
     position, look_at = np.array(camera.position), np.array(camera.look_at)
     there = stand(position, look_at, target, distance)

@@ -1,37 +1,111 @@
-"""All there is on one loop: its numbers, its contexts, its residuals, and both submaps in the scene."""
+"""Everything about one loop: its numbers, its contexts, its residuals, and both submaps laid over each other."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import viser
 
 from app.server.protocol import Snapshot
+from app.slam import lie
 from app.slam.loops.types import LoopDetail, LoopEdge, Pair
-from app.slam.types import F32, F64
-from app.ui.html import box, heading
-from app.ui.loops.charts import best_yaw, contexts_image, histogram, shift_plot
-from app.ui.loops.overlay import Overlay, Pairing, on_the_way, without_ceiling
-from app.ui.loops.words import evidence, submap_legend
+from app.slam.types import F32, F64, NON_GROUND
+from app.ui.ceiling import below_ceiling
+from app.ui.geometry import wxyz
+from app.ui.html import heading, panel
+from app.ui.loops.charts import best_yaw, contexts_image
+from app.ui.loops.kinds import NEWER, OLDER
+from app.ui.loops.words import charts, evidence
 from app.ui.view import View
-from app.ui.widgets import by_user, unchanged
+from app.ui.widgets import ROOT, Page, by_user, unchanged
 
 FLY, SEEK, CLOSE = "fly there", "frame", "close"
+MOST_POINTS: Final = 30_000
 _LEAST_POINT_M: Final = 0.035
-"""Submaps are thinner than the map."""
+"""Submaps have fewer points than the map."""
 _NO_CONTEXTS: Final = np.zeros((1, 1, 4), np.uint8)
 
 
+def on_the_way(T_from: F64, T_to: F64, share: float) -> F64:
+    """(4, 4) between two poses: the position moves in a straight line, the rotation about one axis. share: 0 to 1."""
+    turn = lie.log(T_from[:3, :3].T @ T_to[:3, :3])
+    return lie.transform(T_from[:3, :3] @ lie.exp(share * turn), (1 - share) * T_from[:3, 3] + share * T_to[:3, 3])
+
+
+def without_ceiling(points: F32) -> F32:
+    """(n, 3) points of a submap, z up and its keyframe at the origin, without the ceiling above that."""
+    mask = below_ceiling(points, np.full(len(points), NON_GROUND, np.uint8), np.array([0.0, 0.0, 1.0]))
+    return points if mask is None else points[mask]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairing:
+    """Two clouds to be laid over each other, each in a frame of its own.
+
+    Attributes:
+        older, newer: (n, 3). T_map_older: (4, 4) of the older cloud's frame.
+    """
+
+    older: F32
+    newer: F32
+    T_map_older: F64
+
+
+class Overlay:
+    """The two clouds as nodes below `root`; their points are sent once, a moved slider sends a pose."""
+
+    def __init__(self, scene: viser.SceneApi, root: str) -> None:
+        self._scene = scene
+        self._root = root
+        self._nodes: dict[str, viser.PointCloudHandle] = {}
+        self._points: dict[str, F32] = {}
+
+    def draw(self, pairing: Pairing | None, T_map_newer: F64 | None, point_size: float) -> None:
+        """Show the clouds with the newer one's frame at `T_map_newer` (4, 4); None removes them."""
+        if pairing is None or T_map_newer is None:
+            self._remove(*self._nodes)
+            self._points.clear()
+            return
+        for name, points, colour, T in (
+            ("older", pairing.older, OLDER, pairing.T_map_older),
+            ("newer", pairing.newer, NEWER, T_map_newer),
+        ):
+            if points is not self._points.get(name):
+                self._points[name] = points
+                self._send(name, points, colour, point_size)
+            if (node := self._nodes.get(name)) is not None:
+                node.wxyz, node.position, node.point_size = wxyz(T[:3, :3]), T[:3, 3], point_size
+
+    def _remove(self, *names: str) -> None:
+        for name in names:
+            if (node := self._nodes.pop(name, None)) is not None:
+                node.remove()
+
+    def _send(self, name: str, points: F32, colour: tuple[int, int, int], point_size: float) -> None:
+        if not len(points):  # the page cannot draw a cloud without points
+            self._remove(name)
+            return
+        self._nodes[name] = self._scene.add_point_cloud(
+            f"{self._root}/{name}",
+            points[:MOST_POINTS],
+            colour,
+            point_size=point_size,
+            point_shape="circle",
+            precision="float32",  # a fit is judged by centimetres; a half float resolves 2 cm at 20 m
+        )
+
+
 class Inspector:
-    """Widgets in the caller's container, and clouds below the scene node `root`.
+    """Widgets in the caller's container, and clouds below the scene node of the map.
 
     Args:
         act: called with `FLY`, `SEEK` or `CLOSE` and the browser.
     """
 
-    def __init__(self, server: viser.ViserServer, root: str, act: Callable[[str, viser.ClientHandle], None]) -> None:
-        gui = server.gui
-        self._overlay = Overlay(server.scene, root)
+    def __init__(self, page: Page, act: Callable[[str, viser.ClientHandle], None]) -> None:
+        gui = page.gui
+        self._overlay = Overlay(page.scene, f"{ROOT}/submaps")
         self._pairing: Pairing | None = None
         self._detail: LoopDetail | None = None
         self._clouds: tuple[LoopDetail, bool, F32, F32] | None = None
@@ -41,28 +115,32 @@ class Inspector:
             "go", (FLY, SEEK, CLOSE), hint="Fly to the loop, seek to the frame at which it was decided, or close it."
         )
         self._go.on_click(by_user(act))
-        self._waiting = gui.add_html(box('<span class="hs-quiet">The engine gets the submaps …</span>'))
+        self._waiting = gui.add_html(panel("quiet", "Waiting for the submaps …"))
         self._laid = gui.add_slider(
-            "submaps", 0.0, 1.0, 0.01, 1.0, hint="Left: where the graph had them. Right: as they were registered.",
+            "submaps",
+            0.0,
+            1.0,
+            0.01,
+            1.0,
+            hint="Left: where the graph had them. Right: as they were registered.",
             marks=((0.0, "graph"), (1.0, "fit")),
-        )  # fmt: skip
+        )
         self._alone = gui.add_checkbox("these alone", True, hint="Hide the map and the scan behind the two submaps.")
         self._legend = gui.add_html("")
         self._contexts_title = gui.add_html(
-            heading("Scan Contexts from above; grey was never seen, the newer one is turned to fit")
+            heading("Scan Contexts from above, the newer one turned to match; grey was never seen")
         )
         self._contexts = gui.add_image(_NO_CONTEXTS, format="png")
         self._charts = gui.add_html("")
 
     @property
     def alone(self) -> bool:
-        """Whether the submaps are in the scene and nothing else should be."""
+        """Whether the submaps are in the scene and hide everything else."""
         return self._pairing is not None and self._alone.value
 
     def draw(self, snapshot: Snapshot, edge: LoopEdge | None) -> None:
-        """Show the loop `edge`; what has not come yet from the engine is waited for."""
-        asked = edge.pair if edge is not None else None
-        detail = _detail(snapshot, asked)
+        """Show the loop `edge`; its details come from the engine a moment later."""
+        detail = _detail(snapshot, edge.pair if edge is not None else None)
         news = (detail, edge, snapshot.params.loops)
         if unchanged(self._told, news):
             return
@@ -72,20 +150,14 @@ class Inspector:
         self._waiting.visible = detail is None
         if edge is None:
             return
-        params = snapshot.params.loops
-        self._evidence.content = evidence(edge, params)
-        self._legend.content = submap_legend(edge.pair)
+        self._evidence.content = evidence(edge, snapshot.params.loops)
+        names = [(OLDER, f"keyframe {edge.older}"), (NEWER, f"keyframe {edge.newer}")]
+        self._legend.content = panel("keys", names, True)
         if detail is not None:
             if detail is not self._detail:
                 turn = best_yaw(detail.shift_distances)
                 self._contexts.image = contexts_image(detail.older_context, detail.newer_context, turn)
-            degrees = np.degrees(best_yaw(detail.shift_distances))
-            self._charts.content = (
-                heading(f"Distance of the contexts over the turn of the newer; best at {degrees:.0f}°")
-                + box(shift_plot(detail.shift_distances, params.context_distance))
-                + heading("Points over their distance to the other submap's surface, mm")
-                + box(histogram(detail.residuals, params.max_residual))
-            )
+            self._charts.content = charts(detail, snapshot.params.loops)
         self._detail = detail
 
     def draw_scene(self, snapshot: Snapshot, chosen: Pair | None, view: View) -> None:
@@ -101,13 +173,8 @@ class Inspector:
             older, newer = both if view.ceilings else map(without_ceiling, both)
             self._clouds = detail, view.ceilings, older, newer
         self._pairing = Pairing(*self._clouds[2:], T_map_older)
-        size = max(view.point_size, _LEAST_POINT_M)
-        self._overlay.draw(self._pairing, placed(detail, T_map_older, self._laid.value), size)
-
-
-def placed(detail: LoopDetail, T_map_older: F64, share: float) -> F64:
-    """(4, 4) T_map_newer of the level frames. share: 0 where the graph had it, 1 as registered."""
-    return np.asarray(T_map_older @ on_the_way(detail.T_guess, detail.T_registered, share))
+        T_map_newer = T_map_older @ on_the_way(detail.T_guess, detail.T_registered, self._laid.value)
+        self._overlay.draw(self._pairing, T_map_newer, max(view.point_size, _LEAST_POINT_M))
 
 
 def _detail(snapshot: Snapshot, pair: Pair | None) -> LoopDetail | None:

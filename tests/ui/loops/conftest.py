@@ -46,7 +46,7 @@ class Page:
         self.loops._clicked(event)
 
     def says(self, *html: str) -> bool:
-        return all(part in self.loops._ledger.content for part in html)
+        return all(part in self.loops._table.content for part in html)
 
     def edge(self, pair: tuple[int, int]) -> Any:
         return next(edge for edge in self.engine.snapshot.loops.edges if edge.pair == pair)

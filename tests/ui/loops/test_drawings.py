@@ -11,7 +11,7 @@ from app.slam.loops.scan_context import RINGS, SECTORS, YAWS
 from app.ui.loops.charts import UNSEEN, contexts_image, disc, histogram, shift_plot
 from app.ui.loops.edges import nearest
 from app.ui.loops.fly import stand
-from app.ui.loops.overlay import on_the_way, without_ceiling
+from app.ui.loops.inspector import on_the_way, without_ceiling
 
 angles = st.tuples(*(st.floats(-1.5, 1.5) for _ in range(3)))
 places = st.tuples(*(st.floats(-50, 50) for _ in range(3)))
@@ -75,21 +75,22 @@ def test_a_context_that_saw_nothing_is_all_grey() -> None:
 
 
 def test_the_histogram_has_a_bar_for_each_class_and_none_of_nothing() -> None:
-    svg = histogram(np.concatenate((np.full(90, 0.001), np.full(10, -0.03), [np.nan])), 0.05)
-    heights = [float(part.split('"')[0]) for part in svg.split(' height="')[1:]]
+    plot = histogram(np.concatenate((np.full(90, 0.001), np.full(10, -0.03), [np.nan])), 0.05)
+    assert plot is not None
+    heights = [float(height) for *_, height in plot.bars]
     assert sorted(h for h in heights if h > 0)[0] * 9 == pytest.approx(max(heights), rel=0.02)
-    assert ">90<" in svg and "<" not in histogram(np.empty(0), 0.05)
+    assert "90" in [text for *_, text in plot.ticks] and histogram(np.empty(0), 0.05) is None
 
 
 def test_the_plot_of_shifts_runs_from_half_a_turn_to_half_a_turn_and_marks_the_best() -> None:
     distances = np.full(SECTORS, 0.6)
     distances[15] = 0.1  # 90 degrees
-    svg = shift_plot(distances, 0.3)
-    points = [tuple(map(float, pair.split(","))) for pair in svg.split('points="')[1].split('"')[0].split()]
+    plot = shift_plot(distances, 0.3)
+    points = [tuple(map(float, pair.split(","))) for pair in plot.points.split()]
     xs, ys = np.array(points).T
     assert (np.diff(xs) > 0).all()
     lowest = xs[ys.argmax()]  # SVG counts down
-    assert f'x1="{lowest:.1f}" x2="{lowest:.1f}"' in svg
+    assert [line[0] for line in plot.lines if line[0] == line[2]] == [f"{lowest:.1f}"]
     assert lowest == pytest.approx(26 + 0.75 * (300 - 6 - 26), abs=0.5)
 
 

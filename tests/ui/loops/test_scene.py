@@ -8,25 +8,25 @@ import numpy as np
 
 from app.server.protocol import InspectLoop, LoopsView
 from app.slam.loops.types import Verdict
-from app.ui.loops.kinds import Kind
+from app.ui.loops.kinds import KINDS
 from tests.ui.conftest import SOMEONE, Wire
 from tests.ui.loops.conftest import GOOD, Page
 
 
 def test_loops_that_were_turned_down_are_not_sent_until_asked_for(page: Page) -> None:
-    assert page.node("/map/loops/accepted-in/0").points.shape == (12, 2, 3)
-    assert page.node("/map/loops/candidate-out/0").points.shape == (6, 2, 3)
-    assert page.node("/map/loops/rejected-out/0") is None
+    assert page.node("/map/loops/accepted-in").points.shape == (12, 2, 3)
+    assert page.node("/map/loops/candidate-out").points.shape == (6, 2, 3)
+    assert page.node("/map/loops/rejected-out") is None
     page.loops._act("show rejected", SOMEONE)  # type: ignore[arg-type]
     page.draw()
-    assert page.node("/map/loops/rejected-out/0").points.shape == (40, 2, 3)
+    assert page.node("/map/loops/rejected-out").points.shape == (40, 2, 3)
     page.loops._act("show rejected", SOMEONE)  # type: ignore[arg-type]
     page.draw()
-    assert page.node("/map/loops/rejected-out/0") is None
+    assert page.node("/map/loops/rejected-out") is None
 
 
 def test_an_arch_goes_from_keyframe_to_keyframe_over_a_knob_above_both(page: Page) -> None:
-    legs, poses = page.node("/map/loops/accepted-in/0").points, page.engine.snapshot.keyframe_poses
+    legs, poses = page.node("/map/loops/accepted-in").points, page.engine.snapshot.keyframe_poses
     assert poses is not None
     first = page.engine.snapshot.loops.edges[0]
     accepted = min(e.pair for e in page.engine.snapshot.loops.edges if e.verdict is Verdict.ACCEPTED)
@@ -40,7 +40,7 @@ def test_an_arch_goes_from_keyframe_to_keyframe_over_a_knob_above_both(page: Pag
 def test_however_many_loops_there_are_a_few_nodes_draw_them(page: Page, wire: Wire) -> None:
     edges = page.engine.snapshot.loops.edges
     many = [replace(edges[k % len(edges)], older=k % 60, newer=70 + k // 60) for k in range(600)]
-    page.loops._shown = frozenset(Kind)
+    page.loops._shown = frozenset(KINDS)
     wire.clear()
     page.engine.publish(loops=LoopsView(edges=tuple(sorted(many, key=lambda e: e.pair))))
     page.draw()
@@ -49,31 +49,13 @@ def test_however_many_loops_there_are_a_few_nodes_draw_them(page: Page, wire: Wi
     assert sum(len(page.node(name).points) for name in sent) == 2 * 600
 
 
-def test_with_one_more_loop_only_the_newest_arches_are_sent_again(page: Page, wire: Wire) -> None:
-    edge = next(edge for edge in page.engine.snapshot.loops.edges if edge.counts)
-    many = [replace(edge, older=k % 60, newer=70 - k // 60) for k in range(600)]
-    page.engine.publish(loops=LoopsView(edges=tuple(sorted(many, key=lambda e: e.pair))))
-    page.draw()
-    wire.clear()
-    one = replace(edge, older=0, newer=71)
-    page.engine.publish(loops=LoopsView(edges=tuple(sorted([*many, one], key=lambda e: e.pair))))
-    page.draw()
-    assert [name for name in wire.nodes("LineSegmentsMessage") if name.startswith("/map/loops/")] == [
-        "/map/loops/accepted-in/2"
-    ]
-    page.engine.publish(loops=LoopsView(edges=(one,)))
-    page.draw()
-    assert page.node("/map/loops/accepted-in/0").points.shape == (2, 2, 3)
-    assert page.node("/map/loops/accepted-in/1") is None
-
-
 def test_loops_move_with_their_keyframes(page: Page) -> None:
-    before = page.node("/map/loops/accepted-in/0").points.copy()
+    before = page.node("/map/loops/accepted-in").points.copy()
     poses = page.engine.snapshot.keyframe_poses.copy()  # type: ignore[union-attr]
     poses[:, 1, 3] += 2.0
     page.engine.publish(keyframe_poses=poses)
     page.draw()
-    assert np.allclose(page.node("/map/loops/accepted-in/0").points - before, [0, 2, 0], atol=1e-5)
+    assert np.allclose(page.node("/map/loops/accepted-in").points - before, [0, 2, 0], atol=1e-5)
 
 
 def test_a_click_in_the_scene_chooses_the_loop_it_points_at(page: Page) -> None:

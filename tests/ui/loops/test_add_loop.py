@@ -1,4 +1,4 @@
-"""Two keyframes tied by hand: picked, nudged, tried."""
+"""A loop added by hand: its keyframes are picked, its guess is nudged and tried."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,39 +12,39 @@ from tests.ui.loops.conftest import Page
 
 
 def test_two_keyframes_are_picked_in_the_scene_and_tied_from_where_the_graph_has_them(page: Page) -> None:
-    tie, poses = page.loops._tie, page.engine.snapshot.keyframe_poses
+    added, poses = page.loops._add_loop, page.engine.snapshot.keyframe_poses
     assert poses is not None
-    user_clicks(tie._pick)
+    user_clicks(added._pick)
     page.draw()
-    assert len(page.node("/map/tie/keyframes").points) == KEYFRAMES
+    assert len(page.node("/map/add_loop/keyframes").points) == KEYFRAMES
     for index in (140, 61):  # the newer one first
         page.click_scene(poses[index, :3, 3] + [0.4, -0.3, 6.0], poses[index, :3, 3])
         page.draw()
-    assert tie.pair == (61, 140) and not tie.picking
-    assert page.node("/map/tie/keyframes") is None
-    user_clicks(tie._try)
+    assert added.pair == (61, 140) and not added.picking
+    assert page.node("/map/add_loop/keyframes") is None
+    user_clicks(added._try)
     assert page.engine.sent == [TryLoop(Add(61, 140))]
 
 
 def test_a_pair_that_makes_no_sense_is_not_sent(page: Page) -> None:
-    tie = page.loops._tie
+    added = page.loops._add_loop
     for pair in ((5, 5), (9, 3), (3, KEYFRAMES)):
-        tie.suggest_pair(pair)
-        user_clicks(tie._try)
-        assert tie._problem.visible
+        added.suggest_pair(pair)
+        user_clicks(added._try)
+        assert added._problem.visible
     assert page.engine.sent == []
 
 
 def test_a_nudged_guess_is_tried_when_the_hand_rests_and_is_where_the_cloud_was_put(page: Page) -> None:
-    tie, poses = page.loops._tie, page.engine.snapshot.keyframe_poses
+    added, poses = page.loops._add_loop, page.engine.snapshot.keyframe_poses
     assert poses is not None
-    tie.suggest_pair((20, 97))
-    tie._nudge.value = True
+    added.suggest_pair((20, 97))
+    added._nudge.value = True
     page.draw()
     page.draw()
     assert page.engine.sent == []  # it was only put there
     assert not page.node("/map/keyframes/3").visible
-    gizmo = page.node("/map/tie/gizmo")
+    gizmo = page.node("/map/add_loop/gizmo")
     assert np.allclose(gizmo.position, poses[97, :3, 3])
     turn = Rotation.from_euler("z", 0.3)
     x, y, z, w = turn.as_quat()
@@ -61,21 +61,21 @@ def test_a_nudged_guess_is_tried_when_the_hand_rests_and_is_where_the_cloud_was_
 
 
 def test_an_untouched_gizmo_is_the_graph_s_own_guess(page: Page) -> None:
-    tie, poses = page.loops._tie, page.engine.snapshot.keyframe_poses
+    added, poses = page.loops._add_loop, page.engine.snapshot.keyframe_poses
     assert poses is not None
-    tie.suggest_pair((20, 97))
-    tie._nudge.value = True
-    tie._register.value = False
+    added.suggest_pair((20, 97))
+    added._nudge.value = True
+    added._register.value = False
     page.draw()
-    tie.suggest()
+    added.suggest()
     (command,) = [sent.command for sent in page.engine.sent if isinstance(sent, TryLoop)]
     assert isinstance(command, Add) and command.guess is not None and not command.register
     assert np.allclose(command.guess, lie.inverse(poses[20]) @ poses[97], atol=1e-6)
 
 
 def test_a_loop_tied_by_hand_is_chosen_once_it_is_there(page: Page) -> None:
-    page.loops._tie.suggest_pair((20, 97))
-    page.loops._tie.suggest()
+    page.loops._add_loop.suggest_pair((20, 97))
+    page.loops._add_loop.suggest()
     page.draw()
     user_clicks(page.loops._proposal._commit)
     page.draw()

@@ -1,26 +1,11 @@
-"""What the browser runs for the timeline: draws the strips on a canvas, reads the pointer, asks to seek.
-
-viser's plots tell the server nothing of clicks, and eight of them would cost more than this one canvas.
-"""
-
-from html import escape
-from typing import Final
-
-from app.ui.html import BAD, GOOD, QUIET
-from app.ui.keys import ONE_PIXEL
-
-_WIDE_FROM_PX: Final = 700
-"""Where the scene is at least so wide, the strips lie along its lower edge; else under the transport."""
-
-_SCRIPT: Final = """
+// Draws the strips on a canvas, reads the pointer, and asks the server to seek (see viser_adapter.js).
 const shell = this.parentElement, mover = shell.closest('[data-hs-to]'), home = mover.parentElement;
 const canvas = shell.querySelector('canvas'), button = shell.querySelector('button');
-// Thousands of rectangles: without the hint they go to the process that draws the scene as well, which waits for them.
-const pen = canvas.getContext('2d', {willReadFrequently: true});
+const pen = canvas.getContext('2d');
 for (const old of document.querySelectorAll('body > [data-hs-to]')) if (old.querySelector('.hs-tl')) old.remove();
 const HEAD = 20, NAME = 78, VALUE = 72;
 let ROW = 17;
-const BAD = '%BAD%', GOOD = '%GOOD%', QUIET = '%QUIET%';
+const {bad: BAD, good: GOOD, quiet: QUIET, wideFrom: WIDE_FROM} = canvas.dataset;
 let d = null, text = '', hover = null, scrubbing = false, said = 0;
 const scene = () => [...document.querySelectorAll('canvas')].filter((c) => c !== canvas)
   .sort((a, b) => b.width * b.height - a.width * a.height)[0];
@@ -144,7 +129,7 @@ canvas.onpointermove = (event) => {
   canvas.title = over || row < 0 ? '' : d.strips[row] ? d.strips[row].hint : loops;
   const place = (frame) => NAME + (frame + 0.5) / d.frames * (box.width - NAME - VALUE);
   const near = d.notes.filter(([frame]) => over && Math.abs(place(frame) - x) < 4);
-  if (near.length) canvas.title = near.map(([f, text]) => `${f.toLocaleString('en')}: ${text}`).join('\\n');
+  if (near.length) canvas.title = near.map(([f, text]) => `${f.toLocaleString('en')}: ${text}`).join('\n');
   canvas.style.cursor = over || scrubbing ? 'col-resize' : 'default';
   hover = over || scrubbing ? frameAt(event) : null;
   if (scrubbing) ask(hover, false);
@@ -173,7 +158,7 @@ const place = (wide) => {
   draw();
 };
 const chosen = () => localStorage.getItem('hemislam-timeline');
-const wanted = () => chosen() ? chosen() === 'wide' : Boolean(scene()) && scene().clientWidth >= %WIDE%;
+const wanted = () => chosen() ? chosen() === 'wide' : Boolean(scene()) && scene().clientWidth >= Number(WIDE_FROM);
 button.onclick = () => {
   localStorage.setItem('hemislam-timeline', wanted() ? 'narrow' : 'wide'); place(wanted());
 };
@@ -191,27 +176,3 @@ const watch = () => {
   read();
 };
 watch(); draw();
-"""
-
-STYLE: Final = """<style>
-.hs-tl{position:relative;padding:0 6px 4px 0;user-select:none}.hs-tl canvas{display:block;width:100%;touch-action:none}
-.hs-tl.wide{background:rgba(20,25,32,.95);border:1px solid rgba(127,140,160,.25);border-radius:6px;padding:2px 0}
-.hs-tl button{position:absolute;right:6px;top:2px;border:0;background:none;color:#8b97a8;cursor:pointer;font-size:13px;
-line-height:16px;padding:0 3px}.hs-tl button:hover{color:#fff}
-</style>"""
-
-
-def shell() -> str:
-    """The canvas and what brings it to life; drawn from the JSON in `data`."""
-    script = _SCRIPT
-    for name, value in (("BAD", BAD), ("GOOD", GOOD), ("QUIET", QUIET), ("WIDE", str(_WIDE_FROM_PX))):
-        script = script.replace(f"%{name}%", value)
-    return (
-        f'<div class="hs-tl"><canvas aria-label="timeline"></canvas><button aria-label="timeline place">⤢</button>'
-        f'<img src="{ONE_PIXEL}" hidden onload="{escape(script)}"></div>'
-    )
-
-
-def data(json: str) -> str:
-    """The element that the script reads."""
-    return f'<div class="hs-tl-data" hidden>{escape(json)}</div>'

@@ -1,68 +1,111 @@
-"""Tying two keyframes by hand: which two, from which guess, and whether they are registered."""
+"""Adding a loop by hand: which two keyframes, from which guess, and whether they are registered."""
 
-import time
 from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 import viser
 
-from app.server.protocol import Snapshot
+from app.server.protocol import Chunk, Snapshot
 from app.slam import lie
 from app.slam.loops.types import Add, Pair, rows
-from app.slam.types import F64
-from app.ui.html import box
+from app.slam.types import F32, F64
+from app.ui.chunks import shown_points
+from app.ui.geometry import wxyz
+from app.ui.html import panel
 from app.ui.loops.edges import nearest
+from app.ui.loops.inspector import MOST_POINTS, Overlay, Pairing
 from app.ui.loops.kinds import NEWER, OLDER
-from app.ui.loops.overlay import Gizmo, Overlay, Pairing, surroundings, upright
 from app.ui.view import View
-from app.ui.widgets import by_user, show
+from app.ui.widgets import ROOT, Page, by_user, show, unchanged
 
 _REST_S: Final = 0.4
-"""The guess is tried when the hand has rested for so long."""
+"""The guess is tried after the gizmo has rested this long."""
 _PICK, _FIRST, _SECOND = "Pick in the scene", "Click a keyframe …", "Click the other one …"
 _FROM_M: Final = 12.0
 _DOT: Final = (236, 240, 246)
+_REACH: Final = 5
+"""Keyframes before and after one whose points are shown around it."""
+_NODE: Final = f"{ROOT}/add_loop"
 
 
-class TiePanel:
+def upright(T_map_imu: F64) -> F64:
+    """(4, 4) T_map_upright: at the keyframe, with the map's axes."""
+    return lie.transform(np.eye(3), T_map_imu[:3, 3])
+
+
+def surroundings(chunks: tuple[Chunk, ...], poses: F64, index: int, ceilings: bool) -> F32:
+    """(n, 3) points around a keyframe in its upright frame, from the keyframes before and after it."""
+    near = [chunk for chunk in chunks if abs(chunk.index - index) <= _REACH and chunk.index < len(poses)]
+    share = MOST_POINTS // max(len(near), 1)
+    parts = [np.empty((0, 3))]
+    for chunk in near:
+        T = poses[chunk.index] @ chunk.T_imu_lidar
+        points = chunk.points[shown_points(chunk, T, ceilings)][:share]
+        parts.append(points @ T[:3, :3].T + T[:3, 3] - poses[index][:3, 3])
+    return np.concatenate(parts).astype(np.float32)
+
+
+class Gizmo:
+    """Arrows and rings with which a person moves the newer cloud."""
+
+    def __init__(self, scene: viser.SceneApi, node: str) -> None:
+        self._scene = scene
+        self._node = node
+        self._handle: viser.TransformControlsHandle | None = None
+
+    def show(self, T_map: F64) -> None:
+        """Put it at a pose (4, 4)."""
+        self.hide()
+        self._handle = self._scene.add_transform_controls(
+            self._node, scale=1.6, depth_test=False, wxyz=wxyz(T_map[:3, :3]), position=T_map[:3, 3]
+        )
+
+    def hide(self) -> None:
+        if self._handle is not None:
+            self._handle.remove()
+            self._handle = None
+
+    @property
+    def pose(self) -> F64 | None:
+        """(4, 4) where it was moved to; None while it is hidden."""
+        handle = self._handle
+        if handle is None:
+            return None
+        return lie.transform(lie.matrix(np.asarray(handle.wxyz)[[1, 2, 3, 0]]), np.array(handle.position))
+
+
+class AddLoopPanel:
     """Widgets in the caller's container.
 
     Args:
-        propose: takes the command to be tried. fly: takes a browser's camera to a place (3,) of the map, to see it
-            from so many metres. now: monotonic seconds.
+        propose: takes the edit to be tried. fly: moves a browser's camera to a place (3,) of the map, so many metres
+            away from it.
     """
 
     def __init__(
-        self,
-        server: viser.ViserServer,
-        root: str,
-        propose: Callable[[Add], None],
-        snapshot: Callable[[], Snapshot],
-        fly: Callable[[viser.ClientHandle, F64, float], None],
-        now: Callable[[], float] = time.monotonic,
+        self, page: Page, propose: Callable[[Add], None], fly: Callable[[viser.ClientHandle, F64, float], None]
     ) -> None:
-        gui = server.gui
-        self._scene, self._root = server.scene, root
-        self._propose, self._snapshot, self._fly, self._now = propose, snapshot, fly, now
-        self._overlay = Overlay(server.scene, f"{root}/clouds")
-        self._gizmo = Gizmo(server.scene, f"{root}/gizmo")
+        gui = page.gui
+        self._page, self._propose, self._fly = page, propose, fly
+        self._overlay = Overlay(page.scene, f"{_NODE}/clouds")
+        self._gizmo = Gizmo(page.scene, f"{_NODE}/gizmo")
         self._dots: viser.PointCloudHandle | None = None
         self._dotted: tuple[object, ...] = ()
         self._picked: list[int] | None = None
         self._start: tuple[Pair, Pairing, F64, F64] | None = None
         self._moved: tuple[F64, float] | None = None
-        gui.add_html(box("Tell the graph that two keyframes see the same place, whatever the finder thinks."))
+        gui.add_html(panel("text", "Tell the graph that two keyframes see the same place, whatever the search found."))
         self._older = gui.add_number("older keyframe", 0, min=0, step=1)
         self._newer = gui.add_number("newer keyframe", 0, min=0, step=1)
         self._pick = gui.add_button(_PICK, icon=viser.Icon.POINTER, color="gray")
         self._register = gui.add_checkbox(
-            "register", True, hint="Lay the submaps on each other; without, the guess counts as it is."
+            "register", True, hint="Register the submaps on each other. Off: the guess is used as it is."
         )
         self._nudge = gui.add_checkbox(
             "nudge the guess",
             False,
-            hint="Move the newer submap by arrows and rings first; without, the guess is where the graph has it.",
+            hint="First move the newer submap by arrows and rings. Off: the guess is where the graph has it.",
         )
         self._try = gui.add_button("Try it", icon=viser.Icon.LINK)
         self._problem = gui.add_html("", visible=False)
@@ -84,27 +127,28 @@ class TiePanel:
         return int(self._older.value), int(self._newer.value)
 
     def suggest_pair(self, pair: Pair) -> None:
+        """Fill in the two keyframes."""
         show(self._older, pair[0])
         show(self._newer, pair[1])
 
     def done(self) -> None:
-        """After a decision: the clouds and the gizmo go."""
+        """Remove the clouds and the gizmo, after a decision."""
         show(self._nudge, False)
 
     def suggest(self) -> None:
         """Propose what the widgets say."""
         older, newer = self.pair
-        count = len(_poses(self._snapshot()))
+        count = len(_poses(self._page.snapshot()))
         good = 0 <= older < newer < count
         self._problem.visible = not good
         if good:
             self._propose(Add(older, newer, self._guess(), self._register.value))
         else:
-            self._problem.content = box(f"Choose two of the {count} keyframes, the older one first.")
+            self._problem.content = panel("text", f"Choose two of the {count} keyframes, the older one first.")
 
     def pick(self, origin: F64, direction: F64) -> None:
         """A click while picking; the ray is in the map."""
-        picked, positions = self._picked, _poses(self._snapshot())[:, :3, 3]
+        picked, positions = self._picked, _poses(self._page.snapshot())[:, :3, 3]
         index = nearest(positions[:, None], origin, direction, within=np.radians(3.0))
         if picked is None or index is None or index in picked:
             return
@@ -114,7 +158,7 @@ class TiePanel:
             self._picked = None
 
     def draw_scene(self, snapshot: Snapshot, view: View) -> None:
-        """Called by the drawing thread, often: dots to pick from, the two clouds, and a guess that has come to rest."""
+        """Called by the drawing thread, often: dots to pick from, the two clouds, and the guess once it rests."""
         self._draw_picking(snapshot)
         poses = _poses(snapshot)
         older, newer = pair = self.pair
@@ -137,10 +181,10 @@ class TiePanel:
         self._overlay.draw(self._start[1], T, view.point_size)
         if T is None:
             return
-        now = self._now()
+        now = self._page.now()
         if self._moved is None or not np.array_equal(T, self._moved[0]):
-            resting = self._moved is None  # it was only put there
-            self._moved = (T, np.inf if resting else now)
+            untouched = self._moved is None
+            self._moved = (T, np.inf if untouched else now)
         elif now - self._moved[1] >= _REST_S:
             self._moved = (T, np.inf)
             self.suggest()
@@ -155,8 +199,8 @@ class TiePanel:
         return rows(lie.inverse(T_map_older) @ nudged)
 
     def _look(self, nudging: bool, client: viser.ClientHandle) -> None:
-        """To where there is something to nudge."""
-        poses, newer = _poses(self._snapshot()), self.pair[1]
+        """Fly to the cloud to nudge."""
+        poses, newer = _poses(self._page.snapshot()), self.pair[1]
         if nudging and newer < len(poses):
             self._fly(client, poses[newer][:3, 3], _FROM_M)
 
@@ -165,24 +209,21 @@ class TiePanel:
 
     def _draw_picking(self, snapshot: Snapshot) -> None:
         picked = self._picked
-        label = _PICK if picked is None else (_SECOND if picked else _FIRST)
-        if self._pick.label != label:
-            self._pick.label = label
-        marked = tuple(picked) if picked is not None else None
-        asked = (snapshot.keyframe_poses, marked)
-        if len(self._dotted) == 2 and self._dotted[0] is asked[0] and self._dotted[1] == marked:
+        self._pick.label = _PICK if picked is None else (_SECOND if picked else _FIRST)
+        asked = (snapshot.keyframe_poses, -1 if picked is None else len(picked))
+        if unchanged(self._dotted, asked):
             return
         self._dotted = asked
         if self._dots is not None:
             self._dots.remove()
             self._dots = None
         positions = _poses(snapshot)[:, :3, 3]
-        if marked is None or not len(positions):
+        if picked is None or not len(positions):
             return
         colours = np.tile(np.array(_DOT, np.uint8), (len(positions), 1))
-        colours[list(marked)] = OLDER if len(marked) < 2 else NEWER
-        self._dots = self._scene.add_point_cloud(
-            f"{self._root}/keyframes",
+        colours[picked] = OLDER if len(picked) < 2 else NEWER
+        self._dots = self._page.scene.add_point_cloud(
+            f"{_NODE}/keyframes",
             positions.astype(np.float32),
             colours,
             point_size=0.15,

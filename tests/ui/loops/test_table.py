@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from app.server.protocol import InspectLoop, LoopsView
-from app.ui.loops.kinds import Kind
+from app.ui.loops.kinds import KINDS
 from tests.ui.conftest import SOMEONE
 from tests.ui.loops.conftest import GOOD, Page, rejected
 
 
-def test_the_ledger_counts_and_lists_what_is_shown(page: Page) -> None:
+def test_the_table_counts_and_lists_what_is_shown(page: Page) -> None:
     assert page.says("accepted 6", "candidate 3", "rejected 20", "by hand 0", "12–89")
     hidden = "–".join(str(index) for index in rejected(page))
     assert not page.says(hidden)
@@ -22,7 +22,7 @@ def test_the_ledger_counts_and_lists_what_is_shown(page: Page) -> None:
 
 @pytest.mark.parametrize("column", ["overlap", "residual", "mahalanobis", "context"])
 def test_a_column_s_head_sorts_by_it_and_again_the_other_way_with_what_is_unknown_last(page: Page, column: str) -> None:
-    page.loops._shown = frozenset(Kind)
+    page.loops._shown = frozenset(KINDS)
     value = {
         "overlap": lambda e: e.overlap,
         "residual": lambda e: e.residual_rms,
@@ -33,7 +33,7 @@ def test_a_column_s_head_sorts_by_it_and_again_the_other_way_with_what_is_unknow
     for up in (True, False):
         page.loops._act(f"sort {column}", SOMEONE)  # type: ignore[arg-type]
         page.draw()
-        content = page.loops._ledger.content
+        content = page.loops._table.content
         words = [part.split('"')[0].split() for part in content.split('data-hs="choose ')[1:]]
         values = np.array([value(evidence[int(a), int(b)]) for a, b in words])
         known = values[np.isfinite(values)]
@@ -64,5 +64,5 @@ def test_what_the_engine_says_is_text_and_never_html(page: Page) -> None:
     edge = replace(page.edge(GOOD), reason="<script>alert(1)</script>")
     page.engine.publish(loops=LoopsView(edges=(edge,)))
     page.choose(GOOD)
-    assert "<script>" not in page.loops._ledger.content + page.loops._verdict._headline.content
+    assert "<script>" not in page.loops._table.content + page.loops._verdict._headline.content
     assert "&lt;script&gt;" in page.loops._verdict._headline.content

@@ -1,0 +1,100 @@
+"""All candidates in a table: what is shown of them, in which order, and the chips above that hide kinds."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from app.slam.loops.types import LoopEdge, Pair
+from app.ui.html import number, panel, source
+from app.ui.loops.kinds import EDITED, KINDS, SIGNS, kind_of, name
+
+MOST_ROWS: Final = 300
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Attributes:
+    title: with its unit, as short as possible. meaning: the long form. key: sorts (nan goes last). text: of a cell.
+    """
+
+    title: str
+    meaning: str
+    key: Callable[[LoopEdge], float]
+    text: Callable[[LoopEdge], str]
+
+
+COLUMNS: Final[dict[str, Column]] = {
+    "verdict": Column(
+        "", "Verdict", lambda e: list(KINDS).index(kind_of(e).name) + 0.1 * list(SIGNS).index(e.verdict),
+        lambda e: SIGNS[e.verdict] + ("✎" if kind_of(e).name == EDITED else ""),
+    ),
+    "keyframe": Column(
+        "loop", "Older and newer keyframe", lambda e: e.newer + e.older * 1e-7, lambda e: name(e.pair)
+    ),
+    "context": Column(
+        "ctx", "Distance of the Scan Contexts, 0 (same) to 1",
+        lambda e: e.evidence.context_distance, lambda e: number(e.evidence.context_distance),
+    ),
+    "overlap": Column(
+        "over %", "Share of points near both that have a partner in the other submap",
+        lambda e: e.evidence.overlap, lambda e: number(100 * e.evidence.overlap, 0),
+    ),
+    "residual": Column(
+        "res mm", "Residual (RMS), point to plane",
+        lambda e: e.evidence.residual_rms, lambda e: number(1000 * e.evidence.residual_rms, 0),
+    ),
+    "mahalanobis": Column(
+        "odo σ", "Mahalanobis distance to what odometry expects, in standard deviations",
+        lambda e: e.evidence.mahalanobis, lambda e: number(e.evidence.mahalanobis, 1),
+    ),
+}  # fmt: skip
+"""The first one is drawn in its kind's colour."""
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    column: str = "keyframe"
+    descending: bool = True
+
+    def clicked(self, column: str) -> "Order":
+        """By that column; reversed if it was by that column already."""
+        return Order(column, not self.descending if column == self.column else column == "keyframe")
+
+
+def listed(edges: tuple[LoopEdge, ...], shown: frozenset[str], order: Order) -> list[LoopEdge]:
+    """The edges of the kinds shown in their order; those without a value last, equal ones by keyframes."""
+    key = COLUMNS[order.column].key
+    sign = -1.0 if order.descending else 1.0
+
+    def rank(edge: LoopEdge) -> tuple[bool, float, Pair]:
+        value = key(edge)
+        return math.isnan(value), 0.0 if math.isnan(value) else sign * value, edge.pair
+
+    return sorted((edge for edge in edges if kind_of(edge).name in shown), key=rank)
+
+
+def chips(edges: tuple[LoopEdge, ...], shown: frozenset[str]) -> str:
+    """How many there are of each kind; a click shows or hides them. Also the legend of the scene."""
+    names = [kind_of(edge).name for edge in edges]
+    return panel(
+        "chips", [(kind, names.count(key), key in shown) for key, kind in KINDS.items()], template="loops.html"
+    )
+
+
+def table(edges: list[LoopEdge], order: Order, chosen: Pair | None) -> str:
+    """The table of these edges; rows and column heads can be clicked."""
+    arrow = "▾" if order.descending else "▴"
+    heads = [
+        (key, column.title + (arrow if key == order.column else "" if column.title else "•"), column.meaning)
+        for key, column in COLUMNS.items()
+    ]
+    first, *others = COLUMNS.values()
+    rows = [
+        (edge, first.text(edge), kind_of(edge).colour, [column.text(edge) for column in others], edge.pair == chosen)
+        for edge in edges[:MOST_ROWS]
+    ]
+    remark = "" if edges else "None of the kinds chosen above."
+    if len(edges) > MOST_ROWS:
+        remark = f"The first {MOST_ROWS} of {len(edges):,}; sort by another column or hide a kind to see others."
+    return panel("table", heads, rows, source("loop_table.js"), remark, template="loops.html")

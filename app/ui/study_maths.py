@@ -1,0 +1,273 @@
+"""The numbers of a frame under study: what colours it, the ground threshold over range, and one point of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from app.slam.study import MATCH_M, Patch, nearest_match, neighbourhood, point_numbers
+from app.slam.types import F32, F64, U8, StepResult
+from app.ui.colours import LABEL_NAMES, TABLES, Limits, value_colours
+from app.ui.html import BAD, GOOD, Tile, number, panel
+
+
+# --- colours -------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class StudyMode:
+    """One way to colour a frame.
+
+    Attributes:
+        legend: the unit and what the numbers are. points: (n, 3) m, LiDAR frame, that are shown.
+        values: (n,) their numbers in the legend's unit; nan where there is none. limits: the two ends of the colours;
+            fixed where possible, so that a colour means the same in every frame.
+        open_end: numbers beyond the upper limit take its colour.
+    """
+
+    legend: str
+    table: str
+    values: Callable[[StepResult], F64]
+    limits: Callable[[StepResult], Limits]
+    points: Callable[[StepResult], F32] = lambda result: result.cloud.points
+    open_end: bool = True
+
+
+def _matched(result: StepResult) -> F32:
+    matches = result.registration.matches
+    return matches.points if matches is not None else np.empty((0, 3), np.float32)
+
+
+def _residuals(result: StepResult) -> F64:
+    matches = result.registration.matches
+    return 1e3 * np.abs(matches.residuals.astype(np.float64)) if matches is not None else np.empty(0)
+
+
+AS_MAP: Final = "as the map"
+"""The scan is coloured like the map; nothing is drawn in its place."""
+RESIDUAL: Final = "residual to the map"
+
+STUDY_MODES: Final[dict[str, StudyMode]] = {
+    "ring": StudyMode(
+        "0 = outermost line",
+        "viridis",
+        lambda result: result.cloud.ring.astype(np.float64),
+        lambda result: Limits(0.0, float(max(int(result.cloud.ring.max(initial=1)), 1))),
+        open_end=False,
+    ),
+    "angle to down": StudyMode(
+        "°",
+        "plasma",
+        lambda result: np.degrees(point_numbers(result.cloud.points, result).angle),
+        lambda _: Limits(0.0, 120.0),
+    ),
+    "distance to plane": StudyMode(
+        "cm, above or below",
+        "viridis",
+        lambda result: 100 * np.abs(point_numbers(result.cloud.points, result).distance),
+        lambda _: Limits(0.0, 50.0),
+    ),
+    RESIDUAL: StudyMode(
+        "mm · points the filter used; grey: none",
+        "plasma",
+        _residuals,
+        lambda _: Limits(0.0, 60.0),
+        points=_matched,
+    ),
+}
+STUDY_BY: Final = (AS_MAP, *STUDY_MODES)
+NOTHING: Final = (110, 118, 130)
+"""Colour of points without a number."""
+
+
+def study_colours(result: StepResult, by: str) -> U8:
+    """(n, 3) of the points that a mode shows."""
+    mode = STUDY_MODES[by]
+    values = mode.values(result)
+    colours = value_colours(values, mode.limits(result), TABLES[mode.table])
+    colours[np.isnan(values)] = NOTHING
+    return colours
+
+
+def study_legend(result: StepResult | None, by: str) -> str:
+    """What the colours mean, with units."""
+    if by == AS_MAP or result is None:
+        return panel("note", "The scan is coloured like the map; see the tab View.")
+    mode = STUDY_MODES[by]
+    limits = mode.limits(result)
+    high = f"{limits.high:g}{'+' if mode.open_end else ''}"
+    return panel("colour_bar", TABLES[mode.table][::32], f"{limits.low:g}", f"{by} · {mode.legend}", high)
+
+
+# --- the ground threshold ------------------------------------------------------------------------
+MOST_POINTS: Final = 1200
+HEADROOM: Final = 3.0
+"""Points up to so many thresholds above the plane are plotted; walls and ceilings would flatten the rest."""
+_LEAST_M: Final = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """The ground threshold over range, with the points under and over it.
+
+    Attributes:
+        range: (n,) m, ascending. threshold: (n,) cm.
+        under, over: (n,) cm, |distance to the plane|; a point has one of them, the other is nan.
+        points_under, points_over: of all points, also those not shown.
+    """
+
+    range: F64
+    under: F64
+    over: F64
+    threshold: F64
+    points_under: int
+    points_over: int
+
+
+def curve(result: StepResult | None, sigma: float, most: int = MOST_POINTS) -> Curve:
+    """Of one frame; without points where it has no plane."""
+    numbers = point_numbers(result.cloud.points, result) if result is not None else None
+    if numbers is None or not np.isfinite(numbers.distance).all() or not len(numbers.range):
+        nothing = np.full(2, np.nan)
+        ends = np.array([0.0, 10.0])
+        return Curve(ends, nothing, nothing, 100 * sigma * ends, 0, 0)
+    distance, threshold = np.abs(numbers.distance), sigma * numbers.range
+    under = distance < threshold
+    farthest = max(_LEAST_M, 1.15 * float(np.percentile(numbers.range[under], 98)) if under.any() else 10.0)
+    shown = np.flatnonzero((numbers.range < farthest) & (distance < HEADROOM * sigma * farthest))
+    shown = shown[np.argsort(numbers.range[shown], kind="stable")]
+    shown = shown[np.unique(np.arange(min(len(shown), most)) * len(shown) // max(min(len(shown), most), 1))]
+    cm = 100 * distance[shown]
+    # The two ends belong to the threshold's line alone.
+    return Curve(
+        range=np.concatenate(([0.0], numbers.range[shown], [farthest])),
+        under=np.concatenate(([np.nan], np.where(under[shown], cm, np.nan), [np.nan])),
+        over=np.concatenate(([np.nan], np.where(under[shown], np.nan, cm), [np.nan])),
+        threshold=100 * sigma * np.concatenate(([0.0], numbers.range[shown], [farthest])),
+        points_under=int(np.count_nonzero(under)),
+        points_over=int(np.count_nonzero(~under)),
+    )
+
+
+# --- one point -----------------------------------------------------------------------------------
+_CLOSE: Final = np.radians(0.4)
+_REACH: Final = np.radians(1.0)
+"""A click means the nearest point within `_CLOSE` of its ray, else the one closest to the ray within `_REACH`."""
+
+
+def nearest_to_ray(points: F32, origin: F64, direction: F64) -> int | None:
+    """Index of the point of (n, 3) that a click means, or None. The ray is in the points' frame."""
+    if len(points) == 0:
+        return None
+    towards = points.astype(np.float64) - origin
+    along = towards @ (direction / np.linalg.norm(direction))
+    depth = np.linalg.norm(towards, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = np.where(along > 0, np.arccos(np.clip(along / depth, -1.0, 1.0)), np.inf)
+    close = np.flatnonzero(off < _CLOSE)
+    if len(close):
+        return int(close[np.argmin(depth[close])])
+    best = int(np.argmin(off))
+    return best if off[best] < _REACH else None
+
+
+@dataclass(frozen=True, slots=True)
+class NearestMatch:
+    """The point that the filter used nearest to the one clicked, with the plane that the map gave for it.
+
+    Attributes:
+        away: m from the point clicked. residual: signed m; nan where the plane was not accepted.
+        center, normal: (3,) m, odom frame; None where there was no plane.
+    """
+
+    away: float
+    residual: float
+    center: F64 | None
+    normal: F64 | None
+
+
+@dataclass(frozen=True, slots=True)
+class Picked:
+    """A point under study. Lengths m, angles rad; `patch` in the LiDAR frame."""
+
+    index: int
+    range: float
+    angle: float
+    distance: float
+    threshold: float
+    patch: Patch
+    match: NearestMatch | None
+
+
+def pick(result: StepResult, index: int, sigma: float, neighbours: int) -> Picked:
+    """Everything about one point of the result's cloud.
+
+    Args:
+        sigma: of the ground threshold, m per m of range. neighbours: how many points its patch has.
+    """
+    point = result.cloud.points[index]
+    numbers = point_numbers(point[None], result)
+    return Picked(
+        index=index,
+        range=float(numbers.range[0]),
+        angle=float(numbers.angle[0]),
+        distance=float(numbers.distance[0]),
+        threshold=sigma * float(numbers.range[0]),
+        patch=neighbourhood(result.cloud.points, index, neighbours),
+        match=_match(result, point),
+    )
+
+
+def _match(result: StepResult, point: F32) -> NearestMatch | None:
+    matches = result.registration.matches
+    (nearest,), (away,) = nearest_match(point[None], result)
+    if matches is None or nearest < 0:
+        return None
+    found = bool(np.any(matches.normals[nearest]))
+    return NearestMatch(
+        away=float(away),
+        residual=float(matches.residuals[nearest]),
+        center=matches.centers[nearest].astype(np.float64) if found else None,
+        normal=matches.normals[nearest].astype(np.float64) if found else None,
+    )
+
+
+def describe(result: StepResult, picked: Picked) -> str:
+    """Tiles of one point."""
+    cloud, i, patch = result.cloud, picked.index, picked.patch
+    under = abs(picked.distance) < picked.threshold
+    tilt = np.degrees(np.arccos(min(abs(float(patch.normal @ result.ground.down)), 1.0)))
+    off = 1e3 * float((cloud.points[i] - patch.center) @ patch.normal)
+    near = f"{len(patch.indices)} points within {100 * patch.radius:.0f} cm"
+    threshold = f"cm · threshold {number(100 * picked.threshold, 1)} cm"
+    colour = "" if np.isnan(picked.distance) else GOOD if under else BAD
+    tiles = [
+        Tile("label", LABEL_NAMES.get(int(cloud.labels[i]), "not ground")),
+        Tile("ring", str(int(cloud.ring[i]))),
+        Tile("range", number(picked.range), "m"),
+        Tile("angle to down", number(np.degrees(picked.angle), 1), "°"),
+        Tile("intensity", number(float(cloud.intensity[i]), 0)),
+        Tile("time in scan", number(1e-6 * int(cloud.offsets_ns[i]), 1), "ms"),
+        Tile("distance to plane", number(100 * picked.distance, 1), threshold, "", colour, "wide"),
+        Tile("plane of its neighbours", number(tilt, 1), "° from level", near, width="half"),
+        Tile(
+            "thickness",
+            number(1e3 * float(np.sqrt(patch.variances[2])), 1),
+            "mm",
+            f"this point {off:+.1f} mm off",
+            width="half",
+        ),
+        _match_tile(picked.match),
+    ]
+    return panel("tile_grid", tiles)
+
+
+def _match_tile(match: NearestMatch | None) -> Tile:
+    name = "nearest point that the filter used"
+    if match is None:
+        return Tile(name, "none", f"within {100 * MATCH_M:.0f} cm", width="wide")
+    away = f"{100 * match.away:.1f} cm away"
+    if match.normal is None:
+        return Tile(name, "no plane in the map", note=away, width="wide")
+    if np.isnan(match.residual):
+        return Tile(name, "not used", note=f"{away}; its plane is too far off", width="wide")
+    return Tile(name, f"{1e3 * match.residual:+.1f}", "mm to the map's plane", away, width="wide")

@@ -1,0 +1,45 @@
+"""Everything that relies on how viser's page is built, in one place; `tests/ui/test_viser_contract.py` checks it.
+
+viser has no events for HTML, no way to run a script, and keys of its own. So this module assumes:
+
+* HTML elements are inserted as they are, and an `<img onload=...>` in them runs.
+* The elements of a container are siblings in the order in which they were added: a text field that is followed by
+  HTML is that HTML's previous sibling.
+* A text field is an `<input>` whose `input` events viser sends.
+* Hotkeys are listened to on the html element, the camera's keys on the document.
+* Dock tabs carry `data-dock-tab`.
+"""
+
+from collections.abc import Callable
+
+import viser
+
+from app.ui.html import panel, source
+from app.ui.widgets import by_user
+
+
+def prepare_page(gui: viser.GuiApi) -> None:
+    """Add the style sheet and the script that everything else here relies on. Call it before other HTML is added."""
+    styles = source("style.css") + source("viser_adapter.css")
+    gui.add_html(panel("page_head", styles, source("viser_adapter.js")))
+
+
+class Bridge:
+    """Clicks on the page's own HTML that reach the server.
+
+    An element that names a word in `data-hs` writes it into a hidden text field, whose changes viser sends.
+
+    Args:
+        name: unlike that of any other bridge. act: called with the word of what was clicked, or chosen with Enter,
+            and the browser.
+    """
+
+    def __init__(self, gui: viser.GuiApi, name: str, act: Callable[[str, viser.ClientHandle], None]) -> None:
+        self._name = name
+        self._field = gui.add_text(name, "")
+        gui.add_html(panel("bridge", name))
+        self._field.on_update(by_user(lambda text, client: act(text.split(" #")[0], client)))
+
+    def live(self, html: str) -> str:
+        """HTML whose elements with `data-hs` can be clicked."""
+        return panel("bridged", self._name, html)
