@@ -7,7 +7,7 @@ viser has no events for HTML, no way to run a script, and keys of its own. So th
   HTML is that HTML's previous sibling.
 * A text field is an `<input>` whose `input` events viser sends.
 * Hotkeys are listened to on the html element, the camera's keys on the document.
-* Dock tabs carry `data-dock-tab`.
+* Dock tabs carry `data-dock-tab`; the box of a slider follows its track, with Mantine's class names.
 """
 
 from collections.abc import Callable

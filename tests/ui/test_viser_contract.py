@@ -1,0 +1,94 @@
+"""What `app.ui.viser_adapter` assumes of viser's page. When an upgrade breaks it, a sentence says what fails."""
+
+from pathlib import Path
+
+import pytest
+import viser
+
+from app.ui.html import source
+from app.ui.viser_adapter import Bridge, prepare_page
+from tests.ui.conftest import Wire, user_sets
+
+CLIENT = Path(viser.__file__).parent / "client" / "src"
+
+ASSUMPTIONS = {
+    "HTML elements are no longer inserted as they are, so the page's script does not run.": (
+        "components/Html.tsx",
+        "return <div dangerouslySetInnerHTML={{ __html: props.content }} />;",
+    ),
+    "A container's elements are no longer siblings: a bridge does not find the text field before it.": (
+        "ControlPanel/Generated.tsx",
+        'return <Box pt="xs">{children}</Box>;',
+    ),
+    "A container's elements are no longer in the order in which they were added.": (
+        "ControlPanel/Generated.tsx",
+        "(a, b) => a.order - b.order,",
+    ),
+    "A text field is no longer an input whose changes are sent: clicks on the page's HTML do not arrive.": (
+        "components/TextInput.tsx",
+        'size="xs"\n          onChange={(value) => {\n            setValue(uuid, value.target.value);',
+    ),
+    "An input is no longer wrapped in one box: the hidden text field of a bridge becomes visible.": (
+        "components/common.tsx",
+        '<Box pb="0.5em" px="xs">\n      {children}\n    </Box>',
+    ),
+    "The camera no longer listens to keys on the document: arrows may move it and step frames at once.": (
+        "CameraControls.tsx",
+        'document.addEventListener("keydown", onKeyDown);',
+    ),
+    "Hotkeys are no longer Mantine's, which listen on the html element: arrows in a slider may step frames.": (
+        "CommandPalette.tsx",
+        "useHotkeys(hotkeyItems);",
+    ),
+    "Dock tabs no longer carry data-dock-tab: the left tabs wrap onto more lines.": (
+        "dock/TabGroupFrame.tsx",
+        "data-dock-tab={paneId}",
+    ),
+    "A slider no longer has a track and a number box side by side: the box may cut long numbers off.": (
+        "components/Slider.tsx",
+        '<Flex justify="space-between">\n      <Slider',
+    ),
+}
+
+
+@pytest.mark.parametrize("sentence", ASSUMPTIONS)
+def test_viser_s_page_is_built_as_the_adapter_assumes(sentence: str) -> None:
+    file, text = ASSUMPTIONS[sentence]
+    path = CLIENT / file
+    assert path.is_file() and text in path.read_text(encoding="utf-8"), f"{sentence} (viser's {file} has changed.)"
+
+
+def test_a_bridge_is_a_text_field_followed_by_its_mark(server: viser.ViserServer, wire: Wire) -> None:
+    prepare_page(server.gui)
+    words: list[str] = []
+    bridge = Bridge(server.gui, "test", lambda word, _: words.append(word))
+    kinds = [(type(message).__name__, message.props.order) for message in wire.messages if hasattr(message, "props")]
+    (_, page), (field, first), (mark, second) = kinds
+    assert (field, mark) == ("GuiTextMessage", "GuiHtmlMessage") and page < first < second
+    assert 'class="hs-bridge" data-name="test"' in wire.messages[-1].props.content
+    user_sets(bridge._field, "choose 3 5 #17ab")
+    assert words == ["choose 3 5"]
+    assert 'data-hs-to="test"' in bridge.live("<b>x</b>")
+
+
+def test_the_page_s_script_and_styles_are_sent_and_cannot_end_their_element_early() -> None:
+    for name in ("style.css", "viser_adapter.css"):
+        assert "</style" not in source(name)
+    assert "hemislamSay" in source("viser_adapter.js")
+
+
+PRIVATE = ("._impl", "._websock", "._gui_", "_broadcast_buffer", "mantine", "viser._")
+
+
+def test_nothing_else_of_the_page_touches_private_parts_of_viser() -> None:
+    folder = Path(__file__).parents[2] / "app" / "ui"
+    used = {
+        f"{path.relative_to(folder)}: {name}"
+        for path in folder.rglob("*")
+        if path.is_file()
+        and path.suffix in (".py", ".js", ".css", ".html")
+        and not path.name.startswith("viser_adapter")
+        for name in PRIVATE
+        if name in path.read_text(encoding="utf-8")
+    }
+    assert used == set()
