@@ -1,8 +1,8 @@
-"""A recording fed at real time, as packets and through Foxglove: how far the walk is from the file's.
+"""A recording fed in real time, as packets and through Foxglove: how far the trajectory is from that of the file.
 
-The whole recording, fed by a process of its own. Compared is where the map has each frame at the end, against the
-same engine on the file, by the scans' ends; nothing is aligned. `HEMISLAM_PRESET` names the device; what lies
-beside the recording still holds.
+A separate process feeds the whole recording. The position of each frame in the final map is compared with that of the
+same engine on the file, matched by the scans' end times; nothing is aligned. `HEMISLAM_PRESET` names the device; files
+beside the recording apply as usual.
 """
 
 import math
@@ -30,9 +30,9 @@ from benchmarks.record import Line
 SAMPLE = next((Path(__file__).resolve().parents[1] / "sample_data").glob("*.mcap"))
 PRESET = os.environ.get("HEMISLAM_PRESET")
 SAME_NS = 10_000
-"""Ends of scans this near are of the same scan; packets hold whole microseconds."""
-PATIENCE_S, SILENT_S = 60.0, 3.0
-"""Without anything new before it gives up, and to wait after the last that was sent."""
+"""Scans whose ends are this near are the same scan; packets hold whole microseconds."""
+TIMEOUT_S, SILENT_S = 60.0, 3.0
+"""It gives up after this time without news, and waits this long after the last message was sent."""
 
 
 def run(recording: Path | None = None) -> list[Line]:
@@ -55,10 +55,10 @@ def run(recording: Path | None = None) -> list[Line]:
         same = np.abs(stamps[nearest] - ends) < SAME_NS
         apart = np.linalg.norm(there[same] - positions[nearest[same]], axis=1)
         assert end.live is not None
-        on = f"{recording.stem} at real time, {way}, against the file"
+        on = f"{recording.stem} in real time, {way}, against the file"
         lines += [
             Line.of("distance of a frame", on, "mm", 1e3 * apart),
-            Line.of("frames that are not compared", on, "", [len(stamps) - len(apart)]),
+            Line.of("frames not compared", on, "", [len(stamps) - len(apart)]),
             Line.of("scans dropped", on, "", [end.transport.dropped]),
             Line.of("packets or samples lost", on, "", [end.live.counters.lost + end.live.counters.imu_lost]),
         ]
@@ -66,7 +66,7 @@ def run(recording: Path | None = None) -> list[Line]:
 
 
 def _fed(recording: Path, params: Params, url: str, imu: str | None) -> Snapshot | str:
-    """The end of a live run on it, or why it can not be played out so."""
+    """The final snapshot of a live session fed with it, or why it cannot be fed this way."""
     with TemporaryDirectory() as folder, LiveProcess(url, params, imu) as source:
         setup = Setup(LIVE, params=params, play=True, speed=math.inf, live=source.address, live_folder=Path(folder))
         with closing(EngineProcess(setup)) as engine:
@@ -81,7 +81,7 @@ def _fed(recording: Path, params: Params, url: str, imu: str | None) -> Snapshot
 
 
 def _positions(snapshot: Snapshot) -> tuple[I64, F64]:
-    """Ends of scans (n,), ns, and where the map has the IMU then (n, 3), m."""
+    """Ends of the scans (n,), ns, and positions of the IMU in the map at these times (n, 3), m."""
     assert snapshot.trajectory is not None and snapshot.recording is not None
     stamps = snapshot.recording.start_ns + np.round(snapshot.series["stamp_s"] * 1e9)
     known = np.isfinite(stamps)
@@ -91,7 +91,7 @@ def _positions(snapshot: Snapshot) -> tuple[I64, F64]:
 def _until(engine: EngineProcess, wanted: Callable[[Snapshot], bool]) -> Snapshot:
     snapshot = engine.snapshot
     while not wanted(snapshot):
-        before, snapshot = snapshot, engine.wait(snapshot.revision, timeout=PATIENCE_S)
+        before, snapshot = snapshot, engine.wait(snapshot.revision, timeout=TIMEOUT_S)
         if snapshot.revision == before.revision:
-            raise SystemExit(f"Nothing came for {PATIENCE_S:.0f} s: {[notice.text for notice in snapshot.notices]}")
+            raise SystemExit(f"Nothing came for {TIMEOUT_S:.0f} s: {[notice.text for notice in snapshot.notices]}")
     return snapshot

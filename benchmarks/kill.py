@@ -1,9 +1,9 @@
-"""kill -9 at 20 random moments, of the server, its engine or both: what is reopened comes to the same end.
+"""kill -9 at 20 random moments, of server, engine, both or loop search: the session still reaches the same result.
 
-A user works over REST with the real program, on a recording with loops: seeks to and fro, changes
-parameters, writes notes, overrules loops. After a kill he looks where the session is; what he did over a
-second before it must be there, what he did last he does again if it is not. In the end map and
-trajectory are those of a session that nobody killed, byte for byte.
+A simulated user works over REST with the real program, on a recording with loops: seeks, changes parameters, writes
+notes, edits loops. After a kill, everything done more than a second before it must still be there; what was done
+last is done again if it is missing. At the end, map and trajectory must equal those of a session that was never
+killed, byte for byte.
 """
 
 import contextlib
@@ -29,17 +29,18 @@ from benchmarks.record import Line
 SAMPLE = next((Path(__file__).resolve().parents[1] / "sample_data").glob("*.mcap"))
 KILLS, KILLS_A_RUN = 20, 5
 LOSS_S = 1.0
-"""What was done longer before the kill must not be lost."""
-PATIENCE_S = 900.0
+"""An action may be lost only if it was done this short a time before the kill."""
+TIMEOUT_S = 900.0
 FILES = ("trajectory.tum", "map.ply")
-KINDS: tuple[Literal["engine", "server", "both"], ...] = ("engine", "server", "engine", "both")
+Kind = Literal["engine", "loops", "server", "both"]
+KINDS: tuple[Kind, ...] = ("engine", "server", "loops", "engine", "both")
 
 State = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Deed:
-    """What the user does at a share of the recording, 1: at its end; `done`: by what the server says, it is so."""
+class Action:
+    """What the user does at a share of the recording (1: at its end). `done` asks the server whether it was done."""
 
     at: float
     act: Callable[["Workbench"], None]
@@ -47,16 +48,15 @@ class Deed:
 
 
 class Lost(Exception):
-    """The server does not answer: it was killed."""
+    """The server does not answer because it was killed."""
 
 
 class Workbench:
-    """`hemislam serve` and who uses it over REST."""
+    """`hemislam serve` and a user of its REST interface."""
 
     def __init__(self, folder: Path, recording: Path) -> None:
         self.folder = folder
         self.server: subprocess.Popen[str] | None = None
-        self.journal = ""
         self._address = ""
         self.start(recording)
 
@@ -79,7 +79,7 @@ class Workbench:
         self._address = line.split()[3]
 
     def reopen(self) -> None:
-        """As the user would: the newest session file, once the old engine has ended."""
+        """Open the newest session file, once the old engine has ended."""
         assert self.server is not None
         self.server.wait()
         files = (self.folder / "runs" / "sessions").glob("*.hemislam")
@@ -97,7 +97,7 @@ class Workbench:
         return dict(self.ask("GET", "state").json())
 
     def until(self, wanted: Callable[[State], bool]) -> State:
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not wanted(state := self.state()):
             assert time.monotonic() < deadline, state
             assert not self._refused(state), state["notices"]
@@ -106,17 +106,17 @@ class Workbench:
 
     @staticmethod
     def _refused(state: State) -> bool:
-        return any("can not" in notice["text"] and notice["level"] == "error" for notice in state["notices"])
+        return any("cannot" in notice["text"] and notice["level"] == "error" for notice in state["notices"])
 
     def ready(self) -> State:
-        """Where the session is, once it is anywhere."""
+        """The state of the session, once it is at a frame."""
         return self.until(
             lambda s: s["recording"] is not None and s["progress"] is None and s["transport"]["frame"] >= 0
         )
 
     def go_to(self, frame: int) -> None:
-        """Ask again if an engine that died has not heard of it."""
-        deadline = time.monotonic() + PATIENCE_S
+        """Seek to a frame; asks again in case the engine died before it got the command."""
+        deadline = time.monotonic() + TIMEOUT_S
         while True:
             self.ask("POST", "transport", json={"action": "seek", "frame": frame})
             asked = time.monotonic()
@@ -127,35 +127,36 @@ class Workbench:
                 time.sleep(0.05)
             assert time.monotonic() < deadline, state
 
-    def finish(self, last: int, struck: threading.Event) -> None:
-        """To the end of the recording, where the last loops are found, unless something is struck meanwhile."""
-        if not self.state()["transport"]["finished"]:  # else Play would begin again
+    def finish(self, last: int, killed: threading.Event) -> None:
+        """Play to the end of the recording, where the last loops are found, or until a process is killed."""
+        if not self.state()["transport"]["finished"]:  # otherwise Play would start over
             self.go_to(last)
             self.ask("POST", "transport", json={"action": "speed", "factor": "max"})
             self.ask("POST", "transport", json={"action": "play"})
-            self.until(lambda state: bool(state["transport"]["finished"]) or struck.is_set())
+            self.until(lambda state: bool(state["transport"]["finished"]) or killed.is_set())
 
-    def engine(self) -> int | None:
-        """The engine's process; None if there is none just now."""
+    def child(self, name: str) -> int | None:
+        """The child process of this name; None while there is none."""
         assert self.server is not None
-        for pid in children(self.server.pid):
-            with contextlib.suppress(OSError):
-                if Path(f"/proc/{pid}/comm").read_text().strip() == "hemislam-engine":
+        with contextlib.suppress(OSError):  # a process may end meanwhile
+            for pid in children(self.server.pid):
+                if Path(f"/proc/{pid}/comm").read_text().strip() == f"hemislam-{name}":
                     return pid
         return None
 
-    def kill(self, kind: Literal["engine", "server", "both"]) -> None:
-        """Returns when it has happened, and the server knows."""
+    def kill(self, kind: Kind) -> None:
+        """Kill, and return once the server knows."""
         assert self.server is not None
-        engine = self.engine()
-        if kind != "engine":
+        name = "loops" if kind == "loops" else "engine"
+        child = self.child(name)
+        if kind in ("server", "both"):
             self.server.kill()
-        if kind != "server" and engine is not None:
+        if kind != "server" and child is not None:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(engine, signal.SIGKILL)
-        if kind == "engine":
-            deadline = time.monotonic() + PATIENCE_S
-            while self.engine() in (None, engine) and time.monotonic() < deadline:
+                os.kill(child, signal.SIGKILL)
+        if kind in ("engine", "loops"):
+            deadline = time.monotonic() + TIMEOUT_S
+            while self.child(name) in (None, child) and time.monotonic() < deadline:
                 time.sleep(0.01)
 
     def close(self) -> None:
@@ -165,7 +166,7 @@ class Workbench:
 
 
 # --- what the user does --------------------------------------------------------------------------
-def _sets(at: float, **values: float) -> Deed:
+def _sets(at: float, **values: float) -> Action:
     """Parameters of one section and name, written section__name."""
     tree: dict[str, dict[str, float]] = {}
     for path, value in values.items():
@@ -179,26 +180,26 @@ def _sets(at: float, **values: float) -> Deed:
         now = bench.ask("GET", "params").json()
         return all(now[section][name] == value for section, part in tree.items() for name, value in part.items())
 
-    return Deed(at, act, done)
+    return Action(at, act, done)
 
 
-def _notes(at: float, text: str) -> Deed:
+def _notes(at: float, text: str) -> Action:
     def act(bench: Workbench) -> None:
         bench.ask("POST", "notes", json={"text": text})
 
     def done(bench: Workbench) -> bool:
         return any(note["text"] == text for note in bench.state()["notes"])
 
-    return Deed(at, act, done)
+    return Action(at, act, done)
 
 
-def _overrules(at: float, number: int, word: str, **more: float) -> Deed:
-    """The accepted loop of this number, by keyframes, as they are in the session that nobody kills."""
+def _edits_loop(at: float, number: int, word: str, **more: float) -> Action:
+    """Edit the accepted loop of this number, ordered by keyframes."""
     chosen = list[tuple[int, int]]()
 
     def pair(bench: Workbench) -> tuple[int, int]:
-        found, before, deadline = list[State](), list[State](), time.monotonic() + PATIENCE_S
-        while not chosen and (len(found) <= number or found != before):  # they may still be on their way
+        found, before, deadline = list[State](), list[State](), time.monotonic() + TIMEOUT_S
+        while not chosen and (len(found) <= number or found != before):  # they may still arrive
             assert time.monotonic() < deadline, "there is no such loop to edit; choose another recording"
             time.sleep(1.0)
             before, loops = found, bench.ask("GET", "loops").json()["loops"]
@@ -209,63 +210,61 @@ def _overrules(at: float, number: int, word: str, **more: float) -> Deed:
 
     def act(bench: Workbench) -> None:
         if not bench.state()["transport"]["finished"]:
-            return  # killed meanwhile: the last loops are gone until the end is reached again
+            return  # killed meanwhile: the last loops are missing until the end is reached again
         older, newer = pair(bench)
         bench.ask("POST", "loops", json={"action": word, "older": older, "newer": newer, **more})
 
     def done(bench: Workbench) -> bool:
         return any(word in entry for entry in bench.ask("GET", "loops").json()["edits"])
 
-    return Deed(at, act, done)
+    return Action(at, act, done)
 
 
-DEEDS = (
+ACTIONS = (
     _sets(0.15, ground__sigma=0.02),
     _notes(0.25, "the first turn"),
     _sets(0.4, filter__max_points=1500, filter__plane_tilt=2.0),
-    _sets(0.3, ground__alpha=35.0),  # and what came after it is another walk
+    _sets(0.3, ground__alpha=35.0),  # everything after it is mapped again
     _sets(0.7, filter__max_iterations=3),
     _notes(0.8, "on the way home"),
-    _overrules(1.0, 0, "reject"),
-    _overrules(1.0, 1, "weigh", weight=0.2),
+    _edits_loop(1.0, 0, "reject"),
+    _edits_loop(1.0, 1, "weigh", weight=0.2),
 )
 
 
-def work_through(
-    bench: Workbench, moments: "list[tuple[float, Literal['engine', 'server', 'both']]]"
-) -> dict[str, bytes]:
-    """Do all, killed so many times, each a random time (s) after it was ready again. Returns what came of it."""
-    index, when = 0, [0.0] * len(DEEDS)
-    killed_at, struck, waiting = [0.0], threading.Event(), list(moments)
+def work_through(bench: Workbench, moments: "list[tuple[float, Kind]]") -> dict[str, bytes]:
+    """Do all actions while processes are killed, each a time (s) after the session was ready. Returns the results."""
+    index, when = 0, [0.0] * len(ACTIONS)
+    killed_at, killed, waiting = [0.0], threading.Event(), list(moments)
     last = int(bench.ready()["recording"]["frames"]) - 1
 
-    def killer(delay: float, kind: Literal["engine", "server", "both"]) -> None:
+    def killer(delay: float, kind: Kind) -> None:
         time.sleep(delay)
         killed_at[0] = time.monotonic()
         bench.kill(kind)
-        struck.set()
+        killed.set()
 
     thread: threading.Thread | None = None
     while True:
-        if waiting and (thread is None or not thread.is_alive()) and not struck.is_set():
+        if waiting and (thread is None or not thread.is_alive()) and not killed.is_set():
             thread = threading.Thread(target=killer, args=waiting.pop(0), daemon=True)
             thread.start()
         try:
-            if struck.is_set():
-                struck.clear()
+            if killed.is_set():
+                killed.clear()
                 bench.ready()
                 index = _what_is_left(bench, index, when, killed_at[0])
-            if index < len(DEEDS):
-                deed = DEEDS[index]
-                bench.go_to(round(deed.at * last)) if deed.at < 1.0 else bench.finish(last, struck)
-                deed.act(bench)
+            if index < len(ACTIONS):
+                action = ACTIONS[index]
+                bench.go_to(round(action.at * last)) if action.at < 1.0 else bench.finish(last, killed)
+                action.act(bench)
                 when[index] = time.monotonic()
-                while not (done := deed.done(bench)) and not struck.is_set():
+                while not (done := action.done(bench)) and not killed.is_set():
                     time.sleep(0.05)
                 index += done
                 continue
-            bench.finish(last, struck)
-            if not waiting and (thread is None or not thread.is_alive()) and not struck.is_set():
+            bench.finish(last, killed)
+            if not waiting and (thread is None or not thread.is_alive()) and not killed.is_set():
                 return {name: bench.ask("GET", f"export/{name}").content for name in FILES}
             time.sleep(0.05)
         except Lost:
@@ -273,19 +272,21 @@ def work_through(
 
 
 def _what_is_left(bench: Workbench, index: int, when: list[float], killed_at: float) -> int:
-    """From which deed on to go on: the first that is not there. One that was done long before must be."""
-    for number, deed in enumerate(DEEDS[:index]):
-        deadline = time.monotonic() + 20.0  # loops are told a little after the frame
-        while not (done := deed.done(bench)) and time.monotonic() < deadline:
+    """The first action that was lost, to go on with. None may be lost that was done long before the kill."""
+    for number, action in enumerate(ACTIONS[:index]):
+        deadline = time.monotonic() + 20.0  # loops are published a little after the frame
+        while not (done := action.done(bench)) and time.monotonic() < deadline:
             time.sleep(0.1)
         if not done:
-            assert killed_at - when[number] <= LOSS_S, f"deed {number} was done {killed_at - when[number]:.1f} s before"
+            assert killed_at - when[number] <= LOSS_S, (
+                f"action {number} was done {killed_at - when[number]:.1f} s before"
+            )
             return number
     return index
 
 
 def run(recording: Path | None = None, kills: int = KILLS) -> list[Line]:
-    """Raises AssertionError: something was lost, or the end was another."""
+    """Raises AssertionError: something was lost, or the results differ."""
     path = (recording or SAMPLE).resolve()
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory(prefix="hemislam-kill-") as folder:
@@ -296,14 +297,12 @@ def run(recording: Path | None = None, kills: int = KILLS) -> list[Line]:
             moments = [(delay, KINDS[k % len(KINDS)]) for k, delay in enumerate(delays)]
             came, _ = _ended(Path(folder) / str(number), path, moments)
             differ = [name for name in FILES if came[name] != expected[name]]
-            assert not differ, f"after the kills of run {number} these are others: {', '.join(differ)}"
-    on = f"{path.stem}: {len(DEEDS)} deeds, {runs * KILLS_A_RUN} kills of engine, server or both"
-    return [Line("reopened sessions that ended otherwise", on, "runs", 0.0, 0.0, 0.0, runs)]
+            assert not differ, f"these differ after the kills of run {number}: {', '.join(differ)}"
+    on = f"{path.stem}: {len(ACTIONS)} actions, {runs * KILLS_A_RUN} kills of engine, loop search, server or both"
+    return [Line("reopened sessions with other results", on, "runs", 0.0, 0.0, 0.0, runs)]
 
 
-def _ended(
-    folder: Path, path: Path, moments: "list[tuple[float, Literal['engine', 'server', 'both']]]"
-) -> tuple[dict[str, bytes], float]:
+def _ended(folder: Path, path: Path, moments: "list[tuple[float, Kind]]") -> tuple[dict[str, bytes], float]:
     folder.mkdir()
     bench = Workbench(folder, path)
     try:

@@ -1,4 +1,4 @@
-"""Packets of the sensor: putting them in order, and decoding a revolution of 57,632 firings."""
+"""Time to put the sensor's packets in order and to decode a revolution of 57,632 firings."""
 
 import time
 
@@ -20,7 +20,7 @@ def run() -> list[Line]:
 
 
 def measure(model: Model) -> list[Line]:
-    """ms to put the packets of a revolution in order, and to decode it; every firing returns."""
+    """ms to put the packets of a revolution in order, and to decode it, if every firing has a return."""
     assembler, decoder = Assembler(), Decoder()
     decoder.configure(Difop(calibration=Calibration(NOMINAL.elevations_deg, np.linspace(-1.0, 0.0, CHANNELS))))
     assembling: list[float] = []

@@ -1,4 +1,4 @@
-"""Measured times as a table on the screen and as lines added to benchmarks/results.csv."""
+"""Measurements as a table on the screen and as lines appended to benchmarks/results.csv."""
 
 import csv
 import subprocess
@@ -18,7 +18,7 @@ COLUMNS = ("when", "version", "commit", "processor", "cores", "what", "on", "uni
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One measured thing: its median, 95th percentile and maximum over `count` samples."""
+    """One measurement: median, 95th percentile and maximum over `count` samples."""
 
     what: str
     on: str
@@ -37,7 +37,7 @@ class Line:
 
 
 def show(lines: list[Line]) -> None:
-    """Print the lines as a table and add them to the file, with when and where they were measured."""
+    """Print the lines as a table and append them to the file, with the time and the machine."""
     width = max(len(line.what) for line in lines)
     previous = None
     for line in lines:
