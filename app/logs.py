@@ -1,4 +1,4 @@
-"""What every process of the program logs, on stderr: for people, or one JSON object a line for machines."""
+"""How every process of the program logs, to stderr: sentences for people, or one JSON object a line for machines."""
 
 import contextlib
 import json
@@ -12,13 +12,13 @@ from typing import Any, Final
 
 _OWN: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "taskName"}
 _VARIABLE: Final = "HEMISLAM_LOG_JSON"
-"""In the environment: processes that are started by this one log in the same format."""
+"""Environment variable by which child processes log in the same format."""
 
 log = logging.getLogger(__name__)
 
 
 class JsonLines(logging.Formatter):
-    """time (UTC), level, process, logger, message, `extra` and, if there is one, the traceback."""
+    """Writes time (UTC), level, process, logger, message, `extra` and, if there is one, the traceback."""
 
     def __init__(self, process: str) -> None:
         super().__init__()
@@ -39,14 +39,14 @@ class JsonLines(logging.Formatter):
 
 
 def start_logging(*, json_lines: bool) -> None:
-    """Log this process, the server, to stderr; as JSON everything, else what is a warning."""
+    """Log this process, the server: everything as JSON, or only warnings as sentences."""
     os.environ[_VARIABLE] = "1" if json_lines else "0"
     _log_to_stderr("server", json_lines)
 
 
 @contextlib.contextmanager
 def process_logs(process: str) -> Iterator[None]:
-    """Log a process that the server started as the server logs; what ends it is the last that it says."""
+    """Log this child process as its owner logs. An exception that ends it is the last thing logged."""
     _log_to_stderr(process, os.environ.get(_VARIABLE) == "1")
     try:
         yield

@@ -11,16 +11,16 @@ log = logging.getLogger(__name__)
 
 
 def log_notices(engine: Engine) -> None:
-    """For ever: what the engine tells the page is logged too, as news. For a thread."""
+    """Log the notices that the engine publishes, without end. For a thread of its own."""
     if not log.isEnabledFor(logging.INFO):
-        return  # people read them in the page
-    told: set[int] = set()
+        return  # people read them on the page
+    logged: set[int] = set()
     revision = -1
     while True:
         snapshot = engine.wait(revision, 1.0)
         revision = snapshot.revision
         for notice in snapshot.notices:
-            if notice.number not in told:
-                told.add(notice.number)
+            if notice.number not in logged:
+                logged.add(notice.number)
                 frame = snapshot.transport.frame
                 log.log(_LEVEL[notice.level], notice.text, extra={"notice": notice.number, "frame": frame})

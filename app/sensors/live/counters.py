@@ -1,4 +1,4 @@
-"""What came over the wire and what became of it."""
+"""Counts of what was received and what became of it."""
 
 from dataclasses import dataclass, fields
 
@@ -6,15 +6,15 @@ from dataclasses import dataclass, fields
 @dataclass(slots=True)
 class Counters:
     """Attributes:
-    packets, difop: measurement and device packets of use. frames: revolutions made of them.
-    lost: packets that never came. reordered: came after a later one, and were put back in place.
-    late: came when their revolution was gone. duplicates: came twice. foreign: no packets of this
-        sensor. truncated: cut short. strays: with a time that no other packet confirms.
-    undated: without a date, and so stamped on arrival. bad_blocks: of a packet, without their mark.
+    packets, difop: measurement and device packets used. frames: revolutions made of them.
+    lost: packets that never came. reordered: packets that came after a later one and were put in order.
+    late: packets that came after their revolution was complete. duplicates: packets that came twice.
+    foreign: packets of another sensor. truncated: packets cut short. strays: packets whose time no other confirms.
+    undated: packets without a date, stamped on arrival. bad_blocks: blocks of a packet without their mark.
     imu, imu_lost, imu_late, imu_foreign: datagrams or messages of the IMU.
     jumps: of a sensor's clock. dropped: scans that the engine was too busy for.
     reconnects: of a connection. unreadable: messages that could not be decoded.
-    restarts: of the process that receives.
+    restarts: of the receiving process.
     """
 
     packets: int = 0
@@ -40,6 +40,6 @@ class Counters:
     restarts: int = 0
 
     def describe(self) -> str:
-        """Those that are not zero."""
+        """The counts that are not zero, in words."""
         named = ((field.name.replace("_", " "), getattr(self, field.name)) for field in fields(self))
         return ", ".join(f"{count} {name}" for name, count in named if count)

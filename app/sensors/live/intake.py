@@ -1,7 +1,7 @@
-"""Where the receiving threads put what comes, and the engine's side takes it: bounded, and it never blocks them.
+"""A bounded buffer between the receiving threads and the engine's side. It never blocks the receiving threads.
 
-The rule when the engine falls behind: whole scans are let go, the oldest first, each of them reported
-as a `DroppedScan`; IMU samples never are.
+When the engine falls behind, the oldest waiting scans are dropped, each reported as a `DroppedScan`. IMU samples are
+never dropped.
 """
 
 import threading
@@ -25,12 +25,12 @@ from app.slam.types import DroppedScan, Scan
 MAX_BACKLOG = 20
 """Scans that may wait for the engine: two seconds of them at 10 Hz, and more than are held back at the start."""
 MAX_BACKLOG_ABSENT = 100
-"""The same while there is no engine, which is being started again and will then be faster than the sensor. As it
-catches up it may still fall behind by `MAX_BACKLOG`: its first frame takes a while."""
+"""The same while the engine is started again; it will then be faster than the sensor. While it catches up, it may
+fall behind by `MAX_BACKLOG` more, since its first frame takes long."""
 MAX_WAITING = 600_000
-"""IMU samples and news that may wait: twenty minutes at 500 Hz. If there are more, nobody reads any longer."""
+"""IMU samples and news that may wait: twenty minutes at 500 Hz. The oldest are removed, as nobody reads them."""
 MAX_HELD = 50_000
-"""Entries that may wait for the start, 10 s of an IMU at 5 kHz; the oldest go, should a clock be set back meanwhile."""
+"""Entries that may wait for the start: 10 s of an IMU at 5 kHz. A clock that is set back could make it more."""
 _SETTLE_NS = 1_000_000_000
 _SETTLE_SCANS = 3
 BUSY, NO_IMU = "the engine was too busy", "no IMU sample came to cover it"
@@ -51,7 +51,7 @@ class LiveImu:
 
 @dataclass(frozen=True, slots=True)
 class LiveScan:
-    """A scan, or the news that one could not be read."""
+    """A scan, or a scan that could not be read."""
 
     scan: Scan | DroppedScan
     arrival_ns: int
@@ -59,10 +59,10 @@ class LiveScan:
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """What the first second told, and how the clocks stand: another intake goes on with it.
+    """What was learnt in the first second, and the state of the clocks, for another intake to continue with.
 
     Attributes:
-        clock: in use. maps: by sensor. accel_scale: to m/s^2.
+        clock: which clock stamps the data. maps: by sensor. accel_scale: factor to m/s^2.
     """
 
     clock: Clock
@@ -71,7 +71,7 @@ class Settled:
 
 
 class Tap(Protocol):
-    """Whoever wants to see everything that comes, in the engine's time: the recorder."""
+    """Sees everything that comes, stamped in the engine's time: the recorder."""
 
     def add_scan(self, scan: Scan, arrival_ns: int) -> None: ...
 
@@ -79,16 +79,16 @@ class Tap(Protocol):
 
 
 class Intake:
-    """Between the receiving threads (`put_...`) and one reader (`take`).
+    """Receiving threads call `put_...`; one reader calls `take`.
 
-    For the first second it holds everything back, until it knows the accelerometer's unit and whether
-    the two sensors' clocks agree.
+    For the first second it holds everything back, until it knows the accelerometer's unit and whether the clocks of
+    the two sensors agree.
 
     Attributes:
-        counters: shared with the receiving threads. sensor: what the LiDAR says about itself.
+        counters: shared with the receiving threads. sensor: what the LiDAR reports about itself.
 
     Args:
-        counters, settled: to go on with, of an intake that this one follows.
+        counters, settled: of an intake that this one continues.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Intake:
         self._rest: deque[LiveImu | DroppedScan | Status] = deque()
         self._held: deque[LiveScan | LiveImu] | None = deque()
         self._suspect: LiveImu | None = None
-        self._told_still = False
+        self._still_reported = False
         self._absent = False
         self._limit = MAX_BACKLOG
         self._maps = {"LiDAR": ClockMap(), "IMU": ClockMap()}
@@ -144,7 +144,7 @@ class Intake:
     # --- the reader ------------------------------------------------------------------------------
 
     def take(self, timeout_s: float, *, scan: bool) -> tuple[list[LiveImu | DroppedScan | Status], Scan | None]:
-        """All there is but scans, in the order of arrival, and the oldest scan if wanted; waits so long for any."""
+        """All entries but scans, in the order of arrival, and the oldest scan if wanted; waits this long for any."""
 
         def some() -> bool:
             return bool(self._rest) or (scan and bool(self._scans))
@@ -159,12 +159,12 @@ class Intake:
             return rest, found
 
     def set_absent(self, absent: bool) -> None:
-        """Whether there is no reader at present. What waited for one is not let go when it is back."""
+        """Say whether the reader is away. The scans that waited for it are not dropped when it is back."""
         with self._changed:
             self._absent = absent
 
     def settled(self) -> Settled | None:
-        """What another one could go on with; None as long as it is not known."""
+        """What another intake can continue with; None while it is not known."""
         with self._changed:
             if self._held is not None:
                 return None
@@ -201,14 +201,14 @@ class Intake:
         self._changed.notify()
 
     def _settled(self) -> bool:
-        """Once there is a second of the IMU and a few scans: decide unit and clock. Holds on to 10 s at most."""
+        """Decide unit and clock once there are a second of IMU samples and a few scans. Holds 10 s at most."""
         assert self._held is not None
         while len(self._held) > MAX_HELD or self._held[-1].arrival_ns - self._held[0].arrival_ns > 10 * _SETTLE_NS:
             old = self._held.popleft()
             if isinstance(old, LiveScan):
                 self.counters.dropped += 1
                 self._rest.append(DroppedScan(old.scan.stamp_ns, NO_IMU))
-        # Asked for each of thousands that are held: only once a scan is there, are all of them looked at.
+        # Thousands of samples may be held; going through all of them at each scan is enough.
         if not isinstance(self._held[-1], LiveScan):
             return False
         samples = [entry for entry in self._held if isinstance(entry, LiveImu)]
@@ -216,9 +216,9 @@ class Intake:
         if scans < _SETTLE_SCANS or len(samples) < 20:
             return False
         if abs(samples[-1].stamp_ns - samples[0].stamp_ns) < _SETTLE_NS:
-            if not self._told_still and samples[-1].arrival_ns - samples[0].arrival_ns > 5 * _SETTLE_NS:
-                self._told_still = True
-                self._tell("clocks", "IMU", "the IMU's stamps do not go on with time; check its driver")
+            if not self._still_reported and samples[-1].arrival_ns - samples[0].arrival_ns > 5 * _SETTLE_NS:
+                self._still_reported = True
+                self._tell("clocks", "IMU", "the IMU's stamps do not advance; check its driver")
             return False
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         accel = np.array([sample.accel for sample in samples], np.float64)
@@ -248,7 +248,7 @@ class Intake:
             clock_map.host = self._clock == "host"
 
     def _release(self, entry: LiveScan | LiveImu) -> None:
-        """Into the engine's time, to the recorder, and to the reader."""
+        """Stamp it in the engine's time and pass it to the recorder and the reader."""
         if isinstance(entry, LiveScan):
             self._release_scan(entry)
         elif not self._maps["IMU"].jumps(entry.stamp_ns, entry.arrival_ns):
@@ -259,7 +259,7 @@ class Intake:
             suspect, self._suspect = self._suspect, None
             self._release_imu(suspect)
             self._release_imu(entry)
-        else:  # another time: the next sample must confirm it
+        else:  # another time, which the next sample must confirm
             self.counters.strays += self._suspect is not None
             self._suspect = entry
 
@@ -312,10 +312,10 @@ class Intake:
 
 
 def _rate(times: deque[int], now: int) -> float:
-    """Arrivals a second over the last three."""
+    """Arrivals per second over the last three seconds."""
     recent = [time for time in times if time > now - 3_000_000_000]
     return (len(recent) - 1) * 1e9 / (recent[-1] - recent[0]) if len(recent) > 1 and recent[-1] > recent[0] else 0.0
 
 
 Receive = Callable[[Intake, threading.Event], None]
-"""A receiving thread's work: put what comes, until the event is set."""
+"""Runs in a receiving thread: puts what comes into the intake until the event is set."""

@@ -17,14 +17,14 @@ from app.slam.types import Scan
 
 FLUSH_S = 0.5
 MAX_SCANS, MAX_SAMPLES = 200, 100_000
-"""What may wait for the disk, 20 s of scans: if there is more it is too slow, and the newest are left out."""
+"""What may wait for the disk: 20 s of scans. If the disk is slower than that, the newest are left out."""
 
 _Scan = tuple[Scan, int]
 _Imu = tuple[int, Vector, Vector, int]
 
 
 def further(path: Path) -> Path:
-    """Where to go on when `path` cannot be gone on with: `walk-2.mcap` for `walk.mcap`, or the next that is free."""
+    """The next free name after `path`, where a recording continues: `walk-2.mcap` after `walk.mcap`."""
     names = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
     return next(name for name in names if not name.exists())
 
@@ -69,7 +69,7 @@ class Recorder:
         self._add((stamp_ns, gyro, accel, arrival_ns))
 
     def close(self) -> None:
-        """Write what waits, and the file's end."""
+        """Write what is waiting and the end of the file."""
         self._closing = True
         self._wake.set()
         self._thread.join(30.0)

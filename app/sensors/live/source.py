@@ -1,4 +1,4 @@
-"""A live source: what a recording gives, as it happens."""
+"""A live source: gives what a recording gives, as it happens."""
 
 import threading
 import time
@@ -16,18 +16,19 @@ from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
 SILENCE_S = 1.0
-"""A sensor that sent nothing for so long is silent."""
+"""A sensor that has sent nothing for this time is silent."""
 
 Event = Measurement | DroppedScan | Status
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What a source has found out, for one that takes its place.
+    """What a source knows, for another one that takes its place.
 
     Attributes:
-        at_ns: when, by the host's clock. counters: so far. settled: None while it is not.
-        pairing: where it was. recorded: bytes written so far. waiting: scans that nobody has taken yet.
+        at_ns: the time of this, by the host's clock. settled: units and clocks, None while they are not settled.
+        pairing: the sequencer with its newest samples. recorded: bytes written so far.
+        waiting: scans that nobody has taken yet.
     """
 
     at_ns: int
@@ -39,10 +40,12 @@ class Known:
 
 
 class LiveSource:
-    """Receives on threads of its own; `poll` gives scans paired with IMU samples, and what happened.
+    """Receives on threads of its own; `poll` gives scans paired with IMU samples, and news.
 
     One thread may poll. A context manager; `close` ends the threads and the recording.
-    before: of a source that this one takes the place of.
+
+    Args:
+        before: what a source knew that this one takes the place of.
     """
 
     def __init__(
@@ -62,7 +65,7 @@ class LiveSource:
         self._pairing = False
         self._silent: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": None, "IMU": None}
         self._watched_at = 0.0
-        self._told_failure = False
+        self._failure_reported = False
         self._threads = [
             threading.Thread(target=_run, args=(receive, intake, self._stop), daemon=True, name=f"receive-{number}")
             for number, receive in enumerate(receivers)
@@ -71,7 +74,7 @@ class LiveSource:
             thread.start()
 
     def poll(self, timeout_s: float = 0.1) -> Event | None:
-        """The next scan with its IMU samples, one that is not used and why, or news; None: nothing in that time."""
+        """The next scan with its IMU samples, dropped scan, or news; None if nothing comes in time."""
         deadline = time.monotonic() + timeout_s
         while True:
             self._watch()
@@ -83,30 +86,30 @@ class LiveSource:
                 return None
 
     def events(self) -> Iterator[Event]:
-        """All that comes, waiting for it, until `close`."""
+        """All events until `close`; waits for them."""
         while not self._stop.is_set():
             event = self.poll(0.25)
             if event is not None:
                 yield event
 
     def state(self) -> LiveState:
-        """How it is doing, now."""
+        """How the source is doing now."""
         recorded = None if self._recorder is None else self._recorded_before + self._recorder.bytes_written
         return replace(self._intake.state(), recorded=recorded)
 
     def known(self) -> Known:
-        """For a source that takes the place of this one. Not while another thread polls."""
+        """What another source needs to take the place of this one. Not while another thread polls."""
         state = self.state()
         pairing = self._sequencer.tail()
         recorded, waiting = state.recorded or 0, state.backlog
         return Known(time.time_ns(), state.counters, self._intake.settled(), pairing, recorded, waiting)
 
     def tell(self, kind: Kind, text: str) -> None:
-        """Give this as news to whoever polls."""
+        """Add news for the thread that polls."""
         self._intake.put_status(kind, "source", text)
 
     def set_absent(self, absent: bool) -> None:
-        """Whether nobody polls at present, and will come back: then more scans may wait."""
+        """Say whether the engine that polls is away but will be back: then more scans may wait."""
         self._intake.set_absent(absent)
 
     @property
@@ -127,7 +130,7 @@ class LiveSource:
         self.close()
 
     def _gather(self, timeout_s: float) -> None:
-        """One scan at a time goes to the sequencer, so that those behind it can still be let go."""
+        """Pass scans to the sequencer one at a time, so that later ones can still be dropped."""
         rest, scan = self._intake.take(timeout_s, scan=not self._pairing)
         for entry in rest:
             if isinstance(entry, LiveImu):
@@ -142,17 +145,17 @@ class LiveSource:
             self._events.append(paired)
 
     def _watch(self) -> None:
-        """Who has fallen silent, and who is back."""
+        """Report sensors that fell silent or are back, and a recording that failed."""
         now = time.monotonic()
         if now - self._watched_at < 0.1:
             return
         self._watched_at = now
         state = self._intake.state()
-        if self._recorder is not None and not self._told_failure:
-            slow = "the disk is too slow to record everything; some scans are missing in the recording"
+        if self._recorder is not None and not self._failure_reported:
+            slow = "the disk is too slow; some scans are missing in the recording"
             trouble = self._recorder.failure or (slow if self._recorder.left_out else "")
             if trouble:
-                self._told_failure = True
+                self._failure_reported = True
                 self._events.append(Status("recording", "source", trouble, time.time_ns()))
         ages: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": state.lidar_age_s, "IMU": state.imu_age_s}
         for sensor, age in ages.items():
@@ -172,6 +175,6 @@ class LiveSource:
 def _run(receive: Receive, intake: Intake, stop: threading.Event) -> None:
     try:
         receive(intake, stop)
-    except Exception as error:  # the other threads go on; the user must know that this one does not
-        intake.put_status("disconnected", "source", f"receiving has ended: {type(error).__name__}: {error}")
+    except Exception as error:  # the other threads continue; the user must know that this one does not
+        intake.put_status("disconnected", "source", f"receiving ended: {type(error).__name__}: {error}")
         raise

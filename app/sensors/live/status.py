@@ -1,4 +1,4 @@
-"""What a live source has to tell beside measurements."""
+"""News and state of a live source."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -12,11 +12,11 @@ Kind = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """Something happened to a source; it was survived.
+    """Something happened to a source, which goes on.
 
     Attributes:
-        kind: as named. sensor: whose it is, "LiDAR", "IMU" or "source".
-        text: one sentence for the user. at_ns: when, by the host's clock.
+        sensor: what it happened to, "LiDAR", "IMU" or "source". text: one sentence for the user.
+        at_ns: when, by the host's clock.
     """
 
     kind: Kind
@@ -27,13 +27,13 @@ class Status:
 
 @dataclass(frozen=True, slots=True)
 class LiveState:
-    """How a live source is doing; a value to be shown.
+    """How a live source is doing, to be shown.
 
     Attributes:
         lidar_hz, imu_hz: over the last seconds. lidar_age_s, imu_age_s: since the last arrival, None before the first.
-        backlog: scans that wait for the engine. clock: whose time the measurements have, "" while not settled.
-        offset_s: by how much the IMU's stamps lag behind the LiDAR's, by when they came; None if unknown.
-        sensor: what the LiDAR says about itself. recorded: bytes written, None if not recording.
+        backlog: scans that wait for the engine. clock: which clock stamps the measurements, "" while not settled.
+        offset_s: how far the IMU's stamps lag behind the LiDAR's, estimated from arrival times; None if unknown.
+        sensor: what the LiDAR reports about itself. recorded: bytes written, None if not recording.
     """
 
     counters: Counters = field(default_factory=Counters)
@@ -48,6 +48,6 @@ class LiveState:
     recorded: int | None = None
 
     def unheard(self, seconds: float) -> "LiveState":
-        """The same after so long in which nothing was heard of the source."""
+        """The same after a time in which the source did not answer."""
         lidar, imu = (None if age is None else age + seconds for age in (self.lidar_age_s, self.imu_age_s))
         return replace(self, lidar_hz=0.0, imu_hz=0.0, lidar_age_s=lidar, imu_age_s=imu)

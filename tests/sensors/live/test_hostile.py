@@ -205,4 +205,4 @@ def test_an_imu_whose_clock_stands_still_is_told_once() -> None:
         scan = Scan(now, points, *(nothing.astype(kind) for kind in ("i4", "f4", "u2")))
         intake.put_scan(scan, now)
         told += [entry.text for entry in intake.take(0.0, scan=False)[0] if isinstance(entry, Status)]
-    assert told == ["the IMU's stamps do not go on with time; check its driver"]
+    assert told == ["the IMU's stamps do not advance; check its driver"]
