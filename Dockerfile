@@ -15,7 +15,7 @@ WORKDIR /hemislam
 COPY . .
 RUN make install PYTHON=python3
 
-# Whoever runs it (`--user 12345`) may write results and compiled kernels, but not the program.
+# Any user (`--user 12345`) may write results and compiled kernels, but not change the program.
 RUN useradd --create-home hemislam \
  && install -d -m 1777 /recordings /hemislam/runs /var/cache/hemislam
 ENV NUMBA_CACHE_DIR=/var/cache/hemislam

@@ -63,7 +63,7 @@ $(BIN)/python:
 		echo "hemislam needs Python 3.11, 3.12 or 3.13; install one, or name it: make PYTHON=/path/to/python3.11" >&2; \
 		exit 2; }
 	@$(PYTHON) -m venv $(VENV) || { rm -f $@; \
-		echo "$(PYTHON) can not make environments; on Debian: apt install python3-venv" >&2; exit 2; }
+		echo "$(PYTHON) cannot make environments; on Debian: apt install python3-venv" >&2; exit 2; }
 
 $(VENV)/.installed: requirements.txt pyproject.toml | $(BIN)/python
 	$(INSTALL) -r requirements.txt

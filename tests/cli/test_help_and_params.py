@@ -54,7 +54,7 @@ def test_the_reference_of_all_parameters_is_printed_as_tables(hemislam: Call) ->
     assert "\n| `ground.alpha` | α | `25.0` | 1 to 90 | deg | at once |" in printed.out
 
 
-def test_a_preset_is_overruled_by_a_file_and_a_file_by_set(hemislam: Call, tmp_path: Path) -> None:
+def test_a_file_takes_precedence_over_a_preset_and_set_over_a_file(hemislam: Call, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("recording: {imu_topic: /other}\nground: {alpha: 50, sigma: 0.05}\n")
     printed = hemislam("params", "--preset", "h2lid", "--config", tmp_path / "mine.yaml", "--set", "ground.alpha=20")
     params = Params().merged_yaml(printed.out)

@@ -1,4 +1,4 @@
-"""Requests made from the API's own OpenAPI document: as it says, and as it does not."""
+"""Valid and invalid requests made from the API's own OpenAPI document."""
 
 import json
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ ANYTHING = ODD | st.recursive(
 
 @dataclass(frozen=True)
 class Sent:
-    """A request. valid: whether it is as the document says."""
+    """A request. valid: it conforms to the document."""
 
     method: str
     path: str
@@ -32,17 +32,17 @@ class Sent:
 
 
 class Document:
-    """What requests there can be.
+    """Generates requests.
 
     Args:
-        hints: schemas of bodies that the document itself is vague about, by (method, path).
+        hints: schemas of bodies that the document leaves open, by (method, path).
     """
 
     def __init__(self, document: Json, hints: dict[tuple[str, str], Json]) -> None:
         self._document, self._hints = document, hints
 
     def requests(self, skip: frozenset[str] = frozenset()) -> SearchStrategy[Sent]:
-        """Any that the document names, but for those of the paths to skip."""
+        """Any request that the document describes, except on the paths to skip."""
         found = []
         for path, methods in self._document["paths"].items():
             if path not in skip:
@@ -63,7 +63,7 @@ class Document:
         return valid | broken
 
     def values(self, schema: Json) -> SearchStrategy[Json]:
-        """What a schema lets through."""
+        """Values that conform to a schema."""
         if "$ref" in schema:
             return self.values(self._document["components"]["schemas"][schema["$ref"].rpartition("/")[2]])
         for name in ("anyOf", "oneOf"):
@@ -111,13 +111,13 @@ class Document:
 
 
 def encoded(value: Json) -> bytes:
-    """As JSON, with what is no JSON (NaN) and no character (half of a pair) as Python writes it."""
+    """As JSON, but with NaN and lone surrogates as Python writes them."""
     return json.dumps(value).encode("ascii")
 
 
 @st.composite
 def mutated(draw: st.DrawFn, value: Json) -> bytes:
-    """A body that is not as it should be, or only seldom is."""
+    """A body that is invalid, or valid by chance."""
     kind = draw(st.sampled_from(["part", "part", "part", "more", "less", "other", "bytes"]))
     if kind == "other" or not isinstance(value, dict):
         return encoded(draw(ANYTHING))

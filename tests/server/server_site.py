@@ -20,7 +20,7 @@ from app.server.web import make_app, make_server
 from app.server.worker import EngineProcess
 
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
-PATIENCE_S = 20.0
+TIMEOUT_S = 20.0
 
 
 @dataclass
@@ -55,7 +55,7 @@ def serving(engine: EngineProcess, target: Viser, folder: Path, token: str | Non
 
 
 def engine_recording(engine: EngineProcess) -> Path:
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while (recording := engine.snapshot.recording) is None:
         assert time.monotonic() < deadline
         time.sleep(0.02)
@@ -64,7 +64,7 @@ def engine_recording(engine: EngineProcess) -> Path:
 
 def eventually(site: Site, **wanted: object) -> dict[str, object]:
     """The transport, once it is as wanted."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while True:
         transport: dict[str, object] = httpx.get(site.url("/api/state")).json()["transport"]
         if wanted.items() <= transport.items():

@@ -1,4 +1,4 @@
-"""The REST interface over a real socket: what scripts ask for and do."""
+"""The REST interface over a real socket."""
 
 import socket
 import time
@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 import server_fakes as fakes
-from server_site import PATIENCE_S, Site, eventually
+from server_site import TIMEOUT_S, Site, eventually
 
 from app.server.api import BreakpointsBody
 from app.server.breakpoints import Breakpoints
@@ -40,7 +40,7 @@ def test_transport_by_rest(site: Site) -> None:
 def test_parameters_by_rest(site: Site) -> None:
     answer = httpx.patch(site.url("/api/params"), json={"ground": {"alpha": 31}})
     assert answer.json()["ground"]["alpha"] == 31
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while httpx.get(site.url("/api/params")).json()["ground"]["alpha"] != 31:
         assert time.monotonic() < deadline
     refused = httpx.patch(site.url("/api/params"), json={"ground": {"alpha": 900}})
@@ -50,7 +50,7 @@ def test_parameters_by_rest(site: Site) -> None:
     assert schema["minimum"] == 1 and schema["maximum"] == 90 and schema["unit"] == "deg"
 
 
-def test_what_to_compare_with_by_rest(site: Site) -> None:
+def test_comparing_by_rest(site: Site) -> None:
     answer = httpx.post(site.url("/api/truth"), json={"path": "../secret.tum"})
     assert answer.status_code == 422 and "There is no" in answer.json()["detail"]
     assert httpx.post(site.url("/api/truth"), json={"path": None}).status_code == 202
@@ -59,12 +59,12 @@ def test_what_to_compare_with_by_rest(site: Site) -> None:
 def test_exports_by_rest(site: Site) -> None:
     httpx.post(site.url("/api/transport"), json={"action": "seek", "frame": 20})
     eventually(site, frame=20)
-    trajectory = httpx.get(site.url("/api/export/trajectory.tum"), timeout=PATIENCE_S).text.splitlines()
+    trajectory = httpx.get(site.url("/api/export/trajectory.tum"), timeout=TIMEOUT_S).text.splitlines()
     assert len(trajectory) == 21 and all(len(line.split()) == 8 for line in trajectory)
-    cloud = httpx.get(site.url("/api/export/map.ply"), timeout=PATIENCE_S).content
+    cloud = httpx.get(site.url("/api/export/map.ply"), timeout=TIMEOUT_S).content
     assert f"element vertex {5 * fakes.POINTS:012d}".encode() in cloud
     assert httpx.get(site.url("/api/export/passwd")).status_code == 422
-    without_loops = httpx.get(site.url("/api/export/graph.g2o"), timeout=PATIENCE_S)
+    without_loops = httpx.get(site.url("/api/export/graph.g2o"), timeout=TIMEOUT_S)
     assert without_loops.status_code == 404 and "loop search is off" in without_loops.json()["detail"]
 
 
@@ -77,7 +77,7 @@ def test_recordings_outside_the_folders_are_not_opened(site: Site, path: str) ->
 @pytest.mark.parametrize(
     "path", ["/../pyproject.toml", "/%2e%2e/pyproject.toml", "/..%2fpyproject.toml", "/index.html"]
 )
-def test_no_file_but_the_page_is_served(site: Site, path: str) -> None:
+def test_only_the_page_is_served(site: Site, path: str) -> None:
     with socket.create_connection(("127.0.0.1", site.port)) as raw:
         raw.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n".encode())
         assert raw.recv(100).split()[1] == b"404"
@@ -88,28 +88,28 @@ def test_recordings_inside_are_listed_and_opened(site: Site) -> None:
     assert [Path(name).name for name in names] == ["walk-30.mcap", "walk-60.mcap"]
     for name in names:
         assert httpx.post(site.url("/api/recordings"), json={"path": name}).status_code == 202
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while httpx.get(site.url("/api/state")).json()["recording"]["path"] != name:
             assert time.monotonic() < deadline
 
 
 # --- breakpoints, notes, loops -------------------------------------------------------------------
-def told(site: Site) -> list[str]:
+def notices(site: Site) -> list[str]:
     return [notice["text"] for notice in httpx.get(site.url("/api/state")).json()["notices"]]
 
 
-def test_breakpoints_by_rest_reach_the_engine_all_at_once(site: Site) -> None:
+def test_breakpoints_by_rest_reach_the_engine_together(site: Site) -> None:
     for body in ({"no_ground": True, "residual": 0.5}, {"frame_ms": 80}, {}):
         answer = httpx.put(site.url("/api/breakpoints"), json=body)
         assert answer.status_code == 200 and answer.json() == BreakpointsBody(**body).model_dump()
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while site.engine.snapshot.breakpoints != Breakpoints(**body):
             assert time.monotonic() < deadline
         assert httpx.get(site.url("/api/breakpoints")).json() == answer.json()
 
 
 @pytest.mark.parametrize("body", [{"frame_ms": -1}, {"frame_ms": "slow"}, {"flying": True}])
-def test_a_breakpoint_that_is_none_is_refused(site: Site, body: dict[str, object]) -> None:
+def test_an_invalid_breakpoint_is_refused(site: Site, body: dict[str, object]) -> None:
     before = httpx.get(site.url("/api/breakpoints")).json()
     assert httpx.put(site.url("/api/breakpoints"), json=body).status_code == 422
     assert httpx.get(site.url("/api/breakpoints")).json() == before
@@ -126,20 +126,20 @@ def test_a_note_stays_with_its_frame(site: Site) -> None:
     httpx.post(site.url("/api/transport"), json={"action": "seek", "frame": 9})
     eventually(site, frame=9)
     assert httpx.post(site.url("/api/notes"), json={"text": "  the door opens "}).status_code == 202
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while not (notes := httpx.get(site.url("/api/state")).json()["notes"]):
         assert time.monotonic() < deadline
     assert notes[-1] == {"frame": 9, "text": "the door opens"}
     assert httpx.post(site.url("/api/notes"), json={"text": ""}).status_code == 422
 
 
-def test_a_loop_that_can_not_be_overruled_is_told(site: Site) -> None:
+def test_an_edit_that_has_no_effect_is_noticed(site: Site) -> None:
     assert httpx.get(site.url("/api/loops")).json() == {"loops": [], "edits": [], "undone": []}
-    before = len(told(site))
+    before = len(notices(site))
     for action in ({"action": "reject", "older": 1, "newer": 5}, {"action": "solve"}):
         assert httpx.post(site.url("/api/loops"), json=action).status_code == 202
-    deadline = time.monotonic() + PATIENCE_S
-    while sum("Loops are not looked for" in text for text in told(site)[before:]) < 2:
+    deadline = time.monotonic() + TIMEOUT_S
+    while sum("Loops are not looked for" in text for text in notices(site)[before:]) < 2:
         assert time.monotonic() < deadline
     for bad in ({"action": "reject", "older": 1}, {"action": "weigh", "older": 1, "newer": 5, "weight": 0}):
         assert httpx.post(site.url("/api/loops"), json=bad).status_code == 422

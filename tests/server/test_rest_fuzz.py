@@ -1,4 +1,4 @@
-"""Whatever is asked by REST, as its own description says or not: an answer, none of them the server's own error."""
+"""Requests made from the API's own description, valid and not: each gets an answer, none of them a server error."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rest_fuzz import Document, Sent
-from server_site import PATIENCE_S, Site, engine_recording, serving
+from server_site import TIMEOUT_S, Site, engine_recording, serving
 from test_rewind import SAMPLE
 
 from app.server.access import Access
@@ -21,7 +21,7 @@ from app.slam.params import Params
 JSON = {"Content-Type": "application/json"}
 EXPORT = "/api/export/{name}"
 MAY_BE_REFUSED = ("/api/recordings", "/api/truth", "/api/params", "/api/export/")
-"""What is valid there hangs on more than its form: on files, other values, and what is open."""
+"""Whether a request is accepted there depends on more than its form: on files, other values, and what is open."""
 
 
 def described() -> Document:
@@ -40,7 +40,7 @@ def real() -> Iterator[Site]:
 
 
 def check(client: httpx.Client, site: Site, sent: Sent) -> None:
-    """Send it, and look whether all is still there."""
+    """Send it, and check that the engine and the server go on."""
     pid, session = site.engine.pid, site.engine.snapshot.session
     answer = client.request(sent.method, site.url(sent.path), content=sent.body, headers=JSON if sent.body else {})
     assert answer.status_code < 500, (sent, answer.text)
@@ -56,6 +56,6 @@ def check(client: httpx.Client, site: Site, sent: Sent) -> None:
 @given(sents=st.lists(described().requests(frozenset({EXPORT})), min_size=1, max_size=4))
 def test_no_request_breaks_anything(real: Site, sents: list[Sent]) -> None:
     limits = httpx.Limits(keepalive_expiry=1.0)  # well before the server closes what is idle, after five
-    with httpx.Client(timeout=PATIENCE_S, limits=limits) as client:
+    with httpx.Client(timeout=TIMEOUT_S, limits=limits) as client:
         for sent in sents:
             check(client, real, sent)

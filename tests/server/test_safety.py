@@ -20,7 +20,7 @@ import pytest
 import server_fakes as fakes
 import zstandard
 from mcap.reader import make_reader
-from server_site import PATIENCE_S, PROTOCOL, Site
+from server_site import PROTOCOL, TIMEOUT_S, Site
 from test_live_run import free_ports
 from test_rewind import SAMPLE
 from websockets.asyncio.client import connect as asyncio_connect
@@ -68,7 +68,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 
 def until(true: Any) -> None:
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while not true():
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -85,7 +85,7 @@ def page(site: Site, headers: dict[str, str]) -> ClientConnection:
 def shown(browser: ClientConnection, label: str) -> dict[str, Any]:
     """The message by which viser shows the control with this label."""
     while True:
-        raw = browser.recv(timeout=PATIENCE_S)
+        raw = browser.recv(timeout=TIMEOUT_S)
         assert isinstance(raw, bytes)
         size = int.from_bytes(raw[8:16], "little")
         unpacked = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size])
@@ -186,7 +186,7 @@ def test_a_malformed_message_ends_its_connection_and_nothing_else(site: Site, ra
         browser.send(raw)
         with pytest.raises(ConnectionClosed):
             while True:
-                browser.recv(timeout=PATIENCE_S)
+                browser.recv(timeout=TIMEOUT_S)
     assert httpx.get(site.url("/healthz")).status_code == 200
 
 
@@ -261,7 +261,7 @@ def test_a_file_that_is_too_large_ends_the_connection(
             for message in upload(size, parts):
                 browser.send(message)
             while True:
-                browser.recv(timeout=PATIENCE_S)
+                browser.recv(timeout=TIMEOUT_S)
         assert browser.close_code in codes
 
 
@@ -296,7 +296,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> Tls:
         ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "1",
          "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1",
          "-keyout", str(tls.key), "-out", str(tls.certificate)],
-        check=True, capture_output=True, timeout=PATIENCE_S,
+        check=True, capture_output=True, timeout=TIMEOUT_S,
     )  # fmt: skip
     return tls
 
@@ -390,7 +390,7 @@ def test_a_sigterm_to_the_whole_group_loses_nothing_that_was_received(tmp_path: 
         until(lambda: (live := httpx.get(f"{address}api/state").json()["live"]) and live["imu_age_s"] > 1.0)
         counted = httpx.get(f"{address}api/state").json()["live"]["counters"]
         os.killpg(process.pid, signal.SIGTERM)
-        _, err = process.communicate(timeout=PATIENCE_S)
+        _, err = process.communicate(timeout=TIMEOUT_S)
     finally:
         process.kill()
     assert process.returncode == 0

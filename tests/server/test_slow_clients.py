@@ -12,7 +12,7 @@ from typing import Any
 
 import httpx
 import pytest
-from server_site import PATIENCE_S, Site, serving
+from server_site import TIMEOUT_S, Site, serving
 from test_safety import CAMERA, packed, until
 from websockets.exceptions import InvalidStatus
 
@@ -33,7 +33,7 @@ def talking(site: Site, *beginnings: bytes) -> Iterator[list[socket.socket]]:
     with contextlib.ExitStack() as stack:
         peers = []
         for beginning in beginnings:
-            peers.append(stack.enter_context(socket.create_connection(("127.0.0.1", site.port), PATIENCE_S)))
+            peers.append(stack.enter_context(socket.create_connection(("127.0.0.1", site.port), TIMEOUT_S)))
             peers[-1].sendall(beginning)
         yield peers
 
@@ -60,7 +60,7 @@ def test_a_body_that_does_not_arrive_in_time_is_refused_and_its_connection_close
 
 def test_a_body_that_trickles_in_is_refused_too(site: Site) -> None:
     with talking(site, head(site, 1000)) as (peer,):
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         with pytest.raises(OSError):  # a reset or a broken pipe
             while True:
                 assert time.monotonic() < deadline
@@ -87,7 +87,7 @@ def test_an_idle_connection_is_closed_after_its_request(site: Site) -> None:
     with talking(site, f"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1:{site.port}\r\n\r\n".encode()) as (peer,):
         begin = time.monotonic()
         assert b" 200 " in answer(peer).splitlines()[0]
-        assert 3.0 < time.monotonic() - begin < PATIENCE_S
+        assert 3.0 < time.monotonic() - begin < TIMEOUT_S
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="the system has no limit for unread data")
@@ -99,7 +99,7 @@ def test_a_client_that_reads_nothing_is_disconnected(site: Site, monkeypatch: py
         peer.connect(("127.0.0.1", strict.port))
         peer.sendall(10 * ask)  # the answers exceed all buffers on the way
         time.sleep(4.0)
-        peer.settimeout(PATIENCE_S)
+        peer.settimeout(TIMEOUT_S)
         taken = 0
         with contextlib.suppress(ConnectionResetError):
             while part := peer.recv(1 << 20):
@@ -125,7 +125,7 @@ def test_small_answers_do_not_wait_for_acknowledgements(site: Site) -> None:
 def test_a_page_may_be_silent(site: Site) -> None:
     with site.socket() as page:
         time.sleep(1.6)
-        assert page.ping().wait(PATIENCE_S)
+        assert page.ping().wait(TIMEOUT_S)
 
 
 def test_beyond_the_limit_of_connections_requests_are_turned_away(
@@ -207,8 +207,8 @@ def test_half_an_upload_goes_with_its_page(site: Site) -> None:
 
 def test_slow_exports_leave_threads_for_others(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     written = threading.Event()
-    monkeypatch.setattr(api, "_save", lambda *_, **__: written.wait(PATIENCE_S))
-    ask = partial(httpx.get, site.url("/api/export/map.ply"), timeout=PATIENCE_S)
+    monkeypatch.setattr(api, "_save", lambda *_, **__: written.wait(TIMEOUT_S))
+    ask = partial(httpx.get, site.url("/api/export/map.ply"), timeout=TIMEOUT_S)
     with ThreadPoolExecutor(60) as many:
         answers = [many.submit(ask) for _ in range(60)]
         until(lambda: sum(answer.done() for answer in answers) >= 60 - api.MOST_EXPORTS)

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 import zstandard
-from server_site import PATIENCE_S, PROTOCOL, Site
+from server_site import PROTOCOL, TIMEOUT_S, Site
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
@@ -48,12 +48,12 @@ def test_what_viser_shows_reaches_the_page_and_what_the_user_does_goes_back(site
     with site.socket() as browser:
         shown: list[dict[str, Any]] = []
         while not shown:
-            received = messages(browser.recv(timeout=PATIENCE_S))
+            received = messages(browser.recv(timeout=TIMEOUT_S))
             shown = [m for m in received if m.get("props", {}).get("label") == "a slider for the test"]
         assert shown[0]["value"] == 3
         update = {"type": "GuiUpdateMessage", "uuid": shown[0]["uuid"], "updates": {"value": 7}}
         browser.send(msgspec.msgpack.encode(update))
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while slider.value != 7:
             assert time.monotonic() < deadline
             time.sleep(0.01)
@@ -63,7 +63,7 @@ def test_what_viser_shows_reaches_the_page_and_what_the_user_does_goes_back(site
 def test_a_page_of_another_version_is_refused_and_says_why(site: Site) -> None:
     with connect(f"ws://127.0.0.1:{site.port}/", subprotocols=[Subprotocol("viser-v0.0.1")], proxy=None) as browser:
         with pytest.raises(ConnectionClosed):
-            browser.recv(timeout=PATIENCE_S)
+            browser.recv(timeout=TIMEOUT_S)
         assert browser.close_code == 1002 and "Version mismatch" in (browser.close_reason or "")
 
 
@@ -74,7 +74,7 @@ def test_a_browser_that_does_not_read_is_sent_only_the_newest(site: Site) -> Non
     cloud = site.viser.server.scene.add_point_cloud("/test", points, (0, 0, 0), precision="float32")
     with socket.socket() as browser:
         browser.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 18)
-        browser.settimeout(PATIENCE_S)
+        browser.settimeout(TIMEOUT_S)
         browser.connect(("127.0.0.1", site.port))
         browser.sendall(
             f"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -102,7 +102,7 @@ def test_a_map_is_sent_in_pieces_that_take_little_memory(site: Site) -> None:
     try:
         with site.socket() as browser:
             while len(names) < len(clouds):
-                raw = browser.recv(timeout=PATIENCE_S)
+                raw = browser.recv(timeout=TIMEOUT_S)
                 sizes.append(len(raw))
                 names |= {name for m in messages(raw) if (name := str(m.get("name"))).startswith("/test/")}
     finally:
@@ -252,10 +252,10 @@ def test_the_server_stops_cleanly_with_everything_it_started(tmp_path: Path, num
         engine_pid = int(process.stdout.readline().removeprefix("engine "))
         address = process.stdout.readline().split()[3]
         health = f"{address}healthz"
-        assert httpx.get(health, timeout=PATIENCE_S).json() == {"status": "ok"}
+        assert httpx.get(health, timeout=TIMEOUT_S).json() == {"status": "ok"}
         with connect(address.replace("http", "ws"), subprotocols=[PROTOCOL], proxy=None):
             os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
-            out, err = process.communicate(timeout=PATIENCE_S)
+            out, err = process.communicate(timeout=TIMEOUT_S)
     finally:
         process.kill()
     assert process.returncode == 0 and err == "" and out == "page closed\n"
