@@ -1,8 +1,7 @@
-"""From the last packet of a scan to its pose, and to the page; and how soon a killed engine maps again.
+"""Time from the last packet of a scan to its pose, and to the page; and how soon a killed engine maps again.
 
-A walk at the sensor's full resolution is sent as packets at real time by a process of its own. The pose is
-there when the server's process has it; the page has it when a WebSocket client of the real program was sent
-where the sensor is, with its points.
+A process of its own sends a walk at the sensor's full resolution as packets in real time. A pose has arrived when the
+server's process has it. It has reached the page when a WebSocket client was sent the sensor's position.
 """
 
 import math
@@ -20,14 +19,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import msgspec.msgpack
 import numpy as np
-import viser
-import zstandard
 from mcap.reader import make_reader
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
-from websockets.typing import Subprotocol
 
 from app.sensors.live.feed import LIDAR, packets_of
 from app.sensors.live.process import LiveProcess
@@ -38,15 +31,16 @@ from app.server.protocol import LIVE, Snapshot
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.types import F64
+from benchmarks.client import listening
 from benchmarks.live import free_port, served, wait_until
 from benchmarks.record import Line
 from benchmarks.scenes import recording
 
 SCENE = "corridor"
 RUNS, KILLS = 4, 3
-"""Runs with kills, and kills in each, one as soon as the engine maps again after the other."""
+"""Runs with kills, and kills in each run. A kill follows as soon as the engine maps again."""
 SAME_M = 1e-4
-"""The two runs give the same poses, but for 32-bit numbers on the wire."""
+"""Both runs give the same poses, apart from 32-bit numbers in viser's messages."""
 
 
 def run() -> list[Line]:
@@ -61,7 +55,7 @@ def run() -> list[Line]:
         Line.of(
             "kill -9 of the engine to the next frame", on, "s", [second for one in kills for second in one.seconds]
         ),
-        Line.of("scans and samples that came and are not recorded", on, "", [one.not_recorded for one in kills]),
+        Line.of("scans and samples received but not recorded", on, "", [one.not_recorded for one in kills]),
         Line.of("scans neither mapped nor counted as dropped", on, "", [one.unaccounted for one in kills]),
         Line.of("scans dropped", on, "", [one.dropped for one in kills]),
     ]
@@ -82,32 +76,25 @@ def _to_poses(walk: Path) -> tuple[list[float], dict[int, F64]]:
 
 
 def _to_page(walk: Path, positions: dict[int, F64]) -> list[float]:
-    """Seconds for each scan until a page that is open was sent it. positions: of all scans, by their ends."""
+    """Seconds for each scan until an open page was sent its position. positions: of all scans, by their ends."""
     stamps, places = np.array(list(positions)), np.array(list(positions.values()))
     came: dict[int, float] = {}
-    heard: list[tuple[float, bytes]] = []
     with TemporaryDirectory() as folder, served(walk, Path(folder) / "live.mcap") as (url, _, packets, imu):
         wait_until(url, lambda state: state["recording"] is not None)
-        ended = threading.Event()
-        page = threading.Thread(target=_listen, args=(url, heard, ended))
-        page.start()
-        with sent(walk, packets, imu) as sending:
+        with listening(url) as page, sent(walk, packets, imu) as sending:
             while not sending.ended or time.monotonic() - sending.last < 1.0:
                 time.sleep(0.1)
-        ended.set()
-        page.join()
-    for at, raw in heard:
-        for message in _messages(raw):
-            if message["type"] == "SetPositionMessage" and message["name"] == "/map/sensor":
-                apart = np.linalg.norm(places - np.array(message["position"]), axis=1)
-                if apart.min() < SAME_M:
-                    came.setdefault(int(stamps[apart.argmin()]), at)
+    for at, message in page.entries():
+        if message["type"] == "SetPositionMessage" and message["name"] == "/map/sensor":
+            apart = np.linalg.norm(places - np.array(message["position"]), axis=1)
+            if apart.min() < SAME_M:
+                came.setdefault(int(stamps[apart.argmin()]), at)
     return sending.delays(came)
 
 
 @dataclass(frozen=True, slots=True)
 class _Killed:
-    """Seconds from each kill to the next frame; of all that came what is not recorded, nowhere, dropped."""
+    """Seconds from each kill to the next frame, and how much of what was received is not recorded, lost, dropped."""
 
     seconds: list[float]
     not_recorded: int
@@ -150,38 +137,14 @@ def _until(engine: EngineProcess, wanted: Any) -> Snapshot:
     snapshot = engine.snapshot
     while not wanted(snapshot):
         if time.monotonic() > deadline:
-            raise RuntimeError(f"nothing comes: {snapshot.notices}")
+            raise RuntimeError(f"the engine does not go on: {snapshot.notices}")
         snapshot = engine.wait(snapshot.revision, timeout=0.1)
     return snapshot
 
 
-# --- the page ------------------------------------------------------------------------------------
-def _listen(url: str, heard: list[tuple[float, bytes]], ended: threading.Event) -> None:
-    """As a browser would, but only noting what comes when; it is read later."""
-    protocol = Subprotocol(f"viser-v{viser.__version__}")
-    with connect(url.replace("http", "ws", 1), subprotocols=[protocol], max_size=None, proxy=None) as page:
-        while not ended.is_set():
-            try:
-                raw = page.recv(timeout=0.2)
-            except TimeoutError:
-                continue
-            except ConnectionClosed:
-                return
-            assert isinstance(raw, bytes)
-            heard.append((time.monotonic(), raw))
-
-
-def _messages(raw: bytes) -> list[dict[str, Any]]:
-    """What viser packs into one WebSocket message."""
-    size = int.from_bytes(raw[8:16], "little")
-    unpacked = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size])
-    entries: list[dict[str, Any]] = msgspec.msgpack.decode(unpacked)["messages"]
-    return entries
-
-
 # --- the sensor ----------------------------------------------------------------------------------
 class Sending:
-    """Sends a walk in a process of its own, which tells when each packet of the LiDAR was sent."""
+    """Sends a walk in a process of its own, which reports when each LiDAR packet was sent."""
 
     def __init__(self, walk: Path, packets: str, imu: str) -> None:
         context = multiprocessing.get_context("spawn")
@@ -190,7 +153,7 @@ class Sending:
         self._process = context.Process(target=_send, args=(walk, packets, imu, theirs, self._go), daemon=True)
         self._process.start()
         theirs.close()
-        self._told.recv()  # all is made and waits
+        self._told.recv()  # all packets are ready
         self._sent: list[tuple[int, float]] = []
         self.last = time.monotonic()
         self.ended = False
@@ -204,7 +167,7 @@ class Sending:
         self.ended = True
 
     def delays(self, came: dict[int, float]) -> list[float]:
-        """Seconds from the last packet of each scan to when it came. came: monotonic s, by the ends of scans."""
+        """Seconds from the last packet of each scan to its arrival. came: monotonic s, by the ends of scans."""
         stamps = np.array([stamp for stamp, _ in self._sent])
         last = np.searchsorted(stamps, np.array(list(came)), side="right") - 1
         return [at - self._sent[index][1] for index, at in zip(last, came.values(), strict=True)]
@@ -215,7 +178,7 @@ class Sending:
 
 
 def _send(walk: Path, packets: str, imu: str, told: Any, go: Event) -> None:
-    """The process: makes all packets first, so that nothing delays them."""
+    """The process. It makes all packets first, so that nothing delays them."""
     with open_recording(walk, resolve_params(walk, None, None, [])) as opened:
         made = list(packets_of(opened))
     ports = (*parse_address(packets).ports, *parse_address(imu).ports)
@@ -244,7 +207,7 @@ def sent(walk: Path, packets: str, imu: str) -> Iterator[Sending]:
 
 @contextmanager
 def received(walk: Path, record: Path | None = None) -> Iterator[tuple[EngineProcess, Sending]]:
-    """An engine's process that maps what is sent, without a page."""
+    """An engine's process without a page that maps the packets sent."""
     ports = [free_port() for _ in range(3)]
     packets, imu = f"rsbpearl://127.0.0.1:{ports[0]},{ports[1]}", f"imu-udp://127.0.0.1:{ports[2]}"
     params = resolve_params(walk, None, None, [])

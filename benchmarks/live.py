@@ -1,9 +1,9 @@
-"""Live for minutes on end: a walk fed as packets, with three pages open, one of them stalled.
+"""Live mapping for minutes: a walk sent as packets, with three pages open, one of them stalled.
 
-Prints memory and drops each half minute, and at the end how much each process has grown since a third of the time.
-The pages are WebSocket clients that take everything that a browser would be sent; the stalled one reads nothing at
-all. `HEMISLAM_LIVE_MINUTES` (4) and `HEMISLAM_LIVE_SPEED` (1): up to eight minutes round a building, from then on
-over new ground outdoors, or with `HEMISLAM_LIVE_LAPS=1` round the building all the time.
+Prints memory and dropped scans every half minute. The budget of an hour is `BUDGET_MB` in all processes together, and
+no scan dropped. The pages are WebSocket clients that are sent what a browser would be sent; the stalled one never
+reads. Environment variables: `HEMISLAM_LIVE_MINUTES` (4) and `HEMISLAM_LIVE_SPEED` (1). Up to eight minutes the walk
+goes round a building; a longer one covers new ground outdoors, or stays in the building with `HEMISLAM_LIVE_LAPS=1`.
 """
 
 import os
@@ -16,19 +16,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import httpx
-import viser
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
-from websockets.typing import Subprotocol
 
 from app.sensors.live.feed import Pace, feed
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
+from benchmarks.client import PROTOCOL, listening
 from benchmarks.record import Line
 from benchmarks.scenes import half_hour, half_hour_in_laps, walk_in_laps
 
@@ -36,11 +32,12 @@ MINUTES = float(os.environ.get("HEMISLAM_LIVE_MINUTES", "4"))
 SPEED = float(os.environ.get("HEMISLAM_LIVE_SPEED", "1"))
 """Times real time: at 2, twenty scans a second."""
 LAPS = os.environ.get("HEMISLAM_LIVE_LAPS", "0") != "0"
+BUDGET_MB = 1500
 REPORT_S = 30.0
 NAMED = "hemislam-"
-"""What the names of processes begin with that the server starts."""
+"""How the names of the processes that the server starts begin."""
 SETTLE_S = 3.0
-"""After the last packet: what waits is mapped by then, and has been told."""
+"""After the last packet. By then all scans are mapped and shown."""
 
 
 def run() -> list[Line]:
@@ -51,21 +48,17 @@ def run() -> list[Line]:
         feeder = threading.Thread(target=_feed, args=(walk, packets, imu, ended), daemon=True)
         feeder.start()
         wait_until(url, lambda state: state["transport"]["frame"] >= 20 and state["live"])
-        received = [0, 0]
-        for number in range(2):
-            threading.Thread(target=_page, args=(url, ended, received, number), daemon=True).start()
-        stalled = _stalled_page(url)
-        time.sleep(5.0)  # the loops' process has begun too
         memory: list[dict[str, float]] = []
-        begin = time.monotonic()
-        while (passed := time.monotonic() - begin) < 60 * MINUTES:
+        with listening(url, keep=False) as first, listening(url, keep=False) as second, _stalled_page(url):
+            time.sleep(5.0)  # the loops' process has begun too
+            begin = time.monotonic()
+            while (passed := time.monotonic() - begin) < 60 * MINUTES:
+                memory.append(_memory(server))
+                _report(passed, _state(url), memory[-1])
+                time.sleep(min(REPORT_S, 60 * MINUTES - passed))
             memory.append(_memory(server))
-            _tell(passed, _state(url), memory[-1])
-            time.sleep(min(REPORT_S, 60 * MINUTES - passed))
-        memory.append(_memory(server))
-        _tell(time.monotonic() - begin, _state(url), memory[-1])
+            _report(time.monotonic() - begin, _state(url), memory[-1])
         ended.set()
-        stalled.close()
         feeder.join(30.0)
         time.sleep(SETTLE_S)
         state = _state(url)
@@ -73,31 +66,22 @@ def run() -> list[Line]:
         done = state["transport"]["frame"] + 1
         missing = live["counters"]["frames"] - done - state["transport"]["dropped"]
         on = f"{walk.stem}, {MINUTES:g} min at {SPEED:g}x, 3 pages"
-        print(f"pages took {received[0] / 1e6:.0f} and {received[1] / 1e6:.0f} MB; {live['counters']}")
+        print(f"pages were sent {first.received / 1e6:.0f} and {second.received / 1e6:.0f} MB; {live['counters']}")
         lines = [
             Line.of("frames", on, "", [done]),
             Line.of("keyframes", on, "", [state["keyframes"]]),
             Line.of("scans dropped", on, "", [live["counters"]["dropped"]]),
-            Line.of("scans neither mapped nor dropped; the last waits for samples", on, "", [missing]),
+            Line.of("scans neither mapped nor dropped (the last one waits for IMU samples)", on, "", [missing]),
             Line.of("packets lost", on, "", [live["counters"]["lost"]]),
         ]
-        for name in memory[0]:
-            third, end = (_usual(memory, name, share) for share in (1 / 3, 1.0))
-            print(f"{name}: {third:.0f} MB after a third, {end:.0f} MB at the end, {100 * (end / third - 1):+.0f} %")
-            lines.append(Line.of(f"{name}, after a third", on, "MB", [third]))
-            lines.append(Line.of(f"{name}, end", on, "MB", [end]))
-        return lines
-
-
-def _usual(memory: list[dict[str, float]], name: str, share: float) -> float:
-    """What a process took about that share of the time: the median of a tenth of all samples."""
-    half = len(memory) // 20
-    at = min(round(share * (len(memory) - 1)), len(memory) - 1 - half)
-    return median(one[name] for one in memory[max(at - half, 0) : at + half + 1] if name in one)
+        most = max(sum(one.values()) for one in memory)
+        print(f"at most {most:.0f} MB in all processes; the budget of an hour is {BUDGET_MB} MB")
+        lines.append(Line.of("memory of all processes, at most", on, "MB", [most]))
+        return [*lines, *(Line.of(f"{name}, end", on, "MB", [size]) for name, size in memory[-1].items())]
 
 
 def _feed(walk: Path, packets: str, imu: str, ended: threading.Event) -> None:
-    """Until the time is over or the walk."""
+    """Send packets until the time or the walk is over."""
     feed(
         walk,
         resolve_params(walk, None, None, []),
@@ -107,20 +91,8 @@ def _feed(walk: Path, packets: str, imu: str, ended: threading.Event) -> None:
     )
 
 
-def _page(url: str, ended: threading.Event, received: list[int], number: int) -> None:
-    protocol = Subprotocol(f"viser-v{viser.__version__}")
-    with connect(url.replace("http", "ws", 1), subprotocols=[protocol], max_size=None, proxy=None) as page:
-        while not ended.is_set():
-            try:
-                received[number] += len(page.recv(timeout=1.0))
-            except TimeoutError:
-                continue
-            except ConnectionClosed:
-                return
-
-
 def _stalled_page(url: str) -> socket.socket:
-    """Asks for the page's WebSocket and then reads nothing."""
+    """Opens the page's WebSocket and then reads nothing."""
     host, port = url.removeprefix("http://").rstrip("/").split(":")
     page = socket.socket()
     page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 18)
@@ -128,16 +100,15 @@ def _stalled_page(url: str) -> socket.socket:
     page.sendall(
         f"GET / HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         f"Sec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Version: 13\r\n"
-        f"Sec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n".encode()
+        f"Sec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n".encode()
     )
     return page
 
 
 def _memory(server: "subprocess.Popen[str]") -> dict[str, float]:
-    """MB that each process has written: the server, and those that it started. Linux only.
+    """MB that the server and each process that it started have written. Linux only.
 
-    What several of them share is shared out among them. Pages of libraries do not count: whether they are shared
-    depends on what else the machine happens to run.
+    Shared memory is divided among the processes that share it. Pages of libraries do not count.
     """
     found = {"server": _written_mb(server.pid)}
     for pid in children(server.pid):
@@ -148,7 +119,7 @@ def _memory(server: "subprocess.Popen[str]") -> dict[str, float]:
 
 
 def children(pid: int) -> list[int]:
-    """Processes that it started, and that these started."""
+    """All descendants of a process."""
     direct = [
         int(one) for task in Path(f"/proc/{pid}/task").iterdir() for one in (task / "children").read_text().split()
     ]
@@ -160,7 +131,7 @@ def _written_mb(pid: int) -> float:
     return sum(int(line.split()[1]) for line in lines if line.startswith("Pss_Dirty")) / 1e3
 
 
-def _tell(seconds: float, state: Any, memory: dict[str, float]) -> None:
+def _report(seconds: float, state: Any, memory: dict[str, float]) -> None:
     live = state["live"]
     sizes = ", ".join(f"{name} {size:.0f}" for name, size in memory.items())
     print(
@@ -176,17 +147,17 @@ def _state(url: str) -> Any:
 
 
 def wait_until(url: str, wanted: Callable[[Any], object]) -> None:
-    """Until the state is as wanted: the engine may have to be compiled first, and pages come when there is a map."""
+    """Wait until the state is as wanted. The engine may have to be compiled first."""
     deadline = time.monotonic() + 300
     while not wanted(state := _state(url)):
         if time.monotonic() > deadline:
-            raise RuntimeError(f"no frames come: {state['notices']}")
+            raise RuntimeError(f"there are no frames: {state['notices']}")
         time.sleep(0.2)
 
 
 @contextmanager
 def served(walk: Path, record: Path) -> Iterator[tuple[str, "subprocess.Popen[str]", str, str]]:
-    """The workbench on live packets; gives its address, its process, and where packets and IMU samples go."""
+    """The workbench on live packets: its address, its process, and the addresses for packets and IMU samples."""
     ports = [free_port() for _ in range(3)]
     packets, imu = f"rsbpearl://127.0.0.1:{ports[0]},{ports[1]}", f"imu-udp://127.0.0.1:{ports[2]}"
     params = walk.with_suffix(".params.yaml")
@@ -205,7 +176,7 @@ def served(walk: Path, record: Path) -> Iterator[tuple[str, "subprocess.Popen[st
 
 
 def free_port() -> int:
-    """For UDP."""
+    """A free UDP port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
