@@ -15,10 +15,9 @@ WORKDIR /hemislam
 COPY . .
 RUN make install PYTHON=python3
 
-# Any user (`--user 12345`) may write results and compiled kernels, but not change the program.
+# Any user (`--user 12345`) may write results, but not change the program.
 RUN useradd --create-home hemislam \
- && install -d -m 1777 /recordings /hemislam/runs /var/cache/hemislam
-ENV NUMBA_CACHE_DIR=/var/cache/hemislam
+ && install -d -m 1777 /recordings /hemislam/runs
 ENV PATH="/hemislam/.venv/bin:$PATH"
 USER hemislam
 
