@@ -105,14 +105,6 @@ class Assembler:
             yield self._take(len(self._pending), BLOCKS)
             self._pending, self._first, self._checked = [], 0, 0
 
-    def resume(self, model: Model, first: int, given_ns: int | None) -> None:
-        """Begin as after a revolution that ended before block `first` of the next packet.
-
-        Args:
-            given_ns: time of the last packet that belongs to that one alone.
-        """
-        self._model, self._first, self._given_ns = model, first, given_ns
-
     def pending_since(self) -> int | None:
         """When the newest packet that waits came, by the host's clock; None if none does."""
         return self._pending[-1][1] if self._pending else None

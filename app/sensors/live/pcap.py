@@ -25,7 +25,7 @@ class CaptureError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class CapturedFrame:
     """One captured frame: where it begins in the file, when it was captured, and from which kind of network."""
 
     position: int
@@ -79,14 +79,14 @@ class Capture:
                 if found:
                     yield found
 
-    def records(self, position: int | None = None) -> Iterator[Record]:
+    def records(self, position: int | None = None) -> Iterator[CapturedFrame]:
         """Captured frames up to the end or to where the file is cut or makes no sense."""
         with self._path.open("rb") as file:
             if position is not None:
                 file.seek(position)
             yield from self._next_records(file) if self._next else self._classic_records(file)
 
-    def _classic_records(self, file: BinaryIO) -> Iterator[Record]:
+    def _classic_records(self, file: BinaryIO) -> Iterator[CapturedFrame]:
         if file.tell() < 24:
             file.seek(24)
         header = struct.Struct(self._order + "4I")
@@ -101,10 +101,10 @@ class Capture:
             data = file.read(length) if length <= MAX_RECORD else b""
             if len(data) < length:
                 break
-            yield Record(position, seconds * 1_000_000_000 + fraction * self._fraction_ns, self._link, data)
+            yield CapturedFrame(position, seconds * 1_000_000_000 + fraction * self._fraction_ns, self._link, data)
         self.complete = False
 
-    def _next_records(self, file: BinaryIO) -> Iterator[Record]:
+    def _next_records(self, file: BinaryIO) -> Iterator[CapturedFrame]:
         begin = file.tell()
         section = self._sections[max(at for at in self._sections if at <= begin)] if begin else _Section("<")
         while True:
@@ -131,7 +131,7 @@ class Capture:
                 if number < len(section.interfaces):
                     interface = list(section.interfaces.values())[number]
                     time_ns = (high << 32 | low) * 1_000_000_000 // interface.units + interface.offset_ns
-                    yield Record(position, time_ns, interface.link, body[20 : 20 + captured])
+                    yield CapturedFrame(position, time_ns, interface.link, body[20 : 20 + captured])
         self.complete = False
 
 
@@ -184,7 +184,7 @@ class _Fragments:
         return data if len(data) == self.length else None
 
 
-def _network_layer(record: Record) -> bytes:
+def _network_layer(record: CapturedFrame) -> bytes:
     """The IP packet of a frame; empty if it holds none."""
     data = record.data
     match record.link:
@@ -205,7 +205,7 @@ def _network_layer(record: Record) -> bytes:
     return data[at + 2 :] if data[at : at + 2] in _IP else b""
 
 
-def _udp(record: Record, packet: bytes, fragments: dict[bytes, _Fragments]) -> Datagram | None:
+def _udp(record: CapturedFrame, packet: bytes, fragments: dict[bytes, _Fragments]) -> Datagram | None:
     """The datagram that this packet is, or completes."""
     version = packet[0] >> 4
     first = record.position
