@@ -1,4 +1,4 @@
-"""The time of a point from its azimuth, for clouds that carry none: the sensor turns at a steady rate."""
+"""The time of a point from its azimuth, for clouds without times: the sensor turns at a steady rate."""
 
 from dataclasses import dataclass
 
@@ -8,10 +8,10 @@ import numpy.typing as npt
 from app.slam.types import F32, F64, I64, U16
 
 _SLACK = np.radians(10.0)
-"""Azimuth may run back by this much (noise, horizontal calibration) without counting as a full turn."""
+"""The azimuth may step back by this much (noise, horizontal calibration) without counting as a full turn."""
 
 _SMALL_STEP = np.radians(60.0)
-"""Steps below this are from one firing to the next, not across what gave no return."""
+"""Steps below this lead from one firing to the next, not across firings without a return."""
 
 _FIXED = np.radians(0.7)
 """Clouds that begin within this of each other are cut at a fixed azimuth."""
@@ -25,8 +25,8 @@ class Spin:
         period_s: of one revolution. clockwise: seen from +z (RoboSense) or not.
         ordered: whether the points of one ring come in firing order in the message.
         start: (rings,) rad, azimuth at which each ring's revolution begins (they differ by the
-            channels' horizontal calibration), counted in the sense of rotation; None: each cloud
-            begins somewhere else, at its first point.
+            channels' horizontal calibration), in the sense of rotation; None: each cloud begins at
+            another azimuth, that of its first point.
     """
 
     period_s: float
@@ -43,11 +43,11 @@ class Spin:
             starts = np.asarray(self.start)
             from_start = _forward(azimuth - starts[np.minimum(ring, len(starts) - 1)])
         if self.ordered:
-            order, begins, walked = _walk(azimuth, ring)
+            order, begins, turned_by = _along_rings(azimuth, ring)
             lengths = np.diff(begins, append=len(order))
-            walked += np.repeat(from_start[order[begins]] - walked[begins], lengths)
-            turned = np.empty_like(walked)
-            turned[order] = walked
+            turned_by += np.repeat(from_start[order[begins]] - turned_by[begins], lengths)
+            turned = np.empty_like(turned_by)
+            turned[order] = turned_by
         else:
             turned = np.maximum(from_start, 0.0)
         times: I64 = np.rint(turned / (2 * np.pi) * self.period_s * 1e9).astype(np.int64)
@@ -58,7 +58,7 @@ def settle_spin(clouds: list[tuple[F32, U16]], period_s: float) -> Spin:
     """How the sensor turns, from a few clouds ((n, 3) points, (n,) ring) in the order of the message."""
     points, ring = clouds[0]
     clockwise, turns = sense_of_rotation(points, ring)
-    if not turns < 1.2:  # no order to learn from; almost every sensor turns clockwise seen from above
+    if not turns < 1.2:  # the order tells nothing; almost every sensor turns clockwise seen from above
         return Spin(period_s, clockwise=True, ordered=False, start=(0.0,))
     rings = 1 + max(int(ring.max()) for _, ring in clouds)
     begins: list[list[float]] = [[] for _ in range(rings)]
@@ -71,7 +71,7 @@ def settle_spin(clouds: list[tuple[F32, U16]], period_s: float) -> Spin:
     if np.median(np.abs(_centred(firsts - _circular_median(firsts)))) > _FIXED:
         return Spin(period_s, clockwise, ordered=True, start=None)
     common = _circular_median(np.array([value for values in begins for value in values]))
-    # A ring whose first firings had no return begins late in that cloud: the earliest counts.
+    # A ring whose first firings had no return begins late in that cloud, so the earliest begin counts.
     start = [min(_centred(np.array(values) - common), default=0.0) + common for values in begins]
     return Spin(period_s, clockwise, ordered=True, start=tuple(map(float, start)))
 
@@ -87,7 +87,7 @@ def sense_of_rotation(points: F32, ring: U16) -> tuple[bool, float]:
 
     About one turn is a scan of a rotating sensor; many, or inf, is no rotation at all.
     """
-    # Outdoors a ring may see only part of a turn, so the way around says little; the small steps do.
+    # Outdoors a ring may see only part of a turn, so its ends tell little; the small steps tell the sense.
     order = np.argsort(ring, kind="stable")
     step = _centred(np.diff(turned_azimuth(points, True)[order]))
     same = (np.diff(ring[order].astype(np.int32)) == 0) & (np.abs(step) < _SMALL_STEP) & (step != 0)
@@ -98,21 +98,21 @@ def sense_of_rotation(points: F32, ring: U16) -> tuple[bool, float]:
 
 
 def _laps(points: F32, ring: U16, clockwise: bool) -> float:
-    """Turns that a typical ring makes in this order, walking in this sense."""
-    _, begins, walked = _walk(turned_azimuth(points, clockwise), ring)
-    ends = np.append(begins[1:], len(walked)) - 1
+    """Turns that a typical ring makes in this order and sense."""
+    _, begins, turned_by = _along_rings(turned_azimuth(points, clockwise), ring)
+    ends = np.append(begins[1:], len(turned_by)) - 1
     full = ends - begins >= 8
     if not full.any():
         return np.inf
-    return float(np.median((walked[ends] - walked[begins])[full])) / (2 * np.pi)
+    return float(np.median((turned_by[ends] - turned_by[begins])[full])) / (2 * np.pi)
 
 
-def _walk(azimuth: F64, ring: U16) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], F64]:
-    """Walk along each ring in the order of the message, and only ever forward.
+def _along_rings(azimuth: F64, ring: U16) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], F64]:
+    """The angle by which the sensor has turned, summed along each ring in the order of the message, only forward.
 
-    So a ring that sees nothing for half a turn is still placed rightly, and the last points of a
-    revolution do not become its first. Returns the points' order by ring, where each ring begins in
-    it, and the angle walked at each of these ordered points (it goes on from ring to ring).
+    So a ring that sees nothing for half a turn is still placed correctly, and the last points of a revolution do not
+    become its first. Returns the points' order by ring, where each ring begins in it, and the angle at each of these
+    ordered points (it goes on from ring to ring).
     """
     order = np.argsort(ring, kind="stable")
     lines, sorted_azimuth = ring[order], azimuth[order]

@@ -8,11 +8,11 @@ from app.sensors.findings import Finding
 from app.slam.types import I64
 
 TOLERANCE_S = 0.15
-"""Drivers log a scan up to this late; a difference within it is delay, not another clock."""
+"""Drivers log a scan up to this late; a smaller difference is delay, not another clock."""
 
 
 def clock_offset_s(scan_log_ns: I64, scan_end_ns: I64, imu_log_ns: I64, imu_stamps_ns: I64) -> float:
-    """Seconds by which the IMU's stamps lag behind the LiDAR's, if all was logged without delay.
+    """Seconds by which the IMU's stamps lag behind the LiDAR's, if everything was logged without delay.
 
     Args: log times and the times of measurement, (n,) of scans and (k,) of IMU samples.
     """
@@ -22,7 +22,7 @@ def clock_offset_s(scan_log_ns: I64, scan_end_ns: I64, imu_log_ns: I64, imu_stam
 
 
 def offset_spread_s(scan_log_ns: I64, scan_end_ns: I64, imu_log_ns: I64, imu_stamps_ns: I64, parts: int = 10) -> float:
-    """Seconds by which that offset changes over a recording: a clock that was set, or that drifts."""
+    """Seconds by which this offset changes over a recording, as when a clock is set or drifts."""
     if min(len(scan_log_ns), len(imu_log_ns)) < 10 * parts:
         return 0.0
     edges = np.linspace(scan_log_ns[0], scan_log_ns[-1], parts + 1)
@@ -36,11 +36,11 @@ def offset_spread_s(scan_log_ns: I64, scan_end_ns: I64, imu_log_ns: I64, imu_sta
 
 
 def clock_finding(offset_s: float, applied_s: float, logged_apart: bool) -> Finding:
-    """What that offset means.
+    """What the offset means.
 
     Args:
         offset_s: of `clock_offset_s`, with `recording.imu_time_offset` applied_s already added.
-        logged_apart: whether log times are more than copies of the stamps.
+        logged_apart: whether the log times are not just copies of the stamps.
     """
     if abs(offset_s) <= TOLERANCE_S:
         applied = f" (with your imu_time_offset of {applied_s:g} s)" if applied_s else ""
@@ -48,7 +48,7 @@ def clock_finding(offset_s: float, applied_s: float, logged_apart: bool) -> Find
             f"LiDAR and IMU stamps agree within {abs(offset_s) * 1e3:.0f} ms, judged by when they were logged{applied}"
         )
         if not logged_apart:
-            text = f"log times are copies of the stamps: whether the two clocks agree cannot be told{applied}"
+            text = f"log times are copies of the stamps, so they do not show whether the two clocks agree{applied}"
         return Finding("clocks", "fine", text)
     text = (
         f"the IMU's stamps are {abs(offset_s):.3f} s {'behind' if offset_s > 0 else 'ahead of'} the LiDAR's, judged by "

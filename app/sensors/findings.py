@@ -1,4 +1,4 @@
-"""One line of the recording doctor: the value that probing a recording and examining it both produce."""
+"""One line of the recording doctor, as both opening and examining a recording produce it."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -11,9 +11,9 @@ class Finding:
     """One line of the recording doctor.
 
     Attributes:
-        subject: what was looked at, e.g. "point time". verdict: as named.
-        text: what was found and how that was decided, in one sentence with units.
-        option: the exact option that settles it, e.g. "--set recording.time_unit=us"; "" if none.
+        subject: what was examined, e.g. "point time". verdict: see `Verdict`.
+        text: what was found and how it was decided, in one sentence with units.
+        option: the option that settles it, e.g. "--set recording.time_unit=us"; "" if none.
     """
 
     subject: str

@@ -107,7 +107,8 @@ class CaptureStream:
                 found = [said]
             for content in found:
                 yield running_ns, at, content
-        for content in (*assembler.flush(), *order.flush()):
+        rest: list[Any] = [*assembler.flush(), *order.flush()]
+        for content in rest:
             yield running_ns, at, content
 
     def _index(self) -> None:
@@ -175,7 +176,9 @@ class CaptureStream:
             found.append(Finding("sensor clocks", "corrected", f"{text} clock"))
         if self._jumps:
             jumps = ", ".join(f"{jump / 1e9:+.3f} s" for jump in self._jumps)
-            found.append(Finding("sensor clocks", "corrected", f"set by {jumps} on the way; these steps were taken out"))
+            found.append(
+                Finding("sensor clocks", "corrected", f"set by {jumps} on the way; these steps were taken out")
+            )
         return tuple(found)
 
 

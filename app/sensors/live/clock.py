@@ -1,13 +1,13 @@
-"""The clocks of live sensors: mapped onto one time that goes on steadily, whatever they are set to."""
+"""The clocks of live sensors, mapped onto one time that goes on steadily even when a clock is set."""
 
 from collections import deque
 from dataclasses import dataclass, field
 
 JUMP_NS = 500_000_000
-"""A stamp this much out of step with the one before is another setting of the clock."""
+"""A stamp this much out of step with the one before means that the clock was set."""
 _WINDOW_NS = 10_000_000_000
 _SLEW = 1e-3
-"""Of host time: drifting clocks are a hundred times slower."""
+"""Largest change of the shift per host time; clocks drift a hundred times more slowly."""
 
 
 @dataclass(slots=True)
@@ -15,9 +15,9 @@ class ClockMap:
     """Maps one sensor's stamps onto the time that the engine gets.
 
     Attributes:
-        host: onto the host's clock (for sensors that have no date, or drift), else the sensor's own.
-        shift_ns: added to stamps at present. jump_ns: by how much the clock was last set, and jumped_at
-            (host's clock) when.
+        host: map onto the host's clock (for sensors that have no date, or drift), not the sensor's own.
+        shift_ns: added to stamps at present. jump_ns: by how much the clock was last set, and jumped_at_ns:
+            when, by the host's clock.
     """
 
     host: bool = False
@@ -29,17 +29,17 @@ class ClockMap:
     _started_ns: int = 0
 
     def jumps(self, stamp_ns: int, arrival_ns: int) -> bool:
-        """Whether the clock was set since the last stamp; a sensor that is late or was silent is none."""
+        """Whether the clock was set since the last stamp; a late or silent sensor does not count."""
         if self._last is None:
             return False
         stamp, arrival = stamp_ns - self._last[0], arrival_ns - self._last[1]
         return stamp < -JUMP_NS or (stamp > JUMP_NS and stamp - arrival > JUMP_NS)
 
     def map(self, stamp_ns: int, arrival_ns: int, other: "ClockMap | None" = None) -> int:
-        """The stamp in the engine's time; a jump is taken out, so that time goes on.
+        """The stamp in the engine's time, from which jumps are taken out.
 
         Args:
-            other: of another sensor; one that was set at the same time by as much shares its clock.
+            other: the map of another sensor; if its clock jumped at the same time by as much, they share a clock.
         """
         if self._last is not None and self.jumps(stamp_ns, arrival_ns):
             jump = stamp_ns - self._last[0] - max(arrival_ns - self._last[1], 0)
@@ -55,7 +55,7 @@ class ClockMap:
         return stamp_ns + self.shift_ns
 
     def _follow(self, stamp_ns: int, arrival_ns: int) -> None:
-        """Onto the host's clock by the least delay of the last seconds: what came without waiting."""
+        """Follow the host's clock by the least delay of the last seconds, which is that of transport alone."""
         delay = arrival_ns - stamp_ns
         delays = self._delays
         if not delays:
@@ -77,9 +77,9 @@ class ClockMap:
 
 @dataclass(slots=True)
 class OffsetEstimate:
-    """By how much the IMU's stamps lag behind the LiDAR's, judged by what came at the same moment.
+    """By how much the IMU's stamps lag behind the LiDAR's, judged by what arrived at the same moment.
 
-    So it holds whatever the speed at which a recording is played out. Good to the drivers' delays.
+    It does not depend on the speed at which a recording is played. Its error is the drivers' delays.
     """
 
     _imu: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=2_000))
@@ -100,7 +100,7 @@ class OffsetEstimate:
         self._lags.clear()
 
     def seconds(self) -> float | None:
-        """Median over the last scans; None while there are not three."""
+        """Median over the last scans; None before the third."""
         if len(self._lags) < 3:
             return None
         return sorted(self._lags)[len(self._lags) // 2] / 1e9

@@ -1,4 +1,4 @@
-"""DIFOP, the RS-Bpearl's packet about itself: speed, field of view, calibration; and calibrations from CSV."""
+"""DIFOP, the packet in which an RS-Bpearl states its settings and calibration; and calibrations from CSV."""
 
 import csv
 import struct
@@ -21,7 +21,7 @@ _ELEVATION_AT, _HORIZONTAL_AT = 468, 564
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Where each channel of one unit looks.
+    """The direction of each channel of one unit.
 
     Attributes:
         elevations_deg, horizontal_deg: (32,) by channel, above the base plane and added to the azimuth.
@@ -48,7 +48,7 @@ NOMINAL = Calibration(ELEVATIONS_DEG, np.zeros(CHANNELS))
 @dataclass(frozen=True, slots=True)
 class Difop:
     """Attributes:
-    rpm: 600 or 1200. fov_deg: azimuths between which it measures; (0, 360) is all around.
+    rpm: 600 or 1200. fov_deg: azimuths between which it measures; (0, 360) is the full turn.
     return_mode: of RETURN_MODES. reverse: whether it spins the other way.
     calibration: None if the unit has not been calibrated.
     """
@@ -61,7 +61,7 @@ class Difop:
     calibration: Calibration | None = None
 
     def same(self, other: "Difop") -> bool:
-        """Whether nothing that matters to decoding differs."""
+        """Whether all that matters for decoding is equal."""
         if self.calibration is None or other.calibration is None:
             angles = self.calibration is other.calibration
         else:
@@ -75,13 +75,13 @@ class Difop:
 
 
 def read_difop(packet: bytes) -> Difop | None:
-    """None if it is no DIFOP packet."""
+    """What a packet states; None if it is no DIFOP packet."""
     if len(packet) != PACKET_BYTES or packet[:8] != DIFOP_ID:
         return None
     rpm, begin, end = (int(struct.unpack_from(">H", packet, at)[0]) for at in (8, 32, 34))
     elevations, horizontal = _read_angles(packet, _ELEVATION_AT), _read_angles(packet, _HORIZONTAL_AT)
     calibration = None
-    # A unit without calibration has no signs, or nothing but zeros, which can be no elevations.
+    # A unit without calibration sends invalid signs, or zeros, which cannot be elevations.
     if elevations is not None and elevations.any() and np.abs(elevations).max() <= 91.0:
         calibration = Calibration(elevations, np.zeros(CHANNELS) if horizontal is None else horizontal)
     mode = packet[300]
@@ -96,7 +96,7 @@ def read_difop(packet: bytes) -> Difop | None:
 
 
 def write_difop(difop: Difop, stamp_ns: int) -> bytes:
-    """The packet that says so."""
+    """The packet that states these settings."""
     packet = bytearray(PACKET_BYTES)
     packet[:8] = DIFOP_ID
     struct.pack_into(">H", packet, 8, difop.rpm)
@@ -117,7 +117,7 @@ def read_angles(path: Path) -> Calibration:
     """A calibration from CSV: 32 lines by channel, `elevation, horizontal correction` in degrees.
 
     Raises:
-        HemislamError: the file cannot be read, or holds something else.
+        HemislamError: the file cannot be read, or is no calibration.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:

@@ -1,4 +1,4 @@
-"""Plays a recording out as a live sensor: its packets, or a Foxglove server. To try live without a sensor."""
+"""Plays a recording as a live sensor would send it, as packets or through a Foxglove server, to try live mapping."""
 
 import heapq
 import math
@@ -7,7 +7,8 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import count, islice
 from pathlib import Path
 
 from app.sensors import ros
@@ -27,12 +28,12 @@ from app.slam.types import Scan
 LIDAR, DEVICE, IMU = 0, 1, 2
 _DEVICE_PERIOD_NS = 1_000_000_000
 _FITTED = 5
-"""Scans that the unit's angles are read off."""
+"""Scans from which the unit's angles are read."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Sent:
-    """Something to be sent: when it would be by the sensor's clock, on which stream, what."""
+    """Something to be sent: when, by the sensor's clock, on which stream, what."""
 
     time_ns: int
     number: int
@@ -42,9 +43,9 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How fast to play. speed: times real time, inf: at once. stop: set to end early.
+    """How fast to play. speed: times real time, inf: at once. stop: set it to end early.
 
-    progress: told the seconds of the recording that were played.
+    progress: called with the seconds of the recording that were played.
     """
 
     speed: float = 1.0
@@ -55,7 +56,7 @@ class Pace:
 def packets_of(
     recording: Recording, duration_s: float | None = None, model: Model = BPEARL, angles: Calibration | None = None
 ) -> Iterator[Sent]:
-    """Everything the sensors would have sent, in order of time.
+    """Everything that the sensors would have sent, in order of time.
 
     Raises:
         HemislamError: it is a recording of another LiDAR.
@@ -64,38 +65,34 @@ def packets_of(
     first = _first_scans(recording)
     rate = rate_of(first)
     calibration = angles or fit_angles(first, model, rate)
-    # A packet's angles have two decimals, the nominal ones four: who is not told any others takes these.
+    # A packet's angles have two decimals, the nominal ones four: a receiver without angles uses the nominal ones.
     own = None if calibration.same(NOMINAL) else calibration
     difop = Difop(rpm=60 * rate, serial="68656d690001", calibration=own)
     writer = PacketWriter(model)
     waiting: list[Sent] = []
-    number = samples = 0
+    numbers, samples = count(), count()
     device_ns = 0
 
     def push(time_ns: int, stream: int, data: bytes) -> None:
-        nonlocal number
-        heapq.heappush(waiting, Sent(time_ns, number, stream, data))
-        number += 1
+        heapq.heappush(waiting, Sent(time_ns, next(numbers), stream, data))
 
     for entry in recording.entries():
         if isinstance(entry, ScanEntry):
-            if entry.scan.stamp_ns >= stop_ns + 3e8:
+            scan = entry.scan
+            if scan.stamp_ns >= stop_ns + 3e8:
                 break
-            if not isinstance(entry.scan, Scan) or entry.scan.stamp_ns >= stop_ns:
+            if not isinstance(scan, Scan) or scan.stamp_ns >= stop_ns:
                 continue
-            firings = firings_of(entry.scan, calibration, model, rate)
+            firings = firings_of(scan, calibration, model, rate)
             for time_ns, packet in writer.add(firings.times_ns, firings.azimuth, firings.counts, firings.intensity):
                 push(time_ns, LIDAR, packet)
-            if entry.scan.stamp_ns - device_ns > _DEVICE_PERIOD_NS:
-                device_ns = entry.scan.stamp_ns
+            if scan.stamp_ns - device_ns > _DEVICE_PERIOD_NS:
+                device_ns = scan.stamp_ns
                 push(device_ns, DEVICE, write_difop(difop, device_ns))
-            until = entry.scan.end_ns
-            while waiting and waiting[0].time_ns <= until:
+            while waiting and waiting[0].time_ns <= scan.end_ns:
                 yield heapq.heappop(waiting)
         elif entry.stamp_ns < stop_ns + 2e8:
-            sample = ImuSample(samples, entry.stamp_ns, entry.gyro, entry.accel)
-            samples += 1
-            push(entry.stamp_ns, IMU, write_imu(sample))
+            push(entry.stamp_ns, IMU, write_imu(ImuSample(next(samples), entry.stamp_ns, entry.gyro, entry.accel)))
     for time_ns, packet in writer.flush():
         push(time_ns, LIDAR, packet)
     while waiting:
@@ -112,13 +109,13 @@ def feed(
     duration_s: float | None = None,
     wait_s: float = math.inf,
 ) -> int:
-    """Play a recording out to its end; returns how many packets or messages were sent.
+    """Play a recording to its end; returns how many packets or messages were sent.
 
     Args:
-        wait_s: a Foxglove server waits so long for somebody who wants to receive.
+        wait_s: a Foxglove server waits this long for a client that subscribes.
 
     Raises:
-        HemislamError: the recording cannot be read, or not be played out so; nobody came.
+        HemislamError: the recording cannot be read, or not be played in this way; no client came.
     """
     params = params.with_values({"recording.imu_time_offset": 0.0})  # the receiver applies it
     pace = pace or Pace()
@@ -138,36 +135,36 @@ def _feed_packets(recording: Recording, to: Address, imu_to: Address, pace: Pace
     lidar, imu = to.host or "127.0.0.1", imu_to.host or "127.0.0.1"
     peers = ((lidar, to.ports[0]), (lidar, to.ports[1]), (imu, imu_to.ports[0]))
     angles = read_angles(Path(to.options["angles"])) if "angles" in to.options else None
-    count = 0
+    number = 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for sent in _paced(_ahead(packets_of(recording, duration_s, angles=angles), pace.stop), pace):
             try:
                 sender.sendto(sent.data, peers[sent.stream])
             except ConnectionRefusedError:  # nobody receives there yet
                 continue
-            count += 1
-    return count
+            number += 1
+    return number
 
 
 def _feed_foxglove(
     path: Path, topics: tuple[str, str], to: Address, pace: Pace, duration_s: float | None, wait_s: float
 ) -> int:
-    offers = [
-        Offer(topic, kind, ros.definition(kind)) for topic, kind in zip(topics, (ros.CLOUD, ros.IMU), strict=True)
-    ]
-    count = 0
-    with Source(path) as source, FoxgloveServer(to.host or "127.0.0.1", to.ports[0], offers) as server:
-        deadline = time.monotonic() + wait_s
-        while not server.wait_for_subscribers(0.2):
-            if pace.stop.is_set():
-                return 0
-            if time.monotonic() > deadline:
-                raise HemislamError(f"Nobody came to ws://{to.host or '127.0.0.1'}:{server.port} to receive.")
-        for sent in _paced(_messages_of(source, topics, duration_s), pace):
-            server.publish(sent.stream, sent.time_ns, sent.data)
-            count += 1
-        time.sleep(0.2)  # so that the last message is read before the connection is closed
-    return count
+    host, number = to.host or "127.0.0.1", 0
+    with Source(path) as source:
+        kinds = {topic.name: topic.type for topic in source.topics}
+        offers = [Offer(topic, kinds[topic], ros.definition(kinds[topic])) for topic in topics]
+        with FoxgloveServer(host, to.ports[0], offers) as server:
+            deadline = time.monotonic() + wait_s
+            while not server.wait_for_subscribers(0.2):
+                if pace.stop.is_set():
+                    return 0
+                if time.monotonic() > deadline:
+                    raise HemislamError(f"No client subscribed at ws://{host}:{server.port}.")
+            for sent in _paced(_messages_of(source, topics, duration_s), pace):
+                server.publish(sent.stream, sent.time_ns, sent.data)
+                number += 1
+            time.sleep(0.2)  # so that the last message is read before the connection is closed
+    return number
 
 
 def _messages_of(source: Source, topics: tuple[str, str], duration_s: float | None) -> Iterator[Sent]:
@@ -177,25 +174,24 @@ def _messages_of(source: Source, topics: tuple[str, str], duration_s: float | No
 
 
 def _ahead(items: Iterator[Sent], stop: threading.Event) -> Iterator[Sent]:
-    """The same, made ahead on another thread: making one scan's packets must not delay another's."""
+    """The same items, made ahead on another thread: making one scan's packets must not delay another's."""
     made: queue.Queue[Sent | BaseException | None] = queue.Queue(4_000)
     done = threading.Event()
 
-    def put(item: Sent | BaseException | None) -> None:
+    def put(item: Sent | BaseException | None) -> bool:
+        """False once nobody takes any more."""
         while not (done.is_set() or stop.is_set()):
             try:
-                return made.put(item, timeout=0.2)
+                made.put(item, timeout=0.2)
             except queue.Full:
                 continue
-        return None
+            return True
+        return False
 
     def make() -> None:
         try:
-            for item in items:
-                put(item)
-                if done.is_set() or stop.is_set():
-                    return
-            put(None)
+            if all(map(put, items)):
+                put(None)
         except BaseException as error:  # raised again where the items are used
             put(error)
 
@@ -218,7 +214,7 @@ def _ahead(items: Iterator[Sent], stop: threading.Event) -> Iterator[Sent]:
 
 
 def _paced(items: Iterator[Sent], pace: Pace) -> Iterator[Sent]:
-    """Each at its time. Late ones at once, so that a hiccup does not slow down all that follows."""
+    """Each item at its time. Late ones at once, so that a delay does not slow down all that follows."""
     begin: tuple[float, int] | None = None
     told = -1.0
     for item in items:
@@ -238,10 +234,5 @@ def _paced(items: Iterator[Sent], pace: Pace) -> Iterator[Sent]:
 
 
 def _first_scans(recording: Recording) -> list[Scan]:
-    scans: list[Scan] = []
-    for entry in recording.entries():
-        if isinstance(entry, ScanEntry) and isinstance(entry.scan, Scan):
-            scans.append(replace(entry.scan))
-            if len(scans) == _FITTED:
-                break
-    return scans
+    scans = (entry.scan for entry in recording.entries() if isinstance(entry, ScanEntry))
+    return list(islice((scan for scan in scans if isinstance(scan, Scan)), _FITTED))

@@ -1,8 +1,8 @@
-"""A scan back into the firings that measured it: for packets to be played out, and tests.
+"""From a scan back to the firings that measured it, so that a recording can be played as packets.
 
-A packet has no coordinates, only an azimuth for every block and a distance for every channel; so the
-points must lie on the rays of such a sensor. Those of a recording do, once its unit's angles are
-known: `fit_angles` reads them off a few scans.
+A packet has no coordinates, only an azimuth for every block and a distance for every channel; so the points must lie on
+the rays of such a sensor. Those of a recording do once its unit's angles are known, which `fit_angles` reads from a few
+scans.
 """
 
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from app.slam.types import F64, I64, U8, U16, Scan
 
 _CENTI = 100.0
 MISFIT_M = 0.05
-"""Points this far from the ray they would have to be on (95 of 100 are closer) are not of this sensor."""
+"""If 5 of 100 points are farther than this from their rays, they are not of this sensor."""
 _CUT_DEG = 4.0
-"""A unit's scans that seem to begin so little before azimuth 0 begin there, and its angles are off by as much."""
+"""Scans that seem to begin at most this much before azimuth 0 begin at 0, and the angles are off by as much."""
 _CUT_BLOCKS = 2
-"""A scan's ends that lie no more than this beyond azimuth 0 are cut there: they are moved within the revolution."""
+"""Ends of a scan at most this far beyond azimuth 0 are moved into the revolution."""
 _LEAST_TURN_DEG = 30.0
-"""From less of a turn its speed is not read off."""
+"""A shorter part of a turn does not tell its speed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Firings:
     Attributes:
         times_ns: (b,) absolute. azimuth: (b,) 0.01 deg. counts: (b, 32) distance in steps of the
             model, 0 = no return. intensity: (b, 32).
-        misfit_m: 95th percentile of the distance between the points and what the packets will say.
+        misfit_m: 95th percentile of the distance between the points and those of the packets.
     """
 
     times_ns: I64
@@ -44,7 +44,7 @@ class Firings:
 
 
 def firings_of(scan: Scan, calibration: Calibration = NOMINAL, model: Model = BPEARL, rate_hz: int = 10) -> Firings:
-    """The blocks that give this scan, with all of the revolution between its first and its last.
+    """The blocks that give this scan: all from its first to its last, also those without a return.
 
     Raises:
         HemislamError: its points do not lie on the rays of such a sensor.
@@ -79,22 +79,22 @@ def firings_of(scan: Scan, calibration: Calibration = NOMINAL, model: Model = BP
     if misfit > MISFIT_M or kept < 0.98:
         raise HemislamError(
             f"The recording's points are not those of an RS-Bpearl ({misfit:.2f} m beside its rays, {1 - kept:.0%} of "
-            "them in a firing that is taken): play it out as foxglove://127.0.0.1:8765 instead."
+            "them in a firing that has a point already): play it out as foxglove://127.0.0.1:8765 instead."
         )
     times = turn.base_ns + model.block_ns * order.astype(np.int64)
     return Firings(times, azimuth.astype(np.uint16), counts, intensity, misfit)
 
 
 def rate_of(scans: list[Scan]) -> int:
-    """Revolutions a second, 10 or 20, by how the scans follow each other."""
+    """Revolutions a second, 10 or 20, by the interval of the scans."""
     starts = np.array([scan.stamp_ns for scan in scans])
     return 20 if len(starts) > 1 and np.median(np.diff(starts)) < 75_000_000 else 10
 
 
 def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> Calibration:
-    """The unit's angles from a few of its scans; the nominal ones, if they explain the points.
+    """The unit's angles from a few of its scans; the nominal ones if they explain the points.
 
-    Its channels must be in the nominal order: points tell which ring they are of, and no channel.
+    Its channels must be in the nominal order: points have a ring, but no channel.
     """
     seen, starts = [], []
     for scan in scans:
@@ -112,12 +112,12 @@ def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> C
     elevations, sideways = NOMINAL.elevations_deg.copy(), NOMINAL.horizontal_deg.copy()
     for c in np.unique(channel).astype(int):
         elevations[c], sideways[c] = np.median(elevation[channel == c]), np.median(aside[channel == c])
-    # Near the pole a coordinate's last digit turns the azimuth by degrees: judged by its effect.
+    # Near the pole a coordinate's last digit changes the azimuth by degrees, so its effect is judged.
     off = np.hypot(elevations - NOMINAL.elevations_deg, sideways * np.cos(np.radians(NOMINAL.elevations_deg)))
     if off.max() < 0.03:
         return NOMINAL
-    # The head's azimuth and all corrections together are free by a constant. Where revolutions are cut at 0, the one
-    # that lets none begin before is right; a scan that begins later may have seen nothing until then.
+    # The head's azimuth and the corrections are only known up to a common constant. Where revolutions are cut at 0, it
+    # is such that none begins before; a scan that begins later may have had no return until then.
     if -_CUT_DEG < (start := min(starts)) < 0.0:
         sideways += start
     return Calibration(np.round(elevations, 2), np.round(sideways, 2))
@@ -141,14 +141,14 @@ class _Turn:
 
 
 def _turn(scan: Scan, calibration: Calibration, model: Model, rate_hz: int) -> _Turn:
-    """What the points' times and azimuths agree on."""
+    """The turn that fits the points' times and azimuths."""
     channel = np.argsort(calibration.rings)[np.minimum(scan.ring, CHANNELS - 1)]
     block, base_ns = _blocks(scan, channel, model)
     share = model.firing_offsets_ns[channel] / model.block_ns
     step = 360.0 * rate_hz * model.block_ns * 1e-9
     x, y = scan.points[:, 0].astype(np.float64), scan.points[:, 1].astype(np.float64)
     flat = np.hypot(x, y)
-    # High up the azimuth says little, and the lever much.
+    # High up the azimuth tells little, and the lever matters much.
     good = (calibration.elevations_deg[channel] < 60.0) & (flat > 0.5)
     if not good.any():
         good = np.ones(len(x), bool)
@@ -156,8 +156,8 @@ def _turn(scan: Scan, calibration: Calibration, model: Model, rate_hz: int) -> _
     start = np.degrees(np.arctan2(-y, x))[good] - step * fired - calibration.horizontal_deg[which]
     middle = float(np.degrees(np.angle(np.exp(1j * np.radians(start)).mean())))
     off = _wrapped(start - middle)
-    # No motor turns at just its nominal speed, and 2 in 10,000 are a degree's tenth at the end of a turn.
-    # Every channel tells by itself, so that corrections which are not known do not matter.
+    # No motor turns at exactly its nominal speed, and 2 in 10,000 make a tenth of a degree at the end of a turn.
+    # Each channel is fitted with an intercept of its own, so that unknown corrections do not matter.
     faster = _slope(fired, off, which, _LEAST_TURN_DEG / step)
     return _Turn(channel, block, share, base_ns, middle + float(np.median(off - faster * fired)), step + faster)
 
@@ -172,11 +172,11 @@ def _blocks(scan: Scan, channel: I64, model: Model) -> tuple[I64, int]:
 
 
 def _slope(x: F64, y: F64, group: I64, least: float) -> float:
-    """Least squares' slope of y over x (n,), each group with an intercept of its own; 0 if x spreads over less."""
+    """Slope of y over x (n,) by least squares, an intercept for each group; 0 if x spreads over less than `least`."""
     count = np.maximum(np.bincount(group), 1)
     x, y = (v - (np.bincount(group, v) / count)[group] for v in (x, y))
     spread = float(x @ x)
-    return float(x @ y) / spread if spread > len(x) * least**2 / 12.0 else 0.0  # as if even over so much
+    return float(x @ y) / spread if spread > len(x) * least**2 / 12.0 else 0.0  # the variance of a uniform spread
 
 
 def _wrapped(degrees: F64 | float) -> F64:

@@ -1,7 +1,7 @@
-"""Revolutions from packets: split by azimuth, whatever the network did to them on the way.
+"""Revolutions from packets, which a network may lose, repeat or reorder.
 
-Packets are put in order of their own time. A revolution is given out once a few packets of the next
-one are there, so that a packet overtaken on the way still finds its place.
+Packets are put in order of their own time and split by azimuth. A revolution is given out once a few packets of the
+next one are there, so that a late packet still finds its place.
 """
 
 import bisect
@@ -16,9 +16,9 @@ from app.sensors.rsbpearl import Model
 from app.slam.types import I64, U8
 
 HOLD = 3
-"""Packets of the next revolution to wait for: 2 ms, and the network's reordering is seldom wider."""
+"""Packets of the next revolution to wait for, 2 ms: networks seldom reorder more widely."""
 JUMP_NS = 500_000_000
-"""A packet this far from the one before is another time, not disorder; the next packet must confirm it."""
+"""A packet this far from the one before means another time, not disorder; the next packet must confirm it."""
 MAX_PACKETS = 1024
 """In a revolution; twice what two returns at 10 Hz need. A longer one is cut here."""
 
@@ -32,8 +32,8 @@ class Frame:
 
     Attributes:
         packets: (n, 1248). stamps_ns: (n,) of each packet's first block.
-        first, stop: the revolution begins with this block of the first packet and ends before that
-            one of the last. arrival_ns: when its last packet came, by the host's clock.
+        first, stop: the revolution begins with this block of the first packet and ends before this
+            block of the last. arrival_ns: when its last packet came, by the host's clock.
     """
 
     model: Model
@@ -45,10 +45,10 @@ class Frame:
 
 
 class Assembler:
-    """Takes packets as they come, gives revolutions.
+    """Takes packets as they arrive, and gives revolutions.
 
     Attributes:
-        counters: told what happened. turn_ns: of a revolution, as the device states it.
+        counters: of what happened. turn_ns: duration of a revolution, as the device states it.
     """
 
     def __init__(self, counters: Counters | None = None) -> None:
@@ -64,11 +64,7 @@ class Assembler:
         self._index: int | None = None
 
     def add(self, packet: bytes, arrival_ns: int) -> list[Frame]:
-        """Revolutions that this packet completes: mostly none, then one.
-
-        Args:
-            arrival_ns: by the host's clock.
-        """
+        """Revolutions that this packet completes, mostly none. arrival_ns: by the host's clock."""
         if not self._is_msop(packet):
             return []
         model = model_of(packet)
@@ -98,7 +94,7 @@ class Assembler:
         return frames
 
     def flush(self) -> Iterator[Frame]:
-        """What there is of the present revolutions: the input is over, or silent."""
+        """The revolutions so far, complete or not: the input is over, or silent."""
         while self._checked < len(self._pending):
             yield from self._check()
         if self._pending:
@@ -106,7 +102,7 @@ class Assembler:
             self._pending, self._first, self._checked = [], 0, 0
 
     def pending_since(self) -> int | None:
-        """When the newest packet that waits came, by the host's clock; None if none does."""
+        """When the newest waiting packet arrived, by the host's clock; None if no packet waits."""
         return self._pending[-1][1] if self._pending else None
 
     def _is_msop(self, packet: bytes) -> bool:
@@ -131,7 +127,7 @@ class Assembler:
             if pending[at][0] == stamp:
                 self.counters.duplicates += 1
                 return
-            if at == 0 and self._given_ns is not None:  # before the packet that the revolution begins in
+            if at == 0 and self._given_ns is not None:  # before the packet in which the revolution begins
                 self.counters.late += 1
                 return
             self.counters.reordered += 1
@@ -141,7 +137,7 @@ class Assembler:
         self._count_lost(index_of(packet))
 
     def _count_lost(self, index: int) -> None:
-        """By the packets' numbers; one that comes late after all is taken off again."""
+        """Count by the packets' numbers; one that arrives late after all no longer counts."""
         if self._index is None or not 0 < abs(index - self._index) < 100_000:
             self._index = index
         elif index > self._index:

@@ -1,4 +1,4 @@
-'''IMU samples as UDP datagrams: `imu-udp://:PORT`, for whoever has an IMU beside raw LiDAR packets.
+'''IMU samples as UDP datagrams: `imu-udp://:PORT`, for an IMU beside raw LiDAR packets.
 
 A datagram holds one sample or several, each of 64 bytes, little-endian:
 
@@ -27,23 +27,21 @@ A sender, complete:
         number += 1
         time.sleep(0.005)
 
-Stamp each sample when it is measured, not when it is sent, and by the clock that the LiDAR has too, if
-there is one.
+Stamp each sample when it is measured, not when it is sent, and by the LiDAR's clock if you can.
 '''
 
 import struct
 from dataclasses import dataclass, field
 
 from app.sensors.live.counters import Counters
+from app.sensors.ros import Vector
 
 IMU_PORT = 6700
 IMU_MAGIC = b"HIMU"
 _SAMPLE = struct.Struct("<4sIq6d")
 SAMPLE_BYTES = _SAMPLE.size
 _FAR_NS = 1 << 62
-"""The year 2116: no time that anything here could reckon with."""
-
-Vector = tuple[float, float, float]
+"""The year 2116; later times would overflow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +61,7 @@ def write_imu(sample: ImuSample) -> bytes:
 
 
 def read_imu(datagram: bytes) -> list[ImuSample]:
-    """The samples of a datagram; none, if it is another kind of datagram."""
+    """The samples of a datagram; none if it is of another kind."""
     if not datagram or len(datagram) % SAMPLE_BYTES:
         return []
     samples = []
@@ -82,7 +80,7 @@ _FAR = 1_000
 
 @dataclass(slots=True)
 class ImuOrder:
-    """Puts samples back in order by their numbers; counts what is lost, late or comes twice."""
+    """Puts samples back in order by their numbers; counts what is lost, late or repeated."""
 
     counters: Counters = field(default_factory=Counters)
     _next: int | None = None
@@ -95,39 +93,38 @@ class ImuOrder:
             self.counters.imu_foreign += 1
         return [ready for sample in samples for ready in self._one(sample)]
 
-    def _one(self, sample: ImuSample) -> list[ImuSample]:
-        expected = sample.number if self._next is None else self._next
-        ahead = (sample.number - expected + (1 << 31)) % (1 << 32) - (1 << 31)
-        ready: list[ImuSample] = []
-        if abs(ahead) > _FAR:
-            ready = self.flush()
-            expected, ahead = sample.number, 0
-        if ahead < 0 or sample.number in self._ahead:
-            self.counters.imu_late += 1
-            return []
-        self.counters.imu += 1
-        self._next = expected
-        self._ahead[sample.number] = sample
-        if len(self._ahead) > _HOLD:  # the missing ones will not come any more
-            first = min(self._ahead, key=lambda number: (number - expected) % (1 << 32))
-            self.counters.imu_lost += (first - expected) % (1 << 32)
-            self._next = first
-        return ready + self._take()
-
     def flush(self) -> list[ImuSample]:
-        """What waits for one that is missing."""
+        """The samples that wait for a missing one, which is given up."""
         ready = []
-        while self._ahead and self._next is not None:
-            expected = self._next
-            first = min(self._ahead, key=lambda number: (number - expected) % (1 << 32))
-            self.counters.imu_lost += (first - expected) % (1 << 32)
-            self._next = first
+        while self._ahead:
+            self._skip_missing()
             ready += self._take()
         return ready
 
+    def _one(self, sample: ImuSample) -> list[ImuSample]:
+        ready: list[ImuSample] = []
+        ahead = 0 if self._next is None else (sample.number - self._next + (1 << 31)) % (1 << 32) - (1 << 31)
+        if self._next is None or abs(ahead) > _FAR:
+            ready, self._next, ahead = self.flush(), sample.number, 0
+        if ahead < 0 or sample.number in self._ahead:
+            self.counters.imu_late += 1
+            return ready
+        self.counters.imu += 1
+        self._ahead[sample.number] = sample
+        if len(self._ahead) > _HOLD:
+            self._skip_missing()
+        return ready + self._take()
+
+    def _skip_missing(self) -> None:
+        """Go on with the first sample that is there."""
+        assert self._next is not None
+        missing, first = min(((number - self._next) % (1 << 32), number) for number in self._ahead)
+        self.counters.imu_lost += missing
+        self._next = first
+
     def _take(self) -> list[ImuSample]:
         ready = []
-        while self._next is not None and self._next in self._ahead:
+        while self._next in self._ahead:
             ready.append(self._ahead.pop(self._next))
             self._next = (self._next + 1) % (1 << 32)
         return ready

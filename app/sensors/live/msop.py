@@ -1,6 +1,6 @@
-"""MSOP, the RS-Bpearl's measurement packets: header, time, blocks; reading and writing. Big-endian throughout.
+"""MSOP, the RS-Bpearl's measurement packets, read and written. Big-endian throughout.
 
-A packet is 1,248 bytes: a header of 42, twelve blocks of 100 (FF EE, azimuth in 0.01 deg, then 32
+A packet has 1,248 bytes: a header of 42, twelve blocks of 100 (FF EE, azimuth in 0.01 deg, then 32
 times distance u16 and intensity u8 in channel order), packet index and tail.
 """
 
@@ -31,7 +31,7 @@ _TYPE_BPV4 = b"\x03\x04"
 
 
 def model_of(packet: bytes) -> Model:
-    """Which generation of the sensor sent it."""
+    """The generation of the sensor that sent it."""
     return BPV4 if packet[31:33] == _TYPE_BPV4 else BPEARL
 
 
@@ -116,10 +116,7 @@ class PacketWriter:
     def __init__(self, model: Model = BPEARL) -> None:
         self._model = model
         self._index = 0
-        self._times: list[int] = []
-        self._azimuth: list[int] = []
-        self._counts: list[U16] = []
-        self._intensity: list[U8] = []
+        self._blocks: list[tuple[int, int, U16, U8]] = []
 
     def add(self, times_ns: I64, azimuth: U16, counts: U16, intensity: U8) -> list[tuple[int, bytes]]:
         """Packets that these blocks complete, each with the time at which the sensor would send it.
@@ -129,39 +126,24 @@ class PacketWriter:
             azimuth: (b,) 0.01 deg. counts, intensity: (b, 32).
         """
         made = []
-        for at, time in enumerate(times_ns.tolist()):
-            if self._times and time - self._times[-1] > 1.5 * self._model.block_ns:
+        for block in zip(times_ns.tolist(), azimuth.tolist(), counts, intensity, strict=True):
+            if self._blocks and block[0] - self._blocks[-1][0] > 1.5 * self._model.block_ns:
                 made += self.flush()
-            self._times.append(time)
-            self._azimuth.append(int(azimuth[at]))
-            self._counts.append(counts[at])
-            self._intensity.append(intensity[at])
-            if len(self._times) == BLOCKS:
-                made.append(self._take())
+            self._blocks.append(block)
+            if len(self._blocks) == BLOCKS:
+                made += self.flush()
         return made
 
     def flush(self) -> list[tuple[int, bytes]]:
-        """What is left, filled up with blocks that saw nothing."""
-        if not self._times:
+        """The packet of the remaining blocks, filled up with blocks that saw nothing."""
+        if not self._blocks:
             return []
-        missing = BLOCKS - len(self._times)
-        self._times += [self._times[-1]] * missing
-        self._azimuth += [self._azimuth[-1]] * missing
-        self._counts += [np.zeros(CHANNELS, np.uint16)] * missing
-        self._intensity += [np.zeros(CHANNELS, np.uint8)] * missing
-        return [self._take()]
-
-    def _take(self) -> tuple[int, bytes]:
+        time, angle, *_ = self._blocks[-1]
+        empty = (time, angle, np.zeros(CHANNELS, np.uint16), np.zeros(CHANNELS, np.uint8))
+        times, azimuth, counts, intensity = zip(*(self._blocks + [empty] * BLOCKS)[:BLOCKS], strict=True)
         packet = write_packet(
-            self._times[0],
-            np.array(self._azimuth, np.uint16),
-            np.array(self._counts, np.uint16),
-            np.array(self._intensity, np.uint8),
-            self._model,
-            self._index,
+            times[0], np.array(azimuth, np.uint16), np.array(counts), np.array(intensity), self._model, self._index
         )
-        send_ns = self._times[-1] + self._model.block_ns
         self._index += 1
-        for column in (self._times, self._azimuth, self._counts, self._intensity):
-            column.clear()
-        return send_ns, packet
+        self._blocks.clear()
+        return [(time + self._model.block_ns, packet)]

@@ -1,6 +1,6 @@
 """UDP datagrams from .pcap and .pcapng files: VLAN tags, fragmented IP, IPv6; nothing else of a capture matters.
 
-Written here, since there is no well-kept wheel that keeps file positions, which seeking needs.
+The known libraries for this do not give positions in the file, which reading from a later moment needs.
 """
 
 import struct
@@ -14,10 +14,11 @@ NEXT_MAGIC = b"\x0a\x0d\x0d\x0a"
 MAX_RECORD = 1 << 22
 _FAR_NS = 1 << 62
 _FRAGMENTS_KEPT = 64
-"""Datagrams of which parts wait for the rest; older ones are given up."""
+"""So many datagrams may wait for missing fragments; then the oldest is given up."""
 
 _TAGS = (0x8100, 0x88A8, 0x9100)
 _IP = (b"\x08\x00", b"\x86\xdd")
+_UDP, _FRAGMENT = 17, 44
 
 
 class CaptureError(ValueError):
@@ -25,31 +26,23 @@ class CaptureError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class CapturedFrame:
-    """One captured frame: where it begins in the file, when it was captured, and from which kind of network."""
-
-    position: int
-    time_ns: int
-    link: int
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
 class Datagram:
-    """One UDP datagram. first, position: where its first and its last fragment begin in the file."""
+    """One UDP datagram. position: where the captured frame that completes it begins in the file."""
 
-    first: int
     position: int
     time_ns: int
-    port: int
     payload: bytes
 
 
+Captured = tuple[int, int, int, bytes]
+"""A captured frame: position in the file, time ns, type of network, bytes."""
+
+
 class Capture:
-    """A capture file. Reading can begin at the position of any record.
+    """A capture file. Reading can begin at the position of any frame of an earlier reading.
 
     Attributes:
-        complete: False once the end was found to be in the middle of a record.
+        complete: False once the end was found to be in the middle of a frame.
     """
 
     def __init__(self, path: Path) -> None:
@@ -65,28 +58,22 @@ class Capture:
         self._fraction_ns = 1 if start[:4] in CLASSIC_MAGIC[2:] else 1_000
         self._link = 0 if self._next else int(struct.unpack_from(self._order + "I", start, 20)[0]) & 0xFFFF
         self._sections: dict[int, _Section] = {}
-        """Of a .pcapng, by position; known as far as it was read."""
+        """Of a .pcapng, by position; known as far as the file was read."""
 
     def datagrams(self, position: int | None = None) -> Iterator[Datagram]:
-        """UDP datagrams from a record's position on, or all."""
-        fragments: dict[bytes, _Fragments] = {}
-        for record in self.records(position):
-            if not 0 <= record.time_ns < _FAR_NS:
-                continue
-            network = _network_layer(record)
-            if network:
-                found = _udp(record, network, fragments)
-                if found:
-                    yield found
-
-    def records(self, position: int | None = None) -> Iterator[CapturedFrame]:
-        """Captured frames up to the end or to where the file is cut or makes no sense."""
+        """UDP datagrams from a frame's position on, or all; up to the end, or where the file makes no sense."""
+        waiting: dict[bytes, _Fragments] = {}
         with self._path.open("rb") as file:
             if position is not None:
                 file.seek(position)
-            yield from self._next_records(file) if self._next else self._classic_records(file)
+            for at, time_ns, link, frame in self._next_frames(file) if self._next else self._classic_frames(file):
+                packet = _ip_packet(link, frame)
+                if packet and 0 <= time_ns < _FAR_NS:
+                    payload = _udp_payload(packet, waiting)
+                    if payload is not None:
+                        yield Datagram(at, time_ns, payload)
 
-    def _classic_records(self, file: BinaryIO) -> Iterator[CapturedFrame]:
+    def _classic_frames(self, file: BinaryIO) -> Iterator[Captured]:
         if file.tell() < 24:
             file.seek(24)
         header = struct.Struct(self._order + "4I")
@@ -101,10 +88,10 @@ class Capture:
             data = file.read(length) if length <= MAX_RECORD else b""
             if len(data) < length:
                 break
-            yield CapturedFrame(position, seconds * 1_000_000_000 + fraction * self._fraction_ns, self._link, data)
+            yield position, seconds * 1_000_000_000 + fraction * self._fraction_ns, self._link, data
         self.complete = False
 
-    def _next_records(self, file: BinaryIO) -> Iterator[CapturedFrame]:
+    def _next_frames(self, file: BinaryIO) -> Iterator[Captured]:
         begin = file.tell()
         section = self._sections[max(at for at in self._sections if at <= begin)] if begin else _Section("<")
         while True:
@@ -131,13 +118,13 @@ class Capture:
                 if number < len(section.interfaces):
                     interface = list(section.interfaces.values())[number]
                     time_ns = (high << 32 | low) * 1_000_000_000 // interface.units + interface.offset_ns
-                    yield CapturedFrame(position, time_ns, interface.link, body[20 : 20 + captured])
+                    yield position, time_ns, interface.link, body[20 : 20 + captured]
         self.complete = False
 
 
 @dataclass(frozen=True, slots=True)
 class _Interface:
-    """Link type, time units in a second, ns to add."""
+    """Type of network, time units in a second, ns to add."""
 
     link: int
     units: int
@@ -169,12 +156,31 @@ def _interface(body: bytes, order: str) -> _Interface:
     return _Interface(link, units, offset_s * 1_000_000_000)
 
 
+def _ip_packet(link: int, frame: bytes) -> bytes:
+    """The IP packet of a captured frame; empty if it holds none."""
+    match link:
+        case 1:  # Ethernet
+            at = 12
+        case 113:  # Linux, captured on "any"
+            at = 14
+        case 276:  # the same, second version
+            return frame[20:] if frame[:2] in _IP else b""
+        case 0 | 108:  # BSD loopback
+            return frame[4:]
+        case 12 | 14 | 101 | 228 | 229:  # bare IP
+            return frame
+        case _:
+            return b""
+    while int.from_bytes(frame[at : at + 2], "big") in _TAGS:
+        at += 4
+    return frame[at + 2 :] if frame[at : at + 2] in _IP else b""
+
+
 @dataclass(slots=True)
 class _Fragments:
-    """Parts of one IP datagram. parts: offset -> bytes. length: in all, once the last part is there."""
+    """Parts of one IP datagram, by offset. length: in all, once the last part is there."""
 
-    first: int
-    parts: dict[int, bytes]
+    parts: dict[int, bytes] = field(default_factory=dict)
     length: int | None = None
 
     def whole(self) -> bytes | None:
@@ -184,64 +190,38 @@ class _Fragments:
         return data if len(data) == self.length else None
 
 
-def _network_layer(record: CapturedFrame) -> bytes:
-    """The IP packet of a frame; empty if it holds none."""
-    data = record.data
-    match record.link:
-        case 1:  # Ethernet
-            at = 12
-        case 113:  # Linux, captured on "any"
-            at = 14
-        case 276:  # the same, second version
-            return data[20:] if data[:2] in _IP else b""
-        case 0 | 108:  # BSD loopback
-            return data[4:]
-        case 12 | 14 | 101 | 228 | 229:  # bare IP
-            return data
-        case _:
-            return b""
-    while int.from_bytes(data[at : at + 2], "big") in _TAGS:
-        at += 4
-    return data[at + 2 :] if data[at : at + 2] in _IP else b""
-
-
-def _udp(record: CapturedFrame, packet: bytes, fragments: dict[bytes, _Fragments]) -> Datagram | None:
-    """The datagram that this packet is, or completes."""
+def _udp_payload(packet: bytes, waiting: dict[bytes, _Fragments]) -> bytes | None:
+    """The payload of the datagram that this IP packet is, or completes."""
     version = packet[0] >> 4
-    first = record.position
     if version == 4 and len(packet) >= 20:
-        header = (packet[0] & 15) * 4
         total = int.from_bytes(packet[2:4], "big") or len(packet)
+        data, protocol = packet[(packet[0] & 15) * 4 : total], packet[9]
         flags = int.from_bytes(packet[6:8], "big")
-        if packet[9] != 17:
-            return None
-        data, at, more = packet[header:total], (flags & 0x1FFF) * 8, bool(flags & 0x2000)
-        key = packet[4:6] + packet[12:20]
+        offset, more, key = (flags & 0x1FFF) * 8, bool(flags & 0x2000), packet[4:6] + packet[12:20]
     elif version == 6 and len(packet) >= 48:
         end = 40 + int.from_bytes(packet[4:6], "big")
-        if packet[6] == 17:
-            data, at, more, key = packet[40:end], 0, False, b""
-        elif packet[6] == 44 and packet[40] == 17:
+        data, protocol, offset, more, key = packet[40:end], packet[6], 0, False, b""
+        if protocol == _FRAGMENT:
             flags = int.from_bytes(packet[42:44], "big")
-            data, at, more, key = packet[48:end], flags & 0xFFF8, bool(flags & 1), packet[44:48] + packet[8:40]
-        else:
-            return None
+            data, protocol = packet[48:end], packet[40]
+            offset, more, key = flags & 0xFFF8, bool(flags & 1), packet[44:48] + packet[8:40]
     else:
         return None
-    if at or more:
-        known = fragments.setdefault(key, _Fragments(record.position, {}))
-        known.parts[at] = data
+    if protocol != _UDP:
+        return None
+    if offset or more:
+        known = waiting.setdefault(key, _Fragments())
+        known.parts[offset] = data
         if not more:
-            known.length = at + len(data)
-        if len(fragments) > _FRAGMENTS_KEPT:
-            del fragments[next(iter(fragments))]
+            known.length = offset + len(data)
+        if len(waiting) > _FRAGMENTS_KEPT:
+            del waiting[next(iter(waiting))]
         whole = known.whole()
         if whole is None:
             return None
-        fragments.pop(key, None)
-        data, first = whole, known.first
+        waiting.pop(key, None)
+        data = whole
     if len(data) < 8:
         return None
-    _, port, length, _ = struct.unpack_from(">4H", data)
-    payload = data[8 : length if length >= 8 else None]
-    return Datagram(first, record.position, record.time_ns, port, payload)
+    length = int.from_bytes(data[4:6], "big")
+    return data[8 : length if length >= 8 else None]

@@ -19,15 +19,15 @@ from app.slam.errors import HemislamError
 from app.slam.types import Scan
 
 BUFFER_BYTES = 16 << 20
-"""Asked of the kernel, so that nothing is lost while this process is busy; it may grant less."""
+"""Requested from the kernel, so that nothing is lost while this process is busy; it may grant less."""
 _DRAIN = 128
 _TIMESTAMP = 35
-"""SO_TIMESTAMPNS: Linux notes when a datagram came, so that it matters little when it is read."""
+"""SO_TIMESTAMPNS: Linux notes when a datagram arrived, so that the time of reading matters little."""
 _TIMESPEC = struct.Struct("@ll")
 _REST_NS = 1_000_000_000
-"""Packets wait so long for the rest of their revolution: only the last ones before a silence ever do."""
+"""Packets wait this long for the rest of their revolution; only the last ones before a silence do."""
 _DEVICE_WAIT_NS = 1_500_000_000
-"""The device tells its angles once a second; scans wait for them at the start."""
+"""The device sends its angles once a second; at the start, scans wait for them."""
 
 
 def open_socket(host: str, port: int) -> socket.socket:
@@ -59,11 +59,11 @@ def open_socket(host: str, port: int) -> socket.socket:
 
 
 Peer = tuple[str, int]
-"""Address and port of whoever sent a datagram."""
+"""Address and port of a sender."""
 
 
 def _drain(ready: socket.socket) -> list[tuple[bytes, int, Peer]]:
-    """The datagrams that wait there, some at a time, when each came by the host's clock, and from whom."""
+    """Some of the waiting datagrams, each with its arrival by the host's clock and its sender."""
     found: list[tuple[bytes, int, Peer]] = []
     while len(found) < _DRAIN:
         try:
@@ -80,7 +80,7 @@ def _drain(ready: socket.socket) -> list[tuple[bytes, int, Peer]]:
 
 
 class RsbpearlReceiver:
-    """The sensor's own packets. Sockets are open once it is made, so that what comes then is kept.
+    """Receives the sensor's own packets. Its sockets are open from the start, so that nothing is missed.
 
     Raises:
         HemislamError: a port cannot be opened.
@@ -139,9 +139,10 @@ class RsbpearlReceiver:
         self._frames += self._assembler.add(packet, now)
 
     def _is_another(self, peer: Peer, device: bool, intake: Intake) -> bool:
-        """Whether it sends beside the sensor that is listened to: the first one, until that has been silent a while.
+        """Whether this is another sensor than the one in use: the first one, until it falls silent.
 
-        device: it tells about itself, which a sensor does from another port than it measures.
+        Args:
+            device: it is a packet of the device's settings, which a sensor sends from another port.
         """
         known, now = self._sensor, time.monotonic()
         if known is None or now - self._heard_s > _REST_NS * 1e-9:
@@ -149,7 +150,7 @@ class RsbpearlReceiver:
         elif (peer[0] != known[0]) if device else (peer != known):
             if not self._told_another:
                 self._told_another = True
-                text = f"{peer[0]} sends to the port of {known[0]} too; its packets are left out, as long as both send"
+                text = f"{peer[0]} sends to the port of {known[0]} too; its packets are left out while both send"
                 intake.put_status("configuration", "LiDAR", text)
             return True
         if not device:
@@ -161,7 +162,7 @@ class RsbpearlReceiver:
         if before is not None and before.same(said):
             return
         if before is not None:
-            self._give(now, intake)  # what came before was measured as it was before
+            self._give(now, intake)  # what came before was measured with the old settings
         self._decoder.configure(said)
         self._assembler.turn_ns = round(60e9 / said.rpm)
         intake.sensor = f"RS-Bpearl {said.serial}: {said.describe()}"
@@ -171,7 +172,7 @@ class RsbpearlReceiver:
             intake.put_status("configuration", "LiDAR", f"the LiDAR was set to {said.describe()}")
 
     def _give(self, now: int, intake: Intake) -> None:
-        """Decode and hand on; at the start once the device has told its angles."""
+        """Decode and hand on; at the start, once the angles are known or their time is up."""
         if not self._frames:
             return
         if self._device is None and not self._known_angles:
@@ -179,7 +180,7 @@ class RsbpearlReceiver:
             if now < self._wait_until_ns:
                 return
             self._known_angles = True
-            text = "no DIFOP packet came with this unit's angles; the nominal ones are used until one does"
+            text = "no DIFOP packet came with this unit's angles; the nominal ones are used until one comes"
             intake.put_status("configuration", "LiDAR", text)
         while self._frames:
             frame = self._frames.popleft()
@@ -191,7 +192,7 @@ class RsbpearlReceiver:
 
 
 class ImuReceiver:
-    """IMU samples from datagrams (see `imu_udp.py`). Raises HemislamError: the port cannot be opened."""
+    """Receives IMU samples (see `imu_udp.py`). Raises HemislamError: the port cannot be opened."""
 
     def __init__(self, host: str, port: int) -> None:
         self._socket = open_socket(host, port)

@@ -1,4 +1,4 @@
-"""Where live data come from and go to, as one writes it: `rsbpearl://0.0.0.0:6699,7788?clock=host`."""
+"""Addresses of live data, as `rsbpearl://0.0.0.0:6699,7788?clock=host`, and the source that they stand for."""
 
 import ipaddress
 from dataclasses import dataclass, field
@@ -17,16 +17,21 @@ from app.slam.params import Params
 
 Scheme = Literal["rsbpearl", "imu-udp", "foxglove"]
 FOXGLOVE_PORT = 8765
-_DEFAULT_PORTS: dict[str, tuple[int, ...]] = {
-    "rsbpearl": (MSOP_PORT, DIFOP_PORT),
-    "imu-udp": (IMU_PORT,),
-    "foxglove": (FOXGLOVE_PORT,),
-}
-_OPTIONS: dict[str, tuple[str, ...]] = {"rsbpearl": ("clock", "angles"), "imu-udp": (), "foxglove": ("clock",)}
-_EXAMPLES = {
-    "rsbpearl": "rsbpearl://0.0.0.0:6699,7788",
-    "imu-udp": "imu-udp://:6700",
-    "foxglove": "foxglove://192.168.1.5:8765",
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """What an address of one scheme may hold."""
+
+    ports: tuple[int, ...]
+    options: tuple[str, ...]
+    example: str
+
+
+_KINDS: dict[str, _Kind] = {
+    "rsbpearl": _Kind((MSOP_PORT, DIFOP_PORT), ("clock", "angles"), "rsbpearl://0.0.0.0:6699,7788"),
+    "imu-udp": _Kind((IMU_PORT,), (), "imu-udp://:6700"),
+    "foxglove": _Kind((FOXGLOVE_PORT,), ("clock",), "foxglove://192.168.1.5:8765"),
 }
 
 
@@ -44,30 +49,32 @@ class Address:
 
 
 def parse_address(text: str) -> Address:
-    """Raises HemislamError: it is none of the kinds there are."""
+    """Raises HemislamError: the address has none of the known forms."""
     scheme, separator, rest = text.partition("://")
-    if not separator or scheme not in _DEFAULT_PORTS:
-        raise HemislamError(f"`{text}` is no live source; write one of {', '.join(_EXAMPLES.values())}.")
+    if not separator or scheme not in _KINDS:
+        raise HemislamError(
+            f"`{text}` is no live source; write one of {', '.join(kind.example for kind in _KINDS.values())}."
+        )
+    kind = _KINDS[scheme]
     try:
         parts = urlsplit(f"//{rest}")
     except ValueError:  # a bracket that is not closed
-        raise HemislamError(f"`{text}` has no host as it must be; write it as {_EXAMPLES[scheme]}.") from None
+        raise HemislamError(f"`{text}` has no valid host; write it as {kind.example}.") from None
     host, colon, numbers = parts.netloc.rpartition(":")
     if not colon:
         host, numbers = parts.netloc, ""
-    defaults = _DEFAULT_PORTS[scheme]
     try:
-        ports = tuple(int(number) for number in numbers.split(",")) if numbers else defaults
-        ports += defaults[len(ports) :]
-        if len(ports) != len(defaults) or not all(0 <= port < 65_536 for port in ports):
+        ports = tuple(map(int, numbers.split(","))) if numbers else ()
+        ports += kind.ports[len(ports) :]
+        if len(ports) != len(kind.ports) or not all(0 <= port < 65_536 for port in ports):
             raise ValueError
     except ValueError:
-        raise HemislamError(f"`{text}` has no ports as they must be; write it as {_EXAMPLES[scheme]}.") from None
+        raise HemislamError(f"`{text}` has no valid ports; write it as {kind.example}.") from None
     if not _is_host(host := host.strip("[]")):
-        raise HemislamError(f"`{text}`: `{host}` can be no host; write it as {_EXAMPLES[scheme]}.")
+        raise HemislamError(f"`{text}`: `{host}` cannot be a host; write it as {kind.example}.")
     options = dict(parse_qsl(parts.query))
-    if unknown := [name for name in options if name not in _OPTIONS[scheme]]:
-        known = ", ".join(_OPTIONS[scheme]) or "none"
+    if unknown := [name for name in options if name not in kind.options]:
+        known = ", ".join(kind.options) or "none"
         raise HemislamError(f"`{text}`: there is no option `{unknown[0]}`; there are: {known}.")
     if options.get("clock", "auto") not in ("auto", "sensor", "host"):
         raise HemislamError(f"`{text}`: the clock is `auto`, `sensor` or `host`.")
@@ -75,16 +82,13 @@ def parse_address(text: str) -> Address:
 
 
 def _is_host(host: str) -> bool:
-    """Whether it is a name or an address, or nothing: whether it exists is another question."""
-    if ":" in host:
-        try:
-            ipaddress.IPv6Address(host)
-        except ValueError:
-            return False
-        return True
+    """Whether it may be a name or an address, or is empty; not whether it exists."""
     try:
+        if ":" in host:
+            ipaddress.IPv6Address(host)
+            return True
         host.encode("idna")
-    except UnicodeError:
+    except ValueError:
         return False
     return not any(character.isspace() or character in "@[]\0" for character in host)
 
@@ -97,12 +101,15 @@ def open_live(
     Args:
         lidar: `rsbpearl://HOST:MSOP,DIFOP` or `foxglove://HOST:PORT`. imu: `imu-udp://HOST:PORT`, or another
             `foxglove://`; None: from the LiDAR's Foxglove source.
-        record: an .mcap to write all of it into.
-        before: what a source that this one takes the place of had found out.
+        record: an .mcap into which everything is written.
+        before: what is known from a source that this one replaces.
 
     Raises:
-        HemislamError: an address cannot be understood, a port not opened, a file not written.
+        HemislamError: an address has no known form, a port cannot be opened, or a file not be written.
     """
+    from app.sensors.live.foxglove import FoxgloveReceiver
+    from app.sensors.live.udp import ImuReceiver, RsbpearlReceiver
+
     address = parse_address(lidar)
     beside = parse_address(imu) if imu else None
     if address.scheme == "imu-udp" or (beside is not None and beside.scheme == "rsbpearl"):
@@ -114,28 +121,17 @@ def open_live(
     angles = read_angles(Path(address.options["angles"])) if "angles" in address.options else None
     receivers: list[Receive] = []
     if beside is not None and beside.scheme == "imu-udp":
-        from app.sensors.live.udp import ImuReceiver
-
         receivers.append(ImuReceiver(beside.host or "0.0.0.0", beside.ports[0]))
     if address.scheme == "rsbpearl":
-        from app.sensors.live.udp import RsbpearlReceiver
-
         receivers.append(RsbpearlReceiver(address.host or "0.0.0.0", address.ports[0], address.ports[1], angles))
-    for foxglove, wanted in _foxglove(address, beside):
-        from app.sensors.live.foxglove import FoxgloveReceiver
-
-        receivers.append(FoxgloveReceiver(foxglove.host or "127.0.0.1", foxglove.ports[0], wanted, params))
+    # One connection to each Foxglove server, for all that is wanted of it.
+    wanted: dict[tuple[str, int], frozenset[str]] = {}
+    for source, sensors in ((address, {"lidar"} if beside else {"lidar", "imu"}), (beside, {"imu"})):
+        if source is not None and source.scheme == "foxglove":
+            at = (source.host or "127.0.0.1", source.ports[0])
+            wanted[at] = wanted.get(at, frozenset()) | sensors
+    receivers += [FoxgloveReceiver(*at, sensors, params) for at, sensors in wanted.items()]
     recorder = Recorder(record) if record else None
     clock = cast(Clock, address.options.get("clock", "auto"))
     known = (before.counters, before.settled) if before else ()
     return LiveSource(receivers, Intake(params, clock, recorder, *known), params, recorder, before)
-
-
-def _foxglove(address: Address, beside: Address | None) -> list[tuple[Address, frozenset[str]]]:
-    """The Foxglove connections there are to be, and what is wanted of each."""
-    wanted: dict[tuple[str, tuple[int, ...]], tuple[Address, frozenset[str]]] = {}
-    for source, kinds in ((address, {"lidar"} if beside else {"lidar", "imu"}), (beside, {"imu"})):
-        if source is not None and source.scheme == "foxglove":
-            _, known = wanted.get((source.host, source.ports), (source, frozenset()))
-            wanted[source.host, source.ports] = (source, known | kinds)
-    return list(wanted.values())

@@ -114,9 +114,9 @@ def test_another_lidars_recording_is_no_rsbpearls(shared_data: Path) -> None:
         list(packets_of(recording))
 
 
-def test_nobody_comes_or_nothing_says_where_the_imu_goes(params: Params) -> None:
+def test_no_client_or_no_address_for_the_imu_is_refused(params: Params) -> None:
     (port,) = ports.free(1)
-    with pytest.raises(HemislamError, match="Nobody came"):
+    with pytest.raises(HemislamError, match="No client subscribed"):
         feed(MUSEUM, params, parse_address(f"foxglove://127.0.0.1:{port}"), wait_s=0.1)
     with pytest.raises(HemislamError, match="--imu-to"):
         feed(MUSEUM, params, parse_address("rsbpearl://127.0.0.1:1,2"), pace=Pace(math.inf))
