@@ -72,7 +72,7 @@ class RecordingParams(Section):
     )
     acceleration_unit: Literal["auto", "m/s2", "g"] = _on_restart("auto", "Unit of the accelerometer.")
     imu_time_offset: float = _on_restart(
-        0.0, "Time added to the IMU's stamps, if its clock differs from the LiDAR's.", (-10, 10, 0.001), "s"
+        0.0, "Time added to the IMU's stamps, if its clock differs from the LiDAR's.", (-4e9, 4e9, 0.001), "s"
     )
     rotation_rate: float = _on_restart(
         0.0, "Revolutions per second, used only if points carry no time. 0: the rate of the clouds.", (0, 100, 1), "Hz"

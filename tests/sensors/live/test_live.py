@@ -288,8 +288,8 @@ def test_angles_are_waited_for_but_not_forever() -> None:
     [
         ("rosbag://x", None, "is no live source"),
         ("rsbpearl://0.0.0.0:6699,7788", None, "hold no IMU samples"),
-        ("rsbpearl://0.0.0.0:66999", "imu-udp://:1", "no ports"),
-        ("rsbpearl://0.0.0.0:a,b", "imu-udp://:1", "no ports"),
+        ("rsbpearl://0.0.0.0:66999", "imu-udp://:1", "no valid ports"),
+        ("rsbpearl://0.0.0.0:a,b", "imu-udp://:1", "no valid ports"),
         ("rsbpearl://0.0.0.0?speed=2", "imu-udp://:1", "no option `speed`"),
         ("rsbpearl://0.0.0.0?clock=moon", "imu-udp://:1", "`auto`, `sensor` or `host`"),
         ("rsbpearl://0.0.0.0?angles=/none.csv", "imu-udp://:1", "cannot be read"),
