@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from app.logs import process_logs
-from app.packing import pack, unpack
+from app.packing import Parts, pack, unpack
 from app.slam.errors import HemislamError
 
 PRELOADED: Final = ("app.server.engine_process", "app.fork_server")
@@ -104,9 +104,10 @@ class Link:
             if not head:
                 raise LinkClosed
             (arrays,) = struct.unpack_from("<I", head)
-            return unpack([memoryview(head)[4:], *(self._connection.recv_bytes() for _ in range(arrays))])
+            parts: Parts = [memoryview(head)[4:], *(self._connection.recv_bytes() for _ in range(arrays))]
         except (EOFError, OSError):
             raise LinkClosed from None
+        return unpack(parts)
 
     def close(self) -> None:
         """Have the other end's `receive` raise `LinkClosed` once it has received everything sent before."""
@@ -132,8 +133,8 @@ class Link:
                 os._exit(1)  # the owner reports it
 
 
-class Child:
-    """A function that runs in a process of its own, and ends with its owner at the latest.
+class Child(Link):
+    """The owner's end of a link to a function that runs in a process of its own. It ends with its owner at the latest.
 
     Args:
         main: called there with a `Link` to this process and `args`; all must be picklable. It ends by returning,
@@ -155,7 +156,6 @@ class Child:
         environment: Mapping[str, str] | None = None,
         grace_s: float = GRACE_S,
     ) -> None:
-        self.title = title
         context = fork_context() if fork else multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         call = pickle.dumps((main, args))  # to be loaded once the variables are set, since that imports numpy
@@ -163,7 +163,8 @@ class Child:
         with _signals_blocked():
             self._process.start()
         theirs.close()
-        self._link, self._grace_s = Link(ours), grace_s
+        super().__init__(ours)
+        self._title, self._grace_s = title, grace_s
         self._reaping = threading.Lock()
         _owned.add(self)
 
@@ -171,24 +172,16 @@ class Child:
     def pid(self) -> int:
         return self._process.pid or 0
 
-    def send(self, message: object) -> None:
-        """Send a message, whose arrays must not change any more. Never waits; lost if the child is dead."""
-        self._link.send(message)
-
     def receive(self, timeout: float | None = None) -> Any:
-        """The next message; None if none comes within the time (s). Large arrays in it are read-only.
-
-        Raises:
-            ChildDied: there will be none.
-        """
+        """As `Link.receive`, but raises `ChildDied` if no message will come."""
         try:
-            return self._link.receive(timeout)
+            return super().receive(timeout)
         except LinkClosed:
-            raise ChildDied(self.title, self._exit_code()) from None
+            raise ChildDied(self._title, self._exit_code()) from None
 
     def close(self, timeout: float | None = None) -> None:
         """Ask the child to end; kill it if it has not ended after the time (s; None: its grace), or at once if 0."""
-        self._link.close()
+        super().close()
         if not wait([self._process.sentinel], self._grace_s if timeout is None else timeout):
             self._process.kill()
         self._exit_code()
