@@ -60,6 +60,7 @@ class Log(Generic[T]):
 
     def truncate(self, length: int) -> None:
         """Keep the first `length` rows, or all if there are fewer."""
+        length = max(length, 0)
         if length < len(self._rows):
             del self._rows[length:]
             self._cuts.append(length)

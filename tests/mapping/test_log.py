@@ -70,6 +70,9 @@ def test_a_truncation_that_removes_nothing_makes_no_new_version() -> None:
     log.truncate(2)
     log.truncate(7)
     assert log.cursor == cursor
+    empty = Log[int]()
+    empty.truncate(-1)
+    assert empty.cursor == Cursor()
 
 
 def test_a_reader_of_a_longer_log_of_another_process_keeps_what_this_one_has() -> None:
