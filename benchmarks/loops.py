@@ -13,7 +13,7 @@ from app.sensors.recording import open_recording
 from app.slam.engine import Engine
 from app.slam.loops.factors import Factor
 from app.slam.loops.inspection import residuals
-from app.slam.loops.messages import AddKeyframe, ApplyEdit, LoopState, Undo
+from app.slam.loops.messages import AddKeyframe, ApplyEdit, Ask, LoopState, Target
 from app.slam.loops.pose_graph import PoseGraph, optimise
 from app.slam.loops.service import LoopService
 from app.slam.loops.types import Reject, Verdict
@@ -84,14 +84,16 @@ def _search() -> list[Line]:
     state = None
     for keyframe in tqdm(keyframes, desc="Loops", unit=" keyframes", leave=False, disable=None):
         begin = time.perf_counter()
-        reply = service.handle(AddKeyframe(keyframe, params.loops))
+        service.handle(AddKeyframe(keyframe, params.loops))
+        reply = service.handle(Ask(Target(keyframe.index + 1)))
         times.append((time.perf_counter() - begin) * 1e3)
         state = reply if isinstance(reply, LoopState) else state
     assert state is not None
     accepted = [edge for edge in state.edges if edge.verdict is Verdict.ACCEPTED]
     undoing = []
     for edge in accepted[:: max(1, len(accepted) // 10)]:
-        for request in (ApplyEdit(Reject(*edge.pair)), Undo()):
+        target = Target(len(keyframes))
+        for request in (Ask(target, ApplyEdit(Reject(*edge.pair))), Ask(target)):
             begin = time.perf_counter()
             service.handle(request)
             undoing.append((time.perf_counter() - begin) * 1e3)

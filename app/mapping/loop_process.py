@@ -4,8 +4,8 @@ import os
 from dataclasses import replace
 from typing import Final
 
-from app.child import Child, ChildDied, Link
-from app.slam.loops.messages import LoopState, LoopWorkerDied, Reply, Request
+from app.child import Child, Link
+from app.slam.loops.messages import LoopState, Reply, Request
 from app.slam.loops.types import LoopChange, LoopEdge, changed_by, difference
 
 NICENESS: Final = 10
@@ -15,7 +15,7 @@ _ONE_THREAD: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "NUMBA", "O
 
 
 class LoopProcess:
-    """A `LoopClient` whose back end runs in a process of its own. Used by one thread."""
+    """A `LoopWorker` whose back end runs in a process of its own. Used by one thread."""
 
     def __init__(self) -> None:
         self._child = Child(
@@ -44,14 +44,11 @@ class LoopProcess:
         None at once if nothing is pending; `timeout` None waits without a limit.
 
         Raises:
-            LoopWorkerDied: it will never come.
+            ChildDied: it will never come.
         """
         if not self._pending:
             return None
-        try:
-            message: tuple[Reply, LoopChange | None] | None = self._child.receive(timeout)
-        except ChildDied as death:
-            raise LoopWorkerDied(str(death)) from None
+        message: tuple[Reply, LoopChange | None] | None = self._child.receive(timeout)
         if message is None:
             return None
         self._pending -= 1

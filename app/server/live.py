@@ -6,7 +6,7 @@ import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from app.mapping.loop_process import LoopProcess
+from app.mapping.loops import RestartingLoops
 from app.sensors.findings import Finding
 from app.sensors.live.process import LiveAddress, LiveClient
 from app.sensors.live.status import LiveState, Status
@@ -212,7 +212,11 @@ def open_live_run(address: LiveAddress, params: Params, folder: Path, *, revive:
 
 def _begun(address: LiveAddress, params: Params, folder: Path) -> tuple[LiveRun, LiveClient]:
     client = LiveClient(address)
-    engine = Engine(params, LoopProcess if params.loops.enabled else None, KeyframeStore(folder / KEYFRAMES))
+    engine = Engine(
+        params,
+        RestartingLoops if params.loops.enabled else None,
+        KeyframeStore(folder / KEYFRAMES),
+    )
     return LiveRun(client, engine, folder), client
 
 

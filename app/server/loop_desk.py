@@ -4,7 +4,6 @@ from dataclasses import replace
 
 from app.server.delta import Outbox
 from app.server.protocol import EditLoop, InspectLoop, LoopCommand, LoopsView, RedoLoop, TryLoop, UndoLoop
-from app.slam.loops.line import LoopLine
 from app.slam.loops.messages import (
     ApplyEdit,
     AskResiduals,
@@ -18,6 +17,7 @@ from app.slam.loops.messages import (
     TryOut,
     Undo,
 )
+from app.slam.loops.schedule import LoopSchedule
 from app.slam.loops.types import LoopEdge
 
 
@@ -34,7 +34,7 @@ class LoopDesk:
         self._view, self._state = LoopsView(), None
         self._outbox.put(loops=self._view)
 
-    def handle(self, command: LoopCommand, loops: LoopLine) -> None:
+    def handle(self, command: LoopCommand, loops: LoopSchedule) -> None:
         """Pass a command of the page on; `update` brings what comes of it."""
         view = self._view
         match command:
@@ -57,7 +57,7 @@ class LoopDesk:
             loops.command(AskResiduals())  # for a trial those of the present too, to compare with
         self._show(view)
 
-    def update(self, loops: LoopLine, *, show: bool = True) -> bool:
+    def update(self, loops: LoopSchedule, *, show: bool = True) -> bool:
         """Take in what was answered and, if it is to be shown, what came into effect.
 
         Returns whether the map has moved by it.

@@ -10,7 +10,7 @@ import numpy as np
 from app.mapping import truth as compared
 from app.mapping.frames import Frame
 from app.mapping.log import Log
-from app.mapping.loop_process import LoopProcess
+from app.mapping.loops import RestartingLoops
 from app.sensors.findings import Finding
 from app.sensors.live.status import Status
 from app.sensors.recording import Place, Recording, open_recording
@@ -20,8 +20,8 @@ from app.server.protocol import OpenedRecording
 from app.slam.engine import Checkpoint, Engine
 from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
-from app.slam.loops.messages import LoadCommands
-from app.slam.loops.types import LoopEdit
+from app.slam.loops.messages import LoadEdits
+from app.slam.loops.types import Edits, LoopEdit
 from app.slam.params import Params, leaves
 from app.slam.results import LogState, RunInfo, RunLog, prepare_folder, save_results
 from app.slam.trajectory import Trajectory, read_tum, time_apart, write_tum
@@ -187,7 +187,7 @@ class Run:
         """
         if self.engine.loops is None:
             raise HemislamError("Loops are not looked for, so there are none to edit; set loops.enabled.")
-        self.engine.loops.command(LoadCommands(commands, undone))
+        self.engine.loops.command(LoadEdits(Edits(commands, undone)))
 
     def resume(self, saved: SavedSession) -> None:
         """Repeat a session of this recording: up to its frame as it went, from there on with what it chose last.
@@ -371,7 +371,7 @@ def open_run(
     try:
         return Run(
             recording,
-            Engine(params, LoopProcess if params.loops.enabled else None),
+            Engine(params, RestartingLoops if params.loops.enabled else None),
             truth_path=truth,
             start_s=start_s,
             duration_s=duration_s,

@@ -40,7 +40,7 @@ from app.server.publisher import Publisher
 from app.server.run import EFFECT, Run
 from app.server.saver import Saver
 from app.slam.errors import HemislamError
-from app.slam.loops.line import LoopLine
+from app.slam.loops.schedule import LoopSchedule
 from app.slam.params import Params
 
 SOURCE_PERIOD_S = 0.5
@@ -211,7 +211,7 @@ class Session:
             raise HemislamError("No recording is open; open one first.")
         return self._player.run
 
-    def _need_loops(self) -> LoopLine:
+    def _need_loops(self) -> LoopSchedule:
         loops = self._need_run().engine.loops
         if loops is None:
             raise HemislamError("Loops are not looked for; set loops.enabled and restart.")

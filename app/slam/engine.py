@@ -11,8 +11,9 @@ from app.slam.imu import Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
 from app.slam.local_map import LocalMap, MapState
-from app.slam.loops.line import LoopLine
+from app.slam.loops.keyframe_log import KeyframeLog
 from app.slam.loops.messages import LoopClient
+from app.slam.loops.schedule import LoopSchedule
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
@@ -40,7 +41,7 @@ class Engine:
     same scans, samples and parameters give the same results to the last bit.
 
     Args:
-        loops: makes who looks for loops, for example `InlineLoops`; None: nobody, it is odometry alone.
+        loops: makes the client that looks for loops, for example `InlineLoops`; None: odometry alone.
         keyframes: where to keep them; None: in a temporary file.
 
     Attributes:
@@ -50,11 +51,14 @@ class Engine:
     """
 
     def __init__(
-        self, params: Params, loops: Callable[[], LoopClient] | None = None, keyframes: KeyframeStore | None = None
+        self,
+        params: Params,
+        loops: Callable[[KeyframeLog], LoopClient] | None = None,
+        keyframes: KeyframeStore | None = None,
     ) -> None:
         self.params = params
         self.keyframes = KeyframeStore() if keyframes is None else keyframes
-        self.loops = LoopLine(loops, self.keyframes, params.loops) if loops else None
+        self.loops = LoopSchedule(loops, self.keyframes, params.loops) if loops else None
         self._map = LocalMap(params.map)
         self._grid = VoxelGrid()
         self._belief: Belief | None = None  # None until the start is over

@@ -93,6 +93,12 @@ class KeyframeStore:
             cloud=Cloud(**{name: np.ascontiguousarray(data[name]) for name in _POINT.names or ()}),
         )
 
+    def when(self, index: int) -> tuple[int, int]:
+        """Frame and stamp (ns) of a keyframe, without reading its cloud."""
+        begin = self._ends[index - 1] if index else 0
+        head = np.frombuffer(os.pread(self._file.fileno(), _HEAD.itemsize, begin), dtype=_HEAD)[0]
+        return int(head["frame"]), int(head["stamp_ns"])
+
     def __iter__(self) -> Iterator[Keyframe]:
         return (self[i] for i in range(len(self)))
 

@@ -42,14 +42,14 @@ LOOPS = """
 import pytest
 from app.logs import start_logging
 from app.mapping.loop_process import LoopProcess
-from app.slam.loops.messages import LoopWorkerDied
+from app.child import ChildDied
 
 start_logging(json_lines=True)
 loops = LoopProcess()
 class Unknown: pass
 
 loops.send(Unknown())
-with pytest.raises(LoopWorkerDied, match="exit code 1"):
+with pytest.raises(ChildDied, match="exit code 1"):
     loops.receive(60.0)
 """
 

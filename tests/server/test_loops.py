@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from app.__main__ import cli
 from app.mapping.loop_process import LoopProcess
+from app.mapping.loops import RestartingLoops
 from app.sensors.presets import resolve_params
 from app.server.protocol import (
     EditLoop,
@@ -184,7 +185,9 @@ def test_the_loops_process_killed_twice_is_revived_and_leaves_the_same_files(
 ) -> None:
     def kill() -> None:
         assert walk.run.engine.loops is not None
-        process = walk.run.engine.loops._client  # nobody outside has a reason to know it
+        client = walk.run.engine.loops._client  # only a test has a reason to know it
+        assert isinstance(client, RestartingLoops)
+        process = client._worker
         assert isinstance(process, LoopProcess)
         os.kill(process.pid, signal.SIGKILL)
 

@@ -20,12 +20,14 @@ from app.slam.loops.drift import Drift
 from app.slam.loops.edits import EditList, Entry, check, in_words
 from app.slam.loops.factors import Factor
 from app.slam.loops.history import History, Record
+from app.slam.loops.messages import Target
 from app.slam.loops.odometry import odometry_factor
 from app.slam.loops.pose_graph import g2o_text, optimise
 from app.slam.loops.search import Found, search
 from app.slam.loops.solution import Solution, loop_factors
 from app.slam.loops.types import (
     Add,
+    Edits,
     FactorResidual,
     LoopDetail,
     LoopEdge,
@@ -83,7 +85,7 @@ class LoopBackend:
         A keyframe of the history, as it was, only goes forth to it. Raises HemislamError if it is not the next.
         """
         if keyframe.index != len(self):
-            raise HemislamError(f"Keyframe {keyframe.index} can not follow on {len(self)} keyframes; one is missing.")
+            raise HemislamError(f"Keyframe {keyframe.index} cannot follow on {len(self)} keyframes; one is missing.")
         self.go_to(len(self))
         if self._is_known(keyframe, params):
             self.go_to(len(self) + 1)
@@ -120,7 +122,7 @@ class LoopBackend:
     def go_to(self, count: int) -> None:
         """Be where it was after `count` keyframes of the history. Raises HemislamError if there are not so many."""
         if not 0 <= count <= self.known:
-            raise HemislamError(f"The loop search knows {self.known} keyframes and can not go to {count}.")
+            raise HemislamError(f"The loop search knows {self.known} keyframes and cannot go to {count}.")
         if self._finished or not len(self) <= count <= len(self) + 1:
             self._finished = False
             self._stand(count)
@@ -136,11 +138,19 @@ class LoopBackend:
         count = len(self)
         if count == self.known:
             return
-        half = self._start.submap_keyframes
         self._history.truncate(count)
         self._detector.forget()
-        self._edits.go_back(count, lambda pair: pair[1] + half >= count)
+        self._edits.cut(count, self._start.submap_keyframes)
         self._stand(count)
+
+    def stand(self, target: Target) -> None:
+        """Be in the state that is asked for. Raises as `load`, and then nothing has changed."""
+        self.load(target.edits)
+        count = min(target.count, self.known)
+        if (count, target.finished) != (len(self), self._finished):
+            self.go_to(count)
+            if target.finished:
+                self.finish()
 
     def _reach(self, reached: int) -> None:
         """The walk has come so far: commands that were given here the last time act from now on."""
@@ -249,82 +259,71 @@ class LoopBackend:
 
     # --- edits -----------------------------------------------------------------------------------
     @property
-    def commands(self) -> tuple[LoopEdit, ...]:
-        """The commands in force, in order."""
-        return self._edits.commands
+    def edits(self) -> Edits:
+        """The user's edits, in force and undone."""
+        return self._edits.edits
 
     @property
-    def undone(self) -> tuple[LoopEdit, ...]:
-        """The commands that `redo` would do again, the next one last."""
-        return self._edits.undone
+    def acting(self) -> int:
+        """How many of those in force act already."""
+        return self._edits.acting
 
-    def apply(self, command: LoopEdit) -> None:
-        """ApplyEdit. What was undone before can no longer be redone. Raises HemislamError if it makes no sense."""
-        check(command)
-        pair = pair_of(command)
-        if isinstance(command, Add):
-            there = command.newer < len(self)
-            if there and command.guess is None:  # as it is now, so that it is the same when given again
-                command = replace(command, guess=rows(self._present(command.older, command.newer)))
+    def apply(self, edit: LoopEdit) -> None:
+        """Add an edit. Those undone before can no longer be redone. Raises HemislamError if it makes no sense."""
+        check(edit)
+        pair = pair_of(edit)
+        if isinstance(edit, Add):
+            there = edit.newer < len(self)
+            if there and edit.guess is None:  # as it is now, so that it is the same when repeated
+                edit = replace(edit, guess=rows(self._present(edit.older, edit.newer)))
         else:
             there = pair is None or pair in self.by_pair
-        self._edits.give(self._fitting(self._entry(replace(command, since=self._edits.reached if there else 0))))
+        self._edits.give(self._fitting(self._entry(replace(edit, since=self._edits.reached if there else 0))))
         self._solve()
         if not there:
-            self._notices.append(f"{in_words(command)} waits until there is such a loop.")
+            self._notices.append(f"{in_words(edit)} waits until there is such a loop.")
 
-    def load(self, commands: tuple[LoopEdit, ...], undone: tuple[LoopEdit, ...] = ()) -> None:
-        """These commands in place of all there are. Raises as `apply`, and then nothing has changed."""
-        for command in (*commands, *undone):
-            check(command)
-        self._edits.load(commands, undone)
-        self._solve()
-        self._resolve()
+    def load(self, edits: Edits) -> None:
+        """Replace all edits. Raises HemislamError if one makes no sense, and then nothing has changed."""
+        for edit in (*edits.done, *edits.undone):
+            check(edit)
+        if self._edits.load(edits):
+            self._solve()
+            self._resolve()
 
-    def undo(self) -> None:
-        """Take the last command back. Raises HemislamError if there is none."""
-        self._edits.undo()
-        self._solve()
-
-    def redo(self) -> None:
-        """Do the command again that was last undone. Raises HemislamError if there is none."""
-        self._edits.redo()
-        self._solve()
-        self._resolve()
-
-    def preview(self, command: LoopEdit) -> Preview:
-        """What the graph would become by a command, without doing it.
+    def preview(self, edit: LoopEdit) -> Preview:
+        """What the graph would become by a edit, without doing it.
 
         Raises:
             HemislamError: it makes no sense, or there is no such loop or keyframe yet.
         """
-        check(command)
-        if not isinstance(command, Solve):
-            self._check_there(command.older, command.newer)
-            if not isinstance(command, Add) and pair_of(command) not in self.by_pair:
-                raise HemislamError(f"There is no loop candidate of keyframes {command.older} and {command.newer}.")
-        edges = tuple(self._edges(self._found, self._fitting(self._entry(replace(command, since=0)))).values())
+        check(edit)
+        if not isinstance(edit, Solve):
+            self._check_there(edit.older, edit.newer)
+            if not isinstance(edit, Add) and pair_of(edit) not in self.by_pair:
+                raise HemislamError(f"There is no loop candidate of keyframes {edit.older} and {edit.newer}.")
+        edges = tuple(self._edges(self._found, self._fitting(self._entry(replace(edit, since=0)))).values())
         poses = self._optimum(edges)
         return Preview(poses, inspection.residuals(self._factors(edges), poses))
 
-    def _entry(self, command: LoopEdit) -> Entry:
-        there = isinstance(command, Add) and command.newer < len(self)
-        return Entry(command, self._made(command) if isinstance(command, Add) and there else None)
+    def _entry(self, edit: LoopEdit) -> Entry:
+        there = isinstance(edit, Add) and edit.newer < len(self)
+        return Entry(edit, self._made(edit) if isinstance(edit, Add) and there else None)
 
     def _fitting(self, entry: Entry) -> Entry:
         """The same, unless it ties two places by a registration that found nothing in common."""
         edge = entry.added
-        if edge is not None and isinstance(entry.command, Add) and entry.command.register and not edge.evidence.overlap:
+        if edge is not None and isinstance(entry.edit, Add) and entry.edit.register and not edge.evidence.overlap:
             raise HemislamError(
                 f"The surroundings of keyframes {edge.older} and {edge.newer} have nothing in common from there;"
                 " nudge one nearer to where it belongs, or tie them without registration."
             )
         return entry
 
-    def _made(self, command: Add) -> LoopEdge:
-        older, newer = command.older, command.newer
-        guess = self._present(older, newer) if command.guess is None else np.array(command.guess, dtype=np.float64)
-        return by_hand(older, newer, self._detector, guess, register=command.register)
+    def _made(self, edit: Add) -> LoopEdge:
+        older, newer = edit.older, edit.newer
+        guess = self._present(older, newer) if edit.guess is None else np.array(edit.guess, dtype=np.float64)
+        return by_hand(older, newer, self._detector, guess, register=edit.register)
 
     def _present(self, older: int, newer: int) -> F64:
         """(4, 4) T_older_newer as the graph has it."""
@@ -339,8 +338,8 @@ class LoopBackend:
             self._solve()
 
     def _tell_idle(self) -> None:
-        """At the end: which commands found nothing to act on; each is said once."""
-        idle = [in_words(entry.command) for entry in self._edits if entry.pair and entry.pair not in self.by_pair]
+        """At the end: which edits found nothing to act on; each is said once."""
+        idle = [in_words(entry.edit) for entry in self._edits if entry.pair and entry.pair not in self.by_pair]
         new = [words for words in idle if words not in self._idle]
         self._notices += [f"{words} has no effect: there is no such loop; loops.csv lists all." for words in new]
         self._idle = set(idle)
@@ -348,7 +347,7 @@ class LoopBackend:
     def _check_there(self, older: int, newer: int) -> None:
         if not 0 <= older < newer < len(self):
             raise HemislamError(
-                f"Keyframes {older} and {newer} can not be compared; choose an older and a newer one of the"
+                f"Keyframes {older} and {newer} cannot be compared; choose an older and a newer one of the"
                 f" {len(self)} there are."
             )
 

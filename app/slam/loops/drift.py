@@ -4,7 +4,7 @@ The filter's covariance is of no use for this: it holds the map for known, so it
 however long the walk. Drift grows with the way instead. Model: position drifts by a share of the
 way, heading by an angle per metre, both constant along the way (the worst case: nothing averages
 out), the two independent. Gravity holds roll and pitch. The way between two keyframes is the
-shortest one through the graph: accepted loops are short cuts, and what they tied together can not
+shortest one through the graph: accepted loops are short cuts, and what they tied together cannot
 have drifted apart.
 """
 

@@ -50,7 +50,7 @@ def read(text: str, source: str = "the list of edits") -> tuple[LoopEdit, ...]:
     """Commands of a YAML text.
 
     Raises:
-        HemislamError: naming `source` and the entry that can not be used, counted from 1.
+        HemislamError: naming `source` and the entry that cannot be used, counted from 1.
     """
     entries = read_yaml(text, source, "write entries such as `- accept: [12, 340]`")
     if entries is None:

@@ -1,66 +1,80 @@
-"""The user's commands: a list that lies over whatever was found, and of which any number can be undone.
+"""The user's edits: a list that lies over whatever was found, and of which any number can be undone.
 
-A command is for a pair of keyframes, whether the pair was found already or not. One that finds
-nothing to act on waits, so that a list of commands may be given before the walk begins.
+An edit names a pair of keyframes, whether that pair was found already or not. An edit without a loop to act on waits
+for it, so a list of edits can be given before the session begins.
 """
 
+import operator
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from app.slam.errors import HemislamError
-from app.slam.loops.types import Accept, Add, LoopEdge, LoopEdit, Origin, Pair, SetWeight, Solve, Verdict, pair_of
+from app.slam.loops.types import (
+    Accept,
+    Add,
+    Edits,
+    LoopEdge,
+    LoopEdit,
+    Origin,
+    Pair,
+    SetWeight,
+    Solve,
+    Verdict,
+    loses,
+    pair_of,
+)
 from app.slam.types import F64
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A command, and for Add the loop that it came to; None as long as it waits for its keyframes."""
+    """An edit, and the loop that an Add made; None while it waits for its keyframes."""
 
-    command: LoopEdit
+    edit: LoopEdit
     added: LoopEdge | None = None
 
     @property
     def pair(self) -> Pair | None:
-        return pair_of(self.command)
+        return pair_of(self.edit)
 
 
 class EditList:
-    """Commands in force, and those taken back.
+    """The edits in force and those undone, with the loops that they added.
 
     Attributes:
-        reached: keyframes that the walk ever had, and one more after its end, to hold against `since`.
+        reached: how many keyframes the session ever had, one more after its end. An edit acts if its `since` is not
+            greater.
     """
 
     def __init__(self) -> None:
         self.reached = 0
         self._done: list[Entry] = []
         self._undone: list[Entry] = []
-        self._used = False  # ever: what was found meanwhile may be placed by loops that no longer count
+        self._used = False  # ever; if not, no loop can have been placed by one that no longer counts
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._done)
 
     @property
-    def commands(self) -> tuple[LoopEdit, ...]:
-        """In force, in order."""
-        return tuple(entry.command for entry in self._done)
+    def edits(self) -> Edits:
+        return Edits(tuple(entry.edit for entry in self._done), tuple(entry.edit for entry in self._undone))
 
     @property
-    def undone(self) -> tuple[LoopEdit, ...]:
-        """Those that `redo` would give again, the next one last."""
-        return tuple(entry.command for entry in self._undone)
+    def acting(self) -> int:
+        """How many edits in force act already."""
+        return sum(entry.edit.since <= self.reached for entry in self._done)
 
     @property
     def solving(self) -> bool:
         """Whether poses are those of all factors solved at once."""
-        return any(isinstance(entry.command, Solve) and entry.command.since <= self.reached for entry in self._done)
+        return any(isinstance(entry.edit, Solve) and entry.edit.since <= self.reached for entry in self._done)
 
     @property
     def latest(self) -> int:
-        """The greatest `since`; of a list from a walk that had more keyframes it may lie beyond the end."""
-        return max((entry.command.since for entry in [*self._done, *self._undone]), default=0)
+        """The greatest `since`; in edits of a session with more keyframes it may lie beyond the end."""
+        return max((entry.edit.since for entry in [*self._done, *self._undone]), default=0)
 
     def give(self, entry: Entry) -> None:
         self._done.append(entry)
@@ -68,32 +82,29 @@ class EditList:
         self._used = True
 
     def reach(self, reached: int) -> bool:
-        """The walk has come on. Returns whether commands act from now on that did not before."""
+        """The session has come this far. Returns whether edits act from now on that did not before."""
         before, self.reached = self.reached, max(self.reached, reached)
-        return any(before < entry.command.since <= reached for entry in self._done)
+        return any(before < entry.edit.since <= reached for entry in self._done)
 
-    def load(self, commands: tuple[LoopEdit, ...], undone: tuple[LoopEdit, ...]) -> None:
-        self._done = [Entry(command) for command in commands]
-        self._undone = [Entry(command) for command in undone]
-        self._used = self._used or bool(commands)
+    def load(self, edits: Edits) -> bool:
+        """Replace all edits; loops that were added by those that stay are kept. Returns whether anything changed."""
+        known = {entry.edit: entry for entry in [*self._undone, *self._done]}  # whatever their `since`
 
-    def undo(self) -> None:
-        """Raises HemislamError if there is nothing to undo."""
-        if not self._done:
-            raise HemislamError("There is no edit to undo.")
-        self._undone.append(self._done.pop())
+        def entry_of(edit: LoopEdit) -> Entry:
+            entry = known.get(edit, Entry(edit))
+            return entry if entry.edit.since == edit.since else replace(entry, edit=edit)
 
-    def redo(self) -> None:
-        """Raises HemislamError if there is nothing to redo."""
-        if not self._undone:
-            raise HemislamError("There is no edit to redo.")
-        self._done.append(self._undone.pop())
+        before, self._done = self._done, [entry_of(edit) for edit in edits.done]
+        self._undone = [entry_of(edit) for edit in edits.undone]
+        self._used = self._used or bool(self._done)
+        same = len(before) == len(self._done) and all(map(operator.is_, before, self._done))
+        return not same
 
     def resolve(self, count: int, complete: int, make: Callable[[Add], LoopEdge]) -> bool:
         """Make the loops by hand that wait for their keyframes, where these are there.
 
         Args:
-            count: keyframes there are. complete: how many of them have complete surroundings; commands
+            count: keyframes there are. complete: how many of them have complete surroundings; edits
                 given from the start wait for those, others were given without.
 
         Returns:
@@ -102,31 +113,29 @@ class EditList:
         before = self._done
 
         def resolved(entry: Entry) -> Entry:
-            command = entry.command
-            if not isinstance(command, Add) or entry.added is not None or command.since > self.reached:
+            edit = entry.edit
+            if not isinstance(edit, Add) or entry.added is not None or edit.since > self.reached:
                 return entry
-            there = command.newer < (count if command.since else complete)
-            return replace(entry, added=make(command)) if there else entry
+            there = edit.newer < (count if edit.since else complete)
+            return replace(entry, added=make(edit)) if there else entry
 
         self._done = [resolved(entry) for entry in before]
         return any(new is not old for new, old in zip(self._done, before, strict=True))
 
-    def go_back(self, reached: int, lost: Callable[[Pair], bool]) -> None:
-        """Keyframes were forgotten: commands go on acting, but loops by hand that lost theirs wait for others."""
-        self.reached = reached
-
-        def kept(entry: Entry) -> Entry:
-            if entry.pair is not None and lost(entry.pair):
-                return Entry(replace(entry.command, since=0))
-            return replace(entry, command=replace(entry.command, since=min(entry.command.since, reached)))
-
-        self._done, self._undone = [kept(e) for e in self._done], [kept(e) for e in self._undone]
+    def cut(self, count: int, half: int) -> None:
+        """All keyframes but the first `count` were forgotten; see `Edits.cut`."""
+        self.load(self.edits.cut(count, half))
+        self.reached = count
+        self._done, self._undone = (
+            [replace(entry, added=None) if loses(entry.edit, count, half) else entry for entry in entries]
+            for entries in (self._done, self._undone)
+        )
 
     def lay_over(self, found: Mapping[Pair, LoopEdge], count: int, extra: Entry | None = None) -> dict[Pair, LoopEdge]:
-        """What was found, as it counts with the commands, and with one more if there is one.
+        """What was found, as it counts with the edits, and with one more if given.
 
         Args:
-            count: keyframes there are; loops by hand beyond them do not count.
+            count: number of keyframes; loops by hand beyond them do not count.
         """
         entries = [*self._done, *([extra] if extra else [])]
         if not (self._used or entries):
@@ -134,30 +143,30 @@ class EditList:
         edges = dict(found)
         for entry in entries:
             pair = entry.pair
-            if pair is None or entry.command.since > self.reached:
+            if pair is None or entry.edit.since > self.reached:
                 continue
             if entry.added is not None:
                 if entry.added.newer < count:
                     edges[pair] = entry.added
             elif pair in edges:
-                edges[pair] = _edited(edges[pair], entry.command)
+                edges[pair] = _edited(edges[pair], entry.edit)
         return {pair: _standing(edges[pair], edges) for pair in sorted(edges)}
 
 
-def check(command: LoopEdit) -> None:
-    """Raises HemislamError if the command can never make sense, whatever is found."""
-    if isinstance(command, Solve):
+def check(edit: LoopEdit) -> None:
+    """Raises HemislamError if the edit can never make sense, whatever is found."""
+    if isinstance(edit, Solve):
         return
-    older, newer = command.older, command.newer
+    older, newer = edit.older, edit.newer
     if not 0 <= older < newer:
-        raise HemislamError(f"Keyframes {older} and {newer} can not be tied together; name an older and a newer one.")
-    if isinstance(command, SetWeight) and not (np.isfinite(command.weight) and command.weight > 0):
-        raise HemislamError(f"A loop's weight can not be {command.weight:g}; it must be greater than 0.")
-    if isinstance(command, Add) and command.guess is not None:
-        lengths = {len(row) for row in command.guess}
-        if len(command.guess) != 4 or lengths != {4} or not np.isfinite(command.guess).all():
+        raise HemislamError(f"Keyframes {older} and {newer} cannot be tied together; name an older and a newer one.")
+    if isinstance(edit, SetWeight) and not (np.isfinite(edit.weight) and edit.weight > 0):
+        raise HemislamError(f"A loop's weight cannot be {edit.weight:g}; it must be greater than 0.")
+    if isinstance(edit, Add) and edit.guess is not None:
+        lengths = {len(row) for row in edit.guess}
+        if len(edit.guess) != 4 or lengths != {4} or not np.isfinite(edit.guess).all():
             raise HemislamError("The guess of a loop must be a 4x4 matrix T_older_newer of finite numbers.")
-        if not _is_rigid(np.array(command.guess)):
+        if not _is_rigid(np.array(edit.guess)):
             raise HemislamError("The guess of a loop must be a rotation and a position: a rigid 4x4 T_older_newer.")
 
 
@@ -167,19 +176,19 @@ def _is_rigid(T: F64) -> bool:
     return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0 and np.allclose(T[3], (0, 0, 0, 1)))
 
 
-def in_words(command: LoopEdit) -> str:
-    """A command's name and pair, to begin a sentence with."""
-    pair = pair_of(command)
-    return f"{type(command).__name__} {pair[0]}-{pair[1]}" if pair else type(command).__name__
+def in_words(edit: LoopEdit) -> str:
+    """An edit's name and pair, to begin a sentence with."""
+    pair = pair_of(edit)
+    return f"{type(edit).__name__} {pair[0]}-{pair[1]}" if pair else type(edit).__name__
 
 
-def _edited(edge: LoopEdge, command: LoopEdit) -> LoopEdge:
+def _edited(edge: LoopEdge, edit: LoopEdit) -> LoopEdge:
     edge = replace(edge, represented_by=None, repeats=None)  # what the user has a word on is in the graph itself
-    if isinstance(command, SetWeight):
-        return replace(edge, weight=command.weight)
-    if isinstance(command, Add | Solve):  # one that waits; one that is for no loop
+    if isinstance(edit, SetWeight):
+        return replace(edge, weight=edit.weight)
+    if isinstance(edit, Add | Solve):  # one that waits; one that is for no loop
         return edge
-    verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
+    verdict = Verdict.ACCEPTED if isinstance(edit, Accept) else Verdict.REJECTED
     if verdict is edge.verdict:
         return replace(edge, edited=True)
     reason = f"{verdict} by hand; found {edge.verdict}: {edge.reason}"

@@ -1,88 +1,70 @@
-"""What a loop back end is asked and answers, as frozen values: they also pass between processes.
+"""What a loop back end is asked and what it answers, as frozen values that also pass between processes.
 
-One request, one reply, in order. Most are answered by a `LoopState`; what can not be done, by a
-`Failure`, and nothing has changed then.
+A back end follows a log of keyframes: `AddKeyframe` sends the next one that it lacks. Everything else is a question
+about a `Target`, so an answer depends only on the keyframes and the question, not on what was asked before. Each
+request has one reply, in order. What cannot be done is answered by a `Failure`, and changes nothing.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
-from app.slam.errors import HemislamError
-from app.slam.loops.types import FactorResidual, LoopDetail, LoopEdge, LoopEdit, Pair, Preview
+from app.slam.loops.types import Edits, FactorResidual, LoopDetail, LoopEdge, LoopEdit, Pair, Preview
 from app.slam.params import LoopsParams
 from app.slam.types import F64, Keyframe
 
 
-# --- the walk ------------------------------------------------------------------------------------
+# --- to the back end -----------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class AddKeyframe:
-    """The next keyframe, with its cloud, and the parameters for it.
+    """The next keyframe of the log, with its cloud, its parameters, and the edits that hold. Answered by `Added`.
 
-    One that is known already, as it was and with the same parameters, gives what was found then;
-    any other one there makes the back end forget what it knows from there on. Parameters that act
-    on restart are those of the first keyframe.
+    If the back end has another keyframe at this index, it forgets that one and all later ones. Parameters that act
+    on restart are read from the first keyframe.
     """
 
     keyframe: Keyframe
     params: LoopsParams
+    edits: Edits = field(default_factory=Edits)
 
 
 @dataclass(frozen=True, slots=True)
-class GoTo:
-    """Be where the back end was after the first `count` keyframes, or on again to as many as it knows.
+class Target:
+    """A state of the loops: with the first `count` keyframes, or all if there are fewer, and these edits.
 
-    `forget`: what lies beyond is forgotten, since the walk goes on differently.
+    `finished`: the session ends here, so loops are looked for at the last keyframes too, whose surroundings are
+    half seen.
     """
 
     count: int
-    forget: bool = False
+    edits: Edits = field(default_factory=Edits)
+    finished: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Finish:
-    """The walk ends here: look for loops of the last keyframes too, whose surroundings are half seen.
+class AskState:
+    """Answered by `LoopState`."""
 
-    Whatever comes next of the walk (`AddKeyframe`, `GoTo`) takes that back.
+
+@dataclass(frozen=True, slots=True)
+class ApplyEdit:
+    """Add an edit to those of the target. One for a pair that does not exist yet waits for it. Answered by `LoopState`.
+
+    The reply holds the edit as it must be repeated: with `since`, and with the guess that was used.
     """
 
-
-# --- the user's commands -------------------------------------------------------------------------
-@dataclass(frozen=True, slots=True)
-class ApplyEdit:
-    """Put a command over what was found. One for a pair that is not there yet waits for it."""
-
-    command: LoopEdit
+    edit: LoopEdit
 
 
-@dataclass(frozen=True, slots=True)
-class Undo:
-    """Take the last command back."""
-
-
-@dataclass(frozen=True, slots=True)
-class Redo:
-    """Give the command again that was taken back last."""
-
-
-@dataclass(frozen=True, slots=True)
-class LoadCommands:
-    """These commands in place of all there are. `redo`: as in `LoopState`."""
-
-    commands: tuple[LoopEdit, ...]
-    redo: tuple[LoopEdit, ...] = ()
-
-
-# --- questions -----------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class TryOut:
-    """What would the graph become by this command? Answered by `Tried`."""
+    """What would the graph become by this edit? Answered by `Tried`."""
 
-    command: LoopEdit
+    edit: LoopEdit
 
 
 @dataclass(frozen=True, slots=True)
 class Inspect:
-    """All there is on two keyframes, a candidate or not. Answered by `Inspected`."""
+    """All there is about two keyframes, a candidate or not. Answered by `Inspected`."""
 
     older: int
     newer: int
@@ -98,42 +80,75 @@ class AskG2o:
     """The graph as the text of a g2o file. Answered by `G2o`."""
 
 
-Request = (
-    AddKeyframe | GoTo | Finish | ApplyEdit | Undo | Redo | LoadCommands | TryOut | Inspect | AskResiduals | AskG2o
-)
+Question = AskState | ApplyEdit | TryOut | Inspect | AskResiduals | AskG2o
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    target: Target
+    question: Question = field(default_factory=AskState)
+
+
+Request = AddKeyframe | Ask
+
+
+# --- what only the schedule is asked -------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class Undo:
+    """Take the last edit back."""
+
+
+@dataclass(frozen=True, slots=True)
+class Redo:
+    """Apply the edit again that was taken back last."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoadEdits:
+    """Replace all edits by these."""
+
+    edits: Edits
+
+
+UserRequest = ApplyEdit | Undo | Redo | LoadEdits | TryOut | Inspect | AskResiduals | AskG2o
 
 
 # --- replies -------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
+class Added:
+    """The back end now has this many keyframes."""
+
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
 class LoopState:
-    """Where the back end stands.
+    """The loops with a number of keyframes.
 
     Attributes:
-        count: keyframes. known: how many `GoTo` can go to. finished: whether `Finish` holds.
-        corrections: (count, 4, 4), T_map_odom at each keyframe: its T_map_imu is
-            corrections[i] @ T_odom_imu.
-        edges: all candidates as they count now, by keyframes; from another process without covariances. changed:
-            those of them that are new by this request, or have another verdict, weight or measurement.
-        undo, redo: commands in force and taken back; the last of each is the next one.
+        count: keyframes. finished: as in `Target`.
+        corrections: (count, 4, 4), T_map_odom at each keyframe: its T_map_imu is corrections[i] @ T_odom_imu.
+        edges: all candidates as they count now, by keyframes.
+        undo, redo: edits in force and taken back; the last of each is the next one.
+        acting: how many edits in force act already; one with a later `since` does not.
         notices: new since the last reply.
     """
 
     count: int
-    known: int
     finished: bool
     corrections: F64
     edges: tuple[LoopEdge, ...]
-    changed: tuple[LoopEdge, ...]
-    undo: tuple[LoopEdit, ...]
-    redo: tuple[LoopEdit, ...]
-    notices: tuple[str, ...]
+    undo: tuple[LoopEdit, ...] = ()
+    redo: tuple[LoopEdit, ...] = ()
+    acting: int = 0
+    notices: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """By `TryOut`: poses T_map_imu of all keyframes and residuals as they would be."""
+    """Poses T_map_imu of all keyframes and residuals, as they would be with the edit."""
 
-    command: LoopEdit
+    edit: LoopEdit
     preview: Preview
 
 
@@ -162,32 +177,29 @@ class Failure:
     text: str
 
 
-Reply = LoopState | Tried | Inspected | Residuals | G2o | Failure
-
-
-# --- who answers ---------------------------------------------------------------------------------
-class LoopWorkerDied(HemislamError):
-    """Whoever answered is gone, and what was pending with it; another one can be given the keyframes again."""
+Answer = LoopState | Tried | Inspected | Residuals | G2o | Failure
+Reply = Added | Answer
 
 
 class LoopClient(Protocol):
-    """Whoever answers: `app.slam.loops.service.InlineLoops`, or a process of its own (`app.mapping.loop_process`)."""
+    """Answers questions about a log of keyframes, which it follows: `InlineLoops`, or `app.mapping.loops`."""
 
     @property
-    def pending(self) -> int:
-        """Requests whose replies were not received yet."""
+    def catching_up(self) -> bool:
+        """Whether the back end has yet to be given many keyframes, so that a frame should not wait for it."""
 
-    def send(self, request: Request) -> None:
-        """Hand a request over. Never waits for the answer."""
+    def send(self, ask: Ask) -> None:
+        """Ask. Never waits for the answer."""
 
-    def receive(self, timeout: float | None = None) -> Reply | None:
-        """The answer to the oldest request that has none yet; None if there is none within the time (s).
+    def receive(self, timeout: float | None = None) -> Answer | None:
+        """The answer to the oldest question that has none yet; None if there is none within the time (s).
 
-        None at once if nothing is pending; `timeout` None waits as long as it takes.
-
-        Raises:
-            LoopWorkerDied: there will be no answer.
+        None at once if nothing was asked. With `timeout` None it waits; it returns None only when `catching_up`
+        begins.
         """
 
+    def take_alarms(self) -> list[str]:
+        """What went wrong with the work itself since the last call, in sentences."""
+
     def close(self) -> None:
-        """Give back what is held; pending requests are dropped."""
+        """Release all resources; unanswered questions are dropped."""

@@ -1,34 +1,30 @@
 """The loop back end behind one method, and the client that runs it in the caller's own process."""
 
 from collections import deque
-from collections.abc import Mapping
-
-import numpy as np
 
 from app.slam.errors import HemislamError
 from app.slam.loops.backend import LoopBackend
+from app.slam.loops.keyframe_log import Follower, KeyframeLog
 from app.slam.loops.messages import (
+    Added,
     AddKeyframe,
+    Answer,
     ApplyEdit,
+    Ask,
     AskG2o,
     AskResiduals,
     Failure,
-    Finish,
     G2o,
-    GoTo,
     Inspect,
     Inspected,
-    LoadCommands,
     LoopState,
-    Redo,
+    Question,
     Reply,
     Request,
     Residuals,
     Tried,
     TryOut,
-    Undo,
 )
-from app.slam.loops.types import LoopEdge, Pair
 
 
 class LoopService:
@@ -36,93 +32,80 @@ class LoopService:
 
     def __init__(self) -> None:
         self._backend = LoopBackend()
-        self._told: Mapping[Pair, LoopEdge] = {}
 
     def handle(self, request: Request) -> Reply:
-        """The answer. What can not be done gives a `Failure`, never an exception."""
+        """The answer. What cannot be done gives a `Failure`, never an exception."""
         try:
-            return self._handle(request)
+            return self.add(request) if isinstance(request, AddKeyframe) else self.answer(request)
         except HemislamError as error:
             return Failure(str(error))
+
+    def add(self, request: AddKeyframe) -> Added:
+        """Raises HemislamError if a keyframe before it is missing."""
+        backend = self._backend
+        backend.load(request.edits)
+        backend.go_to(min(request.keyframe.index, backend.known))
+        backend.add(request.keyframe, request.params)
+        return Added(len(backend))
+
+    def answer(self, ask: Ask) -> Answer:
+        """Raises HemislamError if it cannot be done."""
+        self._backend.stand(ask.target)
+        return self._answer(ask.question)
 
     def close(self) -> None:
         self._backend.close()
 
-    def _handle(self, request: Request) -> Reply:
+    def _answer(self, question: Question) -> Answer:
         backend = self._backend
-        match request:
-            case AddKeyframe(keyframe, params):
-                backend.add(keyframe, params)
-            case GoTo(count, forget):
-                backend.go_to(count)
-                if forget:
-                    backend.forget()
-            case Finish():
-                backend.finish()
-            case ApplyEdit(command):
-                backend.apply(command)
-            case Undo():
-                backend.undo()
-            case Redo():
-                backend.redo()
-            case LoadCommands(commands, redo):
-                backend.load(commands, redo)
-            case TryOut(command):
-                return Tried(command, backend.preview(command))
+        match question:
+            case TryOut(edit):
+                return Tried(edit, backend.preview(edit))
             case Inspect(older, newer):
                 return Inspected((older, newer), backend.detail(older, newer))
             case AskResiduals():
                 return Residuals(backend.factor_residuals())
             case AskG2o():
                 return G2o(backend.g2o())
-        return self._state()
-
-    def _state(self) -> LoopState:
-        backend = self._backend
-        edges = backend.by_pair
-        changed = tuple(edge for pair, edge in edges.items() if _differs(edge, self._told.get(pair)))
-        self._told = edges
+            case ApplyEdit(edit):
+                backend.apply(edit)
         corrections = backend.corrections
         corrections.setflags(write=False)
         return LoopState(
             count=len(backend),
-            known=backend.known,
             finished=backend.finished,
             corrections=corrections,
-            edges=tuple(edges.values()),
-            changed=changed,
-            undo=backend.commands,
-            redo=backend.undone,
+            edges=backend.edges,
+            undo=backend.edits.done,
+            redo=backend.edits.undone,
+            acting=backend.acting,
             notices=backend.take_notices(),
         )
 
 
 class InlineLoops:
-    """Answers at once, in this process."""
+    """A `LoopClient` that answers at once, in this process."""
 
-    def __init__(self) -> None:
+    catching_up = False
+
+    def __init__(self, log: KeyframeLog) -> None:
         self._service = LoopService()
-        self._replies: deque[Reply] = deque()
+        self._follower = Follower(log)
+        self._answers: deque[Answer] = deque()
 
-    @property
-    def pending(self) -> int:
-        return len(self._replies)
+    def send(self, ask: Ask) -> None:
+        while (keyframe := self._follower.next(ask.target)) is not None:
+            self._service.add(keyframe)
+        try:
+            self._answers.append(self._service.answer(ask))
+        except HemislamError as error:
+            self._answers.append(Failure(str(error)))
 
-    def send(self, request: Request) -> None:
-        self._replies.append(self._service.handle(request))
+    def receive(self, timeout: float | None = None) -> Answer | None:
+        return self._answers.popleft() if self._answers else None
 
-    def receive(self, timeout: float | None = None) -> Reply | None:
-        return self._replies.popleft() if self._replies else None
+    def take_alarms(self) -> list[str]:
+        return []
 
     def close(self) -> None:
         self._service.close()
-
-
-def _differs(edge: LoopEdge, before: LoopEdge | None) -> bool:
-    if edge is before:
-        return False
-    return (
-        before is None
-        or (edge.verdict, edge.weight) != (before.verdict, before.weight)
-        or not np.array_equal(edge.T_older_newer, before.T_older_newer)
-    )

@@ -5,13 +5,14 @@ so a list of edits can be replayed.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from app.slam.arrays import F32, F64
+from app.slam.errors import HemislamError
 
 LOOP_HUBER = 1.345
 """Whitened error from which a loop pulls with constant force (95 % efficient for a Gaussian)."""
@@ -236,6 +237,37 @@ class Solve:
 LoopEdit = Accept | Reject | SetWeight | Add | Solve
 
 
+@dataclass(frozen=True, slots=True)
+class Edits:
+    """The user's edits in force, in order, and those undone, of which the last is the next to redo."""
+
+    done: tuple[LoopEdit, ...] = ()
+    undone: tuple[LoopEdit, ...] = ()
+
+    def undo(self) -> "Edits":
+        """Raises HemislamError if there is nothing to undo."""
+        if not self.done:
+            raise HemislamError("There is no edit to undo.")
+        return Edits(self.done[:-1], (*self.undone, self.done[-1]))
+
+    def redo(self) -> "Edits":
+        """Raises HemislamError if there is nothing to redo."""
+        if not self.undone:
+            raise HemislamError("There is no edit to redo.")
+        return Edits((*self.done, self.undone[-1]), self.undone[:-1])
+
+    def cut(self, count: int, half: int) -> "Edits":
+        """The same after all keyframes but the first `count` were forgotten: edits go on acting.
+
+        Those that lost a keyframe (see `loses`) wait for another one.
+        """
+
+        def kept(edit: LoopEdit) -> LoopEdit:
+            return replace(edit, since=0 if loses(edit, count, half) else min(edit.since, count))
+
+        return Edits(tuple(map(kept, self.done)), tuple(map(kept, self.undone)))
+
+
 # --- what the inspector and the files show -------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class FactorResidual:
@@ -301,3 +333,9 @@ def pair_of(command: LoopEdit) -> Pair | None:
 def rows(T: F64) -> tuple[tuple[float, ...], ...]:
     """A matrix as a command holds it."""
     return tuple(tuple(float(value) for value in row) for row in np.asarray(T))
+
+
+def loses(edit: LoopEdit, count: int, half: int) -> bool:
+    """Whether an edit's submaps, of `half` keyframes on either side, reach beyond the first `count` keyframes."""
+    pair = pair_of(edit)
+    return pair is not None and pair[1] + half >= count

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.slam.loops.backend import LoopBackend
-from app.slam.loops.types import LoopEdge, LoopEdit, Verdict
+from app.slam.loops.types import Edits, LoopEdge, LoopEdit, Verdict
 from app.slam.params import LoopsParams
 from app.slam.types import F64, Keyframe
 from tests.slam.loops.walks import Walk, drive, take
@@ -55,7 +55,7 @@ class Walked:
 
     def again(self) -> LoopBackend:
         """The back end as it was at the end of the walk, whatever was done with it."""
-        self.backend.load(())
+        self.backend.load(Edits())
         self._walk_on(min(self.backend.known, len(self.keyframes)))
         if not same(self.backend.edges, self.edges[-1]):  # a test went another way
             self.backend.go_to(0)

@@ -1,76 +1,102 @@
+"""The loop back end as a function of the keyframes it was given and of the question."""
+
 import numpy as np
 import pytest
 
+from app.slam.keyframes import KeyframeStore
+from app.slam.loops.keyframe_log import KeyframeLog
 from app.slam.loops.messages import (
+    Added,
     AddKeyframe,
     ApplyEdit,
+    Ask,
     AskG2o,
     AskResiduals,
     Failure,
-    Finish,
     G2o,
-    GoTo,
     Inspect,
     Inspected,
-    LoadCommands,
     LoopState,
-    Redo,
-    Request,
+    Question,
     Residuals,
+    Target,
     Tried,
     TryOut,
-    Undo,
 )
 from app.slam.loops.service import InlineLoops, LoopService
-from app.slam.loops.types import Accept, Add, Reject, Solve, Verdict
-from tests.slam.loops.conftest import PARAMS, Walked
+from app.slam.loops.types import Accept, Add, Edits, Reject, Solve, Verdict, difference
+from tests.slam.loops.conftest import PARAMS, Walked, same
+
+ALL = 10_000
+"""As many keyframes as there are."""
 
 
 @pytest.fixture(scope="module")
 def service(walked: Walked) -> LoopService:
     service = LoopService()
     for keyframe in walked.keyframes:
-        state(service, AddKeyframe(keyframe, PARAMS))
+        assert service.handle(AddKeyframe(keyframe, PARAMS)) == Added(keyframe.index + 1)
     return service
 
 
-def state(service: LoopService, request: Request) -> LoopState:
-    reply = service.handle(request)
+def state(service: LoopService, target: Target, *question: Question) -> LoopState:
+    reply = service.handle(Ask(target, *question))
     assert isinstance(reply, LoopState), reply
     return reply
 
 
+def end(edits: Edits = Edits()) -> Target:  # noqa: B008 - a value
+    return Target(ALL, edits, finished=True)
+
+
 def test_corrections_take_odometry_to_the_map(walked: Walked, service: LoopService) -> None:
-    last = state(service, Finish())
+    last = state(service, end())
     assert last.finished
-    assert last.count == last.known == len(walked.keyframes)
+    assert last.count == len(walked.keyframes)
     odometry = np.array([keyframe.T_odom_imu for keyframe in walked.keyframes])
     np.testing.assert_allclose(last.corrections @ odometry, walked.poses[-1], atol=1e-9)
     assert not last.corrections.flags.writeable
-    assert LoopService()._state().corrections.shape == (0, 4, 4)
+    assert state(LoopService(), Target(0)).corrections.shape == (0, 4, 4)
 
 
-def test_what_changed_adds_up_to_all_edges(walked: Walked) -> None:
-    service, told = LoopService(), {}
+def test_the_same_question_has_the_same_answer_whatever_was_asked_before(walked: Walked, service: LoopService) -> None:
+    half = walked.halfway
+    edge = next(edge for edge in walked.edges[half - 1] if edge.verdict is Verdict.ACCEPTED)
+    targets = (Target(half), Target(half, Edits((Reject(*edge.pair),))), end(), Target(half + 1))
+    first = [state(service, target) for target in targets]
+    for target, before in reversed(list(zip(targets, first, strict=True))):
+        after = state(service, target)
+        assert (after.count, after.finished, after.undo) == (before.count, before.finished, before.undo)
+        assert after.corrections.tobytes() == before.corrections.tobytes()
+        assert same(after.edges, before.edges)
+    assert same(first[0].edges, walked.edges[half - 1])
+    assert same(first[2].edges, walked.edges[-1])
+
+
+def test_differences_of_states_add_up_to_all_edges(walked: Walked) -> None:
+    service, edges = LoopService(), {}
+    before: LoopState | None = None
     for keyframe in walked.keyframes:
-        now = state(service, AddKeyframe(keyframe, PARAMS))
-        told.update((edge.pair, edge.verdict) for edge in now.changed)
-        assert told == {edge.pair: edge.verdict for edge in now.edges}
-    assert Verdict.ACCEPTED in told.values()
+        service.handle(AddKeyframe(keyframe, PARAMS))
+        now = state(service, Target(ALL))
+        change = difference(before.edges if before else (), now.edges)
+        assert change.gone == ()
+        edges.update((edge.pair, edge.verdict) for edge in change.changed)
+        assert edges == {edge.pair: edge.verdict for edge in now.edges}
+        before = now
+    assert Verdict.ACCEPTED in edges.values()
     service.close()
 
 
-def test_questions_change_nothing(walked: Walked, service: LoopService) -> None:
-    before = state(service, Finish())
+def test_questions_change_nothing(service: LoopService) -> None:
+    before = state(service, end())
     edge = next(edge for edge in before.edges if edge.verdict is Verdict.ACCEPTED)
-    replies = [
-        service.handle(request)
-        for request in (TryOut(Reject(*edge.pair)), Inspect(*edge.pair), AskResiduals(), TryOut(Solve()), AskG2o())
-    ]
+    questions = (TryOut(Reject(*edge.pair)), Inspect(*edge.pair), AskResiduals(), TryOut(Solve()), AskG2o())
+    replies = [service.handle(Ask(end(), question)) for question in questions]
     assert [type(reply) for reply in replies] == [Tried, Inspected, Residuals, Tried, G2o]
     tried, inspected, residuals, solved, g2o = replies
     assert isinstance(tried, Tried)
-    assert tried.command == Reject(*edge.pair)
+    assert tried.edit == Reject(*edge.pair)
     assert isinstance(inspected, Inspected)
     assert inspected.pair == edge.pair
     assert isinstance(residuals, Residuals)
@@ -80,74 +106,86 @@ def test_questions_change_nothing(walked: Walked, service: LoopService) -> None:
     assert solved.preview.poses.shape == (before.count, 4, 4)
     assert isinstance(g2o, G2o)
     assert g2o.text.count("\nEDGE_SE3:QUAT") == before.count - 1 + loops
-    after = state(service, Finish())
+    after = state(service, end())
     assert after.corrections.tobytes() == before.corrections.tobytes()
     assert after.edges == before.edges
-    assert after.changed == after.undo == after.notices == ()
+    assert after.undo == after.notices == ()
 
 
-def test_overruling_is_answered_by_what_became_of_it(service: LoopService) -> None:
-    before = state(service, Finish())
+def test_an_edit_is_answered_by_what_became_of_it(service: LoopService) -> None:
+    before = state(service, end())
     edge = next(edge for edge in before.edges if edge.verdict is Verdict.ACCEPTED)
-    rejected = state(service, ApplyEdit(Reject(*edge.pair)))
-    assert [(e.pair, e.verdict) for e in rejected.changed] == [(edge.pair, Verdict.REJECTED)]
+    rejected = state(service, end(), ApplyEdit(Reject(*edge.pair)))
+    assert (edge.pair, Verdict.REJECTED) in {
+        (e.pair, e.verdict) for e in difference(before.edges, rejected.edges).changed
+    }
     assert rejected.undo == (Reject(*edge.pair),)
-    undone = state(service, Undo())
-    assert (undone.undo, undone.redo) == ((), rejected.undo)
+    assert rejected.undo[0].since == before.count + 1, "it acts from the end of the session on"
+    assert rejected.acting == 1
+    undone = state(service, end(Edits(rejected.undo).undo()))
+    assert (undone.undo, undone.redo, undone.acting) == ((), rejected.undo, 0)
     assert undone.corrections.tobytes() == before.corrections.tobytes()
-    redone = state(service, Redo())
+    redone = state(service, end(Edits(rejected.undo)))
     assert redone.corrections.tobytes() == rejected.corrections.tobytes()
-    loaded = state(service, LoadCommands(undone.undo, undone.redo))
-    assert (loaded.undo, loaded.redo) == ((), rejected.undo)
-    assert loaded.corrections.tobytes() == before.corrections.tobytes()
-    state(service, LoadCommands(()))
 
 
-def test_a_command_that_waits_says_so(service: LoopService) -> None:
-    assert state(service, ApplyEdit(Accept(1, 2))).notices == ("Accept 1-2 waits until there is such a loop.",)
-    assert state(service, Undo()).notices == ()
-    state(service, LoadCommands(()))
+def test_an_edit_that_waits_says_so(service: LoopService) -> None:
+    waiting = state(service, end(), ApplyEdit(Accept(1, 2)))
+    assert waiting.notices == ("Accept 1-2 waits until there is such a loop.",)
+    assert state(service, end()).notices == ()
 
 
-def test_what_can_not_be_done_is_said_and_nothing_has_changed(walked: Walked, service: LoopService) -> None:
-    before = state(service, Finish())
-    for request, text in [
-        (GoTo(10_000), "knows"),
-        (AddKeyframe(walked.keyframes[3], PARAMS), "can not follow"),
-        (Undo(), "no edit to undo"),
-        (Redo(), "no edit to redo"),
+def test_what_cannot_be_done_is_said_and_changes_nothing(walked: Walked, service: LoopService) -> None:
+    before = state(service, end())
+    questions: list[tuple[Question, str]] = [
         (ApplyEdit(Add(9, 2)), "older and a newer"),
-        (LoadCommands((Accept(9, 2),)), "older and a newer"),
         (TryOut(Accept(1, 2)), "no loop candidate"),
         (Inspect(0, 10_000), "of the"),
-    ]:
-        reply = service.handle(request)
+    ]
+    for question, text in questions:
+        reply = service.handle(Ask(end(), question))
         assert isinstance(reply, Failure)
         assert text in reply.text
-    after = state(service, Finish())
+    reply = service.handle(Ask(end(Edits((Accept(9, 2),)))))
+    assert isinstance(reply, Failure) and "older and a newer" in reply.text
+    few = LoopService()
+    reply = few.handle(AddKeyframe(walked.keyframes[3], PARAMS))
+    assert isinstance(reply, Failure) and "cannot follow" in reply.text
+    few.close()
+    after = state(service, end())
     assert (after.count, after.undo) == (before.count, before.undo)
     assert after.corrections.tobytes() == before.corrections.tobytes()
 
 
-def test_forgetting_keeps_the_first_keyframes(walked: Walked) -> None:
+def test_a_keyframe_at_a_known_index_replaces_it_and_all_later_ones_unless_it_is_the_same(walked: Walked) -> None:
     service = LoopService()
     for keyframe in walked.keyframes[:6]:
-        state(service, AddKeyframe(keyframe, PARAMS))
-    assert state(service, GoTo(4)).known == 6
-    assert state(service, GoTo(3, forget=True)).known == 3
-    assert isinstance(service.handle(GoTo(4)), Failure)
-    begun = state(service, GoTo(0, forget=True))
-    assert (begun.count, begun.known, begun.corrections.shape) == (0, 0, (0, 4, 4))
+        service.handle(AddKeyframe(keyframe, PARAMS))
+    assert service.handle(AddKeyframe(walked.keyframes[3], PARAMS)) == Added(4)
+    assert state(service, Target(ALL)).count == 6
+    other = PARAMS.model_copy(update={"min_time": PARAMS.min_time + 1})
+    service.handle(AddKeyframe(walked.keyframes[3], other))
+    assert state(service, Target(ALL)).count == 4
     service.close()
 
 
-def test_inline_answers_wait_in_order(walked: Walked) -> None:
-    loops = InlineLoops()
+def test_inline_loops_follow_the_log_and_answer_in_order(walked: Walked) -> None:
+    store = KeyframeStore()
+    log = KeyframeLog(store)
+    loops = InlineLoops(log)
     assert loops.receive() is None
     for keyframe in walked.keyframes[:3]:
-        loops.send(AddKeyframe(keyframe, PARAMS))
-    assert loops.pending == 3
-    replies = [loops.receive() for _ in range(3)]
-    assert [reply.count for reply in replies if isinstance(reply, LoopState)] == [1, 2, 3]
-    assert loops.pending == 0
+        store.append(keyframe)
+        log.append(keyframe.frame, keyframe.stamp_ns, PARAMS)
+        loops.send(Ask(Target(keyframe.index + 1)))
+    log.truncate(1)
+    store.truncate(1)
+    loops.send(Ask(Target(ALL)))
+    store.append(walked.keyframes[1])
+    log.append(walked.keyframes[1].frame, 0, PARAMS)
+    loops.send(Ask(Target(2)))
+    replies = [loops.receive() for _ in range(5)]
+    assert [reply.count for reply in replies if isinstance(reply, LoopState)] == [1, 2, 3, 3, 2]
+    assert loops.receive() is None
     loops.close()
+    store.close()

@@ -165,7 +165,7 @@ def test_rejecting_what_others_repeat_has_them_tie_poses_of_their_own(walked: Wa
     before = backend.poses
     backend.apply(Reject(*first))
     assert first not in ties(backend) and repeating <= set(ties(backend))
-    backend.undo()
+    backend.load(backend.edits.undo())
     np.testing.assert_array_equal(backend.poses, before)
     backend.apply(SetWeight(*max(repeating), 1.0))
     assert ties(backend).count(first) == len(repeating), "what the user has a word on ties poses of its own"
@@ -198,7 +198,7 @@ def test_what_was_found_beside_a_loop_by_hand_counts_by_itself_once_that_is_undo
     assert laid_over[made.pair] is made
     assert laid_over[loop(38).pair].represented_by == made.pair and not laid_over[loop(38).pair].counts
     assert laid_over[loop(34).pair].repeats is None, "the user's word is not to be outvoted"
-    edits.undo()
+    edits.load(edits.edits.undo())
     undone = edits.lay_over(found, len(POSES))
     assert all(edge.counts and edge.repeats is None for edge in undone.values())
     assert loop_factors(undone.values(), undone, POSES, window=0)
@@ -212,7 +212,7 @@ def test_who_stood_in_for_a_rejected_loop_hands_over_when_that_is_back() -> None
     edits.give(Entry(Reject(*first.pair)))
     rejected = edits.lay_over(found, len(POSES))
     assert rejected[second.pair].counts and rejected[third.pair].represented_by == second.pair
-    edits.undo()
+    edits.load(edits.edits.undo())
     back = edits.lay_over(found, len(POSES))
     assert [edge.represented_by for _, edge in sorted(back.items())] == [first.pair, first.pair, None]
 

@@ -1,0 +1,350 @@
+"""When what was found takes effect.
+
+The client looks for loops beside the frames, at its own speed. What it finds with a keyframe takes effect
+`loops.latency` frames after it, no sooner and no later, so the poses shown never depend on the speed of the machine.
+A frame waits only if an answer is late. What the user asks takes effect as soon as it is answered.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from app.slam.errors import HemislamError
+from app.slam.keyframes import KeyframeStore
+from app.slam.loops.files import LoopResults
+from app.slam.loops.keyframe_log import KeyframeLog
+from app.slam.loops.messages import (
+    Answer,
+    ApplyEdit,
+    Ask,
+    AskG2o,
+    AskState,
+    Failure,
+    G2o,
+    LoadEdits,
+    LoopClient,
+    LoopState,
+    Redo,
+    Target,
+    Undo,
+    UserRequest,
+)
+from app.slam.loops.types import Edits, LoopEdge, Verdict, difference
+from app.slam.map_frame import MapFrame
+from app.slam.params import LoopsParams
+from app.slam.types import Keyframe
+
+STATES: Final = 512
+"""States that are kept, so that going back need not solve the graph again."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Moment:
+    """A state of the session: its number of keyframes, and whether it ends there."""
+
+    count: int
+    finished: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """A question without an answer yet.
+
+    Attributes:
+        user: the user waits for it. edits: it changes the edits.
+        version: of the keyframe log. visit: counts how often the session had gone to another frame.
+    """
+
+    ask: Ask
+    user: bool
+    edits: bool
+    version: int
+    visit: int
+
+    @property
+    def moment(self) -> Moment:
+        return Moment(self.ask.target.count, self.ask.target.finished)
+
+
+class _Finish:
+    """The session has ended."""
+
+
+class LoopSchedule:
+    """The loops of one session, as they count at its newest frame.
+
+    Args:
+        client: makes the client that follows a log of keyframes and looks for loops.
+        keyframes: of the session.
+        params: in force at the start. `latency` is read only here.
+
+    Attributes:
+        state: in effect; None before the first. frame: where that lays odometry in the map.
+    """
+
+    def __init__(
+        self, client: Callable[[KeyframeLog], LoopClient], keyframes: KeyframeStore, params: LoopsParams
+    ) -> None:
+        self.state: LoopState | None = None
+        self.frame = MapFrame()
+        self._log = KeyframeLog(keyframes)
+        self._client = client(self._log)
+        self._params = self._start = params
+        self._edits = Edits()
+        self._acting = 0  # how many of them act already
+        self._finished = False
+        self._most_states = STATES
+        self._states: dict[Moment, LoopState] = {}  # with the present edits
+        self._wanted = Moment(0)  # what should be in effect
+        self._shown: Moment | None = self._wanted  # what is; None if that is with other edits
+        self._asked: deque[_Asked] = deque()
+        self._requests: deque[UserRequest | _Finish] = deque()  # of the user, not yet sent
+        self._visit = 0
+        self._reported: tuple[LoopEdge, ...] | None = ()  # candidates at the frame before; None after going elsewhere
+        self._answers: list[Answer] = []
+        self._notices: list[str] = []
+        self._said: set[str] = set()
+
+    # --- the session -----------------------------------------------------------------------------
+    def due(self, frame: int) -> tuple[LoopEdge, ...]:
+        """Put into effect what is due before this frame is processed, and wait for it if it is late.
+
+        Returns:
+            Candidates that are new since the frame before or have another verdict.
+        """
+        self._wait_for_wanted()
+        if self._reported is None:
+            self._reported = self.edges
+        due = min(self._log.until(frame - self._start.latency), self._log.count)
+        if due > self._wanted.count:
+            self._wanted = Moment(due)
+            self._wait_for_wanted()
+        self.poll()
+        before, self._reported = self._reported, self.edges
+        if before is self._reported:
+            return ()
+        verdicts = {edge.pair: edge.verdict for edge in before}
+        changed = difference(before, self._reported).changed
+        return tuple(edge for edge in changed if verdicts.get(edge.pair) is not edge.verdict)
+
+    def add(self, keyframe: Keyframe, params: LoopsParams) -> None:
+        """The session has a new keyframe, or comes to a known one again."""
+        self._finished, self._params = False, params
+        if not self._log.holds(keyframe):
+            self._forget(keyframe.index)
+            self._log.append(keyframe.frame, keyframe.stamp_ns, params)
+        self._ask_next()
+
+    def go_to(self, frame: int) -> None:
+        """The session went to another frame: `frame` is the next.
+
+        Never waits; the state follows with the next frame or `poll`.
+        """
+        self._finished = False
+        self._visit += 1
+        self._requests = deque(request for request in self._requests if not isinstance(request, _Finish))
+        self._log.take_stored(self._params)
+        self._wanted = Moment(min(self._log.until(frame - 1 - self._start.latency), self._log.count))
+        self._reported = None
+        if self._editing:
+            self._forget_states()
+        else:  # states from before an edit began to act are of the past
+            self._states = {moment: state for moment, state in self._states.items() if state.acting == self._acting}
+        if self._wanted.count == 0 and not self._editing:
+            self._states.setdefault(self._wanted, self._empty())
+        self._ask_next()
+        self._take_wanted()
+
+    def forget_after(self, frame: int) -> None:
+        """Keyframes after this frame will be different ones."""
+        self._forget(max(self._log.until(frame), self._log.count))
+
+    def never_go_back(self) -> None:
+        """The session only goes on, so no past states are kept."""
+        self._most_states = 0
+
+    def finish(self) -> None:
+        """The session has ended: look for loops at the last keyframes too, and put all that comes into effect."""
+        self._finished = True
+        self._requests.append(_Finish())
+        self._ask_next()
+
+    def wait_ready(self) -> None:
+        """Wait until the client answers, so that no frame has to: a process takes a second to start."""
+        self._ask(Ask(Target(0, self._edits)))
+        self._settle()
+
+    # --- the user --------------------------------------------------------------------------------
+    def command(self, request: UserRequest) -> None:
+        """Ask on behalf of the user; `poll` until it is `idle` brings the answer."""
+        self._requests.append(request)
+        self._ask_next()
+
+    def poll(self) -> None:
+        """Take in what has been answered, without waiting."""
+        while self._asked and self._receive(0.0):
+            pass
+        self._take_wanted()
+
+    @property
+    def idle(self) -> bool:
+        """Whether every question of the user was answered and the state is that of this frame."""
+        if self._requests or any(asked.user for asked in self._asked):
+            return False
+        return self._shown == self._wanted or not self._asked
+
+    # --- what there is ---------------------------------------------------------------------------
+    @property
+    def edges(self) -> tuple[LoopEdge, ...]:
+        """All candidates in effect."""
+        return self.state.edges if self.state is not None else ()
+
+    @property
+    def accepted(self) -> int:
+        """Loops that count now."""
+        return sum(edge.verdict is Verdict.ACCEPTED for edge in self.edges)
+
+    def take_notices(self) -> list[str]:
+        """What the user should know, in sentences, since the last call."""
+        taken, self._notices = self._notices, []
+        return taken
+
+    def take_alarms(self) -> list[str]:
+        """What went wrong with the work itself since the last call; it is no part of the session."""
+        return self._client.take_alarms()
+
+    def take_answers(self) -> list[Answer]:
+        """Answers to the user's questions since the last call."""
+        taken, self._answers = self._answers, []
+        return taken
+
+    def results(self) -> LoopResults:
+        """All that is written of loops, with all keyframes so far, whether in effect or not. Waits for it."""
+        self.command(AskG2o())
+        self._settle()
+        state = self._states.get(Moment(self._log.count, self._finished), self.state)
+        texts = [answer.text for answer in self._answers if isinstance(answer, G2o)]
+        self._answers = [answer for answer in self._answers if not isinstance(answer, G2o)]
+        frame, edges = (MapFrame(), ()) if state is None else (self._lay(state), state.edges)
+        return LoopResults(frame, self._log.stamps_ns(self._log.count), edges, texts[-1] if texts else "")
+
+    def close(self) -> None:
+        self._client.close()
+
+    # --- asking ----------------------------------------------------------------------------------
+    @property
+    def _editing(self) -> bool:
+        """Whether the edits that hold are not known until an answer comes."""
+        return any(asked.edits for asked in self._asked)
+
+    def _ask_next(self) -> None:
+        """Send what can be asked with the edits that are known: the user's requests, then states that are lacking."""
+        while self._requests and not self._editing:
+            self._ask_for_user(self._requests.popleft())
+        if self._editing:
+            return
+        outstanding = {asked.moment for asked in self._asked}
+        for moment in (self._wanted, *map(Moment, range(self._wanted.count + 1, self._log.count + 1))):
+            if moment != self._shown and moment not in self._states and moment not in outstanding:
+                self._ask(Ask(Target(moment.count, self._edits, moment.finished)))
+
+    def _ask_for_user(self, request: UserRequest | _Finish) -> None:
+        target = Target(self._log.count, self._edits, self._finished)
+        try:
+            match request:
+                case Undo():
+                    self._ask(Ask(replace(target, edits=self._edits.undo())), user=True, edits=True)
+                case Redo():
+                    self._ask(Ask(replace(target, edits=self._edits.redo())), user=True, edits=True)
+                case LoadEdits(edits):
+                    self._ask(Ask(replace(target, edits=edits)), user=True, edits=True)
+                case ApplyEdit():
+                    self._ask(Ask(target, request), user=True, edits=True)
+                case _Finish():
+                    self._ask(Ask(target, AskState()), user=True)
+                case _:
+                    self._ask(Ask(target, request), user=True)
+        except HemislamError as error:
+            self._answers.append(Failure(str(error)))
+
+    def _ask(self, ask: Ask, *, user: bool = False, edits: bool = False) -> None:
+        self._asked.append(_Asked(ask, user, edits, self._log.version, self._visit))
+        self._client.send(ask)
+
+    # --- answers ---------------------------------------------------------------------------------
+    def _settle(self) -> None:
+        """Wait until everything is answered."""
+        while self._asked or self._requests:
+            self._receive(None)
+
+    def _wait_for_wanted(self) -> None:
+        self._take_wanted()
+        while self._shown != self._wanted and self._asked and not self._client.catching_up and self._receive(None):
+            self._take_wanted()
+
+    def _receive(self, timeout: float | None) -> bool:
+        """Take in one answer; whether there was one."""
+        answer = self._client.receive(timeout)
+        if answer is None:
+            return False
+        asked = self._asked.popleft()
+        if isinstance(answer, LoopState):
+            self._learn(asked, answer)
+        elif asked.user:
+            self._answers.append(answer)
+        elif isinstance(answer, Failure):
+            if answer.text not in self._said:
+                self._said.add(answer.text)
+                self._notices.append(answer.text)
+            return True  # asked again when a keyframe comes, not at once
+        self._ask_next()
+        return True
+
+    def _learn(self, asked: _Asked, state: LoopState) -> None:
+        self._notices += state.notices
+        if asked.edits:
+            self._edits = Edits(state.undo, state.redo)
+            if state.count > len(self._log):
+                self._edits = self._edits.cut(len(self._log), self._start.submap_keyframes)
+            self._forget_states()
+        self._acting = state.acting
+        if self._log.keep(asked.version, state.count) < state.count:
+            return  # of keyframes that were replaced since
+        moment = Moment(state.count, state.finished)
+        self._states[moment] = state
+        if asked.user and asked.visit == self._visit and moment >= self._wanted:
+            self._wanted = moment
+            self._put(state)
+        past = [moment for moment in self._states if moment < self._wanted]
+        for moment in past[: max(0, len(self._states) - self._most_states)]:
+            del self._states[moment]
+
+    def _take_wanted(self) -> None:
+        if self._shown != self._wanted and (state := self._states.get(self._wanted)) is not None:
+            self._put(state)
+
+    def _put(self, state: LoopState) -> None:
+        """Put a state into effect."""
+        self._shown, self.state, self.frame = self._wanted, state, self._lay(state)
+
+    def _forget(self, count: int) -> None:
+        """Keep the first `count` keyframes."""
+        if count < len(self._log):
+            self._log.truncate(count)
+            self._edits = self._edits.cut(count, self._start.submap_keyframes)
+            self._states = {moment: state for moment, state in self._states.items() if moment.count <= count}
+
+    def _forget_states(self) -> None:
+        self._states, self._shown = {}, None
+
+    def _empty(self) -> LoopState:
+        """The answer for no keyframes, so that nobody waits for it."""
+        return LoopState(0, False, np.empty((0, 4, 4)), (), self._edits.done, self._edits.undone)
+
+    def _lay(self, state: LoopState) -> MapFrame:
+        if (state.corrections == np.eye(4)).all():
+            return self.frame if not len(self.frame.T_map_odom) else MapFrame()
+        return MapFrame(self._log.stamps_ns(state.count), state.corrections)

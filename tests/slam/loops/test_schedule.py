@@ -1,0 +1,143 @@
+"""What was found takes effect at a frame that depends on nothing but the session."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from app.slam.loops.messages import ApplyEdit, Failure, LoadEdits, Redo, Undo
+from app.slam.loops.types import Accept, Edits
+from tests.slam.loops.held_session import LATENCY, HeldSession, shift_at
+
+
+@pytest.fixture
+def session() -> Iterator[HeldSession]:
+    session = HeldSession()
+    yield session
+    session.store.close()
+
+
+@pytest.mark.parametrize("speed", [0, 1, 100])
+def test_a_loop_takes_effect_at_its_frame_however_fast_the_work_is(session: HeldSession, speed: int) -> None:
+    for frame in range(40):
+        session.worker.answered = speed
+        news, shift = session.step()
+        assert shift == shift_at(frame)
+        assert [e.newer for e in news] == ([shift - 1] if shift != shift_at(frame - 1) else [])
+    assert bool(session.worker.waits) == (speed == 0)
+
+
+@pytest.mark.parametrize("frame", [1, 7, 20, 28])
+def test_gone_back_and_on_again_every_frame_is_as_it_was(session: HeldSession, frame: int) -> None:
+    before = [session.step() for _ in range(30)]
+    sent = len(session.worker.added)
+    session.go_to(frame)
+    again = [session.step() for _ in range(frame, 30)]
+    assert [shift for _, shift in again] == [shift for _, shift in before[frame:]]
+    assert [len(news) for news, _ in again[1:]] == [len(news) for news, _ in before[frame + 1 :]]
+    assert len(session.worker.added) == sent, "known keyframes are not sent twice"
+
+
+def test_a_step_back_never_waits(session: HeldSession) -> None:
+    session.worker.answered = 100
+    shifts = [session.step()[1] for _ in range(30)]
+    session.loops.poll()
+    waits = session.worker.waits
+    for frame in range(28, 15, -1):
+        session.go_to(frame)
+        assert session.shift == shift_at(frame - 1)
+        assert session.step()[1] == shifts[frame]
+    assert session.worker.waits == waits
+
+
+@pytest.mark.parametrize("frame", [0, 1, LATENCY, LATENCY + 1])
+def test_before_the_first_loop_counts_the_worker_is_not_asked(session: HeldSession, frame: int) -> None:
+    """It may still be busy with the end of the session."""
+    for _ in range(30):
+        session.worker.answered = 10
+        session.step()
+    session.loops.finish()
+    waits, asked = session.worker.waits, len(session.worker.requests)
+    session.go_to(frame)
+    assert session.shift == shift_at(frame - 1)
+    assert session.step()[1] == shift_at(frame)
+    assert (session.worker.waits, len(session.worker.requests)) == (waits, asked)
+
+
+def test_an_edit_made_just_before_going_back_is_not_lost(session: HeldSession) -> None:
+    for _ in range(30):
+        session.step()
+    session.loops.command(ApplyEdit(Accept(0, 2)))
+    session.go_to(20)
+    session.step()
+    assert session.loops.state is not None and session.loops.state.undo == (Accept(0, 2),)
+    assert session.shift == shift_at(20)
+
+
+def test_a_session_that_goes_on_differently_sends_its_keyframes_anew(session: HeldSession) -> None:
+    for _ in range(30):
+        session.step()
+    session.go_to(10)
+    session.loops.forget_after(9)
+    session.worker.added.clear()
+    for _ in range(10, 20):
+        session.step()
+    assert session.worker.added == [4, 5, 6]
+
+
+def test_an_edit_takes_effect_when_it_is_answered_and_holds(session: HeldSession) -> None:
+    for _ in range(10):
+        session.step()
+    session.loops.command(ApplyEdit(Accept(0, 2)))
+    assert not session.loops.idle
+    session.until_idle()
+    assert session.loops.state is not None
+    assert session.loops.state.undo == (Accept(0, 2),)
+    assert session.shift == len(session.store), "an edit acts on all there is"
+    for _ in range(20):
+        session.step()
+    assert session.loops.state.undo == (Accept(0, 2),)
+
+
+def test_edits_given_without_waiting_are_applied_in_their_order(session: HeldSession) -> None:
+    for request in (ApplyEdit(Accept(0, 1)), ApplyEdit(Accept(0, 2)), Undo(), Undo(), Redo()):
+        session.loops.command(request)
+        session.step()
+    session.until_idle()
+    assert session.loops.state is not None
+    assert (session.loops.state.undo, session.loops.state.redo) == ((Accept(0, 1),), (Accept(0, 2),))
+    session.loops.command(LoadEdits(Edits()))
+    session.loops.command(Undo())
+    session.until_idle()
+    assert session.loops.take_answers() == [Failure("There is no edit to undo.")]
+
+
+def test_keyframes_that_come_while_an_edit_is_applied_are_looked_at_with_it(session: HeldSession) -> None:
+    for _ in range(4):
+        session.step()
+    session.loops.command(ApplyEdit(Accept(0, 1)))
+    for _ in range(6):
+        session.step()
+    session.until_idle()
+    later = [request for request in session.worker.requests if getattr(request, "keyframe", None) is not None][2:]
+    assert later and all(getattr(request, "edits", None) == Edits((Accept(0, 1),)) for request in later)
+
+
+def test_results_hold_all_keyframes_whether_in_effect_or_not(session: HeldSession) -> None:
+    for _ in range(20):
+        session.step()
+    assert session.shift < 7
+    results = session.loops.results()
+    assert results.frame.newest[0, 3] == len(results.stamps_ns) == 7
+    assert results.g2o == "graph of 7"
+    session.loops.finish()
+    session.loops.results()
+    assert session.loops.state is not None and session.loops.state.finished
+    assert session.shift == 7, "at its end all takes effect"
+
+
+def test_a_session_that_never_goes_back_keeps_no_past_states(session: HeldSession) -> None:
+    session.loops.never_go_back()
+    for frame in range(60):
+        session.worker.answered = 10
+        assert session.step()[1] == shift_at(frame)
+    assert len(session.loops._states) <= LATENCY
