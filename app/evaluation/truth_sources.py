@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from app.evaluation.truth import TruePoses, check
 from app.sensors.source import Source
 from app.slam.errors import HemislamError
+from app.slam.text_tables import as_numbers, read_rows
 from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import F64, I64
 
@@ -64,7 +65,7 @@ def _read_file(path: Path) -> TruePoses:
     Raises:
         HemislamError: it cannot be read, or is none of the formats, or holds NaN.
     """
-    rows = _rows(path, _FORMATS)
+    rows = read_rows(path, _FORMATS)
     if rows and rows[0][1][0].lower().startswith("gpstime"):
         rows = rows[1:]  # the table's heading
     if not rows:
@@ -74,41 +75,10 @@ def _read_file(path: Path) -> TruePoses:
         trajectory = read_tum(path)
         return TruePoses(f"The truth {path}", "TUM", trajectory.stamps_ns, trajectory.positions, trajectory.quaternions)
     if columns == 12:
-        return _kitti(path, _numbers(path, rows, 12))
+        return _kitti(path, as_numbers(path, rows, 12, _FORMATS))
     if columns == GNSS_COLUMNS:
-        return _gnss(path, _numbers(path, rows, GNSS_COLUMNS))
+        return _gnss(path, as_numbers(path, rows, GNSS_COLUMNS, _FORMATS))
     raise HemislamError(f"{path}, line {rows[0][0]} has {columns} columns; {_FORMATS}.")
-
-
-def _rows(path: Path, should: str) -> list[tuple[int, list[str]]]:
-    """Number and words of each line that is not empty, less comments.
-
-    Args:
-        should: how such a file is to be, for the sentence about one that is no text.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise HemislamError(f"The truth {path} is not a text file; {should}.") from None
-    except OSError as error:
-        raise HemislamError(f"The truth {path} cannot be read: {error.strerror}; check the path.") from None
-    rows = [(number, line.partition("#")[0].split()) for number, line in enumerate(lines, 1)]
-    return [(number, words) for number, words in rows if words]
-
-
-def _numbers(path: Path, rows: list[tuple[int, list[str]]], columns: int) -> F64:
-    """(n, columns). Raises HemislamError naming the line that is not so many finite numbers."""
-    table = np.empty((len(rows), columns))
-    for index, (number, words) in enumerate(rows):
-        if len(words) != columns:
-            raise HemislamError(f"{path}, line {number} has {len(words)} columns, the first has {columns}; mend it.")
-        try:
-            table[index] = [float(word) for word in words]
-        except ValueError:
-            raise HemislamError(f"{path}, line {number} holds something that is not a number; remove it.") from None
-        if not np.isfinite(table[index]).all():
-            raise HemislamError(f"{path}, line {number} holds NaN or infinity; remove the line.")
-    return table
 
 
 def _kitti(path: Path, table: F64) -> TruePoses:
@@ -134,13 +104,10 @@ def _kitti(path: Path, table: F64) -> TruePoses:
 
 
 def _times(path: Path, poses: int) -> I64:
-    should = "it holds one time a line, in seconds"
-    rows = _rows(path, should)
-    if odd := next((number for number, words in rows if len(words) != 1), None):
-        raise HemislamError(f"{path}, line {odd} is no time; {should}.")
-    seconds = _numbers(path, rows, 1)[:, 0]
+    layout = "it holds one time per line, in seconds"
+    seconds = as_numbers(path, read_rows(path, layout), 1, layout)[:, 0]
     if len(seconds) != poses:
-        raise HemislamError(f"{path} holds {len(seconds)} times for {poses} poses; there must be one a pose.")
+        raise HemislamError(f"{path} holds {len(seconds)} times for {poses} poses; there must be one per pose.")
     return np.rint(seconds * 1e9).astype(np.int64)
 
 

@@ -1,7 +1,7 @@
 """Poses over time and their TUM text files, `stamp x y z qx qy qz qw` with stamps in seconds."""
 
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from app.slam.errors import HemislamError
+from app.slam.text_tables import as_numbers, read_rows
 from app.slam.types import F64, I64
 
 
@@ -64,59 +65,35 @@ class Trajectory:
         return cls(np.asarray(stamps_ns, dtype=np.int64), matrices[:, :3, 3].copy(), quaternions)
 
 
+_LAYOUT = "a trajectory holds lines of `stamp x y z qx qy qz qw`"
+
+
 def read_tum(path: Path) -> Trajectory:
-    """Read `stamp x y z qx qy qz qw` lines; `#` begins a comment.
+    """Read `stamp x y z qx qy qz qw` lines; `#` begins a comment. Stamps are exact to the last digit written.
 
     Raises:
-        HemislamError: the file can not be read, a line is not eight finite numbers, a quaternion
-            has no unit length, time does not increase, or there are fewer than 3 poses.
+        HemislamError: the file cannot be read, a line is not eight finite numbers, a quaternion has no unit length,
+            time does not increase, or there are fewer than 3 poses.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise HemislamError(
-            f"{path} is not a text file; a trajectory holds lines of `stamp x y z qx qy qz qw`."
-        ) from None
-    except OSError as error:
-        raise HemislamError(f"The trajectory {path} can not be read: {error.strerror}.") from None
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(lines, start=1):
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
-        stamp, row = _parse_line(words, f"{path}, line {number}")
-        if stamps and stamp <= stamps[-1]:
-            raise HemislamError(
-                f"{path}, line {number}: the time does not increase; sort the file by time and remove doubles."
-            )
-        stamps.append(stamp)
-        rows.append(row)
+    rows = read_rows(path, _LAYOUT)
+    table = as_numbers(path, rows, 8, _LAYOUT)
     if len(rows) < 3:
         raise HemislamError(f"{path} holds {count_text(len(rows))}, but at least 3 are needed to compare a trajectory.")
-    table = np.array(rows, dtype=np.float64)
-    quaternions = table[:, 3:] / np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
-    return Trajectory(np.array(stamps, dtype=np.int64), table[:, :3].copy(), quaternions)
-
-
-def _parse_line(words: list[str], where: str) -> tuple[int, list[float]]:
-    """The stamp in ns, exact to the last digit written, and the seven other numbers."""
-    if len(words) != 8:
-        raise HemislamError(f"{where} has {len(words)} columns, not the 8 of `stamp x y z qx qy qz qw`.")
-    try:
-        seconds = Decimal(words[0])
-        row = [float(word) for word in words[1:]]
-    except (InvalidOperation, ValueError):
-        raise HemislamError(f"{where} holds a word that is not a number; write `stamp x y z qx qy qz qw`.") from None
-    if not (seconds.is_finite() and np.isfinite(row).all()):
-        raise HemislamError(f"{where} holds NaN or infinity; remove the line.")
-    if abs(seconds) >= Decimal(2**63).scaleb(-9):
-        raise HemislamError(f"{where}: the stamp {words[0]} is not in seconds; divide the first column.")
-    if abs(np.linalg.norm(row[3:]) - 1) > 0.01:
+    if (beyond := np.abs(table[:, 0]) >= 2**63 * 1e-9).any():
+        number, words = rows[int(np.argmax(beyond))]
+        raise HemislamError(f"{path}, line {number}: the stamp {words[0]} is not in seconds; divide the first column.")
+    lengths = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
+    if (odd := np.abs(lengths[:, 0] - 1) > 0.01).any():
         raise HemislamError(
-            f"{where}: the last four columns are no unit quaternion; their order must be `stamp x y z qx qy qz qw`."
+            f"{path}, line {rows[int(np.argmax(odd))][0]}: the last four columns are not a unit quaternion; {_LAYOUT}."
         )
-    return int(seconds.scaleb(9).to_integral_value()), row
+    stamps_ns = np.array([int(Decimal(words[0]).scaleb(9).to_integral_value()) for _, words in rows], dtype=np.int64)
+    if (late := np.diff(stamps_ns) <= 0).any():
+        number = rows[int(np.argmax(late)) + 1][0]
+        raise HemislamError(
+            f"{path}, line {number}: the time does not increase; sort the file by time and remove duplicates."
+        )
+    return Trajectory(stamps_ns, table[:, 1:4].copy(), table[:, 4:] / lengths)
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:

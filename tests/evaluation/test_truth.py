@@ -96,8 +96,8 @@ def test_kitti_poses_belong_to_frames_or_to_the_times_beside_them(tmp_path: Path
 @pytest.mark.parametrize(
     ("times", "says"),
     [
-        (b"\xff\xfe\x00", "times.txt is not a text file; it holds one time a line"),
-        (b"# s\n0.0 0\n0.1 1\n0.2 2\n", "line 2 is no time"),
+        (b"\xff\xfe\x00", "times.txt is not a text file; it holds one time per line"),
+        (b"# s\n0.0 0\n0.1 1\n0.2 2\n", "line 2 has 2 columns, not 1"),
         (b"0.0\n0.1\n", "holds 2 times for 3 poses"),
     ],
 )
@@ -232,7 +232,7 @@ GOOD = "1700000000.{} {} 0 0 0 0 0 1"
         (["1 2 3"], "line 1 has 3 columns; TUM has 8 columns"),
         (["1 0 0 0 0 1 0 0 0 0 1", "x"], "line 1 has 11 columns"),
         (["1 0 0 0 0 1 0 0 0 0 1 0"], "holds 1 poses; at least 3"),
-        (["1 0 0 0 0 1 0 0 0 0 1 0", "1 0 0"], "line 2 has 3 columns, the first has 12"),
+        (["1 0 0 0 0 1 0 0 0 0 1 0", "1 0 0"], "line 2 has 3 columns, not 12"),
         (["1 0 0 0 0 1 0 0 0 0 nan 0"] * 3, "line 1 holds NaN"),
         (["2 0 0 0 0 1 0 0 0 0 1 0"] * 3, "pose 1: the left 3x3 of its 3x4 matrix is no rotation"),
         (["-5 " + "0 " * 12] * 3, "not in seconds of the GPS week"),

@@ -214,7 +214,7 @@ def test_a_bad_truth_file_is_refused_in_one_sentence(tmp_path: Path, text: str, 
 
 
 def test_a_missing_or_binary_truth_file_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(HemislamError, match=r"none\.tum can not be read"):
+    with pytest.raises(HemislamError, match=r"none\.tum cannot be read"):
         read_tum(tmp_path / "none.tum")
     (tmp_path / "cloud.pcd").write_bytes(b"\xff\xfe\x00\x81" * 10)
     with pytest.raises(HemislamError, match="not a text file"):
