@@ -80,7 +80,7 @@ def _states(limits: Breakpoints, moment: Moment) -> dict[str, str]:
     if limits.residual is not None and update.residual_rms > limits.residual:
         held["residual"] = f"The residual is {1e3 * update.residual_rms:.1f} mm, over {1e3 * limits.residual:g} mm."
     if limits.degenerate and update.degenerate:
-        held["degenerate"] = f"Degenerate: {update.reason or 'one direction is not held by this scan'}."
+        held["degenerate"] = f"Degenerate: {update.reason or 'this scan leaves one direction unobserved'}."
     if limits.frame_ms is not None and took > limits.frame_ms:
         held["frame_ms"] = f"The frame took {took:.1f} ms, over {limits.frame_ms:g} ms."
     if limits.error is not None and moment.error > limits.error:

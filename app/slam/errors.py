@@ -1,8 +1,8 @@
-"""The one error that users are meant to read."""
+"""The one error that users read."""
 
 
 class HemislamError(Exception):
-    """Something the user gave us can not be used.
+    """Something that the user gave cannot be used.
 
     The message is one sentence that says what is wrong, where, and what to do. The command line
     prints it and exits with code 2; the page shows it as a notification and the session goes on.

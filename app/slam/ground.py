@@ -7,7 +7,7 @@ from app.slam.params import GroundParams
 from app.slam.types import F32, F64, NON_GROUND, U8, U16, GroundResult
 
 MIN_SEEDS = 20
-"""Fewer seeds than this do not make a plane worth believing."""
+"""Least number of seeds for a plane."""
 
 
 def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundResult:
@@ -19,8 +19,7 @@ def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundRe
         down: (3,) direction of gravity in the LiDAR frame.
 
     Returns:
-        Labels and the plane; without an acceptable plane every label is NON_GROUND and `reason`
-        says why.
+        Labels and the plane. Without an acceptable plane every label is NON_GROUND, and `reason` says why.
     """
     labels = np.zeros(len(points), dtype=np.uint8)
     down = down / np.linalg.norm(down)

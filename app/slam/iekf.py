@@ -16,21 +16,21 @@ from app.slam.types import F32, F64, Matches, NavState, Registration
 
 RESEARCH_ROTATION = 1e-3
 RESEARCH_TRANSLATION = 1e-2
-"""rad, m: planes are searched again only where the state moved by more than this since."""
+"""rad, m: planes are searched again once the state moved by more than this."""
 CONVERGED_ROTATION = 1e-5
 CONVERGED_TRANSLATION = 1e-4
 """rad, m: an increment below these ends the iteration."""
 MIN_INLIERS = 30
-"""Fewer planes than this do not make an update; the prediction stands."""
+"""Least number of planes for an update; with fewer the prediction stands."""
 ENOUGH_PLANES, RELAXED = 50, 4.0
-"""Where fewer planes than this are found, ones of so many times the allowed tilt are taken too: in
-clutter at arm's length no patch is wide enough for a better normal, and poor planes beat none."""
+"""If fewer planes than this are found, planes of RELAXED times the allowed tilt are used too: in clutter at
+arm's length no patch is wide enough for a better normal, and poor planes are better than none."""
 DEGENERATE_SIGMA = 0.05
-"""m (rotation: rad times the points' typical range): a direction that one scan alone leaves
-more uncertain than this is called degenerate."""
+"""m (rotation: rad times the RMS range of the points): a direction that one scan alone leaves more
+uncertain than this is degenerate."""
 
 NAVIGATION = 17
-"""Error dimensions without the extrinsics, which come last and stay as they are unless estimated."""
+"""Error dimensions without the extrinsics, which come last and are fixed unless estimated."""
 
 
 def boxplus(x: NavState, d: F64) -> NavState:
@@ -67,8 +67,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
         points: (n, 3) float32 m, LiDAR frame, deskewed to the scan's end.
 
     Returns:
-        The posterior belief, or the prior as it was where too few points found a plane; and how
-        the update went.
+        The posterior belief, or the unchanged prior if too few points found a plane; and how the update went.
     """
     n = len(points)
     free = DIM if params.estimate_extrinsics else NAVIGATION
@@ -118,12 +117,12 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
         residual_rms=float(np.sqrt(stats[1] / stats[0])),
         eigenvalues=eigenvalues,
         degenerate=degenerate,
-        reason="one direction is not held by this scan" if degenerate else "",
+        reason="this scan leaves one direction unobserved" if degenerate else "",
         matches=_matches(points, residuals, planes),
     )
     posterior = prior.covariance.copy()
     posterior[:free, :free] = covariance
-    # what is not estimated keeps its variance, and its correlation shrinks with the rest (Schmidt 1966)
+    # states that are not estimated keep their variance, and their correlations shrink with the rest (Schmidt 1966)
     posterior[:free, free:] = covariance @ information @ prior.covariance[:free, free:]
     posterior[free:, :free] = posterior[:free, free:].T
     return Belief(_unpacked(x, prior.state.stamp_ns), posterior), registration
@@ -141,5 +140,5 @@ def _matches(points: F32, residuals: F64, planes: Planes) -> Matches:
 
 
 def _over(step: F64, rotation: float, translation: float) -> bool:
-    """Whether an error's pose part is over either bound (rad, m)."""
+    """Whether the pose part of an error exceeds either bound (rad, m)."""
     return bool(step[ROT] @ step[ROT] > rotation**2 or step[POS] @ step[POS] > translation**2)

@@ -1,4 +1,4 @@
-"""The IMU's part: propagation, and deskew by backward propagation (paper 2.3)."""
+"""Propagation through IMU samples, and deskew by backward propagation (paper 2.3)."""
 
 from dataclasses import dataclass, replace
 
@@ -19,14 +19,14 @@ bias, gravity (2, tangent of S²), extrinsic rotation (LiDAR frame), extrinsic t
 MAX_KNOT_STEP = 0.0025
 """s; poses in between are interpolated linearly."""
 LONG_GAP = 0.4
-"""s; longer than that, a step's half, the accelerations at both ends say nothing of the velocity in between."""
+"""s, half the time of a step. Over a longer gap the accelerations at both ends do not determine the velocity."""
 GAP_NOISE = (0.5, 3.0)
-"""Densities (rad/s, m/s² per sqrt Hz) for bridging a gap: walking and turning, unseen."""
+"""Noise densities (rad/s/√Hz, m/s²/√Hz) for bridging a gap: those of walking and turning."""
 
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """The filter's whole knowledge: a state and the (23, 23) covariance of its error."""
+    """What the filter knows: a state, and the (23, 23) covariance of its error."""
 
     state: NavState
     covariance: F64
@@ -48,12 +48,13 @@ class Path:
 def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -> tuple[Belief, Path]:
     """Carry the belief forward to `end_ns` through the samples that cover the time from its stamp.
 
-    Rates are linear between samples, constant before the first and after the last one; through a long gap the
-    velocity stays as it was.
+    Rates are linear between samples, and constant before the first and after the last one. Through a long gap the
+    velocity is constant.
+
     Returns the predicted belief and the path in between.
     """
     state = belief.state
-    if end_ns <= state.stamp_ns:  # nothing to integrate: the device has not moved meanwhile
+    if end_ns <= state.stamp_ns:  # nothing to integrate
         here = state.T_odom_imu[None, :3]
         return belief, Path(np.array([-1.0, 0.0]), np.concatenate([here, here]))
     times, gyro, accel, spacing = _clipped(imu, state.stamp_ns, end_ns)
@@ -74,9 +75,9 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -
 
 
 def deskew(scan: Scan, path: Path, state: NavState) -> F32:
-    """Every point as the LiDAR would have seen it at the path's end, the time of `state`.
+    """Every point in the LiDAR frame at the path's end, the time of `state`.
 
-    Returns (n, 3) float32, LiDAR frame. Times before the path are extrapolated from its first knots.
+    Returns (n, 3) float32 m. Times before the path are extrapolated from its first knots.
 
     Backward propagation: p_end = T_LI T_odom_end^-1 T_odom_t T_IL p_t.
     """
@@ -94,8 +95,8 @@ def deskew(scan: Scan, path: Path, state: NavState) -> F32:
 def _clipped(imu: ImuSamples, begin_ns: int, end_ns: int) -> tuple[F64, F64, F64, F64]:
     """Samples from begin to end (s after begin), with values interpolated at both ends.
 
-    The last value (k - 1,) is, for each interval, how far apart the samples around it are, s: a gap
-    stays one, however many scans end inside it.
+    The last value (k - 1,) is, for each interval, the time in s between the samples around it, so that a gap
+    stays one gap however many scans end inside it.
     """
     inside = (imu.stamps_ns > begin_ns) & (imu.stamps_ns < end_ns)
     stamps = np.concatenate([[begin_ns], imu.stamps_ns[inside], [end_ns]])

@@ -83,9 +83,9 @@ def between(a: F64, b: F64) -> F64:
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     axis = np.cross(a, b)
     sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
-    if sine < 1e-12:  # no axis of its own: none is needed, or half a turn about any axis across
+    if sine < 1e-12:  # parallel or opposite: any axis across `a` will do
         axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
-    axis -= (axis @ a) * a  # what rounding left along `a` would show at half a turn
+    axis -= (axis @ a) * a  # remove what rounding left along `a`
     return exp(np.arctan2(sine, cosine) * axis / np.linalg.norm(axis))
 
 

@@ -1,4 +1,4 @@
-"""The local map that scans are registered to: hashed voxels, bounded memory, planes on request."""
+"""The local map that scans are registered to: hashed voxels of bounded memory, and planes through them."""
 
 import math
 from dataclasses import dataclass
@@ -11,16 +11,16 @@ from app.slam.params import FilterParams, MapParams
 from app.slam.types import F32, F64, I32, U8
 
 LEAST_SCATTER = 2.0
-"""Times a point's noise: a plane's points are not believed to scatter less, since a few lie flat by chance."""
+"""Least scatter assumed of a plane's points, as a multiple of the point noise: a few points lie flat by chance."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapState:
-    """A copy of everything in the map; restoring it restores every later result exactly.
+    """A copy of the map. Restoring it restores every later result exactly.
 
     Attributes:
-        cells: (v, 3) indices of the voxels, in the order in which they came. counts: (v,) points in each.
-        points: (sum of counts, 3) m, voxel by voxel. center: (3,) m, from where far voxels were last dropped.
+        cells: (v, 3) indices of the voxels, in order of insertion. counts: (v,) points in each.
+        points: (sum of counts, 3) m, voxel by voxel. center: (3,) m, the sensor at the last eviction.
     """
 
     cells: I32
@@ -44,7 +44,7 @@ class Planes:
 
 
 class LocalMap:
-    """Points of past scans in a hash of voxels, a bounded number in each, far voxels dropped."""
+    """Points of past scans in a hash of voxels. The number of points per voxel and of voxels is bounded."""
 
     def __init__(self, params: MapParams) -> None:
         self._voxel = params.voxel_size
@@ -61,10 +61,10 @@ class LocalMap:
         return self._used
 
     def insert(self, points: F32, position: F64, params: MapParams) -> None:
-        """Add (n, 3) odom points seen from `position` (3,); drop what is beyond the radius of it.
+        """Add (n, 3) odom points seen from `position` (3,), and drop voxels beyond the radius around it.
 
-        When the map is full of voxels, its radius shrinks until there is room again: what is near
-        the sensor is always mapped.
+        When the map is full, the radius shrinks until there is room again, so that what is near the sensor is
+        always mapped.
         """
         if np.linalg.norm(position - self._center) > 0.1 * params.radius:
             self._evict(position, params.radius)
@@ -89,7 +89,7 @@ class LocalMap:
         self._center = np.array(center)
 
     def planes(self, queries: F64, params: FilterParams, relaxed: float = 1.0) -> Planes:
-        """A plane for each of (n, 3) odom points; see `kernels.map.planes`. `relaxed` widens the tilt allowed."""
+        """A plane for each of (n, 3) odom points; see `kernels.map.planes`. `relaxed` multiplies the tilt allowed."""
         n = len(queries)
         out = Planes(np.empty((n, 3)), np.empty((n, 3)), np.empty(n))
         reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(relaxed * params.plane_tilt)
@@ -110,7 +110,7 @@ class LocalMap:
         self._cells[:n], self._counts[:n] = state.cells, state.counts
         self._store[:n][self._taken(n)] = state.points
         self._used = n
-        self._evict(np.array(state.center), math.inf)  # drops nothing, and makes the table as it was
+        self._evict(np.array(state.center), math.inf)  # drops nothing; it rebuilds the hash table
 
     def _taken(self, n: int) -> npt.NDArray[np.bool_]:
         """(n, points_per_voxel): which places of the first n voxels hold a point."""

@@ -1,4 +1,4 @@
-"""How far a trajectory is from the truth, and how well ground was told from the rest.
+"""Errors of a trajectory against the truth, and scores of ground labels.
 
 Errors follow Sturm et al. (IROS 2012, "A benchmark for the evaluation of RGB-D SLAM systems") and
 equal those of the `evo` tool, except that truth is interpolated at our stamps.
@@ -30,8 +30,8 @@ _FINEST_M = 1e-6
 def interpolate(truth: Trajectory, stamps_ns: I64) -> tuple[Trajectory, npt.NDArray[np.bool_]]:
     """Truth at the given stamps: positions linearly, orientations by slerp.
 
-    Returns the interpolated poses and a mask over `stamps_ns` of those that have one: inside the
-    truth's time and not in a gap longer than MAX_TRUTH_GAP_S.
+    Returns the interpolated poses, and a mask over `stamps_ns` of those that have one: inside the time of the truth
+    and not in a gap longer than MAX_TRUTH_GAP_S.
     """
     right = np.searchsorted(truth.stamps_ns, stamps_ns).clip(1, len(truth) - 1)
     gap = truth.stamps_ns[right] - truth.stamps_ns[right - 1]
@@ -140,7 +140,7 @@ class Ate:
 
 
 def ate(estimate: Trajectory, truth: Trajectory) -> Ate:
-    """Align `estimate` to `truth` by position (SE(3), no scale) and measure what is left.
+    """Align `estimate` to `truth` by position (SE(3), no scale) and measure the remaining error.
 
     Raises:
         HemislamError: fewer than 3 stamps of the estimate have a truth, or nothing moved.
@@ -246,7 +246,7 @@ def _every(positions: F64, metres: float) -> I64:
 # --- ground --------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class GroundScore:
-    """Points by what they are and were called; scores of frames add up with `+`."""
+    """Counts of ground points, found and missed. Scores of frames add up with `+`."""
 
     true_positive: int = 0
     false_positive: int = 0
@@ -267,19 +267,19 @@ class GroundScore:
 
     @property
     def precision(self) -> float:
-        """Of the points called ground, the share that is; nan if none was called so."""
+        """Share of the points labelled ground that are ground; nan if none was labelled so."""
         called = self.true_positive + self.false_positive
         return self.true_positive / called if called else float("nan")
 
     @property
     def recall(self) -> float:
-        """Of the ground points, the share that was found; nan if there is none."""
+        """Share of the ground points that were found; nan if there are none."""
         real = self.true_positive + self.false_negative
         return self.true_positive / real if real else float("nan")
 
     @property
     def f1(self) -> float:
-        """Harmonic mean of precision and recall; nan if there is no ground and none was called so."""
+        """Harmonic mean of precision and recall; nan if there is no ground and none was labelled so."""
         sizes = 2 * self.true_positive + self.false_positive + self.false_negative
         return 2 * self.true_positive / sizes if sizes else float("nan")
 

@@ -1,4 +1,4 @@
-"""Where results come from: the input's hash, the machine, the memory that was used."""
+"""Where results come from: the hash of the input, the machine, the memory used."""
 
 import hashlib
 import os
@@ -11,7 +11,7 @@ from typing import Any
 
 
 def hash_input(recording: Path) -> str | None:
-    """SHA-256 of a file, or of a folder's files one after the other by name; None once it is gone."""
+    """SHA-256 of a file, or of a folder's files in order of name; None if it cannot be read."""
     digest = hashlib.sha256()
     try:
         files = sorted(path for path in recording.rglob("*") if path.is_file()) if recording.is_dir() else [recording]
@@ -25,13 +25,13 @@ def hash_input(recording: Path) -> str | None:
 
 
 def peak_memory_mb() -> float:
-    """The most resident memory that this process has used, in MB."""
+    """Peak resident memory of this process, MB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
 def describe_machine() -> dict[str, Any]:
-    """Where the run was made; timings mean nothing without it."""
+    """The machine; timings mean nothing without it."""
     return {
         "system": platform.platform(),
         "processor": _processor_name(),

@@ -1,7 +1,7 @@
-"""What standing still tells the filter: the velocity is zero, and the IMU feels nothing but gravity and bias.
+"""Updates of the filter at rest: the velocity is zero, and the IMU measures only gravity and its biases.
 
-A scan alone may leave a direction open (along a street, over bare ground), and its planes' small
-errors then pull the pose about. Knowing the velocity at rest keeps it, and teaches the biases.
+A scan may leave a direction unobserved (along a street, over bare ground), and small errors of its planes then
+move the pose. The zero velocity holds the pose in place and makes the biases observable.
 """
 
 import numpy as np
@@ -14,27 +14,27 @@ from app.slam.types import F64, ImuSamples
 
 MOVING_GYRO = 0.05
 MOVING_ACCEL = 0.4
-"""Standard deviations (rad/s, m/s²) above which a device is not standing still: ten to thirty times
-the noise of a consumer IMU at 200-500 Hz, and well below any step."""
+"""Standard deviations (rad/s, m/s²) above which a device is moving: ten to thirty times the noise of a
+consumer IMU at 200-500 Hz, and well below those of any step."""
 LARGEST_BIAS = 0.2
-"""rad/s; an even turn faster than this is a turn and not a gyroscope's bias."""
+"""rad/s; a steady rate above this is a turn, not the bias of a gyroscope."""
 TREMOR = 0.005
-"""m/s, standard deviation of the velocity of a device that a hand holds still."""
+"""m/s, standard deviation of the velocity of a device held still by hand."""
 LIKELY = 2.37
-"""Chi-squared of three degrees of freedom that half of all rests stay below. A rest that is missed
-costs nothing, the next frame will do; one that is none would hold the first step back."""
+"""Median of chi-squared with three degrees of freedom. A missed rest costs nothing, since the next frame
+will do; a false one would hold back the first step."""
 
 
 def is_moving(imu: ImuSamples) -> bool:
-    """Whether the samples spread more than a device standing still would show, or tell of an even turn."""
+    """Whether the samples spread more than those of a device at rest, or show a steady turn."""
     turning = np.linalg.norm(imu.gyro.mean(axis=0)) > LARGEST_BIAS
     return bool(turning or np.any(imu.gyro.std(axis=0) > MOVING_GYRO) or np.any(imu.accel.std(axis=0) > MOVING_ACCEL))
 
 
 def hold(belief: Belief, imu: ImuSamples) -> Belief:
-    """The belief with its velocity known to be zero, if neither the samples up to it nor itself speak against it.
+    """The belief with its velocity observed as zero, if its samples and its own velocity agree with a rest.
 
-    A lift or a cart that moves evenly feels like a rest; but then the velocity is known to be another.
+    In a lift or on a cart at constant speed the samples look like a rest; the velocity known so far does not.
     """
     if len(imu) < 2 or is_moving(imu):
         return belief
@@ -50,8 +50,8 @@ def hold(belief: Belief, imu: ImuSamples) -> Belief:
 def level(belief: Belief, specific_force: F64, sigma: F64) -> Belief:
     """The belief of a device at rest that feels `specific_force` (3,) m/s², each axis known to `sigma` (3,).
 
-    Neither gravity's direction nor the accelerometer's bias is known well, but their sum is: a device
-    at rest does not accelerate. What that says lies in their correlation.
+    A device at rest does not accelerate, so the sum of gravity and the accelerometer's bias is known well, although
+    neither is by itself. The covariance holds that as their correlation.
     """
     state = belief.state
     up = -state.R_odom_imu.T @ state.g_odom
@@ -63,7 +63,7 @@ def level(belief: Belief, specific_force: F64, sigma: F64) -> Belief:
 
 
 def observe(belief: Belief, H: F64, innovation: F64, noise: F64) -> Belief:
-    """Kalman's update by innovation (m,) = H (m, 23) error + noise, of covariance `noise` (m, m)."""
+    """Kalman update with innovation (m,) = H (m, 23) error + noise, of covariance `noise` (m, m)."""
     P = belief.covariance
     gain = np.linalg.solve(H @ P @ H.T + noise, H @ P).T
     kept = np.eye(DIM) - gain @ H

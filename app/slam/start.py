@@ -1,4 +1,4 @@
-"""How the filter starts: standing still if it can, wide open if it must (architecture: "Start")."""
+"""How the filter starts: from a rest if there is one, otherwise in motion with a wide covariance."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from app.slam.params import Params
 from app.slam.types import F64, ImuSamples, NavState, Scan
 
 LEAST_STILL = 0.3
-"""s; a shorter rest says too little about the gyroscope's bias."""
+"""s; a shorter rest does not determine the gyroscope's bias."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,8 +19,8 @@ class Started:
 
     Attributes:
         belief: where to propagate from; while waiting, the belief at the scan's end.
-        still: samples of the rest so far. waiting: whether more of it is wanted.
-        notice: what to tell the user, once; "" while waiting, and after a full rest.
+        still: samples of the rest so far. waiting: whether a longer rest is awaited.
+        notice: a message for the user; "" while waiting and after a full rest.
     """
 
     belief: Belief
@@ -30,10 +30,10 @@ class Started:
 
 
 def proceed(still: ImuSamples | None, scan: Scan, samples: ImuSamples, params: Params) -> Started:
-    """Go on with the start by one scan: wait for a longer rest, or start from what there is.
+    """Process one scan of the start: wait for a longer rest, or start from the samples so far.
 
     Args:
-        still: samples of the rest before this scan, from the last call; None at the first scan.
+        still: `Started.still` of the last call; None at the first scan.
         samples: IMU samples up to this scan's end.
     """
     together = samples if still is None else _joined(still, samples)
@@ -46,24 +46,24 @@ def proceed(still: ImuSamples | None, scan: Scan, samples: ImuSamples, params: P
         lasted_s = (still.stamps_ns[-1] - still.stamps_ns[0]) * 1e-9
         belief = standing(still, int(still.stamps_ns[-1]), params)
         return Started(belief, still, False, f"Started after only {lasted_s:.1f} s at rest.")
-    notice = "The device was already moving at the start: biases and gravity begin as rough guesses."
+    notice = "The device was moving at the start: biases and gravity begin as rough guesses."
     begin_ns = max(scan.stamp_ns, int(samples.stamps_ns[0]))
     return Started(moving(together, begin_ns, params), together, False, notice)
 
 
 def standing(imu: ImuSamples, stamp_ns: int, params: Params) -> Belief:
-    """Belief at rest: the gyroscope's mean is its bias, the mean specific force is gravity and bias."""
+    """Belief at rest: the mean of the gyroscope is its bias, the mean specific force is gravity plus bias."""
     sigma = _sigma()
     sigma[VEL] = rest.TREMOR
     sigma[BG] = 3.0 * np.maximum(imu.gyro.std(axis=0) / np.sqrt(len(imu)), 1e-5)
-    sigma[GRAV] = 0.15  # the specific force says how much better it is known, and what that leaves to the bias
+    sigma[GRAV] = 0.15  # `rest.level` then narrows it together with the accelerometer's bias
     belief = _belief(imu, stamp_ns, imu.gyro.mean(axis=0), sigma, params)
     spread = np.maximum(imu.accel.std(axis=0), 1e-3)
     return rest.level(belief, imu.accel.mean(axis=0), 3.0 * spread / np.sqrt(len(imu)))
 
 
 def moving(imu: ImuSamples, stamp_ns: int, params: Params) -> Belief:
-    """Belief in motion: nothing is known but roughly where up is."""
+    """Belief in motion: only the direction of gravity is known, roughly."""
     sigma = _sigma()
     sigma[VEL] = 1.5  # walking
     sigma[BG] = 0.02
@@ -73,8 +73,8 @@ def moving(imu: ImuSamples, stamp_ns: int, params: Params) -> Belief:
 
 def _sigma() -> np.ndarray:
     sigma = np.zeros(DIM)
-    sigma[ROT] = sigma[POS] = 1e-4  # odom is defined by this very pose
-    sigma[BA] = 0.05  # turn-on bias of a MEMS accelerometer; at rest it can not be told from gravity
+    sigma[ROT] = sigma[POS] = 1e-4  # this pose defines odom
+    sigma[BA] = 0.05  # turn-on bias of a MEMS accelerometer; at rest it looks like gravity
     sigma[EXT_ROT] = 0.01
     sigma[EXT_POS] = 0.01
     return sigma
@@ -100,8 +100,8 @@ def _belief(imu: ImuSamples, stamp_ns: int, b_gyro: np.ndarray, sigma: np.ndarra
 
 
 def _seen_from_the_lidar(state: NavState, covariance: F64) -> F64:
-    """The first scan makes the map, so it is the LiDAR's pose that defines odom, and the IMU's is as uncertain
-    as the extrinsics between them."""
+    """The covariance (23, 23) if the LiDAR's first pose defines odom: the IMU's pose is then as uncertain as the
+    extrinsics between the two."""
     follows = np.eye(DIM)
     R_odom_imu, R_imu_lidar = state.R_odom_imu, state.R_imu_lidar
     follows[ROT, EXT_ROT] = -R_imu_lidar

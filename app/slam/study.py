@@ -68,7 +68,7 @@ class Patch:
 
 
 def neighbourhood(points: F32, index: int, count: int) -> Patch:
-    """The `count` points nearest to one of (n, 3), itself first, and the plane through them by their principal axes."""
+    """The `count` points nearest to point `index` of (n, 3), itself first, and the plane through them."""
     offsets = points.astype(np.float64) - points[index]
     squared = np.einsum("ij,ij->i", offsets, offsets)
     count = min(count, len(points))
@@ -88,7 +88,7 @@ def neighbourhood(points: F32, index: int, count: int) -> Patch:
 
 
 def nearest_match(points: F32, result: StepResult) -> tuple[I64, F64]:
-    """The point that the filter looked up nearest to each of (n, 3) points in the LiDAR frame.
+    """The nearest point that the filter looked up, for each of (n, 3) points in the LiDAR frame.
 
     Returns:
         (n,) its index in the result's matches, -1 without one within `MATCH_M`; (n,) m to it, nan without one.

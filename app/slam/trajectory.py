@@ -1,4 +1,4 @@
-"""Poses over time and their TUM text files, `stamp x y z qx qy qz qw` with stamps in seconds."""
+"""Poses over time, and their TUM text files: `stamp x y z qx qy qz qw` with stamps in seconds."""
 
 from dataclasses import dataclass
 from decimal import Decimal
@@ -102,7 +102,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 
 def tum_lines(trajectory: Trajectory) -> list[str]:
-    """One line a pose, w >= 0 so that a rotation has one spelling."""
+    """One line per pose. w >= 0, so that each rotation is written in one way."""
     quaternions = np.where(trajectory.quaternions[:, 3:] < 0, -trajectory.quaternions, trajectory.quaternions)
     values = np.hstack([trajectory.positions, quaternions]) + 0.0  # no "-0.000000000"
     return [
@@ -112,23 +112,23 @@ def tum_lines(trajectory: Trajectory) -> list[str]:
 
 
 def stamp_text(stamp_ns: int) -> str:
-    """Nanoseconds as seconds with 9 decimals, without going through a float."""
+    """Nanoseconds as seconds with 9 decimals, exactly."""
     sign, value = ("-", -stamp_ns) if stamp_ns < 0 else ("", stamp_ns)
     return f"{sign}{value // 1_000_000_000}.{value % 1_000_000_000:09d}"
 
 
 def truth_beside(recording: Path) -> Path | None:
-    """The truth file that lies beside a recording, `<name>_truth.tum`, if there is one."""
+    """The truth file beside a recording, `<name>_truth.tum`, if there is one."""
     name = recording.name if recording.is_dir() else recording.stem
     truth = recording.with_name(f"{name}_truth.tum")
     return truth if truth.is_file() else None
 
 
 def time_apart(source: Path | str, stamps_ns: I64, begin_ns: int, duration_s: float) -> str:
-    """What is wrong, in a sentence, if poses and a recording share no time; "" if they do.
+    """A sentence that says so if poses and a recording do not overlap in time; otherwise "".
 
     Args:
-        source: of the poses, to name it. stamps_ns: (n,), increasing.
+        source: of the poses, for the sentence. stamps_ns: (n,), increasing.
     """
     first, last = stamps_ns[0] * 1e-9, stamps_ns[-1] * 1e-9
     begin, end = begin_ns * 1e-9, begin_ns * 1e-9 + duration_s
@@ -141,5 +141,5 @@ def time_apart(source: Path | str, stamps_ns: I64, begin_ns: int, duration_s: fl
 
 
 def count_text(poses: int) -> str:
-    """A number of poses in words fit for a sentence."""
+    """A number of poses in words, for a sentence."""
     return {0: "no pose", 1: "1 pose"}.get(poses, f"{poses} poses")

@@ -2,10 +2,10 @@
 
 Conventions (all of hemislam):
 - `T_target_source` maps coordinates of `source` into `target`; 4x4 float64, or (R, p).
-- Frames: `lidar` and `imu` are the sensors' own axes; `odom` is the filter's world: its origin is
-  the first IMU pose, its +z axis points up (against gravity); `map` is `odom` after corrections by
-  loop closures, identical to it while there are none.
-- Time is integer nanoseconds since the Unix epoch; differences alone are floats, in seconds.
+- Frames: `lidar` and `imu` are the sensors' own axes. `odom` is the filter's world: its origin is
+  the first IMU pose, its +z axis points up (against gravity). `map` is `odom` corrected by loop
+  closures, and equal to it without any.
+- Time is integer nanoseconds since the Unix epoch; only differences are floats, in seconds.
 - Units are SI; angles are radians in code and degrees where a person sets them.
 """
 
@@ -29,7 +29,7 @@ NON_GROUND, GROUND, SEED = 0, 1, 2
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """One LiDAR revolution as measured, in firing order or not, invalid returns already removed.
+    """One LiDAR revolution as measured, in any order, without invalid returns.
 
     Attributes:
         stamp_ns: time of the FIRST point.
@@ -37,7 +37,7 @@ class Scan:
         offsets_ns: (n,) int32, each point's time after `stamp_ns`, >= 0.
         intensity: (n,) float32, the sensor's own scale (0-255 for RoboSense).
         ring: (n,) uint16, rank of the scan line's elevation; 0 = lowest = outermost cone.
-        truth_ground: (n,) uint8, 1 where the recording itself says "ground"; None if it does not.
+        truth_ground: (n,) uint8, 1 where the recording labels a point as ground; None without labels.
     """
 
     stamp_ns: int
@@ -49,7 +49,7 @@ class Scan:
 
     @property
     def end_ns(self) -> int:
-        """Time of the last point; the pose of a frame is the pose at this time."""
+        """Time of the last point. The pose of a frame is the pose at this time."""
         return self.stamp_ns + (int(self.offsets_ns.max()) if self.offsets_ns.size else 0)
 
     def __len__(self) -> int:
@@ -89,7 +89,7 @@ class Measurement:
 
     `imu` runs from the last sample at or before the previous scan's end (for the first scan: from
     the first sample there is) to the first sample at or after this scan's end, so that both ends
-    can be interpolated. `notices` tells what pairing met on the way (gaps, back-steps).
+    can be interpolated. `notices` says what was wrong with their times (gaps, back-steps).
     `streams` holds the samples of other sensors (satellite fixes, wheel odometry, images) by their
     type: those up to this scan's end that no earlier measurement holds, in order of time.
     """
@@ -102,7 +102,7 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True)
 class DroppedScan:
-    """A scan that is not handed to the engine, and why, in a few words fit for a report."""
+    """A scan that the engine does not get. `reason`: why, in a few words for a report."""
 
     stamp_ns: int
     reason: str
@@ -146,7 +146,7 @@ class NavState:
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """A deskewed scan: what is drawn, stored in keyframes and exported.
+    """A deskewed scan, as it is drawn, stored in keyframes and exported.
 
     Attributes:
         points: (n, 3) float32, metres, LiDAR frame at the scan's end.
@@ -170,7 +170,7 @@ class GroundResult:
 
     Attributes:
         labels: (n,) uint8 of NON_GROUND, GROUND, SEED.
-        found: whether a plane was accepted. reason: why not, in words; "" if it was.
+        found: whether a plane was accepted. reason: why not, in words; "" if one was.
         normal: (3,) unit normal of the plane, LiDAR frame, pointing up. centroid: (3,) m.
         down: (3,) unit direction of gravity in the LiDAR frame, as used.
         planarity: lambda3 / lambda2 of the seeds (nan without seeds); accepted below the limit.
@@ -190,7 +190,7 @@ class GroundResult:
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """The points that an update was offered, and the planes of the map that it found for them.
+    """The points that the filter looked up in the map, and the planes that it found for them.
 
     Attributes:
         points: (n, 3) float32 m, LiDAR frame at the scan's end.
@@ -206,16 +206,16 @@ class Matches:
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """How the filter's update went (paper eq. 5-7). A result that explains itself.
+    """How the filter's update went (paper eq. 5-7).
 
     Attributes:
         converged, iterations: of the iterated update.
-        used: points offered to the update. inliers: points with an accepted plane.
+        used: points looked up in the map. inliers: points with an accepted plane.
         residual_rms: m, point to plane, of the inliers after the update.
-        eigenvalues: (6,) ascending, of the 6x6 pose information (rotation, translation blocks
-            scaled by their expected units), the smaller, the less that direction is observed.
-        degenerate: whether a direction was not observed by this scan alone. reason: in words.
-        matches: point by point; None where nothing was looked up.
+        eigenvalues: (6,) ascending, of the 6x6 pose information with rotation scaled to metres. A small one
+            means that the scan hardly observes that direction.
+        degenerate: whether this scan alone leaves a direction unobserved. reason: in words.
+        matches: by point; None if nothing was looked up.
     """
 
     converged: bool
@@ -251,10 +251,10 @@ class Keyframe:
 
 class FrameStatus(StrEnum):
     INITIALISING = "initialising"
-    """Waiting for enough IMU samples at the start; the pose is the origin."""
+    """The device rests at the start, for the first biases. The pose is the origin."""
     TRACKING = "tracking"
     LOST = "lost"
-    """Too few points matched the map; the pose is the IMU's prediction."""
+    """Too few points match the map. The pose is the IMU's prediction."""
 
 
 STAGES = ("propagate", "deskew", "ground", "downsample", "update", "insert", "keyframe", "loops")
@@ -265,19 +265,19 @@ TIMINGS = (*STAGES, "total")
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """Everything that one frame produced.
+    """All that processing one frame gave.
 
     Attributes:
         index: frame number from 0. stamp_ns: scan end, the time of `state`.
-        T_map_odom: (4, 4); the pose to show is T_map_odom @ state.T_odom_imu.
+        T_map_odom: (4, 4). The pose in the map is T_map_odom @ state.T_odom_imu.
         cloud: deskewed points with labels. ground, registration: how those went.
         points_in: points of the scan. points_reduced: after ground downsampling.
-        points_filter: handed to the filter after the scan voxel.
+        points_filter: after the scan voxel, as the filter gets them.
         timings_ms: of STAGES and "total". keyframe: if this frame became one.
-        loops: candidates that came into effect with this frame, or whose verdict changed.
+        loops: candidates that took effect with this frame, or whose verdict changed.
         notices: what a user should know about this frame, in sentences.
         imu_gap_s: longest time between the IMU samples that cover it.
-        dropped: scans left out between the frame before and this one.
+        dropped: scans dropped between the frame before and this one.
     """
 
     index: int

@@ -8,8 +8,8 @@ from app.slam.kernels import voxels as kernels
 from app.slam.types import F32, I32, U8
 
 _STEPS = np.sqrt([6.0, 11.0, 14.0]) % 1.0
-"""By how much a voxel's place differs from its neighbour's, along x, y and z. Of the roots of whole numbers up to 23,
-three that are among the most even at once along lines, over planes and in space, for shares of 5 to 50 %."""
+"""Increments of the recurrence along x, y and z. Among the roots of the integers up to 23, these three spread points
+most evenly along lines, over planes and in space at once, for shares of 5 to 50 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,10 +24,10 @@ class Downsampled:
 
 
 class VoxelGrid:
-    """Thins clouds by centroid. Owns its scratch memory, so that a frame allocates nothing large.
+    """Downsamples clouds by centroid. Owns its scratch memory, so that a frame allocates nothing large.
 
     Args:
-        room: points for which there is some from the start; for larger clouds it is doubled.
+        room: points that the scratch memory holds at first; it doubles for larger clouds.
     """
 
     def __init__(self, room: int = 1 << 16) -> None:
@@ -49,7 +49,7 @@ class VoxelGrid:
         Args:
             points: (n, 3) float32, finite, within 1e6 voxels of the origin.
             voxel_size: edge in the unit of the points.
-            chosen: (n,) uint8; where it is zero a point is kept as it is. None: all take part.
+            chosen: (n,) uint8; a point with zero is kept as it is. None: all take part.
         """
         n = len(points)
         if n > len(self._order):
@@ -64,12 +64,12 @@ class VoxelGrid:
 
 
 def spread(points: F32, most: int, voxel_size: float) -> F32:
-    """At most `most` of the points, evenly over the space that they fill, in the order in which they came.
+    """At most `most` of the points, evenly spread over the space that they fill, in their given order.
 
-    A voxel's place alone says how soon its point is taken, so that one point more or less changes nothing
-    but itself: counted off by their order, all points behind it would be others. The places are those of
-    an additive recurrence (as in Roberts 2018, "The unreasonable effectiveness of quasirandom sequences"):
-    of voxels that lie beside each other, every part has its share.
+    The rank of a point depends on its voxel only. So one point more or less does not change which others are
+    taken; with every-k-th sampling it would change every later choice. The rank is an additive recurrence over
+    the voxel's indices (Roberts 2018, "The unreasonable effectiveness of quasirandom sequences"), which takes an
+    equal share of every part of neighbouring voxels.
 
     Args:
         points: (n, 3) float32, one for each voxel. voxel_size: edge in the unit of the points.

@@ -1,4 +1,4 @@
-"""Compile every kernel once, with progress: the first start of a fresh installation takes a while."""
+"""Compile every kernel once, with progress. It takes a while on the first start of a new installation."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,7 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     """Run each kernel on a toy frame, which compiles it or loads it from numba's cache.
 
     Args:
-        progress: called with what comes next and the fraction done, 0-1; finally with 1.
+        progress: called with the name of the next step and the fraction done, 0-1; finally with 1.
     """
     params = Params()
     u, v = np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-3, 3, 40))
@@ -45,7 +45,7 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
 
 
 def _run_frames(scan: Scan, samples: ImuSamples, params: Params) -> None:
-    """Scans as recordings give them: read-only as they come, and writable once some points are out of range."""
+    """Arrays as the engine meets them: read-only, and writable copies once some points are out of range."""
     for array in (scan.points, scan.offsets_ns, scan.ring):
         array.setflags(write=False)
     engine = Engine(params)

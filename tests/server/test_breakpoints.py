@@ -63,7 +63,7 @@ GOOD = frame()
         (Breakpoints(no_ground=True), "No ground plane: only 3 seed points; a plane takes 20."),
         (Breakpoints(planarity=0.3), "λ3/λ2 of the seeds is 0.400, over 0.3."),
         (Breakpoints(residual=0.05), "The residual is 80.0 mm, over 50 mm."),
-        (Breakpoints(degenerate=True), "Degenerate: one direction is not held by this scan."),
+        (Breakpoints(degenerate=True), "Degenerate: this scan leaves one direction unobserved."),
         (Breakpoints(frame_ms=100.0), "The frame took 130.0 ms, over 100 ms."),
     ],
 )

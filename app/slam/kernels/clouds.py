@@ -7,7 +7,7 @@ from app.slam.kernels.small import CHUNKS
 
 @njit(cache=True, parallel=True)
 def in_range(points, nearest, farthest, keep):
-    """keep (n,) bool out: whether nearest <= |p| <= farthest, for points (n, 3) f32. Returns how many."""
+    """keep (n,) bool, out: nearest <= |p| <= farthest, for points (n, 3) f32 in m. Returns the number kept."""
     n = len(points)
     low, high = nearest * nearest, farthest * farthest
     count = 0

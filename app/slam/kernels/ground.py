@@ -9,8 +9,11 @@ from numba import njit, prange
 def seed_moments(points, ring, candidate, down, cos_alpha, labels, sums):
     """Mark seeds (label 2) and add up their first and second moments about the first seed.
 
-    points (n, 3) f32; ring (n,) u16; candidate (lines,) bool; down (3,) unit; labels (n,) u8 out;
-    sums (12,) f64 out: origin, sum, xx xy xz yy yz zz. Returns the number of seeds.
+    A seed is a point on a candidate line within the angle alpha of down.
+
+    points (n, 3) f32 m, LiDAR frame; ring (n,) u16, line of each point; candidate (lines,) bool; down (3,) unit.
+    Out: labels (n,) u8; sums (12,) f64: origin (the first seed, m), sum of offsets from it (m), and of their products
+    xx xy xz yy yz zz (m²). Returns the number of seeds.
     """
     count = 0
     for j in range(len(points)):
@@ -40,7 +43,10 @@ def seed_moments(points, ring, candidate, down, cos_alpha, labels, sums):
 
 @njit(cache=True, parallel=True)
 def label(points, centroid, normal, sigma, labels):
-    """Paper eq. 2-3: ground where |(mu - p) . n| < sigma |p|; seeds keep their label where they are ground."""
+    """Paper eq. 2-3: a point p is ground if |(mu - p) . n| < sigma |p|. Seeds that are ground stay seeds.
+
+    points (n, 3) f32 m; centroid mu (3,) m; normal n (3,) unit; sigma m/m; labels (n,) u8, in and out.
+    """
     for j in prange(len(points)):
         x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
         d = (centroid[0] - x) * normal[0] + (centroid[1] - y) * normal[1] + (centroid[2] - z) * normal[2]

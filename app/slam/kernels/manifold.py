@@ -1,6 +1,6 @@
-"""The filter's manifold: single-element SO(3) and S² operations, and its Gauss-Newton step.
+"""Operations on the filter's state (SO(3), R3, S²), one element at a time, and its Gauss-Newton step.
 
-The same formulas as `app.slam.lie`, the batched form. A state is packed into one vector of SIZE
+`app.slam.lie` has the batched form of the same formulas. A state is packed into one vector of SIZE
 numbers: R (9, by rows), p, v, b_gyro, b_accel, g (3 each), R_imu_lidar (9), p_imu_lidar (3).
 """
 
@@ -14,7 +14,7 @@ from app.slam.kernels.small import rotation
 
 @njit(cache=True)
 def exp(v):
-    """(3,) rad to (3, 3)."""
+    """Exponential map so(3) -> SO(3): (3,) rad to (3, 3) f64."""
     R = np.empty((3, 3))
     rotation(v[0], v[1], v[2], R)
     return R
@@ -22,7 +22,7 @@ def exp(v):
 
 @njit(cache=True)
 def log(R):
-    """(3, 3) to (3,) rad, for angles up to pi (near pi to 1e-8, as its axis then comes from R + R^T)."""
+    """Logarithm SO(3) -> so(3): (3, 3) to (3,) rad, for angles up to pi (near pi to 1e-8, from R + R^T)."""
     v = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     s = 0.5 * math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     c = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
@@ -45,7 +45,7 @@ def log(R):
 
 @njit(cache=True)
 def right_jacobian_inverse(v):
-    """(3,) rad to (3, 3)."""
+    """Inverse right Jacobian of SO(3): (3,) rad to (3, 3), for angles below 2 pi."""
     t2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     if t2 < 1e-8:
         k = 1.0 / 12.0
@@ -68,7 +68,7 @@ def right_jacobian_inverse(v):
 
 @njit(cache=True)
 def tangent_basis(g):
-    """(3, 2) orthonormal basis of the plane across g (3,), smooth but where |g_x| passes 0.8 |g|.
+    """(3, 2) orthonormal basis of the plane across g (3,), smooth except where |g_x| crosses 0.8 |g|.
 
     It must not jump near the vertical, where gravity is: the covariance is expressed in it.
     """
@@ -124,9 +124,9 @@ def boxminus(a, b, d):
 def gauss_newton(x, prior, information, H, b, covariance, step, out):
     """One step of eq. 7: minimise |x [-] prior|²_P + sum |z + H d|²_R, linearised at x.
 
-    x, prior, out: packed states. information (n, n): inverse prior covariance of the first n error
-    dimensions (17 without the extrinsics, 23 with them). H (12, 12), b (12,): normal equations of
-    the points over rotation, position and the extrinsics. Out: covariance (n, n), step (23,).
+    x, prior (SIZE,) f64: packed states. information (n, n): inverse prior covariance of the first n error
+    dimensions (17 without the extrinsics, 23 with them). H (12, 12), b (12,): normal equations of the points over
+    rotation, position and the extrinsics. Out: covariance (n, n), step (23,), the new state out (SIZE,).
     """
     n = len(information)
     d = np.empty(23)

@@ -11,7 +11,7 @@ from app.slam.kernels.voxels import PRIME_X, PRIME_Y, PRIME_Z
 
 @njit(cache=True, inline="always")
 def _find(table, cells, a, b, c):
-    """Slot of voxel (a, b, c), or -1."""
+    """Slot of voxel (a, b, c) in cells (v, 3) i32 by linear probing of table (2^k,) i32; -1 if it is not there."""
     mask = len(table) - 1
     h = ((a * PRIME_X) ^ (b * PRIME_Y) ^ (c * PRIME_Z)) & mask
     while True:
@@ -25,9 +25,11 @@ def _find(table, cells, a, b, c):
 
 @njit(cache=True)
 def insert(points, voxel, spacing, table, cells, counts, store, used):
-    """Add points (n, 3) f32 that are not within `spacing` of one in their own voxel. Returns (used, refused).
+    """Add points that are not within `spacing` of a point in their own voxel. Returns (used, refused).
 
-    A full voxel takes no more; a full store takes no new voxel (`refused` counts those points).
+    points (n, 3) f32 m, odom; voxel, spacing m. In and out: table (2^k,) i32, slot by hash or -1; cells (v, 3) i32,
+    voxel indices; counts (v,) u8; store (v, m, 3) f32 m. The first `used` slots are taken. A full voxel takes no more
+    points, a full store no new voxel; `refused` counts the points that needed one.
     """
     mask = len(table) - 1
     inverse, near2 = 1.0 / voxel, spacing * spacing
@@ -70,7 +72,7 @@ def insert(points, voxel, spacing, table, cells, counts, store, used):
 
 @njit(cache=True)
 def evict(center, radius, voxel, table, cells, counts, store, used):
-    """Drop voxels whose centre is farther than `radius` from `center` and rebuild the table. Returns used."""
+    """Drop voxels whose centre is farther than `radius` m from `center` (3,), and rebuild the table. Returns used."""
     mask = len(table) - 1
     r2 = radius * radius
     kept = 0
@@ -98,9 +100,9 @@ def evict(center, radius, voxel, table, cells, counts, store, used):
 
 
 MOST = 40
-"""A patch that is not certain with this many neighbours is not used."""
+"""Most neighbours of a patch; one that is still uncertain with them is not used."""
 BINS = 64
-"""Steps of squared distance in which neighbours are ranked; sorting them exactly costs three times as much."""
+"""Steps of squared distance by which neighbours are ranked. Exact sorting takes three times as long."""
 
 
 @njit(cache=True, inline="always")
@@ -111,10 +113,10 @@ def _outside(u, cell):
 
 @njit(cache=True, error_model="numpy")
 def _nearest(x, y, z, voxel, reach2, table, cells, counts, store, near, bins, begin, order):
-    """Map points within reach of (x, y, z), ranked by distance up to the width of a bin.
+    """Map points within reach of (x, y, z) m, ranked by distance up to the width of a bin. Returns their number n.
 
-    Out: near (m, 3) offsets as found; order (n,) their ranking. Scratch: bins (m,), begin (BINS + 2,).
-    Returns n. The inner loop has no branch: what is out of reach falls into a last bin of its own.
+    reach2 m². Out: near (m, 3) f64, offsets in m as found; order (n,) i32, their ranking. Scratch: bins (m,) i32,
+    begin (BINS + 2,) i32. The inner loop has no branch: points out of reach fall into a last bin of their own.
     """
     ux, uy, uz = x / voxel, y / voxel, z / voxel
     a0, b0, c0 = math.floor(ux), math.floor(uy), math.floor(uz)
@@ -151,9 +153,9 @@ def _nearest(x, y, z, voxel, reach2, table, cells, counts, store, near, bins, be
 
 @njit(cache=True, error_model="numpy")
 def _fit(near, order, n, first, flat, tilt, noise, normal, center):
-    """A plane through the nearest of n ranked offsets (`planes` says how many).
+    """A plane through the nearest of n ranked offsets (`planes` says how many). Returns l3 of the patch in m², or -1.
 
-    Returns l3 of the patch, m²; -1 where there is none.
+    Out: normal (3,) unit, center (3,) m, relative to the query.
     """
     sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
     done, take = 0, first
@@ -195,13 +197,13 @@ def _fit(near, order, n, first, flat, tilt, noise, normal, center):
 def planes(queries, voxel, reach, first, flat, tilt, noise, table, cells, counts, store, normals, centers, variances):
     """A plane through the nearest map points of each query.
 
-    The `first` nearest within `reach` m are tried. A plane through k points of scatter s has a normal
-    that is uncertain by s / sqrt(k l2): where that is over `tilt` rad (neighbours from one scan line
-    say nothing about the surface across it) the patch is widened to twice as many, up to MOST.
-    Accepted when it becomes certain enough and every neighbour lies within `flat` m of it.
+    The `first` nearest points within `reach` m are tried first. The normal of a plane through k points of scatter s is
+    uncertain by s / sqrt(k l2) rad. While that exceeds `tilt` (neighbours on one scan line do not determine the
+    surface across it), the patch is widened to twice as many points, up to MOST. The plane is accepted once it is
+    certain enough and every neighbour lies within `flat` m of it.
 
-    queries (n, 3) f64, map frame; noise: least scatter of the points, m. Out: normals (n, 3), centers
-    (n, 3), variances (n,): l3 of the patch in m², negative where there is no plane.
+    queries (n, 3) f64 m, odom; noise: least scatter of the points, m; the map as in `insert`. Out: normals (n, 3) unit,
+    centers (n, 3) m, variances (n,): l3 of the patch in m², negative where there is no plane.
     """
     total = len(queries)
     for chunk in prange(CHUNKS):

@@ -12,11 +12,11 @@ from app.slam.kernels.small import CHUNKS, cross, rotation
 def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, g, B, P, noise, knot_t, knot_T):
     """Integrate the kinematics from times[0] to times[-1]; R, p, v and P are updated in place.
 
-    times (k,) s ascending; gyro, accel (k, 3) at those times, linear in between. Error state order
-    as in `app.slam.imu`. noise (6,): densities of gyro, accel, gyro bias, accel bias, and those of
-    gyro and accel in intervals that are `bridged` (k - 1,) bool, for want of samples. In those that are
-    `coasting` (k - 1,) bool the velocity stays. Knots (time, 3x4 pose) are written every `max_step` seconds
-    at most. Returns the number of knots.
+    times (k,) s ascending; gyro (k, 3) rad/s and accel (k, 3) m/s² at those times, linear in between; bg, ba, g (3,):
+    biases and gravity; B (3, 2): tangent basis of gravity. noise (6,): densities of gyro, accel, gyro bias, accel bias,
+    and of gyro and accel in intervals that are `bridged` (k - 1,) bool. In intervals that are `coasting` (k - 1,) bool
+    the velocity is constant. In and out: R (3, 3), p (3,) m, v (3,) m/s, P (23, 23) in the order of `app.slam.imu`.
+    Out: knots, times knot_t (m,) s and poses knot_T (m, 3, 4), at most `max_step` s apart. Returns their number.
     """
     d = P.shape[0]
     F = np.zeros((d, d))
@@ -83,7 +83,7 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
             for i in range(3):
                 w[i] = (1.0 - u) * gyro[s, i] + u * gyro[s + 1, i] - bg[i]
                 a[i] = (1.0 - u) * accel[s, i] + u * accel[s + 1, i] - ba[i]
-            if coasting[s]:  # feels nothing but gravity
+            if coasting[s]:  # the specific force that keeps the velocity
                 for i in range(3):
                     a[i] = -(R[0, i] * g[0] + R[1, i] * g[1] + R[2, i] * g[2])
             rotation(0.5 * w[0] * h, 0.5 * w[1] * h, 0.5 * w[2] * h, dR)

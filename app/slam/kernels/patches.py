@@ -9,9 +9,9 @@ from app.slam.kernels.small import plane_of
 def planes(points, neighbours, eyes, thickness, normals, flat):
     """Fit a plane to the neighbours of each point.
 
-    points (n, 3) f64; neighbours (n, k) i64, indices into points; eyes (n, 3) f32, from where each
-    point was seen; thickness m, most spread (standard deviation) of a flat patch along its normal;
-    normals (n, 3) f64 out, unit, towards the eye; flat (n,) bool out: thin, and no mere line.
+    points (n, 3) f64 m; neighbours (n, k) i64, indices into points; eyes (n, 3) f32 m, from where each point was seen;
+    thickness m: largest standard deviation of a flat patch along its normal. Out: normals (n, 3) f64, unit, towards the
+    eye; flat (n,) bool: whether the patch is thin and not a line.
     """
     k = neighbours.shape[1]
     for i in range(len(points)):

@@ -8,16 +8,16 @@ from numba import njit, prange
 from app.slam.kernels.small import CHUNKS
 
 SHARED = 4.0
-"""How much more than a point's own noise the scatter of a plane counts, as variance: points that meet the
-same patch share its error, so it does not average out between them."""
+"""Weight of a plane's variance beside the point's own: points on the same patch share its error, so it does not
+average out between them."""
 RESIDUAL_HUBER = 2.0
-"""A residual over so many times its own standard deviation pulls no harder than one of just so many (Huber 1964):
-where a plane is wrong, one point of 400 could move the pose by millimetres."""
+"""Standard deviations beyond which a residual has constant influence (Huber 1964). Without that, one point of 400 on
+a wrong plane could move the pose by millimetres."""
 
 
 @njit(cache=True, parallel=True)
 def to_world(points, R, p, R_il, p_il, out):
-    """out (n, 3) f64 = R (R_il points + p_il) + p."""
+    """out (n, 3) f64 m, odom = R (R_il points + p_il) + p, for points (n, 3) f32 m, LiDAR frame."""
     A = R @ R_il
     t = R @ p_il + p
     for j in prange(len(points)):
@@ -32,9 +32,11 @@ def normal_equations(
 ):
     """Accumulate H^T W H and H^T W z of eq. 5-6 over all points with a plane.
 
-    Columns: rotation (right perturbation), position, extrinsic rotation, extrinsic translation.
-    points (n, 3) f32 LiDAR frame. noise: standard deviation of a point, m. Out: H (12, 12), b (12,),
-    stats (2,): inliers and their sum of squared distances; residuals (n,): signed m, nan if not used.
+    Columns: rotation (right perturbation), position, extrinsic rotation, extrinsic translation; the last two are zero
+    unless `extrinsics`. points (n, 3) f32 m, LiDAR frame; R, p: pose of the IMU in odom; R_il, p_il: pose of the LiDAR
+    in the IMU frame; normals, centers (n, 3), variances (n,) m²: planes as from `kernels.map.planes`; noise: standard
+    deviation of a point, m; gate m/√m. Out: H (12, 12), b (12,), stats (2,): inliers and their sum of squared
+    distances in m²; residuals (n,) m, signed, nan if not used.
     """
     n = len(points)
     H_part = np.zeros((CHUNKS, 12, 12))
@@ -57,7 +59,7 @@ def normal_equations(
                 + ny * (R[1, 0] * ix + R[1, 1] * iy + R[1, 2] * iz + p[1] - centers[j, 1])
                 + nz * (R[2, 0] * ix + R[2, 1] * iy + R[2, 2] * iz + p[2] - centers[j, 2])
             )
-            # FAST-LIO2's gate: what is near must fit well, what is far may miss by more
+            # FAST-LIO2's gate: near points must fit better than far ones
             reach = math.sqrt(x * x + y * y + z * z)
             if abs(d) > gate * math.sqrt(reach):
                 continue

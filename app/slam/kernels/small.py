@@ -5,11 +5,12 @@ import math
 from numba import njit
 
 CHUNKS = 32
-"""Fixed number of pieces that parallel reductions work in, whatever the number of threads."""
+"""Number of pieces of a parallel reduction; fixed, so that results do not depend on the number of threads."""
 
 
 @njit(cache=True, inline="always")
 def cross(a, b, out):
+    """out (3,) = a x b."""
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
@@ -33,8 +34,8 @@ def rotation(wx, wy, wz, out):
 def plane_of(xx, xy, xz, yy, yz, zz, normal):
     """Eigenvalues l1 >= l2 >= l3 of a symmetric 3x3 matrix; `normal` becomes the eigenvector of l3.
 
-    Trigonometric solution (Smith 1961) with the eigenvector as the best-conditioned cross product of
-    two rows of A - l3 I. Where l2 = l3 the normal is one of many, and callers refuse such patches.
+    Trigonometric solution (Smith 1961). The eigenvector is the best-conditioned cross product of two rows of A - l3 I.
+    If l2 = l3 the normal is arbitrary; callers refuse such patches.
     """
     off = xy * xy + xz * xz + yz * yz
     m = (xx + yy + zz) / 3.0

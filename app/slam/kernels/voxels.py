@@ -12,10 +12,10 @@ PRIME_X, PRIME_Y, PRIME_Z = 73856093, 19349669, 83492791
 def centroids(points, chosen, voxel, table, stamp, generation, cells, sums, order):
     """Replace the chosen points of each voxel by their centroid; copy the others unchanged.
 
-    points (n, 3) f32; chosen (n,) u8, non-zero where a point takes part; table (2^k,) i32 and stamp
-    (2^k,) i32 with `generation` marking live slots, so that nothing has to be cleared; cells
-    (n, 3) i32 scratch; sums (n, 4) f64 out: x y z count, in order of first appearance; order (n,)
-    i32 out: the first point of each output. Returns the number of outputs.
+    points (n, 3) f32 and voxel in the same unit; chosen (n,) u8, non-zero where a point takes part. Scratch: table
+    (2^k,) i32 and stamp (2^k,) i32, where `generation` marks live slots, so that nothing has to be cleared; cells
+    (n, 3) i32. Out: sums (n, 4) f64: x y z count, in order of first appearance; order (n,) i32: the first point of each
+    output. Returns the number of outputs.
     """
     mask = len(table) - 1
     inverse = 1.0 / voxel
