@@ -15,7 +15,8 @@ from app.server.protocol import Chunk
 from app.slam.types import F32, F64, U8
 from app.ui.ceiling import below_ceiling
 from app.ui.colours import HEIGHT, MODES, Limits, PointSet, colours, grown
-from app.ui.geometry import STILL_M, wxyz
+from app.ui.geometry import STILL_M
+from app.ui.nodes import add_points, place
 from app.ui.view import View
 
 _STILL: Final[F32] = np.array([5e-5, 5e-5, 5e-5, STILL_M], np.float32)
@@ -92,7 +93,7 @@ class MapChunks:
             elif drawn.handle is not None:
                 T = self._T_map_imu[index]
                 if moved[index]:
-                    drawn.handle.wxyz, drawn.handle.position = _pose(T, chunk)
+                    place(drawn.handle, T @ chunk.T_imu_lidar)
                 if view.point_size != seen.point_size or view.map != seen.map:
                     drawn.handle.point_size, drawn.handle.visible = view.point_size, view.map
                 lifted = moved[index] and view.colour_by == HEIGHT and bool((abs(T[2] - drawn.height) > _STILL).any())
@@ -151,27 +152,18 @@ class MapChunks:
                 drawn.handle.remove()
                 drawn.handle = None
             return
-        orientation, position = _pose(T_map_imu, drawn.chunk)
-        drawn.handle = self._scene.add_point_cloud(
+        drawn.handle = add_points(
+            self._scene,
             f"{self._root}/{drawn.chunk.index}",
             cloud.points,
             self._colours(cloud),
-            point_size=self._view.point_size,
-            point_shape="circle",
-            point_shading="flat",
-            wxyz=orientation,
-            position=position,
+            self._view.point_size,
+            cloud.T_map_lidar,
             visible=self._view.map,
         )
 
     def _colours(self, cloud: PointSet) -> U8:
         return colours(cloud, self._view.colour_by, self._coloured)
-
-
-def _pose(T_map_imu: F64, chunk: Chunk) -> tuple[F64, F64]:
-    """Orientation and position of a keyframe's LiDAR frame in the map."""
-    T = T_map_imu @ chunk.T_imu_lidar
-    return wxyz(T[:, :3]), T[:, 3]
 
 
 def shown_points(chunk: Chunk, T_map_lidar: F64, ceilings: bool) -> Chosen:

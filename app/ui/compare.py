@@ -18,8 +18,8 @@ from app.server.protocol import Command, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.types import F64, U8, StepResult
 from app.ui import compare_maths as maths
-from app.ui.geometry import wxyz
 from app.ui.html import css, heading, panel
+from app.ui.nodes import NO_COLOURS, NO_POINTS, add_points, place
 from app.ui.paths import Trajectory
 from app.ui.sensor import SCAN_POINT_SCALE, shown_of
 from app.ui.view import View
@@ -85,14 +85,7 @@ class CompareScene:
             visible=False,
         )
         self._lidar = scene.add_frame(f"{ROOT}/compare_lidar", show_axes=False, visible=False)
-        self._cloud = scene.add_point_cloud(
-            f"{ROOT}/compare_lidar/scan",
-            np.zeros((1, 3), np.float32),
-            np.zeros((1, 3), np.uint8),
-            point_size=0.04,
-            point_shape="circle",
-            point_shading="flat",
-        )
+        self._cloud = add_points(scene, f"{ROOT}/compare_lidar/scan", NO_POINTS, NO_COLOURS, 0.04)
 
     def draw_b(self, positions: F64, at: F64 | None, visible: bool) -> None:
         """B's trajectory since the fork, (n, 3), and where its sensor is, (3,); None hides it."""
@@ -106,8 +99,7 @@ class CompareScene:
         self._lidar.visible = result is not None
         if result is None:
             return
-        T = result.T_map_imu @ result.state.T_imu_lidar
-        self._lidar.wxyz, self._lidar.position = wxyz(T[:3, :3]), T[:3, 3]
+        place(self._lidar, result.T_map_imu @ result.state.T_imu_lidar)
         shown = shown_of(len(result.cloud))
         self._cloud.points = result.cloud.points[shown].astype(np.float16)
         self._cloud.colors = maths.GROUND_COLOURS[ground[shown]]

@@ -7,7 +7,8 @@ import viser
 
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
-from app.ui.geometry import STILL_M, wxyz
+from app.ui.geometry import STILL_M
+from app.ui.nodes import add_lines, place
 
 PATH_COLOUR: Final = (255, 92, 141)
 TRUTH_COLOUR: Final = (240, 244, 250)
@@ -40,11 +41,7 @@ class Trajectory:
             part = positions[first : first + BLOCK + 1].astype(np.float32)
             if index == len(self._blocks):
                 self._drawn.append(part)
-                self._blocks.append(
-                    self._scene.add_line_segments(
-                        f"{self._root}/{index}", segments(part), self._colour, thickness=3.0, thickness_units="screen"
-                    )
-                )
+                self._blocks.append(add_lines(self._scene, f"{self._root}/{index}", segments(part), self._colour, 3.0))
             elif len(part) != len(self._drawn[index]) or np.abs(part - self._drawn[index]).max() > STILL_M:
                 self._drawn[index] = part
                 self._blocks[index].points = segments(part)
@@ -69,11 +66,9 @@ class Truth:
                 self._line = None
             if positions is not None and len(positions) >= 2:
                 some = positions[:: max(1, len(positions) // _MOST_TRUTH_POINTS)]
-                self._line = self._scene.add_line_segments(
-                    self._root, segments(some), TRUTH_COLOUR, thickness=1.5, thickness_units="screen", visible=False
-                )
+                self._line = add_lines(self._scene, self._root, segments(some), TRUTH_COLOUR, 1.5, visible=False)
         if self._line is None:
             return
         self._line.visible = visible and T_map_truth is not None
         if T_map_truth is not None:
-            self._line.wxyz, self._line.position = wxyz(T_map_truth[:3, :3]), T_map_truth[:3, 3]
+            place(self._line, T_map_truth)

@@ -6,9 +6,10 @@ import numpy as np
 import viser
 
 from app.slam.params import Params
-from app.slam.types import F64, StepResult
+from app.slam.types import F64, GROUND, SEED, StepResult
 from app.ui.colours import LABEL_COLOURS, Limits, PointSet, colours
 from app.ui.geometry import disc, field_of_view, foot, ring_elevations, rotation_to, seed_wedge, wxyz
+from app.ui.nodes import NO_COLOURS, NO_LINES, NO_POINTS, add_lines, add_points, add_surface, place
 from app.ui.view import View
 
 MOST_SCAN_POINTS: Final = 30_000
@@ -17,7 +18,6 @@ MOST_SCAN_POINTS: Final = 30_000
 _PATCH_RADIUS_M: Final = 2.5
 SCAN_POINT_SCALE: Final = 1.3
 """The current scan has larger points than the map, to stand out."""
-_NOTHING: Final = np.zeros((1, 2, 3), dtype=np.float32)
 
 
 def shown_of(count: int) -> slice:
@@ -32,48 +32,16 @@ class SensorScene:
         self._imu = scene.add_frame(root, axes_length=0.35, axes_radius=0.012, origin_radius=0.03, visible=False)
         self._lidar = scene.add_frame(f"{root}/lidar", show_axes=False)
         below = f"{root}/lidar"
-        self._scan = scene.add_point_cloud(
-            f"{below}/scan",
-            np.zeros((1, 3), np.float32),
-            np.zeros((1, 3), np.uint8),
-            point_size=0.04,
-            point_shape="circle",
-            point_shading="flat",
-            visible=False,
-        )
-        self._view_lines = scene.add_line_segments(
-            f"{below}/view", _NOTHING, (120, 140, 170), thickness=1.2, thickness_units="screen"
-        )
-        seed = LABEL_COLOURS[2]
-        self._wedge = scene.add_mesh_simple(
-            f"{below}/wedge",
-            np.zeros((3, 3), np.float32),
-            np.array([[0, 1, 2]], np.uint32),
-            color=seed,
-            opacity=0.14,
-            side="double",
-            material="toon3",
-            cast_shadow=False,
-            receive_shadow=False,
-        )
-        self._wedge_lines = scene.add_line_segments(
-            f"{below}/wedge_lines", _NOTHING, seed, thickness=1.5, thickness_units="screen"
-        )
+        self._scan = add_points(scene, f"{below}/scan", NO_POINTS, NO_COLOURS, 0.04, visible=False)
+        self._view_lines = add_lines(scene, f"{below}/view", NO_LINES, (120, 140, 170), 1.2)
+        seed, ground = LABEL_COLOURS[SEED], LABEL_COLOURS[GROUND]
+        triangle = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
+        self._wedge = add_surface(scene, f"{below}/wedge", *triangle, seed, 0.14)
+        self._wedge_lines = add_lines(scene, f"{below}/wedge_lines", NO_LINES, seed, 1.5)
         vertices, faces, rim = disc(_PATCH_RADIUS_M)
-        ground = LABEL_COLOURS[1]
         self._plane = scene.add_frame(f"{below}/plane", show_axes=False)
-        scene.add_mesh_simple(
-            f"{below}/plane/disc",
-            vertices,
-            faces,
-            color=ground,
-            opacity=0.16,
-            side="double",
-            material="toon3",
-            cast_shadow=False,
-            receive_shadow=False,
-        )
-        scene.add_line_segments(f"{below}/plane/rim", rim, ground, thickness=2.0, thickness_units="screen")
+        add_surface(scene, f"{below}/plane/disc", vertices, faces, ground, 0.16)
+        add_lines(scene, f"{below}/plane/rim", rim, ground, 2.0)
         self._elevations: F64 = np.empty(0)
         self._height = 1.3
         self.ground_z: float | None = None
@@ -117,9 +85,8 @@ class SensorScene:
             if another:
                 self._scan.points = points.points.astype(np.float16)
         if another:
-            T = result.T_map_imu
-            self._imu.wxyz, self._imu.position = wxyz(T[:3, :3]), T[:3, 3]
-            self._lidar.wxyz, self._lidar.position = wxyz(result.state.R_imu_lidar), result.state.p_imu_lidar
+            place(self._imu, result.T_map_imu)
+            place(self._lidar, result.state.T_imu_lidar)
         self._scan.point_size = view.point_size * SCAN_POINT_SCALE
         self._scan.visible = view.scan and len(cloud) > 0
         self._draw_plane(result, T_map_lidar, view)

@@ -5,9 +5,11 @@ from typing import Any, Final
 import numpy as np
 import viser
 
+from app.slam import lie
 from app.slam.types import F64, StepResult
-from app.ui.geometry import disc, rotation_to, wxyz
-from app.ui.sensor import shown_of
+from app.ui.geometry import disc, rotation_to
+from app.ui.nodes import add_lines, add_points, add_surface, place
+from app.ui.sensor import SCAN_POINT_SCALE, shown_of
 from app.ui.study_maths import AS_MAP, RESIDUAL, STUDY_MODES, Picked, study_colours
 from app.ui.widgets import ROOT
 
@@ -35,15 +37,14 @@ class StudyScene:
                 self._cloud.remove()
                 self._cloud = None
             return
-        self._place(result)
+        place(self._lidar, result.T_map_imu @ result.state.T_imu_lidar)
         shown = shown_of(len(points))
-        self._cloud = self._scene.add_point_cloud(
+        self._cloud = add_points(
+            self._scene,
             f"{self._map}/cloud",
             np.asarray(points)[shown],
             study_colours(result, by)[shown],
-            point_size=size * (2.2 if by == RESIDUAL else 1.3),
-            point_shape="circle",
-            point_shading="flat",
+            size * (2.2 if by == RESIDUAL else SCAN_POINT_SCALE),
         )
 
     def draw_picked(self, result: StepResult, picked: Picked | None, size: float) -> None:
@@ -53,43 +54,25 @@ class StudyScene:
         self._marks.clear()
         if picked is None:
             return
-        self._place(result)
+        place(self._lidar, result.T_map_imu @ result.state.T_imu_lidar)
         points, patch = result.cloud.points, picked.patch
         for name, chosen, colour, scale in (
             ("neighbours", patch.indices[1:], _NEIGHBOURS, 2.0),
             ("point", patch.indices[:1], _POINT, 3.0),
         ):
-            self._marks.append(
-                self._scene.add_point_cloud(
-                    f"{self._map}/{name}", points[chosen], colour, point_size=scale * size, point_shape="circle",
-                    point_shading="flat",
-                )
-            )  # fmt: skip
+            mark = add_points(self._scene, f"{self._map}/{name}", points[chosen], colour, scale * size)
+            self._marks.append(mark)
         radius = max(patch.radius, _LEAST_RADIUS_M)
         self._plane("patch", patch.center, patch.normal, radius, _NEIGHBOURS)
         match = picked.match
         if match is not None and match.center is not None and match.normal is not None:
-            T_lidar_odom = np.linalg.inv(result.state.T_odom_imu @ result.state.T_imu_lidar)
+            T_lidar_odom = lie.inverse(result.state.T_odom_imu @ result.state.T_imu_lidar)
             R = T_lidar_odom[:3, :3]
             self._plane("map_patch", R @ match.center + T_lidar_odom[:3, 3], R @ match.normal, radius, _MAP)
 
     def _plane(self, name: str, center: F64, normal: F64, radius: float, colour: tuple[int, int, int]) -> None:
         vertices, faces, rim = disc(radius, 40)
         stem = np.array([[[0, 0, 0], [0, 0, radius]]], dtype=np.float32)
-        orientation = wxyz(rotation_to(normal))
-        self._marks.append(
-            self._scene.add_mesh_simple(
-                f"{self._map}/{name}", vertices, faces, color=colour, opacity=0.25, side="double", cast_shadow=False,
-                receive_shadow=False, wxyz=orientation, position=center,
-            )
-        )  # fmt: skip
-        self._marks.append(
-            self._scene.add_line_segments(
-                f"{self._map}/{name}_rim", np.concatenate((rim, stem)), colour, thickness=2.0,
-                thickness_units="screen", wxyz=orientation, position=center,
-            )
-        )  # fmt: skip
-
-    def _place(self, result: StepResult) -> None:
-        T = result.T_map_imu @ result.state.T_imu_lidar
-        self._lidar.wxyz, self._lidar.position = wxyz(T[:3, :3]), T[:3, 3]
+        T, node = lie.transform(rotation_to(normal), center), f"{self._map}/{name}"
+        self._marks.append(add_surface(self._scene, node, vertices, faces, colour, 0.25, T))
+        self._marks.append(add_lines(self._scene, f"{node}_rim", np.concatenate((rim, stem)), colour, 2.0, T))

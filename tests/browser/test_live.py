@@ -27,7 +27,7 @@ WELL = LiveState(
 def test_the_panel_is_there_while_a_source_is_live_and_tells_when_it_is_not_well(bench: Bench) -> None:
     page = bench.page
     page.get_by_role("tab", name="Recording").click()
-    heading = page.get_by_text("The live source")
+    heading = page.get_by_text("Live source", exact=True)
     expect(heading).to_have_count(0)
     bench.engine.send(StepFrame(10))
     bench.engine.publish(live=WELL)

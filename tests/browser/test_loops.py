@@ -28,7 +28,7 @@ def bench(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     engine.close()
 
 
-def test_chips_rows_and_heads_of_the_ledger_can_be_clicked(bench: Bench) -> None:
+def test_chips_rows_and_heads_of_the_table_can_be_clicked(bench: Bench) -> None:
     page = bench.page
     expect(page.locator("tr[aria-selected]")).to_have_count(9)
     page.get_by_role("button", name="rejected 20").click()

@@ -16,6 +16,7 @@ from app.ui.html import panel
 from app.ui.loops.edges import nearest
 from app.ui.loops.inspector import MOST_POINTS, Overlay, Pairing
 from app.ui.loops.kinds import NEWER, OLDER
+from app.ui.nodes import add_exact_points
 from app.ui.view import View
 from app.ui.widgets import ROOT, Page, by_user, show, unchanged
 
@@ -222,13 +223,8 @@ class AddLoopPanel:
             return
         colours = np.tile(np.array(_DOT, np.uint8), (len(positions), 1))
         colours[picked] = OLDER if len(picked) < 2 else NEWER
-        self._dots = self._page.scene.add_point_cloud(
-            f"{_NODE}/keyframes",
-            positions.astype(np.float32),
-            colours,
-            point_size=0.15,
-            point_shape="circle",
-            precision="float32",
+        self._dots = add_exact_points(
+            self._page.scene, f"{_NODE}/keyframes", positions.astype(np.float32), colours, 0.15
         )
 
 

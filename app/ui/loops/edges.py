@@ -15,6 +15,7 @@ from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.geometry import STILL_M
 from app.ui.loops.kinds import EDITED, KINDS, kind_of, name
+from app.ui.nodes import add_exact_points, add_lines
 from app.ui.widgets import unchanged
 
 _RISE: Final = (0.7, 0.12)
@@ -108,10 +109,8 @@ class LoopEdges:
         path = f"{self._root}/{style}"
         knobs = np.ascontiguousarray(lines[:, 1])
         self._nodes[style] = [
-            self._scene.add_line_segments(path, _legs(lines), colour, thickness=width, thickness_units="screen"),
-            self._scene.add_point_cloud(
-                f"{path}-knobs", knobs, colour, point_size=knob_m, point_shape="circle", precision="float32"
-            ),
+            add_lines(self._scene, path, _legs(lines), colour, width),
+            add_exact_points(self._scene, f"{path}-knobs", knobs, colour, knob_m),
         ]
         if label:
             self._nodes[style].append(self._scene.add_label(f"{path}-label", label, position=lines[0, 1] + _LABEL))

@@ -15,6 +15,7 @@ from app.ui.colours import Rgb
 from app.ui.html import panel
 from app.ui.loops.kinds import describe_edit
 from app.ui.loops.words import forecast, headline
+from app.ui.nodes import add_lines
 from app.ui.paths import segments
 from app.ui.widgets import ROOT, Page, by_user, show, unchanged
 
@@ -52,10 +53,7 @@ class Ghost:
             self._add("moves", sticks, _STICK, 1.0)
 
     def _add(self, name: str, lines: F32, colour: Rgb, width: float) -> None:
-        node = f"{ROOT}/ghost/{name}"
-        self._nodes.append(
-            self._scene.add_line_segments(node, lines, colour, thickness=width, thickness_units="screen")
-        )
+        self._nodes.append(add_lines(self._scene, f"{ROOT}/ghost/{name}", lines, colour, width))
 
 
 class Proposal:

@@ -10,15 +10,16 @@ import viser
 from app.server.protocol import Snapshot
 from app.slam import lie
 from app.slam.loops.types import LoopDetail, LoopEdge, Pair
+from app.slam.params import LoopsParams
 from app.slam.types import F32, F64, NON_GROUND
 from app.ui.ceiling import below_ceiling
-from app.ui.geometry import wxyz
-from app.ui.html import heading, panel
-from app.ui.loops.charts import best_yaw, contexts_image
+from app.ui.html import WARN, heading, panel
+from app.ui.loops.charts import best_yaw, contexts_image, histogram, shift_curve
 from app.ui.loops.kinds import NEWER, OLDER
-from app.ui.loops.words import charts, evidence
+from app.ui.loops.words import evidence
+from app.ui.nodes import add_exact_points, place
 from app.ui.view import View
-from app.ui.widgets import ROOT, Page, by_user, unchanged
+from app.ui.widgets import ROOT, Page, by_user, chart, unchanged
 
 FLY, SEEK, CLOSE = "fly there", "frame", "close"
 MOST_POINTS: Final = 30_000
@@ -75,7 +76,8 @@ class Overlay:
                 self._points[name] = points
                 self._send(name, points, colour, point_size)
             if (node := self._nodes.get(name)) is not None:
-                node.wxyz, node.position, node.point_size = wxyz(T[:3, :3]), T[:3, 3], point_size
+                place(node, T)
+                node.point_size = point_size
 
     def _remove(self, *names: str) -> None:
         for name in names:
@@ -86,14 +88,8 @@ class Overlay:
         if not len(points):  # the page cannot draw a cloud without points
             self._remove(name)
             return
-        self._nodes[name] = self._scene.add_point_cloud(
-            f"{self._root}/{name}",
-            points[:MOST_POINTS],
-            colour,
-            point_size=point_size,
-            point_shape="circle",
-            precision="float32",  # a fit is judged by centimetres; a half float resolves 2 cm at 20 m
-        )
+        node = f"{self._root}/{name}"
+        self._nodes[name] = add_exact_points(self._scene, node, points[:MOST_POINTS], colour, point_size)
 
 
 class Inspector:
@@ -107,7 +103,6 @@ class Inspector:
         gui = page.gui
         self._overlay = Overlay(page.scene, f"{ROOT}/submaps")
         self._pairing: Pairing | None = None
-        self._detail: LoopDetail | None = None
         self._clouds: tuple[LoopDetail, bool, F32, F32] | None = None
         self._told: tuple[object, ...] = ()
         self._evidence = gui.add_html("")
@@ -131,7 +126,22 @@ class Inspector:
             heading("Scan Contexts from above, the newer one turned to match; grey was never seen")
         )
         self._contexts = gui.add_image(_NO_CONTEXTS, format="png")
-        self._charts = gui.add_html("")
+        self._shifts_title = gui.add_html("")
+        line, limit = {"stroke": "#40b8f0", "width": 1.5}, {"stroke": WARN, "width": 1.5, "dash": [3, 3]}
+        self._shifts = chart(gui, (np.zeros(1),) * 3, [line, limit])
+        self._residuals_title = gui.add_html(heading("Points over their distance to the other submap's surface, mm"))
+        self._residuals = chart(gui, (np.zeros(1),) * 3, [line | {"fill": "#40b8f080"}, limit])
+        self._detailed = (
+            self._laid,
+            self._alone,
+            self._legend,
+            self._contexts_title,
+            self._contexts,
+            self._shifts_title,
+            self._shifts,
+            self._residuals_title,
+            self._residuals,
+        )
 
     @property
     def alone(self) -> bool:
@@ -145,7 +155,7 @@ class Inspector:
         if unchanged(self._told, news):
             return
         self._told = news
-        for handle in (self._laid, self._alone, self._legend, self._contexts_title, self._contexts, self._charts):
+        for handle in self._detailed:
             handle.visible = detail is not None
         self._waiting.visible = detail is None
         if edge is None:
@@ -154,11 +164,16 @@ class Inspector:
         names = [(OLDER, f"keyframe {edge.older}"), (NEWER, f"keyframe {edge.newer}")]
         self._legend.content = panel("keys", names, True)
         if detail is not None:
-            if detail is not self._detail:
-                turn = best_yaw(detail.shift_distances)
-                self._contexts.image = contexts_image(detail.older_context, detail.newer_context, turn)
-            self._charts.content = charts(detail, snapshot.params.loops)
-        self._detail = detail
+            self._draw_charts(detail, snapshot.params.loops)
+
+    def _draw_charts(self, detail: LoopDetail, params: LoopsParams) -> None:
+        turn = best_yaw(detail.shift_distances)
+        self._contexts.image = contexts_image(detail.older_context, detail.newer_context, turn)
+        title = f"Distance of the Scan Contexts over the turn of the newer one; best at {np.degrees(turn):.0f}°"
+        self._shifts_title.content = heading(title)
+        self._shifts.data = shift_curve(detail.shift_distances, params.context_distance)
+        self._residuals.data = outline = histogram(detail.residuals, params.max_residual)
+        self._residuals.scales = {"x": {"time": False}, "y": {"range": (0.0, float(outline[1].max()))}}
 
     def draw_scene(self, snapshot: Snapshot, chosen: Pair | None, view: View) -> None:
         """Lay the submaps into the scene, as far between the two poses as the slider says."""

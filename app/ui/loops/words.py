@@ -5,11 +5,10 @@ from typing import Any, Final
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops.types import FactorResidual, LoopDetail, LoopEdge, LoopEdit, Preview, Solve
+from app.slam.loops.types import FactorResidual, LoopEdge, LoopEdit, Preview, Solve
 from app.slam.params import LoopsParams
 from app.slam.types import F64
 from app.ui.html import BAD, GOOD, Tile, number, panel
-from app.ui.loops.charts import best_yaw, histogram, shift_plot
 from app.ui.loops.kinds import describe_edit, kind_of, name
 
 _LARGEST: Final = 12
@@ -46,14 +45,6 @@ def evidence(edge: LoopEdge, params: LoopsParams) -> str:
              _judged(e.context_distance, params.context_distance)),
     ]  # fmt: skip
     return panel("tile_grid", tiles)
-
-
-def charts(detail: LoopDetail, params: LoopsParams) -> str:
-    """The distance of the Scan Contexts over the heading, and the points' distances to the other submap."""
-    degrees = f"{np.degrees(best_yaw(detail.shift_distances)):.0f}"
-    shifts = shift_plot(detail.shift_distances, params.context_distance)
-    residuals = histogram(detail.residuals, params.max_residual)
-    return panel("charts", degrees, shifts, residuals, template="loops.html")
 
 
 def largest_factors(residuals: tuple[FactorResidual, ...], most: int = _LARGEST) -> str:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from app.slam import lie
 from app.slam.loops.scan_context import RINGS, SECTORS, YAWS
-from app.ui.loops.charts import UNSEEN, contexts_image, disc, histogram, shift_plot
+from app.ui.loops.charts import UNSEEN, best_yaw, contexts_image, disc, histogram, shift_curve
 from app.ui.loops.edges import nearest
 from app.ui.loops.fly import stand
 from app.ui.loops.inspector import on_the_way, without_ceiling
@@ -74,24 +74,22 @@ def test_a_context_that_saw_nothing_is_all_grey() -> None:
     assert {tuple(pixel) for pixel in image[image[..., 3] > 0][:, :3]} == {UNSEEN}
 
 
-def test_the_histogram_has_a_bar_for_each_class_and_none_of_nothing() -> None:
-    plot = histogram(np.concatenate((np.full(90, 0.001), np.full(10, -0.03), [np.nan])), 0.05)
-    assert plot is not None
-    heights = [float(height) for *_, height in plot.bars]
-    assert sorted(h for h in heights if h > 0)[0] * 9 == pytest.approx(max(heights), rel=0.02)
-    assert "90" in [text for *_, text in plot.ticks] and histogram(np.empty(0), 0.05) is None
+def test_the_histogram_counts_every_point_below_its_end_and_marks_the_limit() -> None:
+    edges, counts, mark = histogram(np.concatenate((np.full(90, 0.001), np.full(10, -0.03), [np.nan])), 0.05)
+    assert counts[::2].tolist() == counts[1::2].tolist() and sorted(counts[::2])[-2:] == [10, 90]
+    assert edges[2 * np.argmax(counts[::2])] <= 1.0 < edges[2 * np.argmax(counts[::2]) + 1]
+    marked = np.isfinite(mark)
+    assert np.allclose(edges[marked], 50.0) and mark[marked].tolist() == [0, 90]
+    assert not histogram(np.empty(0), 0.05)[1].any()
 
 
-def test_the_plot_of_shifts_runs_from_half_a_turn_to_half_a_turn_and_marks_the_best() -> None:
+def test_the_curve_of_turns_goes_from_half_a_turn_to_half_a_turn() -> None:
     distances = np.full(SECTORS, 0.6)
     distances[15] = 0.1  # 90 degrees
-    plot = shift_plot(distances, 0.3)
-    points = [tuple(map(float, pair.split(","))) for pair in plot.points.split()]
-    xs, ys = np.array(points).T
-    assert (np.diff(xs) > 0).all()
-    lowest = xs[ys.argmax()]  # SVG counts down
-    assert [line[0] for line in plot.lines if line[0] == line[2]] == [f"{lowest:.1f}"]
-    assert lowest == pytest.approx(26 + 0.75 * (300 - 6 - 26), abs=0.5)
+    degrees, shown, limit = shift_curve(distances, 0.3)
+    assert (np.diff(degrees) > 0).all() and degrees[0] >= -180 and degrees[-1] <= 180
+    assert degrees[shown.argmin()] == pytest.approx(90) == pytest.approx(np.degrees(best_yaw(distances)))
+    assert (limit == 0.3).all()
 
 
 @settings(deadline=None)
