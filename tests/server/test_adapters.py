@@ -17,7 +17,7 @@ from app.server.viser_adapter import Viser
 
 APP = Path(viser_adapter.__file__).resolve().parents[1]
 
-ADAPTERS = {"server/viser_adapter.py", "ui/chunks.py", "ui/loops/bridge.py"}
+ADAPTERS = {"server/viser_adapter.py"}
 """Modules that may use private names of a library."""
 
 PUBLIC = {"os._exit"}
