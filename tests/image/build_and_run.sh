@@ -41,9 +41,9 @@ fi
 
 say "build"
 buildah build --isolation chroot --pull=never --network host "${volumes[@]}" --tag hemislam-test .
-container=$(buildah from --pull=never hemislam-test)
 
-# run USER COMMAND...: as `docker run --user USER` does, "" for the image's own. A user without an entry has HOME=/.
+# run USER COMMAND...: in $container, as `docker run --user USER` does; "" for the image's own user. A user that the
+# image does not know has HOME=/.
 run() {
   local user=()
   if [ -n "$1" ]; then user=(--user "$1" --env HOME=/); fi
@@ -72,10 +72,12 @@ PYTHON
   fi
   wait "$pid" || { cat "$out"; echo "hemislam serve failed"; return 1; }
   cat "$out"
+  run "$1" sh -c 'test -s runs/sessions/*.hemislam' || { echo "hemislam serve kept no session file"; return 1; }
 }
 
 for user in "" 12345; do
   name=${user:-hemislam}
+  container=$(buildah from --pull=never hemislam-test)
   say "as $name: info"
   run "$user" hemislam info sample_data/museum.mcap
   say "as $name: run"
@@ -83,6 +85,6 @@ for user in "" 12345; do
   run "$user" test -s "runs/image-test-$name/trajectory.tum"
   say "as $name: serve"
   served "$user"
+  buildah rm "$container" >/dev/null
 done
-buildah rm "$container" >/dev/null
 say "the image works"
