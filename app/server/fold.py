@@ -116,9 +116,11 @@ class _Frames:
         moved = corrections is not self._corrections
         self._rows.truncate(delta.keep)
         self._rows.extend(as_table(delta.frames))
-        self._positions.truncate(0 if moved else delta.keep)
-        laid = len(self._positions)
-        self._positions.extend(corrections.trajectory(_odometry(self._rows.view()[laid:])).positions)
+        self._positions.truncate(delta.keep)
+        if moved:
+            self._positions.truncate(self._first_moved(corrections))
+        new_rows = self._rows.view()[len(self._positions) :]
+        self._positions.extend(corrections.trajectory(_odometry(new_rows)).positions)
         self._corrections = corrections
         kept = int(np.searchsorted(self.keyframes, delta.keep))
         new = [delta.keep + index for index, frame in enumerate(delta.frames) if frame.keyframe]
@@ -131,6 +133,13 @@ class _Frames:
             self.keyframe_poses = corrections.poses(self._T_odom_imu)
             self.keyframe_poses.setflags(write=False)
         return moved
+
+    def _first_moved(self, corrections: MapFrame) -> int:
+        """The first frame that may lie elsewhere by these corrections."""
+        keyframe = corrections.first_change(self._corrections)
+        if keyframe == 0:
+            return 0
+        return int(np.searchsorted(self._rows.view()["stamp_ns"], corrections.stamps_ns[keyframe - 1]))
 
     def series(self, shown: int, recording: OpenedRecording | None) -> tuple[F64 | None, dict[str, F64]]:
         """T_map_truth, if the first `shown` frames determine it, and their arrays by SERIES name."""

@@ -138,6 +138,26 @@ def test_a_loop_closure_sends_corrections_and_no_frame() -> None:
     assert not before.trajectory[:, 2].any(), "what was shown before stays as it was"
 
 
+@given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 6), st.floats(-1, 1)), min_size=1, max_size=6))
+def test_frames_lie_where_the_newest_corrections_put_them_whatever_came_before(
+    steps: list[tuple[int, int, float]],
+) -> None:
+    """A step goes back to some frames, adds others, and changes the corrections of the later half of keyframes."""
+    frames = Frames()
+    ups = np.zeros(100)
+    for back_to, added, up in steps:
+        frames.log.truncate(back_to)
+        frames.add(added, keyframes=True)
+        count = len(frames.log)
+        ups[count // 2 :] += up
+        T_map_odom = np.tile(np.eye(4), (count, 1, 1))
+        T_map_odom[:, 2, 3] = ups[:count]
+        seen = frames.see(corrections=MapFrame(np.arange(count), T_map_odom))
+        assert seen.trajectory is not None
+        np.testing.assert_allclose(seen.trajectory[:, 0], np.arange(count), atol=1e-12)
+        np.testing.assert_allclose(seen.trajectory[:, 2], ups[:count], atol=1e-12)
+
+
 def test_the_error_to_the_truth_follows_from_the_trajectory_that_is_shown() -> None:
     frames, turn = Frames(), np.array([0.0, 0.0, 0.0, 1.0])
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.1]])
