@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from app.cli.run import process
+from app.mapping.opening import open_session
+from app.mapping.session import Session
 from app.sensors.presets import resolve_params
-from app.server.run import Run, open_run
 from app.slam import lie
 from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.metrics import ate, interpolate
@@ -98,10 +99,10 @@ def measure(recording: Path, truth_path: Path | None, params: Params) -> Score:
 
 
 def _run(recording: Path, params: Params) -> Walk:
-    work = open_run(recording, None, params)
+    work = open_session(recording, params)
     try:
-        if work.engine.loops:
-            work.engine.loops.wait_ready()
+        if work.loops:
+            work.loops.wait_ready()
         if (stop := process(work)) is not None:
             raise stop
         return _walk(work)
@@ -109,8 +110,8 @@ def _run(recording: Path, params: Params) -> Walk:
         work.close()
 
 
-def _walk(work: Run) -> Walk:
-    found = work.engine.loops.results() if work.engine.loops else None
+def _walk(work: Session) -> Walk:
+    found = work.loops.results() if work.loops else None
     odometry = work.log.odometry
     keyframes = [work.engine.keyframes[index] for index in range(len(work.engine.keyframes))]
     return Walk(

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from app.mapping.opening import open_session
+from app.mapping.session import Session
 from app.sensors.presets import resolve_params
+from app.server.controller import Controller
 from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import Command, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
-from app.server.run import Run, open_run
-from app.server.session import Session
 from app.slam.loops.types import Verdict
 from app.slam.params import Params
 from app.slam.warmup import compile_kernels
@@ -49,21 +50,23 @@ class Walk:
     def __init__(self, path: Path) -> None:
         self.params = resolve_params(path, None, None, [])
         self._outbox, self._fold = Outbox(self.params), Fold(Snapshot(params=self.params))
-        self.session = Session(self._outbox, self.params, self._open)
-        self.session.open(path, None)
+        self.controller = Controller(self._outbox, self.params, self._open)
+        self.controller.open(path, None)
         self.do(SetSpeed(math.inf))
 
     @staticmethod
-    def _open(path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /) -> Run:
-        run = open_run(path, truth, params, *(part or (0.0, None)), checkpoint_bytes=BUDGET)
-        if run.engine.loops is not None:
-            run.engine.loops.wait_ready()
-        return run
+    def _open(
+        path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /
+    ) -> Session:
+        session = open_session(path, params, *(part or (0.0, None)), truth=truth, checkpoint_bytes=BUDGET)
+        if session.loops is not None:
+            session.loops.wait_ready()
+        return session
 
     def do(self, command: Command) -> Snapshot:
         """Until nothing is awaited any more."""
-        self.session.handle(command)
-        while (wait := self.session.work()) is not None:
+        self.controller.handle(command)
+        while (wait := self.controller.work()) is not None:
             time.sleep(wait)
             if self._outbox.filled:
                 self._fold.apply(self._outbox.take())
@@ -111,7 +114,7 @@ def run(recording: Path | None = None, frames: int = FRAMES) -> list[Line]:
             again = walk.saved(Path(folder) / str(index))
             differ = [name for name in sorted(expected | again) if expected.get(name) != again.get(name)]
             assert not differ, f"restored at frame {frame} and continued, these differ: {', '.join(differ)}"
-    walk.session.close()
+    walk.controller.close()
     on = f"{path.stem}: {last + 1:,} frames, {loops} loops, {len(CHANGES)} changes of parameters, {len(expected)} files"
     return [Line(f"of {frames} restored and continued", on, "differ", 0.0, 0.0, 0.0, frames)]
 

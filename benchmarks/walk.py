@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from app.mapping.feed import Feed, FeedInfo
+from app.mapping.session import Session
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.sensors.simulator.suite import PAPER, make_twin
 from app.slam.engine import Engine
 from app.slam.loops.service import InlineLoops
-from app.slam.types import Measurement
+from app.slam.params import Params
+from app.slam.types import Measurement, StepResult
 from app.slam.warmup import compile_kernels
 from benchmarks.record import Line
 from benchmarks.scenes import FOLDER
@@ -39,7 +42,7 @@ def run() -> list[Line]:
 def measure(path: Path) -> list[Line]:
     """Whole-frame time in ms around some frames, and that at the late ones over that at the early ones."""
     params = resolve_params(path, None, None, [])
-    waiting, walking = Engine(params, InlineLoops), Engine(params, InlineLoops)
+    waiting, walking = _Walk(path, params), _Walk(path, params)
     early: list[Measurement] = []
     times: dict[int, list[float]] = {place: [] for place in (0, EARLY, *PLACES, LATE)}
     with open_recording(path, params) as source, tqdm(desc=TWIN, unit=" frames", leave=False, disable=None) as bar:
@@ -47,24 +50,46 @@ def measure(path: Path) -> list[Line]:
         scans = (entry for entry in source.measurements() if isinstance(entry, Measurement))
         for frame, entry in enumerate(islice(scans, LATE + AROUND)):
             if frame < EARLY - AROUND:
-                waiting.step(entry.scan, entry.imu)
+                waiting.step(entry)
             elif frame < EARLY + AROUND:
                 early.append(entry)
             place = next((place for place in (*PLACES, LATE) if place - AROUND <= frame < place + AROUND), 0)
             work = [(walking, entry, place)]
             if place == LATE:
                 work.append((waiting, early[frame - (LATE - AROUND)], EARLY))
-            for engine, scan, there in work if frame % 2 else reversed(work):
-                times[there].append(engine.step(scan.scan, scan.imu).timings_ms["total"])
+            for walk, scan, there in work if frame % 2 else reversed(work):
+                times[there].append(walk.step(scan).timings_ms["total"])
             bar.update()
-    waiting.close()
-    walking.close()
+    waiting.session.close()
+    walking.session.close()
     on = f"{TWIN}: {frame + 1:,} frames, {9600:,} firings a scan"
     lines = [Line.of(f"frames around {place:,}", on, "ms", window) for place, window in times.items() if place]
     for name, middle in (("median", np.median), ("mean", np.mean)):
         ratio = float(middle(times[LATE]) / middle(times[EARLY]))
         lines.append(Line.of(f"{LATE:,} over {EARLY:,}, {name}", on, "ratio", [ratio]))
     return lines
+
+
+class _Walk(Feed):
+    """A session that is handed its measurements one by one."""
+
+    def __init__(self, path: Path, params: Params) -> None:
+        self._path = path
+        self._next: Measurement | None = None
+        self.session = Session(self, Engine(params), loops=InlineLoops)
+
+    @property
+    def info(self) -> FeedInfo:
+        return FeedInfo(self._path)
+
+    def next(self) -> Measurement | None:
+        return self._next
+
+    def step(self, measurement: Measurement) -> StepResult:
+        self._next = measurement
+        result = self.session.advance()
+        assert isinstance(result, StepResult)
+        return result
 
 
 def _recording() -> Path:

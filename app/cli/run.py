@@ -1,7 +1,6 @@
 """`hemislam run`: a recording from end to end, without a browser."""
 
 import contextlib
-import itertools
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,9 +22,8 @@ from app.cli.options import (
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
-    from app.server.run import Run
+    from app.mapping.session import Session
     from app.slam.loops.types import LoopEdit
-    from app.slam.results import RunInfo
 
 
 def run(
@@ -66,65 +64,60 @@ def run(
       hemislam run walk.mcap --loops edits.yaml
     """
     from app.evaluation.truth_sources import read_poses
-    from app.server.run import open_run
-    from app.slam.results import RunInfo, prepare_folder
+    from app.mapping.opening import open_session
+    from app.slam.results import prepare_folder
     from app.slam.trajectory import time_apart, truth_beside
 
     params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
     edits = _read_edits(loops) if loops else ()
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
-    work = open_run(recording, truth_path, params, start, duration)
+    session = open_session(recording, params, start, duration, truth=truth_path)
     try:
         true_poses = read_poses(truth_path) if truth_path else None
-        opened = work.opened
         if truth and true_poses:
-            if apart := time_apart(truth, true_poses.stamps_ns, opened.start_ns, opened.duration_s):
+            info = session.feed.info
+            if apart := time_apart(truth, true_poses.stamps_ns, info.start_ns, info.duration_s or 0.0):
                 raise HemislamError(apart)
         elif truth_path:
             typer.echo(f"Using the truth that lies beside the recording: {truth_path}")
         prepare_folder(folder, replace=force)
-        for finding in work.opened.findings:
+        for finding in session.findings:
             if finding.verdict != "fine":
                 typer.echo(f"{finding.verdict}: {finding.subject}: {finding.text} {finding.option}".rstrip())
-        compile_behind_bar()
-        if work.engine.loops:
-            work.engine.loops.wait_ready()
+        prepare(session)
         if edits:
-            work.edit_loops(edits)
-        stop = process(work)
-        if not len(work.log):
+            session.edit_loops(edits)
+        stop = process(session)
+        if not len(session.log):
             with contextlib.suppress(OSError):
                 folder.rmdir()  # only if it is empty
-            raise stop or HemislamError(_nothing_processed(work))
-        info = RunInfo(
-            recording=recording,
-            params=params,
-            start_s=start,
-            duration_s=duration,
-            truth=true_poses,
-            truth_path=truth_path,
-            stopped="" if stop is None else str(stop) or type(stop).__name__,
-        )
-        save(work, folder, info, stop, replace=force)
+            raise stop or HemislamError(_nothing_processed(session))
+        save(session, folder, stop, replace=force)
     finally:
-        work.close()
+        session.close()
 
 
-def save(work: "Run", folder: Path, info: "RunInfo", stop: BaseException | None, *, replace: bool) -> None:
+def prepare(session: "Session") -> None:
+    """Wait for everything that the first frame would have to wait for."""
+    compile_behind_bar()
+    if session.loops:
+        session.loops.wait_ready()
+
+
+def save(session: "Session", folder: Path, stop: BaseException | None, *, replace: bool) -> None:
     """Write the results and sum them up.
 
     Raises:
         BaseException: `stop`, what ended the run early, once the frames so far are saved.
     """
     from app.slam.report import summarise
-    from app.slam.results import save_results
 
-    found = work.engine.loops.results() if work.engine.loops else None
-    report = save_results(folder, work.log, work.engine.keyframes, info, found, replace=replace)
+    stopped = "" if stop is None else str(stop) or type(stop).__name__
+    report = session.save(folder, replace=replace, stopped=stopped).result()
     typer.echo(summarise(report, folder))
-    if work.engine.loops:
-        for notice in (*work.engine.loops.take_notices(), *work.engine.loops.take_alarms()):
+    if session.loops:
+        for notice in (*session.loops.take_notices(), *session.loops.take_alarms()):
             typer.echo(notice)
     if isinstance(stop, HemislamError):
         raise HemislamError(f"{stop} The frames before that were processed and saved in {folder}.")
@@ -146,8 +139,9 @@ def _read_edits(path: Path) -> "tuple[LoopEdit, ...]":
 
 def free_folder(recording: Path) -> Path:
     """The first of runs/NAME-1, runs/NAME-2, ... that does not exist yet."""
-    name = recording.resolve().stem
-    return next(folder for n in itertools.count(1) if not (folder := Path("runs") / f"{name}-{n}").exists())
+    from app.mapping.session_file import free_path
+
+    return free_path(Path("runs") / recording.resolve().stem, always_numbered=True)
 
 
 def compile_behind_bar() -> None:
@@ -166,7 +160,7 @@ def compile_behind_bar() -> None:
         compile_kernels(show)
 
 
-def process(work: "Run", *, until: int | None = None) -> BaseException | None:
+def process(session: "Session", *, until: int | None = None) -> BaseException | None:
     """Run to the end of the recording. What stopped it before, an interruption say, is returned, not raised.
 
     Args:
@@ -174,22 +168,18 @@ def process(work: "Run", *, until: int | None = None) -> BaseException | None:
     """
     from tqdm import tqdm
 
-    from app.slam.types import Measurement
-
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    frames = work.opened.frames if until is None else until + 1
+    frames = session.feed.info.frames if until is None else until + 1
     with tqdm(total=frames, unit=" frames", disable=None) as bar:
         try:
-            while (until is None or work.frame < until) and (entry := work.peek()) is not None:
-                if isinstance(entry, Measurement):
-                    work.step(sought=True)
+            while (until is None or session.frame < until) and session.advance() is not None:
                 bar.update()
         except (Exception, KeyboardInterrupt) as error:  # whatever it was, the frames so far must be saved
             return error
     return None
 
 
-def _nothing_processed(work: "Run") -> str:
-    reasons = "; ".join(f"{count} x {reason}" for reason, count in work.log.dropped.most_common(3))
+def _nothing_processed(session: "Session") -> str:
+    reasons = "; ".join(f"{count} x {reason}" for reason, count in session.log.dropped.most_common(3))
     why = f"all were dropped: {reasons}" if reasons else "there is none in the part asked for"
-    return f"No scan of {work.opened.path} could be processed ({why}); `hemislam info` tells more."
+    return f"No scan of {session.feed.info.path} could be processed ({why}); `hemislam info` tells more."

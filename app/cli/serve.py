@@ -104,10 +104,10 @@ def serve(
     start_logging(json_lines=log_json)
     fork_context()  # it imports the engine while this process imports the rest
     from app.evaluation.truth_sources import read_poses
+    from app.mapping.session_file import SUFFIX, read_session
     from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording
     from app.server.folders import Folders
-    from app.server.journal import SUFFIX, read_session
     from app.server.protocol import LIVE
     from app.server.setup import Setup
     from app.server.web import Tls, run_server

@@ -19,14 +19,14 @@ import numpy as np
 
 from app import __version__
 from app.evaluation import crops, map_sharpness
-from app.sensors.recording import open_recording
-from app.slam.engine import Engine
+from app.mapping.opening import open_session
+from app.mapping.session import Session
 from app.slam.metrics import GroundScore
 from app.slam.params import Params
 from app.slam.provenance import describe_machine, peak_memory_mb
-from app.slam.results import RunLog, timings_csv
+from app.slam.results import timings_csv
 from app.slam.trajectory import Trajectory, write_tum
-from app.slam.types import F64, DroppedScan, FrameStatus, StepResult
+from app.slam.types import F64, FrameStatus, Measurement, StepResult
 
 FORMAT = 1
 GROUND_RANGES_M = (0.0, 5.0, 10.0, 20.0, 40.0, 100.0)
@@ -37,7 +37,8 @@ RUN_FILES = ("trajectory.tum", "timings.csv", "crops.npz", "run.json")
 def code_digest() -> str:
     """Hash of the code that results depend on: a version that changes between releases is another one."""
     root = Path(__file__).parents[1]
-    files = [*(root / "slam").rglob("*.py"), *(root / "sensors").glob("*.py")]
+    files = [path for room in ("slam", "mapping") for path in (root / room).rglob("*.py")]
+    files += (root / "sensors").glob("*.py")
     files += [root / "evaluation" / name for name in ("job.py", "map_sharpness.py", "crops.py")]
     digest = hashlib.sha256()
     for path in sorted(files):
@@ -101,34 +102,29 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
 
     numba.set_num_threads(min(job.threads, numba.get_num_threads()))
     compile_kernels()
-    log, ground, cpu_ms = RunLog(), [GroundScore() for _ in GROUND_RANGES_M[1:]], []
-    with open_recording(job.recording, job.params) as recording:
-        rest = max(0.0, recording.duration_s - job.start_s)
-        part = (rest if job.duration_s is None else min(rest, job.duration_s)) / max(recording.duration_s, 1e-9)
-        total = round(recording.scan_count * part)
-        engine = Engine(job.params, InlineLoops if job.params.loops.enabled else None)
-        try:
-            for entry in recording.measurements(job.start_s, job.duration_s):
-                if isinstance(entry, DroppedScan):
-                    log.drop(entry)
-                    continue
-                begin = time.process_time()
-                result = engine.step(entry.scan, entry.imu)
-                cpu_ms.append((time.process_time() - begin) * 1e3)
-                log.add(result)
-                _score_ground(ground, result)
-                progress(len(log), total)
-            if engine.loops:
-                engine.loops.finish()
-                engine.loops.poll()
-            memory = peak_memory_mb()
-            _write(job, log, engine, _facts(job, log, engine, ground, memory), cpu_ms)
-        finally:
-            engine.close()
+    ground, cpu_ms = [GroundScore() for _ in GROUND_RANGES_M[1:]], list[float]()
+    session = open_session(job.recording, job.params, job.start_s, job.duration_s, loops=InlineLoops)
+    try:
+        total = session.feed.info.frames or 0
+        while (entry := session.peek()) is not None:
+            if not isinstance(entry, Measurement):
+                continue
+            begin = time.process_time()
+            result = session.advance()
+            cpu_ms.append((time.process_time() - begin) * 1e3)
+            assert isinstance(result, StepResult)
+            _score_ground(ground, result)
+            progress(len(session.log), total)
+        if session.loops:
+            session.loops.poll()  # those of the last keyframes
+        _write(job, session, _facts(job, session, ground, peak_memory_mb()), cpu_ms)
+    finally:
+        session.close()
 
 
-def _facts(job: Job, log: RunLog, engine: Engine, ground: list[GroundScore], memory_mb: float) -> dict[str, Any]:
+def _facts(job: Job, session: Session, ground: list[GroundScore], memory_mb: float) -> dict[str, Any]:
     """What run.json holds but for what needs the map."""
+    log = session.log
     return {
         "key": job.key,
         "hemislam": __version__,
@@ -142,8 +138,8 @@ def _facts(job: Job, log: RunLog, engine: Engine, ground: list[GroundScore], mem
         "frames": len(log),
         "lost": log.statuses[FrameStatus.LOST],
         "dropped": dict(log.dropped.most_common()),
-        "distance_m": engine.map_frame.trajectory(log.odometry).distance,
-        "loops": None if engine.loops is None else engine.loops.accepted,
+        "distance_m": session.map_frame.trajectory(log.odometry).distance,
+        "loops": None if session.loops is None else session.loops.accepted,
         "ground_share": log.ground_points / log.points if log.points else None,
         "ground": None if log.ground_score is None else [asdict(score) for score in ground],
         "peak_memory_mb": memory_mb,
@@ -153,11 +149,12 @@ def _facts(job: Job, log: RunLog, engine: Engine, ground: list[GroundScore], mem
     }
 
 
-def _write(job: Job, log: RunLog, engine: Engine, facts: dict[str, Any], cpu_ms: list[float]) -> None:
+def _write(job: Job, session: Session, facts: dict[str, Any], cpu_ms: list[float]) -> None:
     """All files beside their places, then moved there, run.json last: a kill in between leaves no result."""
-    trajectory = engine.map_frame.trajectory(log.odometry)
-    poses = engine.map_frame.poses(np.array([keyframe.T_odom_imu for keyframe in engine.keyframes]).reshape(-1, 4, 4))
-    measured = map_sharpness.measure(map_sharpness.collect(engine.keyframes, poses))
+    log, keyframes, frame = session.log, session.engine.keyframes, session.map_frame
+    trajectory = frame.trajectory(log.odometry)
+    poses = frame.poses(np.array([keyframe.T_odom_imu for keyframe in keyframes]).reshape(-1, 4, 4))
+    measured = map_sharpness.measure(map_sharpness.collect(keyframes, poses))
     facts["map_sharpness"] = {name: value if np.isfinite(value) else None for name, value in asdict(measured).items()}
 
     part = job.folder.with_name(f"{job.folder.name}.part-{os.getpid()}")
@@ -169,7 +166,7 @@ def _write(job: Job, log: RunLog, engine: Engine, facts: dict[str, Any], cpu_ms:
         np.savez_compressed(
             part / "crops.npz",
             allow_pickle=False,
-            **{place: crops.crop(engine.keyframes, poses, centre) for place, centre in centres.items()},
+            **{place: crops.crop(keyframes, poses, centre) for place, centre in centres.items()},
         )
         (part / "run.json").write_text(json.dumps(facts, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
         job.folder.mkdir(exist_ok=True)

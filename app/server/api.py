@@ -12,7 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -21,10 +21,10 @@ from fastapi import Path as PathParam
 from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
-from app.server.breakpoints import Breakpoints
+from app.mapping.breakpoints import BREAKPOINTS, Breakpoint, Breakpoints
+from app.mapping.session_file import SUFFIX
 from app.server.folders import Folders
-from app.server.fork import Engine
-from app.server.journal import SUFFIX
+from app.server.fork import RunningEngine
 from app.server.protocol import (
     AddNote,
     Command,
@@ -113,7 +113,9 @@ def _bodies(actions: Mapping[str, Action]) -> Any:
     return Annotated[functools.reduce(operator.or_, models), Field(discriminator="action")]
 
 
-def _add_actions(router: APIRouter, path: str, engine: Engine, actions: Mapping[str, Action], summary: str) -> None:
+def _add_actions(
+    router: APIRouter, path: str, engine: RunningEngine, actions: Mapping[str, Action], summary: str
+) -> None:
     """A route that sends the engine the command of the action named in the body."""
 
     def post(body: Any) -> None:
@@ -125,20 +127,21 @@ def _add_actions(router: APIRouter, path: str, engine: Engine, actions: Mapping[
 
 
 # --- other bodies --------------------------------------------------------------------------------
-class BreakpointsBody(BaseModel):
+def _breakpoint_field(one: Breakpoint) -> tuple[Any, Any]:
+    if one.limit is None:
+        return bool, Field(False, description=one.hint)
+    unit = f" Unit: {one.limit.base_unit}." if one.limit.base_unit else ""
+    return float | None, Field(None, ge=0, description=one.hint + unit)
+
+
+_FIELDS: dict[str, Any] = {one.name: _breakpoint_field(one) for one in BREAKPOINTS}
+_Breakpoints: Any = create_model("_Breakpoints", **_FIELDS)
+
+
+class BreakpointsBody(_Breakpoints):  # type: ignore[misc]  # its fields are those of the table
     """Where playing pauses. A limit pauses where it is exceeded; left out or null it does not."""
 
     model_config = ConfigDict(extra="forbid")
-
-    loop_found: bool = Field(False, description="A loop was accepted.")
-    loop_rejected: bool = Field(False, description="A loop candidate was rejected.")
-    no_ground: bool = Field(False, description="A frame without a ground plane.")
-    degenerate: bool = Field(False, description="A scan leaves a direction open.")
-    dropped: bool = Field(False, description="A scan was left out.")
-    planarity: float | None = Field(None, ge=0, description="λ3/λ2 of the ground's seeds.")
-    residual: float | None = Field(None, ge=0, description="RMS of the filter's update, m.")
-    frame_ms: float | None = Field(None, ge=0, description="Time that the engine took for the frame, ms.")
-    error: float | None = Field(None, ge=0, description="To the truth, m.")
 
 
 class NoteBody(BaseModel):
@@ -159,7 +162,7 @@ _ANY_OF_THESE: Final = "|".join(f"^{re.escape(name)}$" for name in EXPORTED)
 ExportName = Annotated[str, PathParam(pattern=_ANY_OF_THESE, json_schema_extra={"enum": [*EXPORTED]})]
 
 
-def make_router(engine: Engine, folders: Folders) -> APIRouter:
+def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
     """All routes below /api. HemislamError raised here becomes status 422."""
     router = APIRouter(prefix="/api")
     exporting = threading.BoundedSemaphore(MOST_EXPORTS)
@@ -201,7 +204,7 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
     @router.get("/breakpoints")
     def breakpoints() -> BreakpointsBody:
         """Where playing pauses."""
-        return BreakpointsBody(**asdict(engine.snapshot.breakpoints))
+        return BreakpointsBody(**engine.snapshot.breakpoints)
 
     @router.put("/breakpoints")
     def set_breakpoints(body: BreakpointsBody) -> BreakpointsBody:
@@ -256,13 +259,13 @@ def make_router(engine: Engine, folders: Folders) -> APIRouter:
     return router
 
 
-def _send(engine: Engine, command: Command) -> None:
+def _send(engine: RunningEngine, command: Command) -> None:
     if not engine.snapshot.engine_alive and not isinstance(command, Restart | OpenRecording):
         raise HTTPException(503, "The engine's process has ended; the action `restart` starts it again.")
     engine.send(command)
 
 
-def _exported(engine: Engine, name: str, background: BackgroundTasks) -> FileResponse:
+def _exported(engine: RunningEngine, name: str, background: BackgroundTasks) -> FileResponse:
     folder = Path(tempfile.mkdtemp(prefix="hemislam-export-"))
     background.add_task(shutil.rmtree, folder, ignore_errors=True)
     try:
@@ -275,7 +278,7 @@ def _exported(engine: Engine, name: str, background: BackgroundTasks) -> FileRes
     return FileResponse(folder / name, filename=name, background=background)
 
 
-def _save(engine: Engine, folder: Path, *, trajectory_only: bool) -> None:
+def _save(engine: RunningEngine, folder: Path, *, trajectory_only: bool) -> None:
     """Let the engine save into a folder, and wait until it has."""
     snapshot = engine.snapshot
     if snapshot.transport.frame < 0:

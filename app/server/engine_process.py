@@ -5,11 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from app.child import Link, LinkClosed
+from app.mapping.live import open_live_session
+from app.mapping.opening import open_session
+from app.mapping.session import Session
+from app.server.controller import Controller, OpenSession
 from app.server.delta import Outbox
-from app.server.live import open_live_run
 from app.server.protocol import ACKNOWLEDGED, LIVE, Command, Progress, SetBreakpoints, SetSpeed
-from app.server.run import Run, open_run
-from app.server.session import OpenRun, Session
 from app.server.setup import Setup
 from app.slam.params import Params
 from app.slam.warmup import compile_kernels
@@ -70,13 +71,13 @@ def main(owner: Link, setup: Setup) -> None:
 
     def opener(
         path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /
-    ) -> Run:
+    ) -> Session:
         if path == LIVE and setup.live is not None and setup.live_folder is not None:
             revive = setup.revive and not opened_before
             opened_before.append(path)
-            return open_live_run(setup.live, params, setup.live_folder, revive=revive)
+            return open_live_session(setup.live, LIVE, params, setup.live_folder, take_over=revive)
         part = part or ((setup.start_s, setup.duration_s) if path == setup.recording else (0.0, None))
-        return open_run(path, truth, params, *part, checkpoint_bytes=setup.checkpoint_bytes)
+        return open_session(path, params, *part, truth=truth, checkpoint_bytes=setup.checkpoint_bytes)
 
     run_loop(owner, setup, opener, compile_kernels)
 
@@ -84,7 +85,7 @@ def main(owner: Link, setup: Setup) -> None:
 def run_loop(
     owner: Link,
     setup: Setup,
-    opener: OpenRun,
+    opener: OpenSession,
     prepare: Callable[[Callable[[str, float], None]], None] | None = None,
 ) -> None:
     """As `main`, with the function that opens a recording and one that prepares it, reporting (name, fraction)."""
@@ -97,15 +98,15 @@ def run_loop(
         chunks=setup.chunks,
     )
     updates = Updates(owner, outbox)
-    session = Session(
+    controller = Controller(
         outbox,
         setup.params,
         opener,
         resolve=setup.resolve,
         journals=setup.journals,
     )
-    session.handle(SetSpeed(setup.speed))
-    session.handle(SetBreakpoints(setup.breakpoints))
+    controller.handle(SetSpeed(setup.speed))
+    controller.handle(SetBreakpoints(setup.breakpoints))
     if prepare is not None:
 
         def progress(name: str, fraction: float) -> None:
@@ -115,15 +116,15 @@ def run_loop(
         prepare(progress)
         outbox.put(progress=None)
     if setup.recording is not None:
-        session.open(setup.recording, setup.truth, play=setup.play)
+        controller.open(setup.recording, setup.truth, play=setup.play)
     wait: float | None = 0.0
     try:
         while True:
             for command in updates.commands(_sooner(wait, updates.publish())):
-                session.handle(command)
-            wait = session.work()
+                controller.handle(command)
+            wait = controller.work()
     except LinkClosed:
-        session.close()
+        controller.close()
 
 
 def _sooner(a: float | None, b: float | None) -> float | None:

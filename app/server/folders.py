@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from app.mapping.session_file import SUFFIX, read_session
 from app.sensors.source import SUFFIXES
-from app.server.journal import SUFFIX, read_session
 from app.slam.errors import HemislamError
 
 RECORDINGS = (*SUFFIXES, SUFFIX)

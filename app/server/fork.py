@@ -15,9 +15,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-from app.server.breakpoints import Breakpoints
+from app.mapping.breakpoints import Breakpoints
+from app.mapping.session_file import SUFFIX, SavedSession, free_path, read_session, write_session
 from app.server.follower import Follower, same_recording
-from app.server.journal import SUFFIX, SavedSession, read_session, write_session
 from app.server.protocol import AddNote, Command, CompareWith, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
 from app.server.setup import Setup
 from app.slam.errors import HemislamError
@@ -33,7 +33,7 @@ _MOST_KEPT = 30
 _NOT_KEPT = "This session is not kept in a file, so it can not be forked; serve keeps one."
 
 
-class Engine(Protocol):
+class RunningEngine(Protocol):
     """An engine's process as its users know it (`app.server.worker.EngineProcess`)."""
 
     @property
@@ -51,7 +51,7 @@ class Side:
     name: for people. folder: of its own, gone when it is discarded; None for the first session.
     """
 
-    engine: Engine
+    engine: RunningEngine
     name: str
     folder: Path | None = None
 
@@ -73,7 +73,7 @@ def forked(a: Snapshot, values: Mapping[str, Any]) -> SavedSession:
     history = tuple(entry for entry in saved.state.history if entry[0] <= frame)
     notes = tuple(note for note in saved.state.notes if note.frame <= frame)
     state = replace(saved.state, params=a.params.with_values(dict(values)), history=history, notes=notes)
-    return SavedSession(saved.opened, state, frame)
+    return SavedSession(saved.opened, state, frame, ended=saved.ended and frame == saved.frame)
 
 
 def engine_number(snapshot: Snapshot) -> int:
@@ -91,7 +91,7 @@ class Workspace:
         start: starts an engine.
     """
 
-    def __init__(self, engine: Engine, setup: Setup, start: Callable[[Setup], Engine]) -> None:
+    def __init__(self, engine: RunningEngine, setup: Setup, start: Callable[[Setup], RunningEngine]) -> None:
         self._setup = setup
         self._start = start
         self._sides: tuple[Side, Side | None] = (Side(engine, MAIN), None)
@@ -226,7 +226,7 @@ class Workspace:
                 raise HemislamError("B was not kept in a file.")
             session = read_session(journal)
             stem = f"{session.opened.recording.stem}-{_plain(name.strip() or b.name)}"
-            path = _free(self._setup.journals / stem, SUFFIX)
+            path = free_path(self._setup.journals / stem, SUFFIX)
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_session(path, session)
@@ -257,7 +257,7 @@ class Workspace:
             raise HemislamError(_NOT_KEPT)
         self._forks += 1
         stamp = f"{datetime.now():%Y%m%d-%H%M%S}"
-        return a, _free(self._setup.journals / FOLDER / f"{stamp}-{_plain(name.strip())}", "")
+        return a, free_path(self._setup.journals / FOLDER / f"{stamp}-{_plain(name.strip())}")
 
     def _begin(self, file: Path, session: SavedSession, name: str, folder: Path, forked_at: int) -> None:
         engine = self._start(
@@ -316,9 +316,3 @@ def _recording_of(session: Path) -> Path | None:
 def _plain(name: str) -> str:
     """A name that any file system takes."""
     return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name).strip(".-")[:60] or "fork"
-
-
-def _free(path: Path, suffix: str) -> Path:
-    """The path with the suffix, numbered if there is such a file already."""
-    tries = (path.with_name(f"{path.name}{more}{suffix}") for more in ("", *(f"-{n}" for n in range(2, 1000))))
-    return next(one for one in tries if not one.exists())

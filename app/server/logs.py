@@ -3,14 +3,14 @@
 import logging
 from typing import Final
 
-from app.server.fork import Engine
+from app.server.fork import RunningEngine
 
 _LEVEL: Final = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
 
 log = logging.getLogger(__name__)
 
 
-def log_notices(engine: Engine) -> None:
+def log_notices(engine: RunningEngine) -> None:
     """Log the notices that the engine publishes, without end. For a thread of its own."""
     if not log.isEnabledFor(logging.INFO):
         return  # people read them on the page

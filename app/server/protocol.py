@@ -1,21 +1,25 @@
 """What crosses the border of the engine's process: commands one way, snapshots the other.
 
-Both are plain frozen values. A command is data, so that it can be written to a journal and played
-again. A snapshot is cumulative: a reader that misses ten of them loses nothing.
+Both are plain frozen values. A command is data, so that it can be written to a session file. A snapshot is
+cumulative: a reader that misses ten of them loses nothing.
 """
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from app.mapping.breakpoints import Breakpoints
 from app.mapping.frames import READOUTS
+from app.mapping.session_file import Note
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
-from app.server.breakpoints import Breakpoints
 from app.slam.loops import types as loops
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import F32, F64, I64, U8, U16, StepResult
+
+if TYPE_CHECKING:
+    from app.mapping.session import Session
 
 LIVE = Path("live")
 """Stands for the live source wherever a recording is named."""
@@ -211,6 +215,23 @@ class OpenedRecording:
     """(m, 3) truth positions of the IMU, in the truth's own frame, if truth was given."""
     truth: Path | None = None
 
+    @classmethod
+    def of(cls, session: "Session") -> "OpenedRecording":
+        """What a session works on. A source without an end is as long as what was processed of it."""
+        info, truth = session.feed.info, session.truth
+        stamps_ns = session.log.stamps_ns
+        so_far_s = (int(stamps_ns[-1]) - info.start_ns) * 1e-9 if len(stamps_ns) else 0.0
+        return cls(
+            path=info.path,
+            start_ns=info.start_ns,
+            duration_s=so_far_s if info.duration_s is None else info.duration_s,
+            frames=session.frame + 1 if info.frames is None else info.frames,
+            findings=session.findings,
+            truth_stamps_ns=truth.stamps_ns if truth else None,
+            truth_positions=truth.positions if truth else None,
+            truth=session.truth_path,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Transport:
@@ -246,14 +267,6 @@ class Notice:
 
     number: int
     level: Literal["info", "warning", "error"]
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Note:
-    """A remark of the user, or what was done with forks."""
-
-    frame: int
     text: str
 
 

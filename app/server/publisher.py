@@ -4,9 +4,9 @@ import re
 from dataclasses import replace
 from typing import Any
 
+from app.mapping.session import Session
 from app.server.delta import Outbox
-from app.server.protocol import Saved, Transport
-from app.server.run import Run
+from app.server.protocol import OpenedRecording, Saved, Transport
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import StepResult
@@ -31,14 +31,16 @@ class Publisher:
         self._noticed: dict[str, int] = {}
         self._saved: tuple[Saved, ...] = ()
 
-    def opened(self, run: Run) -> None:
-        """Show another run, from its first frame on, or from where an earlier process left it."""
-        self.outbox.begin(run.frames, run.engine.keyframes)
+    def opened(self, session: Session) -> None:
+        """Show another session, from its first frame on, or from where an earlier process left it."""
+        self.outbox.begin(session.frames, session.engine.keyframes)
         self.result, self._corrections, self._noticed = None, MapFrame(), {}
-        self.outbox.put(recording=run.opened)
-        self.show(frame=run.frame, stamp_ns=0, finished=False, frames_per_second=0.0, dropped=run.log.dropped.total())
-        if run.frame < 0:
-            for finding in run.opened.findings:
+        self.outbox.put(recording=OpenedRecording.of(session))
+        self.show(
+            frame=session.frame, stamp_ns=0, finished=False, frames_per_second=0.0, dropped=session.log.dropped.total()
+        )
+        if session.frame < 0:
+            for finding in session.findings:
                 if finding.verdict == "needs you":
                     self.outbox.notice("warning", " ".join(filter(None, (finding.text, finding.option))))
 
@@ -47,37 +49,37 @@ class Publisher:
         self.transport = replace(self.transport, **changes)
         self.outbox.put(transport=self.transport, urgent=urgent)
 
-    def frame(self, run: Run, result: StepResult) -> None:
+    def frame(self, session: Session, result: StepResult) -> None:
         """Show the next frame, which was just processed."""
-        self._show_frame(run, result)
-        self.show(frame=run.frame, stamp_ns=result.stamp_ns, urgent=False)
+        self._show_frame(session, result)
+        self.show(frame=session.frame, stamp_ns=result.stamp_ns, urgent=False)
         for notice in result.notices:
             self.notice_once(notice, result.stamp_ns)
 
-    def arrived(self, run: Run, result: StepResult | None) -> None:
-        """Show the known frame that the run went to."""
-        self._show_frame(run, result)
+    def arrived(self, session: Session, result: StepResult | None) -> None:
+        """Show the known frame that the session went to."""
+        self._show_frame(session, result)
         self.show(
-            frame=run.frame,
+            frame=session.frame,
             stamp_ns=result.stamp_ns if result else 0,
-            finished=run.finished,
-            dropped=run.log.dropped.total(),
+            finished=session.ended,
+            dropped=session.log.dropped.total(),
         )
 
-    def _show_frame(self, run: Run, result: StepResult | None) -> None:
+    def _show_frame(self, session: Session, result: StepResult | None) -> None:
         self.result = result and replace(result, keyframe=None)
         self.outbox.put(result=self.result)
-        self.map_moved(run)
+        self.map_moved(session)
 
-    def map_moved(self, run: Run) -> None:
+    def map_moved(self, session: Session) -> None:
         """Loops may have moved keyframes."""
-        if run.engine.map_frame is not self._corrections:
-            self._corrections = run.engine.map_frame
+        if session.map_frame is not self._corrections:
+            self._corrections = session.map_frame
             self.outbox.put(corrections=self._corrections)
 
-    def compared(self, run: Run) -> None:
+    def compared(self, session: Session) -> None:
         """The session is compared with another trajectory."""
-        self.outbox.put(recording=run.opened, urgent=True)
+        self.outbox.put(recording=OpenedRecording.of(session), urgent=True)
 
     def relabelled(self, result: StepResult) -> None:
         """The newest frame got other labels."""

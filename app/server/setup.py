@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.server.breakpoints import Breakpoints
+from app.mapping.breakpoints import Breakpoints
 from app.slam.params import Params
 
 if TYPE_CHECKING:
@@ -24,12 +24,12 @@ class Setup:
         start_s, duration_s: the part of that recording to process.
         resolve: parameters for recordings opened later; None keeps the present ones.
         play: begin at once. speed: to play at. breakpoints: where to pause.
-        chunk_voxel: m, see `Session`. point_budget: most points of the map that are held for pages;
+        chunk_voxel: m, see `Controller`. point_budget: most points of the map that are held for pages;
             see `app.server.chunks.room`.
-        checkpoint_bytes: see `app.server.checkpoints`.
+        checkpoint_bytes: see `app.mapping.checkpoints`.
         live_folder: where a live run keeps what a process that takes over needs. revive: it is that process.
         live: where to take scans from while `recording` is `app.server.protocol.LIVE`.
-        journals: folder for session files, see `Session`.
+        journals: folder for session files, see `Controller`.
         session, notices, frames, chunks: how many there were before, for a process that takes over from another.
     """
 

@@ -10,9 +10,10 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
+from app.mapping.session_file import Note
 from app.sensors.findings import Finding
 from app.sensors.live.counters import Counters
-from app.server.protocol import LoopsView, Note, Notice, Snapshot
+from app.server.protocol import LoopsView, Notice, Snapshot
 from app.slam.loops import edit_files
 from app.slam.types import StepResult
 

@@ -29,7 +29,7 @@ from app.server.address import has_display, links, listen
 from app.server.api import make_router
 from app.server.bridge import bridge
 from app.server.folders import Folders
-from app.server.fork import Engine, Workspace
+from app.server.fork import RunningEngine, Workspace
 from app.server.logs import log_notices
 from app.server.setup import Setup
 from app.server.viser_adapter import Viser, page_html, start_viser, viewer_html
@@ -61,7 +61,7 @@ class _AsciiJson(JSONResponse):
         return json.dumps(content).encode("ascii")
 
 
-def make_app(engine: Engine, folders: Folders, target: Viser, access: Access) -> FastAPI:
+def make_app(engine: RunningEngine, folders: Folders, target: Viser, access: Access) -> FastAPI:
     """Everything that can be reached from outside."""
     app = FastAPI(
         title="hemislam",

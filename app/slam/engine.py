@@ -1,7 +1,6 @@
 """The engine: one frame in, one result out. Synchronous and deterministic."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +10,6 @@ from app.slam.imu import Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
 from app.slam.local_map import LocalMap, MapState
-from app.slam.loops.keyframe_log import KeyframeLog
-from app.slam.loops.messages import LoopClient
-from app.slam.loops.schedule import LoopSchedule
-from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
 from app.slam.voxel import VoxelGrid, spread
@@ -35,30 +30,23 @@ class Checkpoint:
 
 
 class Engine:
-    """LiDAR-inertial odometry and mapping of one walk (paper 2.2-2.4).
+    """LiDAR-inertial odometry and keyframes of one session (paper 2.2-2.4).
 
     Feed it scans in order of time, each with the IMU samples that cover it (`Measurement`). The
-    same scans, samples and parameters give the same results to the last bit.
+    same scans, samples and parameters give the same results to the last bit. Loops are not its
+    concern: `app.mapping.session.Session` looks for them beside it.
 
     Args:
-        loops: makes the client that looks for loops, for example `InlineLoops`; None: odometry alone.
         keyframes: where to keep them; None: in a temporary file.
 
     Attributes:
         params: used from the next step on; those that act on restart are read only once, here.
         keyframes: the full map so far.
-        loops: what was found, and the way to edit it; None for odometry alone.
     """
 
-    def __init__(
-        self,
-        params: Params,
-        loops: Callable[[KeyframeLog], LoopClient] | None = None,
-        keyframes: KeyframeStore | None = None,
-    ) -> None:
+    def __init__(self, params: Params, keyframes: KeyframeStore | None = None) -> None:
         self.params = params
         self.keyframes = KeyframeStore() if keyframes is None else keyframes
-        self.loops = LoopSchedule(loops, self.keyframes, params.loops) if loops else None
         self._map = LocalMap(params.map)
         self._grid = VoxelGrid()
         self._belief: Belief | None = None  # None until the start is over
@@ -71,8 +59,6 @@ class Engine:
         """Process one scan with the samples that cover the time from the previous scan's end to its own."""
         p, watch = self.params, _Stopwatch()
         end_ns, notices = scan.end_ns, []
-        news = self.loops.due(self._frame) if self.loops else ()
-        watch.lap("loops")
         scan = _in_range(scan, p.sensor.min_range, p.sensor.max_range)
 
         belief, waiting = self._belief, False
@@ -111,11 +97,6 @@ class Engine:
             array.setflags(write=False)
         keyframe = None if waiting else self._keyframe(posterior, cloud)
         watch.lap("keyframe")
-        if self.loops:
-            if keyframe is not None:
-                self.loops.add(keyframe, p.loops)
-            notices += self.loops.take_notices()
-        watch.lap("loops")
 
         if status is not self._status and FrameStatus.LOST in (status, self._status):
             notices.append(f"Lost: {registration.reason}." if status is FrameStatus.LOST else "Tracking again.")
@@ -124,7 +105,7 @@ class Engine:
             stamp_ns=end_ns,
             status=status,
             state=posterior.state,
-            T_map_odom=self.T_map_odom,
+            T_map_odom=np.eye(4),
             cloud=cloud,
             ground=surface,
             registration=registration,
@@ -133,7 +114,6 @@ class Engine:
             points_filter=len(sampled.points),
             timings_ms=watch.laps(),
             keyframe=keyframe,
-            loops=news,
             notices=tuple(notices),
             truth_ground=scan.truth_ground,
             imu_gap_s=float(np.diff(samples.stamps_ns).max(initial=0)) * 1e-9,
@@ -152,17 +132,8 @@ class Engine:
             result, cloud=replace(cloud, labels=surface.labels), ground=surface, points_reduced=len(reduced.points)
         )
 
-    @property
-    def map_frame(self) -> MapFrame:
-        """Where loops lay odometry in the map, at the newest frame."""
-        return self.loops.frame if self.loops else _NO_LOOPS
-
-    @property
-    def T_map_odom(self) -> np.ndarray:
-        return self.map_frame.newest
-
     def checkpoint(self) -> Checkpoint:
-        """Loops need no more than the numbers of frames and keyframes."""
+        """The present state; of the keyframes only their number, since the store keeps them."""
         return Checkpoint(
             params=self.params,
             frame=self._frame,
@@ -184,13 +155,9 @@ class Engine:
         self._map.restore(checkpoint.map)
         self.keyframes.truncate(checkpoint.keyframes)
         self._T_odom_keyframe = checkpoint.T_odom_keyframe
-        if self.loops:
-            self.loops.go_to(self._frame)
 
     def close(self) -> None:
         """Give the disk space of the keyframes back."""
-        if self.loops:
-            self.loops.close()
         self.keyframes.close()
 
     def _insert(self, belief: Belief, points: np.ndarray) -> None:
@@ -215,7 +182,6 @@ class Engine:
         return keyframe
 
 
-_NO_LOOPS = MapFrame()
 _NOT_REGISTERED = Registration(
     False, 0, 0, 0, float("nan"), np.full(6, np.nan), False, "the map is still empty; this scan begins it"
 )

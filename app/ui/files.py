@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import viser
 
+from app.mapping.session_file import SUFFIX
 from app.server.folders import RECORDINGS, TRAJECTORIES, Entry, Folders
-from app.server.journal import SUFFIX
 from app.server.protocol import CompareWith, OpenRecording, Save, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.results import EXPORTS

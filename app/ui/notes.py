@@ -2,7 +2,8 @@
 
 import viser
 
-from app.server.protocol import AddNote, Note, Snapshot
+from app.mapping.session_file import Note
+from app.server.protocol import AddNote, Snapshot
 from app.ui.html import panel
 from app.ui.widgets import Page, by_user
 

@@ -16,7 +16,7 @@ from typing import Final
 import viser
 
 from app.server.folders import Folders
-from app.server.fork import Engine, Workspace
+from app.server.fork import RunningEngine, Workspace
 from app.server.protocol import Snapshot
 from app.server.setup import POINT_BUDGET, Setup
 from app.ui.appearance import AppearancePanel
@@ -62,7 +62,7 @@ class Workbench:
     def __init__(
         self,
         server: viser.ViserServer,
-        engine: Engine | Workspace,
+        engine: RunningEngine | Workspace,
         folders: Folders,
         point_budget: int = POINT_BUDGET,
         *,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Locator, expect
 
-from app.server.breakpoints import Breakpoints
+from app.mapping.breakpoints import Breakpoints
 from app.server.protocol import Seek, SetBreakpoints, StepFrame
 from tests.browser.conftest import Bench
 

@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from app.__main__ import cli
+from app.mapping.session import Session
+from app.mapping.session_file import Opened, SavedSession, State, size_of, write_session
 from app.sensors.presets import resolve_params
-from app.server.journal import Opened, SavedSession, State, size_of, write_session
-from app.server.run import Run
 from app.slam.errors import HemislamError
 from app.slam.metrics import ate
 from app.slam.results import EXPORTS
@@ -125,8 +125,10 @@ def test_a_session_is_repeated_though_what_it_was_compared_with_is_gone(
     hemislam: Call, walk: Path, tmp_path: Path
 ) -> None:
     session = tmp_path / "short.hemislam"
-    opened = Opened(walk, tmp_path / "gone.tum", nbytes=size_of(walk))
-    write_session(session, SavedSession(opened, State(resolve_params(walk, None, None, [])), 5))
+    opened = Opened(walk, nbytes=size_of(walk))
+    write_session(
+        session, SavedSession(opened, State(resolve_params(walk, None, None, []), truth=tmp_path / "gone.tum"), 5)
+    )
     outcome = hemislam("replay", session, "--out", tmp_path / "out")
     assert outcome.code == 0, outcome.err
     assert "gone.tum, which is gone" in outcome.out
@@ -188,14 +190,14 @@ def run_with_trouble(
     monkeypatch: pytest.MonkeyPatch, walk: Path, folder: Path, trouble: BaseException, after: int = 20
 ) -> Any:
     """Run in this process; `trouble` is raised when the frame number `after` is due."""
-    step = Run.step
+    advance = Session.advance
 
-    def trouble_comes(self: Run, **way: bool) -> Any:
+    def trouble_comes(self: Session) -> Any:
         if self.frame + 1 == after:
             raise trouble
-        return step(self, **way)
+        return advance(self)
 
-    monkeypatch.setattr(Run, "step", trouble_comes)
+    monkeypatch.setattr(Session, "advance", trouble_comes)
     return CliRunner().invoke(cli, ["run", str(walk), "--out", str(folder)])
 
 

@@ -6,18 +6,18 @@ reports that pose. Points with z < `ground.sigma` are called ground, so a relabe
 
 import threading
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from app.child import Link
+from app.mapping.checkpoints import Checkpoints
+from app.mapping.feed import Feed, FeedInfo
+from app.mapping.session import Session
 from app.sensors.findings import Finding
 from app.server.engine_process import run_loop
-from app.server.run import Run
 from app.server.setup import Setup
 from app.slam.errors import HemislamError
-from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import (
     GROUND,
@@ -41,53 +41,50 @@ FRAME_NS = 100_000_000
 POINTS = 200
 
 
-class FakeRecording:
+class FakeFeed(Feed):
     """`frames` scans; with `broken_at`, reading fails there; with `dropped_at`, that scan is left out."""
 
+    repeatable = True
+
     def __init__(self, path: Path, frames: int, *, broken_at: int | None = None, dropped_at: int | None = None) -> None:
-        self.path = path
-        self.start_ns = START_NS
-        self.duration_s = frames * FRAME_NS * 1e-9
-        self.scan_count = frames
-        self.findings: tuple[Finding, ...] = (
+        findings = (
             Finding("IMU units", "needs you", "The unit is unclear.", "--set recording.acceleration_unit=g"),
             Finding("rings", "fine", "32 rings."),
         )
-        self.closed = False
+        self._info = FeedInfo(path, START_NS, frames * FRAME_NS * 1e-9, frames, findings=findings)
+        self._frames = frames
+        self._index = 0
         self._broken_at, self._dropped_at = broken_at, dropped_at
+        self.closed = False
 
-    def measurements(
-        self, start_s: float = 0.0, duration_s: float | None = None, *, after: int = 0
-    ) -> "FakeMeasurements":
-        return FakeMeasurements(self._read(after), after)
+    @property
+    def info(self) -> FeedInfo:
+        return self._info
 
-    def _read(self, first: int) -> Iterator[Measurement | DroppedScan]:
-        for index in range(first, self.scan_count):
-            stamp = START_NS + index * FRAME_NS
-            if index == self._broken_at:
-                raise HemislamError(f"{self.path} is damaged at frame {index}; repair it.")
-            if index == self._dropped_at:
-                yield DroppedScan(stamp, "no IMU samples cover it")
-                continue
-            points = np.random.default_rng(index).uniform(-1, 1, (POINTS, 3)).astype(np.float32)
-            zeros = np.zeros(POINTS, dtype=np.int32)
-            scan = Scan(stamp, points, zeros, zeros.astype(np.float32), zeros.astype(np.uint16))
-            yield Measurement(scan, ImuSamples(np.array([stamp]), np.zeros((1, 3)), np.zeros((1, 3))))
+    def next(self) -> Measurement | DroppedScan | None:
+        index = self._index
+        if index >= self._frames:
+            return None
+        self._index += 1
+        stamp = START_NS + index * FRAME_NS
+        if index == self._broken_at:
+            self._index = self._frames
+            raise HemislamError(f"{self._info.path} is damaged at frame {index}; repair it.")
+        if index == self._dropped_at:
+            return DroppedScan(stamp, "no IMU samples cover it")
+        points = np.random.default_rng(index).uniform(-1, 1, (POINTS, 3)).astype(np.float32)
+        zeros = np.zeros(POINTS, dtype=np.int32)
+        scan = Scan(stamp, points, zeros, zeros.astype(np.float32), zeros.astype(np.uint16))
+        return Measurement(scan, ImuSamples(np.array([stamp]), np.zeros((1, 3)), np.zeros((1, 3))))
+
+    def place(self) -> int:
+        return self._index
+
+    def go_to(self, place: int) -> None:
+        self._index = place
 
     def close(self) -> None:
         self.closed = True
-
-
-class FakeMeasurements(Iterator[Measurement | DroppedScan]):
-    def __init__(self, entries: Iterator[Measurement | DroppedScan], read: int) -> None:
-        self._entries, self._count = entries, read
-
-    def __next__(self) -> Measurement | DroppedScan:
-        self._count += 1
-        return next(self._entries)
-
-    def place(self) -> int:
-        return self._count
 
 
 class FakeStore(list[Keyframe]):
@@ -123,7 +120,6 @@ class FakeEngine:
         self.steps_with: list[Params] = []
         self._fails_at = fails_at
         self._index, self._memory = 0, 0.1
-        self.loops, self.map_frame, self.T_map_odom = None, MapFrame(), np.eye(4)
 
     def close(self) -> None:
         self.keyframes.close()
@@ -180,17 +176,19 @@ class FakeEngine:
         return GroundResult(cloud.labels, True, "", up, np.zeros(3), -up, 0.01, 10, share)
 
 
-def open_fake(path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /) -> Run:
+def open_fake(
+    path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /
+) -> Session:
     """Opens names like `walk-50.mcap` (50 frames), `broken-50-20.mcap`, `failing-50-20.mcap`, `dropped-50-20.mcap`."""
     kind, *numbers = path.stem.split("-")
     if kind not in ("walk", "broken", "failing", "dropped"):
         raise HemislamError(f"{path} is not a recording; choose another file.")
     frames, at = int(numbers[0]), int(numbers[1]) if len(numbers) > 1 else None
-    recording = FakeRecording(
+    feed = FakeFeed(
         path, frames, broken_at=at if kind == "broken" else None, dropped_at=at if kind == "dropped" else None
     )
     engine = FakeEngine(params, fails_at=at if kind == "failing" else None)
-    return Run(recording, engine, truth_path=truth)  # type: ignore[arg-type]
+    return Session(feed, engine, truth=truth, checkpoints=Checkpoints())  # type: ignore[arg-type]
 
 
 def fake_main(owner: Link, setup: Setup) -> None:

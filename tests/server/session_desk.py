@@ -4,11 +4,11 @@ from pathlib import Path
 
 import server_fakes as fakes
 
+from app.mapping.session import Session
+from app.server.controller import Controller
 from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import Command, Snapshot
-from app.server.run import Run
-from app.server.session import Session
 from app.slam.params import Params
 
 
@@ -17,22 +17,22 @@ class Desk:
 
     def __init__(self, recording: str | None = "walk-60.mcap", truth: Path | None = None, **kwargs: object) -> None:
         self.now = 0.0
-        self.runs: list[Run] = []
+        self.sessions: list[Session] = []
         self.outbox = Outbox(Params())
         self.fold = Fold()
-        self.session = Session(self.outbox, Params(), self._open, clock=lambda: self.now, **kwargs)  # type: ignore[arg-type]
+        self.controller = Controller(self.outbox, Params(), self._open, clock=lambda: self.now, **kwargs)  # type: ignore[arg-type]
         if recording:
-            self.session.open(Path(recording), truth)
+            self.controller.open(Path(recording), truth)
             self.settle()
 
-    def _open(self, path: Path, truth: Path | None, params: Params, part: object = None, /) -> Run:
-        self.runs.append(fakes.open_fake(path, truth, params))
-        return self.runs[-1]
+    def _open(self, path: Path, truth: Path | None, params: Params, part: object = None, /) -> Session:
+        self.sessions.append(fakes.open_fake(path, truth, params))
+        return self.sessions[-1]
 
     def settle(self, limit: int = 1000) -> Snapshot:
         """Work until nothing is due at this moment."""
         for _ in range(limit):
-            if self.session.work() != 0:
+            if self.controller.work() != 0:
                 break
         else:
             raise AssertionError("still busy")
@@ -45,7 +45,7 @@ class Desk:
 
     def do(self, *commands: Command) -> Snapshot:
         for command in commands:
-            self.session.handle(command)
+            self.controller.handle(command)
         return self.settle()
 
     def pass_time(self, seconds: float, step: float = 0.01) -> Snapshot:

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import server_fakes as fakes
 
-from app.server.breakpoints import Breakpoints, Moment, reasons
+from app.mapping.breakpoints import Breakpoints, Moment, reasons
+from app.mapping.session import Session
+from app.server.controller import Controller
 from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import Pause, Play, Restart, Seek, SetBreakpoints, SetSpeed, Snapshot, StepFrame
-from app.server.run import Run
-from app.server.session import Session
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
@@ -44,7 +44,7 @@ def spoilt(result: StepResult) -> StepResult:
 
 def frame(**changes: object) -> StepResult:
     engine = fakes.FakeEngine(Params())
-    entry = next(iter(fakes.FakeRecording(Path("x"), 1)._read(0)))
+    entry = fakes.FakeFeed(Path("x"), 1).next()
     return replace(engine.step(entry.scan, entry.imu), **changes)  # type: ignore[union-attr, arg-type]
 
 
@@ -86,7 +86,7 @@ def test_an_error_that_is_not_known_is_no_error() -> None:
 
 def test_scans_left_out_pause_every_time() -> None:
     before, now = Moment(frame(dropped=1)), Moment(frame(dropped=2))
-    assert reasons(Breakpoints(dropped=True), before, now) == ("2 scans were left out just before this frame.",)
+    assert reasons(Breakpoints(dropped=True), before, now) == ("2 scans were dropped just before this frame.",)
     assert reasons(Breakpoints(dropped=True), now, Moment(GOOD)) == ()
 
 
@@ -121,23 +121,23 @@ class Desk:
     def __init__(self, name: str = f"walk-{FRAMES}.mcap") -> None:
         self.now = 0.0
         self.outbox, self.fold = Outbox(Params()), Fold()
-        self.session = Session(self.outbox, Params(), self._open, clock=lambda: self.now)
-        self.session.open(Path(name), None)
+        self.controller = Controller(self.outbox, Params(), self._open, clock=lambda: self.now)
+        self.controller.open(Path(name), None)
         self.settle()
 
-    def _open(self, path: Path, truth: Path | None, params: Params, part: object = None, /) -> Run:
-        run = fakes.open_fake(path, truth, params)
-        run.engine = MoodyEngine(params)  # type: ignore[assignment]
-        return run
+    def _open(self, path: Path, truth: Path | None, params: Params, part: object = None, /) -> Session:
+        session = fakes.open_fake(path, truth, params)
+        session.engine = MoodyEngine(params)  # type: ignore[assignment]
+        return session
 
     def settle(self) -> Snapshot:
-        while self.session.work() == 0:
+        while self.controller.work() == 0:
             pass
         return self.fold.apply(self.outbox.take()) if self.outbox.filled else self.fold.snapshot
 
     def do(self, *commands: object) -> Snapshot:
         for command in commands:
-            self.session.handle(command)  # type: ignore[arg-type]
+            self.controller.handle(command)  # type: ignore[arg-type]
         return self.settle()
 
 
@@ -177,7 +177,7 @@ def test_a_scan_left_out_pauses_at_the_frame_after_it() -> None:
     desk = Desk("dropped-30-12.mcap")
     snapshot = desk.do(SetBreakpoints(Breakpoints(dropped=True)), FAST, Play())
     assert snapshot.transport.frame == 12 and not snapshot.transport.playing
-    assert "1 scan was left out" in snapshot.notices[-1].text
+    assert "1 scan was dropped" in snapshot.notices[-1].text
     assert snapshot.series["dropped"][-2:].tolist() == [0.0, 1.0]
 
 
@@ -192,7 +192,7 @@ def test_an_engine_that_was_killed_still_pauses_there() -> None:
     engine = EngineProcess(Setup(recording=Path("dropped-30-12.mcap")), main=fakes.fake_main)
     try:
         engine.send(SetBreakpoints(Breakpoints(dropped=True)))
-        first = until(engine, lambda s: s.breakpoints.dropped and s.transport.frame == 0)
+        first = until(engine, lambda s: s.breakpoints["dropped"] and s.transport.frame == 0)
         assert engine.pid is not None
         os.kill(engine.pid, signal.SIGKILL)
         until(engine, lambda s: not s.engine_alive)

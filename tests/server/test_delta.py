@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from app.mapping.frames import READOUTS, Frame
 from app.mapping.log import Log
 from app.server.chunks import one_per_voxel
+from app.server.controller import Controller
 from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import (
@@ -28,7 +29,6 @@ from app.server.protocol import (
     StepFrame,
     Transport,
 )
-from app.server.session import Session
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 
@@ -75,16 +75,16 @@ def test_a_reader_that_misses_updates_ends_with_the_same_snapshot(
 ) -> None:
     def drive(take_after: list[bool]) -> Snapshot:
         outbox, fold, now = Outbox(Params()), Fold(), 0.0
-        session = Session(outbox, Params(), fakes.open_fake, clock=lambda: now)
-        session.open(Path("walk-40.mcap"), None)
+        controller = Controller(outbox, Params(), fakes.open_fake, clock=lambda: now)
+        controller.open(Path("walk-40.mcap"), None)
         for (command, pieces), take in zip(script, take_after, strict=True):
-            session.handle(command)
+            controller.handle(command)
             for _ in range(pieces):
-                session.work()
+                controller.work()
                 now += 0.05
                 if take and outbox.filled:
                     fold.apply(outbox.take())
-        session.close()
+        controller.close()
         if outbox.filled:
             fold.apply(outbox.take())
         return fold.snapshot

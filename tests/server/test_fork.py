@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import server_fakes as fakes
 
+from app.mapping.opening import open_session
+from app.mapping.session_file import Note, Opened, SessionWriter, State, read_session
 from app.sensors.presets import resolve_params
 from app.server.follower import STUCK_S, Follower
 from app.server.fork import Workspace, forked
-from app.server.journal import Journal, Opened, State, read_session
 from app.server.protocol import (
     SERIES,
     AddNote,
-    Note,
     OpenRecording,
     Pause,
     Play,
@@ -32,12 +32,11 @@ from app.server.protocol import (
     StepFrame,
     Transport,
 )
-from app.server.run import open_run
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import Measurement
+from app.slam.types import StepResult
 
 PATIENCE_S = 60.0
 SAMPLE = next((Path(__file__).resolve().parents[2] / "sample_data").glob("*.mcap"))
@@ -119,9 +118,9 @@ def test_another_recording_is_nothing_to_follow() -> None:
 
 def test_a_fork_knows_only_what_came_before_it(tmp_path: Path) -> None:
     first, later, latest = (Params().with_values({"ground.alpha": alpha}) for alpha in (30.0, 40.0, 50.0))
-    journal = Journal(tmp_path / "a.hemislam", Opened(tmp_path / "none.mcap"))
-    journal.note(80, State(latest, ((0, first), (20, later), (60, latest))))
-    journal.close()
+    writer = SessionWriter(tmp_path / "a.hemislam", Opened(tmp_path / "none.mcap"))
+    writer.write(80, State(latest, ((0, first), (20, later), (60, latest))))
+    writer.close()
     a = Snapshot(params=latest, transport=Transport(frame=40), journal=tmp_path / "a.hemislam")
     session = forked(a, {"ground.sigma": 0.2})
     assert session.frame == 40 and session.state.history == ((0, first), (20, later))
@@ -263,16 +262,16 @@ def test_a_fork_with_the_same_parameters_is_the_same_and_with_others_what_a_fres
     real.send(Seek(32))
     a, b = both_at(real, 32)
 
-    run = open_run(SAMPLE, None, a.params, 0.0, 6.0)
+    session = open_session(SAMPLE, a.params, 0.0, 6.0)
     positions, turns = [], []
-    while run.frame < 32 and (entry := run.peek()) is not None:
-        if isinstance(entry, Measurement):
-            if run.frame == 20:
-                run.choose(a.params.with_values(COARSE))
-            result = run.step()
-            positions.append(result.T_map_imu[:3, 3])
-            turns.append(result.state.R_odom_imu)
-    run.close()
+    while session.frame < 32:
+        if session.frame == 20:
+            session.choose(a.params.with_values(COARSE))
+        result = session.advance()
+        assert isinstance(result, StepResult)
+        positions.append(result.T_map_imu[:3, 3])
+        turns.append(result.state.R_odom_imu)
+    session.close()
     assert b.trajectory is not None and a.trajectory is not None
     np.testing.assert_array_equal(b.trajectory, positions)
     assert np.abs(a.trajectory - b.trajectory)[21:].max() > 1e-6, "the parameters were meant to change something"
@@ -319,7 +318,7 @@ def test_breakpoints_stay_with_what_is_shown() -> None:
         def send(self, command: object) -> None:
             self.sent.append(command)
 
-    from app.server.breakpoints import Breakpoints
+    from app.mapping.breakpoints import Breakpoints
     from app.server.fork import Side
 
     a, b = Told(replace(at(7), breakpoints=Breakpoints(no_ground=True))), Told(at(5))

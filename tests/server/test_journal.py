@@ -10,27 +10,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_rewind import SAMPLE, Desk, page
+from test_rewind import SAMPLE, Desk, open_whole, page
 from typer.testing import CliRunner
 
 from app.__main__ import cli
-from app.sensors.presets import resolve_params
-from app.server.breakpoints import Breakpoints
-from app.server.journal import (
+from app.mapping.breakpoints import Breakpoints
+from app.mapping.session import Session
+from app.mapping.session_file import (
     EVERY_S,
     SUFFIX,
-    Journal,
+    Note,
     Opened,
     SavedSession,
+    SessionWriter,
     State,
     new_path,
     read_session,
     size_of,
     write_session,
 )
+from app.sensors.presets import resolve_params
+from app.server.controller import MOST_NOTES, Controller
 from app.server.protocol import (
     AddNote,
-    Note,
     OpenRecording,
     Pause,
     Play,
@@ -41,8 +43,6 @@ from app.server.protocol import (
     Snapshot,
     StepFrame,
 )
-from app.server.run import Run, open_run
-from app.server.session import MOST_NOTES, Session
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
@@ -62,11 +62,12 @@ def saved(tmp_path: Path) -> SavedSession:
         ((0, Params()), (12, coarse)),
         (Accept(1, 20, 21), Add(2, 30, None, False, 31)),
         (Reject(3, 9),),
+        tmp_path / "truth.tum",
         (Note(12, 'the "door" opens\nand closes'),),
         Breakpoints(no_ground=True, residual=0.05),
         math.inf,
     )
-    return SavedSession(Opened(recording, None, 2.0, 30.0, 5), state, 41)
+    return SavedSession(Opened(recording, 2.0, 30.0, 5), state, 41, ended=True)
 
 
 def test_what_is_written_is_read(saved: SavedSession, tmp_path: Path) -> None:
@@ -76,13 +77,13 @@ def test_what_is_written_is_read(saved: SavedSession, tmp_path: Path) -> None:
 
 def test_a_journal_cut_anywhere_tells_the_session_up_to_there(saved: SavedSession, tmp_path: Path) -> None:
     now = 0.0
-    journal = Journal(tmp_path / "b.hemislam", saved.opened, clock=lambda: now)
-    journal.note(0, State(Params()))
+    writer = SessionWriter(tmp_path / "b.hemislam", saved.opened, clock=lambda: now)
+    writer.write(0, State(Params()))
     for frame in range(1, 40):
         now += EVERY_S / 4
-        journal.did(frame, SetParams({"ground.alpha": 30.0}))
-        journal.note(frame, State(Params()) if frame < 20 else saved.state)
-    journal.close()
+        writer.did(frame, SetParams({"ground.alpha": 30.0}))
+        writer.write(frame, State(Params()) if frame < 20 else saved.state)
+    writer.close()
     whole = (tmp_path / "b.hemislam").read_bytes()
     frames = []
     for length in range(whole.index(b"state"), len(whole), 97):
@@ -99,10 +100,10 @@ def test_a_journal_cut_anywhere_tells_the_session_up_to_there(saved: SavedSessio
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (b"", "no session"),
-        (b"PNG\x00\n", "no session"),
+        (b"", "not a session"),
+        (b"PNG\x00\n", "not a session"),
         (b'{"hemislam": "9.0", "format": 99}\n', "written by hemislam 9.0"),
-        (b'{"hemislam": "0.1", "format": 1}\n', "damaged"),
+        (b'{"hemislam": "0.1", "format": 2}\n', "damaged"),
     ],
 )
 def test_a_file_that_is_no_session_is_refused_in_a_sentence(tmp_path: Path, content: bytes, says: str) -> None:
@@ -115,19 +116,19 @@ def test_a_file_that_is_no_session_is_refused_in_a_sentence(tmp_path: Path, cont
 def test_a_recording_that_is_gone_or_another_is_said(saved: SavedSession, tmp_path: Path) -> None:
     write_session(tmp_path / "a.hemislam", saved)
     saved.opened.recording.write_bytes(b"123456")
-    with pytest.raises(HemislamError, match="another file now"):
+    with pytest.raises(HemislamError, match="a different file now"):
         read_session(tmp_path / "a.hemislam")
     saved.opened.recording.unlink()
-    with pytest.raises(HemislamError, match="not there any more"):
+    with pytest.raises(HemislamError, match="is gone"):
         read_session(tmp_path / "a.hemislam")
 
 
 def test_a_folder_that_can_not_be_written_ends_the_journal_not_the_session(saved: SavedSession, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    journal = Journal(tmp_path / "file" / "a.hemislam", saved.opened)
-    assert "not recorded" in journal.error
-    journal.note(0, saved.state)
-    journal.close()
+    writer = SessionWriter(tmp_path / "file" / "a.hemislam", saved.opened)
+    assert "not recorded" in writer.error
+    writer.write(0, saved.state)
+    writer.close()
 
 
 def test_two_sessions_at_one_time_have_two_names(tmp_path: Path) -> None:
@@ -142,10 +143,10 @@ class Kept(Desk):
 
     def __init__(self, folder: Path, path: Path = SAMPLE) -> None:
         self.folder = folder
-        super().__init__(resolve_params(SAMPLE, None, None, []), open_run, path)
+        super().__init__(resolve_params(SAMPLE, None, None, []), open_whole, path)
 
-    def _session(self, opener: Callable[..., Run]) -> Session:
-        return Session(self.outbox, self.params, opener, journals=self.folder, clock=lambda: 0.0)
+    def _controller(self, opener: Callable[..., Session]) -> Controller:
+        return Controller(self.outbox, self.params, opener, journals=self.folder, clock=lambda: 0.0)
 
     @property
     def journal(self) -> Path:
@@ -175,7 +176,7 @@ def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path)
     third = Kept(tmp_path, second.journal)  # the one reopened is kept as well
     assert page(first.do(StepFrame(10))) == page(second.do(StepFrame(10))) == page(third.do(StepFrame(10)))
     for desk in (first, second, third):
-        desk.session.close()
+        desk.controller.close()
 
 
 def test_a_session_stopped_on_its_way_back_goes_on_as_it_went_unless_it_is_changed_there(tmp_path: Path) -> None:
@@ -183,29 +184,29 @@ def test_a_session_stopped_on_its_way_back_goes_on_as_it_went_unless_it_is_chang
     there = walk_about(first)
     file = first.journal
     for change, same in (({}, True), ({"ground.alpha": 50.0}, False)):
-        desk = Desk(first.params, open_run, file, settle=False)
+        desk = Desk(first.params, open_whole, file, settle=False)
         while desk.see().transport.frame < 20:
-            desk.session.work()
+            desk.controller.work()
         stopped = desk.do(Pause())
         assert stopped.transport.frame < 45
         again = desk.do(SetParams(change), Seek(72))
         assert again.transport.frame == 72 and again.trajectory is not None and there.trajectory is not None
         assert np.array_equal(again.trajectory, there.trajectory) is same
-        desk.session.close()
-    first.session.close()
+        desk.controller.close()
+    first.controller.close()
 
 
 def test_what_is_wanted_while_a_session_opens_is_not_lost(tmp_path: Path) -> None:
     first = Kept(tmp_path)
     walk_about(first)
-    desk = Desk(first.params, open_run, first.journal, settle=False)
+    desk = Desk(first.params, open_whole, first.journal, settle=False)
     for command in (SetParams({"ground.sigma": 0.07}), AddNote("here")):
-        desk.session.handle(command)
+        desk.controller.handle(command)
     desk.settle()
     opened = desk.see()
     assert opened.params.ground.sigma == 0.07 and opened.notes[-1] == Note(72, "here")
     for each in (first, desk):
-        each.session.close()
+        each.controller.close()
 
 
 def test_notes_are_kept_up_to_a_limit_and_what_is_beyond_it_is_told(tmp_path: Path) -> None:
@@ -214,17 +215,17 @@ def test_notes_are_kept_up_to_a_limit_and_what_is_beyond_it_is_told(tmp_path: Pa
     seen = desk.see()
     assert [note.text for note in seen.notes] == [f"note {number}" for number in range(MOST_NOTES)]
     assert "A session keeps 1,000 notes; this one was not kept." in seen.notices[-1].text
-    desk.session.close()
+    desk.controller.close()
 
 
 def test_a_saved_session_repeats_headless_to_the_same_files(tmp_path: Path) -> None:
     desk = Kept(tmp_path)
     walk_about(desk)
-    desk.session.handle(Save(tmp_path / "page"))
+    desk.controller.handle(Save(tmp_path / "page"))
     while not desk.see().saved:
-        desk.session.work()
+        desk.controller.work()
         time.sleep(0.01)
-    desk.session.close()
+    desk.controller.close()
     file = tmp_path / "page" / f"session{SUFFIX}"
     result = CliRunner().invoke(cli, ["replay", str(file), "--out", str(tmp_path / "again")])
     assert result.exit_code == 0, result.output
@@ -278,8 +279,8 @@ def test_a_session_file_opens_in_the_page_too(tmp_path: Path) -> None:
     there = other.do(OpenRecording(desk.journal))
     assert there.transport.frame == 23 and there.params.ground.sigma == 0.02
     assert other.do(Play()).transport.playing
-    desk.session.close()
-    other.session.close()
+    desk.controller.close()
+    other.controller.close()
 
 
 def test_size_is_that_of_all_files(tmp_path: Path) -> None:

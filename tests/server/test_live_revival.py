@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from test_rewind import SAMPLE
 
+from app.mapping.live import open_live_session
+from app.mapping.session import Session
 from app.sensors.live import receiver
 from app.sensors.live.process import LiveAddress
 from app.sensors.live.receiver import ScanServer
@@ -19,11 +21,10 @@ from app.sensors.live.source import Event
 from app.sensors.live.status import LiveState
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
+from app.server.controller import Controller
 from app.server.delta import Outbox
 from app.server.fold import Fold
-from app.server.live import LiveRun, open_live_run
 from app.server.protocol import LIVE, Snapshot
-from app.server.session import Session
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
@@ -54,7 +55,7 @@ class Bench:
     def __init__(self, address: LiveAddress, params: Params, folder: Path) -> None:
         self._address, self._params, self._folder = address, params, folder
         self.fold = Fold(Snapshot(params=params))
-        self.run: LiveRun | None = None
+        self.session: Session | None = None
         self.begin(revive=False)
 
     @property
@@ -70,20 +71,21 @@ class Bench:
             chunks=len(page.chunks),
         )
 
-        def opened(*_: object) -> LiveRun:
-            self.run = open_live_run(self._address, self._params, self._folder, revive=revive)
-            return self.run
+        def opened(*_: object) -> Session:
+            self.session = open_live_session(self._address, LIVE, self._params, self._folder, take_over=revive)
+            return self.session
 
-        self.session = Session(self.outbox, self._params, opened, clock=lambda: 0.0)
-        self.session.open(LIVE, None, play=True)
+        self.controller = Controller(self.outbox, self._params, opened, clock=lambda: 0.0)
+        self.controller.open(LIVE, None, play=True)
 
     def kill(self, *, asking: bool) -> None:
         """asking: it has asked for a scan and dies before the answer."""
-        if self.run is not None:
+        if self.session is not None:
             if asking:
-                self.run._client._connection.send(("poll", self.run._client.place, 1.0))
-            self.run._client.close()
-            self.run.engine.close()
+                client = self.session.feed._client
+                client._connection.send(("poll", client.place, 1.0))
+            self.session.feed.close()
+            self.session.engine.close()
 
     def tell(self) -> None:
         """The page hears what there is to hear."""
@@ -121,7 +123,7 @@ def given(events: list[Event], folder: Path) -> Iterator[LiveAddress]:
 def walked(bench: Bench, events: list[Event]) -> Snapshot:
     """To the end of the events."""
     for _ in range(5 * len(events)):
-        bench.session.work()
+        bench.controller.work()
     bench.tell()
     done = bench.page.transport
     assert done.frame + 1 + done.dropped == len(events)
@@ -144,7 +146,7 @@ def test_however_often_engines_die_every_scan_is_mapped_once_or_counted_as_dropp
         bench = Bench(address, params, tmp_path)
         for _ in range(15):
             for _ in range(rng.choice((1, 2, 4, 9, 25))):
-                bench.session.work()
+                bench.controller.work()
                 if rng.random() < 0.3:
                     bench.tell()
             bench.kill(asking=rng.random() < 0.5)
@@ -152,9 +154,9 @@ def test_however_often_engines_die_every_scan_is_mapped_once_or_counted_as_dropp
         page = walked(bench, events)
 
     assert page.transport.dropped == sum(isinstance(event, DroppedScan) for event in events)
-    assert bench.run is not None and bench.run.log.dropped == {BUSY: page.transport.dropped}
+    assert bench.session is not None and bench.session.log.dropped == {BUSY: page.transport.dropped}
     mapped = [event.scan.end_ns for event in events if isinstance(event, Measurement)]
-    assert bench.run.log.stamps_ns.tolist() == mapped
+    assert bench.session.log.stamps_ns.tolist() == mapped
     assert page.trajectory is not None and undisturbed.trajectory is not None
     np.testing.assert_allclose(page.trajectory, undisturbed.trajectory, rtol=0, atol=1e-9)
     for name in ("stamp_s", "dropped", "used", "distance"):
@@ -169,10 +171,10 @@ def test_scans_that_are_too_many_to_be_had_again_are_counted_as_dropped(
     monkeypatch.setattr(receiver, "HISTORY", 5)
     with given(events, tmp_path) as address:
         bench = Bench(address, params, tmp_path)
-        while bench.run is None or bench.run.frame < 9:  # one before the second checkpoint
-            bench.session.work()
+        while bench.session is None or bench.session.frame < 9:  # one before the second checkpoint
+            bench.controller.work()
         bench.kill(asking=False)
         bench.begin()
         page = walked(bench, events)
-    assert bench.run.log.dropped[receiver.LOST] == 4
+    assert bench.session.log.dropped[receiver.LOST] == 4
     assert page.series["dropped"].sum() == page.transport.dropped

@@ -15,17 +15,17 @@ import numpy as np
 import pytest
 from test_rewind import SAMPLE
 
+from app.mapping.opening import open_session
 from app.sensors.live.feed import Pace, feed
 from app.sensors.live.intake import MAX_BACKLOG
 from app.sensors.live.process import LiveClient, LiveProcess
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
 from app.server.protocol import LIVE, Pause, Seek, Snapshot, StepFrame
-from app.server.run import open_run
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.params import Params
-from app.slam.types import Measurement
+from app.slam.types import StepResult
 
 LENGTH_S = 9.0
 PATIENCE_S = 90.0
@@ -39,13 +39,12 @@ def params() -> Params:
 @pytest.fixture(scope="module")
 def from_file(params: Params) -> dict[int, np.ndarray]:
     """Positions by scan end, as the file gives them."""
-    run = open_run(SAMPLE, None, params, 0.0, LENGTH_S)
+    session = open_session(SAMPLE, params, 0.0, LENGTH_S)
     found = {}
-    while (entry := run.peek()) is not None:
-        if isinstance(entry, Measurement):
-            result = run.step()
+    while (result := session.advance()) is not None:
+        if isinstance(result, StepResult):
             found[result.stamp_ns] = result.T_map_imu[:3, 3]
-    run.close()
+    session.close()
     return found
 
 

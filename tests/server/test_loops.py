@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_rewind import SAMPLE, Desk
+from test_rewind import SAMPLE, Desk, open_whole
 from typer.testing import CliRunner
 
 from app.__main__ import cli
@@ -29,7 +29,6 @@ from app.server.protocol import (
     TryLoop,
     UndoLoop,
 )
-from app.server.run import open_run
 from app.slam.loops import edit_files
 from app.slam.loops.types import Accept, LoopEdge, Reject, SetWeight, Verdict
 from app.slam.results import EXPORTS
@@ -47,12 +46,12 @@ class Walk(Desk):
     """The whole recording, walked to its end."""
 
     def __init__(self) -> None:
-        super().__init__(resolve_params(SAMPLE, None, None, list(DRIFTING)), open_run, SAMPLE)
+        super().__init__(resolve_params(SAMPLE, None, None, list(DRIFTING)), open_whole, SAMPLE)
 
     def settle(self) -> None:
         """Until nothing is awaited any more, of the loops' process neither."""
         deadline = time.monotonic() + 60
-        while (wait := self.session.work()) is not None:
+        while (wait := self.controller.work()) is not None:
             assert time.monotonic() < deadline
             time.sleep(wait)
 
@@ -69,7 +68,7 @@ def walk() -> Iterator[Walk]:
     walk = Walk()
     walk.end()
     yield walk
-    walk.session.close()
+    walk.controller.close()
 
 
 @pytest.fixture(scope="module")
@@ -184,8 +183,8 @@ def test_the_loops_process_killed_twice_is_revived_and_leaves_the_same_files(
     walk: Walk, files: dict[str, bytes], tmp_path: Path
 ) -> None:
     def kill() -> None:
-        assert walk.run.engine.loops is not None
-        client = walk.run.engine.loops._client  # only a test has a reason to know it
+        assert walk.session.loops is not None
+        client = walk.session.loops._client  # only a test has a reason to know it
         assert isinstance(client, RestartingLoops)
         process = client._worker
         assert isinstance(process, LoopProcess)
@@ -196,7 +195,7 @@ def test_the_loops_process_killed_twice_is_revived_and_leaves_the_same_files(
     ended = walk.end()
     assert any("started again" in notice.text for notice in ended.notices)
     pair = accepted(ended)[0].pair
-    walk.session.handle(EditLoop(Reject(*pair)))
+    walk.controller.handle(EditLoop(Reject(*pair)))
     kill()  # before it has answered
     walk.settle()
     assert walk.see().loops.undo == (Reject(*pair),)

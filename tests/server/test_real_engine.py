@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.mapping.opening import open_session
 from app.sensors.presets import resolve_params
 from app.server.protocol import Seek, SetParams
-from app.server.run import open_run
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
-from app.slam.types import GROUND, Measurement
+from app.slam.types import GROUND, StepResult
 
 SAMPLE_DATA = Path(__file__).resolve().parents[2] / "sample_data"
 DURATION_S = 3.0
@@ -19,12 +19,12 @@ DURATION_S = 3.0
 def test_the_page_sees_exactly_what_a_headless_run_computes() -> None:
     recording = next(SAMPLE_DATA.glob("*.mcap"))
     params = resolve_params(recording, None, None, [])
-    run = open_run(recording, None, params, 0.0, DURATION_S)
+    session = open_session(recording, params, 0.0, DURATION_S)
     positions = []
-    while (entry := run.peek()) is not None:
-        if isinstance(entry, Measurement):
-            positions.append(run.step().T_map_imu[:3, 3])
-    run.close()
+    while (result := session.advance()) is not None:
+        if isinstance(result, StepResult):
+            positions.append(result.T_map_imu[:3, 3])
+    session.close()
 
     engine = EngineProcess(Setup(recording, params=params, duration_s=DURATION_S, play=True, speed=float("inf")))
     try:

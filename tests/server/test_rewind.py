@@ -12,12 +12,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from test_delta import content
 
+from app.mapping.checkpoints import DEFAULT_BYTES
+from app.mapping.feed import open_file
+from app.mapping.opening import open_session
+from app.mapping.session import Session
 from app.sensors.presets import resolve_params
+from app.server.controller import Controller
 from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import SERIES, Command, Pause, Play, Seek, SetParams, SetSpeed, Snapshot, StepFrame
-from app.server.run import Run, open_run
-from app.server.session import Session
 from app.slam.params import Params
 from app.slam.types import DroppedScan
 
@@ -30,34 +33,34 @@ FREE = tuple(name for name in SERIES if name.endswith("_ms"))
 class Desk:
     """A session that works whenever it is told something, and the page's view of it."""
 
-    def __init__(self, params: Params, opener: Callable[..., Run], path: Path, *, settle: bool = True) -> None:
+    def __init__(self, params: Params, opener: Callable[..., Session], path: Path, *, settle: bool = True) -> None:
         self.params, self.outbox, self.fold = params, Outbox(params), Fold()
-        self.runs: list[Run] = []
+        self.sessions: list[Session] = []
 
-        def opening(path: Path, truth: Path | None, params: Params, part: object = None) -> Run:
-            self.runs.append(opener(path, truth, params))
-            return self.runs[-1]
+        def opening(path: Path, truth: Path | None, params: Params, part: object = None) -> Session:
+            self.sessions.append(opener(path, truth, params))
+            return self.sessions[-1]
 
-        self.session = self._session(opening)
-        self.session.open(path, None)
+        self.controller = self._controller(opening)
+        self.controller.open(path, None)
         if settle:
             self.settle()
 
-    def _session(self, opener: Callable[..., Run]) -> Session:
-        return Session(self.outbox, self.params, opener, clock=lambda: 0.0)
+    def _controller(self, opener: Callable[..., Session]) -> Controller:
+        return Controller(self.outbox, self.params, opener, clock=lambda: 0.0)
 
     @property
-    def run(self) -> Run:
-        return self.runs[-1]
+    def session(self) -> Session:
+        return self.sessions[-1]
 
     def do(self, *commands: Command) -> Snapshot:
         for command in commands:
-            self.session.handle(command)
+            self.controller.handle(command)
             self.settle()
         return self.see()
 
     def settle(self) -> None:
-        while self.session.work() == 0:
+        while self.controller.work() == 0:
             pass
 
     def see(self) -> Snapshot:
@@ -132,13 +135,13 @@ def test_the_page_is_that_of_a_run_that_went_straight_there(script: list[Command
         desk.do(command)
         expected.do(command)
     assert page(desk.see()) == page(straight_to(expected))
-    desk.session.close()
+    desk.controller.close()
 
 
 def test_going_back_sends_nothing_that_the_page_has() -> None:
     desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
     desk.do(Seek(50))
-    desk.session.handle(Seek(33))
+    desk.controller.handle(Seek(33))
     desk.settle()
     delta = desk.outbox.take()
     assert (delta.keep, delta.frames, delta.chunks) == (51, (), ())
@@ -149,7 +152,7 @@ def test_going_forth_again_sends_no_keyframe_that_the_page_had() -> None:
     desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
     had = desk.do(Seek(50)).chunks
     assert len(desk.do(Seek(20)).chunks) == 5
-    desk.session.handle(Seek(43))
+    desk.controller.handle(Seek(43))
     desk.settle()
     delta = desk.outbox.take()
     assert (delta.keep, delta.frames, delta.chunks) == (51, (), ())
@@ -160,10 +163,10 @@ def test_going_forth_again_sends_no_keyframe_that_the_page_had() -> None:
 def test_frames_on_the_way_back_are_not_shown() -> None:
     desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
     desk.do(Seek(50))
-    desk.session.handle(Seek(38))
+    desk.controller.handle(Seek(38))
     seen = set()
     for _ in range(30):
-        desk.session.work()
+        desk.controller.work()
         seen.add(desk.see().transport.frame)
     assert seen == {50, 38}
 
@@ -171,9 +174,9 @@ def test_frames_on_the_way_back_are_not_shown() -> None:
 def test_a_pause_on_the_way_back_shows_the_frame_that_was_reached() -> None:
     desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
     there = desk.do(Seek(50))
-    desk.session.handle(Seek(38))
+    desk.controller.handle(Seek(38))
     for _ in range(3):
-        desk.session.work()
+        desk.controller.work()
     snapshot = desk.do(Pause())
     at = snapshot.transport.frame
     assert 20 < at < 38
@@ -186,9 +189,9 @@ def test_steps_back_that_come_faster_than_they_are_done_add_up() -> None:
     desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
     desk.do(Seek(50))
     for _ in range(7):
-        desk.session.handle(StepFrame(-1))
-    desk.session.work()
-    desk.session.handle(StepFrame())
+        desk.controller.handle(StepFrame(-1))
+    desk.controller.work()
+    desk.controller.handle(StepFrame())
     desk.settle()
     assert desk.see().transport.frame == 44
 
@@ -200,17 +203,17 @@ def test_playing_on_after_going_back_overwrites_the_future() -> None:
     after = desk.do(Seek(50))
     assert np.array_equal(after.series["speed"][:21], before.series["speed"][:21])
     assert np.all(after.series["speed"][21:51] > before.series["speed"][21:51])
-    used = [params.ground.sigma for params in desk.run.engine.steps_with]  # type: ignore[attr-defined]
+    used = [params.ground.sigma for params in desk.session.engine.steps_with]  # type: ignore[attr-defined]
     assert used[-1] == 0.2
 
 
 def test_a_longer_way_shows_progress() -> None:
     desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
     desk.do(Seek(50))
-    desk.run.checkpoints.forget_after(-1)
-    desk.session.handle(Seek(40))
+    desk.session.checkpoints.forget_after(-1)
+    desk.controller.handle(Seek(40))
     fractions = []
-    while desk.session.work() == 0:
+    while desk.controller.work() == 0:
         progress = desk.see().progress
         fractions += [progress.fraction] if progress else []
     assert len(fractions) > 30 and fractions == sorted(fractions) and fractions[-1] > 0.9
@@ -234,8 +237,12 @@ LENGTH_S = 6.0
 CHANGES = {12: {"ground.sigma": 0.02}, 25: {"filter.max_iterations": 2}, 40: {"scan.voxel_size": 0.6}}
 
 
-def open_sample(path: Path, truth: Path | None, params: Params, /, *, kilobytes: int = 1 << 20) -> Run:
-    return open_run(path, truth, params, 0.0, LENGTH_S, checkpoint_bytes=kilobytes << 10)
+def open_sample(path: Path, truth: Path | None, params: Params, /, *, kilobytes: int = 1 << 20) -> Session:
+    return open_session(path, params, 0.0, LENGTH_S, truth=truth, checkpoint_bytes=kilobytes << 10)
+
+
+def open_whole(path: Path, truth: Path | None, params: Params, part: object = None, /) -> Session:
+    return open_session(path, params, truth=truth, checkpoint_bytes=DEFAULT_BYTES)
 
 
 @pytest.fixture(scope="module")
@@ -247,14 +254,14 @@ def sample_params() -> Params:
 def never_stopped(sample_params: Params) -> Snapshot:
     desk = Desk(sample_params, open_sample, SAMPLE)
     walk_on(desk, FRAMES)
-    desk.session.close()
+    desk.controller.close()
     return desk.see()
 
 
 def walk_on(desk: Desk, end: int) -> None:
     """Frame by frame to the end, changing parameters on the way."""
     while (at := desk.see().transport.frame) < end - 1:
-        desk.session.handle(SetParams(CHANGES.get(at, {})))
+        desk.controller.handle(SetParams(CHANGES.get(at, {})))
         desk.do(StepFrame())
         if desk.see().transport.finished:
             break
@@ -264,7 +271,7 @@ def walk_on(desk: Desk, end: int) -> None:
 def test_restored_and_continued_equals_never_stopped(
     sample_params: Params, never_stopped: Snapshot, kilobytes: int
 ) -> None:
-    def opener(path: Path, truth: Path | None, params: Params, /) -> Run:
+    def opener(path: Path, truth: Path | None, params: Params, /) -> Session:
         return open_sample(path, truth, params, kilobytes=kilobytes)
 
     desk = Desk(sample_params, opener, SAMPLE)
@@ -275,37 +282,36 @@ def test_restored_and_continued_equals_never_stopped(
         snapshot = desk.do(Seek(frame))
         assert snapshot.trajectory is not None and never_stopped.trajectory is not None
         assert snapshot.trajectory.tobytes() == never_stopped.trajectory[: frame + 1].tobytes()
-        assert desk.run.checkpoints.memory <= kilobytes << 10
-    assert (desk.run.checkpoints.disk > 0) is (kilobytes == 100)
+        assert desk.session.checkpoints.memory <= kilobytes << 10
+    assert (desk.session.checkpoints.disk > 0) is (kilobytes == 100)
     # From an early frame on, all of it anew, with the parameters chosen anew:
     first = {name: sample_params.value(name) for change in CHANGES.values() for name in change}
     desk.do(Seek(5), SetParams(first))
     walk_on(desk, FRAMES)
-    assert desk.run.engine.params == never_stopped.params
+    assert desk.session.engine.params == never_stopped.params
     assert page(desk.see()) == page(never_stopped)
-    desk.session.close()
+    desk.controller.close()
 
 
 def test_after_going_back_there_is_nothing_of_what_came_later(sample_params: Params) -> None:
     desk = Desk(sample_params, open_sample, SAMPLE)
     fresh = desk.do(Seek(17))
     assert page(desk.do(Seek(45), Seek(17))) == page(fresh)
-    desk.session.close()
+    desk.controller.close()
 
 
 def test_reading_is_taken_up_between_any_two_measurements_as_if_it_had_gone_on(sample_params: Params) -> None:
-    run = open_sample(SAMPLE, None, sample_params)
-    entries, places = run._recording.measurements(1.0, 3.0), []
-    read = []
-    for entry in entries:
+    feed, read, places = open_file(SAMPLE, sample_params, 1.0, 3.0), [], []
+    while (entry := feed.next()) is not None:
         read.append(entry)
-        places.append(entries.place())
+        places.append(feed.place())
     for at in range(0, len(places), 3):
-        rest = list(run._recording.measurements(1.0, 3.0, after=places[at]))
+        feed.go_to(places[at])
+        rest = list(iter(feed.next, None))
         assert len(rest) == len(read) - at - 1
         for one, other in zip(rest, read[at + 1 :], strict=True):
             assert not isinstance(one, DroppedScan) and not isinstance(other, DroppedScan)
             assert one.scan.points.tobytes() == other.scan.points.tobytes()
             assert one.imu.stamps_ns.tobytes() == other.imu.stamps_ns.tobytes()
             assert one.imu.accel.tobytes() == other.imu.accel.tobytes() and one.notices == other.notices
-    run.close()
+    feed.close()

@@ -13,9 +13,11 @@ import httpx
 import pytest
 from test_rewind import SAMPLE, Desk
 
+from app.mapping.checkpoints import DEFAULT_BYTES
+from app.mapping.opening import open_session
+from app.mapping.session import Session
 from app.sensors.presets import resolve_params
 from app.server.protocol import Save, Seek, SetParams
-from app.server.run import Run, open_run
 from app.slam.params import Params
 
 LENGTH_S = 7.0
@@ -86,8 +88,8 @@ class Server:
 def never_killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, dict[str, bytes]]:
     """The last frame, and what a session that nobody kills ends with."""
 
-    def opener(path: Path, truth: Path | None, params: Params, /) -> Run:
-        return open_run(path, truth, params, 0.0, LENGTH_S)
+    def opener(path: Path, truth: Path | None, params: Params, /) -> Session:
+        return open_session(path, params, 0.0, LENGTH_S, truth=truth, checkpoint_bytes=DEFAULT_BYTES)
 
     desk, folder = (
         Desk(resolve_params(SAMPLE, None, None, list(SETTINGS)), opener, SAMPLE),
@@ -95,8 +97,8 @@ def never_killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, dict[st
     )
     last = desk.do(Seek(10_000)).transport.frame
     desk.do(Seek(CHANGED_AT), SetParams(CHANGE), Seek(last))
-    desk.session.handle(Save(folder))
-    desk.session.close()
+    desk.controller.handle(Save(folder))
+    desk.controller.close()
     return last, {name: (folder / name).read_bytes() for name in FILES}
 
 

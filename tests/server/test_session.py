@@ -8,6 +8,7 @@ import pytest
 import server_fakes as fakes
 from session_desk import Desk, last_notice
 
+from app.mapping.session import Session
 from app.server.protocol import (
     Command,
     CompareWith,
@@ -21,7 +22,6 @@ from app.server.protocol import (
     Snapshot,
     StepFrame,
 )
-from app.server.run import Run
 from app.slam.params import Params
 from app.slam.types import GROUND
 
@@ -70,8 +70,8 @@ def test_pause_stays_and_play_goes_on_from_there() -> None:
 def test_steps_pause_and_add_up() -> None:
     desk = Desk()
     before = desk.do(Play()).transport.frame
-    desk.session.handle(StepFrame())
-    desk.session.handle(StepFrame(3))
+    desk.controller.handle(StepFrame())
+    desk.controller.handle(StepFrame(3))
     snapshot = desk.settle()
     assert snapshot.transport.frame == before + 4 and not snapshot.transport.playing
 
@@ -81,9 +81,9 @@ def test_seeking_ahead_runs_on_with_progress_and_then_goes_on_as_before(playing:
     desk = Desk()
     if playing:
         desk.do(Play())
-    desk.session.handle(Seek(40))
+    desk.controller.handle(Seek(40))
     for _ in range(20):
-        desk.session.work()
+        desk.controller.work()
     halfway = desk.see()
     assert halfway.progress is not None and 0.3 < halfway.progress.fraction < 0.7
     snapshot = desk.settle()
@@ -101,15 +101,15 @@ def test_seeking_back_takes_from_the_scene_what_came_later() -> None:
     assert snapshot.trajectory is not None and there.trajectory is not None
     assert np.array_equal(snapshot.trajectory, there.trajectory[:13])
     assert [chunk.index for chunk in snapshot.chunks] == [0, 1, 2]
-    assert len(desk.runs) == 1, "the recording stays open"
+    assert len(desk.sessions) == 1, "the recording stays open"
     assert all(ours is theirs for ours, theirs in zip(snapshot.chunks, there.chunks, strict=False)), "sent only once"
 
 
 def test_pause_ends_a_seek() -> None:
     desk = Desk()
-    desk.session.handle(Seek(50))
+    desk.controller.handle(Seek(50))
     for _ in range(10):
-        desk.session.work()
+        desk.controller.work()
     snapshot = desk.do(Pause())
     assert snapshot.transport.frame == 10 and snapshot.progress is None
 
@@ -144,7 +144,7 @@ def test_everything_the_page_draws_arrives() -> None:
 
 def test_commands_given_while_a_recording_opens_act_once_it_is_open() -> None:
     desk = Desk(recording=None)
-    desk.session.open(Path("walk-60.mcap"), None)
+    desk.controller.open(Path("walk-60.mcap"), None)
     snapshot = desk.do(Seek(30), Play())
     assert snapshot.notices[-1].level != "error"
     assert snapshot.transport.frame == 31 and snapshot.transport.playing
@@ -154,9 +154,9 @@ def test_dragging_the_time_slider_back_and_forth_ends_where_it_was_let_go() -> N
     desk = Desk()
     desk.do(Seek(50))
     for frame in (40, 20, 10, 35):
-        desk.session.handle(Seek(frame))
+        desk.controller.handle(Seek(frame))
     assert desk.settle().transport.frame == 35
-    assert len(desk.runs) == 1, "not opened again"
+    assert len(desk.sessions) == 1, "not opened again"
 
 
 # --- parameters ----------------------------------------------------------------------------------
@@ -171,16 +171,16 @@ def test_a_ground_slider_relabels_the_present_frame_at_once_and_the_engine_uses_
     desk.do(StepFrame(3))
     if playing:
         desk.do(Play())
-    desk.session.handle(SetParams({"ground.sigma": 0.2}))
+    desk.controller.handle(SetParams({"ground.sigma": 0.2}))
     assert desk.outbox.urgent
     frame = desk.see().transport.frame
-    desk.session.work()
+    desk.controller.work()
     snapshot = desk.see()
     assert snapshot.transport.frame == frame, "before the next frame"
     assert snapshot.result is not None
     assert np.mean(snapshot.result.cloud.labels == GROUND) == ground_share_below(snapshot, 0.2)
     desk.do(StepFrame())
-    assert desk.runs[0].engine.steps_with[-1].ground.sigma == 0.2  # type: ignore[attr-defined]
+    assert desk.sessions[0].engine.steps_with[-1].ground.sigma == 0.2  # type: ignore[attr-defined]
 
 
 def test_a_frame_parameter_acts_on_the_next_frame_without_relabelling() -> None:
@@ -189,19 +189,19 @@ def test_a_frame_parameter_acts_on_the_next_frame_without_relabelling() -> None:
     desk.do(SetParams({"filter.max_iterations": 7}))
     assert desk.see().result is before
     desk.do(StepFrame())
-    assert desk.runs[0].engine.steps_with[-1].filter.max_iterations == 7  # type: ignore[attr-defined]
+    assert desk.sessions[0].engine.steps_with[-1].filter.max_iterations == 7  # type: ignore[attr-defined]
 
 
 def test_a_restart_parameter_waits_for_the_restart() -> None:
     desk = Desk()
     snapshot = desk.do(SetParams({"map.voxel_size": 2.5, "filter.max_iterations": 7}), StepFrame())
     assert snapshot.params.map.voxel_size == 2.5 and snapshot.pending_restart == ("map.voxel_size",)
-    used = desk.runs[0].engine.steps_with[-1]  # type: ignore[attr-defined]
+    used = desk.sessions[0].engine.steps_with[-1]  # type: ignore[attr-defined]
     assert used.map.voxel_size == Params().map.voxel_size and used.filter.max_iterations == 7
     desk.do(Seek(0))
     assert desk.see().pending_restart == ("map.voxel_size",), "going back is no restart"
     snapshot = desk.do(Restart())
-    assert snapshot.pending_restart == () and desk.runs[-1].engine.params.map.voxel_size == 2.5
+    assert snapshot.pending_restart == () and desk.sessions[-1].engine.params.map.voxel_size == 2.5
 
 
 def test_taking_back_a_restart_parameter_leaves_nothing_pending() -> None:
@@ -241,12 +241,12 @@ def test_steps_ahead_that_come_on_the_way_go_on_from_there(monkeypatch: pytest.M
     desk = Desk()
     desk.do(Pause())
     gone_back: list[int] = []
-    monkeypatch.setattr(Run, "go_before", lambda _, frame: gone_back.append(frame))
+    monkeypatch.setattr(Session, "return_to", lambda _, checkpoint: gone_back.append(checkpoint.frame))
     begin = desk.fold.snapshot.transport.frame
-    desk.session.handle(StepFrame(5))
+    desk.controller.handle(StepFrame(5))
     for _ in range(3):
-        desk.session.work()
-    desk.session.handle(StepFrame(4))
+        desk.controller.work()
+    desk.controller.handle(StepFrame(4))
     assert desk.settle().transport.frame == begin + 9
     assert gone_back == []
 
@@ -256,9 +256,9 @@ def test_a_comparison_on_the_way_back_waits_for_no_frame_that_is_forgotten() -> 
     desk = Desk()
     desk.do(SetSpeed(math.inf), Play())
     assert desk.fold.snapshot.transport.frame == 59
-    desk.session.handle(Seek(25))
-    desk.session.work()  # back at a checkpoint, not yet at the frame
-    desk.session.handle(SetParams({"ground.sigma": 0.05}))
-    desk.session.handle(CompareWith(None))
+    desk.controller.handle(Seek(25))
+    desk.controller.work()  # back at a checkpoint, not yet at the frame
+    desk.controller.handle(SetParams({"ground.sigma": 0.05}))
+    desk.controller.handle(CompareWith(None))
     assert desk.settle().transport.frame == 25
     assert len(desk.do(StepFrame(3)).series["stamp_s"]) == 29

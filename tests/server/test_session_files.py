@@ -8,7 +8,7 @@ import pytest
 import server_fakes as fakes
 from session_desk import Desk, last_notice
 
-from app.server.breakpoints import Breakpoints
+from app.mapping.breakpoints import Breakpoints
 from app.server.protocol import (
     Command,
     CompareWith,
@@ -123,7 +123,7 @@ def test_a_session_is_reopened_with_its_speed_and_breakpoints(tmp_path: Path) ->
     desk = Desk(str(recording), journals=tmp_path / "sessions")
     chosen = Breakpoints(no_ground=True, error=0.2)
     snapshot = desk.do(SetBreakpoints(chosen), SetSpeed(math.inf), Seek(30))
-    desk.session.close()
+    desk.controller.close()
     again = Desk(str(snapshot.journal)).see()
     assert (again.breakpoints, again.transport.speed, again.transport.frame) == (chosen, math.inf, 30)
     assert not again.transport.playing
@@ -148,9 +148,9 @@ def test_results_are_written_while_replay_goes_on(tmp_path: Path) -> None:
 def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     desk = Desk()
-    desk.session.handle(Save(tmp_path / "file"))
+    desk.controller.handle(Save(tmp_path / "file"))
     while not desk.see().saved:
-        desk.session.work()
+        desk.controller.work()
     assert str(tmp_path / "file") in desk.see().saved[0].error
     assert str(tmp_path / "file") in last_notice(desk.see())
 
@@ -192,7 +192,7 @@ def test_a_session_remembers_what_it_was_compared_with_and_opens_without_it_if_t
     desk = Desk(str(recording), journals=tmp_path / "sessions")
     snapshot = desk.do(Seek(30), CompareWith(truth))
     assert snapshot.journal is not None
-    desk.session.close()
+    desk.controller.close()
     again = Desk(str(snapshot.journal)).see()
     assert again.series["error_m"][-1] == pytest.approx(0.01, rel=0.2)
     truth.unlink()

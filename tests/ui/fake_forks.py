@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from app.mapping.session_file import Opened, SessionWriter, State, read_session
 from app.server.fork import Workspace
-from app.server.journal import Journal, Opened, State, read_session
 from app.server.protocol import Seek, SetParams
 from app.server.setup import Setup
 from app.slam.params import Params
@@ -34,9 +34,9 @@ class Drifting(World):
 def workspace(a: FakeEngine, folder: Path, columns: int = 40) -> Workspace:
     """`a` can be forked; files go to the folder."""
     path = folder / "a.hemislam"
-    journal = Journal(path, Opened(Path("/data/hall_bpearl.mcap")))
-    journal.note(0, State(Params(), ((0, Params()),)))
-    journal.close()
+    writer = SessionWriter(path, Opened(Path("/data/hall_bpearl.mcap")))
+    writer.write(0, State(Params(), ((0, Params()),)))
+    writer.close()
     a.publish(journal=path)
     return Workspace(a, Setup(journals=folder), starter(columns))  # type: ignore[arg-type, return-value]
 

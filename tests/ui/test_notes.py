@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import viser
 
-from app.server.protocol import AddNote, Command, Note, Snapshot
+from app.mapping.session_file import Note
+from app.server.protocol import AddNote, Command, Snapshot
 from app.ui.notes import _SHOWN, NotesPanel
 from tests.ui.conftest import BusyThreads, Wire, browser_sends, page_of, user_clicks, user_sets
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import viser
 
-from app.server.breakpoints import Breakpoints
+from app.mapping.breakpoints import Breakpoints
 from app.server.folders import Folders
 from app.server.protocol import Command, Seek, SetBreakpoints, SetParams, Snapshot, StepFrame
 from app.ui.breakpoints import BreakpointPanel

@@ -6,61 +6,52 @@ import tempfile
 from dataclasses import dataclass
 from typing import IO
 
-from app.packing import Parts
-
 
 @dataclass(frozen=True, slots=True, order=True)
 class Slot:
-    """Where a value lies in the file: its first byte, and how long each of its parts is."""
+    """Where a value is in the file: its first byte and its length."""
 
     begin: int
-    lengths: tuple[int, ...]
+    length: int
 
     @property
     def end(self) -> int:
-        return self.begin + sum(self.lengths)
+        return self.begin + self.length
 
 
 class Spill:
-    """An unnamed temporary file of packed values (`app.packing.pack`); space given back is used again."""
+    """An unnamed temporary file of values. Released space is used again."""
 
     def __init__(self) -> None:
         self._file: IO[bytes] | None = None
         self._used: list[Slot] = []
         self.nbytes = 0
 
-    def put(self, parts: Parts) -> Slot:
+    def put(self, value: bytes) -> Slot:
         """Write a value. Raises OSError, and changes nothing, if the disk does not take it."""
         if self._file is None:
             self._file = tempfile.TemporaryFile(prefix="hemislam-spill-", buffering=0)  # noqa: SIM115 - see close
-        lengths = tuple(memoryview(part).nbytes for part in parts)
-        slot = Slot(self._gap(sum(lengths)), lengths)
+        slot = Slot(self._gap(len(value)), len(value))
         self._file.seek(slot.begin)
-        for part in parts:
-            rest = memoryview(part).cast("B")
-            while rest:
-                rest = rest[self._file.write(rest) :]
+        rest = memoryview(value)
+        while rest:
+            rest = rest[self._file.write(rest) :]
         bisect.insort(self._used, slot)
-        self.nbytes += sum(lengths)
+        self.nbytes += slot.length
         return slot
 
-    def get(self, slot: Slot) -> Parts:
-        """Read a value's parts. Raises OSError."""
+    def get(self, slot: Slot) -> bytes:
+        """Read a value. Raises OSError."""
         assert self._file is not None
-        parts: Parts = []
-        at = slot.begin
-        for length in slot.lengths:
-            part = os.pread(self._file.fileno(), length, at)
-            if len(part) != length:
-                raise OSError(f"{length - len(part)} bytes of a temporary file are missing")
-            parts.append(part)
-            at += length
-        return parts
+        value = os.pread(self._file.fileno(), slot.length, slot.begin)
+        if len(value) != slot.length:
+            raise OSError(f"{slot.length - len(value)} bytes of a temporary file are missing")
+        return value
 
     def release(self, slot: Slot) -> None:
-        """Give a value's space back."""
+        """Release the space of a value."""
         self._used.remove(slot)
-        self.nbytes -= sum(slot.lengths)
+        self.nbytes -= slot.length
 
     def close(self) -> None:
         if self._file is not None:

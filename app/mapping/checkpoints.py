@@ -1,40 +1,40 @@
-"""States of a run to go back to: dense near the present, sparse far from it, within a budget of memory.
+"""States of a session to go back to: dense near the present, sparse far from it, within a memory budget.
 
 Which ones are kept follows from frame numbers and sizes alone, never from the clock.
 """
 
 import logging
+import pickle
 from dataclasses import dataclass
+from typing import Any
 
-from app.packing import Parts, pack, unpack
-from app.server.spill import Slot, Spill
+from app.mapping.spill import Slot, Spill
 
 log = logging.getLogger(__name__)
 
 DEFAULT_BYTES = 1 << 30
 EVERY = 10
-"""Frames between two checkpoints while a run goes on. One takes a tenth to a half of a frame's time."""
+"""Frames between two checkpoints while a session goes on. One takes a tenth to a half of a frame's time."""
 NEAR = 24
-"""Frames before a sought one after each of which there is a checkpoint, so that stepping back is at once."""
+"""Each of so many frames before a sought one gets a checkpoint, so that stepping back is immediate."""
 SPACING = ((NEAR, 1), (8_000, EVERY), (25_600, 2 * EVERY))
 """(distance from the present, frames between checkpoints up to there)."""
 FARTHEST = 4 * EVERY
 DISK_SHARE = 4
-"""Times the memory's budget that may lie on disk; beyond it, checkpoints become sparser."""
+"""Disk space that checkpoints may take, in multiples of the memory budget; beyond it they become sparser."""
 START = -1
 
 
 @dataclass(slots=True)
 class _Entry:
-    """A packed state: its parts in memory, or where they are on disk."""
+    """A pickled state, in memory or on disk."""
 
-    parts: Parts | None
-    nbytes: int
+    value: bytes | None
     slot: Slot | None = None
 
 
 class Checkpoints:
-    """States by the frame they were taken after; that of the start, frame -1, is always kept.
+    """States by the frame they were taken after. The one of the start, frame -1, is always kept.
 
     Args:
         budget: bytes in memory.
@@ -57,36 +57,36 @@ class Checkpoints:
         return self._spill.nbytes
 
     def wanted(self, frame: int, *, near: bool = False) -> bool:
-        """Whether to take one now, after this frame; `near`: it is just before a sought one."""
+        """Whether to take one now, after this frame. near: the frame is just before a sought one."""
         return frame not in self._entries and (near or frame == START or frame % EVERY == 0)
 
     def add(self, frame: int, state: object) -> None:
-        """Keep a state; what is in it must never change. Others may be put on disk or let go of."""
-        parts = pack(state)
-        self._entries[frame] = _Entry(parts, sum(memoryview(part).nbytes for part in parts))
-        self.memory += self._entries[frame].nbytes
+        """Keep a state. Others may be moved to disk or dropped."""
+        value = pickle.dumps(state, protocol=5)
+        self._entries[frame] = _Entry(value)
+        self.memory += len(value)
         self._thin(frame)
         self._fit(frame)
 
     def before(self, frame: int) -> int | None:
-        """The last frame before this one that there is a state of."""
+        """The last frame before this one that has a state."""
         return max((other for other in self._entries if other < frame), default=None)
 
-    def get(self, frame: int) -> object:
+    def get(self, frame: int) -> Any:
         """The state after a frame of `frames`. Raises OSError if it is on a disk that fails."""
         entry = self._entries[frame]
-        if entry.parts is not None:
-            return unpack(entry.parts)
+        if entry.value is not None:
+            return pickle.loads(entry.value)
         assert entry.slot is not None
-        return unpack(self._spill.get(entry.slot))
+        return pickle.loads(self._spill.get(entry.slot))
 
     def forget_after(self, frame: int) -> None:
-        """Let go of all states of later frames."""
+        """Drop the states of all later frames."""
         for other in [other for other in self._entries if other > frame]:
             self._drop(other)
 
     def close(self) -> None:
-        """Give memory and disk space back."""
+        """Release memory and disk space."""
         self._entries.clear()
         self.memory = 0
         self._spill.close()
@@ -101,39 +101,39 @@ class Checkpoints:
                 self._drop(frame)
 
     def _fit(self, present: int) -> None:
-        """First those between the regular ones go, then the farthest go to disk."""
+        """Drop those between the regular ones first, then move the farthest to disk."""
         if self.memory > self._budget:
-            held = [frame for frame, entry in self._entries.items() if entry.parts is not None]
+            held = [frame for frame, entry in self._entries.items() if entry.value is not None]
             held.sort(key=lambda frame: (frame % EVERY != 0 and frame != START, abs(present - frame)))
             while self.memory > self._budget and held:
                 frame = held.pop()
                 if frame % EVERY and frame != START:
                     self._drop(frame)
                 else:
-                    self._put_aside(frame)
+                    self._move_to_disk(frame)
         while self.disk > DISK_SHARE * self._budget and len(self._entries) > 1:
             self._coarseness *= 2
             self._thin(present)
-            if self._coarseness > max(self._entries, default=0):  # nothing is left but the newest
+            if self._coarseness > max(self._entries, default=0):  # only the newest is left
                 self.forget_after(START)
 
-    def _put_aside(self, frame: int) -> None:
+    def _move_to_disk(self, frame: int) -> None:
         entry = self._entries[frame]
-        assert entry.parts is not None
+        assert entry.value is not None
         try:
-            entry.slot = self._spill.put(entry.parts)
+            entry.slot = self._spill.put(entry.value)
         except OSError as error:
             if frame == START:
                 return
-            log.warning("The checkpoint of frame %d can not be put on disk (%s) and is let go of", frame, error)
+            log.warning("The checkpoint of frame %d cannot be written to disk (%s) and is dropped", frame, error)
             self._drop(frame)
             return
-        entry.parts = None
-        self.memory -= entry.nbytes
+        self.memory -= len(entry.value)
+        entry.value = None
 
     def _drop(self, frame: int) -> None:
         entry = self._entries.pop(frame)
-        if entry.parts is not None:
-            self.memory -= entry.nbytes
+        if entry.value is not None:
+            self.memory -= len(entry.value)
         if entry.slot is not None:
             self._spill.release(entry.slot)

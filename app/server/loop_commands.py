@@ -1,4 +1,4 @@
-"""What the page asks about loops and does to them, and what it is shown of them."""
+"""Loop commands of the page, and what the page is shown of loops."""
 
 from dataclasses import replace
 
@@ -21,8 +21,8 @@ from app.slam.loops.schedule import LoopSchedule
 from app.slam.loops.types import LoopEdge
 
 
-class LoopDesk:
-    """Between the page and the loops of the open recording."""
+class LoopCommands:
+    """Passes commands on to the loops of the open session, and shows what comes of them."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
@@ -30,12 +30,12 @@ class LoopDesk:
         self._state: LoopState | None = None
 
     def clear(self) -> None:
-        """Another walk begins."""
+        """Another session begins."""
         self._view, self._state = LoopsView(), None
         self._outbox.put(loops=self._view)
 
     def handle(self, command: LoopCommand, loops: LoopSchedule) -> None:
-        """Pass a command of the page on; `update` brings what comes of it."""
+        """Pass a command on; `update` brings the answer."""
         view = self._view
         match command:
             case EditLoop(edit):
@@ -54,14 +54,11 @@ class LoopDesk:
             case InspectLoop():
                 view = replace(view, inspected=None)
         if command != TryLoop(None):
-            loops.command(AskResiduals())  # for a trial those of the present too, to compare with
+            loops.command(AskResiduals())  # for a trial, too: to compare with
         self._show(view)
 
     def update(self, loops: LoopSchedule, *, show: bool = True) -> bool:
-        """Take in what was answered and, if it is to be shown, what came into effect.
-
-        Returns whether the map has moved by it.
-        """
+        """Take in answers and, if `show`, the state that came into effect. Returns whether the map has moved."""
         loops.poll()
         view = self._view
         for answer in loops.take_answers():

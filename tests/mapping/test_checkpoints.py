@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.packing import pack, unpack
-from app.server.checkpoints import DISK_SHARE, EVERY, NEAR, START, Checkpoints
-from app.server.spill import Spill
+from app.mapping.checkpoints import DISK_SHARE, EVERY, NEAR, START, Checkpoints
+from app.mapping.spill import Spill
 
 
 def state(frame: int, size: int = 20_000) -> dict[str, object]:
@@ -103,14 +102,14 @@ def test_the_same_walk_keeps_the_same_frames() -> None:
 @given(sizes=st.lists(st.integers(0, 30_000), min_size=1, max_size=20), released=st.sets(st.integers(0, 19)))
 def test_values_on_disk_never_overlap_and_their_space_is_used_again(sizes: list[int], released: set[int]) -> None:
     spill = Spill()
-    values = [np.full(size, number, dtype=np.uint8) for number, size in enumerate(sizes)]
-    slots = {number: spill.put(pack(value)) for number, value in enumerate(values)}
+    values = [bytes([number]) * size for number, size in enumerate(sizes)]
+    slots = {number: spill.put(value) for number, value in enumerate(values)}
     end = max(slot.end for slot in slots.values())
     for number in released & slots.keys():
         spill.release(slots[number])
-        slots[number] = spill.put(pack(values[number]))
+        slots[number] = spill.put(values[number])
     assert max(slot.end for slot in slots.values()) <= end
     for number, slot in slots.items():
-        assert np.array_equal(unpack(spill.get(slot)), values[number])
+        assert spill.get(slot) == values[number]
     assert spill.nbytes == sum(slot.end - slot.begin for slot in slots.values())
     spill.close()

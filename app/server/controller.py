@@ -1,17 +1,27 @@
-"""What happens in the engine's process: commands in, one unit of work at a time, changes out."""
+"""What happens in the engine's process: commands in, one piece of work at a time, changes out."""
 
+import logging
 import math
 import time
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
-from typing import Protocol, assert_never
+from typing import Any, Protocol, assert_never
 
-from app.server.breakpoints import Breakpoints
+from app.mapping.breakpoints import Breakpoints
+from app.mapping.session import EFFECT, Session
+from app.mapping.session_file import (
+    SUFFIX,
+    Note,
+    SavedSession,
+    SessionWriter,
+    State,
+    new_path,
+    read_session,
+)
 from app.server.delta import Outbox
-from app.server.journal import SUFFIX, SavedSession, State, read_session
-from app.server.keeper import Keeper, opened_of
-from app.server.live import LiveRun
-from app.server.loop_desk import LoopDesk
+from app.server.loop_commands import LoopCommands
 from app.server.player import Player
 from app.server.protocol import (
     AddNote,
@@ -20,7 +30,7 @@ from app.server.protocol import (
     EditLoop,
     InspectLoop,
     LoadParams,
-    Note,
+    OpenedRecording,
     OpenRecording,
     Pause,
     Play,
@@ -28,6 +38,7 @@ from app.server.protocol import (
     RedoLoop,
     Restart,
     Save,
+    Saved,
     Seek,
     SetBreakpoints,
     SetParams,
@@ -37,42 +48,40 @@ from app.server.protocol import (
     UndoLoop,
 )
 from app.server.publisher import Publisher
-from app.server.run import EFFECT, Run
-from app.server.saver import Saver
 from app.slam.errors import HemislamError
 from app.slam.loops.schedule import LoopSchedule
 from app.slam.params import Params
 
+log = logging.getLogger(__name__)
+
 SOURCE_PERIOD_S = 0.5
 POLL_S = 0.02
-"""How often to look for what others are at work on."""
+"""How often to look for what other threads and processes are at work on."""
 MOST_NOTES = 1000
-"""Of a session: every page and every state by REST has them all."""
+"""Of a session: every page and every answer by REST has all of them."""
 
 _AT_ONCE = OpenRecording | Restart | SetSpeed | SetBreakpoints
 """Commands that do not wait until what is being opened is open."""
 _FOR_THE_FRAME = EditLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop | AddNote | CompareWith | Save
 
 
-class OpenRun(Protocol):
+class OpenSession(Protocol):
     """Opens a recording, or the part of it from start for a duration (s), with a new engine; raises HemislamError."""
 
     def __call__(
         self, path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /
-    ) -> Run: ...
+    ) -> Session: ...
 
 
-class Session:
-    """The open recording, its engine and the transport.
-
-    Commands only note what is wanted; `work` does it, a short piece a call. One thread calls both.
+class Controller:
+    """The open session and its transport. One thread calls `handle` and `work`.
 
     Args:
         outbox: takes everything that changes.
         params: to begin with.
-        open_run: opens a recording.
+        open_session: opens a recording.
         resolve: parameters that a recording is opened with, before changes by hand; None: the present ones.
-        journals: folder in which sessions are kept while they go on; None: nowhere.
+        journals: folder in which session files are kept; None: nowhere.
         clock: monotonic seconds.
     """
 
@@ -80,7 +89,7 @@ class Session:
         self,
         outbox: Outbox,
         params: Params,
-        open_run: OpenRun,
+        open_session: OpenSession,
         *,
         resolve: Callable[[Path], Params] | None = None,
         journals: Path | None = None,
@@ -88,16 +97,17 @@ class Session:
     ) -> None:
         self._outbox = outbox
         self._page = Publisher(outbox)
-        self._desk = LoopDesk(outbox)
-        self._saver = Saver()
-        self._player = Player(outbox, self._page, self._saver, clock)
-        self._keeper = Keeper(outbox, journals)
+        self._loops = LoopCommands(outbox)
+        self._player = Player(outbox, self._page, clock)
+        self._saves: deque[tuple[Path, Future[Any]]] = deque()
+        self._journals = journals
+        self._writer: SessionWriter | None = None
         self._clock, self._looked_at_source = clock, -1e9
-        self._open_run = open_run
+        self._open_session = open_session
         self._resolve = resolve
         self._params = self._base = params
         self._notes: tuple[Note, ...] = ()
-        self._resuming = False  # whether a session that was reopened is not yet where it was
+        self._resuming: SavedSession | None = None  # what is still being repeated
         # What is wanted but not done yet:
         self._opening: Callable[[], None] | None = None
         self._after_opening: list[Command] = []
@@ -110,48 +120,48 @@ class Session:
             if path.suffix == SUFFIX:
                 self._resume(path)
             else:
-                self._take(self._open_run(path, truth, self._params))
+                self._take(self._open_session(path, truth, self._params))
             self._page.show(playing=play)
 
         self._open_soon(path, opening)
 
     # --- commands --------------------------------------------------------------------------------
     def handle(self, command: Command) -> None:
-        """Take in a command. What can not be done becomes a notice; nothing is raised."""
+        """Take in a command. What cannot be done becomes a notice; nothing is raised."""
         if self._opening is not None and not isinstance(command, _AT_ONCE):
             self._after_opening.append(command)  # it is meant for what will be open then
             return
-        if self._resuming and isinstance(command, _FOR_THE_FRAME):
-            self._after_resuming.append(command)  # it is meant for the frame that is gone to
+        if self._resuming is not None and isinstance(command, _FOR_THE_FRAME):
+            self._after_resuming.append(command)  # it is meant for the frame that the session goes to
             return
         try:
             self._handle(command)
-            if self._player.run is not None:
-                self._keeper.did(self._player.run, command)
+            if self._writer is not None and self._player.session is not None:
+                self._writer.did(self._player.session.frame, command)
         except HemislamError as error:
             self._outbox.notice("error", str(error))
 
     def _handle(self, command: Command) -> None:
         match command:
             case Play():
-                if self._need_run().finished:
+                if self._need_session().ended:
                     self._handle(Restart())
                 self._player.play()
             case Pause():
                 self._player.halt()
             case StepFrame(frames):
-                self._player.step(self._need_run(), frames)
+                self._player.step(self._need_session(), frames)
             case SetSpeed(factor):
                 self._player.set_speed(factor)
             case Seek(frame):
-                self._player.seek(self._need_run(), frame)
+                self._player.seek(self._need_session(), frame)
             case SetBreakpoints(breakpoints):
                 self._set_breakpoints(breakpoints)
             case AddNote(text):
                 if len(self._notes) >= MOST_NOTES:
                     raise HemislamError(f"A session keeps {MOST_NOTES:,} notes; this one was not kept.")
                 if text.strip():
-                    self._show_notes((*self._notes, Note(self._need_run().frame, text.strip())))
+                    self._show_notes((*self._notes, Note(self._need_session().frame, text.strip())))
             case SetParams(values):
                 self._set_params(self._params.with_values(values))
             case LoadParams(text):
@@ -159,37 +169,28 @@ class Session:
             case OpenRecording(path, truth):
                 self._open_soon(path, lambda: self._open_other(path, truth))
             case CompareWith(trajectory):
-                self._compare_with(trajectory)
+                session = self._need_session()
+                session.compare_with(trajectory)
+                self._page.compared(session)
             case Restart():
-                path = self._need_run().opened.path
-                self._open_soon(path, self._reopen)
+                self._open_soon(self._need_session().feed.info.path, self._reopen)
             case Save(folder, trajectory_only):
-                run = self._need_run()
-                session = SavedSession(opened_of(run), self._state(run), run.frame)
-                self._saver.start(folder, run.saver(folder, session, trajectory_only=trajectory_only))
+                session = self._need_session()
+                saved = session.saved(self._state(session))
+                save = session.save(folder, session=saved, trajectory_only=trajectory_only)
+                self._saves.append((folder, save))
             case EditLoop() | UndoLoop() | RedoLoop() | TryLoop() | InspectLoop():
-                self._desk.handle(command, self._need_loops())
+                self._loops.handle(command, self._need_loops())
             case _:
                 assert_never(command)
 
     def _set_params(self, params: Params) -> None:
         changed = self._params.changed(params)
         self._params = params
-        run = self._player.run
-        if run is not None:
-            usable = run.usable(self._params)
-            if usable != run.params:
-                run.forget_after(self._player.last_known(run))
-                run.choose(usable)
+        if self._player.session is not None:
+            self._player.session.choose(params)
             self._player.relabelling |= any(EFFECT[path] == "now" for path in changed)
         self._page.params(params, self._pending_restart())
-
-    def _compare_with(self, path: Path | None) -> None:
-        run = self._need_run()
-        if run.live:
-            raise HemislamError("A live walk can not be compared with a trajectory; record it, and open the recording.")
-        run.compare_with(path)
-        self._page.compared(run)
 
     def _set_breakpoints(self, breakpoints: Breakpoints) -> None:
         self._player.breakpoints = breakpoints
@@ -200,19 +201,17 @@ class Session:
         self._outbox.put(notes=notes, urgent=True)
 
     def _pending_restart(self) -> tuple[str, ...]:
-        """Names of parameters that the engine still has another value of, since it can not change them."""
-        run = self._player.run
-        if run is None:
-            return ()
-        return tuple(path for path in run.params.changed(self._params) if EFFECT[path] == "restart")
+        """Names of parameters of which the engine still has another value, since they act on restart."""
+        session = self._player.session
+        return tuple(session.params.changed(self._params)) if session is not None else ()
 
-    def _need_run(self) -> Run:
-        if self._player.run is None:
+    def _need_session(self) -> Session:
+        if self._player.session is None:
             raise HemislamError("No recording is open; open one first.")
-        return self._player.run
+        return self._player.session
 
     def _need_loops(self) -> LoopSchedule:
-        loops = self._need_run().engine.loops
+        loops = self._need_session().loops
         if loops is None:
             raise HemislamError("Loops are not looked for; set loops.enabled and restart.")
         return loops
@@ -226,61 +225,66 @@ class Session:
             before the next command.
         """
         wait = self._work()
-        self._note(settled=wait is None)
+        session = self._player.session
+        if self._writer is not None and session is not None and self._resuming is None:
+            self._writer.write(session.frame, self._state(session), ended=session.ended, settled=wait is None)
         return wait
 
     def _work(self) -> float | None:
-        while (saved := self._saver.ended()) is not None:
-            self._page.saved(saved)
+        while self._saves and self._saves[0][1].done():
+            self._report(*self._saves.popleft())
         if self._opening is not None:
             self._do_opening(self._opening)
             return 0.0
-        wait, run = self._player.work(), self._player.run
-        if run is None:
-            return POLL_S if self._saver.busy else wait
-        if self._resuming and (run.followed_to < 0 or run.finished):
-            self._resumed(run)
-        if isinstance(run, LiveRun):
-            self._look_at_source(run)
-        looking = SOURCE_PERIOD_S if isinstance(run, LiveRun) and not self._page.transport.finished else None
-        waits = [wait, POLL_S if self._saver.busy else None, self._look_at_loops(run), looking]
+        wait, session = self._player.work(), self._player.session
+        if session is None:
+            return wait
+        if self._resuming is not None and _is_over(self._resuming, session):
+            self._resumed(session)
+        saving = POLL_S if self._saves else None
+        waits = [wait, saving, self._look_at_loops(session), self._look_at_source(session)]
         return min((seconds for seconds in waits if seconds is not None), default=None)
 
-    def _look_at_source(self, run: LiveRun) -> None:
-        """Show now and then how a live source is doing."""
+    def _report(self, folder: Path, save: "Future[Any]") -> None:
+        """Show that a save has ended."""
+        error = save.exception()
+        if error is not None and not isinstance(error, HemislamError):
+            log.error("Saving to %s failed", folder, exc_info=error)
+        self._page.saved(Saved(folder, "" if error is None else str(error) or type(error).__name__))
+
+    def _look_at_source(self, session: Session) -> float | None:
+        """Show now and then how a live source is doing. Returns when (s) to look again."""
+        if self._page.transport.finished or session.feed.info.duration_s is not None:
+            return None
         now = self._clock()
         if now - self._looked_at_source >= SOURCE_PERIOD_S:
             self._looked_at_source = now
-            run.grown()
             try:
-                self._outbox.put(live=run.state(), recording=run.opened)
+                state = session.feed.live_state()
             except HemislamError as error:
-                if not self._page.transport.finished:
-                    self._player.fail("Nothing more comes live", error)
-                    self._page.show(finished=True)
+                self._player.fail("Nothing more comes live", error)
+                self._page.show(finished=True)
+                return None
+            self._outbox.put(live=state, recording=OpenedRecording.of(session))
+        return SOURCE_PERIOD_S
 
-    def _look_at_loops(self, run: Run) -> float | None:
+    def _look_at_loops(self, session: Session) -> float | None:
         """Take in what came of them. Returns when (s) to look again if something is awaited."""
-        loops = run.engine.loops
+        loops = session.loops
         if loops is None:
             return None
-        if self._desk.update(loops, show=not self._player.page_behind):
-            self._page.map_moved(run)
+        if self._loops.update(loops, show=not self._player.page_behind):
+            self._page.map_moved(session)
         return None if loops.idle else POLL_S
 
-    def _note(self, *, settled: bool) -> None:
-        run = self._player.run
-        if run is not None and not self._resuming and self._keeper.keeping:
-            self._keeper.note(run.frame, self._state(run), settled=settled)
-
-    def _state(self, run: Run) -> State:
+    def _state(self, session: Session) -> State:
         """All that the present state of the session follows from."""
-        loops = run.engine.loops.state if run.engine.loops is not None else None
         return State(
             params=self._params,
-            history=run.history,
-            edits=loops.undo if loops is not None else (),
-            undone=loops.redo if loops is not None else (),
+            history=session.history,
+            edits=session.edits[0],
+            undone=session.edits[1],
+            truth=session.truth_path,
             notes=self._notes,
             breakpoints=self._player.breakpoints,
             speed=self._page.transport.speed,
@@ -300,7 +304,7 @@ class Session:
         except HemislamError as error:
             self._outbox.notice("error", str(error))
         except Exception as error:
-            self._player.fail("The recording can not be opened", error)
+            self._player.fail("The recording cannot be opened", error)
         self._outbox.put(progress=None, urgent=True)
         waiting, self._after_opening = self._after_opening, []
         for command in waiting:
@@ -321,60 +325,86 @@ class Session:
             if name.partition(".")[0] not in ("recording", "sensor")
         }
         params = base.with_values(by_hand)
-        run = self._open_run(path, truth, params)
+        session = self._open_session(path, truth, params)
         self._base, self._params = base, params
         self._player.halt()
-        self._take(run)
+        self._take(session)
 
     def _reopen(self) -> None:
-        run = self._need_run()
-        self._take(self._open_run(run.opened.path, run.opened.truth, self._params, run.part))
+        session = self._need_session()
+        info = session.feed.info
+        self._take(self._open_session(info.path, session.truth_path, self._params, (info.start_s, info.part_s)))
 
     def _resume(self, path: Path) -> None:
-        """Open what a session file opened and go, as it went, to the frame that it was at."""
+        """Open what a session file opened, and repeat it as it went up to the frame that it was at."""
         saved = read_session(path)
         opened, state = saved.opened, saved.state
-        first = state.history[0][1] if state.history else state.params
-        gone = opened.truth is not None and not opened.truth.exists()
-        truth = None if gone else opened.truth
-        run = self._open_run(opened.recording, truth, first, (opened.start_s, opened.duration_s))
+        gone = state.truth is not None and not state.truth.exists()
+        session = self._open_session(
+            opened.recording, None if gone else state.truth, saved.first_params, (opened.start_s, opened.duration_s)
+        )
         self._base = self._params = state.params
         self._player.halt()
-        self._take(run, saved)
+        self._take(session, saved)
         self._set_breakpoints(state.breakpoints)
         self._player.set_speed(state.speed)
         if gone:
-            self._outbox.notice("warning", f"The session was compared with {opened.truth}, which is gone.")
+            self._outbox.notice("warning", f"The session was compared with {state.truth}, which is gone.")
 
-    def _take(self, run: Run, saved: SavedSession | None = None) -> None:
-        """Let go of the present run and show the first frame of this one, or that at which it was saved."""
-        if self._player.run is not None:
-            self._saver.wait()
-            self._player.run.close()
-        self._keeper.begin(run)
-        if saved is not None:
-            self._keeper.note(saved.frame, saved.state)  # at once: it may be killed on the way there
-        self._desk.clear()
-        self._player.take(run)
+    def _take(self, session: Session, saved: SavedSession | None = None) -> None:
+        """Let go of the present session and show the first frame of this one, or that at which it was saved."""
+        if self._player.session is not None:
+            self._player.session.close()
+        self._begin_file(session)
+        if saved is not None and self._writer is not None:
+            self._writer.write(
+                saved.frame, saved.state, ended=saved.ended
+            )  # at once: it may be killed on the way there
+        self._loops.clear()
+        self._player.take(session)
         self._show_notes(saved.state.notes if saved is not None else ())
-        self._resuming, self._after_resuming = saved is not None, []
+        self._resuming, self._after_resuming = None, []
         if saved is not None:
-            run.resume(saved)
-            self._player.go_to(max(saved.frame, 0), -1)
+            session.resume(saved)
+            self._player.resume(session, saved.frame, to_end=saved.ended)
+            self._resuming = saved
         self._page.params(self._params, self._pending_restart())
 
-    def _resumed(self, run: Run) -> None:
+    def _begin_file(self, session: Session) -> None:
+        """Begin a session file; a session that cannot be repeated has none."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+        self._outbox.put(journal=None)
+        if self._journals is not None and session.feed.repeatable:
+            path = new_path(self._journals, session.feed.info.path)
+            self._writer = SessionWriter(path, session.opened)
+            self._outbox.put(journal=path)
+            if self._writer.error:
+                self._outbox.notice("warning", self._writer.error)
+
+    def _resumed(self, session: Session) -> None:
         """A reopened session is where it was, or the user has left its way."""
-        self._resuming = False
-        self._player.settle_labels(run)
+        self._resuming = None
+        self._player.settle_labels(session)
         waiting, self._after_resuming = self._after_resuming, []
         for command in waiting:
             self.handle(command)
 
     def close(self) -> None:
         """Finish the saves under way and close the recording."""
-        self._saver.close()
-        self._note(settled=True)
-        self._keeper.close()
-        if self._player.run is not None:
-            self._player.run.close()
+        session = self._player.session
+        if session is not None:
+            session.finish_saves()
+            if self._writer is not None:
+                self._writer.write(session.frame, self._state(session), ended=session.ended, settled=True)
+        if self._writer is not None:
+            self._writer.close()
+        if session is not None:
+            session.close()
+
+
+def _is_over(saved: SavedSession, session: Session) -> bool:
+    """Whether nothing of a saved session is left to be repeated: it is where it was, or goes on differently."""
+    arrived = session.frame >= saved.frame and not saved.ended
+    return arrived or session.ended or session.planned < saved.frame

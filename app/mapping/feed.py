@@ -1,0 +1,123 @@
+"""Where measurements come from. A session knows nothing else of its source."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from app.sensors.findings import Finding
+from app.sensors.live.status import LiveState, Status
+from app.sensors.recording import Measurements, Place, Recording, open_recording
+from app.slam.params import Params
+from app.slam.types import DroppedScan, Measurement
+
+
+@dataclass(frozen=True, slots=True)
+class Quiet:
+    """There is no scan at the moment. status: what the source reports instead, if anything."""
+
+    status: Status | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FeedInfo:
+    """What is known of a source beside its measurements.
+
+    Attributes:
+        path: of the recording, or a name for a live source.
+        start_ns: time of the first point; 0 while it is unknown.
+        duration_s: of the whole recording. frames: scans expected in the part that is processed.
+            Both are None if the source has no end yet.
+        start_s, part_s: the part that is processed: where it begins, and how long it is (None: to the end).
+        findings: what is unusual about the source.
+    """
+
+    path: Path
+    start_ns: int = 0
+    duration_s: float | None = None
+    frames: int | None = None
+    start_s: float = 0.0
+    part_s: float | None = None
+    findings: tuple[Finding, ...] = field(default=())
+
+
+class Feed(Protocol):
+    """A source of measurements in order of time. Subclass it: only `info` and `next` are required.
+
+    Attributes:
+        repeatable: whether the same measurements can be had again, by `go_to` or from another feed of
+            the same source: only then can a session go back, and be repeated from its file.
+    """
+
+    repeatable: bool = False
+
+    @property
+    def info(self) -> FeedInfo: ...
+
+    def next(self) -> Measurement | DroppedScan | Quiet | None:
+        """The next measurement, a scan that cannot be used, or `Quiet`; None at the end.
+
+        Raises:
+            HemislamError: the source is damaged here, or has gone; it cannot be read any further.
+        """
+        ...
+
+    def place(self) -> Any:
+        """Where the feed is between two measurements: a value that can be pickled."""
+        return None
+
+    def go_to(self, place: Any) -> None:
+        """Go on from a place, exactly as the feed did that was there."""
+        return
+
+    def live_state(self) -> LiveState | None:
+        """How a live source is doing; None for others. Raises HemislamError: it has ended."""
+        return None
+
+    def close(self) -> None:
+        """Release what is held."""
+        return
+
+
+class FileFeed(Feed):
+    """A recording, or a part of it."""
+
+    repeatable = True
+
+    def __init__(self, recording: Recording, start_s: float = 0.0, duration_s: float | None = None) -> None:
+        self._recording = recording
+        rest = max(0.0, recording.duration_s - start_s)
+        share = (rest if duration_s is None else min(rest, duration_s)) / max(recording.duration_s, 1e-9)
+        self._info = FeedInfo(
+            path=recording.path,
+            start_ns=recording.start_ns,
+            duration_s=recording.duration_s,
+            frames=round(recording.scan_count * share),
+            start_s=start_s,
+            part_s=duration_s,
+            findings=recording.findings,
+        )
+        self._measurements = self._read(None)
+
+    @property
+    def info(self) -> FeedInfo:
+        return self._info
+
+    def next(self) -> Measurement | DroppedScan | None:
+        return next(self._measurements, None)
+
+    def place(self) -> Place:
+        return self._measurements.place()
+
+    def go_to(self, place: Place) -> None:
+        self._measurements = self._read(place)
+
+    def close(self) -> None:
+        self._recording.close()
+
+    def _read(self, after: Place | None) -> Measurements:
+        return self._recording.measurements(self._info.start_s, self._info.part_s, after=after)
+
+
+def open_file(path: Path, params: Params, start_s: float = 0.0, duration_s: float | None = None) -> FileFeed:
+    """Open a recording, or a part of it. Raises HemislamError: it cannot be used."""
+    return FileFeed(open_recording(path, params), start_s, duration_s)

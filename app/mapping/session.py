@@ -1,0 +1,457 @@
+"""A session: a feed of measurements, the engine at work on it, loops, and the log of what came of it so far."""
+
+import copy
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Protocol
+
+import numpy as np
+
+from app.mapping import truth as errors
+from app.mapping.checkpoints import NEAR
+from app.mapping.feed import Feed, Quiet
+from app.mapping.frames import Frame
+from app.mapping.log import Log
+from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
+from app.sensors.findings import Finding
+from app.slam import engine
+from app.slam.engine import Engine
+from app.slam.errors import HemislamError
+from app.slam.keyframes import KeyframeStore
+from app.slam.loops.keyframe_log import KeyframeLog
+from app.slam.loops.messages import LoadEdits, LoopClient
+from app.slam.loops.schedule import LoopSchedule
+from app.slam.loops.types import Edits, LoopEdit
+from app.slam.map_frame import MapFrame
+from app.slam.params import Params, leaves
+from app.slam.results import LogState, RunInfo, RunLog, prepare_folder, save_results
+from app.slam.trajectory import Trajectory, read_tum, time_apart, write_tum
+from app.slam.types import F64, DroppedScan, Keyframe, Measurement, StepResult
+
+EFFECT = {leaf.path: leaf.effect for leaf in leaves()}
+_NO_LOOPS = MapFrame()
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A session after a frame, but for the rows that its parts keep."""
+
+    frame: int
+    engine: engine.Checkpoint
+    place: Any
+    log: LogState
+
+
+class Memory(Protocol):
+    """Where checkpoints are kept (`app.mapping.checkpoints.Checkpoints`)."""
+
+    def wanted(self, frame: int, *, near: bool = False) -> bool: ...
+    def add(self, frame: int, checkpoint: Checkpoint, /) -> None: ...
+    def before(self, frame: int) -> int | None: ...
+    def get(self, frame: int) -> Any: ...
+    def forget_after(self, frame: int) -> None: ...
+    def close(self) -> None: ...
+
+
+class Session:
+    """One pass through a feed, frame by frame. `serve`, `run`, `replay` and `evaluate` all drive this.
+
+    A session that went back knows how it went on before, up to frame `known`, until it goes on
+    differently. A session that repeats a file knows it up to frame `planned`.
+
+    Args:
+        loops: makes the client that looks for loops, `InlineLoops` for example; None: odometry alone.
+        truth: a trajectory (TUM) to compare with.
+        checkpoints: to go back to; None: the session only goes on.
+
+    Attributes:
+        frame: index of the newest frame, -1 before the first. result: what the engine made of it; None
+            before the first, and right after going back.
+        frames: all that are known, also those after `frame` that the session went back over.
+        planned: the last frame that a session file tells of, -1 if there is none.
+        heading: frames up to this one are repeated as they were, see `go_to`.
+        history: from which frame on which parameters were in force, ascending.
+        params: for frames not yet processed; set them with `choose`.
+        ended: whether the feed has no more to give.
+        log: of the frames up to `frame`, for the results.
+
+    Raises:
+        HemislamError: the truth cannot be read.
+    """
+
+    def __init__(
+        self,
+        feed: Feed,
+        engine: Engine,
+        *,
+        loops: Callable[[KeyframeLog], LoopClient] | None = None,
+        truth: Path | None = None,
+        checkpoints: Memory | None = None,
+    ) -> None:
+        self.truth = read_tum(truth) if truth else None
+        self.truth_path = truth
+        self.feed = feed
+        self.engine = engine
+        self.loops = LoopSchedule(loops, engine.keyframes, engine.params.loops) if loops else None
+        if self.loops and not feed.repeatable:
+            self.loops.never_go_back()
+        self.params = engine.params
+        self.frame = self.planned = self.heading = -1
+        self.result: StepResult | None = None
+        self.history: tuple[tuple[int, Params], ...] = ()
+        self.ended = False
+        self.frames: Log[Frame] = Log()
+        self.log = RunLog()
+        self.checkpoints = checkpoints
+        self._waiting: Measurement | None = None
+        self._dropped = 0  # scans since the newest frame
+        self._saving = ThreadPoolExecutor(max_workers=1, thread_name_prefix="save")
+        self._saves: list[Future[Any]] = []
+        self._remember()
+
+    # --- going on --------------------------------------------------------------------------------
+    def peek(self) -> Measurement | DroppedScan | Quiet | None:
+        """What `advance` will process; None at the end. Anything but a measurement is returned once.
+
+        Raises:
+            HemislamError: the feed cannot be read any further.
+        """
+        if self._waiting is None:
+            had_ended, self.ended = self.ended, True  # also if reading fails: it cannot be resumed
+            entry = self.feed.next()
+            self.ended = entry is None
+            if self.ended and not had_ended and self.loops:
+                self.loops.finish()
+            if isinstance(entry, DroppedScan):
+                self.log.drop(entry)
+                self._dropped += 1
+            if not isinstance(entry, Measurement):
+                return entry
+            self._waiting = entry
+        return self._waiting
+
+    def advance(self) -> StepResult | DroppedScan | Quiet | None:
+        """Process the next frame. Returns its result, or what `peek` gives if that is no measurement.
+
+        On the way to a frame (`go_to`) the parameters are those of then, else the present ones. A scan on
+        which the engine fails is used up; one on which it failed before is a `DroppedScan`.
+
+        Raises:
+            HemislamError: the feed cannot be read any further. Exception: the engine failed.
+        """
+        entry = self.peek()
+        if not isinstance(entry, Measurement):
+            return entry
+        self._waiting = None
+        frame, repeated = self.frame + 1, self.frame < self.heading
+        params = (self.params_of(frame) if repeated else None) or self.params
+        if self.params_of(frame) != params:
+            self._forget_after(self.frame)
+            self.history = (*self.history, (frame, params))
+        try:
+            result = self._step(entry, frame, params)
+        except Exception as error:
+            if not repeated:
+                raise
+            return DroppedScan(entry.scan.stamp_ns, f"the engine failed: {error}")
+        self.frame, self.result, self._dropped = frame, result, 0
+        if frame > self.known:
+            self.frames.append(Frame.of(result))
+        self.log.add(result)
+        self._remember(near=repeated and self.heading - frame <= NEAR)
+        return result
+
+    def _step(self, measurement: Measurement, frame: int, params: Params) -> StepResult:
+        """The engine's step, and the loops that come into effect before it."""
+        watch = _LoopsWatch()
+        with watch:
+            news = self.loops.due(frame) if self.loops else ()
+        self.engine.params = params
+        try:
+            result = self.engine.step(measurement.scan, measurement.imu)
+        finally:
+            self.engine.params = self.params
+        notices = (*measurement.notices, *result.notices)
+        if self.loops:
+            with watch:
+                if result.keyframe is not None:
+                    self.loops.add(result.keyframe, params.loops)
+                notices = (*notices, *self.loops.take_notices())
+            result = replace(result, T_map_odom=self.map_frame.newest, loops=news, timings_ms=watch.added_to(result))
+        return replace(result, notices=notices, dropped=self._dropped)
+
+    @property
+    def known(self) -> int:
+        """The last frame that was processed and still holds; -1 if there is none."""
+        return len(self.frames) - 1
+
+    @property
+    def map_frame(self) -> MapFrame:
+        """Where loops lay odometry in the map, at the newest frame."""
+        return self.loops.frame if self.loops else _NO_LOOPS
+
+    # --- parameters and edits --------------------------------------------------------------------
+    def choose(self, params: Params) -> None:
+        """Use these for all frames not yet processed, but for those that act on restart."""
+        waiting = [path for path in self.params.changed(params) if EFFECT[path] == "restart"]
+        usable = params.with_values({path: self.params.value(path) for path in waiting})
+        if usable != self.params:
+            self._forget_after(max(self.frame, self.heading))
+            self.params = self.engine.params = usable
+
+    def params_of(self, frame: int) -> Params | None:
+        """Those in force at a known or planned frame; of a later one, those of the last."""
+        return in_force(self.history, frame)
+
+    def edit_loops(self, edits: tuple[LoopEdit, ...], undone: tuple[LoopEdit, ...] = ()) -> None:
+        """Put these edits over the loops that are found, now and later; the undone ones can be redone.
+
+        Raises:
+            HemislamError: loops are not looked for.
+        """
+        if self.loops is None:
+            raise HemislamError("Loops are not looked for, so there are none to edit; set loops.enabled.")
+        self.loops.command(LoadEdits(Edits(edits, undone)))
+
+    def resume(self, saved: SavedSession) -> None:
+        """Plan to repeat a session of this recording: `go_to` its frame repeats it as it went.
+
+        Raises:
+            HemislamError: it edits loops, and none are looked for.
+        """
+        state = saved.state
+        self.choose(state.params)
+        if state.edits or state.undone:
+            self.edit_loops(state.edits, state.undone)
+        self.history = state.history
+        self.planned = saved.frame
+
+    @property
+    def edits(self) -> tuple[tuple[LoopEdit, ...], tuple[LoopEdit, ...]]:
+        """Those in force, and those that can be redone."""
+        state = self.loops.state if self.loops else None
+        return (state.undo, state.redo) if state is not None else ((), ())
+
+    @property
+    def opened(self) -> Opened:
+        """What a session file says of the feed."""
+        info = self.feed.info
+        return Opened(info.path.resolve(), info.start_s, info.part_s, size_of(info.path))
+
+    def saved(self, state: State) -> SavedSession:
+        """The session as a file holds it, with this state."""
+        return SavedSession(self.opened, state, self.frame, self.ended)
+
+    # --- going back ------------------------------------------------------------------------------
+    def go_to(self, frame: int) -> None:
+        """Head for a frame that is known or planned: `advance` repeats all up to it as it was.
+
+        If it lies behind, or a later checkpoint is nearer, the session is at that checkpoint now.
+        Saves under way are waited for: they may read keyframes that are about to be replaced.
+
+        Raises:
+            HemislamError: the feed cannot go back, or a checkpoint cannot be read; nothing has changed.
+        """
+        heading = min(frame, max(self.known, self.planned))
+        nearest = self.checkpoints.before(min(heading, self.known)) if self.checkpoints else None
+        behind = heading < self.frame or (heading == self.frame >= 0 and self.result is None)
+        if behind or (nearest is not None and nearest > self.frame):
+            if nearest is None or self.checkpoints is None:
+                raise HemislamError("This session only goes on; open its recording to go back in it.")
+            self.finish_saves()
+            try:
+                checkpoint = self.checkpoints.get(nearest)
+            except OSError as error:
+                raise HemislamError(f"A checkpoint cannot be read: {error.strerror}.") from error
+            self.return_to(checkpoint)
+        self.heading = heading
+
+    def stay(self) -> None:
+        """Head for no frame any more: what comes next is processed with the present parameters."""
+        self.heading = self.frame
+
+    @property
+    def revisits(self) -> bool:
+        """Whether the next frame is one that was processed before and is taken as it was."""
+        return self.frame < min(self.heading, self.known)
+
+    def checkpoint(self) -> Checkpoint:
+        """The present state. Call it between two frames, with nothing peeked at."""
+        assert self._waiting is None
+        return Checkpoint(
+            frame=self.frame,
+            engine=self.engine.checkpoint(),
+            place=self.feed.place(),
+            log=self.log.checkpoint(),
+        )
+
+    def return_to(self, checkpoint: Checkpoint) -> None:
+        """Be where a checkpoint of this session was taken."""
+        self.feed.go_to(checkpoint.place)
+        self.engine.restore(checkpoint.engine)
+        self.engine.params = self.params
+        self.log.restore(checkpoint.log)
+        self.frame, self.result = checkpoint.frame, None
+        if self.loops:
+            self.loops.go_to(self.frame + 1)
+        self._waiting, self._dropped, self.ended = None, 0, False
+
+    def _forget_after(self, frame: int) -> None:
+        """What comes after a frame will be different."""
+        self.frames.truncate(frame + 1)
+        self.planned, self.heading = min(self.planned, frame), min(self.heading, frame)
+        self.history = tuple(entry for entry in self.history if entry[0] <= frame)
+        if self.loops:
+            self.loops.forget_after(frame)
+        if self.checkpoints:
+            self.checkpoints.forget_after(frame)
+
+    def _remember(self, *, near: bool = False) -> None:
+        if self.checkpoints and self.checkpoints.wanted(self.frame, near=near):
+            self.checkpoints.add(self.frame, self.checkpoint())
+
+    # --- what came of it -------------------------------------------------------------------------
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is unusual about the feed and the truth."""
+        info, truth = self.feed.info, self.truth
+        if truth is None or info.duration_s is None:
+            return info.findings
+        apart = time_apart(str(self.truth_path), truth.stamps_ns, info.start_ns, info.duration_s)
+        return (*info.findings, *([Finding("truth", "needs you", apart)] if apart else []))
+
+    def compare_with(self, path: Path | None) -> None:
+        """Compare with another trajectory, or none, from now on.
+
+        Raises:
+            HemislamError: the feed has no end yet, or the trajectory cannot be read or shares no time with it;
+                nothing has changed.
+        """
+        info = self.feed.info
+        if info.duration_s is None:
+            raise HemislamError(
+                "A live session cannot be compared with a trajectory; record it, and open the recording."
+            )
+        truth = read_tum(path) if path else None
+        if truth and (apart := time_apart(str(path), truth.stamps_ns, info.start_ns, info.duration_s)):
+            raise HemislamError(apart)
+        self.truth, self.truth_path = truth, path
+
+    def errors(self) -> F64:
+        """(frame + 1,) m, distances of the frames so far to the truth, which is aligned to them; nan without truth."""
+        if self.truth is None:
+            return np.full(self.frame + 1, np.nan)
+        ours = self.map_frame.trajectory(self.log.odometry)
+        there = errors.interpolated(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns)
+        return errors.distances(errors.align(there, ours.positions), there, ours.positions)
+
+    def save(
+        self,
+        folder: Path,
+        *,
+        session: SavedSession | None = None,
+        trajectory_only: bool = False,
+        replace: bool = True,
+        stopped: str = "",
+    ) -> "Future[dict[str, Any]]":
+        """Write the results of the frames so far, in a thread of its own.
+
+        All loops that are known of count, whether in effect yet or not.
+
+        Args:
+            session: to be written beside them. trajectory_only: nothing but trajectory.tum.
+            replace: overwrite older results. stopped: why the session ended early, if it did.
+
+        Returns:
+            What report.json holds, or HemislamError if the folder cannot be written to.
+        """
+        log, keyframes = copy.deepcopy(self.log), _Present(self.engine.keyframes)
+        loops = self.loops.results() if self.loops else None
+        info = RunInfo(
+            recording=self.feed.info.path,
+            params=self.params,
+            start_s=self.feed.info.start_s,
+            duration_s=self.feed.info.part_s,
+            truth=self.truth,
+            truth_path=self.truth_path,
+            stopped=stopped,
+        )
+
+        def write() -> dict[str, Any]:
+            if trajectory_only:
+                _save_trajectory(folder, (loops.frame if loops else _NO_LOOPS).trajectory(log.odometry))
+                return {}
+            report = save_results(folder, log, keyframes, info, loops, replace=replace)
+            if session is not None:
+                _save_session(folder / f"session{SUFFIX}", session)
+            return report
+
+        self._saves = [save for save in self._saves if not save.done()]
+        self._saves.append(self._saving.submit(write))
+        return self._saves[-1]
+
+    def finish_saves(self) -> None:
+        """Wait until no save is under way."""
+        for save in self._saves:
+            save.exception()
+
+    def close(self) -> None:
+        """Finish the saves and release what is held."""
+        self._saving.shutdown(wait=True)
+        self.feed.close()
+        if self.loops:
+            self.loops.close()
+        self.engine.close()
+        if self.checkpoints:
+            self.checkpoints.close()
+
+
+def in_force(history: Sequence[tuple[int, Params]], frame: int) -> Params | None:
+    """The parameters of a frame by a history as in `Session.history`; None before its first."""
+    return next((params for first, params in reversed(history) if first <= frame), None)
+
+
+def _save_session(path: Path, session: SavedSession) -> None:
+    try:
+        write_session(path, session)
+    except OSError as error:
+        raise HemislamError(f"The session cannot be written to {path}: {error.strerror}.") from error
+
+
+def _save_trajectory(folder: Path, trajectory: Trajectory) -> None:
+    prepare_folder(folder, replace=True)
+    write_tum(folder / "trajectory.tum", trajectory)
+
+
+class _LoopsWatch:
+    """Milliseconds spent on loops in one frame. What it reads never influences a result."""
+
+    def __init__(self) -> None:
+        self._ms = self._begin = 0.0
+
+    def __enter__(self) -> None:
+        self._begin = perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self._ms += (perf_counter() - self._begin) * 1e3
+
+    def added_to(self, result: StepResult) -> dict[str, float]:
+        """The timings of a frame with those of its loops."""
+        total = result.timings_ms["total"] + self._ms
+        return {**result.timings_ms, "loops": self._ms, "total": total}
+
+
+class _Present:
+    """The keyframes that there are now; later ones are not seen."""
+
+    def __init__(self, keyframes: KeyframeStore) -> None:
+        self._keyframes, self._count = keyframes, len(keyframes)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int, /) -> Keyframe:
+        return self._keyframes[index]

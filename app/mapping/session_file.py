@@ -1,0 +1,278 @@
+"""A session as a file: what was opened, and everything that its present state follows from.
+
+Lines of JSON that are only appended, so a file that was cut anywhere holds the session up to its last
+whole line. The engine is deterministic: a session is the recording, the parameters by the frame from
+which they were in force, the edits of loops, and the frame that it is at.
+
+    {"hemislam": "0.3.0", "format": 2, "recording": "/data/walk.mcap", ...}    what was opened
+    {"frame": 120, "did": "SetParams", "values": {"ground.alpha": 30}}         what the user did, for people
+    {"frame": 120, "state": {...}}                                             all of the state, where it changed
+    {"frame": 131}                                                             how far the session has come
+    {"frame": 512, "ended": true}                                              that the recording has ended
+"""
+
+import itertools
+import json
+import logging
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, is_dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from app import __version__
+from app.mapping.breakpoints import Breakpoints
+from app.slam.errors import HemislamError
+from app.slam.loops import edit_files
+from app.slam.loops.types import LoopEdit
+from app.slam.params import Params
+
+log = logging.getLogger(__name__)
+
+SUFFIX = ".hemislam"
+FORMAT = 2
+EVERY_S = 0.5
+"""How often the frame is written: a process that dies loses no more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A remark of the user, or what was done with forks."""
+
+    frame: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """What a session was opened on.
+
+    Attributes:
+        recording: its file or folder. start_s, duration_s: the part of it. nbytes: its size, to recognise it.
+    """
+
+    recording: Path
+    start_s: float = 0.0
+    duration_s: float | None = None
+    nbytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Attributes:
+    params: as chosen now. history: from which frame on which were in force, ascending.
+    edits: of loops, in force. undone: those that can be redone, the next one last.
+    truth: what the trajectory is compared with. notes: in the order in which they were made.
+    breakpoints: where playing pauses. speed: to play at.
+    """
+
+    params: Params
+    history: tuple[tuple[int, Params], ...] = ()
+    edits: tuple[LoopEdit, ...] = ()
+    undone: tuple[LoopEdit, ...] = ()
+    truth: Path | None = None
+    notes: tuple[Note, ...] = ()
+    breakpoints: Breakpoints = field(default_factory=Breakpoints)
+    speed: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class SavedSession:
+    """What a session file holds. frame: that it was at, -1 before the first. ended: whether the recording had ended,
+    so that loops of the last keyframes were looked for, too.
+    """
+
+    opened: Opened
+    state: State
+    frame: int
+    ended: bool = False
+
+    @property
+    def first_params(self) -> Params:
+        """Those that the first frame was processed with."""
+        return self.state.history[0][1] if self.state.history else self.state.params
+
+
+class SessionWriter:
+    """Writes a session file while the session goes on. A disk that fails ends the file, not the session.
+
+    Attributes:
+        path: of the file. error: why it cannot be written any more, in a sentence; "" if it can.
+    """
+
+    def __init__(self, path: Path, opened: Opened, clock: Callable[[], float] = time.monotonic) -> None:
+        self.path = path
+        self.error = ""
+        self._clock = clock
+        self._written_at = -1e9
+        self._state: State | None = None
+        self._at: tuple[int, bool] | None = None
+        self._file = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("x", encoding="utf-8")
+        except OSError as error:
+            self._failed(error)
+        self._line(_head(opened))
+
+    def did(self, frame: int, command: Any) -> None:
+        """Write what the user did: a command, which is a dataclass."""
+        values = {name: _plain(value) for name, value in asdict(command).items()}
+        self._line({"frame": frame, "did": type(command).__name__, **values})
+
+    def write(self, frame: int, state: State, *, ended: bool = False, settled: bool = False) -> None:
+        """Write where the session is, if that has changed.
+
+        A changed state is written at once; the frame alone every `EVERY_S`, or when the session stays there.
+        """
+        now, at = self._clock(), (frame, ended)
+        if state != self._state:
+            self._line(_place(frame, ended) | {"state": _state_tree(state)})
+        elif at != self._at and (settled or ended or now - self._written_at >= EVERY_S):
+            self._line(_place(frame, ended))
+        else:
+            return
+        self._state, self._at, self._written_at = state, at, now
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _line(self, entry: Mapping[str, Any]) -> None:
+        if self._file is None:
+            return
+        try:
+            self._file.write(json.dumps(entry, ensure_ascii=False) + "\n")
+            self._file.flush()  # a process that is killed loses nothing of it then
+        except OSError as error:
+            self._failed(error)
+
+    def _failed(self, error: OSError) -> None:
+        self.error = f"The session cannot be kept in {self.path} ({error.strerror}); what is done now is not recorded."
+        log.warning(self.error)
+        self._file = None
+
+
+def new_path(folder: Path, recording: Path) -> Path:
+    """A name for the session file of a recording, in the order of time."""
+    return free_path(folder / f"{recording.stem}-{datetime.now():%Y%m%d-%H%M%S}", SUFFIX)
+
+
+def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) -> Path:
+    """The first of STEM, STEM-2, STEM-3, ... that does not exist, with the suffix. always_numbered: from STEM-1 on."""
+    names = (f"-{number}" if number > 1 or always_numbered else "" for number in itertools.count(1))
+    return next(path for name in names if not (path := stem.with_name(f"{stem.name}{name}{suffix}")).exists())
+
+
+def write_session(path: Path, session: SavedSession) -> None:
+    """Write a session file as a whole. Raises OSError."""
+    state = _place(session.frame, session.ended) | {"state": _state_tree(session.state)}
+    entries = [_head(session.opened), state]
+    path.write_text("".join(json.dumps(entry, ensure_ascii=False) + "\n" for entry in entries), encoding="utf-8")
+
+
+def read_session(path: Path) -> SavedSession:
+    """What a session file holds, up to its last whole line.
+
+    Raises:
+        HemislamError: it cannot be read, is not a session, is of another version, or its recording is gone or changed.
+    """
+    try:
+        lines = path.read_bytes().split(b"\n")[:-1]
+    except OSError as error:
+        raise HemislamError(f"The session {path} cannot be read: {error.strerror}.") from None
+    entries = []
+    for line in lines:
+        try:
+            entries.append(json.loads(line))
+        except ValueError:
+            break  # cut by a crash; what comes after it cannot be trusted
+    if not entries or not isinstance(entries[0], dict) or "hemislam" not in entries[0]:
+        raise HemislamError(f"{path} is not a session of hemislam; open one that the workbench has written.")
+    head = entries[0]
+    if head.get("format") != FORMAT:
+        raise HemislamError(
+            f"The session {path} was written by hemislam {head['hemislam']}; open it with that version."
+        )
+    try:
+        opened = _opened(head)
+        states = [entry for entry in entries if "state" in entry]
+        state = _state(states[-1]["state"]) if states else State(Params())
+        places = [entry for entry in entries if "frame" in entry and "did" not in entry]
+        frame, ended = (int(places[-1]["frame"]), bool(places[-1].get("ended"))) if places else (-1, False)
+    except (KeyError, TypeError, ValueError) as error:
+        raise HemislamError(f"The session {path} is damaged ({error!r}); an older copy may be whole.") from None
+    if not states:
+        raise HemislamError(f"The session {path} ends before its first frame; open its recording {opened.recording}.")
+    if size_of(opened.recording) != opened.nbytes:
+        gone = "is a different file now" if opened.recording.exists() else "is gone"
+        raise HemislamError(f"The recording {opened.recording} of the session {path} {gone}; put it back there.")
+    return SavedSession(opened, state, frame, ended)
+
+
+def size_of(recording: Path) -> int:
+    """Bytes of a recording, be it a file or a folder."""
+    files = recording.rglob("*") if recording.is_dir() else [recording]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def _head(opened: Opened) -> dict[str, Any]:
+    return {"hemislam": __version__, "format": FORMAT} | {k: _plain(v) for k, v in asdict(opened).items()}
+
+
+def _place(frame: int, ended: bool) -> dict[str, Any]:
+    return {"frame": frame, "ended": True} if ended else {"frame": frame}
+
+
+def _opened(tree: Mapping[str, Any]) -> Opened:
+    duration_s = tree["duration_s"]
+    return Opened(
+        Path(tree["recording"]),
+        float(tree["start_s"]),
+        None if duration_s is None else float(duration_s),
+        int(tree["nbytes"]),
+    )
+
+
+def _state_tree(state: State) -> dict[str, Any]:
+    return {
+        "params": Params().changed(state.params),
+        "history": [[frame, Params().changed(params)] for frame, params in state.history],
+        "edits": yaml.safe_load(edit_files.write(state.edits)),
+        "undone": yaml.safe_load(edit_files.write(state.undone)),
+        "truth": _plain(state.truth),
+        "notes": [[note.frame, note.text] for note in state.notes],
+        "breakpoints": state.breakpoints.chosen,
+        "speed": "max" if math.isinf(state.speed) else state.speed,
+    }
+
+
+def _state(tree: Mapping[str, Any]) -> State:
+    return State(
+        params=Params().with_values(tree["params"]),
+        history=tuple((int(frame), Params().with_values(values)) for frame, values in tree["history"]),
+        edits=edit_files.read(yaml.safe_dump(tree["edits"])),
+        undone=edit_files.read(yaml.safe_dump(tree["undone"])),
+        truth=Path(tree["truth"]) if tree["truth"] else None,
+        notes=tuple(Note(int(frame), str(text)) for frame, text in tree["notes"]),
+        breakpoints=Breakpoints(**tree["breakpoints"]),
+        speed=math.inf if tree["speed"] == "max" else float(tree["speed"]),
+    )
+
+
+def _plain(value: Any) -> Any:
+    """As JSON can hold it."""
+    if isinstance(value, Path):
+        return str(value.resolve())
+    if isinstance(value, Mapping):
+        return {name: _plain(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return _plain(asdict(value))
+    return value if isinstance(value, str | int | float | bool | None) else str(value)
