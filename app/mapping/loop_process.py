@@ -69,8 +69,7 @@ def main(owner: Link) -> None:
     """The process: answers requests in their order."""
     if hasattr(os, "nice"):
         os.nice(NICENESS)
-    from app.slam.loops.service import LoopService  # the owner has no need of the solver
-    from app.slam.loops.warmup import warm_up
+    from app.slam.loops.service import LoopService, warm_up  # the owner does not need the solver
 
     warm_up()
     service = LoopService()

@@ -18,10 +18,9 @@ from app.slam.loops import inspection
 from app.slam.loops.detection import Detector, Head
 from app.slam.loops.drift import Drift
 from app.slam.loops.edits import EditList, Entry, check, in_words
-from app.slam.loops.factors import Factor
+from app.slam.loops.factors import Factor, odometry_factor
 from app.slam.loops.history import History, Record
 from app.slam.loops.messages import Target
-from app.slam.loops.odometry import odometry_factor
 from app.slam.loops.pose_graph import g2o_text, optimise
 from app.slam.loops.search import Found, search
 from app.slam.loops.solution import Solution, loop_factors

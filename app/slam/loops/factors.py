@@ -1,8 +1,13 @@
-"""Measured transforms between keyframes, and what is done to a graph with them."""
+"""Factors of the pose graph: what was measured between two keyframes, or of one."""
 
 from dataclasses import dataclass
 
-from app.slam.types import F64
+import numpy as np
+
+from app.slam import lie
+from app.slam.loops.detection import Head
+from app.slam.loops.drift import Drift
+from app.slam.types import F64, KeyframeId
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,11 +16,11 @@ class Factor:
 
     Attributes:
         robust: whether a large error pulls less than its square, as a loop's should.
-        loop: which loop it is of, if that is not between these two; None: it is.
+        loop: the loop it stands for, if that is not between these two; None: it is.
     """
 
-    first: int
-    second: int
+    first: KeyframeId
+    second: KeyframeId
     T_first_second: F64
     covariance: F64
     robust: bool = False
@@ -24,8 +29,74 @@ class Factor:
     @property
     def name(self) -> tuple[int, int]:
         """The keyframes of the loop or of the step."""
-        return self.loop or (self.first, self.second)
+        return self.loop or (self.first.index, self.second.index)
+
+    @property
+    def keyframes(self) -> tuple[KeyframeId, ...]:
+        return self.first, self.second
 
 
-Step = Factor | tuple[Factor, ...]
-"""One change of a graph: odometry to the next pose, or loops between poses that there are."""
+@dataclass(frozen=True, slots=True)
+class PositionPrior:
+    """A measured position p_map_imu (3,) m of one keyframe, from GNSS for example, with its covariance (3, 3)."""
+
+    keyframe: KeyframeId
+    p_map_imu: F64
+    covariance: F64
+
+    @property
+    def keyframes(self) -> tuple[KeyframeId, ...]:
+        return (self.keyframe,)
+
+
+Closing = Factor | PositionPrior
+"""What ties poses that are in the graph already."""
+Step = Factor | tuple[Closing, ...]
+"""One change of a graph: odometry to the next pose, or what ties poses that it has."""
+
+
+def between(
+    first: int,
+    second: int,
+    T_first_second: F64,
+    covariance: F64,
+    robust: bool = False,
+    loop: tuple[int, int] | None = None,
+    *,
+    session: int = 0,
+) -> Factor:
+    """A factor between two keyframes of one session."""
+    ends = KeyframeId(session, first), KeyframeId(session, second)
+    return Factor(*ends, T_first_second, covariance, robust, loop)
+
+
+STILL_M, STILL_RAD = 0.001, np.radians(0.02)
+"""Standard deviations of a step, however short."""
+EVEN_M = 1.0
+"""Distance over which drift goes on in one direction; a way L drifts by drift * sqrt(L * EVEN_M)."""
+
+
+def odometry_factor(second: int, before: Head, after: Head, drift: Drift) -> Factor:
+    """From one keyframe to the next.
+
+    The filter gives the covariance of each pose in its map, not of the step between them, and holds
+    the map for known. So: the covariances of both poses add up (as if they were independent, which
+    is more than there is), and drift is added as a random walk: even over some metres, independent
+    between them.
+    """
+    T = lie.inverse(before.T_odom_imu) @ after.T_odom_imu
+    walked = float(np.linalg.norm(T[:3, 3]))
+    turn = np.kron(np.eye(2), T[:3, :3].T)
+    first = turn @ _own_axes(before) @ turn.T
+    even = walked * EVEN_M
+    noise = np.array([STILL_RAD**2 + drift.rotation**2 * even] * 3 + [STILL_M**2 + drift.translation**2 * even] * 3)
+    covariance = first + _own_axes(after) + np.diag(noise)
+    return between(second - 1, second, T, (covariance + covariance.T) / 2)
+
+
+def _own_axes(head: Head) -> F64:
+    """(6, 6) covariance with the position's error in the IMU's axes, as the rotation's is; zero if it is no number."""
+    turn = np.eye(6)
+    turn[3:, 3:] = head.T_odom_imu[:3, :3].T
+    out = turn @ head.covariance @ turn.T
+    return out if np.isfinite(out).all() else np.zeros((6, 6))

@@ -39,7 +39,7 @@ def residuals(factors: Sequence[Factor], poses: F64) -> tuple[FactorResidual, ..
     """Of every factor, by poses (k, 4, 4)."""
     if not factors:
         return ()
-    first, second = np.array([(f.first, f.second) for f in factors]).T
+    first, second = np.array([(f.first.index, f.second.index) for f in factors]).T
     measured = np.array([f.T_first_second for f in factors])
     errors = se3.log(lie.inverse(measured) @ lie.inverse(poses[first]) @ poses[second])
     whitened = np.linalg.solve(np.array([f.covariance for f in factors]), errors[..., None])[..., 0]

@@ -20,15 +20,17 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops import se3
 from app.slam.loops.chain import Chain
-from app.slam.loops.factors import Factor, Step
+from app.slam.loops.factors import Closing, Factor, PositionPrior, Step, between
 from app.slam.loops.types import LOOP_HUBER
 from app.slam.rows import Rows
-from app.slam.types import F64
+from app.slam.types import F64, KeyframeId
 
 RELINEARISE = 0.05
 """Change of a pose (rad, m) from which its factors are linearised again."""
 MOST_UPDATES = 5
 """After a loop the update is repeated while the newest pose moves more than that, at most so often."""
+SESSION_BITS = 40
+"""The lower bits of a key of gtsam hold the index of the keyframe, those above its session."""
 _HELD = 1e-6
 """Standard deviation (rad, m) with which the first pose is held."""
 
@@ -57,7 +59,7 @@ class PoseGraph:
     def steps(self) -> tuple[Step, ...]:
         return tuple(self._steps)
 
-    def extend(self, odometry: Factor) -> tuple[Factor, ...]:
+    def extend(self, odometry: Factor) -> tuple[Closing, ...]:
         """Add the next pose by its odometry factor.
 
         Returns:
@@ -65,11 +67,11 @@ class PoseGraph:
         """
         return self._do(odometry)
 
-    def close(self, loops: Sequence[Factor]) -> tuple[Factor, ...]:
-        """Add loops. Returns those that the solver failed with; they are not in the graph."""
-        return self._do(tuple(loops)) if loops else ()
+    def close(self, factors: Sequence[Closing]) -> tuple[Closing, ...]:
+        """Add loops or position priors. Returns those that the solver failed with; they are not in the graph."""
+        return self._do(tuple(factors)) if factors else ()
 
-    def replay(self, steps: Iterable[Step]) -> tuple[Factor, ...]:
+    def replay(self, steps: Iterable[Step]) -> tuple[Closing, ...]:
         """Be what these steps make of the first pose. Returns the factors that the solver failed with."""
         self._reset()
         return tuple(failed for step in steps for failed in self._do(step))
@@ -78,7 +80,7 @@ class PoseGraph:
         self._steps: list[Step] = []
         self._solver: _All | _Window = _Window(self._first, self._window) if self._window else _All(self._first)
 
-    def _do(self, step: Step) -> tuple[Factor, ...]:
+    def _do(self, step: Step) -> tuple[Closing, ...]:
         try:
             self._try(step)
             self._steps.append(step)
@@ -92,7 +94,7 @@ class PoseGraph:
             return (step,)
         if len(step) == 1:
             return step
-        return tuple(failed for loop in step for failed in self.close([loop]))
+        return tuple(failed for factor in step for failed in self.close([factor]))
 
     def _try(self, step: Step) -> None:
         self._solver.update(step)
@@ -100,7 +102,7 @@ class PoseGraph:
             raise ArithmeticError("a pose is not finite")
 
 
-def optimise(first: F64, factors: Sequence[Factor], start: Sequence[F64] | F64) -> F64:
+def optimise(first: F64, factors: Sequence[Closing], start: Sequence[F64] | F64) -> F64:
     """(n, 4, 4) the optimum of all factors at once, by Levenberg-Marquardt from (n, 4, 4) `start`.
 
     Raises:
@@ -108,7 +110,7 @@ def optimise(first: F64, factors: Sequence[Factor], start: Sequence[F64] | F64) 
     """
     graph, values = _start(first)
     for factor in factors:
-        graph.add(_between(factor))
+        graph.add(_gtsam(factor))
     for key in range(1, len(start)):
         values.insert(key, gtsam.Pose3(start[key]))
     params = gtsam.LevenbergMarquardtParams()
@@ -124,7 +126,7 @@ def g2o_text(poses: F64, factors: Sequence[Factor]) -> str:
     """Poses (n, 4, 4) and factors as the text of a g2o file."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for factor in factors:
-        graph.add(_between(replace(factor, robust=False)))  # g2o has no word for a robust loss
+        graph.add(_gtsam(replace(factor, robust=False)))  # g2o has no word for a robust loss
     for key, pose in enumerate(poses):
         values.insert(key, gtsam.Pose3(pose))
     with tempfile.TemporaryDirectory(prefix="hemislam-") as folder:  # gtsam writes files only
@@ -151,7 +153,7 @@ class _All:
         self._chain = Chain(first)
         self._tied = [0]
         self._odometry: dict[tuple[int, int], int] = {}  # number of the factor between two of these
-        self._loops: dict[tuple[int, int], _Mean] = {}
+        self._loops: dict[tuple[KeyframeId, ...], _Mean] = {}
         self._poses: Rows[np.float64] | None = Rows((4, 4), np.float64, [first])  # None: loops have moved them since
         self._ahead: list[F64] = []  # the poses after those
 
@@ -165,8 +167,8 @@ class _All:
             self.count += 1
             (self._ahead if self._poses is None else self._poses).append(self.newest)
             return
-        if not all(0 <= loop.first < loop.second < self.count for loop in step):
-            raise IndexError("a loop ties poses that are not there")
+        if not all(0 <= keyframe.index < self.count for factor in step for keyframe in factor.keyframes):
+            raise IndexError("a factor ties a pose that does not exist")
         self._poses, self._ahead = None, []
         T_last, odometry = self._tie(step), self._chain.poses
         self.newest = T_last @ lie.inverse(odometry[self._tied[-1]]) @ odometry[-1]
@@ -181,10 +183,10 @@ class _All:
                 self._poses.append(pose)
         return self._poses.view()
 
-    def _tie(self, loops: Sequence[Factor]) -> F64:
-        """Solve with more loops. Returns the last pose (4, 4) that one ties."""
+    def _tie(self, factors: Sequence[Closing]) -> F64:
+        """Solve with more factors. Returns the last pose (4, 4) that one ties."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        new = sorted({key for loop in loops for key in (loop.first, loop.second)}.difference(self._tied))
+        new = sorted({keyframe.index for factor in factors for keyframe in factor.keyframes}.difference(self._tied))
         expected = {key: self._expected(key) for key in new}
         removed, added = [], dict[tuple[int, int], None]()
         for key, pose in expected.items():
@@ -201,18 +203,21 @@ class _All:
                     removed.append(self._odometry.pop((before, end)))
         for first, second in added:
             self._odometry[first, second] = self._factors + graph.size()
-            graph.add(_between(Factor(first, second, *self._chain.between(first, second))))
-        for loop in loops:
-            pair = loop.first, loop.second
-            if pair in self._loops:
-                self._loops[pair].take(loop)
+            graph.add(_gtsam(between(first, second, *self._chain.between(first, second))))
+        means: dict[_Mean, None] = {}  # in the order of their first loops
+        for factor in factors:
+            if isinstance(factor, PositionPrior):
+                graph.add(_gtsam(factor))
+            elif (mean := self._loops.get(factor.keyframes)) is not None:
+                mean.take(factor)
+                means[mean] = None
             else:
-                self._loops[pair] = _Mean(loop)
-        for mean in {(loop.first, loop.second): self._loops[loop.first, loop.second] for loop in loops}.values():
+                means[self._loops.setdefault(factor.keyframes, _Mean(factor))] = None
+        for mean in means:
             if mean.number is not None:
                 removed.append(mean.number)
             mean.number = self._factors + graph.size()
-            graph.add(_between(mean.factor, mean.times))
+            graph.add(_gtsam(mean.factor, mean.times))
         self._factors += graph.size()
         last = self._tied[-1]
         T_last = expected[last] if last in expected else _estimate(self._isam, last)
@@ -262,7 +267,7 @@ class _Window:
     def update(self, step: Step) -> None:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         stamps: dict[Any, Any] = {}
-        loops: tuple[Factor, ...] = ()
+        closing: tuple[Closing, ...] = ()
         if isinstance(step, Factor):
             self.newest = _add(step, self.newest, graph, values)
             stamps[self.count] = float(self.count)
@@ -270,15 +275,16 @@ class _Window:
                 self._left.append(_estimate(self._smoother, len(self._left)))
             self.count += 1
         else:
-            loops = step
-        for loop in loops:
-            if loop.first >= len(self._left):
-                graph.add(_between(loop))
-            elif loop.second >= len(self._left):  # the older pose stays where it was left
-                where = gtsam.Pose3(self._left[loop.first] @ loop.T_first_second)
-                graph.add(gtsam.PriorFactorPose3(loop.second, where, _noise(loop)))
+            closing = step
+        for factor in closing:
+            first, last = factor.keyframes[0].index, factor.keyframes[-1]
+            if first >= len(self._left):
+                graph.add(_gtsam(factor))
+            elif isinstance(factor, Factor) and last.index >= len(self._left):  # the older pose stays where it was left
+                where = gtsam.Pose3(self._left[first] @ factor.T_first_second)
+                graph.add(gtsam.PriorFactorPose3(_key(last), where, _noise(factor)))
         self._smoother.update(graph, values, stamps)
-        if loops:
+        if closing:
             self.newest = _settled(self._smoother, self._smoother.update, self.count - 1, self.newest)
 
     def poses(self) -> F64:
@@ -310,8 +316,8 @@ def _start(first: F64) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
 def _add(odometry: Factor, newest: F64, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> F64:
     """Put a step in the graph. Returns the pose after it, as it is before loops."""
     after = newest @ odometry.T_first_second
-    values.insert(odometry.second, gtsam.Pose3(after))
-    graph.add(_between(odometry))
+    values.insert(_key(odometry.second), gtsam.Pose3(after))
+    graph.add(_gtsam(odometry))
     return after
 
 
@@ -333,9 +339,18 @@ def _noise(factor: Factor, times: int = 1) -> gtsam.noiseModel.Base:
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(LOOP_HUBER * times**0.5), noise)
 
 
-def _between(factor: Factor, times: int = 1) -> gtsam.BetweenFactorPose3:
+def _gtsam(factor: Closing, times: int = 1) -> gtsam.NonlinearFactor:
+    """The factor as gtsam has it."""
+    if isinstance(factor, PositionPrior):
+        noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
+        return gtsam.GPSFactor(_key(factor.keyframe), factor.p_map_imu, noise)
     T = gtsam.Pose3(factor.T_first_second)
-    return gtsam.BetweenFactorPose3(factor.first, factor.second, T, _noise(factor, times))
+    return gtsam.BetweenFactorPose3(_key(factor.first), _key(factor.second), T, _noise(factor, times))
+
+
+def _key(keyframe: KeyframeId) -> int:
+    """gtsam's key of a pose; the index itself in session 0."""
+    return (keyframe.session << SESSION_BITS) | keyframe.index
 
 
 def _matrices(values: Any) -> F64:

@@ -2,8 +2,12 @@
 
 from collections import deque
 
+import numpy as np
+
 from app.slam.errors import HemislamError
+from app.slam.loops import scan_context, verification
 from app.slam.loops.backend import LoopBackend
+from app.slam.loops.factors import between
 from app.slam.loops.keyframe_log import Follower, KeyframeLog
 from app.slam.loops.messages import (
     Added,
@@ -25,6 +29,9 @@ from app.slam.loops.messages import (
     Tried,
     TryOut,
 )
+from app.slam.loops.pose_graph import PoseGraph
+from app.slam.loops.submap import Submap
+from app.slam.voxel import VoxelGrid
 
 
 class LoopService:
@@ -109,3 +116,20 @@ class InlineLoops:
 
     def close(self) -> None:
         self._service.close()
+
+
+def warm_up() -> None:
+    """Load the kernels and the solver before the first keyframe waits for them, on a small scene."""
+    rng = np.random.default_rng(0)
+    sides = np.repeat(np.arange(3), 400)
+    points = rng.uniform(0.0, 4.0, (len(sides), 3)).astype(np.float32)
+    points[np.arange(len(sides)), sides] = 0.0  # a corner of three walls
+    thin = VoxelGrid().downsample(points, 0.1).points
+    place = verification.prepare(Submap(0, thin, np.full_like(thin, 2.0)))
+    fit = verification.assess(place, place, verification.register(place, place, np.eye(4)))
+    verification.slide(place, place, fit)
+    context = scan_context.describe(thin)
+    scan_context.shift_distances(context, context)
+    graph = PoseGraph(np.eye(4))
+    graph.extend(between(0, 1, np.eye(4), np.eye(6)))
+    graph.close([between(0, 1, np.eye(4), np.eye(6), robust=True)])

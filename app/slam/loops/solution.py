@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from app.slam.loops.factors import Factor, Step
+from app.slam.loops.factors import Closing, Factor, PositionPrior, Step, between
 from app.slam.loops.pose_graph import PoseGraph
 from app.slam.loops.support import laid
 from app.slam.loops.types import LoopEdge, Pair
@@ -58,13 +58,15 @@ class Solution:
         notices, self._notices = self._notices, []
         return notices
 
-    def _report(self, failed: Iterable[Factor], told: Iterable[str] = ()) -> None:
+    def _report(self, failed: Iterable[Closing], told: Iterable[str] = ()) -> None:
         for factor in failed:
-            if factor.robust:
+            if isinstance(factor, PositionPrior):
+                text = f"The solver failed with the position of keyframe {factor.keyframe.index}; it is left out."
+            elif factor.robust:
                 self.broken |= {factor.name}
                 text = f"The solver failed with the loop {factor.name[0]}-{factor.name[1]}; the graph goes on without."
             else:
-                text = f"The solver failed with the step to keyframe {factor.second}; it now says little."
+                text = f"The solver failed with the step to keyframe {factor.second.index}; it now says little."
             self._failures.add(text)
             if text not in told:
                 self._notices.append(text)
@@ -86,5 +88,5 @@ def loop_factors(
             T, covariance = edge.T_older_newer, edge.covariance
             if first is not edge:
                 T, covariance = laid(edge, first, T_odom_imu)
-            factors.append(Factor(first.older, first.newer, T, covariance / edge.weight, True, edge.pair))
+            factors.append(between(first.older, first.newer, T, covariance / edge.weight, True, edge.pair))
     return factors

@@ -5,7 +5,7 @@ from scipy.linalg import expm, logm
 
 from app.slam import lie
 from app.slam.loops import se3
-from app.slam.loops.corrections import corrected
+from app.slam.map_frame import corrected
 from app.slam.types import F64
 
 S = 1_000_000_000
