@@ -27,6 +27,7 @@ from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 
 from app.logs import process_logs
@@ -160,7 +161,7 @@ class Child(Link):
         ours, theirs = context.Pipe()
         call = pickle.dumps((main, args))  # to be loaded once the variables are set, since that imports numpy
         self._process = context.Process(target=_run, args=(theirs, name, grace_s, dict(environment or {}), call))
-        with _signals_blocked():
+        with _signals_blocked(), _main_hidden():
             self._process.start()
         theirs.close()
         super().__init__(ours)
@@ -244,7 +245,7 @@ def fork_context() -> ForkServerContext | SpawnContext:
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(PRELOADED))
-    with _signals_blocked():
+    with _signals_blocked(), _main_hidden():
         forkserver.ensure_running()
     return context
 
@@ -261,6 +262,17 @@ def _signals_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def _main_hidden() -> Iterator[None]:
+    """A process started meanwhile does not run the owner's script again, which so needs no `if __name__ == ...`."""
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
 
 
 def show_as(name: str) -> None:

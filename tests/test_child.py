@@ -252,6 +252,24 @@ def test_no_child_outlives_its_owner(end: str) -> None:
         until_gone(pid)
 
 
+def test_the_script_of_the_owner_is_not_run_again(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    paths = [str(ROOT), str(Path(__file__).parent)]
+    script.write_text(f"""
+import sys
+sys.path[:0] = {paths!r}
+import test_child
+from app.child import Child
+print("run")
+for fork in (False, True):
+    child = Child(test_child.echo, "hello", name="echo", title="The echo", fork=fork)
+    print(child.receive(30.0))
+    child.close()
+""")
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
+    assert (done.stdout.split(), done.stderr) == (["run", "hello", "hello"], "")
+
+
 def test_restarts_are_allowed_so_often_within_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr("app.child.time.monotonic", lambda: now)
