@@ -1,5 +1,6 @@
 """Reads an MCAP from front to back, for files that rosbags refuses: cut off, or without a ROS 2 profile."""
 
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,7 @@ class McapStream:
             while True:
                 try:
                     record = next(records, None)
-                except (EndOfFile, McapError):
+                except (EndOfFile, McapError, struct.error):  # the last of a record that is cut in its middle
                     return
                 if record is None or isinstance(record, Footer):
                     self.complete = True
