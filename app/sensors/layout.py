@@ -77,31 +77,24 @@ def settle_cloud(
 def settle_imu(probe: ImuProbe, chosen: RecordingParams) -> tuple[float, list[Finding]]:
     """The factor that makes the accelerometer m/s^2, decided from the norm of its first samples."""
     norm = float(np.median(np.linalg.norm(probe.accel, axis=1)))
-    text = f"the acceleration's norm is {norm:.3f} at the start"
+    text, option = f"the acceleration's norm is {norm:.3f} at the start", "--set recording.acceleration_unit="
     if chosen.acceleration_unit != "auto":
         scale = STANDARD_GRAVITY if chosen.acceleration_unit == "g" else 1.0
-        good = 8.5 < norm * scale < 11.0
-        finding = Finding(
-            "IMU units",
-            "fine" if good else "needs you",
-            f"{chosen.acceleration_unit}, as you set it; {text}"
-            + ("" if good else ", which is not gravity in this unit"),
-            "" if good else "--set recording.acceleration_unit=auto",
-        )
+        text = f"{chosen.acceleration_unit}, as you set it; {text}"
+        if 8.5 < norm * scale < 11.0:
+            finding = Finding("IMU units", "fine", text)
+        else:
+            finding = Finding("IMU units", "needs you", f"{text}, which is not gravity in it", f"{option}auto")
     elif 0.8 < norm < 1.25:
         scale = STANDARD_GRAVITY
-        finding = Finding("IMU units", "corrected", f"g: {text}; scaled to m/s²", "--set recording.acceleration_unit=g")
+        finding = Finding("IMU units", "corrected", f"g: {text}; scaled to m/s²", f"{option}g")
     elif 8.5 < norm < 11.0:
         scale = 1.0
-        finding = Finding("IMU units", "fine", f"m/s²: {text}", "--set recording.acceleration_unit=m/s2")
+        finding = Finding("IMU units", "fine", f"m/s²: {text}", f"{option}m/s2")
     else:
-        scale = STANDARD_GRAVITY if norm < 3.0 else 1.0
-        finding = Finding(
-            "IMU units",
-            "needs you",
-            f"{text}, neither 1 g nor 9.81 m/s²; taken as {'g' if norm < 3.0 else 'm/s²'}",
-            f"--set recording.acceleration_unit={'m/s2' if norm < 3.0 else 'g'}",
-        )
+        scale, taken, other = (STANDARD_GRAVITY, "g", "m/s2") if norm < 3.0 else (1.0, "m/s²", "g")
+        text = f"{text}, neither 1 g nor 9.81 m/s²; taken as {taken}"
+        finding = Finding("IMU units", "needs you", text, option + other)
     findings = [finding]
     turning = float(np.percentile(np.linalg.norm(probe.gyro, axis=1), 90))
     if turning > 10.0:
@@ -111,7 +104,7 @@ def settle_imu(probe: ImuProbe, chosen: RecordingParams) -> tuple[float, list[Fi
 
 
 def gravity_findings(probe: ImuProbe, scale: float, params: Params) -> list[Finding]:
-    """Where down is in the LiDAR frame by the IMU's first samples, and whether the mount was given."""
+    """The direction of down in the LiDAR frame, by the IMU's first samples, and whether the mount was given."""
     first = probe.stamps_ns - probe.stamps_ns[0] <= params.imu.start_duration * 1e9
     accel, gyro = probe.accel[first] * scale, probe.gyro[first]
     specific = accel.mean(axis=0)
@@ -128,20 +121,15 @@ def gravity_findings(probe: ImuProbe, scale: float, params: Params) -> list[Find
         if moving:
             text += f"; the device moves during the first {params.imu.start_duration:g} s, so this is rough"
         findings.append(Finding("gravity", "corrected" if moving else "fine", text))
-    if not any(params.sensor.translation + params.sensor.rotation):
-        findings.append(
-            Finding(
-                "mount",
-                "needs you",
-                "no pose of the LiDAR on the IMU is given; taken as the same axes and origin",
-                "--set 'sensor.translation=[x, y, z]' --set 'sensor.rotation=[roll, pitch, yaw]'",
-            )
-        )
-    else:
+    if any(params.sensor.translation + params.sensor.rotation):
         x, y, z = params.sensor.translation
         roll, pitch, yaw = params.sensor.rotation
         text = f"LiDAR in the IMU frame at {x:g}, {y:g}, {z:g} m, turned by {roll:g}, {pitch:g}, {yaw:g} deg"
         findings.append(Finding("mount", "fine", text))
+    else:
+        text = "no pose of the LiDAR on the IMU is given; taken as the same axes and origin"
+        option = "--set 'sensor.translation=[x, y, z]' --set 'sensor.rotation=[roll, pitch, yaw]'"
+        findings.append(Finding("mount", "needs you", text, option))
     return findings
 
 

@@ -17,18 +17,18 @@ PRESETS: dict[str, dict[str, Any]] = {
     "h2lid-mount": {"sensor": _H2LID_MOUNT},
     "close": {"scan": {"voxel_size": 0.3}, "map": {"spacing": 0.15}},
 }
-"""`rslidar`: the vendor's ROS driver. `h2lid`: the authors' published recordings. `h2lid-mount`: their
-LiDAR-on-IMU extrinsics alone, for recordings of such a device under other topics. `close`: most things
-are at arm's length (a desk, a cabin, a shaft)."""
+"""One entry each. `rslidar`: the vendor's ROS driver. `h2lid`: the authors' published recordings. `h2lid-mount`: only
+their pose of the LiDAR on the IMU, for recordings under other topics. `close`: most things are at arm's length (a desk,
+a cabin, a shaft)."""
 
 
 def sidecar(recording: Path) -> Path:
-    """Where a recording's own parameters lie, if it has some: `<stem>.params.yaml` beside it."""
+    """Where a recording's own parameters would be: `<stem>.params.yaml` beside it."""
     return recording.parent / f"{recording.name if recording.is_dir() else recording.stem}.params.yaml"
 
 
 def resolve_params(recording: Path | None, preset: str | None, config: Path | None, assignments: list[str]) -> Params:
-    """Parameters by rising precedence: defaults, preset, sidecar file, config file, assignments.
+    """The parameters. Later ones win: defaults, preset, sidecar file, config file, assignments.
 
     Raises:
         HemislamError: unknown preset, unreadable file, unknown or out-of-range parameter.

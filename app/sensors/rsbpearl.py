@@ -1,11 +1,11 @@
 """Facts about the RoboSense RS-Bpearl: its firing pattern, geometry and units.
 
-Source: the vendor's own open driver (rs_driver: decoder_RSBP.hpp, chan_angles.hpp) and data sheet.
-The simulator fires by these facts; whoever decodes the sensor's packets reads them here too.
+Source: the vendor's open driver (rs_driver: decoder_RSBP.hpp, chan_angles.hpp) and data sheet. The simulator and the
+decoder of packets both use them.
 
-Frame of the sensor: x, y in the base plane, +z the pole of the hemisphere; azimuth turns from +x
-towards -y. A block is one firing of all 32 channels; the channels of a block fire one after the
-other while the head turns on, so every firing has its own time and azimuth.
+Frame of the sensor: x, y in the base plane, +z the pole of the hemisphere; azimuth turns from +x towards -y. A block is
+one firing of all 32 channels, which fire one after the other while the head turns, so every firing has its own time and
+azimuth.
 """
 
 from dataclasses import dataclass

@@ -1,1 +1,5 @@
-"""Measurements as they happen: the sensor's own packets, captures of them, other robots, and what plays them out."""
+"""Live sensors: an RS-Bpearl's packets, IMU datagrams, Foxglove bridges, and captures of packets.
+
+Packets become revolutions (`frames`) and scans (`decoder`). Receiving threads (`udp`, `foxglove`) put scans and samples
+into the `intake`, from which the `source` hands out measurements. `feed` plays a recording as a live sensor.
+"""

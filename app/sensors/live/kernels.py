@@ -9,7 +9,7 @@ from app.sensors.live.msop import BLOCK_BYTES, BLOCKS, HEADER_BYTES, TURN
 from app.sensors.rsbpearl import CHANNELS
 
 _GAP = 100
-"""0.01 deg: a longer step between neighbouring blocks is the blind gap of a limited field of view."""
+"""0.01 deg: a longer step between two blocks is the gap of a limited field of view."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -43,7 +43,7 @@ def decode_blocks(
         begin = first if i == 0 else 0
         end = stop if i == last else BLOCKS
         for b in range(end):
-            if b > 0 and azimuth[b] != azimuth[b - 1]:  # else it is the other return of the same firing
+            if b > 0 and azimuth[b] != azimuth[b - 1]:  # else it is another return of the same firing
                 moved = (azimuth[b] - azimuth[b - 1] + TURN // 2) % TURN - TURN // 2
                 if abs(moved) > _GAP:
                     time += round(turn_ns * ((moved if nominal > 0 else -moved) % TURN) / TURN)
@@ -74,7 +74,7 @@ def decode_blocks(
                 if count < least or count > most:
                     continue
                 if again and packet[p - BLOCK_BYTES] == packet[p] and packet[p + 1 - BLOCK_BYTES] == packet[p + 1]:
-                    continue  # strongest and last return are one
+                    continue  # strongest and last return are the same
                 # The head turns on by at most 1 deg within a block: the series is exact to 1e-13.
                 w = width * share[c]
                 w2 = w * w

@@ -1,4 +1,4 @@
-"""The RS-Bpearl at work: each of its firings has its own time, azimuth, origin and pose."""
+"""The simulated RS-Bpearl: each of its firings has its own time, azimuth, origin and pose."""
 
 from dataclasses import dataclass, field
 
@@ -23,7 +23,7 @@ P_IMU_LIDAR: F64 = np.array([0.0175, 0.0276, -0.1083])
 """m, the LiDAR's place on H2LID's IMU; their axes agree."""
 
 STRAY_LOSS = 0.005
-"""Share of firings that are lost whatever they hit."""
+"""Share of firings without a return, whatever they hit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +114,8 @@ class Lidar:
     def _rays(self, trajectory: SmoothTrajectory, start_ns: int) -> tuple[F64, F64]:
         """Every firing's ray in the world, from the pose at its own time.
 
-        Poses are taken at both ends of each block and interpolated between: over 55 us a hand's
-        motion departs from a straight line by nanometres.
+        Poses are computed at both ends of each block and interpolated between: within 55 us a hand's motion deviates
+        from a straight line by nanometres.
         """
         pattern = self.pattern
         begin = start_ns + pattern.blocks_ns

@@ -1,4 +1,4 @@
-"""Triangle meshes with what a laser needs to know of them, and the solids that scenes are built of.
+"""Triangle meshes with the properties that a laser sees, and the solids from which scenes are built.
 
 World frame: x, y level, z up, metres.
 """
@@ -39,7 +39,7 @@ class Mesh:
 
 
 class MeshBuilder:
-    """Collects solids; `build` hands out the mesh. Angles in radians, yaw about +z."""
+    """Collects solids; `build` returns the mesh. Angles in radians, yaw about +z."""
 
     def __init__(self) -> None:
         self._vertices: list[F64] = []
@@ -125,7 +125,7 @@ class MeshBuilder:
         reflectivity: float,
         rng: np.random.Generator,
     ) -> None:
-        """Small triangles at random attitudes in an ellipsoid, denser at its skin: foliage."""
+        """Foliage: small triangles in random orientations in an ellipsoid, denser at its surface."""
         directions = rng.normal(size=(count, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         middles = directions * rng.uniform(0.3, 1.0, (count, 1)) ** 0.5 * np.asarray(radii) + np.asarray(centre)

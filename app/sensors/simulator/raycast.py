@@ -1,4 +1,4 @@
-"""What a laser beam meets: the still part of a scene and the bodies that move through it."""
+"""What a laser beam hits: the static part of a scene and the bodies that move through it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class Mover:
 @dataclass(frozen=True, slots=True)
 class SimulatedScene:
     """Attributes:
-    mesh: everything that stands still, world frame. movers: bodies that move.
+    mesh: everything static, world frame. movers: bodies that move.
     path: (n, 2) waypoints of the trajectory in plan, m. closed: whether it is repeated lap by lap.
     height: the ground's z at (n, 2) points; None is z = 0.
     """
@@ -42,7 +42,7 @@ class SimulatedScene:
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """What each of n rays met. Rays that met nothing have infinite distance.
+    """What each of n rays hit. Rays that hit nothing have infinite distance.
 
     Attributes:
         distance: (n,) m. incidence: (n,) cosine of the angle to the surface's normal, 0-1.

@@ -67,7 +67,7 @@ def simulate(
     imu_noise: ImuNoise | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulationSummary:
-    """Simulate a handheld walk with an RS-Bpearl and an IMU and write it as a ROS 2 recording.
+    """Simulate a person who carries an RS-Bpearl and an IMU, and write it as a ROS 2 recording.
 
     Beside `out` (`<stem>.mcap`, streamed scan by scan) it writes the truth `<stem>_truth.tum`
     (T_world_imu at every scan's end, absolute seconds, exact; the world's z is up) and
@@ -110,22 +110,21 @@ def simulate(
     imu = imu_model.measure(trajectory, imu_stamps, START_NS, imu_noise or ImuNoise(), _random(seed, _IMU))
 
     total = int((duration_s - _FIRST_TURN_S) * rate_hz + 1e-6)
-    points = 0
-    next_imu = 0
+    points = written = 0
     truth, params = out.with_name(f"{out.stem}_truth.tum"), out.with_name(f"{out.stem}.params.yaml")
     unfinished = out.with_name(out.name + ".part")
     ends: list[int] = []
+
+    def add_imu(stop: int) -> None:
+        nonlocal written
+        for k in range(written, stop):
+            stamp = int(imu.stamps_ns[k])
+            recording.add_imu(stamp, imu.gyro[k], imu.accel[k], stamp)
+        written = max(written, stop)
+
     try:
         with unfinished.open("wb") as file:
             recording = RecordingWriter(file)
-
-            def add_imu_until(received_ns: float) -> None:
-                nonlocal next_imu
-                while next_imu < len(imu) and imu.stamps_ns[next_imu] <= received_ns:
-                    stamp = int(imu.stamps_ns[next_imu])
-                    recording.add_imu(stamp, imu.gyro[next_imu], imu.accel[next_imu], stamp)
-                    next_imu += 1
-
             for index in range(total):
                 start_s = _FIRST_TURN_S + index / rate_hz
                 scan = lidar.turn(caster, trajectory, start_s, START_NS, _random(seed, _LIDAR, index))
@@ -133,10 +132,11 @@ def simulate(
                     continue
                 points += len(scan)
                 ends.append(scan.end_ns)
-                add_imu_until(scan.end_ns + TRANSPORT_NS)
-                recording.add_scan(scan, scan.end_ns + TRANSPORT_NS)
+                logged_ns = scan.end_ns + TRANSPORT_NS
+                add_imu(int(np.searchsorted(imu.stamps_ns, logged_ns, side="right")))
+                recording.add_scan(scan, logged_ns)
                 progress(index + 1, total)
-            add_imu_until(np.inf)
+            add_imu(len(imu))
             recording.finish()
         truth.write_text(_tum(trajectory, np.array(ends, np.int64)))
         params.write_text(_SIDECAR + yaml.safe_dump({"sensor": {"translation": P_IMU_LIDAR.tolist()}}))

@@ -1,7 +1,7 @@
 """The paper's suite: simulated twins of the six sequences of its Table 1, from one seed.
 
-Same number of frames, duration and length; the places are `scenes.paper`. The short form is the
-first minute of each, with fewer firings.
+They have the same number of frames, duration and length; their places are `scenes.paper`. The short form is the first
+minute of each, with fewer firings.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ from app.slam.errors import HemislamError
 RATE_HZ = 10
 SHORT_S = 60.0
 SHORT_EVERY_BLOCK = 3
-"""The short form fires every third azimuth, 19,000 a scan, so that it is made within minutes."""
+"""The short form fires every third azimuth, 19,000 a scan, so that it is simulated within minutes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Twin:
 
     @property
     def duration_s(self) -> float:
-        """So that just as many scans fit (the first begins after 0.05 s)."""
+        """Long enough for exactly these frames (the first begins after 0.05 s)."""
         return self.frames / RATE_HZ + 0.05
 
 
@@ -69,7 +69,7 @@ def make_twin(
     every_block: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Made:
-    """Simulate one sequence into `folder`, unless the same is there already.
+    """Simulate one sequence into `folder`, unless it is there already.
 
     The walker's speed is chosen so that the whole trajectory is as long as the paper's.
 
@@ -83,9 +83,8 @@ def make_twin(
     out, note = folder / f"{name}.mcap", folder / f"{name}.suite.json"
     every_block = every_block or (SHORT_EVERY_BLOCK if short else 1)
     duration_s = min(SHORT_S, twin.duration_s) if short else twin.duration_s
-    wanted = {"twin": asdict(twin), "seed": seed, "duration_s": duration_s, "every_block": every_block} | {
-        "simulator": _digest()
-    }
+    wanted = {"twin": asdict(twin), "seed": seed, "duration_s": duration_s, "every_block": every_block}
+    wanted["simulator"] = _digest()
     if out.is_file() and (there := _noted(note)) is not None and there["made"] == wanted:
         return Made(out, False, there["distance_m"])
     made = simulate(
@@ -130,7 +129,7 @@ def _noted(path: Path) -> dict[str, Any] | None:
 
 
 def _digest() -> str:
-    """Hash of the simulator's code: another one makes other recordings."""
+    """Hash of the simulator's code, since changed code makes other recordings."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())

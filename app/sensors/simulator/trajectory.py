@@ -1,11 +1,10 @@
-"""A handheld walk as one smooth curve, and the exact motion an IMU on it feels.
+"""The trajectory of a handheld scanner as one smooth curve, and what an ideal IMU on it measures.
 
-The walk IS a quintic spline through samples of (x, y, z, yaw, pitch, roll), so that every
-derivative is exact: poses, angular rates and specific forces belong to the same curve.
+The curve is a quintic spline through samples of (x, y, z, yaw, pitch, roll), so that every derivative is exact: poses,
+angular rates and specific forces belong to the same curve.
 
-Frames: `world` has z up; `body` has x forward, y left, z up; the IMU is mounted as on H2LID: its
-z looks forward, its x points DOWN, its y left, so that at rest it reads -9.81 m/s^2 on x (gravity
-along -x, as the accelerometer feels it).
+Frames: `world` has z up; `body` has x forward, y left, z up. The IMU is mounted as on H2LID: z forward, x down, y left,
+so that at rest it reads -9.81 m/s^2 on x.
 """
 
 from collections.abc import Callable
@@ -93,14 +92,14 @@ def walk(
     closed: bool = True,
     height: Callable[[F64], F64] | None = None,
 ) -> SmoothTrajectory:
-    """Walk along waypoints, as often around a closed path as time allows; stop at the end of an open one.
+    """A person walks along waypoints, round a closed path for all of the time, or to the end of an open one.
 
     Args:
         path: (n, 2) waypoints in plan, m. height: the ground's z at (n, 2) points; None is z = 0.
     """
     t = np.arange(-1.0, duration_s + 1.0, 1.0 / _SAMPLE_HZ)
     awake = _smoothstep((t - walker.still) / 1.5)
-    # Smoothing in time reaches back before the first step, hence the second of delay.
+    # Smoothing reaches back before the first step, hence the delay of one second.
     walking = _smoothstep((t - walker.still - 1.0) / 1.5)
     speed = walker.speed * walking * (1.0 + 0.1 * _wander(t, rng, (0.05, 0.15)))
     travelled = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2) / _SAMPLE_HZ])
@@ -158,7 +157,7 @@ def _smoothstep(x: F64) -> F64:
 
 
 def _smoothed(values: F64, sigma: float) -> F64:
-    """Convolved with a Gaussian whose spread is `sigma` samples; the ends go on as they are."""
+    """Convolved with a Gaussian whose spread is `sigma` samples; beyond the ends the values are constant."""
     reach = round(4 * sigma)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     return np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), mode="valid")
@@ -183,7 +182,7 @@ def _unrolled(path: F64, closed: bool, length: float) -> tuple[F64, F64]:
 
 
 def _brake(travelled: F64, end: float) -> F64:
-    """Come softly to a stop two metres before the end of an open path."""
+    """Stop gently two metres before the end of an open path."""
     limit = end - 1.0
     over = np.maximum(travelled - (limit - 1.0), 0.0)
     return np.where(travelled > limit - 1.0, limit - 1.0 + np.tanh(over), travelled)

@@ -1,7 +1,7 @@
-"""Twins of the places of the paper's six sequences (Table 1): a garage, an office, and four walks outdoors.
+"""Twins of the places of the paper's six sequences (Table 1): a garage, an office, and four paths outdoors.
 
-Each path begins with a small round, so that the first minute already comes back to where it began;
-outdoor_4 never does, as in the paper.
+Each path begins with a small lap, so that the first minute already returns to its start; outdoor_4 never returns, as in
+the paper.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from app.slam.types import F64
 
 _ASPHALT, _GRASS = 0.18, 0.42
 _EDGE = 45.0
-"""m of ground around the path: beyond it a laser sees the sky."""
+"""m of ground around the path; beyond it a laser sees the sky."""
 
 Path = Sequence[tuple[float, float]]
 

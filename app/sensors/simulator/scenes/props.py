@@ -1,4 +1,4 @@
-"""Things that stand and walk about in scenes. Sizes in metres, `at` is (x, y, floor z), yaw in radians."""
+"""Furniture, plants, vehicles and people of scenes. Sizes in metres, `at` is (x, y, floor z), yaw in radians."""
 
 from collections.abc import Callable
 
@@ -149,7 +149,7 @@ def person_mesh(height: float = 1.75) -> Mesh:
 def pedestrian(
     corners: Corners, speed: float, start: float = 0.0, height: Callable[[F64], F64] | None = None, size: float = 1.75
 ) -> Mover:
-    """A person who walks round a closed polygon for ever, `start` metres along it at time 0."""
+    """A person who walks round a closed polygon without end, `start` metres along it at time 0."""
     path = stroll(corners)
     loop = np.vstack([path, path[:1]])
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(loop, axis=0), axis=1))])
@@ -167,7 +167,7 @@ def pedestrian(
 
 
 def building(mesh: MeshBuilder, at: Vector, size: Vector, yaw: float = 0.0) -> None:
-    """Rows of windows all round, a plinth, a gabled roof; its walls reach 2 m below `at`, so it stands on slopes."""
+    """Rows of windows on all sides, a plinth, a gabled roof; walls reach 2 m below `at`, for slopes."""
     p = _place(at, yaw)
     length, depth, height = size
     mesh.box(p(0, 0, height / 2 - 1.0), (length, depth, height + 2.0), 0.4, yaw)
