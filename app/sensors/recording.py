@@ -17,7 +17,7 @@ from app.sensors.pointcloud import decode, read_scan
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu
 from app.sensors.ros import Vector, stamp_ns
 from app.sensors.sequencer import Sequencer
-from app.sensors.source import SUFFIXES, Mark, Source
+from app.sensors.source import Mark, Source
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement, Scan
@@ -253,23 +253,3 @@ def open_recording(path: Path, params: Params) -> Recording:
     except BaseException:
         source.close()
         raise
-
-
-def find_recordings(folder: Path) -> list[Path]:
-    """Recordings below a folder: .bag, .mcap, .db3 files, and ROS 2 folders as one entry each, sorted.
-
-    Hidden entries, links to folders (they may form circles) and what cannot be read are skipped.
-    """
-    found: list[Path] = []
-    try:
-        entries = sorted(folder.iterdir())
-    except OSError:
-        return found
-    for entry in entries:
-        if entry.name.startswith(".") or (entry.is_symlink() and entry.is_dir()):
-            continue
-        if entry.is_dir():
-            found += [entry] if (entry / "metadata.yaml").is_file() else find_recordings(entry)
-        elif entry.suffix in SUFFIXES:
-            found.append(entry)
-    return found

@@ -47,7 +47,7 @@ def test_a_file_with_a_wrong_suffix_is_recognised(tmp_path: Path) -> None:
     assert "it is a .bag: rename it" in refusal(bag.rename(tmp_path / "walk.mcap"))
 
 
-def test_other_suffixes_and_folders_are_told_what_can_be_read(tmp_path: Path) -> None:
+def test_other_files_and_folders_are_refused_with_what_can_be_read(tmp_path: Path) -> None:
     (tmp_path / "walk.pcap").write_bytes(b"1")
     assert "ROS 1 .bag" in refusal(tmp_path / "walk.pcap")
     assert "metadata.yaml" in refusal(tmp_path)
@@ -137,7 +137,7 @@ def test_without_lidar_or_imu_the_topics_that_there_are_are_listed(tmp_path: Pat
     assert "no IMU samples" in refusal(deaf) and "/points" in refusal(deaf)
 
 
-def test_a_topic_that_is_not_there_lists_those_that_are(tmp_path: Path) -> None:
+def test_a_missing_topic_is_refused_with_the_topics_of_the_recording(tmp_path: Path) -> None:
     path = rig.write(tmp_path / "walk", rig.walk(turns=3, columns=4))
     assert "--lidar-topic /points" in refusal(path, Params().with_values({"recording.lidar_topic": "/nope"}))
     wrong_type = refusal(path, Params().with_values({"recording.imu_topic": "/points"}))
@@ -199,7 +199,7 @@ def test_an_imu_of_nan_is_refused(tmp_path: Path) -> None:
     assert "are all NaN" in refusal(rig.write(tmp_path / "walk", entries))
 
 
-def test_a_part_beyond_the_end_is_told_how_long_the_recording_is(tmp_path: Path) -> None:
+def test_a_part_beyond_the_end_is_refused_with_the_length_of_the_recording(tmp_path: Path) -> None:
     path = rig.write(tmp_path / "walk", rig.walk(turns=4, columns=4))
     with (
         open_recording(path, Params()) as recording,

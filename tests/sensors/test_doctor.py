@@ -55,7 +55,7 @@ def test_outages_steps_back_and_missing_scans_are_counted(tmp_path: Path) -> Non
     assert "gap of the IMU" in found["pairing"].text
 
 
-def test_the_share_of_nan_is_told(tmp_path: Path) -> None:
+def test_the_share_of_nan_is_reported(tmp_path: Path) -> None:
     entries = []
     for topic, log, sent in rig.walk(turns=4, columns=10):
         if topic == "/points":

@@ -127,7 +127,7 @@ def test_a_wrong_unit_is_named_with_the_option_that_helps() -> None:
     assert "every 0.100 s" in findings["point time"].text
 
 
-def test_a_time_field_that_is_not_there_is_an_error_that_lists_those_that_are() -> None:
+def test_a_missing_time_field_is_refused_with_the_fields_of_the_clouds() -> None:
     with pytest.raises(HemislamError, match=r"no field `tof`.*timestamp"):
         settle(clouds(rig.Layout()), time_field="tof")
 
@@ -218,7 +218,7 @@ def test_without_a_ring_field_the_rings_are_derived(rows: int) -> None:
     assert "8 scan lines" in findings["ring order"].text
 
 
-def test_lines_are_told_apart_although_the_beams_start_above_the_origin() -> None:
+def test_lines_are_separated_although_the_beams_start_above_the_origin() -> None:
     """As on the RS-Bpearl: near points of a line appear higher than far ones."""
     rng = np.random.default_rng(1)
     elevations = np.radians(2.3125 + 2.8125 * np.arange(32))
@@ -263,7 +263,7 @@ def test_a_gyroscope_in_degrees_is_suspected() -> None:
     assert findings[-1].verdict == "needs you" and "rad/s" in findings[-1].text
 
 
-def test_down_is_told_in_the_lidar_frame_through_the_mount() -> None:
+def test_down_is_reported_in_the_lidar_frame_through_the_mount() -> None:
     """IMU upright, LiDAR pitched by +90 deg: its x axis then points down."""
     params = Params.parse({"sensor": {"rotation": [0, 90, 0], "translation": [0, 0, 0.1]}})
     gravity, mount = gravity_findings(imu_probe((0, 0, 9.81)), 1.0, params)

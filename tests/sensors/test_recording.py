@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.sensors.presets import resolve_params
-from app.sensors.recording import Measurements, Place, find_recordings, open_recording
+from app.sensors.recording import Measurements, Place, open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.provenance import hash_input
@@ -187,17 +187,6 @@ def test_the_hash_of_a_file_is_its_sha256_and_that_of_a_folder_covers_all_its_fi
     before = hash_input(folder)
     (folder / "metadata.yaml").write_text("changed")
     assert hash_input(folder) != before
-
-
-def test_recordings_are_found_below_a_folder(tmp_path: Path) -> None:
-    entries = rig.walk(turns=2, columns=4)
-    rig.write(tmp_path / "inside", entries, "mcap")
-    (tmp_path / "deep").mkdir()
-    rig.write(tmp_path / "deep" / "one", rig.walk(turns=2, columns=4, ros=1), "bag")
-    (tmp_path / "notes.txt").write_text("no recording")
-    (tmp_path / ".hidden.mcap").write_text("")
-    (tmp_path / "circle").symlink_to(tmp_path)
-    assert find_recordings(tmp_path) == [tmp_path / "deep" / "one.bag", tmp_path / "inside"]
 
 
 @pytest.mark.parametrize(

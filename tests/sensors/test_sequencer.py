@@ -73,7 +73,7 @@ def test_a_sample_exactly_at_a_scans_end_closes_it_and_opens_the_next() -> None:
     imu_delay=st.integers(0, 400),
     phase=st.integers(0, 9),
 )
-def test_whatever_the_delays_of_arrival_the_pairs_are_the_same(delays: list[int], imu_delay: int, phase: int) -> None:
+def test_the_pairs_do_not_depend_on_delays_of_arrival(delays: list[int], imu_delay: int, phase: int) -> None:
     scans = [scan(100 * n) for n in range(12)]
     imu = samples(-20 + phase, 1250 + phase)
     expected, _ = feed(imu, scans)
@@ -95,7 +95,7 @@ def test_whatever_the_delays_of_arrival_the_pairs_are_the_same(delays: list[int]
 
 @settings(deadline=None)
 @given(st.lists(st.integers(0, 3000), min_size=2, max_size=80), st.lists(st.integers(0, 3000), max_size=15))
-def test_every_measurement_is_covered_and_in_order_whatever_comes_in(imu: list[int], begins: list[int]) -> None:
+def test_every_measurement_is_covered_and_in_order_for_any_input(imu: list[int], begins: list[int]) -> None:
     out, _ = feed(imu, [scan(begin) for begin in begins])
     assert len(out) == len(begins)
     previous_end = None
@@ -141,7 +141,7 @@ def test_a_silent_imu_does_not_fill_the_memory() -> None:
     assert isinstance(out[0], Measurement) and all(isinstance(entry, DroppedScan) for entry in out[1:])
 
 
-def test_an_outage_of_the_imu_drops_the_scans_inside_and_is_told_with_the_next() -> None:
+def test_an_imu_outage_drops_the_scans_inside_and_is_reported_with_the_next() -> None:
     out, sequencer = feed([*samples(0, 210), *samples(480, 800)], [scan(100 * n) for n in range(7)])
     assert dropped(out) == [(200, "it lies in a gap of the IMU"), (300, "it lies in a gap of the IMU"),
                             (400, "it lies in a gap of the IMU")]  # fmt: skip
@@ -151,7 +151,7 @@ def test_an_outage_of_the_imu_drops_the_scans_inside_and_is_told_with_the_next()
     assert sequencer.counts.imu_gaps == 1
 
 
-def test_a_scan_that_lies_only_partly_in_a_gap_is_used_and_told() -> None:
+def test_a_scan_partly_in_a_gap_is_used_and_reported() -> None:
     out, _ = feed([*samples(0, 160), *samples(270, 400)], [scan(0), scan(100), scan(200), scan(300)])
     assert dropped(out) == [(200, "it lies in a gap of the IMU")]
     assert stamps(out[1]) == [*samples(100, 160), 270]
@@ -159,7 +159,7 @@ def test_a_scan_that_lies_only_partly_in_a_gap_is_used_and_told() -> None:
     assert stamps(out[3]) == [160, *samples(270, 400)]
 
 
-def test_repeated_and_reversed_samples_are_left_out_once_and_told() -> None:
+def test_repeated_and_reversed_samples_are_left_out_and_reported_once() -> None:
     sequencer = Sequencer(max_gap_s=0.1)
     order = [*samples(0, 50), 50, 20, 30, 40, *samples(60, 210)]
     for at in order:
@@ -191,7 +191,7 @@ def test_the_imu_goes_on_after_an_outage_of_many_seconds() -> None:
     assert sequencer.counts.longest_imu_gap_s == 4.89
 
 
-def test_nan_samples_are_left_out_and_told() -> None:
+def test_nan_samples_are_left_out_and_reported() -> None:
     sequencer = Sequencer(max_gap_s=0.1)
     for at in samples(0, 110):
         push(sequencer, at)
@@ -214,7 +214,7 @@ def test_repeated_and_reversed_scans_are_dropped_and_the_next_is_used() -> None:
     assert [e.scan.stamp_ns // MS for e in out if isinstance(e, Measurement)] == [0, 100, 200]
 
 
-def test_missing_scans_are_told_with_the_next() -> None:
+def test_missing_scans_are_reported_with_the_next() -> None:
     begins = [*range(0, 1000, 100), 1300]
     out, _ = feed(samples(0, 1500), [scan(begin) for begin in begins])
     assert isinstance(out[-1], Measurement)

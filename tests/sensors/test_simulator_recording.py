@@ -153,9 +153,7 @@ def test_coordinates_can_be_rounded(tmp_path: Path) -> None:
         ({"out": "absent/walk.mcap"}, "absent does not exist"),
     ],
 )
-def test_what_cannot_be_simulated_is_said_in_a_sentence(
-    tmp_path: Path, arguments: dict[str, Any], sentence: str
-) -> None:
+def test_wrong_arguments_are_refused_in_one_sentence(tmp_path: Path, arguments: dict[str, Any], sentence: str) -> None:
     given = {"scene": "room", "out": "walk.mcap", "duration_s": 1.0} | arguments
     out = tmp_path / given.pop("out")
     with pytest.raises(HemislamError, match=sentence):

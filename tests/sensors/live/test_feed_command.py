@@ -11,7 +11,7 @@ from tests.sensors.live import ports
 MUSEUM = str(Path(__file__).resolve().parents[3] / "sample_data" / "museum.mcap")
 
 
-def test_it_plays_packets_to_whoever_listens_or_nobody() -> None:
+def test_it_plays_packets_whether_or_not_anybody_listens() -> None:
     one, two, three = ports.free(3)
     to, beside = f"rsbpearl://127.0.0.1:{one},{two}", f"imu-udp://127.0.0.1:{three}"
     done = CliRunner().invoke(

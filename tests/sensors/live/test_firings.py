@@ -131,7 +131,7 @@ SIGHTS: dict[str, Callable[[float, int], bool]] = {
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
-def test_a_units_own_angles_are_read_off_its_points_whatever_it_sees(sight: str) -> None:
+def test_a_units_own_angles_are_read_from_its_points_in_any_scene(sight: str) -> None:
     scans = [scan_of(speed, angles=CORRECTED, sees=SIGHTS[sight]) for speed in (0.999, 1.0, 1.001)]
     found = fit_angles(scans)
     np.testing.assert_allclose(found.elevations_deg, [e for e, _ in CORRECTED], atol=0.011)
@@ -148,7 +148,7 @@ def test_a_units_own_angles_are_read_off_its_points_whatever_it_sees(sight: str)
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
-def test_a_unit_with_the_nominal_angles_has_these_whatever_it_sees(sight: str) -> None:
+def test_a_unit_with_the_nominal_angles_keeps_them_in_any_scene(sight: str) -> None:
     scans = [scan_of(speed, sees=SIGHTS[sight]) for speed in (0.999, 1.0, 1.001)]
     assert fit_angles(scans) is NOMINAL
 

@@ -141,7 +141,7 @@ def told(events: list[Event], kind: str) -> int:
     return sum(isinstance(event, Status) and event.kind == kind for event in events)
 
 
-def test_topics_are_taken_by_name_and_missing_ones_are_told() -> None:
+def test_topics_are_chosen_by_name_and_missing_ones_are_reported() -> None:
     number = port()
     params = Params().with_values({"recording.lidar_topic": "/elsewhere"})
     with Bridge(number), open_live(f"foxglove://127.0.0.1:{number}", params) as source:

@@ -40,7 +40,7 @@ def test_a_host_that_can_be_one_is_taken(host: str) -> None:
     assert parse_address(f"foxglove://{host}:8765").host == host.strip("[]")
 
 
-def test_a_second_sensor_at_the_same_port_is_told_and_left_out() -> None:
+def test_a_second_sensor_at_the_same_port_is_reported_and_left_out() -> None:
     lidar, device, imu = ports.free(3)
     url, imu_url = f"rsbpearl://127.0.0.1:{lidar},{device}", f"imu-udp://127.0.0.1:{imu}"
     with (
@@ -135,7 +135,7 @@ def _odd_cloud(luck: random.Random, number: int) -> Any:
 
 
 @pytest.mark.filterwarnings("ignore:.*encountered in:RuntimeWarning")  # random numbers do that
-def test_clouds_that_contradict_themselves_are_told_and_take_no_memory() -> None:
+def test_clouds_that_contradict_themselves_are_reported_and_take_no_memory() -> None:
     """Billions of points of no bytes each once took all there is."""
     luck = random.Random(0)
     for _ in range(60):
@@ -194,7 +194,7 @@ def test_a_server_that_talks_nonsense_is_still_listened_to_afterwards() -> None:
         thread.join(5.0)
 
 
-def test_an_imu_whose_clock_stands_still_is_told_once() -> None:
+def test_an_imu_whose_clock_stands_still_is_reported_once() -> None:
     intake = Intake(Params())
     told = []
     for tenth in range(100):

@@ -113,7 +113,7 @@ def test_an_engine_that_is_back_has_time_to_catch_up_and_then_none_to_fall_behin
 
 @pytest.mark.parametrize("who", ["lidar", "imu", "both"])
 @pytest.mark.parametrize("jump_s", [-86_400, -2, 3, 86_400])
-def test_a_clock_that_is_set_is_told_and_time_goes_on(who: str, jump_s: int) -> None:
+def test_a_clock_that_is_set_is_reported_and_time_goes_on(who: str, jump_s: int) -> None:
     rig = Rig()
     for _ in range(15):
         rig.turn()
@@ -163,7 +163,7 @@ def test_sensors_with_clocks_of_their_own_are_put_on_the_hosts() -> None:
         )
 
 
-def test_acceleration_in_g_is_scaled_and_told() -> None:
+def test_acceleration_in_g_is_scaled_and_reported() -> None:
     rig = Rig()
     rig.accel = (0.0, 0.0, 1.0)
     for _ in range(12):
@@ -173,7 +173,7 @@ def test_acceleration_in_g_is_scaled_and_told() -> None:
     assert ports.measurements(events)[0].imu.accel[0, 2] == pytest.approx(9.80665)
 
 
-def test_scans_without_an_imu_are_told_apart_from_those_the_engine_was_too_busy_for() -> None:
+def test_scans_without_an_imu_and_scans_of_a_busy_engine_have_different_reasons() -> None:
     rig = Rig()
     rig.now -= 60 * 10**9
     for _ in range(12):
@@ -256,7 +256,7 @@ def test_ten_percent_lost_doubled_shuffled_and_broken_packets_still_make_every_s
     assert counters.truncated > 100 and counters.foreign > 50 and counters.duplicates > 50 and counters.reordered > 100
 
 
-def test_silence_return_and_another_configuration_are_told() -> None:
+def test_silence_return_and_another_configuration_are_reported() -> None:
     wire = Wire()
     packets = sensor.turns(14)
     with open_live(wire.url, Params(), wire.imu_url) as source:
@@ -301,7 +301,7 @@ def test_an_address_that_cannot_be_is_refused_in_one_sentence(lidar: str, imu: s
         open_live(lidar, Params(), imu)
 
 
-def test_addresses_have_the_sensors_own_ports_unless_told() -> None:
+def test_addresses_have_the_sensors_own_ports_by_default() -> None:
     assert parse_address("rsbpearl://0.0.0.0").ports == (6699, 7788)
     assert parse_address("rsbpearl://:1700").ports == (1700, 7788)
     assert parse_address("foxglove://robot").host == "robot"
@@ -312,7 +312,7 @@ def test_addresses_have_the_sensors_own_ports_unless_told() -> None:
     }
 
 
-def test_a_port_in_use_is_said() -> None:
+def test_a_port_in_use_is_refused() -> None:
     wire = Wire()
     with (
         open_live(wire.url, Params(), wire.imu_url),

@@ -153,7 +153,7 @@ def test_written_packets_are_the_tables_packets(model: object) -> None:
     assert stamp_of(truth) == stamp
 
 
-def test_a_date_that_is_none_is_told() -> None:
+def test_an_invalid_date_is_recognised() -> None:
     packet = bytearray(sensor.turns(1)[0])
     packet[20:26] = bytes(6)
     assert stamp_of(bytes(packet)) is None

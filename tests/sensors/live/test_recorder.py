@@ -156,7 +156,7 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path) -> None
     assert "cannot be written any more" in recorder.failure
 
 
-def test_no_place_to_write_is_said(tmp_path: Path) -> None:
+def test_a_place_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(HemislamError, match="cannot be written"):
         Recorder(tmp_path / "file" / "session.mcap")
