@@ -32,12 +32,10 @@ class _Drawn:
     Attributes:
         limits: ends of the colour maps with this keyframe and those before it.
         count: points shown. handle: None while there are none.
-        height: (4,) third row of the pose with which it was coloured.
     """
 
     chunk: Chunk
     limits: dict[str, Limits]
-    height: F64
     count: int = 0
     handle: viser.PointCloudHandle | None = None
 
@@ -82,7 +80,7 @@ class MapChunks:
         known = len(self._drawn)
         moved = self._move(poses[: len(chunks), :3])
         for chunk, T in zip(chunks[known:], self._T_map_imu[known:], strict=True):
-            self._drawn.append(_Drawn(chunk, self._grown(chunk, T), T[2]))
+            self._drawn.append(_Drawn(chunk, self._grown(chunk, T)))
         seen, limits = self._view, self.limits.get(view.colour_by)
         recolour = view.colour_by != seen.colour_by or limits != self._coloured
         self._view, self._coloured = view, limits
@@ -96,10 +94,8 @@ class MapChunks:
                     place(drawn.handle, T @ chunk.T_imu_lidar)
                 if view.point_size != seen.point_size or view.map != seen.map:
                     drawn.handle.point_size, drawn.handle.visible = view.point_size, view.map
-                lifted = moved[index] and view.colour_by == HEIGHT and bool((abs(T[2] - drawn.height) > _STILL).any())
-                if recolour or lifted:
+                if recolour or (moved[index] and view.colour_by == HEIGHT):
                     drawn.handle.colors = self._colours(self._shown(chunk, T))
-                    drawn.height = T[2]
 
     def _keep(self, count: int) -> None:
         """Remove all keyframes but the first so many."""
@@ -146,7 +142,7 @@ class MapChunks:
         then not sent what was thinned away.
         """
         cloud = self._shown(drawn.chunk, T_map_imu)
-        drawn.count, drawn.height = len(cloud.points), T_map_imu[2]
+        drawn.count = len(cloud.points)
         if not drawn.count:  # the page cannot draw a cloud without points
             if drawn.handle is not None:
                 drawn.handle.remove()

@@ -130,7 +130,6 @@ class FileBrowser:
     def __init__(self, client: viser.ClientHandle, folders: Folders, title: str) -> None:
         self._gui = client.gui
         self._folders = folders
-        self._shown: list[viser.GuiButtonHandle | viser.GuiHtmlHandle] = []
         self._suffixes: tuple[str, ...] = ()
         self._nothing = ""
         self._choose: Callable[[Path], None] = lambda _: None
@@ -168,9 +167,10 @@ class FileBrowser:
 
     def _go(self, folder: Path | None) -> None:
         """List a folder; None lists the roots."""
-        for handle in self._shown:
-            handle.remove()
-        self._shown.clear()
+        order = self._list.order
+        self._list.remove()
+        with self._modal:
+            self._list = self._gui.add_folder(None, order=order)
         with self._list:
             if folder is None:
                 self._here.content = panel("text", "Folders that this server was started with:")
@@ -181,7 +181,7 @@ class FileBrowser:
             try:
                 entries = self._folders.listing(folder, self._suffixes)
             except HemislamError as error:
-                self._shown.append(self._gui.add_html(panel("path", "", str(error))))
+                self._gui.add_html(panel("path", "", str(error)))
                 entries = []
             at_root = folder in self._folders.roots
             if not at_root or len(self._folders.roots) > 1:
@@ -189,10 +189,10 @@ class FileBrowser:
             for entry in entries[:_MOST_ENTRIES]:
                 self._entry(entry)
             if not entries:
-                self._shown.append(self._gui.add_html(panel("text", self._nothing)))
+                self._gui.add_html(panel("text", self._nothing))
             if len(entries) > _MOST_ENTRIES:
                 more = f"{len(entries) - _MOST_ENTRIES} more are not shown; name the file on the command line."
-                self._shown.append(self._gui.add_html(panel("text", more)))
+                self._gui.add_html(panel("text", more))
 
     def _entry(self, entry: Entry) -> None:
         path = entry.path
@@ -202,9 +202,7 @@ class FileBrowser:
             self._button(path.name, viser.Icon.FOLDER, lambda: self._go(path))
 
     def _button(self, text: str, icon: viser.IconName, act: Callable[[], None]) -> None:
-        button = self._gui.add_button(text, icon=icon, color="gray")
-        button.on_click(lambda _: act())
-        self._shown.append(button)
+        self._gui.add_button(text, icon=icon, color="gray").on_click(lambda _: act())
 
     def _chosen(self, path: Path) -> None:
         try:

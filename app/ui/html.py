@@ -38,9 +38,10 @@ def _macro(name: str, template: str) -> Any:
     return getattr(_environment().get_template(template).module, name)
 
 
-def panel(name: str, *args: Any, template: str = "panels.html") -> str:
-    """The HTML of one macro of a template."""
-    return str(_macro(name, template)(*args))
+def panel(name: str, *args: Any) -> str:
+    """The HTML of a macro: "note" of `panels.html`, "loops.table" of `loops.html`."""
+    template, _, macro = name.rpartition(".")
+    return str(_macro(macro, f"{template or 'panels'}.html")(*args))
 
 
 def render(template: str) -> str:

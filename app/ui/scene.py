@@ -16,7 +16,7 @@ from app.ui.colours import Limits
 from app.ui.paths import Trajectory, Truth
 from app.ui.sensor import SensorScene
 from app.ui.view import View
-from app.ui.widgets import ROOT
+from app.ui.widgets import ROOT, poses_of
 
 _FOLLOWED_M: Final = 1e-3
 _FOLLOW_RATE: Final = 0.3
@@ -24,7 +24,6 @@ _FOLLOW_RATE: Final = 0.3
 _FOLLOW_JUMP_M: Final = 4.0
 _GROUND_BEFORE_SEEN_M: Final = -1.2
 _GRID_STEP_M: Final = 0.03
-_NO_POSES: Final[F64] = np.empty((0, 4, 4))
 
 
 class Scene:
@@ -80,7 +79,7 @@ class Scene:
             if before is None:
                 self._chunks.clear(start_ns, recording.duration_s if recording else 1.0)
                 self._sensor.clear()
-            poses = current.keyframe_poses if current.keyframe_poses is not None else _NO_POSES
+            poses = poses_of(current)
             limits_before = self.limits(view.colour_by)
             self._chunks.draw(current.chunks[: len(poses)], poses, view)
             self._trajectory.draw(current.trajectory if current.trajectory is not None else np.empty((0, 3)), view.path)

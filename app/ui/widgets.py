@@ -44,6 +44,11 @@ class Page:
         return np.array(event.ray_origin) - self.offset(), np.array(event.ray_direction)
 
 
+def poses_of(snapshot: Snapshot) -> F64:
+    """(k, 4, 4) T_map_imu of the keyframes."""
+    return snapshot.keyframe_poses if snapshot.keyframe_poses is not None else np.empty((0, 4, 4))
+
+
 _PLAIN: Final = (str, int, float, Enum, frozenset)
 
 

@@ -123,7 +123,7 @@ class Workbench:
 
         self._drawn: Snapshot | None = None
         self._drawn_view: View | None = None
-        self._scene_drawn_at = self._frame_drawn_at = self._panels_drawn_at = -1e9
+        self._scene_drawn_at = self._panels_drawn_at = -1e9
         self._panels_due = True
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="workbench", daemon=True)
@@ -167,20 +167,15 @@ class Workbench:
         self._draw_panels(current, view)
 
     def _draw_scene(self, current: Snapshot, view: View) -> None:
-        """A new frame waits only for the frame before, not for other drawings since."""
         now, drawn = self._now(), self._drawn
-        news = drawn is not current
         awaited = drawn is not None and _changed_by_user(drawn, current)
-        frame = news and (drawn is None or drawn.result is not current.result)
-        due = now - (self._frame_drawn_at if frame else self._scene_drawn_at) >= _SCENE_PERIOD_S
-        if not (news and (due or awaited)) and view == self._drawn_view:
+        due = awaited or now - self._scene_drawn_at >= _SCENE_PERIOD_S
+        if (drawn is current or not due) and view == self._drawn_view:
             return
         if current.result is not None and (drawn is None or drawn.result is None):
             self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
         self._scene.draw(drawn, current, view, self._drawn_view)
-        self._drawn, self._drawn_view = current, view
-        self._scene_drawn_at = now
-        self._frame_drawn_at = now if frame else self._frame_drawn_at
+        self._drawn, self._drawn_view, self._scene_drawn_at = current, view, now
         self._panels_due = True
         if awaited:  # the user waits for this before anything else
             self._server.flush()

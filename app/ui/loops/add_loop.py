@@ -18,7 +18,7 @@ from app.ui.loops.inspector import MOST_POINTS, Overlay, Pairing
 from app.ui.loops.kinds import NEWER, OLDER
 from app.ui.nodes import add_exact_points
 from app.ui.view import View
-from app.ui.widgets import ROOT, Page, by_user, show, unchanged
+from app.ui.widgets import ROOT, Page, by_user, poses_of, show, unchanged
 
 _REST_S: Final = 0.4
 """The guess is tried after the gizmo has rested this long."""
@@ -139,7 +139,7 @@ class AddLoopPanel:
     def suggest(self) -> None:
         """Propose what the widgets say."""
         older, newer = self.pair
-        count = len(_poses(self._page.snapshot()))
+        count = len(poses_of(self._page.snapshot()))
         good = 0 <= older < newer < count
         self._problem.visible = not good
         if good:
@@ -149,7 +149,7 @@ class AddLoopPanel:
 
     def pick(self, origin: F64, direction: F64) -> None:
         """A click while picking; the ray is in the map."""
-        picked, positions = self._picked, _poses(self._page.snapshot())[:, :3, 3]
+        picked, positions = self._picked, poses_of(self._page.snapshot())[:, :3, 3]
         index = nearest(positions[:, None], origin, direction, within=np.radians(3.0))
         if picked is None or index is None or index in picked:
             return
@@ -161,7 +161,7 @@ class AddLoopPanel:
     def draw_scene(self, snapshot: Snapshot, view: View) -> None:
         """Called by the drawing thread, often: dots to pick from, the two clouds, and the guess once it rests."""
         self._draw_picking(snapshot)
-        poses = _poses(snapshot)
+        poses = poses_of(snapshot)
         older, newer = pair = self.pair
         wanted = self._nudge.value and 0 <= older < newer < len(poses)
         if self._start is not None and (not wanted or self._start[0] != pair):
@@ -201,7 +201,7 @@ class AddLoopPanel:
 
     def _look(self, nudging: bool, client: viser.ClientHandle) -> None:
         """Fly to the cloud to nudge."""
-        poses, newer = _poses(self._page.snapshot()), self.pair[1]
+        poses, newer = poses_of(self._page.snapshot()), self.pair[1]
         if nudging and newer < len(poses):
             self._fly(client, poses[newer][:3, 3], _FROM_M)
 
@@ -218,7 +218,7 @@ class AddLoopPanel:
         if self._dots is not None:
             self._dots.remove()
             self._dots = None
-        positions = _poses(snapshot)[:, :3, 3]
+        positions = poses_of(snapshot)[:, :3, 3]
         if picked is None or not len(positions):
             return
         colours = np.tile(np.array(_DOT, np.uint8), (len(positions), 1))
@@ -226,7 +226,3 @@ class AddLoopPanel:
         self._dots = add_exact_points(
             self._page.scene, f"{_NODE}/keyframes", positions.astype(np.float32), colours, 0.15
         )
-
-
-def _poses(snapshot: Snapshot) -> F64:
-    return snapshot.keyframe_poses if snapshot.keyframe_poses is not None else np.empty((0, 4, 4))

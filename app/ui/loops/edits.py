@@ -17,7 +17,7 @@ from app.ui.loops.kinds import describe_edit
 from app.ui.loops.words import forecast, headline
 from app.ui.nodes import add_lines
 from app.ui.paths import segments
-from app.ui.widgets import ROOT, Page, by_user, show, unchanged
+from app.ui.widgets import ROOT, Page, by_user, poses_of, show, unchanged
 
 _REST_S: Final = 0.3
 _GHOST: Final[Rgb] = (206, 176, 255)
@@ -99,7 +99,7 @@ class Proposal:
         """Panel and ghost; called by the drawing thread, often."""
         command, tried = self.command, snapshot.loops.tried
         preview = tried[1] if tried is not None and tried[0] == command else None
-        poses = snapshot.keyframe_poses if snapshot.keyframe_poses is not None else np.empty((0, 4, 4))
+        poses = poses_of(snapshot)
         self._ghost.draw(preview.poses if command is not None and preview is not None else None, poses)
         problem = self._problem(snapshot) if preview is None else ""
         told = (command, preview, snapshot.loops.residuals, problem)

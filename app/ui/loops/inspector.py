@@ -19,7 +19,7 @@ from app.ui.loops.kinds import NEWER, OLDER
 from app.ui.loops.words import evidence
 from app.ui.nodes import add_exact_points, place
 from app.ui.view import View
-from app.ui.widgets import ROOT, Page, by_user, chart, unchanged
+from app.ui.widgets import ROOT, Page, by_user, chart, poses_of, unchanged
 
 FLY, SEEK, CLOSE = "fly there", "frame", "close"
 MOST_POINTS: Final = 30_000
@@ -177,8 +177,8 @@ class Inspector:
 
     def draw_scene(self, snapshot: Snapshot, chosen: Pair | None, view: View) -> None:
         """Lay the submaps into the scene, as far between the two poses as the slider says."""
-        detail, poses = _detail(snapshot, chosen), snapshot.keyframe_poses
-        if detail is None or chosen is None or poses is None or chosen[1] >= len(poses):
+        detail, poses = _detail(snapshot, chosen), poses_of(snapshot)
+        if detail is None or chosen is None or chosen[1] >= len(poses):
             self._pairing = None
             self._overlay.draw(None, None, view.point_size)
             return

@@ -21,7 +21,7 @@ from app.ui.loops.table import COLUMNS, Order, chips, listed, table
 from app.ui.loops.words import largest_factors
 from app.ui.view import View
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Page, unchanged
+from app.ui.widgets import ROOT, Page, poses_of, unchanged
 
 _NONE_YET: Final = (
     "No loops yet. They are searched for where the trajectory comes back to a place that it left at least 15 s before; "
@@ -90,7 +90,7 @@ class LoopsPanel:
 
     def tick(self, snapshot: Snapshot, view: View) -> None:
         """Called by the drawing thread, often."""
-        poses = snapshot.keyframe_poses if snapshot.keyframe_poses is not None else np.empty((0, 4, 4))
+        poses = poses_of(snapshot)
         if snapshot.session != self._session:
             self._session, self._coming = snapshot.session, None
             self.choose(None)
@@ -177,8 +177,8 @@ class LoopsPanel:
             frame = frames.get(edge.decided_at, frames.get(edge.newer))
             if frame is not None:
                 self._send(Seek(frame))
-        elif what == FLY and snapshot.keyframe_poses is not None and edge.newer < len(snapshot.keyframe_poses):
-            ends = snapshot.keyframe_poses[[edge.older, edge.newer], :3, 3]
+        elif what == FLY and edge.newer < len(poses := poses_of(snapshot)):
+            ends = poses[[edge.older, edge.newer], :3, 3]
             self._fly(client, ends.mean(axis=0), 7.0 + 1.2 * float(np.linalg.norm(ends[1] - ends[0])))
 
     def _fly(self, client: viser.ClientHandle, place: F64, distance: float) -> None:

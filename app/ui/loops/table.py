@@ -77,9 +77,7 @@ def listed(edges: tuple[LoopEdge, ...], shown: frozenset[str], order: Order) -> 
 def chips(edges: tuple[LoopEdge, ...], shown: frozenset[str]) -> str:
     """How many there are of each kind; a click shows or hides them. Also the legend of the scene."""
     names = [kind_of(edge).name for edge in edges]
-    return panel(
-        "chips", [(kind, names.count(key), key in shown) for key, kind in KINDS.items()], template="loops.html"
-    )
+    return panel("loops.chips", [(kind, names.count(key), key in shown) for key, kind in KINDS.items()])
 
 
 def table(edges: list[LoopEdge], order: Order, chosen: Pair | None) -> str:
@@ -97,4 +95,4 @@ def table(edges: list[LoopEdge], order: Order, chosen: Pair | None) -> str:
     remark = "" if edges else "None of the kinds chosen above."
     if len(edges) > MOST_ROWS:
         remark = f"The first {MOST_ROWS} of {len(edges):,}; sort by another column or hide a kind to see others."
-    return panel("table", heads, rows, source("loop_table.js"), remark, template="loops.html")
+    return panel("loops.table", heads, rows, source("loop_table.js"), remark)

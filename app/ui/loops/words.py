@@ -21,7 +21,7 @@ _NOTHING: Final = ("", "")
 
 def headline(edge: LoopEdge) -> str:
     """Which loop, its verdict and why."""
-    return panel("headline", edge, kind_of(edge).colour, template="loops.html")
+    return panel("loops.headline", edge, kind_of(edge).colour)
 
 
 def evidence(edge: LoopEdge, params: LoopsParams) -> str:
@@ -65,7 +65,7 @@ def largest_factors(residuals: tuple[FactorResidual, ...], most: int = _LARGEST)
     ]
     loops = sum(factor.loop for factor in residuals)
     cost = f"{_cost(residuals):.4g}"
-    return panel("factors", len(residuals) - loops, loops, cost, rows, template="loops.html")
+    return panel("loops.factors", len(residuals) - loops, loops, cost, rows)
 
 
 def forecast(
@@ -80,14 +80,14 @@ def forecast(
     what = describe_edit(command).capitalize()
     if preview is None:
         working = problem or "The engine computes what it would change …"
-        return panel("forecast", what, working, None, None, [], [], (), template="loops.html")
+        return panel("loops.forecast", what, working, None, None, [], [], ())
     before, after = (_rows(side) for side in (residuals, preview.residuals))
     lines = max(len(before), len(after))
     before, after = (side + [_NOTHING] * (lines - len(side)) for side in (before, after))
     costs = tuple(f"{_cost(side):.4g}" for side in (residuals, preview.residuals))
     change = _cost_change(residuals, preview.residuals) if isinstance(command, Solve) else None
     moves = _moves(preview.poses, poses)
-    return panel("forecast", what, "", moves, change, before, after, costs, template="loops.html")
+    return panel("loops.forecast", what, "", moves, change, before, after, costs)
 
 
 def _moves(after: F64, before: F64) -> dict[str, Any] | None:
