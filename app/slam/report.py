@@ -92,7 +92,7 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
     lines = [
         ("frames", f"{counts}; {report['distance_m']:.1f} m walked"),
         (
-            "time",
+            "frame time",
             f"{total['median']:.1f} ms (median), {total['p95']:.1f} ms (95 %), {total['max']:.1f} ms (max)",
         ),
         ("map", f"{points['points']:,} points in {points['keyframes']} keyframes; {share:.0f} % ground"),

@@ -151,14 +151,6 @@ class RunLog:
         poses = self._poses.view()
         return Trajectory(self.stamps_ns, poses[:, :3], poses[:, 3:])
 
-    def odometry_of(self, frames: int) -> Trajectory:
-        """The same of the first `frames`, be it that some were gone back over."""
-        now = len(self)
-        self._go_to(frames)
-        odometry = self.odometry
-        self._go_to(now)
-        return odometry
-
 
 @dataclass
 class Results:

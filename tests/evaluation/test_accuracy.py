@@ -86,7 +86,7 @@ def test_a_slip_at_the_start_is_told_from_the_errors_after_it() -> None:
     assert column.accuracy.later_m < 1e-9
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_errors_equal_those_of_evo_on_random_walks(seed: int) -> None:
     truth = walks.wandering(walks.frames(), seed)

@@ -193,17 +193,17 @@ def test_two_variants_of_one_name_and_misspelt_parameters_are_refused() -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ([], "nothing to evaluate"),
+        ([], "Nothing to evaluate"),
         (["--suite", "papre"], "no suite `papre`"),
         (["RECORDING", "--lever", "1,2"], "not three numbers"),
         (["RECORDING", "--compare", "theirs.tum"], "NAME=FILE"),
-        (["RECORDING", "--compare", "Ours=theirs.tum"], "a column Ours already"),
+        (["RECORDING", "--compare", "Ours=theirs.tum"], "a column Ours exists already"),
         (["RECORDING", "--short"], "--duration shortens it"),
         (["RECORDING", "--truth", "topic:/odom"], "no topic /odom"),
-        (["RECORDING", "--truth", "a", "--truth", "b"], "2 --truth for 1 recordings"),
+        (["RECORDING", "--truth", "a", "--truth", "b"], "2 --truth options for 1 recordings"),
     ],
 )
-def test_what_can_not_be_done_is_said_in_one_sentence(
+def test_what_cannot_be_done_is_said_in_one_sentence(
     recording: Path, tmp_path: Path, arguments: list[str], says: str
 ) -> None:
     done = call(*(str(recording) if text == "RECORDING" else text for text in arguments), "--out", tmp_path)

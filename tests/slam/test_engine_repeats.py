@@ -43,15 +43,14 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
         "from tests.slam.test_engine_repeats import *;"
         "print(fingerprint(run(Engine(params_for(REAL)), room_walk(25))), kernels.__name__)"
     )
-    prints = set()
+    started = []
     for threads in ("1", "2", "7"):
         environment = os.environ | {"NUMBA_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
         environment |= {"OMP_NUM_THREADS": threads, "PYTHONPATH": os.pathsep.join(sys.path)}
-        done = subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        prints.add(done.stdout)
+        command = [sys.executable, "-c", code]
+        started.append(subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True))
+    prints = {process.communicate(timeout=300)[0] for process in started}
+    assert [process.returncode for process in started] == [0, 0, 0]
     assert len(prints) == 1
     assert fingerprint(run(Engine(params_for(REAL)), room_walk(25))) in prints.pop()
 
@@ -173,18 +172,18 @@ def footprint(engine: Engine) -> int:
     return size(engine)
 
 
-def test_memory_stays_flat_however_far_one_walks() -> None:
-    """Seventy metres of corridor; what is held after a third of it is held at the end."""
-    rig, length = replace(REAL, columns=16), 80.0
+def test_memory_does_not_grow_with_the_distance() -> None:
+    """Fifty metres of corridor: the engine holds as much at the end as after a third of it."""
+    rig, length = replace(REAL, columns=16), 60.0
     values = {"map.radius": 15.0, "map.max_voxels": 3000, "sensor.max_range": 12.0}
     engine = Engine(params_for(rig, values))
-    walk, frames = replace(ALONG, speed=(2.0, 0.0, 0.0)), 400
+    walk, frames = replace(ALONG, speed=(2.0, 0.0, 0.0)), 270
     held, voxels = [], []
     for m in measurements(corridor(length, pillars=True), walk, rig, frames):
         r = engine.step(m.scan, m.imu)
         held.append(footprint(engine))
         voxels.append(len(engine.checkpoint().map.cells) if r.index % 20 == 0 else 0)
-    assert r.state.p_odom_imu @ r.state.p_odom_imu > 60**2
+    assert r.state.p_odom_imu @ r.state.p_odom_imu > 45**2
     third = frames // 3
     assert max(held[third:]) <= 1.02 * max(held[:third])
     assert 0 < max(voxels[third:]) <= 1.2 * max(voxels[:third]) < 3000

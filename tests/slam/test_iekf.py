@@ -59,7 +59,7 @@ def room() -> LocalMap:
 
 
 def points_of(scene: Scene, rig: Rig = RIG) -> np.ndarray:
-    return sweep(scene, STANDING, rig, 0.0, seed=7).points[::2]
+    return np.ascontiguousarray(sweep(scene, STANDING, rig, 0.0, seed=7).points[::2])
 
 
 def uncertain(rotation: float = 0.1, position: float = 0.3) -> np.ndarray:

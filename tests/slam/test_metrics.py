@@ -128,7 +128,7 @@ def test_real_truth_files_read_and_score_as_with_evo(shared_data: Path, name: st
         assert ours.rotation is not None and ours.rotation.rmse == pytest.approx(rotation["rmse"], abs=EXACT)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000), other=st.integers(0, 10_000))
 def test_ate_does_not_depend_on_the_world_frame_of_the_estimate(seed: int, other: int) -> None:
     truth = walk(seed, poses=20)
@@ -139,7 +139,7 @@ def test_ate_does_not_depend_on_the_world_frame_of_the_estimate(seed: int, other
     assert there.rotation.rmse == pytest.approx(here.rotation.rmse, abs=1e-7)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_a_trajectory_that_was_only_moved_has_no_error(seed: int) -> None:
     truth = walk(seed, poses=20)
@@ -166,7 +166,7 @@ def test_truth_is_not_made_up_outside_its_time_or_in_a_gap() -> None:
     assert usable.tolist() == [False, True, True, False, True, True, False]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_a_written_trajectory_is_read_back(seed: int, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("tum") / "t.tum"

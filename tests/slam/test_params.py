@@ -62,7 +62,7 @@ def test_every_number_has_a_range_and_a_step_for_its_slider(leaf: Leaf) -> None:
     assert 0 < leaf.step <= leaf.maximum - leaf.minimum
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(any_values)
 def test_what_is_printed_is_read_back_to_the_last_digit(values: dict[str, Any]) -> None:
     params = Params().with_values(values)
@@ -72,7 +72,7 @@ def test_what_is_printed_is_read_back_to_the_last_digit(values: dict[str, Any]) 
     assert Params().with_values(Params().changed(params)) == params
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(any_values)
 def test_an_assignment_on_the_command_line_reads_as_yaml(values: dict[str, Any]) -> None:
     texts = [
