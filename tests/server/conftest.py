@@ -44,3 +44,10 @@ def site(engine: EngineProcess, target: Viser) -> Iterator[Site]:
 def locked_site(engine: EngineProcess, target: Viser) -> Iterator[Site]:
     with serving(engine, target, engine_recording(engine).parent, "the-token") as running:
         yield running
+
+
+@pytest.fixture(scope="module")
+def public_site(engine: EngineProcess, target: Viser) -> Iterator[Site]:
+    """A server as on a public address, with both tokens."""
+    with serving(engine, target, engine_recording(engine).parent, "for-owners", "for-viewers") as running:
+        yield running

@@ -6,8 +6,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import httpx
+import msgspec
 import viser
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
@@ -16,11 +18,15 @@ from app.server.access import Access
 from app.server.address import listen
 from app.server.folders import Folders
 from app.server.viser_adapter import Viser
-from app.server.web import make_app, make_server
+from app.server.web import Tls, make_app, make_server
 from app.server.worker import EngineProcess
 
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 TIMEOUT_S = 20.0
+
+VIEWER = {"Authorization": "Bearer for-viewers"}
+OWNER = {"Authorization": "Bearer for-owners"}
+"""For `public_site`."""
 
 
 @dataclass
@@ -40,10 +46,17 @@ class Site:
 
 
 @contextmanager
-def serving(engine: EngineProcess, target: Viser, folder: Path, token: str | None) -> Iterator[Site]:
+def serving(
+    engine: EngineProcess,
+    target: Viser,
+    folder: Path,
+    token: str | None,
+    viewer_token: str | None = None,
+    tls: Tls | None = None,
+) -> Iterator[Site]:
     listener = listen("127.0.0.1", 0)
-    access = Access(listener.getsockname()[1], token)
-    server = make_server(make_app(engine, Folders([folder]), target, access))
+    access = Access(listener.getsockname()[1], token, viewer_token, secure=tls is not None)
+    server = make_server(make_app(engine, Folders([folder]), target, access), tls)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:
@@ -71,3 +84,28 @@ def eventually(site: Site, **wanted: object) -> dict[str, object]:
             return transport
         assert time.monotonic() < deadline, transport
         time.sleep(0.02)
+
+
+def until(true: Any) -> None:
+    deadline = time.monotonic() + TIMEOUT_S
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def packed(**message: Any) -> bytes:
+    return msgspec.msgpack.encode(message)
+
+
+CAMERA: dict[str, Any] = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1.0, 0.0, 0.0, 0.0),
+    "position": (0.0, 0.0, 0.0),
+    "fov": 1.0,
+    "near": 0.1,
+    "far": 100.0,
+    "image_height": 100,
+    "image_width": 100,
+    "look_at": (1.0, 0.0, 0.0),
+    "up_direction": (0.0, 0.0, 1.0),
+}

@@ -12,8 +12,7 @@ from typing import Any
 
 import httpx
 import pytest
-from server_site import TIMEOUT_S, Site, serving
-from test_safety import CAMERA, packed, until
+from server_site import CAMERA, TIMEOUT_S, Site, packed, serving, until
 from websockets.exceptions import InvalidStatus
 
 from app.server import access, address, api, web

@@ -1,12 +1,16 @@
-"""The public port over real sockets: the page, the bridge, the REST interface, and who is refused."""
+"""The public port over real sockets: the page, tokens and origins, https, and how the server ends."""
 
+import asyncio
+import json
 import os
 import re
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +18,26 @@ import httpx
 import msgspec
 import numpy as np
 import pytest
+import server_fakes as fakes
 import zstandard
-from server_site import PROTOCOL, TIMEOUT_S, Site
+from mcap.reader import make_reader
+from server_site import OWNER, PROTOCOL, TIMEOUT_S, Site, serving, until
+from test_live_run import free_ports
+from test_rewind import SAMPLE
+from websockets.asyncio.client import connect as asyncio_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
+from app.sensors.live.feed import Pace, feed
+from app.sensors.live.urls import parse_address
+from app.sensors.presets import resolve_params
 from app.server.access import Access
 from app.server.address import links, listen
+from app.server.setup import Setup
+from app.server.viser_adapter import Viser
+from app.server.web import Tls
+from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
 
 
@@ -261,3 +277,94 @@ def test_the_server_stops_cleanly_with_everything_it_started(tmp_path: Path, num
     assert process.returncode == 0 and err == "" and out == "page closed\n"
     with pytest.raises(ProcessLookupError):
         os.kill(engine_pid, 0)
+
+
+# --- https, health, the end ----------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Tls:
+    folder = tmp_path_factory.mktemp("tls")
+    tls = Tls(folder / "cert.pem", folder / "key.pem")
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "1",
+         "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1",
+         "-keyout", str(tls.key), "-out", str(tls.certificate)],
+        check=True, capture_output=True, timeout=TIMEOUT_S,
+    )  # fmt: skip
+    return tls
+
+
+def test_page_rest_and_websocket_by_https(
+    engine: EngineProcess, target: Viser, tmp_path: Path, certificate: Tls
+) -> None:
+    with serving(engine, target, tmp_path, "for-owners", "for-viewers", certificate) as site:
+        trust = ssl.create_default_context(cafile=str(certificate.certificate))
+        (link,) = links("localhost", site.access)
+        assert link.startswith("https://localhost:")
+        with httpx.Client(verify=trust) as browser:
+            cookie = browser.get(link.replace("localhost", "127.0.0.1")).headers["set-cookie"]
+            assert "Secure" in cookie and "HttpOnly" in cookie
+            assert browser.get(f"https://127.0.0.1:{site.port}/api/state", headers=OWNER).status_code == 200
+        with ThreadPoolExecutor(1) as beside:  # a browser's event loop may be running in this thread
+            address = f"wss://127.0.0.1:{site.port}/"
+            assert beside.submit(asyncio.run, _protocol(address, trust)).result() == PROTOCOL
+        with pytest.raises(httpx.HTTPError):
+            httpx.get(site.url("/healthz"))
+
+
+async def _protocol(address: str, trust: ssl.SSLContext) -> str | None:
+    """In one thread: with the two of websockets' other client, OpenSSL sometimes waits forever."""
+    async with asyncio_connect(
+        address, ssl=trust, subprotocols=[PROTOCOL], additional_headers=OWNER, proxy=None
+    ) as socket:
+        return socket.subprotocol
+
+
+def test_a_certificate_that_cannot_be_used_is_refused_at_once(certificate: Tls, tmp_path: Path) -> None:
+    (tmp_path / "no.pem").write_text("nothing")
+    for bad in (Tls(tmp_path / "missing.pem"), Tls(tmp_path / "no.pem"), Tls(certificate.certificate)):
+        with pytest.raises(HemislamError, match="--certificate and --key"):
+            bad.check()
+
+
+def test_health_is_503_when_the_engine_has_ended_for_good(target: Viser, tmp_path: Path) -> None:
+    engine = EngineProcess(Setup(), main=fakes.fake_main)
+    with serving(engine, target, tmp_path, None) as site:
+        assert httpx.get(site.url("/healthz")).status_code == 200
+        assert engine.pid is not None
+        os.kill(engine.pid, signal.SIGKILL)
+        until(lambda: httpx.get(site.url("/healthz")).status_code == 503)
+        assert httpx.get(site.url("/healthz")).json() == {"status": "engine down"}
+    engine.close()
+
+
+def test_a_sigterm_to_the_whole_group_loses_nothing_that_was_received(tmp_path: Path) -> None:
+    """As a service manager sends it: to the server, the engine and the receiver at once."""
+    msop, difop, imu_port = free_ports(3)
+    packets, imu = f"rsbpearl://127.0.0.1:{msop},{difop}", f"imu-udp://127.0.0.1:{imu_port}"
+    record = tmp_path / "live.mcap"
+    command = [sys.executable, "-m", "app", "serve", "--live", packets, "--imu", imu, "--record", str(record)]
+    command += ["--port", "0", "--no-browser", "--log-json"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        assert process.stdout is not None
+        address = process.stdout.readline().split()[3]
+        params = resolve_params(SAMPLE, None, None, [])
+        feed(SAMPLE, params, parse_address(packets), parse_address(imu), pace=Pace(2.0), duration_s=4.0)
+        until(lambda: (live := httpx.get(f"{address}api/state").json()["live"]) and live["imu_age_s"] > 1.0)
+        counted = httpx.get(f"{address}api/state").json()["live"]["counters"]
+        os.killpg(process.pid, signal.SIGTERM)
+        _, err = process.communicate(timeout=TIMEOUT_S)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    entries = [json.loads(line) for line in err.splitlines()]
+    assert "Traceback" not in err and entries[-1]["message"] == "Ending"
+    assert {entry["process"] for entry in entries} >= {"server", "live"}
+    with record.open("rb") as file:
+        found = make_reader(file).get_summary()
+    assert found is not None and found.statistics is not None, "the file has its end"
+    topics = {channel.topic: found.statistics.channel_message_counts[n] for n, channel in found.channels.items()}
+    assert counted["frames"] > 30 and counted["imu"] > 700
+    assert sorted(topics.values()) == [counted["frames"], counted["imu"]]
