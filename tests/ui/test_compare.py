@@ -195,7 +195,7 @@ def test_the_drift_and_the_turn_are_told_and_plotted_over_time(page: Page) -> No
     assert all(chart.visible for _, chart in page.panel._plots)
 
 
-def test_b_walks_in_blue_from_the_fork_on(page: Page, wire: Wire, server: viser.ViserServer) -> None:
+def test_b_s_trajectory_is_blue_from_the_fork_on(page: Page, wire: Wire, server: viser.ViserServer) -> None:
     page.forks.fork("")
     wire.clear()
     page.engine.send(Seek(30))
@@ -266,7 +266,7 @@ def test_swapped_b_is_drawn_whole_and_a_follows(page: Page) -> None:
     eventually(lambda: page.engine.snapshot.transport.frame == 41)
 
 
-def test_keep_says_where_it_is_and_what_can_not_be_is_told(page: Page, tmp_path: Path) -> None:
+def test_keep_says_where_the_file_is_and_errors_are_shown(page: Page, tmp_path: Path) -> None:
     page.forks.fork("wide")
     page.both_at(20)
     told = chooses(page.panel._what, "keep").told
@@ -278,7 +278,7 @@ def test_keep_says_where_it_is_and_what_can_not_be_is_told(page: Page, tmp_path:
     assert page.engine.sent[-1] == SetParams({"ground.alpha": 31.0}), "without a fork all is A's"
 
 
-def test_how_b_gets_on_is_said(page: Page) -> None:
+def test_the_page_says_how_b_is_doing(page: Page) -> None:
     a = page.engine.snapshot
     recording = a.recording
     assert recording is not None and how(a, a) == ("", "")

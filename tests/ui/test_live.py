@@ -61,7 +61,7 @@ def test_the_worst_is_said_in_a_word(state: LiveState, words: str, colour: str) 
     assert verdict(state) == (words, colour)
 
 
-def test_a_source_that_has_ended_for_good_is_not_said_to_receive() -> None:
+def test_an_ended_source_is_not_shown_as_receiving() -> None:
     ended = live_html(WELL, ended=True)
     assert "receiving" not in ended and "ended" in ended and BAD in ended
 
@@ -79,7 +79,7 @@ def test_only_trouble_is_coloured_as_trouble() -> None:
     assert WARN not in live_html(replace(WELL, offset_s=0.3, clock="host")), "then it does no harm"
 
 
-def test_what_a_sensor_says_is_no_html() -> None:
+def test_a_sensor_s_words_are_no_html() -> None:
     assert "<script>" not in live_html(replace(WELL, sensor="<script>alert(1)</script>"))
 
 
@@ -102,7 +102,7 @@ def test_nothing_is_sent_while_nothing_changes(server: viser.ViserServer, engine
     assert not wire.messages
 
 
-def test_live_there_is_no_way_back_and_the_page_says_why(server: viser.ViserServer, engine: FakeEngine) -> None:
+def test_a_live_session_cannot_go_back_and_the_page_says_why(server: viser.ViserServer, engine: FakeEngine) -> None:
     panel = TransportPanel(page_of(server, engine.send, lambda: engine.snapshot, now=Clock()))
     panel.tick(replace(engine.snapshot, live=WELL))
     assert panel._slider.disabled and panel._speed.disabled and not panel._frames.visible

@@ -42,7 +42,7 @@ def test_a_remark_is_sent_once_and_the_field_is_free_for_the_next(notes: Notes) 
 
 
 @pytest.mark.parametrize("text", ["", "   ", "\t"])
-def test_what_says_nothing_is_not_noted(notes: Notes, text: str) -> None:
+def test_an_empty_note_is_not_sent(notes: Notes, text: str) -> None:
     notes.write(text)
     assert notes.sent == []
 

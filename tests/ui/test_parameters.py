@@ -46,10 +46,22 @@ def test_every_parameter_has_a_control_that_shows_its_default(parameters: Parame
         assert parameters.control(leaf.path).hint == leaf.help
 
 
-def test_the_papers_four_come_first_and_are_sliders(parameters: Parameters) -> None:
+def test_the_papers_four_come_first(parameters: Parameters) -> None:
     orders = {path: control.order for path, control in parameters.panel._controls.items()}
     assert set(sorted(orders, key=lambda path: orders[path])[:4]) == set(PRIMARY)
-    assert all(isinstance(parameters.control(path), viser.GuiSliderHandle) for path in PRIMARY)
+
+
+def test_every_number_with_a_range_has_a_slider_with_that_range(parameters: Parameters) -> None:
+    numbers = [leaf for leaf in leaves() if type(leaf.default) in (int, float)]
+    assert len(numbers) > 40
+    for leaf in numbers:
+        control = parameters.control(leaf.path)
+        if leaf.minimum is None or leaf.maximum is None:
+            assert isinstance(control, viser.GuiNumberHandle)
+        else:
+            assert isinstance(control, viser.GuiSliderHandle)
+            assert (control.min, control.max, control.step) == (leaf.minimum, leaf.maximum, leaf.step)
+            assert round(leaf.default, control.precision) == leaf.default, "its box can hold the default value"
 
 
 @pytest.mark.parametrize(("path", "mark"), [("ground.alpha", ""), ("filter.point_noise", "▸"), ("imu.gravity", "↻")])
@@ -73,7 +85,7 @@ def test_a_typed_value_is_sent_once_the_keys_rest(parameters: Parameters) -> Non
     assert parameters.sent == [SetParams({"filter.point_noise": 0.25})]
 
 
-def test_what_the_engine_says_is_shown_and_not_sent_back(parameters: Parameters) -> None:
+def test_a_snapshot_s_values_are_shown_and_not_sent_back(parameters: Parameters) -> None:
     parameters.params = Params().with_values(
         {"ground.alpha": 12.0, "imu.max_gap": 0.3, "sensor.translation": (1, 2, 3)}
     )
@@ -118,7 +130,7 @@ def test_changed_parameters_can_be_reset_one_by_one_or_all(parameters: Parameter
     assert command.values == {path: Params().value(path) for path in PRIMARY}
 
 
-def test_what_waits_for_a_restart_is_named_and_can_be_had_now(parameters: Parameters) -> None:
+def test_changes_that_wait_for_a_restart_are_named_beside_a_restart_button(parameters: Parameters) -> None:
     parameters.tick()
     assert not parameters.panel._restart.visible
     parameters.tick(pending_restart=("imu.gravity",))
@@ -127,12 +139,12 @@ def test_what_waits_for_a_restart_is_named_and_can_be_had_now(parameters: Parame
     assert parameters.sent == [Restart()]
 
 
-def test_the_slider_of_m_ends_at_the_lines_there_are(parameters: Parameters) -> None:
+def test_the_slider_of_m_ends_at_the_sensor_s_number_of_lines(parameters: Parameters) -> None:
     parameters.panel.fit_lines(32)
     assert parameters.control("ground.scan_lines").max == 32
 
 
-def test_what_a_browser_set_is_sent_though_an_older_snapshot_is_drawn_just_then(
+def test_a_value_set_in_a_browser_is_sent_although_an_older_snapshot_is_drawn_meanwhile(
     parameters: Parameters, server: viser.ViserServer, busy: BusyThreads
 ) -> None:
     browser_sends(server, parameters.control("ground.alpha"), 33.0)

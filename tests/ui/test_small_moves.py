@@ -1,4 +1,4 @@
-"""Loops move most of a walk by next to nothing: the page is not told of that, until it adds up."""
+"""Loops move most of a map by almost nothing: the page is sent such moves only when they add up."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def drawn(server: viser.ViserServer, engine: FakeEngine) -> Drawn:
     return drawn
 
 
-def test_a_map_that_drifts_is_told_of_by_the_millimetre(
+def test_a_drifting_map_is_sent_by_the_millimetre(
     drawn: Drawn, server: viser.ViserServer, wire: Wire, engine: FakeEngine
 ) -> None:
     poses, walk = engine.snapshot.keyframe_poses, engine.snapshot.trajectory
@@ -45,7 +45,7 @@ def test_a_map_that_drifts_is_told_of_by_the_millimetre(
     assert {len(sent) for sent in clouds} == {0, len(chunk_nodes(server))}
 
 
-def test_a_turn_that_could_be_seen_far_away_is_told(drawn: Drawn, wire: Wire, engine: FakeEngine) -> None:
+def test_a_turn_that_is_visible_far_away_is_sent(drawn: Drawn, wire: Wire, engine: FakeEngine) -> None:
     assert engine.snapshot.keyframe_poses is not None
     for angle, told in ((3e-5, False), (2e-4, True)):
         turned = engine.snapshot.keyframe_poses.copy()

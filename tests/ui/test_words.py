@@ -25,7 +25,7 @@ from app.ui.readouts import HISTORY, recent, stacked_stages, worst
 from tests.ui.fake_engine import FINDINGS, FakeEngine
 
 
-def test_what_needs_the_user_comes_first_with_its_option() -> None:
+def test_findings_that_need_the_user_come_first_with_their_option() -> None:
     text = findings_html(FINDINGS)
     assert text.index("needs you") < text.index("corrected") < text.index("fine")
     assert "<code>--set imu.max_gap=0.4</code>" in text
@@ -77,7 +77,7 @@ def test_plots_show_the_newest_frames_only(engine: FakeEngine) -> None:
     assert stamps[-1] == pytest.approx(0.1 * (HISTORY + 19))
 
 
-def test_plots_of_all_frames_leave_out_no_peak_and_no_part_of_the_walk() -> None:
+def test_plots_of_all_frames_keep_every_peak_and_cover_the_whole_trajectory() -> None:
     count = 4 * HISTORY + 7
     error = np.full(count, np.nan)  # not known for most frames
     error[[5, 900]] = 3.0, 2.0

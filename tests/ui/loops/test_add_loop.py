@@ -11,7 +11,7 @@ from tests.ui.fake_loops import KEYFRAMES
 from tests.ui.loops.conftest import Page
 
 
-def test_two_keyframes_are_picked_in_the_scene_and_tied_from_where_the_graph_has_them(page: Page) -> None:
+def test_two_keyframes_are_picked_in_the_scene_and_connected_from_where_the_graph_has_them(page: Page) -> None:
     added, poses = page.loops._add_loop, page.engine.snapshot.keyframe_poses
     assert poses is not None
     user_clicks(added._pick)
@@ -73,7 +73,7 @@ def test_an_untouched_gizmo_is_the_graph_s_own_guess(page: Page) -> None:
     assert np.allclose(command.guess, lie.inverse(poses[20]) @ poses[97], atol=1e-6)
 
 
-def test_a_loop_tied_by_hand_is_chosen_once_it_is_there(page: Page) -> None:
+def test_a_loop_added_by_hand_is_chosen_once_it_arrives(page: Page) -> None:
     page.loops._add_loop.suggest_pair((20, 97))
     page.loops._add_loop.suggest()
     page.draw()

@@ -44,7 +44,9 @@ def test_cancelling_leaves_all_as_it_was(page: Page) -> None:
     assert not page.loops._proposal._folder.visible and page.node("/map/ghost/path") is None
 
 
-def test_before_a_decision_the_page_says_how_far_keyframes_move_and_which_factors_are_met_worst(page: Page) -> None:
+def test_before_a_decision_the_page_says_how_far_keyframes_move_and_which_factors_have_the_largest_residuals(
+    page: Page,
+) -> None:
     page.choose(GOOD)
     user_clicks(page.loops._verdict._reject)
     page.draw()
@@ -65,7 +67,7 @@ def test_nothing_can_be_committed_before_its_effect_is_known(page: Page) -> None
     assert page.loops._proposal._commit.disabled and "computes" in page.loops._proposal._words.content
 
 
-def test_what_the_engine_refuses_is_told_where_it_was_asked(page: Page) -> None:
+def test_the_engine_s_refusal_is_shown_in_the_proposal(page: Page) -> None:
     page.loops._proposal.propose(Accept(0, 3))
     page.draw()
     assert "There is no loop candidate of keyframes 0 and 3" in page.loops._proposal._words.content
@@ -110,7 +112,7 @@ def test_undo_and_redo_say_what_they_would_do(page: Page) -> None:
     assert page.engine.sent[-1] == RedoLoop() and panel._redo.disabled
 
 
-def test_edits_are_saved_and_given_again(page: Page) -> None:
+def test_edits_are_saved_and_loaded_again(page: Page) -> None:
     commands = (Reject(*GOOD), Accept(*WAITING), Add(20, 97), SetWeight(20, 97, 0.5))
     for command in commands:
         page.engine.send(EditLoop(command))

@@ -1,4 +1,4 @@
-"""How well the graph is met, and solving all of it at once."""
+"""Graph residuals, and solving for all factors at once."""
 
 import numpy as np
 

@@ -13,7 +13,7 @@ from tests.ui.conftest import SOMEONE, Wire
 from tests.ui.loops.conftest import GOOD, Page
 
 
-def test_loops_that_were_turned_down_are_not_sent_until_asked_for(page: Page) -> None:
+def test_rejected_loops_are_not_sent_until_asked_for(page: Page) -> None:
     assert page.node("/map/loops/accepted-in").points.shape == (12, 2, 3)
     assert page.node("/map/loops/candidate-out").points.shape == (6, 2, 3)
     assert page.node("/map/loops/rejected-out") is None

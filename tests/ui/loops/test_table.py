@@ -51,7 +51,7 @@ def test_a_row_shows_its_loop_and_hides_it_again(page: Page) -> None:
     assert page.engine.sent == [InspectLoop(GOOD), InspectLoop(None)]
 
 
-def test_what_is_clicked_but_means_nothing_does_nothing(page: Page) -> None:
+def test_unknown_words_from_a_click_do_nothing(page: Page) -> None:
     page.choose(GOOD)
     page.engine.sent.clear()
     for word in ("", "show everything", "sort colour", "choose", "choose x y", "choose 1", "choose 0 1", "fly"):
@@ -60,7 +60,7 @@ def test_what_is_clicked_but_means_nothing_does_nothing(page: Page) -> None:
     assert page.engine.sent == [] and page.loops.chosen == GOOD
 
 
-def test_what_the_engine_says_is_text_and_never_html(page: Page) -> None:
+def test_the_engine_s_words_are_text_and_never_html(page: Page) -> None:
     edge = replace(page.edge(GOOD), reason="<script>alert(1)</script>")
     page.engine.publish(loops=LoopsView(edges=(edge,)))
     page.choose(GOOD)
