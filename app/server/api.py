@@ -139,7 +139,7 @@ _Breakpoints: Any = create_model("_Breakpoints", **_FIELDS)
 
 
 class BreakpointsBody(_Breakpoints):  # type: ignore[misc]  # its fields are those of the table
-    """Where playing pauses. A limit pauses where it is exceeded; left out or null it does not."""
+    """Where playing pauses. A limit pauses when it is exceeded; without a value, or with null, it is off."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -149,12 +149,14 @@ class NoteBody(BaseModel):
 
 
 class OpenBody(BaseModel):
-    path: str = Field(description="Of a recording in the folders given at the start.")
-    truth: str | None = Field(None, description="A TUM file there; null: the one beside the recording, if any.")
+    path: str = Field(description="A recording or session in the folders given by --folder.")
+    truth: str | None = Field(
+        None, description="A TUM file in the same folders; null: the one beside the recording, if any."
+    )
 
 
 class CompareBody(BaseModel):
-    path: str | None = Field(None, description="A TUM file in the folders given at the start; null: against nothing.")
+    path: str | None = Field(None, description="A TUM file in the folders given by --folder; null ends the comparison.")
 
 
 EXPORTED: Final = (*(export.name for export in EXPORTS), f"session{SUFFIX}")
