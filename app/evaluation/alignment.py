@@ -1,4 +1,4 @@
-"""The offset between two clocks from the motion that both saw, whatever frames they saw it in."""
+"""The offset between two clocks, found from the motion that both trajectories show, in any coordinate frames."""
 
 from dataclasses import dataclass
 
@@ -18,8 +18,8 @@ MIN_CORRELATION = 0.6
 @dataclass(frozen=True, slots=True)
 class Offset:
     """Attributes:
-    offset_s: to be added to the truth's stamps. correlation: of both motions then, up to 1.
-    what: was compared.
+    offset_s: time to add to the truth's stamps. correlation: of both motions then, up to 1.
+    what: the quantity that was compared.
     """
 
     offset_s: float
@@ -28,15 +28,14 @@ class Offset:
 
 
 def find_offset(estimate: Trajectory, truth: Trajectory, *, by_rotation: bool) -> Offset:
-    """By the speed of turning (or, without orientations, of walking), which no choice of axes changes.
+    """Compare the angular speed (or, without orientations, the speed), which does not depend on the axes.
 
-    First over all offsets at which both overlap for at least half of the shorter, then within one
-    step of that to FINE_S.
+    First over all offsets at which both overlap for at least half of the shorter one, then around the best to FINE_S.
 
     Raises:
-        HemislamError: they are too short, or nowhere alike.
+        HemislamError: they are too short, or similar at no offset.
     """
-    what = "speed of turning" if by_rotation else "speed of walking"
+    what = "angular speed" if by_rotation else "speed"
     window_s = 0.2 if by_rotation else 1.0
     spans = [(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in (estimate, truth)]
     if min(spans) < MIN_OVERLAP_S:
@@ -50,7 +49,7 @@ def find_offset(estimate: Trajectory, truth: Trajectory, *, by_rotation: bool) -
     best = int(np.argmax(correlations))
     if correlations[best] < MIN_CORRELATION:
         raise HemislamError(
-            f"The {what} of the truth fits that of the recording nowhere (correlation"
+            f"The {what} of the truth matches that of the recording at no offset (correlation"
             f" {correlations[best]:.2f} at best); is it the truth of this recording?"
         )
     coarse = lags[best] * GRID_S
@@ -66,7 +65,7 @@ def find_offset(estimate: Trajectory, truth: Trajectory, *, by_rotation: bool) -
 
 
 def _motion(trajectory: Trajectory, step_s: float, window_s: float, by_rotation: bool) -> F64:
-    """Speed at times k * step_s after the start, over a window around each; NaN where it is not known."""
+    """Speed at times k * step_s after the start, over a window around each; NaN where it is unknown."""
     span_ns = int(trajectory.stamps_ns[-1] - trajectory.stamps_ns[0])
     times: I64 = trajectory.stamps_ns[0] + np.arange(0, span_ns + 1, round(step_s * 1e9), dtype=np.int64)
     half = round(window_s * 0.5e9)
@@ -84,7 +83,7 @@ def _motion(trajectory: Trajectory, step_s: float, window_s: float, by_rotation:
 
 
 def _correlations(a: F64, b: F64, least: int) -> tuple[I64, F64]:
-    """Pearson correlation of a[i] with b[i - lag] over all that is known in both, for every lag."""
+    """Pearson correlation of a[i] with b[i - lag] over all values known in both, for every lag."""
     known_a, known_b = np.isfinite(a), np.isfinite(b)
     x = np.where(known_a, a - np.nanmean(a), 0.0)
     y = np.where(known_b, b - np.nanmean(b), 0.0)

@@ -1,4 +1,4 @@
-"""Pieces of the map seen from above, the same for every variant, to be looked at side by side."""
+"""Pieces of the map from above, at the same place in every variant, to compare side by side."""
 
 from collections.abc import Iterable
 
@@ -12,7 +12,7 @@ SLICE_M = (-0.6, 0.7)
 """Heights above the sensor: walls and trunks show as lines, floor and ceiling stay out."""
 REACH_M = 15.0
 PLACES = {"start": 0.0, "half way": 0.5}
-"""By share of the recording's time. A walk that comes back shows both passes at its start."""
+"""By share of the recording's time. A trajectory that returns shows both passes at its start."""
 
 
 def crop(keyframes: Iterable[Keyframe], poses: F64, centre: F64) -> U16:

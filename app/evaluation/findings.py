@@ -15,7 +15,7 @@ CHANCE = 2.0
 """A mean difference of fewer standard errors than this, over the recordings, may be chance."""
 
 _CLAIMS = (
-    ("FAST-LIO-GD", "FAST-LIO", "thinning the ground"),
+    ("FAST-LIO-GD", "FAST-LIO", "downsampling the ground"),
     ("FAST-LIO-L", "FAST-LIO", "closing loops"),
     ("Ours", "FAST-LIO", "both together"),
 )

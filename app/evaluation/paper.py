@@ -1,4 +1,4 @@
-"""The paper's own figures, to be put beside ours (Duan et al., ISPRS Archives 2023, Tables 1 to 3)."""
+"""The paper's own figures, to compare with ours (Duan et al., ISPRS Archives 2023, Tables 1 to 3)."""
 
 from dataclasses import dataclass
 
@@ -53,12 +53,12 @@ SEQUENCES: dict[str, Sequence] = {
         _times(19.24, 21.17),
     ),
 }
-"""By the name of our simulated twin. The paper gives errors for the two sequences with GNSS only."""
+"""By the name of our simulated twin. The paper gives errors only for the two sequences with GNSS."""
 
 NOT_COMPARABLE = (
-    "The paper measured its own recordings, real ones, with LOAM, LIOM and FAST-LIO as programs, on an Intel i7-8565U."
-    " Ours are simulated twins of the same frames, duration and length on other streets, with exact truth, and all"
-    " variants are this one engine with parts switched off. So the order of the columns may be compared, and which part"
-    " helps where; the metres and milliseconds themselves may not: a simulated world has no wrong calibration, no"
-    " drifting clock and no GNSS error, and another machine is another machine."
+    "The paper ran LOAM, LIOM and FAST-LIO on real recordings, on an Intel i7-8565U. Ours are simulated twins with the"
+    " same number of frames, duration and length, on other streets and with exact truth; all variants are this engine"
+    " with parts switched off. Compare the order of the columns, and which part helps where. Do not compare the metres"
+    " and milliseconds: a simulation has no calibration error, no drifting clock and no GNSS error, and the machine is"
+    " another one."
 )

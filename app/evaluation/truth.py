@@ -20,8 +20,8 @@ class TruePoses:
         source: file or topic. kind: what it is, in words.
         stamps_ns: (n,) strictly increasing; None: one pose for each frame of the recording.
         positions: (n, 3) m of the truth's point. quaternions: (n, 4) x y z w, T_world_body; None if unknown.
-        own_clock: its stamps are not those of the recording.
-        own_axes: the body's axes are not the IMU's; the rotation between them is constant and unknown.
+        own_clock: its stamps are not in the recording's clock.
+        own_axes: the body's axes differ from the IMU's by a constant, unknown rotation.
         lever: (3,) m from the IMU to the truth's point, in the body's axes.
     """
 
@@ -63,7 +63,7 @@ def check(truth: TruePoses) -> None:
 
 
 def check_overlap(truth: TruePoses, begin_ns: int, duration_s: float) -> None:
-    """Better now than after a long run. Raises HemislamError if truth and recording share no time."""
+    """Raises HemislamError if truth and recording do not overlap in time."""
     if truth.stamps_ns is None or truth.own_clock:
         return
     if apart := time_apart(truth.source, truth.stamps_ns, begin_ns, duration_s):

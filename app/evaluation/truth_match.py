@@ -24,9 +24,9 @@ class Matched:
     """Truth beside an estimate: T_world_imu in the recording's clock.
 
     Attributes:
-        has_rotation: whether orientations are the truth's own, in known axes; if not they are the
-            estimate's, so that motions can be compared, and rotation errors mean nothing.
-        offset_s: what was added to the truth's stamps. notes: what was assumed or estimated.
+        has_rotation: whether the orientations are the truth's own, in known axes. If not, they are those of the
+            estimate, so that motions can be compared, and rotation errors mean nothing.
+        offset_s: time added to the truth's stamps. notes: what was assumed or estimated.
     """
 
     trajectory: Trajectory
@@ -39,7 +39,7 @@ def match(truth: TruePoses, estimate: Trajectory, offset_s: float | None = None)
     """Bring the truth into the clock, point and axes of the estimate.
 
     Args:
-        offset_s: to be added to the truth's stamps if its clock is its own; None: find it.
+        offset_s: time to add to the truth's stamps if its clock is its own; None: find it.
 
     Raises:
         HemislamError: the two have no time or no motion in common.
@@ -53,7 +53,7 @@ def match(truth: TruePoses, estimate: Trajectory, offset_s: float | None = None)
                 " put their times, a line each, into a file times.txt beside it."
             )
         truth = replace(truth, stamps_ns=estimate.stamps_ns)
-        notes.append("It holds no times: its poses were taken one for each frame.")
+        notes.append("It holds no times: one pose was assigned to each frame.")
     stamps_ns = truth.stamps_ns
     assert stamps_ns is not None
     quaternions = truth.quaternions if truth.quaternions is not None else np.tile([0.0, 0.0, 0.0, 1.0], (len(truth), 1))
@@ -72,11 +72,11 @@ def match(truth: TruePoses, estimate: Trajectory, offset_s: float | None = None)
     lever = np.array(truth.lever)
     if truth.quaternions is None:
         there = _borrow_rotation(there, estimate)
-        notes.append("It has no orientations: rotation errors cannot be told.")
+        notes.append("It has no orientations: rotation errors cannot be measured.")
     if lever.any():
         there = replace(there, positions=there.positions - there.rotations.apply(lever))
         axes = "its body's axes" if truth.quaternions is not None else "the IMU's axes"
-        notes.append(f"Its point lies {_vector(lever)} m from the IMU, in {axes}; this lever arm was taken off.")
+        notes.append(f"Its point lies {_vector(lever)} m from the IMU, in {axes}; this lever arm was subtracted.")
     has_rotation = truth.quaternions is not None
     if has_rotation:
         there, has_rotation, note = _common_axes(there, estimate, certainly=truth.own_axes)
@@ -85,7 +85,7 @@ def match(truth: TruePoses, estimate: Trajectory, offset_s: float | None = None)
 
 
 def _borrow_rotation(there: Trajectory, estimate: Trajectory) -> Trajectory:
-    """The truth with the estimate's orientations, turned into its world; only where the estimate has some."""
+    """The truth with the orientations of the estimate, in the world of the truth, where both overlap in time."""
     inside = (there.stamps_ns >= estimate.stamps_ns[0]) & (there.stamps_ns <= estimate.stamps_ns[-1])
     there = there.chosen(inside)
     if len(there) < 3:
@@ -99,20 +99,20 @@ def _borrow_rotation(there: Trajectory, estimate: Trajectory) -> Trajectory:
 
 
 def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) -> tuple[Trajectory, bool, str]:
-    """The truth turned into the IMU's axes by the mean rotation between both, if they are `certainly` others.
+    """The truth in the IMU's axes, by the mean rotation between both, if its axes `certainly` differ.
 
-    Also whether its orientations are still its own, and what is to be said of it.
+    Also returns whether the orientations are still the truth's own, and a note for the report.
     """
     theirs, usable = interpolate(there, estimate.stamps_ns)
     if len(theirs) < 3:
-        return there, True, ""  # the metrics will say so
+        return there, True, ""  # the metrics report it
     ours = estimate.chosen(usable)
     T = umeyama(ours.positions, theirs.positions)
     left = ours.positions @ T[:3, :3].T + T[:3, 3] - theirs.positions
     if doubt := alignment_doubt(theirs.positions, float(np.sqrt((left**2).sum(axis=1).mean()))):
         if not certainly:
             return there, True, ""
-        why = f"Its axes are not the IMU's, and this walk does not tell the rotation between them. {doubt}"
+        why = f"Its axes are not the IMU's, and this trajectory does not determine the rotation between them. {doubt}"
         return _borrow_rotation(there, estimate), False, why
     R_truth_estimate = Rotation.from_matrix(T[:3, :3])
     between = theirs.rotations.inv() * R_truth_estimate * ours.rotations
@@ -125,8 +125,8 @@ def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) ->
             there,
             True,
             (
-                f"Its orientations differ from ours by a constant {angle:.0f}°; its axes may not be the IMU's, and then"
-                " rotation errors and RPE mean little."
+                f"Its orientations differ from ours by a constant {angle:.0f}°. Its axes may not be the IMU's; rotation"
+                " errors and RPE then mean little."
                 if odd
                 else ""
             ),
@@ -135,7 +135,7 @@ def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) ->
         replace(there, quaternions=(there.rotations * R_body_imu).as_quat()),
         True,
         f"Its axes are not the IMU's: the constant rotation between them ({angle:.1f}°) was estimated as the mean"
-        f" over the walk (spread {spread:.2f}°) and taken off, so rotation errors do not hold it.",
+        f" over the trajectory (spread {spread:.2f}°) and removed, so rotation errors do not contain it.",
     )
 
 

@@ -35,7 +35,7 @@ TYPES = (*_POSES, _FIX)
 
 
 def read_truth(text: str, recording: Path | None = None, lever: tuple[float, float, float] | None = None) -> TruePoses:
-    """Read a file, or `topic:/name` in the recording; `lever` overrules what the format implies.
+    """Read a file, or `topic:/name` in the recording; `lever` replaces the lever arm that the format implies.
 
     Raises:
         HemislamError: it cannot be read, is not what it should be, or jumps.
@@ -53,14 +53,14 @@ def read_truth(text: str, recording: Path | None = None, lever: tuple[float, flo
 
 
 def read_poses(path: Path) -> Trajectory:
-    """Poses of the IMU itself, as TUM, where no other truth is taken. Raises HemislamError as `read_truth`."""
+    """A TUM file of poses of the IMU itself. Raises HemislamError as `read_truth`."""
     poses = read_tum(path)
     check(TruePoses(f"The truth {path}", "TUM", poses.stamps_ns, poses.positions, poses.quaternions))
     return poses
 
 
 def _read_file(path: Path) -> TruePoses:
-    """Read a truth file; its format is told by the number of columns.
+    """Read a truth file. The number of columns tells its format.
 
     Raises:
         HemislamError: it cannot be read, or is none of the formats, or holds NaN.
@@ -82,15 +82,15 @@ def _read_file(path: Path) -> TruePoses:
 
 
 def _kitti(path: Path, table: F64) -> TruePoses:
-    """Rows of a 3x4 matrix T_world_body; their times from `times.txt` or `<stem>_times.txt` beside, if there."""
+    """Rows of a 3x4 matrix T_world_body. Their times are in `<stem>_times.txt` or `times.txt` beside it, if any."""
     poses = table.reshape(-1, 3, 4)
     rotations = poses[:, :, :3]
     odd = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 0.01
     odd |= np.linalg.det(rotations) < 0
     if odd.any():
         raise HemislamError(
-            f"{path}, pose {int(np.argmax(odd)) + 1}: the left 3x3 of its 3x4 matrix is no rotation; KITTI's rows are"
-            " r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz."
+            f"{path}, pose {int(np.argmax(odd)) + 1}: the left 3x3 of its 3x4 matrix is not a rotation; KITTI's rows"
+            " are r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz."
         )
     stamps = None
     for beside in (path.with_name(f"{path.stem}_times.txt"), path.with_name("times.txt")):
@@ -98,7 +98,7 @@ def _kitti(path: Path, table: F64) -> TruePoses:
             stamps = _times(beside, len(poses))
             break
     quaternions = Rotation.from_matrix(rotations).as_quat()
-    # Times that count from zero are no date: the clock is the truth's own.
+    # Times that count from zero are not a date: the clock is the truth's own.
     own = stamps is not None and bool(stamps[0] < 1e17)
     return TruePoses(f"The truth {path}", "KITTI", stamps, poses[:, :, 3].copy(), quaternions, own_clock=own)
 
@@ -147,7 +147,7 @@ def _read_topic(recording: Path, topic: str) -> TruePoses:
         kind = kinds[topic]
         if kind not in TYPES:
             raise HemislamError(
-                f"Topic {topic} is of type {kind}, which is no truth; use one of type {', '.join(TYPES)}."
+                f"Topic {topic} is of type {kind}, which is not a truth; use one of type {', '.join(TYPES)}."
             )
         stamps, rows = [], []
         for _, _, message in source.messages((topic,)):
@@ -163,9 +163,9 @@ def _read_topic(recording: Path, topic: str) -> TruePoses:
     if kind == _FIX:
         return TruePoses(name, "satellite fixes", stamps_ns, _east_north_up(table), None)
     lengths = np.linalg.norm(table[:, 3:], axis=1)
-    if not (np.abs(lengths - 1) <= 0.01).all():  # nan is none either
+    if not (np.abs(lengths - 1) <= 0.01).all():  # also refuses nan
         raise HemislamError(
-            f"Topic {topic} holds orientations that are no unit quaternions; it cannot be used as truth."
+            f"Topic {topic} holds orientations that are not unit quaternions; it cannot be used as truth."
         )
     return TruePoses(name, "poses of a topic", stamps_ns, table[:, :3], table[:, 3:], own_axes=True)
 

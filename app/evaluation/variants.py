@@ -1,4 +1,4 @@
-"""Variants: parameter sets that are run on the same recording, the paper's ablation among them."""
+"""Variants: sets of parameters that are run on the same recording, such as the paper's ablation."""
 
 import re
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ LOOPS = "loops.enabled"
 @dataclass(frozen=True, slots=True)
 class Variant:
     """Attributes:
-    name: column of the tables. values: parameters by dotted name, laid over those of the recording.
+    name: column of the tables. values: parameters by dotted name that replace those of the recording.
     meaning: in words.
     """
 
@@ -41,7 +41,7 @@ PAPER: tuple[Variant, ...] = (
     Variant("FAST-LIO-L", {"ground.enabled": False, LOOPS: True}, "loops, no ground downsampling"),
     Variant("Ours", {"ground.enabled": True, LOOPS: True}, "ground downsampling and loops"),
 )
-"""The ablation of the paper's Table 2: all four are this engine, with its parts switched off in turn."""
+"""The ablation of the paper's Table 2: this engine with parts of it switched off."""
 
 
 def parse_variant(text: str) -> Variant:
