@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -15,21 +15,21 @@ from app.mapping.checkpoints import NEAR
 from app.mapping.feed import Feed, Quiet
 from app.mapping.frames import Frame
 from app.mapping.log import Log
-from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
+from app.mapping.saver import Saver
+from app.mapping.session_file import Opened, SavedSession, State, size_of
 from app.sensors.findings import Finding
 from app.slam import engine
 from app.slam.engine import Engine
 from app.slam.errors import HemislamError
-from app.slam.keyframes import KeyframeStore
 from app.slam.loops.keyframe_log import KeyframeLog
 from app.slam.loops.messages import LoadEdits, LoopClient
 from app.slam.loops.schedule import LoopSchedule
 from app.slam.loops.types import Edits, LoopEdit
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params, leaves
-from app.slam.results import LogState, RunInfo, RunLog, prepare_folder, save_results
-from app.slam.trajectory import Trajectory, read_tum, time_apart, write_tum
-from app.slam.types import F64, DroppedScan, Keyframe, Measurement, StepResult
+from app.slam.results import LogState, RunInfo, RunLog
+from app.slam.trajectory import read_tum, time_apart
+from app.slam.types import F64, DroppedScan, Measurement, StepResult
 
 EFFECT = {leaf.path: leaf.effect for leaf in leaves()}
 _NO_LOOPS = MapFrame()
@@ -108,8 +108,7 @@ class Session:
         self.checkpoints = checkpoints
         self._waiting: Measurement | None = None
         self._dropped = 0  # scans since the newest frame
-        self._saving = ThreadPoolExecutor(max_workers=1, thread_name_prefix="save")
-        self._saves: list[Future[Any]] = []
+        self._saver = Saver()
         self._remember()
 
     # --- going on --------------------------------------------------------------------------------
@@ -368,39 +367,20 @@ class Session:
         Returns:
             What report.json holds, or HemislamError if the folder cannot be written to.
         """
-        log, keyframes = copy.deepcopy(self.log), _Present(self.engine.keyframes)
-        loops = self.loops.results() if self.loops else None
-        info = RunInfo(
-            recording=self.feed.info.path,
-            params=self.params,
-            start_s=self.feed.info.start_s,
-            duration_s=self.feed.info.part_s,
-            truth=self.truth,
-            truth_path=self.truth_path,
-            stopped=stopped,
-        )
-
-        def write() -> dict[str, Any]:
-            if trajectory_only:
-                _save_trajectory(folder, (loops.frame if loops else _NO_LOOPS).trajectory(log.odometry))
-                return {}
-            report = save_results(folder, log, keyframes, info, loops, replace=replace)
-            if session is not None:
-                _save_session(folder / f"session{SUFFIX}", session)
-            return report
-
-        self._saves = [save for save in self._saves if not save.done()]
-        self._saves.append(self._saving.submit(write))
-        return self._saves[-1]
+        info = self.feed.info
+        made_from = RunInfo(info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped)
+        log, loops = copy.deepcopy(self.log), self.loops.results() if self.loops else None
+        if trajectory_only:
+            return self._saver.save_trajectory(folder, log, loops)
+        return self._saver.save(folder, log, self.engine.keyframes, made_from, loops, session, replace=replace)
 
     def finish_saves(self) -> None:
         """Wait until no save is under way."""
-        for save in self._saves:
-            save.exception()
+        self._saver.finish()
 
     def close(self) -> None:
         """Finish the saves and release what is held."""
-        self._saving.shutdown(wait=True)
+        self._saver.close()
         self.feed.close()
         if self.loops:
             self.loops.close()
@@ -412,18 +392,6 @@ class Session:
 def in_force(history: Sequence[tuple[int, Params]], frame: int) -> Params | None:
     """The parameters of a frame by a history as in `Session.history`; None before its first."""
     return next((params for first, params in reversed(history) if first <= frame), None)
-
-
-def _save_session(path: Path, session: SavedSession) -> None:
-    try:
-        write_session(path, session)
-    except OSError as error:
-        raise HemislamError(f"The session cannot be written to {path}: {error.strerror}.") from error
-
-
-def _save_trajectory(folder: Path, trajectory: Trajectory) -> None:
-    prepare_folder(folder, replace=True)
-    write_tum(folder / "trajectory.tum", trajectory)
 
 
 class _LoopsWatch:
@@ -442,16 +410,3 @@ class _LoopsWatch:
         """The timings of a frame with those of its loops."""
         total = result.timings_ms["total"] + self._ms
         return {**result.timings_ms, "loops": self._ms, "total": total}
-
-
-class _Present:
-    """The keyframes that there are now; later ones are not seen."""
-
-    def __init__(self, keyframes: KeyframeStore) -> None:
-        self._keyframes, self._count = keyframes, len(keyframes)
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index: int, /) -> Keyframe:
-        return self._keyframes[index]

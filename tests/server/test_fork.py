@@ -20,6 +20,7 @@ from app.server.fork import Workspace, forked
 from app.server.protocol import (
     SERIES,
     AddNote,
+    OpenedRecording,
     OpenRecording,
     Pause,
     Play,
@@ -60,8 +61,8 @@ def both_at(workspace: Workspace, frame: int) -> tuple[Snapshot, Snapshot]:
 
 # --- what B is told ------------------------------------------------------------------------------
 def at(frame: int, revision: int = 1, *, frames: int = 100, name: str = "walk", busy: bool = False) -> Snapshot:
-    run = fakes.open_fake(Path(f"walk-{frames}.mcap"), None, Params())
-    opened = replace(run.opened, path=Path(f"{name}.mcap"))
+    session = fakes.open_fake(Path(f"walk-{frames}.mcap"), None, Params())
+    opened = replace(OpenedRecording.of(session), path=Path(f"{name}.mcap"))
     return Snapshot(
         revision=revision,
         recording=opened,

@@ -1,0 +1,104 @@
+"""The workbench, `replay` of its session and `run` write the same bytes, also of loops that only the end brings."""
+
+import math
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from app.__main__ import cli
+from app.mapping.checkpoints import DEFAULT_BYTES
+from app.mapping.opening import open_session
+from app.mapping.session import Session
+from app.mapping.session_file import SUFFIX
+from app.sensors.presets import resolve_params
+from app.server.controller import Controller
+from app.server.delta import Outbox
+from app.server.fold import Fold
+from app.server.protocol import Command, EditLoop, Play, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.slam.loops.types import LoopEdge, Reject, Verdict
+from app.slam.params import Params
+
+SAMPLE = next((Path(__file__).resolve().parents[2] / "sample_data").glob("*.mcap"))
+FILES = ("trajectory.tum", "trajectory_odometry.tum", "loops.csv", "graph.g2o")
+START_S = 0.0
+"""All of it: it ends where it began, and its loops are found at the end."""
+
+
+class Workbench:
+    """The part of the recording in the engine's side of the workbench."""
+
+    def __init__(self) -> None:
+        self._params = resolve_params(SAMPLE, None, None, [])
+        self._outbox, self._fold = Outbox(self._params), Fold()
+        self.controller = Controller(self._outbox, self._params, self._open)
+        self.controller.open(SAMPLE, None)
+        self.do(SetSpeed(math.inf))
+
+    @staticmethod
+    def _open(path: Path, truth: Path | None, params: Params, part: object = None, /) -> Session:
+        return open_session(path, params, START_S, truth=truth, checkpoint_bytes=DEFAULT_BYTES)
+
+    def do(self, *commands: Command) -> Snapshot:
+        """Until nothing is awaited any more."""
+        for command in commands:
+            self.controller.handle(command)
+            deadline = time.monotonic() + 120
+            while (wait := self.controller.work()) is not None:
+                assert time.monotonic() < deadline
+                time.sleep(wait)
+        if self._outbox.filled:
+            self._fold.apply(self._outbox.take())
+        return self._fold.snapshot
+
+    def saved(self, folder: Path) -> dict[str, bytes]:
+        assert not self.do(Save(folder)).saved[-1].error
+        return read(folder)
+
+
+def read(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in FILES}
+
+
+def accepted(snapshot: Snapshot) -> list[LoopEdge]:
+    return [edge for edge in snapshot.loops.edges if edge.verdict is Verdict.ACCEPTED]
+
+
+def hemislam(folder: Path, *words: str) -> dict[str, bytes]:
+    result = CliRunner().invoke(cli, [*words, "--out", str(folder)])
+    assert result.exit_code == 0, result.output
+    return read(folder)
+
+
+@pytest.fixture
+def workbench() -> Workbench:
+    return Workbench()
+
+
+def test_an_undisturbed_session_a_replay_and_a_run_write_the_same(workbench: Workbench, tmp_path: Path) -> None:
+    ended = workbench.do(Play())
+    assert ended.transport.finished and accepted(ended)
+    ours = workbench.saved(tmp_path / "page")
+    workbench.controller.close()
+    assert hemislam(tmp_path / "run", "run", str(SAMPLE), "--start", str(START_S)) == ours
+    assert hemislam(tmp_path / "replay", "replay", str(tmp_path / "page" / f"session{SUFFIX}")) == ours
+
+
+def test_a_session_with_detours_edits_and_other_parameters_is_replayed_to_the_same(
+    workbench: Workbench, tmp_path: Path
+) -> None:
+    workbench.do(
+        Seek(120), SetParams({"filter.max_iterations": 3}), StepFrame(30), Seek(90), SetParams({"ground.sigma": 0.05})
+    )
+    last = accepted(workbench.do(Play()))
+    assert last, "else there is nothing to edit"
+    workbench.do(EditLoop(Reject(*last[-1].pair)))
+    at_end = workbench.saved(tmp_path / "end")
+    workbench.do(StepFrame(-3))
+    before_end = workbench.saved(tmp_path / "before")
+    workbench.controller.close()
+    assert at_end["loops.csv"] != before_end["loops.csv"], "the end brings loops"
+    for name, expected in (("end", at_end), ("before", before_end)):
+        again = hemislam(tmp_path / f"{name}-again", "replay", str(tmp_path / name / f"session{SUFFIX}"))
+        assert again == expected, name
