@@ -35,7 +35,7 @@ RUN_FILES = ("trajectory.tum", "timings.csv", "crops.npz", "run.json")
 
 @cache
 def code_digest() -> str:
-    """Hash of the code that results depend on: a version that changes between releases is another one."""
+    """Hash of the code that results depend on, so that a change of it runs jobs again."""
     root = Path(__file__).parents[1]
     files = [path for room in ("slam", "mapping") for path in (root / room).rglob("*.py")]
     files += (root / "sensors").glob("*.py")
@@ -93,7 +93,7 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
     """Run to the end and write the files; `progress` is called with (frames done, frames in all).
 
     Raises:
-        HemislamError: the recording can not be used. OSError: the disk is full or fails.
+        HemislamError: the recording cannot be used. OSError: the disk is full or fails.
     """
     import numba
 
@@ -123,7 +123,7 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
 
 
 def _facts(job: Job, session: Session, ground: list[GroundScore], memory_mb: float) -> dict[str, Any]:
-    """What run.json holds but for what needs the map."""
+    """What run.json holds, except what needs the map."""
     log = session.log
     return {
         "key": job.key,

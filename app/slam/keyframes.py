@@ -44,7 +44,7 @@ def is_due(T_odom_last: F64 | None, T_odom_imu: F64, params: KeyframeParams) -> 
 
 
 class KeyframeStore:
-    """All keyframes of a walk, in an unnamed temporary file or in one that outlives the process.
+    """All keyframes of a session, in an unnamed temporary file or in one that outlives the process.
 
     `store[i]` reads keyframe i, from any thread; iterating streams all of them in order.
 

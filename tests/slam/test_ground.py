@@ -78,7 +78,7 @@ def test_neither_ceiling_nor_wall_nor_table_is_ground(mount: str) -> None:
 
 
 def test_a_sensor_that_looks_at_the_ceiling_labels_no_ground() -> None:
-    """z up: the hemisphere above. The floor can not be seen, and the ceiling is no floor."""
+    """z up: the hemisphere above. The floor is not visible, and the ceiling is not a floor."""
     scan = seen(furnished_room(), np.eye(3))
     result = segment(scan, np.eye(3))
     assert not result.found

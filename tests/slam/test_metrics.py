@@ -228,7 +228,7 @@ def test_a_truth_of_another_day_is_refused() -> None:
         ate(estimate, later)
 
 
-def test_a_walk_that_never_moved_can_not_be_aligned() -> None:
+def test_a_walk_that_never_moved_cannot_be_aligned() -> None:
     truth = walk(1)
     still = Trajectory(truth.stamps_ns, np.tile([1.0, 2, 3], (len(truth), 1)), truth.quaternions)
     with pytest.raises(HemislamError, match="longer walk"):

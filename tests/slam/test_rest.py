@@ -68,7 +68,7 @@ def test_a_rest_tells_the_bias_along_gravity_but_not_across() -> None:
     assert np.all(of_the_sum < 0.012)
 
 
-def test_standing_longer_does_not_make_a_bias_known_that_a_rest_can_not_tell() -> None:
+def test_standing_longer_does_not_make_a_bias_known_that_a_rest_cannot_tell() -> None:
     """An inconsistent filter would gain certainty from nothing, frame by frame."""
     belief = after_a_rest(10, held=True)
     assert all(sigma_of(axis, belief) > 0.03 for axis in axes(belief)[1])
