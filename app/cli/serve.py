@@ -161,7 +161,7 @@ def serve(
                 play=not paused or live is not None,
                 point_budget=point_budget,
                 checkpoint_bytes=checkpoint_memory << 20,
-                journals=Path("runs") / "sessions",
+                session_folder=Path("runs") / "sessions",
                 live=source.address if source else None,
                 live_folder=Path(folder_live),
             ),

@@ -81,7 +81,7 @@ class Controller:
         params: to begin with.
         open_session: opens a recording.
         resolve: parameters that a recording is opened with, before changes by hand; None: the present ones.
-        journals: folder in which session files are kept; None: nowhere.
+        session_folder: folder in which session files are kept; None: nowhere.
         clock: monotonic seconds.
     """
 
@@ -92,7 +92,7 @@ class Controller:
         open_session: OpenSession,
         *,
         resolve: Callable[[Path], Params] | None = None,
-        journals: Path | None = None,
+        session_folder: Path | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._outbox = outbox
@@ -100,7 +100,7 @@ class Controller:
         self._loops = LoopCommands(outbox)
         self._player = Player(outbox, self._page, clock)
         self._saves: deque[tuple[Path, Future[Any]]] = deque()
-        self._journals = journals
+        self._session_folder = session_folder
         self._writer: SessionWriter | None = None
         self._clock, self._looked_at_source = clock, -1e9
         self._open_session = open_session
@@ -375,11 +375,11 @@ class Controller:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-        self._outbox.put(journal=None)
-        if self._journals is not None and session.feed.repeatable:
-            path = new_path(self._journals, session.feed.info.path)
+        self._outbox.put(session_file=None)
+        if self._session_folder is not None and session.feed.repeatable:
+            path = new_path(self._session_folder, session.feed.info.path)
             self._writer = SessionWriter(path, session.opened)
-            self._outbox.put(journal=path)
+            self._outbox.put(session_file=path)
             if self._writer.error:
                 self._outbox.notice("warning", self._writer.error)
 

@@ -103,7 +103,7 @@ def run_loop(
         setup.params,
         opener,
         resolve=setup.resolve,
-        journals=setup.journals,
+        session_folder=setup.session_folder,
     )
     controller.handle(SetSpeed(setup.speed))
     controller.handle(SetBreakpoints(setup.breakpoints))

@@ -3,7 +3,7 @@
 from app.server.protocol import Command, Seek, Snapshot, StepFrame
 
 STUCK_S = 1.0
-"""B is told again where to go if nothing came of it for so long: what is sent to a process that dies is lost."""
+"""B is told again where to go if nothing has happened for so long: a process that dies loses its commands."""
 
 
 def same_recording(a: Snapshot, b: Snapshot) -> bool:
@@ -14,10 +14,10 @@ def same_recording(a: Snapshot, b: Snapshot) -> bool:
 
 
 class Follower:
-    """Says what brings B to A's frame: one journey at a time, but back at once.
+    """Says what brings B to A's frame: one seek at a time, except that going back is immediate.
 
     Args:
-        frame: that B goes to by itself at first.
+        frame: that B goes to at first.
     """
 
     def __init__(self, frame: int) -> None:

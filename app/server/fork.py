@@ -1,8 +1,7 @@
 """Two settings side by side: the session A, and a fork of it, B, that goes where A goes.
 
-The engine is deterministic, so a fork is a session file: where A stands, with other parameters. B is
-one more engine's process that opens it, comes to A's frame by itself, and then only ever seeks to the
-frame that A is at. A never waits for B.
+The engine is deterministic, so a fork is a session file: where A is, with other parameters. B is a second
+engine's process that opens the file and then seeks to whatever frame A is at. A never waits for B.
 """
 
 import json
@@ -30,7 +29,7 @@ PERIOD_S = 0.02
 APART = 1_000_000
 """Between the session and notice numbers of one engine and the next, so that the page never takes one for another."""
 _MOST_KEPT = 30
-_NOT_KEPT = "This session is not kept in a file, so it can not be forked; serve keeps one."
+_NOT_KEPT = "This session is not kept in a file, so it cannot be forked; serve keeps one."
 
 
 class RunningEngine(Protocol):
@@ -66,10 +65,10 @@ def forked(a: Snapshot, values: Mapping[str, Any]) -> SavedSession:
     if frame < 0:
         raise HemislamError("There is no frame to fork at yet; play or step first.")
     if a.live is not None:
-        raise HemislamError("A live source can not be forked; record it, and open the recording.")
-    if a.journal is None:
+        raise HemislamError("A live source cannot be forked; record it, and open the recording.")
+    if a.session_file is None:
         raise HemislamError(_NOT_KEPT)
-    saved = read_session(a.journal)
+    saved = read_session(a.session_file)
     history = tuple(entry for entry in saved.state.history if entry[0] <= frame)
     notes = tuple(note for note in saved.state.notes if note.frame <= frame)
     state = replace(saved.state, params=a.params.with_values(dict(values)), history=history, notes=notes)
@@ -112,7 +111,7 @@ class Workspace:
         return self._sides[0].engine.pid
 
     def send(self, command: Command) -> None:
-        """Enqueue a command for A; what both are compared with is B's affair too."""
+        """Enqueue a command for A; a comparison is sent to B as well."""
         self._sides[0].engine.send(command)
         if isinstance(command, CompareWith):
             self.send_other(command)
@@ -135,7 +134,7 @@ class Workspace:
         return a.name, b.name if b is not None else ""
 
     def send_other(self, command: Command) -> None:
-        """Enqueue a command for B: its parameters. Where it goes is A's affair."""
+        """Enqueue a command for B, for example to change its parameters. B's frame follows A's."""
         b = self._sides[1]
         if b is not None:
             b.engine.send(command)
@@ -144,7 +143,7 @@ class Workspace:
         """Start B where A is, with these parameters by dotted name in place of A's, from the next frame on.
 
         Raises:
-            HemislamError: there is a fork already, A can not be forked, or its file can not be written.
+            HemislamError: there is a fork already, A cannot be forked, or its file cannot be written.
         """
         with self._lock:
             a, folder = self._place(name)
@@ -154,7 +153,7 @@ class Workspace:
                 folder.mkdir(parents=True)
                 write_session(file, session)
             except OSError as error:
-                raise HemislamError(f"The fork can not be written to {folder}: {error.strerror}.") from None
+                raise HemislamError(f"The fork cannot be written to {folder}: {error.strerror}.") from None
             self._begin(file, session, name, folder, session.frame)
             changed = ", ".join(f"{path} = {value}" for path, value in (values or {}).items())
             a.engine.send(AddNote(f"Forked as {self.names[1]}{f' with {changed}' if changed else ''}."))
@@ -167,8 +166,8 @@ class Workspace:
         """
         with self._lock:
             a, folder = self._place(path.stem)
-            session, journal = read_session(path), a.engine.snapshot.journal
-            ours = read_session(journal).opened if journal is not None else None
+            session, session_file = read_session(path), a.engine.snapshot.session_file
+            ours = read_session(session_file).opened if session_file is not None else None
             theirs = session.opened
             if ours is None or (ours.recording, ours.start_s) != (theirs.recording, theirs.start_s):
                 raise HemislamError(f"{path.name} is of {theirs.recording} from {theirs.start_s:g} s; open that first.")
@@ -177,10 +176,12 @@ class Workspace:
 
     def kept(self) -> list[Path]:
         """Session files of A's recording that B can be opened on, the newest first."""
-        a, folder = self._sides[0].engine.snapshot, self._setup.journals
+        a, folder = self._sides[0].engine.snapshot, self._setup.session_folder
         if folder is None or a.recording is None:
             return []
-        files = [file for file in folder.glob(f"*{SUFFIX}") if a.journal is None or file.name != a.journal.name]
+        files = [
+            file for file in folder.glob(f"*{SUFFIX}") if a.session_file is None or file.name != a.session_file.name
+        ]
         newest = sorted(files, key=lambda file: file.stat().st_mtime, reverse=True)[:_MOST_KEPT]
         return [file for file in newest if _recording_of(file) == a.recording.path.resolve()]
 
@@ -203,7 +204,7 @@ class Workspace:
             b.engine.send(AddNote(f"Swapped: goes on in place of {a.name}."))
 
     def discard(self) -> None:
-        """End B; what it came to is gone. Raises HemislamError without a fork."""
+        """End B and delete its files. Raises HemislamError without a fork."""
         with self._lock:
             b = self._end()
             if b.folder is not None:
@@ -217,22 +218,22 @@ class Workspace:
             The file, beside the other session files; no older one is replaced.
 
         Raises:
-            HemislamError: there is no fork, or the file can not be written; B's own files stay then.
+            HemislamError: there is no fork, or the file cannot be written; B's own files stay then.
         """
         with self._lock:
             b = self._end()
-            journal = b.engine.snapshot.journal or (b.folder / f"start{SUFFIX}" if b.folder else None)
-            if journal is None or self._setup.journals is None:
+            session_file = b.engine.snapshot.session_file or (b.folder / f"start{SUFFIX}" if b.folder else None)
+            if session_file is None or self._setup.session_folder is None:
                 raise HemislamError("B was not kept in a file.")
-            session = read_session(journal)
+            session = read_session(session_file)
             stem = f"{session.opened.recording.stem}-{_plain(name.strip() or b.name)}"
-            path = free_path(self._setup.journals / stem, SUFFIX)
+            path = free_path(self._setup.session_folder / stem, SUFFIX)
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_session(path, session)
             except OSError as error:
                 raise HemislamError(
-                    f"The fork can not be kept as {path}: {error.strerror}; it still is in {journal}."
+                    f"The fork cannot be kept as {path}: {error.strerror}; it still is in {session_file}."
                 ) from None
             if b.folder is not None:
                 shutil.rmtree(b.folder, ignore_errors=True)
@@ -253,11 +254,11 @@ class Workspace:
         a, b = self._sides
         if b is not None:
             raise HemislamError("There is a fork already; keep or discard it first.")
-        if self._setup.journals is None:
+        if self._setup.session_folder is None:
             raise HemislamError(_NOT_KEPT)
         self._forks += 1
         stamp = f"{datetime.now():%Y%m%d-%H%M%S}"
-        return a, free_path(self._setup.journals / FOLDER / f"{stamp}-{_plain(name.strip())}")
+        return a, free_path(self._setup.session_folder / FOLDER / f"{stamp}-{_plain(name.strip())}")
 
     def _begin(self, file: Path, session: SavedSession, name: str, folder: Path, forked_at: int) -> None:
         engine = self._start(
@@ -268,7 +269,7 @@ class Workspace:
                 params=session.state.params,
                 play=False,
                 breakpoints=Breakpoints(),
-                journals=folder.resolve(),
+                session_folder=folder.resolve(),
                 session=APART * self._forks,
                 notices=APART * self._forks,
                 live=None,
@@ -305,7 +306,7 @@ class Workspace:
 
 
 def _recording_of(session: Path) -> Path | None:
-    """What a session file says that it opened; None if that can not be told."""
+    """What a session file says that it opened; None if that cannot be told."""
     try:
         with session.open(encoding="utf-8") as lines:
             return Path(json.loads(lines.readline())["recording"])

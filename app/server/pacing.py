@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 
 LONGEST_LAG_S = 0.5
-"""A replay that is later than this does not hurry to catch up; it goes on from where it is."""
+"""A replay that is later than this does not catch up; it goes on from where it is."""
 
 
 class Pacer:

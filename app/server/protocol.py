@@ -318,7 +318,7 @@ class Snapshot:
         saved: the newest 10 `Save`s that ended.
         engine_alive: False when the engine's process has died.
         live: how the live source is doing; None for a recording.
-        journal: file in which this session is kept; opening it goes on from there.
+        session_file: file in which this session is kept; opening it goes on from there.
     """
 
     session: int = 0
@@ -341,5 +341,5 @@ class Snapshot:
     notices: tuple[Notice, ...] = ()
     saved: tuple[Saved, ...] = ()
     engine_alive: bool = True
-    journal: Path | None = None
+    session_file: Path | None = None
     live: LiveState | None = None

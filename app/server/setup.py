@@ -29,7 +29,7 @@ class Setup:
         checkpoint_bytes: see `app.mapping.checkpoints`.
         live_folder: where a live run keeps what a process that takes over needs. revive: it is that process.
         live: where to take scans from while `recording` is `app.server.protocol.LIVE`.
-        journals: folder for session files, see `Controller`.
+        session_folder: folder for session files, see `Controller`.
         session, notices, frames, chunks: how many there were before, for a process that takes over from another.
     """
 
@@ -48,7 +48,7 @@ class Setup:
     live: "LiveAddress | None" = None
     live_folder: Path | None = None
     revive: bool = False
-    journals: Path | None = None
+    session_folder: Path | None = None
     session: int = 0
     notices: int = 0
     frames: int = 0

@@ -127,7 +127,7 @@ class StateView(View):
     pending_restart: list[str]
     notices: list[Notice]
     live: LiveView | None
-    journal: str | None = Field(description="The session file; opening it continues the session.")
+    session_file: str | None = Field(description="The session file; opening it continues the session.")
     notes: list[Note]
 
 
@@ -143,7 +143,7 @@ def state_view(snapshot: Snapshot) -> StateView:
     computed = {
         "frame": _frame(snapshot.result, snapshot) if snapshot.result else None,
         "keyframes": len(snapshot.chunks),
-        "journal": str(snapshot.journal) if snapshot.journal else None,
+        "session_file": str(snapshot.session_file) if snapshot.session_file else None,
     }
     taken = {name: getattr(snapshot, name) for name in StateView.model_fields if name not in computed}
     return StateView.model_validate(taken | computed)

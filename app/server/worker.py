@@ -111,7 +111,7 @@ class EngineProcess:
     def _died(self, death: ChildDied) -> None:
         """Say so, and start the process again if there is something that it can go on with."""
         last = self.snapshot
-        place = last.journal or (LIVE if last.live is not None else None)
+        place = last.session_file or (LIVE if last.live is not None else None)
         restarts = place is not None and self._restarts.allows()
         then = (
             "It is started again and returns to where it was."

@@ -122,14 +122,14 @@ def test_a_fork_knows_only_what_came_before_it(tmp_path: Path) -> None:
     writer = SessionWriter(tmp_path / "a.hemislam", Opened(tmp_path / "none.mcap"))
     writer.write(80, State(latest, ((0, first), (20, later), (60, latest))))
     writer.close()
-    a = Snapshot(params=latest, transport=Transport(frame=40), journal=tmp_path / "a.hemislam")
+    a = Snapshot(params=latest, transport=Transport(frame=40), session_file=tmp_path / "a.hemislam")
     session = forked(a, {"ground.sigma": 0.2})
     assert session.frame == 40 and session.state.history == ((0, first), (20, later))
     assert session.state.params == latest.with_values({"ground.sigma": 0.2})
     with pytest.raises(HemislamError, match="play or step first"):
         forked(replace(a, transport=Transport()), {})
     with pytest.raises(HemislamError, match="not kept in a file"):
-        forked(replace(a, journal=None), {})
+        forked(replace(a, session_file=None), {})
 
 
 # --- two processes with an engine that knows the answer ------------------------------------------
@@ -137,7 +137,7 @@ def test_a_fork_knows_only_what_came_before_it(tmp_path: Path) -> None:
 def pair(tmp_path: Path) -> Iterator[Workspace]:
     """A at frame 20 of 300."""
     start = partial(EngineProcess, main=fakes.fake_main)
-    setup = Setup(Path("walk-300.mcap"), journals=tmp_path)
+    setup = Setup(Path("walk-300.mcap"), session_folder=tmp_path)
     workspace = Workspace(start(setup), setup, start)
     workspace.send(Seek(20))
     until(lambda: workspace.snapshot, lambda s: s.transport.frame == 20)
@@ -175,7 +175,7 @@ def test_a_fork_is_led_swapped_and_discarded(pair: Workspace, tmp_path: Path) ->
     np.testing.assert_array_equal(speeds(follows)[:31], speeds(a)[:31])
     pair.send(Pause())
 
-    kept = pair.snapshot.journal
+    kept = pair.snapshot.session_file
     pair.discard()
     assert pair.other is None and kept is not None and kept.exists(), "what A is now is not thrown away with the other"
     assert list(tmp_path.glob("*.hemislam")), "nor is the first session"
@@ -183,7 +183,7 @@ def test_a_fork_is_led_swapped_and_discarded(pair: Workspace, tmp_path: Path) ->
     assert [(note.frame, note.text.split()[0]) for note in pair.snapshot.notes][1:] == [
         (pair.snapshot.transport.frame, "Discarded")
     ]
-    first = read_session(a.journal)  # type: ignore[arg-type]  # None would fail
+    first = read_session(a.session_file)  # type: ignore[arg-type]  # None would fail
     assert first.state.notes == (Note(20, "Forked as wide with ground.sigma = 0.2."),)
     with pytest.raises(HemislamError, match="no fork"):
         pair.swap()
@@ -231,7 +231,7 @@ def test_what_can_not_be_is_said(pair: Workspace) -> None:
 @pytest.fixture(scope="module")
 def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workspace]:
     folder = tmp_path_factory.mktemp("sessions")
-    setup = Setup(SAMPLE, params=resolve_params(SAMPLE, None, None, []), duration_s=6.0, journals=folder)
+    setup = Setup(SAMPLE, params=resolve_params(SAMPLE, None, None, []), duration_s=6.0, session_folder=folder)
     workspace = Workspace(EngineProcess(setup), setup, EngineProcess)
     yield workspace
     workspace.close()

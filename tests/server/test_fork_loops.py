@@ -21,7 +21,7 @@ BEFORE, LAST = 490, 498
 def walked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workspace]:
     """A near the end of the recording that ships, where its loops are, and B from there on."""
     params = resolve_params(SAMPLE, None, None, [])
-    setup = Setup(SAMPLE, params=params, speed=math.inf, journals=tmp_path_factory.mktemp("kept"))
+    setup = Setup(SAMPLE, params=params, speed=math.inf, session_folder=tmp_path_factory.mktemp("kept"))
     workspace = Workspace(EngineProcess(setup), setup, EngineProcess)
     until(lambda: workspace.snapshot, lambda s: s.transport.frame == 0)
     workspace.send(Seek(BEFORE))

@@ -120,11 +120,11 @@ def test_an_error_of_a_centimetre_is_reported_as_such(tmp_path: Path) -> None:
 def test_a_session_is_reopened_with_its_speed_and_breakpoints(tmp_path: Path) -> None:
     recording = tmp_path / "walk-60.mcap"
     recording.write_bytes(b"something to hash")
-    desk = Desk(str(recording), journals=tmp_path / "sessions")
+    desk = Desk(str(recording), session_folder=tmp_path / "sessions")
     chosen = Breakpoints(no_ground=True, error=0.2)
     snapshot = desk.do(SetBreakpoints(chosen), SetSpeed(math.inf), Seek(30))
     desk.controller.close()
-    again = Desk(str(snapshot.journal)).see()
+    again = Desk(str(snapshot.session_file)).see()
     assert (again.breakpoints, again.transport.speed, again.transport.frame) == (chosen, math.inf, 30)
     assert not again.transport.playing
 
@@ -189,13 +189,13 @@ def test_a_trajectory_of_another_time_is_refused_and_the_one_before_stays(tmp_pa
 def test_a_session_remembers_what_it_was_compared_with_and_opens_without_it_if_that_is_gone(tmp_path: Path) -> None:
     recording, truth = tmp_path / "walk-60.mcap", truth_file(tmp_path, 60, wobble=0.01)
     recording.write_bytes(b"something to hash")
-    desk = Desk(str(recording), journals=tmp_path / "sessions")
+    desk = Desk(str(recording), session_folder=tmp_path / "sessions")
     snapshot = desk.do(Seek(30), CompareWith(truth))
-    assert snapshot.journal is not None
+    assert snapshot.session_file is not None
     desk.controller.close()
-    again = Desk(str(snapshot.journal)).see()
+    again = Desk(str(snapshot.session_file)).see()
     assert again.series["error_m"][-1] == pytest.approx(0.01, rel=0.2)
     truth.unlink()
-    without = Desk(str(snapshot.journal)).see()
+    without = Desk(str(snapshot.session_file)).see()
     assert without.transport.frame == 30 and np.isnan(without.series["error_m"]).all()
     assert "truth.tum, which is gone" in last_notice(without)

@@ -20,7 +20,7 @@ def snapshot() -> Snapshot:
 
 
 def test_the_state_holds_the_snapshots_values(snapshot: Snapshot) -> None:
-    state = json.loads(state_view(replace(snapshot, journal=Path("runs/a.hemislam"))).model_dump_json())
+    state = json.loads(state_view(replace(snapshot, session_file=Path("runs/a.hemislam"))).model_dump_json())
     assert snapshot.result is not None and snapshot.recording is not None
     assert state["recording"]["path"] == str(snapshot.recording.path)
     assert [finding["subject"] for finding in state["recording"]["findings"]] == [
@@ -30,7 +30,7 @@ def test_the_state_holds_the_snapshots_values(snapshot: Snapshot) -> None:
     assert state["frame"]["position"] == pytest.approx(snapshot.result.T_map_imu[:3, 3])
     assert state["frame"]["planarity"] == pytest.approx(snapshot.result.ground.planarity)
     assert state["keyframes"] == len(snapshot.chunks)
-    assert state["journal"] == "runs/a.hemislam"
+    assert state["session_file"] == "runs/a.hemislam"
 
 
 def test_infinite_speed_is_max_and_unknown_numbers_are_null(snapshot: Snapshot) -> None:
@@ -52,4 +52,4 @@ def test_infinite_speed_is_max_and_unknown_numbers_are_null(snapshot: Snapshot) 
 
 def test_a_session_without_a_recording_has_a_state() -> None:
     state = state_view(Snapshot())
-    assert (state.recording, state.frame, state.live, state.journal) == (None, None, None, None)
+    assert (state.recording, state.frame, state.live, state.session_file) == (None, None, None, None)

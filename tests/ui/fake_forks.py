@@ -37,8 +37,8 @@ def workspace(a: FakeEngine, folder: Path, columns: int = 40) -> Workspace:
     writer = SessionWriter(path, Opened(Path("/data/hall_bpearl.mcap")))
     writer.write(0, State(Params(), ((0, Params()),)))
     writer.close()
-    a.publish(journal=path)
-    return Workspace(a, Setup(journals=folder), starter(columns))  # type: ignore[arg-type, return-value]
+    a.publish(session_file=path)
+    return Workspace(a, Setup(session_folder=folder), starter(columns))  # type: ignore[arg-type, return-value]
 
 
 def starter(columns: int) -> Callable[[Setup], FakeEngine]:
@@ -48,7 +48,7 @@ def starter(columns: int) -> Callable[[Setup], FakeEngine]:
         b = FakeEngine(columns=columns)
         b.world = Drifting(columns, session.frame)
         b.send(SetParams(Params().changed(session.state.params)))
-        b.publish(session=setup.session + 1, journal=setup.recording)
+        b.publish(session=setup.session + 1, session_file=setup.recording)
         b.send(Seek(session.frame))
         return b
 

@@ -75,7 +75,7 @@ def test_what_is_written_is_read(saved: SavedSession, tmp_path: Path) -> None:
     assert read_session(tmp_path / "a.hemislam") == saved
 
 
-def test_a_journal_cut_anywhere_tells_the_session_up_to_there(saved: SavedSession, tmp_path: Path) -> None:
+def test_a_session_file_cut_anywhere_holds_the_session_up_to_there(saved: SavedSession, tmp_path: Path) -> None:
     now = 0.0
     writer = SessionWriter(tmp_path / "b.hemislam", saved.opened, clock=lambda: now)
     writer.write(0, State(Params()))
@@ -123,7 +123,7 @@ def test_a_recording_that_is_gone_or_another_is_said(saved: SavedSession, tmp_pa
         read_session(tmp_path / "a.hemislam")
 
 
-def test_a_folder_that_can_not_be_written_ends_the_journal_not_the_session(saved: SavedSession, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_ends_the_file_not_the_session(saved: SavedSession, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     writer = SessionWriter(tmp_path / "file" / "a.hemislam", saved.opened)
     assert "not recorded" in writer.error
@@ -146,11 +146,11 @@ class Kept(Desk):
         super().__init__(resolve_params(SAMPLE, None, None, []), open_whole, path)
 
     def _controller(self, opener: Callable[..., Session]) -> Controller:
-        return Controller(self.outbox, self.params, opener, journals=self.folder, clock=lambda: 0.0)
+        return Controller(self.outbox, self.params, opener, session_folder=self.folder, clock=lambda: 0.0)
 
     @property
-    def journal(self) -> Path:
-        path = self.see().journal
+    def session_file(self) -> Path:
+        path = self.see().session_file
         assert path is not None
         return path
 
@@ -165,7 +165,7 @@ def walk_about(desk: Kept) -> Snapshot:
 def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path) -> None:
     first = Kept(tmp_path)
     there = walk_about(first)
-    second = Kept(tmp_path, first.journal)
+    second = Kept(tmp_path, first.session_file)
     again = second.see()
     assert again.params == there.params and again.transport.frame == there.transport.frame == 72
     assert again.trajectory is not None and there.trajectory is not None
@@ -173,7 +173,7 @@ def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path)
     assert again.notes == there.notes == (Note(70, "a turn"),)
     assert again.result is not None and there.result is not None
     np.testing.assert_array_equal(again.result.cloud.labels, there.result.cloud.labels, "relabelled by the last wish")
-    third = Kept(tmp_path, second.journal)  # the one reopened is kept as well
+    third = Kept(tmp_path, second.session_file)  # the one reopened is kept as well
     assert page(first.do(StepFrame(10))) == page(second.do(StepFrame(10))) == page(third.do(StepFrame(10)))
     for desk in (first, second, third):
         desk.controller.close()
@@ -182,7 +182,7 @@ def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path)
 def test_a_session_stopped_on_its_way_back_goes_on_as_it_went_unless_it_is_changed_there(tmp_path: Path) -> None:
     first = Kept(tmp_path)
     there = walk_about(first)
-    file = first.journal
+    file = first.session_file
     for change, same in (({}, True), ({"ground.alpha": 50.0}, False)):
         desk = Desk(first.params, open_whole, file, settle=False)
         while desk.see().transport.frame < 20:
@@ -199,7 +199,7 @@ def test_a_session_stopped_on_its_way_back_goes_on_as_it_went_unless_it_is_chang
 def test_what_is_wanted_while_a_session_opens_is_not_lost(tmp_path: Path) -> None:
     first = Kept(tmp_path)
     walk_about(first)
-    desk = Desk(first.params, open_whole, first.journal, settle=False)
+    desk = Desk(first.params, open_whole, first.session_file, settle=False)
     for command in (SetParams({"ground.sigma": 0.07}), AddNote("here")):
         desk.controller.handle(command)
     desk.settle()
@@ -242,7 +242,7 @@ def test_an_engine_killed_at_any_moment_goes_on_to_the_same_end(tmp_path: Path) 
         duration_s=LENGTH_S,
         speed=math.inf,
         play=True,
-        journals=tmp_path / "kept",
+        session_folder=tmp_path / "kept",
     )
     ends = []
     rng = np.random.default_rng(3)
@@ -276,7 +276,7 @@ def test_a_session_file_opens_in_the_page_too(tmp_path: Path) -> None:
     desk = Kept(tmp_path)
     desk.do(SetSpeed(0.5), Seek(20), SetParams({"ground.sigma": 0.02}), StepFrame(3))
     other = Kept(tmp_path)
-    there = other.do(OpenRecording(desk.journal))
+    there = other.do(OpenRecording(desk.session_file))
     assert there.transport.frame == 23 and there.params.ground.sigma == 0.02
     assert other.do(Play()).transport.playing
     desk.controller.close()
