@@ -1,4 +1,4 @@
-"""`hemislam feed`: a recording played out as if its sensors were here."""
+"""`hemislam feed`: a recording sent as if by its sensors."""
 
 import math
 from typing import Annotated
@@ -21,7 +21,9 @@ def feed(
             "--imu-to", metavar="URL", help="imu-udp://HOST:PORT, beside packets; else port 6700 of their HOST."
         ),
     ] = None,
-    speed: Annotated[float, typer.Option("--speed", metavar="X", help="Times real time; 0: as fast as it goes.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option("--speed", metavar="X", help="Times real time; 0: as fast as possible.")
+    ] = 1.0,
     preset: Preset = None,
     config: Config = None,
     assignments: Assignments = None,
@@ -29,7 +31,7 @@ def feed(
     imu_topic: ImuTopic = None,
     duration: Duration = None,
 ) -> None:
-    """Play a recording out as live data: to try `serve --live` without a sensor.
+    """Send a recording as live data, to try `serve --live` without a sensor.
 
     As RS-Bpearl packets with the IMU beside them, or as a Foxglove server like foxglove_bridge.
 
@@ -45,18 +47,18 @@ def feed(
     from app.sensors.live.urls import parse_address
 
     if not speed >= 0:  # nan neither
-        raise HemislamError(f"`--speed {speed:g}` is less than nothing; 1 is real time, 0 as fast as it goes.")
+        raise HemislamError(f"`--speed {speed:g}` is negative; 1 is real time, 0 as fast as possible.")
     params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
     target, beside = parse_address(to), parse_address(imu_to) if imu_to else None
     if "clock" in target.options:
-        raise HemislamError(f"`{to}`: the clock is chosen by who receives: serve --live '…?clock=…'.")
+        raise HemislamError(f"`{to}`: the receiver chooses the clock: serve --live '…?clock=…'.")
     if target.scheme == "foxglove" and beside is not None:
-        raise HemislamError("--imu-to belongs to packets; a Foxglove server sends the IMU's samples too.")
+        raise HemislamError("--imu-to applies to packets only; a Foxglove server sends IMU samples itself.")
     if target.scheme == "rsbpearl" and beside is None:
         beside = parse_address(f"imu-udp://{target.host}")
         typer.echo(f"IMU samples go to imu-udp://{target.host}:{beside.ports[0]}")
     if target.scheme == "foxglove":
-        typer.echo(f"Waiting at {to} for somebody to receive; Ctrl+C ends it.")
+        typer.echo(f"Waiting at {to} for a receiver; Ctrl+C ends it.")
     with tqdm(desc="Playing", unit=" s", leave=False, disable=None, bar_format="{desc}: {n:.1f} s") as bar:
 
         def show(seconds: float) -> None:

@@ -134,7 +134,7 @@ def _read_edits(path: Path) -> "tuple[LoopEdit, ...]":
     except UnicodeDecodeError:
         raise HemislamError(f"{path} is not a text file; save edits of loops in the workbench.") from None
     except OSError as error:
-        raise HemislamError(f"{path} can not be read: {error.strerror}.") from None
+        raise HemislamError(f"{path} cannot be read: {error.strerror}.") from None
 
 
 def free_folder(recording: Path) -> Path:

@@ -10,13 +10,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from app.mapping import truth as errors
 from app.mapping.checkpoints import NEAR
 from app.mapping.feed import Feed, Quiet
 from app.mapping.frames import Frame
 from app.mapping.log import Log
 from app.mapping.saver import Saver
 from app.mapping.session_file import Opened, SavedSession, State, size_of
+from app.mapping.truth import align, distances, interpolated
 from app.sensors.findings import Finding
 from app.slam import engine
 from app.slam.engine import Engine
@@ -344,8 +344,8 @@ class Session:
         if self.truth is None:
             return np.full(self.frame + 1, np.nan)
         ours = self.map_frame.trajectory(self.log.odometry)
-        there = errors.interpolated(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns)
-        return errors.distances(errors.align(there, ours.positions), there, ours.positions)
+        there = interpolated(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns)
+        return distances(align(there, ours.positions), there, ours.positions)
 
     def save(
         self,

@@ -1,4 +1,4 @@
-"""What a session reads and writes: recordings, truth, results; and what becomes of it if they can not be used."""
+"""What a session reads and writes: recordings, truth, results; and what happens if they cannot be used."""
 
 import math
 from pathlib import Path

@@ -26,9 +26,9 @@ def test_it_plays_packets_whether_or_not_anybody_listens() -> None:
     [
         (["--to", "http://x"], "is no live source"),
         (["--to", "imu-udp://127.0.0.1:1"], "Play it out to rsbpearl:// or foxglove://"),
-        (["--to", "rsbpearl://127.0.0.1:1,2?clock=host"], "chosen by who receives"),
-        (["--to", "foxglove://127.0.0.1:1", "--speed", "-1"], "less than nothing"),
-        (["--to", "foxglove://127.0.0.1:1", "--imu-to", "imu-udp://127.0.0.1:1"], "belongs to packets"),
+        (["--to", "rsbpearl://127.0.0.1:1,2?clock=host"], "the receiver chooses the clock"),
+        (["--to", "foxglove://127.0.0.1:1", "--speed", "-1"], "is negative"),
+        (["--to", "foxglove://127.0.0.1:1", "--imu-to", "imu-udp://127.0.0.1:1"], "applies to packets only"),
     ],
 )
 def test_what_cannot_be_is_refused(arguments: list[str], words: str) -> None:
