@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from app.evaluation.evaluate import Plan, Subject, evaluate
-from app.evaluation.truth import read_truth
+from app.evaluation.truth_sources import read_truth
 from app.evaluation.variants import Variant
 from app.slam.params import Params
 
