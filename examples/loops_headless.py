@@ -32,8 +32,7 @@ if accepted:
     after = edited.frame.trajectory(session.log.odometry).positions
     # 0 mm is usual: loops that odometry meets already move nothing (docs/decisions/019)
     moved = np.linalg.norm(after - before, axis=1).max()
-    print(
-        f"{edited.count(Verdict.ACCEPTED)} of {len(accepted)} loops are left; the trajectory moves by up to {1e3 * moved:.2f} mm"
-    )
+    print(f"{edited.count(Verdict.ACCEPTED)} of {len(accepted)} loops are left")
+    print(f"the trajectory moves by up to {1e3 * moved:.2f} mm")
     print(f"the graph has {sum(line.startswith('EDGE') for line in edited.g2o.splitlines())} factors")
 session.close()
