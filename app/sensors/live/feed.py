@@ -216,7 +216,7 @@ def _ahead(items: Iterator[Sent], stop: threading.Event) -> Iterator[Sent]:
 def _paced(items: Iterator[Sent], pace: Pace) -> Iterator[Sent]:
     """Each item at its time. Late ones at once, so that a delay does not slow down all that follows."""
     begin: tuple[float, int] | None = None
-    told = -1.0
+    reported = -1.0
     for item in items:
         if pace.stop.is_set():
             return
@@ -227,8 +227,8 @@ def _paced(items: Iterator[Sent], pace: Pace) -> Iterator[Sent]:
         ahead = begin[0] + played / pace.speed - now
         if ahead > 0.0005 and pace.stop.wait(ahead):
             return
-        if played - told > 0.5:
-            told = played
+        if played - reported > 0.5:
+            reported = played
             pace.progress(played)
         yield item
 

@@ -24,7 +24,7 @@ _Imu = tuple[int, Vector, Vector, int]
 
 
 def further(path: Path) -> Path:
-    """The next free name after `path`, where a recording continues: `walk-2.mcap` after `walk.mcap`."""
+    """The next free name after `path`, where a recording continues: `session-2.mcap` after `session.mcap`."""
     names = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
     return next(name for name in names if not name.exists())
 

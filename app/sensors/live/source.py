@@ -3,7 +3,6 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,7 +10,7 @@ from app.sensors.live.counters import Counters
 from app.sensors.live.intake import Intake, LiveImu, Receive, Settled
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Kind, LiveState, Status
-from app.sensors.sequencer import Counts, Sequencer
+from app.sensors.sequencer import Sequencer
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
@@ -85,13 +84,6 @@ class LiveSource:
             if not self._events and remaining <= 0:
                 return None
 
-    def events(self) -> Iterator[Event]:
-        """All events until `close`; waits for them."""
-        while not self._stop.is_set():
-            event = self.poll(0.25)
-            if event is not None:
-                yield event
-
     def state(self) -> LiveState:
         """How the source is doing now."""
         recorded = None if self._recorder is None else self._recorded_before + self._recorder.bytes_written
@@ -111,10 +103,6 @@ class LiveSource:
     def set_absent(self, absent: bool) -> None:
         """Say whether the engine that polls is away but will be back: then more scans may wait."""
         self._intake.set_absent(absent)
-
-    @property
-    def pairing(self) -> Counts:
-        return self._sequencer.counts
 
     def close(self) -> None:
         self._stop.set()
