@@ -60,10 +60,7 @@ def settle_cloud(
     else:
         time_findings.append(_rotation_finding(clouds[-1], probes[-1].column(timing.field), timing))
     layout = CloudLayout(
-        time_field=timing.field,
-        unit_ns=timing.unit_ns,
-        anchor=timing.anchor,
-        shift_ns=timing.shift_ns,
+        timing=timing,
         rings=rings,
         spin=spin,
         intensity_field=next((names[name] for name in kind.intensities if name in names), None),

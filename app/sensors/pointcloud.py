@@ -4,7 +4,7 @@
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,7 @@ from app.sensors.azimuth import Spin
 from app.sensors.cloud_types import POINT_CLOUD_2, CloudError, CloudMessage, CloudType, valid_points
 from app.sensors.rings import Rings
 from app.sensors.ros import stamp_ns
+from app.sensors.timing import Timing
 from app.slam.types import I64, DroppedScan, Scan
 
 
@@ -21,20 +22,13 @@ class CloudLayout:
     """How every cloud of one topic is read.
 
     Attributes:
-        time_field: per-point time; None: derived from the azimuth by `spin`.
-        unit_ns: nanoseconds in one unit of it.
-        anchor: "absolute": it is Unix time. "header": it counts from the header stamp plus
-            `shift_ns`. "first"/"last": it counts from an unknown moment (the sensor's own clock), and
-            the scan's earliest/latest point is at the header stamp.
-        rings: where the ring comes from. spin: rotation, for clouds without time.
+        timing: where the points' times come from. rings: where the ring comes from.
+        spin: rotation, for clouds without times.
         intensity_field, ground_field: None if there is none.
         kind: type of the messages. stamped: False if headers carry no time, and log times stand for it.
     """
 
-    time_field: str | None
-    unit_ns: int
-    anchor: Literal["absolute", "header", "first", "last"]
-    shift_ns: int
+    timing: Timing
     rings: Rings
     spin: Spin | None = None
     intensity_field: str | None = None
@@ -62,7 +56,8 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
     Raises:
         CloudError: no valid point is left, a field is missing, or the times make no scan.
     """
-    time = cloud.column(layout.time_field) if layout.time_field is not None else None
+    timing = layout.timing
+    time = cloud.column(timing.field) if timing.field is not None else None
     points, index = valid_points(cloud.xyz(), time)
     if not len(points):
         raise CloudError(_nothing_left(cloud))
@@ -75,15 +70,15 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
         assert layout.spin is not None
         base_ns, times_ns = 0, layout.spin.times_ns(points, ring)
     else:
-        base_ns, times_ns = exact_ns(kept(time), layout.unit_ns)
+        base_ns, times_ns = exact_ns(kept(time), timing.unit_ns)
     earliest, latest = int(times_ns.min()), int(times_ns.max())
     if latest - earliest > np.iinfo(np.int32).max:
         raise CloudError("its points are more than 2 s apart, which is no single scan")
-    match layout.anchor:
+    match timing.anchor:
         case "absolute":
             begin_ns = base_ns + earliest
         case "header":
-            begin_ns = cloud.stamp_ns + layout.shift_ns + base_ns + earliest
+            begin_ns = cloud.stamp_ns + timing.shift_ns + base_ns + earliest
         case "first":
             begin_ns = cloud.stamp_ns
         case "last":

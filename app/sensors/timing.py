@@ -23,9 +23,13 @@ End = Literal["first", "last"]
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """The decision, as `CloudLayout` wants it. field: None if the time is derived from the azimuth.
+    """Where the points' times come from.
 
     Attributes:
+        field: per-point time; None: derived from the azimuth. unit_ns: nanoseconds in one unit of it.
+        anchor: "absolute": it is Unix time. "header": it counts from the header stamp plus `shift_ns`.
+            "first"/"last": it counts from an unknown moment (the sensor's own clock), and the scan's
+            earliest/latest point is at the header stamp.
         period_ns: between scans.
     """
 

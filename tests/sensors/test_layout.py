@@ -103,7 +103,7 @@ def test_absolute_time_in_a_float32_is_refused_and_derived_from_the_azimuth() ->
     layout = rig.Layout([*XYZ, RING, ("timestamp", "f4", "time")])
     probes = clouds(layout)
     settled, findings = settle(probes)
-    assert settled.time_field is None
+    assert settled.timing.field is None
     assert "float32" in findings["point time"].text
     assert time_error_ns(probes[0], settled) < 8 * FIRING_NS  # one column
 
@@ -116,7 +116,7 @@ def test_a_time_field_that_is_all_zero_is_not_believed() -> None:
         message = rig.message(made, rig.Layout([*XYZ, RING, ("time", "f4", "nothing")]))
         probes.append(Probe(made.begin_ns + rig.PERIOD_NS + 3_000_000, read_point_cloud_2(message)))
     settled, findings = settle(probes)
-    assert settled.time_field is None
+    assert settled.timing.field is None
     assert "the same for all points" in findings["point time"].text
 
 
