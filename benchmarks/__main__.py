@@ -1,4 +1,4 @@
-"""Run the benchmarks by name, or all: `python -m benchmarks frame`; some on a recording: `... seek walk.mcap`."""
+"""Run benchmarks by name, or all of them: `python -m benchmarks frame`. Some take a recording: `... seek walk.mcap`."""
 
 import os
 import sys
@@ -32,7 +32,7 @@ def main() -> None:
         sys.exit(f"There is no benchmark {unknown[0]}; choose from {', '.join(BENCHMARKS)}.")
     busy = os.getloadavg()[0]
     if busy > 0.5:
-        print(f"Other programs keep this machine busy (load {busy:.1f} on {os.cpu_count()} cores); times mislead.")
+        print(f"Other programs use this machine (load {busy:.1f} on {os.cpu_count()} cores); the times are too long.")
     for name in names:
         show(ON_A_RECORDING[name](recording) if name in ON_A_RECORDING else BENCHMARKS[name]())
 

@@ -1,8 +1,8 @@
-"""Peers from PyPI on the same recording, in the same minute: KISS-ICP, RKO-LIO; Patchwork++ for the ground alone.
+"""Compare with peers from PyPI on the same recording: KISS-ICP and RKO-LIO, and Patchwork++ for the ground alone.
 
-`make bench-peers` installs them into build/peers, which comes last on the path, and runs this. Each
-gets the same scans, its own defaults, and the sensor's true mounting; where a peer may date its pose
-to the start, middle or end of a scan, the date that suits it best is taken.
+`make bench-peers` installs them into build/peers, which comes last on the path, and runs this. Each gets the same
+scans, its own defaults, and the true mounting of the sensor. A peer's pose may belong to the start, the middle or the
+end of a scan; the one with the smallest error is used.
 """
 
 import argparse
@@ -47,7 +47,7 @@ def run(paths: list[Path], preset: str | None = None, duration_s: float | None =
 
 
 def _odometry(path: Path, params: Params, duration_s: float | None) -> list[Line]:
-    """Time a frame of each, on the clock and on all cores together, and both and the error over ours."""
+    """Wall time and CPU time per frame and the error of each system, and their ratios to ours."""
     T_imu_lidar = _mounting(params)
     truth_path = truth_beside(path)
     truth = read_truth(str(truth_path)) if truth_path else None
@@ -55,8 +55,8 @@ def _odometry(path: Path, params: Params, duration_s: float | None) -> list[Line
     ours: tuple[float, float, float] | None = None
     for name, make in (("hemislam", _hemislam), ("rko_lio", _rko_lio), ("kiss-icp", _kiss_icp)):
         times, cpu_times, poses, dates = _play(path, params, duration_s, name, make(params, T_imu_lidar))
-        lines.append(Line.of(f"{name}, time a frame", on, "ms", times))
-        lines.append(Line.of(f"{name}, CPU time a frame", on, "ms", cpu_times))
+        lines.append(Line.of(f"{name}, time per frame", on, "ms", times))
+        lines.append(Line.of(f"{name}, CPU time per frame", on, "ms", cpu_times))
         error = float("nan")
         if truth is not None:
             error = min(_error(poses @ lie.inverse(T_imu_lidar), stamps, truth) for stamps in dates)
@@ -72,7 +72,7 @@ def _odometry(path: Path, params: Params, duration_s: float | None) -> list[Line
 def _play(
     path: Path, params: Params, duration_s: float | None, name: str, step: Step
 ) -> tuple[list[float], list[float], F64, list[Any]]:
-    """Milliseconds, those of all cores, and poses of all scans, and their stamps at start, middle and end."""
+    """Wall ms, CPU ms and pose of each scan, and the stamps of the scans' start, middle and end."""
     times, cpu_times, poses, dates = [], [], [], []
     with open_recording(path, params) as source, tqdm(desc=name, unit=" frames", leave=False, disable=None) as bar:
         for entry in source.measurements(0.0, duration_s):
@@ -89,7 +89,7 @@ def _play(
 
 
 def _error(poses: F64, stamps: Any, truth: Any) -> float:
-    """ATE, m; nan for a peer that got lost so far that nothing can be aligned."""
+    """ATE, m; nan if the peer is so far off that nothing can be aligned."""
     try:
         estimate = Trajectory.from_poses(stamps, poses)
         return ate(estimate, match(truth, estimate).trajectory).position.rmse
@@ -186,9 +186,9 @@ def _ground(path: Path, params: Params, duration_s: float | None) -> list[Line]:
     engine.close()
     on = f"{path.stem}, ground alone"
     return [
-        Line.of("hemislam, time a frame", on, "ms", ours_ms),
+        Line.of("hemislam, time per frame", on, "ms", ours_ms),
         Line.of("hemislam, F1", on, "", [ours.f1]),
-        Line.of("patchwork++, time a frame", on, "ms", theirs_ms),
+        Line.of("patchwork++, time per frame", on, "ms", theirs_ms),
         Line.of("patchwork++, F1", on, "", [theirs.f1]),
         Line.of("patchwork++ over hemislam, time", on, "ratio", [np.median(theirs_ms) / np.median(ours_ms)]),
     ]
