@@ -1,10 +1,9 @@
 """The loop back end: keyframes in, loops and corrected poses out. Synchronous and deterministic.
 
-Two layers. What was FOUND is history: it came with one keyframe after the other, is only ever
-appended, and going back is looking at fewer of them. Over it lie the user's COMMANDS, which belong
-to the present. The graph is a function of both, solved in the order in which keyframes and loops
-came, so that undoing is the same as never having done. A command forgets nothing that was found;
-but keyframes that come after it are looked at with the loops as they count then.
+There are two layers. What was found is history: each keyframe appends to it, and going back means reading less of
+it. The user's edits lie over the history and belong to the present. The graph is a function of both, solved in the
+order in which keyframes and loops came, so undoing an edit is the same as never having made it. An edit removes
+nothing from the history, but later keyframes are looked at with the loops as they count then.
 """
 
 from collections.abc import Iterable, Mapping
@@ -44,9 +43,9 @@ from app.slam.types import F64, Keyframe
 
 
 class LoopBackend:
-    """Finds loops among the keyframes of one walk and straightens their poses (paper 2.4).
+    """Finds loops among the keyframes of one session and corrects their poses (paper 2.4).
 
-    It keeps a thinned cloud of every keyframe on disk; `close` gives that space back.
+    It keeps a thinned cloud of every keyframe on disk until `close`.
     """
 
     def __init__(self) -> None:
@@ -56,18 +55,18 @@ class LoopBackend:
         self._detector = Detector(self._start)
         self._solution = Solution()
         self._found: dict[Pair, LoopEdge] = {}
-        self._by_pair: dict[Pair, LoopEdge] | None = None  # as they count; None: to be laid over again
+        self._by_pair: dict[Pair, LoopEdge] | None = None  # as they count; None: not up to date
         self._finished = False
-        self._idle: set[str] = set()  # commands of which was said that they found nothing
+        self._idle: set[str] = set()  # edits reported to have no effect
         self._notices: list[str] = []
-        self._said: set[str] = set()  # failures of the solver
+        self._said: set[str] = set()  # reported failures of the solver
 
     def __len__(self) -> int:
         return len(self._detector)
 
     @property
     def known(self) -> int:
-        """Keyframes of the history, also those gone back over."""
+        """Keyframes of the history, including those beyond the present one."""
         return len(self._history)
 
     @property
@@ -77,11 +76,11 @@ class LoopBackend:
     def close(self) -> None:
         self._detector.close()
 
-    # --- the walk --------------------------------------------------------------------------------
+    # --- the session -----------------------------------------------------------------------------
     def add(self, keyframe: Keyframe, params: LoopsParams) -> None:
-        """Take the next keyframe; look for loops of the newest one whose surroundings are complete.
+        """Take the next keyframe, and look for loops of the newest one whose surroundings are complete.
 
-        A keyframe of the history, as it was, only goes forth to it. Raises HemislamError if it is not the next.
+        If the history has the same keyframe next, nothing is computed again. Raises HemislamError if one is missing.
         """
         if keyframe.index != len(self):
             raise HemislamError(f"Keyframe {keyframe.index} cannot follow on {len(self)} keyframes; one is missing.")
@@ -105,7 +104,7 @@ class LoopBackend:
         self._reach(self.known)
 
     def finish(self) -> None:
-        """The walk ends here: look for loops of the last keyframes too. The next step of the walk takes it back."""
+        """The session ends here: look for loops of the last keyframes too. `add` and `go_to` take that back."""
         if self._finished or not len(self):
             return
         count, params = len(self), self._history[len(self) - 1].params
@@ -119,7 +118,7 @@ class LoopBackend:
         self._tell_idle()
 
     def go_to(self, count: int) -> None:
-        """Be where it was after `count` keyframes of the history. Raises HemislamError if there are not so many."""
+        """Go to the state after `count` keyframes of the history. Raises HemislamError if it has fewer."""
         if not 0 <= count <= self.known:
             raise HemislamError(f"The loop search knows {self.known} keyframes and cannot go to {count}.")
         if self._finished or not len(self) <= count <= len(self) + 1:
@@ -133,7 +132,7 @@ class LoopBackend:
         self._resolve()
 
     def forget(self) -> None:
-        """Forget the history beyond where it stands."""
+        """Forget the history beyond the present keyframe."""
         count = len(self)
         if count == self.known:
             return
@@ -143,7 +142,7 @@ class LoopBackend:
         self._stand(count)
 
     def stand(self, target: Target) -> None:
-        """Be in the state that is asked for. Raises as `load`, and then nothing has changed."""
+        """Go to a state. Raises as `load`, and then nothing has changed."""
         self.load(target.edits)
         count = min(target.count, self.known)
         if (count, target.finished) != (len(self), self._finished):
@@ -152,7 +151,7 @@ class LoopBackend:
                 self.finish()
 
     def _reach(self, reached: int) -> None:
-        """The walk has come so far: commands that were given here the last time act from now on."""
+        """The session has come this far: edits that were made here act from now on."""
         if self._edits.reach(reached):
             self._solve()
         self._resolve()
@@ -162,19 +161,19 @@ class LoopBackend:
         self._start, self._detector = params, Detector(params)
 
     def _stand(self, count: int) -> None:
-        """Take from the history what was found with the first `count` keyframes, and solve."""
+        """Read from the history what was found with the first `count` keyframes, and solve."""
         self._detector.stand(count, self._history.contexts(count, finished=self._finished))
         self._found = {edge.pair: edge for edge in self._history.updates(count, finished=self._finished)}
         self._solve()
 
     def _is_known(self, keyframe: Keyframe, params: LoopsParams) -> bool:
-        """Whether this is the next one of the history, looked at with the same parameters."""
+        """Whether the history has this keyframe next, with the same parameters."""
         index = len(self)
         looked = index < self.known and self._history[index].params == params
         return looked and self._detector.head(index).same(Head.of(keyframe))
 
     def _step(self, odometry: Factor | None) -> None:
-        """One more keyframe in the graph."""
+        """Add the next keyframe to the graph."""
         self._detector.go_on()
         self._by_pair = None
         if odometry is None:
@@ -183,7 +182,7 @@ class LoopBackend:
             self._solution.extend(odometry)
 
     def _learn(self, found: Found) -> None:
-        """What was found with the newest keyframe takes effect."""
+        """Put into effect what was found with the newest keyframe."""
         self._found.update((edge.pair, edge) for edge in found.updates)
         self._by_pair, newest = None, len(self) - 1
         decided = [edge for edge in self.edges if edge.decided_at == newest]
@@ -193,11 +192,11 @@ class LoopBackend:
             self._by_pair = None
 
     def _look(self, first: int, end: int, params: LoopsParams) -> Found:
-        """Look for loops of the keyframes from `first` to before `end`; the graph stays as it is."""
+        """Look for loops of the keyframes `first` to `end` - 1, without changing the graph."""
         keyframes = range(first, max(end, 0))
         return search(self._detector, keyframes, self._found, self._edges, self._solution.poses, _drift(params), params)
 
-    # --- what there is ---------------------------------------------------------------------------
+    # --- results --------------------------------------------------------------------------------
     @property
     def poses(self) -> F64:
         """(k, 4, 4) T_map_imu of all keyframes."""
@@ -213,43 +212,43 @@ class LoopBackend:
 
     @property
     def corrections(self) -> F64:
-        """(k, 4, 4) T_map_odom at each keyframe; identity while odometry meets the loops as well as they are known."""
+        """(k, 4, 4) T_map_odom at each keyframe; identity while odometry agrees with the loops."""
         if self._edits.solving or worth_correcting(self.edges, self._detector.poses):
             return self.corrections_of(self.poses)
         return np.tile(np.eye(4), (len(self), 1, 1))
 
     def corrections_of(self, poses: F64) -> F64:
-        """(k, 4, 4) T_map_odom at each keyframe, by these T_map_imu."""
+        """(k, 4, 4) T_map_odom at each keyframe, for these T_map_imu."""
         return poses @ lie.inverse(self._detector.poses)
 
     @property
     def edges(self) -> tuple[LoopEdge, ...]:
-        """All candidates ever, as they count now, by keyframes."""
+        """All candidates as they count now, in the order of their keyframes."""
         return tuple(self.by_pair.values())
 
     @property
     def by_pair(self) -> Mapping[Pair, LoopEdge]:
-        """The same; stays as it is."""
+        """The same, by pair. It is not changed later."""
         if self._by_pair is None:
             self._by_pair = self._edges(self._found)
         return self._by_pair
 
     def take_notices(self) -> tuple[str, ...]:
-        """What went wrong since this was last asked, in sentences."""
+        """What went wrong since the last call, in sentences."""
         notices, self._notices = self._notices, []
         return (*self._solution.take_notices(), *notices)
 
     def factor_residuals(self) -> tuple[FactorResidual, ...]:
-        """Of every factor of the graph, odometry first."""
+        """The residual of every factor of the graph, odometry first."""
         return inspection.residuals(self._factors(self.edges), self.poses)
 
     def detail(self, older: int, newer: int) -> LoopDetail:
-        """What the inspector shows of two keyframes. Raises HemislamError if there are none such."""
+        """What the inspector shows of two keyframes. Raises HemislamError if one does not exist."""
         self._check_there(older, newer)
         edge = self.by_pair.get((older, newer))
         measured = None if edge is None else edge.T_older_newer
         counts = edge is not None and edge.verdict is Verdict.ACCEPTED
-        poses = self._detector.poses if counts else self.poses  # the graph has obeyed it already
+        poses = self._detector.poses if counts else self.poses  # the graph already includes it
         return inspection.detail(self._detector, older, newer, poses, measured)
 
     def g2o(self) -> str:
@@ -310,7 +309,7 @@ class LoopBackend:
         return Entry(edit, self._made(edit) if isinstance(edit, Add) and there else None)
 
     def _fitting(self, entry: Entry) -> Entry:
-        """The same, unless it ties two places by a registration that found nothing in common."""
+        """The same entry. Raises HemislamError if its registration found nothing in common."""
         edge = entry.added
         if edge is not None and isinstance(entry.edit, Add) and entry.edit.register and not edge.evidence.overlap:
             raise HemislamError(
@@ -330,7 +329,7 @@ class LoopBackend:
         return np.asarray(lie.inverse(poses[older]) @ poses[newer])
 
     def _resolve(self) -> None:
-        """Make the loops by hand that waited for keyframes."""
+        """Make the loops by hand whose keyframes now exist."""
         count = len(self)
         complete = count if self._finished else count - self._start.submap_keyframes
         if self._edits.resolve(count, complete, self._made):
@@ -358,7 +357,7 @@ class LoopBackend:
         return edges
 
     def _solve(self) -> None:
-        """Solve again, in the order in which keyframes and loops came."""
+        """Solve the graph again, in the order in which keyframes and loops came."""
         self._by_pair = None
         if not len(self):
             self._solution.clear()

@@ -1,10 +1,9 @@
-"""Odometry from keyframe to keyframe: any stretch of it as one measurement, and the poses within a stretch.
+"""Odometry from keyframe to keyframe: any stretch as one measurement, and the poses within a stretch.
 
-A pose that no loop ties says nothing of its own. It can be left out of a graph without loss if the odometry
-through it is one factor, and once the poses at the ends of a stretch are known, the most likely poses between
-them follow in closed form: what odometry misses the other end by is shared out as the covariances of its steps
-have it (a Gaussian conditioned on the end of a random walk; errors are right perturbations, carried by the
-adjoint, Barfoot 2017).
+A pose that no loop ties can be left out of the graph without loss, if the odometry across it is one factor. Once the
+poses at the ends of a stretch are known, the most likely poses between them follow in closed form: the error at the
+far end is distributed over the steps by their covariances (a Gaussian random walk conditioned on its end; errors are
+right perturbations, carried by the adjoint, Barfoot 2017).
 """
 
 import numpy as np

@@ -1,11 +1,12 @@
 """From a keyframe to candidates with evidence: place recognition and registration.
 
-A keyframe is looked at once the keyframes after it that belong to its submap have come: what lies
-on either side of it is then as dense as at the older ones it is compared with.
+A keyframe is looked at once all keyframes of its submap have come, so that its surroundings are as dense as those of
+the older ones it is compared with.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -15,17 +16,17 @@ from app.slam import lie
 from app.slam.loops import scan_context, verification
 from app.slam.loops.drift import Expectation
 from app.slam.loops.scan_context import ScanContext
-from app.slam.loops.submap import Recent, Submap, Submaps
+from app.slam.loops.submap import Submap, Submaps
 from app.slam.loops.verification import Fit, Prepared
 from app.slam.params import LoopsParams
 from app.slam.types import F64, I64, Keyframe
 
 NEAR_M = 3.0
-"""Beyond the reach of drift, places this far apart still see each other."""
+"""Added to the reach of drift: places this far apart still see each other."""
 KEPT_PREPARED = 2
-"""Submaps ready for registration that stay in memory, 1 to 2 MB each: the newer one, and an older one at a time."""
+"""Submaps that stay in memory, ready for registration: the newer one, and one older one at a time."""
 KEPT_SUBMAPS = 1
-"""Others; that of a keyframe that is described is needed once more."""
+"""Submaps that stay in memory otherwise: the one just described is needed again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +66,10 @@ class Head:
 
 
 class Detector:
-    """Describes keyframes and compares them. What it answers follows from the keyframes it stands at alone.
+    """Describes and compares the first `len` keyframes of those it was given.
 
     Args:
-        params: those that act on restart are read here; others are given where they are used.
+        params: only those that act on restart are read here.
 
     Attributes:
         half: keyframes on either side of one that make its submap with it.
@@ -77,10 +78,8 @@ class Detector:
     def __init__(self, params: LoopsParams) -> None:
         self.half = params.submap_keyframes
         self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS)
-        self._around: Recent[tuple[int, int], Submap] = Recent(KEPT_SUBMAPS, self._make)
-        self._prepared: Recent[tuple[int, int], Prepared] = Recent(
-            KEPT_PREPARED, lambda key: verification.prepare(self._around[key])
-        )
+        self._around = lru_cache(KEPT_SUBMAPS)(self._make)
+        self._prepared = lru_cache(KEPT_PREPARED)(lambda *key: verification.prepare(self._around(*key)))
         self._heads: list[Head] = []
         self._poses = np.empty((0, 4, 4))
         self._stamps = np.empty(0, np.int64)
@@ -95,7 +94,7 @@ class Detector:
         return len(self._contexts)
 
     def head(self, index: int) -> Head:
-        """Of any keyframe that was taken, there or beyond."""
+        """Of any keyframe that was taken, also beyond the present one."""
         return self._heads[index]
 
     @property
@@ -104,14 +103,14 @@ class Detector:
         return self._poses[: len(self)]
 
     def take(self, keyframe: Keyframe) -> None:
-        """Store a keyframe that was never there before, with its cloud; `go_on` and `stand` go to it."""
+        """Store a new keyframe with its cloud; `go_on` and `stand` go to it."""
         self._heads.append(Head.of(keyframe))
         self._poses = np.concatenate([self._poses, keyframe.T_odom_imu[None]])
         self._stamps = np.append(self._stamps, keyframe.stamp_ns)
         self._submaps.append(keyframe)
 
     def stand(self, count: int, contexts: Sequence[ScanContext]) -> None:
-        """Be where the first `count` keyframes of those that were taken, and these contexts, are all there are."""
+        """Go to the first `count` keyframes that were taken, with these contexts."""
         self._count, self._contexts = count, list(contexts)
         self._keys = [context.ring_key for context in contexts]
 
@@ -120,31 +119,31 @@ class Detector:
         self._count += 1
 
     def learn(self, contexts: Iterable[ScanContext]) -> None:
-        """The contexts of the next keyframes that have none, as they were described before."""
+        """Take the contexts of the next keyframes that have none."""
         for context in contexts:
             self._contexts.append(context)
             self._keys.append(context.ring_key)
 
     def forget(self) -> None:
-        """Forget the keyframes beyond where it stands."""
+        """Forget the keyframes beyond the present one."""
         del self._heads[len(self) :]
         self._poses, self._stamps = self._poses[: len(self)], self._stamps[: len(self)]
         self._submaps.truncate(len(self))
-        self._around.clear()
-        self._prepared.clear()
+        self._around.cache_clear()
+        self._prepared.cache_clear()
 
     def close(self) -> None:
         self._submaps.close()
 
     def describe(self, index: int) -> ScanContext:
-        """The context of a keyframe, from the keyframes around it that there are."""
-        return scan_context.describe(self._around[index, self._last(index)].points)
+        """The context of a keyframe, from the keyframes around it."""
+        return scan_context.describe(self._around(index, self._last(index)).points)
 
     def context(self, index: int) -> ScanContext:
         return self._contexts[index] if index < self.described else self.describe(index)
 
     def submap(self, index: int) -> Prepared:
-        return self._prepared[index, self._last(index)]
+        return self._prepared(index, self._last(index))
 
     def T_level_imu(self, index: int) -> F64:
         """(4, 4) from a keyframe's IMU frame to its level frame: a rotation."""
@@ -185,12 +184,12 @@ class Detector:
         return verification.slide(*self._both(older, newer), fit)
 
     def _both(self, older: int, newer: int) -> tuple[Prepared, Prepared]:
-        """Their submaps; the newer's is made first: it was described just now, and is compared with others next."""
+        """Their submaps; the newer one first, since it is needed again next."""
         source = self.submap(newer)
         return self.submap(older), source
 
     def _eligible(self, newer: int, expectation: Expectation, params: LoopsParams) -> I64:
-        """Keyframes left long enough ago, as near as drift may have brought them."""
+        """Keyframes old enough and within the reach of drift."""
         stamps = self._stamps
         old = np.flatnonzero(stamps[: self.described] <= stamps[newer] - round(params.min_time * 1e9))
         away = np.linalg.norm(expectation.poses[old, :3, 3] - expectation.poses[newer, :3, 3], axis=1)
@@ -209,11 +208,10 @@ class Detector:
         return Sighting(older, newer, float(distances[shift]), float(scan_context.YAWS[shift]))
 
     def _last(self, index: int) -> int:
-        """The last keyframe of a submap, of those there are."""
+        """The last keyframe of a submap."""
         return min(len(self) - 1, index + self.half)
 
-    def _make(self, key: tuple[int, int]) -> Submap:
-        index, last = key
+    def _make(self, index: int, last: int) -> Submap:
         return self._submaps.around(index, self.poses, max(0, index - self.half), last)
 
 

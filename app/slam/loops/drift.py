@@ -1,11 +1,9 @@
 """How far odometry may have drifted between two keyframes, and whether measured loops agree with it.
 
-The filter's covariance is of no use for this: it holds the map for known, so it stays at millimetres
-however long the walk. Drift grows with the way instead. Model: position drifts by a share of the
-way, heading by an angle per metre, both constant along the way (the worst case: nothing averages
-out), the two independent. Gravity holds roll and pitch. The way between two keyframes is the
-shortest one through the graph: accepted loops are short cuts, and what they tied together cannot
-have drifted apart.
+The filter's covariance does not tell: it takes the map as exact, so it stays at millimetres however long the
+trajectory. Drift grows with the distance. Model: position drifts by a share of the distance, heading by an angle per
+metre, both constant (the worst case, as nothing averages out) and independent. Gravity fixes roll and pitch. The
+distance between two keyframes is the shortest one through the graph: accepted loops are short cuts.
 """
 
 from collections.abc import Sequence
@@ -20,13 +18,13 @@ from app.slam.loops.types import LoopEdge
 from app.slam.types import F64
 
 POSITION_M, ROTATION = 0.05, np.radians(0.5)
-"""Standard deviations with no way at all: of registration and of submaps (m; rad about each axis)."""
+"""Standard deviations at distance zero, of registration and of submaps (m; rad about each axis)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drift:
     """Attributes:
-    translation: per distance walked. rotation: rad/m, of the heading. Standard deviations.
+    translation: per distance. rotation: rad/m, of the heading. Standard deviations.
     """
 
     translation: float
@@ -105,11 +103,11 @@ def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift) -> Ex
 
 
 def agree(a: LoopEdge, b: LoopEdge, poses: F64, way: float, drift: Drift) -> bool:
-    """Whether two loops tell the same story: round from older to older by both is no way at all.
+    """Whether two loops agree: going round by both leads back to the start, within drift.
 
     Args:
         poses: (k, 4, 4) by odometry, which is exact enough between ends that are near each other.
-        way: m, walked between the older ends and between the newer ends together.
+        way: m along the trajectory between the older ends, plus between the newer ends.
     """
     older = lie.inverse(poses[a.older]) @ poses[b.older]
     newer = lie.inverse(poses[a.newer]) @ poses[b.newer]

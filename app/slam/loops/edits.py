@@ -163,11 +163,10 @@ def check(edit: LoopEdit) -> None:
     if isinstance(edit, SetWeight) and not (np.isfinite(edit.weight) and edit.weight > 0):
         raise HemislamError(f"A loop's weight cannot be {edit.weight:g}; it must be greater than 0.")
     if isinstance(edit, Add) and edit.guess is not None:
-        lengths = {len(row) for row in edit.guess}
-        if len(edit.guess) != 4 or lengths != {4} or not np.isfinite(edit.guess).all():
+        if [len(row) for row in edit.guess] != [4] * 4 or not np.isfinite(edit.guess).all():
             raise HemislamError("The guess of a loop must be a 4x4 matrix T_older_newer of finite numbers.")
         if not _is_rigid(np.array(edit.guess)):
-            raise HemislamError("The guess of a loop must be a rotation and a position: a rigid 4x4 T_older_newer.")
+            raise HemislamError("The guess of a loop must be a rigid 4x4 transform: a rotation and a position.")
 
 
 def _is_rigid(T: F64) -> bool:

@@ -73,16 +73,15 @@ def between(
 STILL_M, STILL_RAD = 0.001, np.radians(0.02)
 """Standard deviations of a step, however short."""
 EVEN_M = 1.0
-"""Distance over which drift goes on in one direction; a way L drifts by drift * sqrt(L * EVEN_M)."""
+"""m over which drift keeps its direction: over a distance L it grows to drift * sqrt(L * EVEN_M)."""
 
 
 def odometry_factor(second: int, before: Head, after: Head, drift: Drift) -> Factor:
     """From one keyframe to the next.
 
-    The filter gives the covariance of each pose in its map, not of the step between them, and holds
-    the map for known. So: the covariances of both poses add up (as if they were independent, which
-    is more than there is), and drift is added as a random walk: even over some metres, independent
-    between them.
+    The filter gives the covariance of each pose in its map, which it takes as exact, not that of the step between them.
+    So the covariances of both poses are added, as if they were independent (an upper bound), and drift is added as a
+    random walk: constant over `EVEN_M`, independent beyond.
     """
     T = lie.inverse(before.T_odom_imu) @ after.T_odom_imu
     walked = float(np.linalg.norm(T[:3, 3]))

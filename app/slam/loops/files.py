@@ -14,14 +14,14 @@ from app.slam.types import I64
 COLUMNS = (
     "older", "newer", "older_stamp_s", "newer_stamp_s", "verdict", "origin", "edited", "weight",
     "represented_by", "repeats", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw",
-    "context_distance", "overlap", "residual_m", "slide_m", "rival_m", "mahalanobis_sigma", "gate_m", "support",
+    "context_distance", "overlap", "residual_m", "slide_m", "alternative_m", "mahalanobis_sigma", "gate_m", "support",
     "reason",
 )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class LoopResults:
-    """What loops made of a walk.
+    """What loops made of a session.
 
     Attributes:
         frame: where odometry lies in the map. stamps_ns: (k,) of keyframes.
@@ -38,7 +38,7 @@ class LoopResults:
 
 
 def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
-    """One line a candidate; the pose is T_older_newer of the IMU frames, numbers not looked at are empty.
+    """One line a candidate; the pose is T_older_newer of the IMU frames, numbers that were not measured are empty.
 
     Args:
         stamps_ns: (k,) of keyframes.
@@ -49,7 +49,7 @@ def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
     for edge in edges:
         T, e = edge.T_older_newer, edge.evidence
         pose = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
-        measures = (e.context_distance, e.overlap, e.residual_rms, e.slide, e.rival_m, e.mahalanobis, e.gate_m)
+        measures = (e.context_distance, e.overlap, e.residual_rms, e.slide, e.alternative_m, e.mahalanobis, e.gate_m)
         writer.writerow(
             [
                 edge.older,

@@ -1,8 +1,7 @@
 """The factor graph of keyframe poses (paper 2.4, eq. 8). The only place where gtsam is used.
 
-Everything that is done to the graph is kept in a list of our own. Taking a factor out, and getting
-over an exception (after which gtsam's solver stays broken), is doing the rest of the list again:
-the poses are a function of the list alone, to the last bit.
+A list keeps every step that was done to the graph. To take a factor out, or to recover from an exception (after which
+gtsam's solver stays broken), the rest of the list is done again. The poses are a function of the list, to the last bit.
 
 A pose is T_map_imu of a keyframe; its error is a right perturbation, rotation then translation.
 """
@@ -28,7 +27,7 @@ from app.slam.types import F64, KeyframeId
 RELINEARISE = 0.05
 """Change of a pose (rad, m) from which its factors are linearised again."""
 MOST_UPDATES = 5
-"""After a loop the update is repeated while the newest pose moves more than that, at most so often."""
+"""After a loop the update is repeated while the newest pose moves more than that, at most this often."""
 SESSION_BITS = 40
 """The lower bits of a key of gtsam hold the index of the keyframe, those above its session."""
 _HELD = 1e-6
@@ -63,7 +62,7 @@ class PoseGraph:
         """Add the next pose by its odometry factor.
 
         Returns:
-            The factor if the solver failed with it; in its place there is one that says little.
+            The factor if the solver failed with it; one with a large covariance takes its place.
         """
         return self._do(odometry)
 
@@ -72,7 +71,7 @@ class PoseGraph:
         return self._do(tuple(factors)) if factors else ()
 
     def replay(self, steps: Iterable[Step]) -> tuple[Closing, ...]:
-        """Be what these steps make of the first pose. Returns the factors that the solver failed with."""
+        """Start again and do these steps. Returns the factors that the solver failed with."""
         self._reset()
         return tuple(failed for step in steps for failed in self._do(step))
 
@@ -126,7 +125,7 @@ def g2o_text(poses: F64, factors: Sequence[Factor]) -> str:
     """Poses (n, 4, 4) and factors as the text of a g2o file."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for factor in factors:
-        graph.add(_gtsam(replace(factor, robust=False)))  # g2o has no word for a robust loss
+        graph.add(_gtsam(replace(factor, robust=False)))  # the g2o format has no robust loss
     for key, pose in enumerate(poses):
         values.insert(key, gtsam.Pose3(pose))
     with tempfile.TemporaryDirectory(prefix="hemislam-") as folder:  # gtsam writes files only
@@ -136,10 +135,10 @@ def g2o_text(poses: F64, factors: Sequence[Factor]) -> str:
 
 
 class _All:
-    """Every pose is solved for. The solver has those that loops tie, with the odometry between them as one factor.
+    """Every pose is solved for. The solver holds the poses that loops tie; odometry between two of them is one factor.
 
-    All others follow from these (`Chain`), so what the solver takes and costs grows with loops, not with the walk.
-    Loops between the same two poses are one factor too, their mean.
+    All other poses follow from these (`Chain`), so the cost grows with the loops, not with the length of the session.
+    Loops between the same two poses are also one factor, their mean.
 
     Attributes:
         count: of poses. newest: (4, 4), the last of them.
@@ -149,7 +148,7 @@ class _All:
         self.count, self.newest = 1, first
         self._isam = gtsam.ISAM2(_params())
         self._isam.update(*_start(first))
-        self._factors = 1  # that the solver ever got
+        self._factors = 1  # ever given to the solver
         self._chain = Chain(first)
         self._tied = [0]
         self._odometry: dict[tuple[int, int], int] = {}  # number of the factor between two of these
@@ -158,7 +157,7 @@ class _All:
         self._ahead: list[F64] = []  # the poses after those
 
     def update(self, step: Step) -> None:
-        """Raises what gtsam raises, IndexError, ValueError and ArithmeticError; it is of no use then."""
+        """Raises what gtsam raises, IndexError, ValueError and ArithmeticError; the solver is broken then."""
         if isinstance(step, Factor):
             if not np.isfinite(np.linalg.cholesky(step.covariance)).all():
                 raise ArithmeticError("a covariance is not finite")  # or the next loop would fail, and be blamed
@@ -195,7 +194,7 @@ class _All:
             before, after = self._tied[at - 1], self._tied[at : at + 1]
             self._tied.insert(at, key)
             added[before, key] = None
-            for end in after:  # odometry from `before` to there is two factors now
+            for end in after:  # odometry from `before` to `end` becomes two factors
                 added[key, end] = None
                 if (before, end) in added:
                     del added[before, end]
@@ -233,7 +232,7 @@ class _All:
 
 
 class _Mean:
-    """Loops between the same two poses, robust, as one: their squares add up to that of the mean, but for a constant.
+    """Loops between the same two poses as one factor: their squared errors add up to that of the mean, plus a constant.
 
     Attributes:
         factor: their mean, each by its information. times: how many they are. number: the solver's.
@@ -255,7 +254,7 @@ class _Mean:
 
 
 class _Window:
-    """Only the newest poses are solved for; the rest is marginalised (the paper's fixed number of nodes)."""
+    """Only the newest poses are solved for; older ones are marginalised (the paper's fixed number of nodes)."""
 
     def __init__(self, first: F64, size: int) -> None:
         self.count, self.newest = 1, first
@@ -332,7 +331,7 @@ def _params() -> gtsam.ISAM2Params:
 
 
 def _noise(factor: Factor, times: int = 1) -> gtsam.noiseModel.Base:
-    """times: of how many it is the mean; equally sure ones pull together as far as each by itself."""
+    """times: how many loops it is the mean of. Huber's limit grows so that they pull as far as each would alone."""
     noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
     if not factor.robust:
         return noise

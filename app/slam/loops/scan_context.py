@@ -1,12 +1,11 @@
 """Scan Context (Kim and Kim, IROS 2018): a place as rings times sectors around it.
 
-Differences from the paper, for a scanner that sees a hemisphere and walks indoors too:
+Differences from the paper, for a scanner that sees a hemisphere, also indoors:
 - A cell holds how many height bins are occupied, not the greatest height: under a ceiling the
   greatest height is the same everywhere, while walls and furniture still stand out.
 - Cells that were never seen are masked: they count for neither side of the distance.
-- Columns count from odom's x axis, not from the walker's heading: walking back the other way gives
-  the same columns, and the best shift is the heading that odometry has lost. All shifts are
-  compared at once, by circular correlation.
+- Columns count from odom's x axis, not from the heading: going back the other way gives the same columns, and the best
+  shift is the drift of the heading. All shifts are compared at once, by circular correlation.
 """
 
 from dataclasses import dataclass

@@ -196,7 +196,7 @@ class LoopSchedule:
             return False
         return self._shown == self._wanted or not self._asked
 
-    # --- what there is ---------------------------------------------------------------------------
+    # --- results --------------------------------------------------------------------------------
     @property
     def edges(self) -> tuple[LoopEdge, ...]:
         """All candidates in effect."""

@@ -1,4 +1,4 @@
-"""Looking for loops of keyframes: what is recognised is judged, and settled with what was found before."""
+"""Search for loops of keyframes: recognise places, judge each candidate, then compare candidates."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from app.slam.params import LoopsParams
 from app.slam.types import F64
 
 SURE_M = 0.3
-"""Where odometry is surer than this of its position, one place that fits is enough."""
+"""If odometry knows its position better than this (standard deviation), one place that fits is enough."""
 
 Edges = dict[Pair, LoopEdge]
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What looking found: contexts of the next keyframes that had none; candidates, new or changed."""
+    """Result of a search: contexts of the keyframes that had none, and candidates that are new or changed."""
 
     contexts: tuple[ScanContext, ...] = ()
     updates: tuple[LoopEdge, ...] = ()
@@ -35,10 +35,10 @@ def search(
     drift: Drift,
     params: LoopsParams,
 ) -> Found:
-    """Look for loops of some keyframes; all before the last of them are described on the way.
+    """Look for loops of some keyframes; those before the last that lack a context get one.
 
     Args:
-        found: before. counting: how such edges count with the user's commands.
+        found: candidates so far. counting: returns them as they count with the user's edits.
         poses: (k, 4, 4) T_map_imu.
     """
     described, updates, now = detector.described, Edges(), len(detector) - 1

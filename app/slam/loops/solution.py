@@ -1,4 +1,4 @@
-"""The graph as the back end uses it: whatever the solver fails with is left out, remembered, and said once."""
+"""The graph of the back end: factors that the solver fails with are left out and reported once."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -47,14 +47,14 @@ class Solution:
             self._report(self._graph.close(loops))
 
     def solve(self, first: F64, window: int, steps: Iterable[Step]) -> None:
-        """All over again. A failure that was there before is not said again."""
+        """Solve again from the start. A failure that was reported before is not reported again."""
         before = self._failures
         self.begin(first, window)
         if self._graph is not None:
             self._report(self._graph.replay(steps), before)
 
     def take_notices(self) -> list[str]:
-        """What went wrong since this was last asked, in sentences."""
+        """What went wrong since the last call, in sentences."""
         notices, self._notices = self._notices, []
         return notices
 
@@ -75,11 +75,11 @@ class Solution:
 def loop_factors(
     edges: Iterable[LoopEdge], by_pair: Mapping[Pair, LoopEdge], T_odom_imu: F64, *, window: int
 ) -> list[Factor]:
-    """Of those that count.
+    """The factors of the loops that count.
 
     Args:
-        by_pair: all, with those that they repeat. T_odom_imu: (k, 4, 4). window: of the solver. With one, each is
-            between its own keyframes: there are few poses, and those of the loop that it repeats may not be among them.
+        by_pair: all loops, including those that others repeat. T_odom_imu: (k, 4, 4). window: of the solver. With one,
+            each factor is between its own keyframes, as those of the loop that it repeats may have left the window.
     """
     factors = []
     for edge in edges:

@@ -9,10 +9,7 @@ changes, so a submap never has to be made again.
 import os
 import tempfile
 from array import array
-from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -20,12 +17,9 @@ from app.slam.types import F32, F64, I64, Keyframe
 from app.slam.voxel import VoxelGrid
 
 AT_ONCE = 1 << 17
-"""Points of a submap before it is thinned: by default 17 clouds of some thousands."""
+"""Points of a submap before thinning that the buffers hold: by default 17 clouds of some thousands."""
 
 _POINT_BYTES = 12
-
-K = TypeVar("K")
-V = TypeVar("V")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,29 +31,6 @@ class Submap:
     keyframe: int
     points: F32
     eyes: F32
-
-
-class Recent(Generic[K, V]):
-    """The `size` values that were used last; others are made again by `make`."""
-
-    def __init__(self, size: int, make: Callable[[K], V]) -> None:
-        self._size, self._make = size, make
-        self._values: OrderedDict[K, V] = OrderedDict()
-
-    def __getitem__(self, key: K) -> V:
-        if key in self._values:
-            self._values.move_to_end(key)
-        else:
-            self[key] = self._make(key)
-        return self._values[key]
-
-    def __setitem__(self, key: K, value: V) -> None:
-        self._values[key] = value
-        if len(self._values) > self._size:
-            self._values.popitem(last=False)
-
-    def clear(self) -> None:
-        self._values.clear()
 
 
 class Clouds:

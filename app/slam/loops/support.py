@@ -1,7 +1,6 @@
-"""Candidates side by side: which agree, which contradict each other, and which are accepted for it.
+"""Candidates are compared: those that enough others agree with, and few contradict, are accepted.
 
-One registration can be fooled by a place that looks the same; several, at different keyframes,
-that tell the same story are fooled more rarely. Where two stories are told, neither is believed.
+A place that looks the same can fool one registration; it rarely fools several at different keyframes in the same way.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -18,11 +17,11 @@ from app.slam.params import LoopsParams
 from app.slam.types import F64
 
 NEIGHBOURHOOD_M = 15.0
-"""Loops with farther to walk between their ends, on either side, say nothing of each other."""
+"""Loops whose ends are farther apart than this along the trajectory, on either side, are not compared."""
 SAME = 2 * LOOP_HUBER
-"""Standard deviations up to which a loop says what another near it says: by there the graph's loss halves its pull."""
+"""Standard deviations up to which two loops near each other measured the same; there Huber's loss halves the pull."""
 NO_NEWS = 1.0
-"""The same beyond a submap's length. Of six numbers, few errors are as small; covariances of loops are generous."""
+"""The same limit beyond a submap's length. It is strict, as the covariances of loops are generous."""
 
 
 def settle(
@@ -33,15 +32,15 @@ def settle(
     params: LoopsParams,
     now: int,
 ) -> list[LoopEdge]:
-    """Verdicts on the candidates seen just now, and on those before that they bear on.
+    """Verdicts on new candidates, and on earlier ones that they support or contradict.
 
     Args:
-        fresh: seen just now, judged each by itself. edges: all, with those, as they count with the
-            user's commands; what the user has decided is not decided here.
+        fresh: new candidates with a verdict on each alone. edges: all, including those, as they count with the
+            user's edits. A candidate that the user decided on is left alone.
         poses: (k, 4, 4) T_odom_imu. now: newest keyframe.
 
     Returns:
-        All of `fresh`, and those before whose verdict changed, without the user's commands.
+        All of `fresh`, and earlier candidates whose verdict changed, without the user's edits.
     """
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
 
@@ -56,7 +55,7 @@ def settle(
         if edge.verdict is not Verdict.CANDIDATE or edge.edited:
             continue
         others = [o for o in near if o.pair != edge.pair and max(ways(edge, o)) < NEIGHBOURHOOD_M]
-        # what is ambiguous agrees with nothing: where a place has twins, all that was seen there may be one's
+        # an ambiguous candidate supports nothing: all that was seen there may belong to a place that looks the same
         verdicts = [not o.evidence.ambiguous and agree(edge, o, poses, sum(ways(edge, o)), drift) for o in others]
         support = len({other.newer for other, yes in zip(others, verdicts, strict=True) if yes} - {edge.newer})
         against = verdicts.count(False)
@@ -75,21 +74,20 @@ def settle(
 
 
 def _ends(edges: Iterable[LoopEdge], walked: F64) -> F64:
-    """(n, 2) m, walked to the older and to the newer keyframe of each."""
+    """(n, 2) m along the trajectory to the older and to the newer keyframe of each."""
     return np.asarray(walked[np.array([edge.pair for edge in edges], np.int64).reshape(-1, 2)])
 
 
 def placed(
     settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], T_odom_imu: F64, T_map_imu: F64, half: int
 ) -> list[LoopEdge]:
-    """The same, those just accepted with the loop that is in the graph for them or that they repeat, if there is one.
+    """The same candidates; accepted ones name the loop that represents them or that they repeat, if there is one.
 
-    A pose costs the solver far more than a measurement between poses that are tied already, so of loops whose submaps
-    share any points and that measured the same, one ties poses and the others are laid on these. Where a place was
-    passed several times before, being tied to one of these times is being tied to all, as they are to each other: what
-    the graph says already, to `SAME` within a submap's length of the last tie or to `NO_NEWS` within two, is not told
-    it again, else it would be the denser the more often one comes by. And submaps of keyframes a quarter of their
-    length apart share three quarters of it: two loops between such neighbours, at both ends, are one measurement.
+    Tying a new pose costs the solver far more than a further measurement between poses that are tied already. So:
+    - Loops whose keyframes are a quarter of a submap apart at both ends share most points: they are one measurement.
+    - Of loops whose submaps share points and that measured the same, one ties poses; the others repeat it.
+    - A loop that the graph already predicts, to `SAME` within a submap's length of the last tie or to `NO_NEWS` within
+      two, is represented by that tie. Otherwise the graph would grow denser with every visit to a place.
 
     Args:
         edges: all, as they count. T_odom_imu, T_map_imu: (k, 4, 4). half: of a submap, in keyframes.
@@ -125,7 +123,7 @@ def _placed(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_m
 
 
 def laid(edge: LoopEdge, first: LoopEdge, T_odom_imu: F64) -> tuple[F64, F64]:
-    """What a loop measured, as one between the keyframes of another near it: T (4, 4), and its covariance (6, 6).
+    """A loop's measurement, transported by odometry to the keyframes of a nearby loop: T (4, 4), covariance (6, 6).
 
     Args:
         T_odom_imu: (k, 4, 4); taken as exact between ends that are near each other.
@@ -138,11 +136,11 @@ def laid(edge: LoopEdge, first: LoopEdge, T_odom_imu: F64) -> tuple[F64, F64]:
 
 
 def _apart(a: LoopEdge, b: LoopEdge) -> int:
-    """Keyframes between them, at the ends that are farther from one another."""
+    """Number of keyframes between two loops, at the ends that are farther apart."""
     return max(abs(a.older - b.older), abs(a.newer - b.newer))
 
 
 def _off(edge: LoopEdge, T_older_newer: F64, covariance: F64 | float = 0.0) -> float:
-    """Standard deviations by which a loop measured something else than that. covariance: (6, 6) of that; 0: exact."""
+    """Standard deviations between a loop's measurement and this one. covariance: (6, 6) of this one; 0 if exact."""
     missed = se3.log(lie.inverse(edge.T_older_newer) @ T_older_newer)
     return float(np.sqrt(missed @ np.linalg.solve(edge.covariance + covariance, missed)))

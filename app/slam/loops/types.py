@@ -45,11 +45,11 @@ class Evidence:
         condition: smallest eigenvalue of the registration's translation information over its
             largest, 0-1; near 0 the two submaps slide along each other.
         slide: m, how far registrations from disturbed starts ended from one another.
-        rival_m: m to the nearest other alignment that fits as well and that odometry allows too; inf:
+        alternative_m: m to the nearest other alignment that fits as well and that odometry also allows; inf if
             there is none.
         mahalanobis: distance to what odometry predicts, in standard deviations.
         gate_m: m, standard deviation of that prediction's position.
-        support: other candidates nearby that agree.
+        support: number of other candidates nearby that agree.
     """
 
     context_distance: float = float("nan")
@@ -58,14 +58,14 @@ class Evidence:
     residual_rms: float = float("nan")
     condition: float = float("nan")
     slide: float = float("nan")
-    rival_m: float = float("nan")
+    alternative_m: float = float("nan")
     mahalanobis: float = float("nan")
     gate_m: float = float("nan")
     support: int = 0
 
     @property
     def ambiguous(self) -> bool:
-        return self.rival_m < float("inf")
+        return self.alternative_m < float("inf")
 
     @property
     def summary(self) -> str:
@@ -176,12 +176,12 @@ def changed_by(change: LoopChange, before: Iterable[LoopEdge]) -> tuple[LoopEdge
     return tuple(edges[pair] for pair in sorted(edges))
 
 
-# --- the user's commands -------------------------------------------------------------------------
-# `since` of each: how many keyframes the walk had when it was given, one more after its end. The first
-# time round a command acts from there on, so that a session given again goes as it went; 0: from the start.
+# --- the user's edits ----------------------------------------------------------------------------
+# `since` of each: how many keyframes the session had when the edit was made, one more after its end. When a session is
+# repeated, the edit acts from there on; 0: from the start.
 @dataclass(frozen=True, slots=True)
 class Accept:
-    """Make a candidate a factor of the graph, whatever was found against it."""
+    """Make a candidate a factor of the graph, whatever its verdict."""
 
     older: int
     newer: int
@@ -199,7 +199,7 @@ class Reject:
 
 @dataclass(frozen=True, slots=True)
 class SetWeight:
-    """Divide a loop's covariance by `weight` (> 0); 1 is what registration said."""
+    """Divide a loop's covariance by `weight` (> 0); 1 leaves it as registered."""
 
     older: int
     newer: int
@@ -213,7 +213,7 @@ class Add:
 
     Attributes:
         guess: (4, 4) T_older_newer of the IMU frames from which their submaps are registered;
-            None: where the graph has them now. As rows of numbers, so that commands compare.
+            None: as the graph has them now. Rows of numbers, so that edits can be compared.
         register: False takes the guess as it is.
     """
 
@@ -226,9 +226,9 @@ class Add:
 
 @dataclass(frozen=True, slots=True)
 class Solve:
-    """Take the poses from all factors solved at once (Levenberg-Marquardt), from here on.
+    """From here on, take the poses from all factors solved at once (Levenberg-Marquardt).
 
-    They differ from the incremental ones where these only came near the optimum, and with a window.
+    They differ from the incremental ones where those only came near the optimum, and with a window.
     """
 
     since: int = field(default=0, compare=False)
@@ -286,7 +286,7 @@ class FactorResidual:
 
     @property
     def cost(self) -> float:
-        """What it adds to that which the solver minimises: the square of `sigmas`, of a loop by Huber's loss."""
+        """Its share of the cost that the solver minimises: the square of `sigmas`; for a loop, Huber's loss."""
         if not self.loop or self.sigmas <= LOOP_HUBER:
             return self.sigmas**2
         return 2 * LOOP_HUBER * self.sigmas - LOOP_HUBER**2
@@ -302,7 +302,7 @@ class Preview:
 
 @dataclass(frozen=True, slots=True)
 class LoopDetail:
-    """All that the inspector shows of one candidate. Points are level frames: z up, origin at the IMU.
+    """All that the inspector shows of one candidate. Points are in level frames: z up, origin at the IMU.
 
     Attributes:
         older, newer: (n, 3) submap points, each in its own level frame.
@@ -325,13 +325,13 @@ class LoopDetail:
     residuals: F64
 
 
-def pair_of(command: LoopEdit) -> Pair | None:
-    """What a command is for; None: the graph as a whole."""
-    return None if isinstance(command, Solve) else (command.older, command.newer)
+def pair_of(edit: LoopEdit) -> Pair | None:
+    """The pair that an edit names; None: the graph as a whole."""
+    return None if isinstance(edit, Solve) else (edit.older, edit.newer)
 
 
 def rows(T: F64) -> tuple[tuple[float, ...], ...]:
-    """A matrix as a command holds it."""
+    """A matrix as an edit holds it."""
     return tuple(tuple(float(value) for value in row) for row in np.asarray(T))
 
 

@@ -1,4 +1,4 @@
-"""What speaks for and against one candidate, and the verdict on it alone. No two candidates meet here."""
+"""The evidence for one candidate and the verdict on it alone; `support` compares candidates."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -6,25 +6,25 @@ from dataclasses import replace
 import numpy as np
 
 from app.slam import lie
+from app.slam.loops.ambiguity import nearest_alternative
 from app.slam.loops.detection import Detector, Sighting
 from app.slam.loops.drift import Expectation
-from app.slam.loops.rivals import rival
 from app.slam.loops.types import Evidence, LoopEdge, Measured, Origin, Verdict
 from app.slam.loops.verification import Fit
 from app.slam.params import LoopsParams
 from app.slam.types import F64
 
-FARTHEST_RIVAL_M = 10.0
+FARTHEST_M = 10.0
 """Beyond this the submaps no longer overlap enough to fit as well."""
 FLOOR_M, FLOOR_RAD = 0.04, np.radians(0.5)
-"""Standard deviations that no number of points brings a registration below."""
+"""Least standard deviations of a registration, however many points it has."""
 POINT_M, INDEPENDENT = 0.1, 0.05
-"""Standard deviation of a point's distance to a plane with all that is not noise, and the share of
-points whose errors are independent of their neighbours'."""
+"""Standard deviation of a point's distance to a plane, including systematic errors, and the share of points whose
+errors are independent of their neighbours'."""
 
 
 def judge(sighting: Sighting, detector: Detector, expectation: Expectation, params: LoopsParams) -> LoopEdge:
-    """Register a sighting and hold it against the limits: a candidate if it meets them all, else rejected."""
+    """Register a sighting and check it against the limits: a candidate if it meets all, else rejected."""
     older, newer = sighting.older, sighting.newer
     guess = detector.guess(older, newer, expectation.poses)
     sigma = float(expectation.position_sigmas()[older])
@@ -55,7 +55,9 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
         evidence = replace(evidence, slide=detector.slide(older, newer, fit))
         reason = _objection(evidence, fit, params)
     if not reason:
-        evidence = replace(evidence, rival_m=_rival(older, newer, detector, expectation, fit, params))
+        evidence = replace(
+            evidence, alternative_m=_nearest_alternative(older, newer, detector, expectation, fit, params)
+        )
         reason = _objection(evidence, fit, params)
     return edge(T, covariance(detector, newer, fit), evidence, reason)
 
@@ -82,7 +84,7 @@ def covariance(detector: Detector, newer: int, fit: Fit) -> F64:
 
 
 def _objection(e: Evidence, fit: Fit, p: LoopsParams) -> str:
-    """The first limit that is not met, in words and numbers; "" if all are."""
+    """The first limit that is not met, in words and numbers; "" if all are met."""
     if len(fit.residuals) < 100:
         return f"only {len(fit.residuals)} points correspond (least 100)"
     if e.overlap < p.min_overlap:
@@ -96,18 +98,19 @@ def _objection(e: Evidence, fit: Fit, p: LoopsParams) -> str:
     if e.slide > p.max_slide:
         return f"it slides: pushed along its weakest direction it ends {e.slide:.2f} m off (most {p.max_slide:g} m)"
     if e.ambiguous:
-        return f"it is ambiguous: {e.rival_m:.1f} m away it fits as well, and odometry (σ {e.gate_m:.2f} m) allows both"
+        away = f"{e.alternative_m:.1f} m away"
+        return f"it is ambiguous: {away} it fits as well, and odometry (σ {e.gate_m:.2f} m) allows both"
     return ""
 
 
-def _rival(
+def _nearest_alternative(
     older: int, newer: int, detector: Detector, expectation: Expectation, fit: Fit, params: LoopsParams
 ) -> float:
     def allowed(T_level: F64) -> bool:
         return expectation.mahalanobis(older, _imu(detector, older, newer, T_level)) <= params.max_mahalanobis
 
     reach = 2 * params.max_mahalanobis * float(expectation.position_sigmas()[older])
-    return rival(detector.submap(older), detector.submap(newer), fit, min(reach, FARTHEST_RIVAL_M), allowed)
+    return nearest_alternative(detector.submap(older), detector.submap(newer), fit, min(reach, FARTHEST_M), allowed)
 
 
 def _imu(detector: Detector, older: int, newer: int, T_level: F64) -> F64:
@@ -116,11 +119,10 @@ def _imu(detector: Detector, older: int, newer: int, T_level: F64) -> F64:
 
 
 def worth_correcting(edges: Iterable[LoopEdge], poses: F64) -> bool:
-    """Whether the loops that count tell something that odometry does not know already.
+    """Whether the loops that count add information to odometry.
 
-    Where odometry meets all of them within half of what they are uncertain by (2 cm and 0.25 degrees at
-    best, in each direction by its own), following them would only add their noise. The user's word always
-    counts.
+    If odometry agrees with all of them within half their standard deviation (2 cm and 0.25 degrees at best), following
+    them would only add their noise. Edits by the user always count.
 
     Args:
         poses: (k, 4, 4) T_odom_imu of all keyframes.

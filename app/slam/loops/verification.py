@@ -1,9 +1,8 @@
 """Verification: register one submap to another and measure what speaks for the result.
 
-Point to plane, between points whose surroundings are flat in both submaps and face the same way:
-the two sides of a wall or of a door's recess, which a walker sees one each on the way there and on
-the way back, lie nearer to each other than many a wrong guess. small_gicp finds the neighbours, on
-one thread, so that the result is the same every time.
+Point to plane, between points whose surroundings are flat in both submaps and face the same way: the two sides of a
+wall, seen on the way there and on the way back, are often nearer to each other than a guess is wrong. small_gicp finds
+the neighbours, on one thread, so that the result is the same every time.
 """
 
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from app.slam.types import F64, I64
 Flags = npt.NDArray[np.bool_]
 
 ONE_THREAD = 1
-"""Given by place: by name, each call leaves a dead entry in Python's table of strings, which is doubled for them."""
+"""Results must not depend on the order in which threads finish."""
 NEIGHBOURS = 10
 """Points of a patch, to estimate its normal."""
 FLAT_M = 0.04
@@ -32,7 +31,7 @@ PASSES = ((1.2, 0.3, 8), (0.5, 0.08, 12))
 ENOUGH = 2e-4
 """Change (rad, m) that ends a pass."""
 MOST_POINTS, FEW_POINTS = 2500, 800
-"""Points of the source that take part, and of those that do where a rough answer is enough; all are judged."""
+"""Points of the source that take part in a registration, and in a rough one; all points are judged."""
 PARTNER_M = 0.3
 """A point with another within this distance in the other submap has a partner."""
 COMMON_M = 10.0

@@ -27,7 +27,7 @@ def headline(edge: LoopEdge) -> str:
 def evidence(edge: LoopEdge, params: LoopsParams) -> str:
     """The numbers of a loop, green or red by the present limits."""
     e = edge.evidence
-    alone = "none" if np.isinf(e.rival_m) and e.rival_m > 0 else f"{number(e.rival_m, 1)}"
+    alone = "none" if np.isinf(e.alternative_m) and e.alternative_m > 0 else f"{number(e.alternative_m, 1)}"
     tiles = [
         Tile("overlap", number(100 * e.overlap, 0), "%", f"≥ {100 * params.min_overlap:.0f} %",
              _judged(e.overlap, params.min_overlap, least=True)),
@@ -39,7 +39,7 @@ def evidence(edge: LoopEdge, params: LoopsParams) -> str:
              _judged(e.mahalanobis, params.max_mahalanobis)),
         Tile("odometry ±", number(e.gate_m, 2), "m", "1 σ"),
         Tile("support", str(e.support), "", "others agree"),
-        Tile("rival place", alone, "m away" if np.isfinite(e.rival_m) else "", "", BAD if e.ambiguous else ""),
+        Tile("other place", alone, "m away" if np.isfinite(e.alternative_m) else "", "", BAD if e.ambiguous else ""),
         Tile("condition", number(e.condition, 3), "", "0: it slides"),
         Tile("contexts", number(e.context_distance), "", f"≤ {params.context_distance:g}",
              _judged(e.context_distance, params.context_distance)),

@@ -73,4 +73,4 @@ def test_loops_agree_that_go_round_to_nothing() -> None:
     assert agree(a, loop(3, 80, poses, (0.05, 0.05, 0.0)), poses, 2.5, DRIFT)
     assert not agree(a, loop(3, 80, poses, (0.5, 0.0, 0.0)), poses, 2.5, DRIFT)
     both = loop(0, 78, poses, (4.0, 0.0, 0.0)), loop(3, 80, poses, (4.0, 0.0, 0.0))
-    assert agree(*both, poses, 2.5, DRIFT), "two that err alike agree: why rivals are looked for as well"
+    assert agree(*both, poses, 2.5, DRIFT), "two that err alike agree; that is why other places are tried too"

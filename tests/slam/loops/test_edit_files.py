@@ -1,4 +1,4 @@
-"""EditList as a file."""
+"""Loop edits as a file."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from app.slam.loops.types import Accept, Add, LoopEdit, Reject, SetWeight, Solve
 
 
 @st.composite
-def _commands(draw: st.DrawFn) -> LoopEdit:
+def _edits(draw: st.DrawFn) -> LoopEdit:
     older = draw(st.integers(0, 10_000))
     newer = draw(st.integers(older + 1, 20_000))
     weight = draw(st.floats(1e-9, 1e9))
@@ -37,11 +37,11 @@ def _commands(draw: st.DrawFn) -> LoopEdit:
 
 
 @settings(deadline=None)
-@given(st.lists(_commands(), max_size=6))
-def test_what_is_written_is_read_again_to_the_last_digit(commands: list[LoopEdit]) -> None:
-    again = read(write(commands))
-    assert again == tuple(commands)
-    assert [command.since for command in again] == [command.since for command in commands]
+@given(st.lists(_edits(), max_size=6))
+def test_what_is_written_is_read_again_to_the_last_digit(edits: list[LoopEdit]) -> None:
+    again = read(write(edits))
+    assert again == tuple(edits)
+    assert [edit.since for edit in again] == [edit.since for edit in edits]
 
 
 def test_a_list_written_by_hand_is_understood() -> None:
@@ -51,7 +51,7 @@ def test_a_list_written_by_hand_is_understood() -> None:
     assert read(text) == (Accept(12, 340), Reject(3, 40), SetWeight(12, 340, 2.0), Add(5, 300), Solve())
 
 
-def test_an_empty_file_overrules_nothing() -> None:
+def test_an_empty_file_has_no_edits() -> None:
     assert read("") == read("# nothing yet\n") == read(write([])) == ()
 
 
@@ -64,26 +64,26 @@ def test_an_empty_file_overrules_nothing() -> None:
         ("accept: [-1, 1]", "older one first"),
         ("accept: [1, 2, 3]", "two keyframes"),
         ("accept: [1.5, 2]", "two keyframes"),
-        ("{accept: [1, 2], weight: 3}", "weight means nothing to accept"),
+        ("{accept: [1, 2], weight: 3}", "accept has no weight"),
         ("{accept: [1, 2], since: -1}", "number of keyframes"),
         ("weigh: [1, 2]", "weight is None"),
         ("{weigh: [1, 2], weight: 0}", "greater than 0"),
         ("{weigh: [1, 2], weight: .nan}", "greater than 0"),
         ("{add: [1, 2], register: perhaps}", "true or false"),
         ("{add: [1, 2], guess: [[1, 0], [0, 1]]}", "4x4"),
-        ("{add: [1, 2], guess: [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}", "no rigid transform"),
+        ("{add: [1, 2], guess: [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}", "rigid 4x4 transform"),
         ("solve: twice", "at once"),
         ("{solve: at once, accept: [1, 2]}", "solve: at once"),
         ("12", "accept, reject, weigh or add"),
     ],
 )
-def test_an_entry_that_can_not_be_used_is_named(entry: str, what: str) -> None:
+def test_an_entry_that_cannot_be_used_is_named(entry: str, what: str) -> None:
     with pytest.raises(HemislamError) as caught:
         read(f"- accept: [1, 2]\n- {entry}\n", "edits.yaml")
     assert str(caught.value).startswith("edits.yaml, entry 2: ") and what in str(caught.value)
 
 
 @pytest.mark.parametrize("text", ["a: [1", "accept: [1, 2]", "12"])
-def test_what_is_no_list_is_told_with_an_example(text: str) -> None:
+def test_anything_but_a_list_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(HemislamError, match=r"edits\.yaml.*- accept: \[12, 340\]"):
         read(text, "edits.yaml")

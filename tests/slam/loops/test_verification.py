@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from app.slam import lie
-from app.slam.loops.rivals import rival
+from app.slam.loops.ambiguity import nearest_alternative
 from app.slam.loops.submap import Submap
 from app.slam.loops.verification import Prepared, assess, prepare, register, slide
 from app.slam.types import F64
@@ -94,18 +94,18 @@ def test_the_information_is_that_of_small_motions() -> None:
         assert curvature / 2 == pytest.approx(fit.information[3 + axis, 3 + axis], rel=0.3), "partners change a little"
 
 
-def test_where_fins_repeat_there_is_a_rival_one_period_away_unless_odometry_rules_it_out() -> None:
+def test_where_fins_repeat_another_place_one_period_away_fits_unless_odometry_rules_it_out() -> None:
     even = tuple(np.arange(-14.0, 14.0, 4.0))
     target = seen(corridor(np.random.default_rng(0), tuple(np.repeat(even, 2))), np.eye(4))
     source = seen(corridor(np.random.default_rng(1), tuple(np.repeat(even, 2))), np.eye(4))
     fit = assess(target, source, register(target, source, np.eye(4)))
-    assert rival(target, source, fit, 6.0, lambda T: True) == pytest.approx(4.0, abs=0.1)
-    assert rival(target, source, fit, 6.0, lambda T: abs(T[0, 3]) < 3) == np.inf
-    assert rival(target, source, fit, 3.0, lambda T: True) == np.inf
+    assert nearest_alternative(target, source, fit, 6.0, lambda T: True) == pytest.approx(4.0, abs=0.1)
+    assert nearest_alternative(target, source, fit, 6.0, lambda T: abs(T[0, 3]) < 3) == np.inf
+    assert nearest_alternative(target, source, fit, 3.0, lambda T: True) == np.inf
 
 
-def test_where_nothing_repeats_there_is_no_rival() -> None:
+def test_where_nothing_repeats_no_other_place_fits() -> None:
     target = seen(corridor(np.random.default_rng(0), FINS), np.eye(4))
     source = seen(corridor(np.random.default_rng(1), FINS), np.eye(4))
     fit = assess(target, source, register(target, source, np.eye(4)))
-    assert rival(target, source, fit, 6.0, lambda T: True) == np.inf
+    assert nearest_alternative(target, source, fit, 6.0, lambda T: True) == np.inf

@@ -1,8 +1,7 @@
-"""Whether a place would fit as well somewhere else: the guard against corridors and rooms that repeat.
+"""Whether a place would fit as well elsewhere, as in corridors and rooms that repeat.
 
-A registration says that two submaps fit, not that they fit nowhere else. Where odometry leaves more
-than one place open, the newer submap is tried at the others too: at the shifts in plan at which the
-walls of the two coincide best.
+A registration shows that two submaps fit, not that they fit nowhere else. If odometry allows more than one place, the
+newer submap is also tried at the others: at the shifts in plan where the walls of the two coincide best.
 """
 
 from collections.abc import Callable
@@ -14,23 +13,24 @@ from app.slam.loops.verification import Fit, Prepared, assess, register
 from app.slam.types import F64
 
 CELL_M, CELLS = 0.4, 128
-"""Of the plan in which walls are laid over each other; it wraps around, so it is twice as wide as the walls."""
+"""Of the plan in which walls are compared; it wraps around, so it is twice as wide as the walls."""
 WALL = 0.5
 """Most cosine between a wall's normal and the vertical."""
 APART_M = 0.8
-"""Alignments nearer to each other than this are one."""
+"""Alignments nearer to each other than this are the same one."""
 LEAST_OVERLAP, MOST_RESIDUAL, RESIDUAL_M = 0.5, 1.6, 0.002
-"""An alignment fits as well with this share of the overlap and of the points, and at most this many
-times the residual and so many metres more. (Wrong alignments in a place that does not repeat leave
-twice the residual or more; shifted by a room that has a twin, no more than the right one.)"""
+"""An alignment fits as well with at least this share of the overlap and of the points, and at most this many times the
+residual plus so many metres. (In a place that does not repeat, wrong alignments leave twice the residual or more.)"""
 PEAK_CELLS = 5
-"""Walls coincide best at a shift if at none within half as many cells they do better."""
+"""A shift is a candidate if walls coincide no better at any shift within half this many cells."""
 TRIED = 6
 """Shifts from which the newer submap is registered again."""
 
 
-def rival(target: Prepared, source: Prepared, fit: Fit, reach_m: float, allowed: Callable[[F64], bool]) -> float:
-    """m to the nearest other alignment that fits as well and that odometry allows too; inf if there is none.
+def nearest_alternative(
+    target: Prepared, source: Prepared, fit: Fit, reach_m: float, allowed: Callable[[F64], bool]
+) -> float:
+    """m to the nearest other alignment that fits as well and that odometry also allows; inf if there is none.
 
     Args:
         reach_m: how far to look. allowed: whether odometry allows a (4, 4) T_target_source of the level frames.
