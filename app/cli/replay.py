@@ -49,7 +49,7 @@ def replay(
         work.resume(saved)
         work.go_to(saved.frame)
         stop = process(work, until=None if to_end or saved.ended else saved.frame)
-        if not len(work.log):
+        if work.frame < 0:
             raise stop or HemislamError(
                 f"The session {session} ended before its first frame; there is nothing to repeat."
             )

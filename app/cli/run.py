@@ -89,7 +89,7 @@ def run(
         if edits:
             session.edit_loops(edits)
         stop = process(session)
-        if not len(session.log):
+        if session.frame < 0:
             with contextlib.suppress(OSError):
                 folder.rmdir()  # only if it is empty
             raise stop or HemislamError(_nothing_processed(session))

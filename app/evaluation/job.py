@@ -114,7 +114,7 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
             cpu_ms.append((time.process_time() - begin) * 1e3)
             assert isinstance(result, StepResult)
             _score_ground(ground, result)
-            progress(len(session.log), total)
+            progress(session.frame + 1, total)
         if session.loops:
             session.loops.poll()  # those of the last keyframes
         _write(job, session, _facts(job, session, ground, peak_memory_mb()), cpu_ms)

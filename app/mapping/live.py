@@ -144,14 +144,13 @@ class Handover:
             file.seek(self._rows_end)
             file.truncate()
             session, first = self._session, self._rows_written
-            pickle.dump((session.log.rows(first), session.frames[first:]), file, protocol=5)
+            pickle.dump(session.frames[first:], file, protocol=5)
             self._rows_end, self._rows_written = file.tell(), len(session.frames)
 
     def _read_rows(self, end: int) -> None:
         with (self._folder / ROWS).open("rb") as file:
             while file.tell() < end:
-                rows, frames = pickle.load(file)
-                self._session.log.extend(rows)
+                frames = pickle.load(file)
                 self._session.frames.extend(frames)
                 self._rows_written += len(frames)
         self._rows_end = end

@@ -5,14 +5,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from app.mapping.labels import LabelledKeyframes
 from app.mapping.session_file import SUFFIX, SavedSession, write_session
 from app.slam.errors import HemislamError
-from app.slam.keyframes import KeyframeStore
 from app.slam.loops.files import LoopResults
 from app.slam.map_frame import MapFrame
 from app.slam.results import RunInfo, RunLog, prepare_folder, save_results
 from app.slam.trajectory import write_tum
-from app.slam.types import Keyframe
 
 
 class Saver:
@@ -26,18 +25,17 @@ class Saver:
         self,
         folder: Path,
         log: RunLog,
-        keyframes: KeyframeStore,
+        keyframes: LabelledKeyframes,
         info: RunInfo,
         loops: LoopResults | None,
         session: SavedSession | None,
         *,
         replace: bool,
     ) -> "Future[dict[str, Any]]":
-        """Write all results of the keyframes so far, and the session. `log` must not change any more."""
-        present = _Present(keyframes)
+        """Write all results of these frames and keyframes, and the session."""
 
         def write() -> dict[str, Any]:
-            report = save_results(folder, log, present, info, loops, replace=replace)
+            report = save_results(folder, log, keyframes, info, loops, replace=replace)
             if session is not None:
                 _save_session(folder / f"session{SUFFIX}", session)
             return report
@@ -73,16 +71,3 @@ def _save_session(path: Path, session: SavedSession) -> None:
         write_session(path, session)
     except OSError as error:
         raise HemislamError(f"The session cannot be written to {path}: {error.strerror}.") from error
-
-
-class _Present:
-    """The keyframes that there are now; later ones are not seen."""
-
-    def __init__(self, keyframes: KeyframeStore) -> None:
-        self._keyframes, self._count = keyframes, len(keyframes)
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index: int, /) -> Keyframe:
-        return self._keyframes[index]

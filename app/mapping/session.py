@@ -1,6 +1,5 @@
 """A session: a feed of measurements, the engine at work on it, loops, and the log of what came of it so far."""
 
-import copy
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ import numpy as np
 
 from app.mapping.checkpoints import NEAR
 from app.mapping.feed import Feed, Quiet
-from app.mapping.frames import Frame
+from app.mapping.labels import LabelLayer
 from app.mapping.log import Log
 from app.mapping.saver import Saver
 from app.mapping.session_file import Opened, SavedSession, State, size_of
@@ -21,13 +20,14 @@ from app.sensors.findings import Finding
 from app.slam import engine
 from app.slam.engine import Engine
 from app.slam.errors import HemislamError
+from app.slam.frames import Frame
 from app.slam.loops.keyframe_log import KeyframeLog
 from app.slam.loops.messages import LoadEdits, LoopClient
 from app.slam.loops.schedule import LoopSchedule
 from app.slam.loops.types import Edits, LoopEdit
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params, leaves
-from app.slam.results import LogState, RunInfo, RunLog
+from app.slam.results import RunInfo, RunLog
 from app.slam.trajectory import read_tum, time_apart
 from app.slam.types import F64, DroppedScan, Measurement, StepResult
 
@@ -37,12 +37,11 @@ _NO_LOOPS = MapFrame()
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A session after a frame, but for the rows that its parts keep."""
+    """A session after a frame. The frames themselves are in the session's log."""
 
     frame: int
     engine: engine.Checkpoint
     place: Any
-    log: LogState
 
 
 class Memory(Protocol):
@@ -76,7 +75,7 @@ class Session:
         history: from which frame on which parameters were in force, ascending.
         params: for frames not yet processed; set them with `choose`.
         ended: whether the feed has no more to give.
-        log: of the frames up to `frame`, for the results.
+        labels: of the keyframes' points.
 
     Raises:
         HemislamError: the truth cannot be read.
@@ -104,10 +103,10 @@ class Session:
         self.history: tuple[tuple[int, Params], ...] = ()
         self.ended = False
         self.frames: Log[Frame] = Log()
-        self.log = RunLog()
+        self.labels = LabelLayer()
         self.checkpoints = checkpoints
         self._waiting: Measurement | None = None
-        self._dropped = 0  # scans since the newest frame
+        self._dropped: tuple[str, ...] = ()  # why scans since the newest frame were
         self._saver = Saver()
         self._remember()
 
@@ -125,8 +124,7 @@ class Session:
             if self.ended and not had_ended and self.loops:
                 self.loops.finish()
             if isinstance(entry, DroppedScan):
-                self.log.drop(entry)
-                self._dropped += 1
+                self._dropped = (*self._dropped, entry.reason)
             if not isinstance(entry, Measurement):
                 return entry
             self._waiting = entry
@@ -156,10 +154,9 @@ class Session:
             if not repeated:
                 raise
             return DroppedScan(entry.scan.stamp_ns, f"the engine failed: {error}")
-        self.frame, self.result, self._dropped = frame, result, 0
         if frame > self.known:
-            self.frames.append(Frame.of(result))
-        self.log.add(result)
+            self.frames.append(Frame.of(result, self._dropped))
+        self.frame, self.result, self._dropped = frame, result, ()
         self._remember(near=repeated and self.heading - frame <= NEAR)
         return result
 
@@ -180,12 +177,22 @@ class Session:
                     self.loops.add(result.keyframe, params.loops)
                 notices = (*notices, *self.loops.take_notices())
             result = replace(result, T_map_odom=self.map_frame.newest, loops=news, timings_ms=watch.added_to(result))
-        return replace(result, notices=notices, dropped=self._dropped)
+        return replace(result, notices=notices, dropped=len(self._dropped))
 
     @property
     def known(self) -> int:
         """The last frame that was processed and still holds; -1 if there is none."""
         return len(self.frames) - 1
+
+    @property
+    def log(self) -> RunLog:
+        """The frames up to the newest, for results."""
+        return RunLog(self.frames[: self.frame + 1], self._dropped)
+
+    @property
+    def dropped(self) -> int:
+        """Scans dropped up to the newest frame, and since then."""
+        return sum(len(one.dropped) for one in self.frames[: self.frame + 1]) + len(self._dropped)
 
     @property
     def map_frame(self) -> MapFrame:
@@ -284,7 +291,6 @@ class Session:
             frame=self.frame,
             engine=self.engine.checkpoint(),
             place=self.feed.place(),
-            log=self.log.checkpoint(),
         )
 
     def return_to(self, checkpoint: Checkpoint) -> None:
@@ -292,15 +298,15 @@ class Session:
         self.feed.go_to(checkpoint.place)
         self.engine.restore(checkpoint.engine)
         self.engine.params = self.params
-        self.log.restore(checkpoint.log)
         self.frame, self.result = checkpoint.frame, None
         if self.loops:
             self.loops.go_to(self.frame + 1)
-        self._waiting, self._dropped, self.ended = None, 0, False
+        self._waiting, self._dropped, self.ended = None, (), False
 
     def _forget_after(self, frame: int) -> None:
         """What comes after a frame will be different."""
         self.frames.truncate(frame + 1)
+        self.labels.forget(sum(one.keyframe for one in self.frames))
         self.planned, self.heading = min(self.planned, frame), min(self.heading, frame)
         self.history = tuple(entry for entry in self.history if entry[0] <= frame)
         if self.loops:
@@ -369,10 +375,11 @@ class Session:
         """
         info = self.feed.info
         made_from = RunInfo(info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped)
-        log, loops = copy.deepcopy(self.log), self.loops.results() if self.loops else None
+        loops = self.loops.results() if self.loops else None
         if trajectory_only:
-            return self._saver.save_trajectory(folder, log, loops)
-        return self._saver.save(folder, log, self.engine.keyframes, made_from, loops, session, replace=replace)
+            return self._saver.save_trajectory(folder, self.log, loops)
+        keyframes = self.labels.over(self.engine.keyframes)
+        return self._saver.save(folder, self.log, keyframes, made_from, loops, session, replace=replace)
 
     def finish_saves(self) -> None:
         """Wait until no save is under way."""

@@ -9,10 +9,10 @@ from bisect import bisect_left
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from app.mapping.frames import Frame
 from app.mapping.log import Cursor, Log
 from app.server.chunks import thinned
 from app.server.protocol import Chunk, LoopsView, Notice
+from app.slam.frames import Frame
 from app.slam.loops.types import LoopChange, LoopEdge, difference
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params

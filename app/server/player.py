@@ -177,7 +177,7 @@ class Player:
             return 0.0
         if isinstance(entry, DroppedScan):
             if not revisited:
-                self._page.show(dropped=session.log.dropped.total(), urgent=False)
+                self._page.show(dropped=session.dropped, urgent=False)
                 self._page.notice_once(f"A scan was dropped: {entry.reason}.", entry.stamp_ns)
             return 0.0
         paced = target is None and session.feed.repeatable  # a live source keeps its own pace

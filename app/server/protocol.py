@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.frames import READOUTS
 from app.mapping.session_file import Note
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
+from app.slam.frames import READOUTS
 from app.slam.loops import types as loops
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
@@ -219,8 +219,8 @@ class OpenedRecording:
     def of(cls, session: "Session") -> "OpenedRecording":
         """What a session works on. A source without an end is as long as what was processed of it."""
         info, truth = session.feed.info, session.truth
-        stamps_ns = session.log.stamps_ns
-        so_far_s = (int(stamps_ns[-1]) - info.start_ns) * 1e-9 if len(stamps_ns) else 0.0
+        newest = session.frames[session.frame] if session.frame >= 0 else None
+        so_far_s = (newest.stamp_ns - info.start_ns) * 1e-9 if newest is not None else 0.0
         return cls(
             path=info.path,
             start_ns=info.start_ns,

@@ -36,9 +36,7 @@ class Publisher:
         self.outbox.begin(session.frames, session.engine.keyframes)
         self.result, self._corrections, self._noticed = None, MapFrame(), {}
         self.outbox.put(recording=OpenedRecording.of(session))
-        self.show(
-            frame=session.frame, stamp_ns=0, finished=False, frames_per_second=0.0, dropped=session.log.dropped.total()
-        )
+        self.show(frame=session.frame, stamp_ns=0, finished=False, frames_per_second=0.0, dropped=session.dropped)
         if session.frame < 0:
             for finding in session.findings:
                 if finding.verdict == "needs you":
@@ -63,7 +61,7 @@ class Publisher:
             frame=session.frame,
             stamp_ns=result.stamp_ns if result else 0,
             finished=session.ended,
-            dropped=session.log.dropped.total(),
+            dropped=session.dropped,
         )
 
     def _show_frame(self, session: Session, result: StepResult | None) -> None:

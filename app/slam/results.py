@@ -1,9 +1,8 @@
 """What a session leaves behind: one folder of result files. `EXPORTS` declares them.
 
-`RunLog` collects one small row per frame; `save_results` writes the files from it at any moment.
+`save_results` writes them from the frames of a session, at any moment.
 """
 
-import copy
 import json
 import os
 from collections import Counter
@@ -14,23 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from app.slam import report
 from app.slam.errors import HemislamError
+from app.slam.frames import READOUTS, Frame, as_table
 from app.slam.loops.files import LoopResults, loops_csv
 from app.slam.loops.types import Verdict
 from app.slam.map_frame import MapFrame
 from app.slam.metrics import GroundScore
 from app.slam.params import Params
 from app.slam.ply import Keyframes, write_map
-from app.slam.rows import Rows
 from app.slam.trajectory import Trajectory, stamp_text, write_tum
-from app.slam.types import F64, I64, NON_GROUND, TIMINGS, DroppedScan, FrameStatus, StepResult
+from app.slam.types import F64, I64, TIMINGS, FrameStatus
 
 MOST_NOTICES = 200
-_SUMS = ("statuses", "dropped", "notices", "points", "ground_points", "ground_score")
-"""Attributes of `RunLog` that are not rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,104 +48,74 @@ class RunInfo:
     stopped: str = ""
 
 
-LogRows = tuple[I64, F64, F64]
-"""Rows of a `RunLog`: (n,) stamps, (n, 7) poses, (n, len(TIMINGS)) timings."""
-
-
-@dataclass(frozen=True, slots=True)
-class LogState:
-    """What `RunLog.restore` needs beside the rows, which the log keeps."""
-
-    frames: int
-    sums: dict[str, Any]
-
-
+@dataclass(frozen=True)
 class RunLog:
-    """One row a frame (about 150 bytes), and sums over all of them.
+    """What the results tell of the frames of a session up to some moment. Arrays are read-only.
 
-    After going back to a checkpoint the later rows stay until others are put in their place.
+    Attributes:
+        frames: in order. dropped_since: why scans after the last of them were dropped.
     """
 
-    def __init__(self) -> None:
-        self._stamps = Rows((), np.int64)
-        self._poses = Rows((7,), np.float64)
-        self._timings = Rows((len(TIMINGS),), np.float64)
-        self.statuses: Counter[FrameStatus] = Counter()
-        self.dropped: Counter[str] = Counter()
-        self.notices: Counter[str] = Counter()
-        self.points = 0
-        self.ground_points = 0
-        self.ground_score: GroundScore | None = None
+    frames: Sequence[Frame]
+    dropped_since: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        return len(self._stamps)
+        return len(self.frames)
 
-    def add(self, result: StepResult) -> None:
-        """Take in a processed frame."""
-        T_odom_imu = result.state.T_odom_imu
-        pose = (*T_odom_imu[:3, 3], *Rotation.from_matrix(T_odom_imu[:3, :3]).as_quat())
-        self._stamps.append(result.stamp_ns)
-        self._poses.append(pose)
-        self._timings.append([result.timings_ms.get(stage, 0.0) for stage in TIMINGS])
-        self.statuses[result.status] += 1
-        self._count(result.notices)
-        self.points += len(result.cloud)
-        self.ground_points += int(np.count_nonzero(result.cloud.labels != NON_GROUND))
-        if result.truth_ground is not None:
-            score = GroundScore.of(result.cloud.labels, result.truth_ground)
-            self.ground_score = score if self.ground_score is None else self.ground_score + score
+    @cached_property
+    def _table(self) -> np.ndarray:
+        table = as_table(self.frames)
+        table.setflags(write=False)
+        return table
 
-    def drop(self, scan: DroppedScan) -> None:
-        """Take in a scan that was not processed."""
-        self.dropped[scan.reason] += 1
-
-    def checkpoint(self) -> LogState:
-        return LogState(len(self), {name: copy.copy(getattr(self, name)) for name in _SUMS})
-
-    def restore(self, state: LogState) -> None:
-        """Go back to a checkpoint of this log, or forth again to one whose rows were not replaced since."""
-        self._go_to(state.frames)
-        for name, value in state.sums.items():
-            setattr(self, name, copy.copy(value))
-
-    def rows(self, first: int) -> LogRows:
-        """The rows of the frames from `first` on."""
-        return self._stamps.view()[first:], self._poses.view()[first:], self._timings.view()[first:]
-
-    def extend(self, rows: LogRows) -> None:
-        """Put rows of another log behind those of this one; `restore` says what they amount to."""
-        for table, more in zip(self._tables, rows, strict=True):
-            table.extend(more)
-
-    @property
-    def _tables(self) -> tuple[Rows[Any], ...]:
-        return self._stamps, self._poses, self._timings
-
-    def _go_to(self, frames: int) -> None:
-        for table in self._tables:
-            table.go_to(frames)
-
-    def _count(self, notices: tuple[str, ...]) -> None:
-        for notice in notices:
-            if notice in self.notices or len(self.notices) < MOST_NOTICES:
-                self.notices[notice] += 1
-
-    # Arrays are read-only, and as they are only until the log goes back and on from there.
     @property
     def stamps_ns(self) -> I64:
-        """(n,) scan ends of all processed frames."""
-        return self._stamps.view()
+        """(n,) scan ends."""
+        stamps_ns: I64 = self._table["stamp_ns"]
+        return stamps_ns
 
     @property
     def timings_ms(self) -> F64:
-        """(n, len(TIMINGS)) milliseconds."""
-        return self._timings.view()
+        """(n, len(TIMINGS)) milliseconds; 0 for a stage that a frame did not have."""
+        columns = [READOUTS.index(f"{stage}_ms") for stage in TIMINGS]
+        return np.asarray(np.nan_to_num(self._table["readouts"][:, columns]))
 
     @property
     def odometry(self) -> Trajectory:
-        """T_odom_imu at every scan's end; while the filter waits at rest to start, the origin."""
-        poses = self._poses.view()
-        return Trajectory(self.stamps_ns, poses[:, :3], poses[:, 3:])
+        """T_odom_imu at every scan's end; the origin while the filter waits at rest to start."""
+        return Trajectory(self.stamps_ns, self._table["position"], self._table["quaternion"])
+
+    @cached_property
+    def statuses(self) -> Counter[FrameStatus]:
+        return Counter(frame.status for frame in self.frames)
+
+    @cached_property
+    def dropped(self) -> Counter[str]:
+        """Scans that were not processed, by reason."""
+        return Counter([*(reason for frame in self.frames for reason in frame.dropped), *self.dropped_since])
+
+    @cached_property
+    def notices(self) -> Counter[str]:
+        """How often each notice was given, of the first `MOST_NOTICES` different ones."""
+        notices = Counter[str]()
+        for notice in (notice for frame in self.frames for notice in frame.notices):
+            if notice in notices or len(notices) < MOST_NOTICES:
+                notices[notice] += 1
+        return notices
+
+    @property
+    def points(self) -> int:
+        return sum(frame.points for frame in self.frames)
+
+    @property
+    def ground_points(self) -> int:
+        return sum(frame.ground_points for frame in self.frames)
+
+    @property
+    def ground_score(self) -> GroundScore | None:
+        """Of all frames whose true labels are known."""
+        scores = [frame.ground_score for frame in self.frames if frame.ground_score is not None]
+        return sum(scores[1:], scores[0]) if scores else None
 
 
 @dataclass

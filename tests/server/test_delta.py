@@ -9,7 +9,6 @@ import server_fakes as fakes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.mapping.frames import READOUTS, Frame
 from app.mapping.log import Log
 from app.server.chunks import one_per_voxel
 from app.server.controller import Controller
@@ -29,6 +28,7 @@ from app.server.protocol import (
     StepFrame,
     Transport,
 )
+from app.slam.frames import READOUTS, Frame
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from app.slam.errors import HemislamError
+from app.slam.frames import Frame
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.ply import VERTEX, write_map
@@ -21,7 +22,6 @@ from app.slam.types import (
     SEED,
     TIMINGS,
     Cloud,
-    DroppedScan,
     FrameStatus,
     GroundResult,
     Keyframe,
@@ -93,34 +93,18 @@ def recording(tmp_path: Path) -> Path:
 
 
 def logged(frames: int = 6) -> RunLog:
-    log = RunLog()
-    log.add(frame(0, status=FrameStatus.INITIALISING))
-    for index in range(1, frames):
-        log.add(frame(index, truth=[1, 0, 1, 0]))
-    log.drop(DroppedScan(START_NS, "no IMU"))
-    log.drop(DroppedScan(START_NS, "no IMU"))
-    return log
+    results = [frame(0, status=FrameStatus.INITIALISING), *(frame(k, truth=[1, 0, 1, 0]) for k in range(1, frames))]
+    return RunLog([Frame.of(result) for result in results], ("no IMU", "no IMU"))
 
 
-def test_a_log_that_went_back_and_forth_and_back_is_as_it_was_then() -> None:
-    log, states, then = RunLog(), [], []
-    for index in range(6):
-        log.add(frame(index, truth=[1, 0, 1, 0]))
-        log.drop(DroppedScan(START_NS, "no IMU"))
-        states.append(log.checkpoint())
-        then.append(facts(log))
-    for index in (1, 4, 0, 5, 2):
-        log.restore(states[index])
-        assert facts(log) == then[index]
-    log.add(frame(9))
-    assert log.stamps_ns.tolist() == [*(frame(index).stamp_ns for index in range(3)), frame(9).stamp_ns]
-
-
-def facts(log: RunLog) -> tuple[object, ...]:
-    trajectory = log.odometry
-    arrays = (log.stamps_ns, log.timings_ms, trajectory.positions, trajectory.quaternions)
-    sums = (len(log), log.dropped.copy(), log.statuses.copy(), log.points, log.ground_points, log.ground_score)
-    return *sums, *(array.tobytes() for array in arrays)
+def test_a_log_adds_up_what_its_frames_hold() -> None:
+    first, second = Frame.of(frame(0), ("too far", "no IMU")), Frame.of(frame(1, truth=[1, 0, 1, 0]), ("no IMU",))
+    log = RunLog([first, second], ("no IMU",))
+    assert log.dropped == {"no IMU": 3, "too far": 1}
+    assert (log.points, log.ground_points) == (2 * first.points, first.ground_points + second.ground_points)
+    assert log.ground_score == second.ground_score is not None
+    assert RunLog([first]).ground_score is None and not RunLog([]).dropped
+    assert log.stamps_ns.tolist() == [first.stamp_ns, second.stamp_ns] and not log.stamps_ns.flags.writeable
 
 
 def read_ply(path: Path) -> np.ndarray:
@@ -211,7 +195,7 @@ def test_a_truth_that_does_not_fit_is_told_in_the_report(tmp_path: Path, recordi
 
 
 def test_a_run_without_a_single_frame_still_has_a_report(tmp_path: Path, recording: Path) -> None:
-    report = save_results(tmp_path / "out", RunLog(), [], RunInfo(recording, Params(), stopped="It was cut."))
+    report = save_results(tmp_path / "out", RunLog([]), [], RunInfo(recording, Params(), stopped="It was cut."))
     assert report["stopped_early"] == "It was cut."
     assert report["ground"]["share"] is None
     assert (tmp_path / "out" / "trajectory.tum").read_text() == ""

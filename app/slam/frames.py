@@ -7,7 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from app.slam import lie
-from app.slam.types import F64, StepResult
+from app.slam.metrics import GroundScore
+from app.slam.types import F64, NON_GROUND, FrameStatus, StepResult
 
 READOUTS = (
     "planarity", "seeds", "ground_share", "points_in", "points_reduced", "points_filter",
@@ -29,16 +30,19 @@ FRAME = np.dtype(
         ("readouts", "f8", len(READOUTS)),
     ]
 )
-"""A `Frame` as a row of a table."""
+"""The numbers of a `Frame` as a row of a table."""
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A processed frame.
+    """A processed frame, without its points.
 
     Attributes:
         stamp_ns: end of its scan. keyframe: whether it became a keyframe.
         position: (3,) and quaternion: (4,), x, y, z, w, of T_odom_imu. readouts: (len(READOUTS),).
+        status, notices: as in `StepResult`. points, ground_points: of its cloud.
+        ground_score: of its labels, if the true ones are known.
+        dropped: why scans between the frame before and this one were dropped, one reason each.
     """
 
     stamp_ns: int
@@ -46,16 +50,28 @@ class Frame:
     position: F64
     quaternion: F64
     readouts: F64
+    status: FrameStatus = FrameStatus.TRACKING
+    notices: tuple[str, ...] = ()
+    points: int = 0
+    ground_points: int = 0
+    ground_score: GroundScore | None = None
+    dropped: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, result: StepResult) -> "Frame":
-        T_odom_imu = result.state.T_odom_imu
+    def of(cls, result: StepResult, dropped: tuple[str, ...] = ()) -> "Frame":
+        T_odom_imu, labels, true_labels = result.state.T_odom_imu, result.cloud.labels, result.truth_ground
         return cls(
             stamp_ns=result.stamp_ns,
             keyframe=result.keyframe is not None,
             position=T_odom_imu[:3, 3].copy(),
             quaternion=Rotation.from_matrix(T_odom_imu[:3, :3]).as_quat(),
             readouts=_readouts(result),
+            status=result.status,
+            notices=result.notices,
+            points=len(labels),
+            ground_points=int(np.count_nonzero(labels != NON_GROUND)),
+            ground_score=None if true_labels is None else GroundScore.of(labels, true_labels),
+            dropped=dropped,
         )
 
 
