@@ -117,7 +117,7 @@ def test_a_limit_that_is_no_limit_is_refused_by_name(value: float) -> None:
 
 
 # --- in a session --------------------------------------------------------------------------------
-class Desk:
+class Bench:
     def __init__(self, name: str = f"walk-{FRAMES}.mcap") -> None:
         self.now = 0.0
         self.outbox, self.fold = Outbox(Params()), Fold()
@@ -146,46 +146,46 @@ NO_GROUND = SetBreakpoints(Breakpoints(no_ground=True))
 
 
 def test_playing_pauses_there_also_at_full_speed_tells_why_and_play_goes_on() -> None:
-    desk = Desk()
-    snapshot = desk.do(NO_GROUND, FAST, Play())
+    bench = Bench()
+    snapshot = bench.do(NO_GROUND, FAST, Play())
     assert snapshot.breakpoints == NO_GROUND.breakpoints
     assert snapshot.transport.frame == BAD[0] and not snapshot.transport.playing
     assert snapshot.notices[-1].text == (
         f"Paused at frame {BAD[0]}. No ground plane: only 3 seed points; a plane takes 20."
     )
-    assert desk.do(Play()).transport.frame == FRAMES - 1
+    assert bench.do(Play()).transport.frame == FRAMES - 1
 
 
 def test_a_seek_passes_but_playing_over_known_frames_pauses_again() -> None:
-    desk = Desk()
-    snapshot = desk.do(NO_GROUND, FAST, Seek(BAD[-1] + 5))
+    bench = Bench()
+    snapshot = bench.do(NO_GROUND, FAST, Seek(BAD[-1] + 5))
     assert snapshot.transport.frame == BAD[-1] + 5
-    assert desk.do(Seek(BAD[0] - 3)).transport.frame == BAD[0] - 3
-    assert desk.do(Play()).transport.frame == BAD[0]
+    assert bench.do(Seek(BAD[0] - 3)).transport.frame == BAD[0] - 3
+    assert bench.do(Play()).transport.frame == BAD[0]
 
 
 def test_playing_on_from_within_does_not_pause_for_what_already_was_so() -> None:
-    desk = Desk()
-    desk.do(NO_GROUND, FAST, Seek(FRAMES - 2))
-    assert desk.do(Seek(BAD[1]), Play()).transport.frame == FRAMES - 1
-    desk = Desk()
-    desk.do(NO_GROUND, FAST, StepFrame(BAD[1]))
-    assert desk.do(Play()).transport.frame == FRAMES - 1
+    bench = Bench()
+    bench.do(NO_GROUND, FAST, Seek(FRAMES - 2))
+    assert bench.do(Seek(BAD[1]), Play()).transport.frame == FRAMES - 1
+    bench = Bench()
+    bench.do(NO_GROUND, FAST, StepFrame(BAD[1]))
+    assert bench.do(Play()).transport.frame == FRAMES - 1
 
 
 def test_a_scan_left_out_pauses_at_the_frame_after_it() -> None:
-    desk = Desk("dropped-30-12.mcap")
-    snapshot = desk.do(SetBreakpoints(Breakpoints(dropped=True)), FAST, Play())
+    bench = Bench("dropped-30-12.mcap")
+    snapshot = bench.do(SetBreakpoints(Breakpoints(dropped=True)), FAST, Play())
     assert snapshot.transport.frame == 12 and not snapshot.transport.playing
     assert "1 scan was dropped" in snapshot.notices[-1].text
     assert snapshot.series["dropped"][-2:].tolist() == [0.0, 1.0]
 
 
 def test_breakpoints_taken_off_pause_nothing() -> None:
-    desk = Desk()
-    desk.do(NO_GROUND, SetBreakpoints(Breakpoints()), FAST)
-    assert desk.do(Play(), Pause()).transport.frame >= 0
-    assert desk.do(Play()).transport.frame == FRAMES - 1
+    bench = Bench()
+    bench.do(NO_GROUND, SetBreakpoints(Breakpoints()), FAST)
+    assert bench.do(Play(), Pause()).transport.frame >= 0
+    assert bench.do(Play()).transport.frame == FRAMES - 1
 
 
 def test_an_engine_that_was_killed_still_pauses_there() -> None:

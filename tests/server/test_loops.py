@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_rewind import SAMPLE, Desk, open_whole
+from test_rewind import SAMPLE, Bench, open_whole
 from typer.testing import CliRunner
 
 from app.__main__ import cli
@@ -42,7 +42,7 @@ DRIFTING = (
 LAST = 498
 
 
-class Walk(Desk):
+class Walk(Bench):
     """The whole recording, walked to its end."""
 
     def __init__(self) -> None:

@@ -30,7 +30,7 @@ FREE = tuple(name for name in SERIES if name.endswith("_ms"))
 """Readouts that no two runs share."""
 
 
-class Desk:
+class Bench:
     """A session that works whenever it is told something, and the page's view of it."""
 
     def __init__(self, params: Params, opener: Callable[..., Session], path: Path, *, settle: bool = True) -> None:
@@ -120,115 +120,115 @@ class Expected:
 
 def straight_to(expected: Expected) -> Snapshot:
     """The page of a run that went there without a detour."""
-    desk = Desk(Params(), fakes.open_fake, Path(f"walk-{FRAMES}.mcap"))
+    bench = Bench(Params(), fakes.open_fake, Path(f"walk-{FRAMES}.mcap"))
     for sigma in expected.used[1 : expected.at + 1]:
-        desk.do(SetParams({"ground.sigma": sigma}), StepFrame())
-    return desk.do(SetParams({"ground.sigma": expected.present}))
+        bench.do(SetParams({"ground.sigma": sigma}), StepFrame())
+    return bench.do(SetParams({"ground.sigma": expected.present}))
 
 
 @settings(deadline=None, max_examples=40)
 @example(script=[Seek(10), Seek(0), StepFrame(5), Seek(10)])
 @given(script=SCRIPTS)
 def test_the_page_is_that_of_a_run_that_went_straight_there(script: list[Command]) -> None:
-    desk, expected = Desk(Params(), fakes.open_fake, Path(f"walk-{FRAMES}.mcap")), Expected()
+    bench, expected = Bench(Params(), fakes.open_fake, Path(f"walk-{FRAMES}.mcap")), Expected()
     for command in script:
-        desk.do(command)
+        bench.do(command)
         expected.do(command)
-    assert page(desk.see()) == page(straight_to(expected))
-    desk.controller.close()
+    assert page(bench.see()) == page(straight_to(expected))
+    bench.controller.close()
 
 
 def test_going_back_sends_nothing_that_the_page_has() -> None:
-    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
-    desk.do(Seek(50))
-    desk.controller.handle(Seek(33))
-    desk.settle()
-    delta = desk.outbox.take()
+    bench = Bench(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    bench.do(Seek(50))
+    bench.controller.handle(Seek(33))
+    bench.settle()
+    delta = bench.outbox.take()
     assert (delta.keep, delta.frames, delta.chunks) == (51, (), ())
-    assert len(desk.fold.apply(delta).chunks) == 7
+    assert len(bench.fold.apply(delta).chunks) == 7
 
 
 def test_going_forth_again_sends_no_keyframe_that_the_page_had() -> None:
-    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
-    had = desk.do(Seek(50)).chunks
-    assert len(desk.do(Seek(20)).chunks) == 5
-    desk.controller.handle(Seek(43))
-    desk.settle()
-    delta = desk.outbox.take()
+    bench = Bench(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    had = bench.do(Seek(50)).chunks
+    assert len(bench.do(Seek(20)).chunks) == 5
+    bench.controller.handle(Seek(43))
+    bench.settle()
+    delta = bench.outbox.take()
     assert (delta.keep, delta.frames, delta.chunks) == (51, (), ())
-    again = desk.fold.apply(delta).chunks
+    again = bench.fold.apply(delta).chunks
     assert len(again) == 9 and all(one is other for one, other in zip(again, had, strict=False))
 
 
 def test_frames_on_the_way_back_are_not_shown() -> None:
-    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
-    desk.do(Seek(50))
-    desk.controller.handle(Seek(38))
+    bench = Bench(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    bench.do(Seek(50))
+    bench.controller.handle(Seek(38))
     seen = set()
     for _ in range(30):
-        desk.controller.work()
-        seen.add(desk.see().transport.frame)
+        bench.controller.work()
+        seen.add(bench.see().transport.frame)
     assert seen == {50, 38}
 
 
 def test_a_pause_on_the_way_back_shows_the_frame_that_was_reached() -> None:
-    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
-    there = desk.do(Seek(50))
-    desk.controller.handle(Seek(38))
+    bench = Bench(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    there = bench.do(Seek(50))
+    bench.controller.handle(Seek(38))
     for _ in range(3):
-        desk.controller.work()
-    snapshot = desk.do(Pause())
+        bench.controller.work()
+    snapshot = bench.do(Pause())
     at = snapshot.transport.frame
     assert 20 < at < 38
     assert snapshot.trajectory is not None and there.trajectory is not None and snapshot.result is not None
     assert np.array_equal(snapshot.trajectory, there.trajectory[: at + 1]) and snapshot.result.index == at
-    assert desk.do(StepFrame()).transport.frame == at + 1
+    assert bench.do(StepFrame()).transport.frame == at + 1
 
 
 def test_steps_back_that_come_faster_than_they_are_done_add_up() -> None:
-    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
-    desk.do(Seek(50))
+    bench = Bench(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    bench.do(Seek(50))
     for _ in range(7):
-        desk.controller.handle(StepFrame(-1))
-    desk.controller.work()
-    desk.controller.handle(StepFrame())
-    desk.settle()
-    assert desk.see().transport.frame == 44
+        bench.controller.handle(StepFrame(-1))
+    bench.controller.work()
+    bench.controller.handle(StepFrame())
+    bench.settle()
+    assert bench.see().transport.frame == 44
 
 
 def test_playing_on_after_going_back_overwrites_the_future() -> None:
-    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
-    before = desk.do(Seek(50))
-    desk.do(Seek(20), SetParams({"ground.sigma": 0.2}), SetSpeed(math.inf), Play())
-    after = desk.do(Seek(50))
+    bench = Bench(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    before = bench.do(Seek(50))
+    bench.do(Seek(20), SetParams({"ground.sigma": 0.2}), SetSpeed(math.inf), Play())
+    after = bench.do(Seek(50))
     assert np.array_equal(after.series["speed"][:21], before.series["speed"][:21])
     assert np.all(after.series["speed"][21:51] > before.series["speed"][21:51])
-    used = [params.ground.sigma for params in desk.session.engine.steps_with]  # type: ignore[attr-defined]
+    used = [params.ground.sigma for params in bench.session.engine.steps_with]  # type: ignore[attr-defined]
     assert used[-1] == 0.2
 
 
 def test_a_longer_way_shows_progress() -> None:
-    desk = Desk(Params(), fakes.open_fake, Path("walk-60.mcap"))
-    desk.do(Seek(50))
-    desk.session.checkpoints.forget_after(-1)
-    desk.controller.handle(Seek(40))
+    bench = Bench(Params(), fakes.open_fake, Path("walk-60.mcap"))
+    bench.do(Seek(50))
+    bench.session.checkpoints.forget_after(-1)
+    bench.controller.handle(Seek(40))
     fractions = []
-    while desk.controller.work() == 0:
-        progress = desk.see().progress
+    while bench.controller.work() == 0:
+        progress = bench.see().progress
         fractions += [progress.fraction] if progress else []
     assert len(fractions) > 30 and fractions == sorted(fractions) and fractions[-1] > 0.9
-    assert desk.see().progress is None and desk.see().transport.frame == 40
+    assert bench.see().progress is None and bench.see().transport.frame == 40
 
 
 def test_scans_dropped_and_frames_failed_before_are_so_again_and_not_told_again() -> None:
     for name in ("dropped-60-20.mcap", "failing-60-20.mcap"):
-        desk = Desk(Params(), fakes.open_fake, Path(name))
-        desk.do(SetSpeed(math.inf), Play())
-        there = desk.do(Play() if name.startswith("failing") else Pause(), Seek(45))
+        bench = Bench(Params(), fakes.open_fake, Path(name))
+        bench.do(SetSpeed(math.inf), Play())
+        there = bench.do(Play() if name.startswith("failing") else Pause(), Seek(45))
         notices = len(there.notices)
-        back = desk.do(Seek(15))
+        back = bench.do(Seek(15))
         assert back.transport.dropped == 0 and len(back.notices) == notices
-        again = desk.do(Seek(45))
+        again = bench.do(Seek(45))
         assert page(again) == page(there) and len(again.notices) == notices
 
 
@@ -252,18 +252,18 @@ def sample_params() -> Params:
 
 @pytest.fixture(scope="module")
 def never_stopped(sample_params: Params) -> Snapshot:
-    desk = Desk(sample_params, open_sample, SAMPLE)
-    walk_on(desk, FRAMES)
-    desk.controller.close()
-    return desk.see()
+    bench = Bench(sample_params, open_sample, SAMPLE)
+    walk_on(bench, FRAMES)
+    bench.controller.close()
+    return bench.see()
 
 
-def walk_on(desk: Desk, end: int) -> None:
+def walk_on(bench: Bench, end: int) -> None:
     """Frame by frame to the end, changing parameters on the way."""
-    while (at := desk.see().transport.frame) < end - 1:
-        desk.controller.handle(SetParams(CHANGES.get(at, {})))
-        desk.do(StepFrame())
-        if desk.see().transport.finished:
+    while (at := bench.see().transport.frame) < end - 1:
+        bench.controller.handle(SetParams(CHANGES.get(at, {})))
+        bench.do(StepFrame())
+        if bench.see().transport.finished:
             break
 
 
@@ -274,30 +274,30 @@ def test_restored_and_continued_equals_never_stopped(
     def opener(path: Path, truth: Path | None, params: Params, /) -> Session:
         return open_sample(path, truth, params, kilobytes=kilobytes)
 
-    desk = Desk(sample_params, opener, SAMPLE)
-    walk_on(desk, FRAMES)
+    bench = Bench(sample_params, opener, SAMPLE)
+    walk_on(bench, FRAMES)
     rng = np.random.default_rng(kilobytes)
     last = never_stopped.transport.frame
     for frame in rng.integers(0, last, 8).tolist():
-        snapshot = desk.do(Seek(frame))
+        snapshot = bench.do(Seek(frame))
         assert snapshot.trajectory is not None and never_stopped.trajectory is not None
         assert snapshot.trajectory.tobytes() == never_stopped.trajectory[: frame + 1].tobytes()
-        assert desk.session.checkpoints.memory <= kilobytes << 10
-    assert (desk.session.checkpoints.disk > 0) is (kilobytes == 100)
+        assert bench.session.checkpoints.memory <= kilobytes << 10
+    assert (bench.session.checkpoints.disk > 0) is (kilobytes == 100)
     # From an early frame on, all of it anew, with the parameters chosen anew:
     first = {name: sample_params.value(name) for change in CHANGES.values() for name in change}
-    desk.do(Seek(5), SetParams(first))
-    walk_on(desk, FRAMES)
-    assert desk.session.engine.params == never_stopped.params
-    assert page(desk.see()) == page(never_stopped)
-    desk.controller.close()
+    bench.do(Seek(5), SetParams(first))
+    walk_on(bench, FRAMES)
+    assert bench.session.engine.params == never_stopped.params
+    assert page(bench.see()) == page(never_stopped)
+    bench.controller.close()
 
 
 def test_after_going_back_there_is_nothing_of_what_came_later(sample_params: Params) -> None:
-    desk = Desk(sample_params, open_sample, SAMPLE)
-    fresh = desk.do(Seek(17))
-    assert page(desk.do(Seek(45), Seek(17))) == page(fresh)
-    desk.controller.close()
+    bench = Bench(sample_params, open_sample, SAMPLE)
+    fresh = bench.do(Seek(17))
+    assert page(bench.do(Seek(45), Seek(17))) == page(fresh)
+    bench.controller.close()
 
 
 def test_reading_is_taken_up_between_any_two_measurements_as_if_it_had_gone_on(sample_params: Params) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import httpx
 import pytest
-from test_rewind import SAMPLE, Desk
+from test_rewind import SAMPLE, Bench
 
 from app.mapping.checkpoints import DEFAULT_BYTES
 from app.mapping.opening import open_session
@@ -91,14 +91,14 @@ def never_killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, dict[st
     def opener(path: Path, truth: Path | None, params: Params, /) -> Session:
         return open_session(path, params, 0.0, LENGTH_S, truth=truth, checkpoint_bytes=DEFAULT_BYTES)
 
-    desk, folder = (
-        Desk(resolve_params(SAMPLE, None, None, list(SETTINGS)), opener, SAMPLE),
+    bench, folder = (
+        Bench(resolve_params(SAMPLE, None, None, list(SETTINGS)), opener, SAMPLE),
         tmp_path_factory.mktemp("e"),
     )
-    last = desk.do(Seek(10_000)).transport.frame
-    desk.do(Seek(CHANGED_AT), SetParams(CHANGE), Seek(last))
-    desk.controller.handle(Save(folder))
-    desk.controller.close()
+    last = bench.do(Seek(10_000)).transport.frame
+    bench.do(Seek(CHANGED_AT), SetParams(CHANGE), Seek(last))
+    bench.controller.handle(Save(folder))
+    bench.controller.close()
     return last, {name: (folder / name).read_bytes() for name in FILES}
 
 

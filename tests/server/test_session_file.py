@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_rewind import SAMPLE, Desk, open_whole, page
+from test_rewind import SAMPLE, Bench, open_whole, page
 from typer.testing import CliRunner
 
 from app.__main__ import cli
@@ -138,7 +138,7 @@ def test_two_sessions_at_one_time_have_two_names(tmp_path: Path) -> None:
 
 
 # --- with the real engine ------------------------------------------------------------------------
-class Kept(Desk):
+class Kept(Bench):
     """A session on the sample that is kept in a folder."""
 
     def __init__(self, folder: Path, path: Path = SAMPLE) -> None:
@@ -155,11 +155,11 @@ class Kept(Desk):
         return path
 
 
-def walk_about(desk: Kept) -> Snapshot:
+def walk_about(bench: Kept) -> Snapshot:
     """On, back, other parameters, on, and one last wish that no frame has seen yet."""
-    desk.do(Seek(30), SetParams({"ground.sigma": 0.02}), Seek(60), Seek(45), SetParams({"scan.voxel_size": 0.6}))
-    desk.do(Seek(80), Seek(70), AddNote("a turn"))
-    return desk.do(StepFrame(2), SetParams({"ground.alpha": 35.0}))
+    bench.do(Seek(30), SetParams({"ground.sigma": 0.02}), Seek(60), Seek(45), SetParams({"scan.voxel_size": 0.6}))
+    bench.do(Seek(80), Seek(70), AddNote("a turn"))
+    return bench.do(StepFrame(2), SetParams({"ground.alpha": 35.0}))
 
 
 def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path) -> None:
@@ -175,8 +175,8 @@ def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path)
     np.testing.assert_array_equal(again.result.cloud.labels, there.result.cloud.labels, "relabelled by the last wish")
     third = Kept(tmp_path, second.session_file)  # the one reopened is kept as well
     assert page(first.do(StepFrame(10))) == page(second.do(StepFrame(10))) == page(third.do(StepFrame(10)))
-    for desk in (first, second, third):
-        desk.controller.close()
+    for bench in (first, second, third):
+        bench.controller.close()
 
 
 def test_a_session_stopped_on_its_way_back_goes_on_as_it_went_unless_it_is_changed_there(tmp_path: Path) -> None:
@@ -184,48 +184,48 @@ def test_a_session_stopped_on_its_way_back_goes_on_as_it_went_unless_it_is_chang
     there = walk_about(first)
     file = first.session_file
     for change, same in (({}, True), ({"ground.alpha": 50.0}, False)):
-        desk = Desk(first.params, open_whole, file, settle=False)
-        while desk.see().transport.frame < 20:
-            desk.controller.work()
-        stopped = desk.do(Pause())
+        bench = Bench(first.params, open_whole, file, settle=False)
+        while bench.see().transport.frame < 20:
+            bench.controller.work()
+        stopped = bench.do(Pause())
         assert stopped.transport.frame < 45
-        again = desk.do(SetParams(change), Seek(72))
+        again = bench.do(SetParams(change), Seek(72))
         assert again.transport.frame == 72 and again.trajectory is not None and there.trajectory is not None
         assert np.array_equal(again.trajectory, there.trajectory) is same
-        desk.controller.close()
+        bench.controller.close()
     first.controller.close()
 
 
 def test_what_is_wanted_while_a_session_opens_is_not_lost(tmp_path: Path) -> None:
     first = Kept(tmp_path)
     walk_about(first)
-    desk = Desk(first.params, open_whole, first.session_file, settle=False)
+    bench = Bench(first.params, open_whole, first.session_file, settle=False)
     for command in (SetParams({"ground.sigma": 0.07}), AddNote("here")):
-        desk.controller.handle(command)
-    desk.settle()
-    opened = desk.see()
+        bench.controller.handle(command)
+    bench.settle()
+    opened = bench.see()
     assert opened.params.ground.sigma == 0.07 and opened.notes[-1] == Note(72, "here")
-    for each in (first, desk):
+    for each in (first, bench):
         each.controller.close()
 
 
 def test_notes_are_kept_up_to_a_limit_and_what_is_beyond_it_is_told(tmp_path: Path) -> None:
-    desk = Kept(tmp_path)
-    desk.do(*[AddNote(f"note {number}") for number in range(MOST_NOTES + 1)])
-    seen = desk.see()
+    bench = Kept(tmp_path)
+    bench.do(*[AddNote(f"note {number}") for number in range(MOST_NOTES + 1)])
+    seen = bench.see()
     assert [note.text for note in seen.notes] == [f"note {number}" for number in range(MOST_NOTES)]
     assert "A session keeps 1,000 notes; this one was not kept." in seen.notices[-1].text
-    desk.controller.close()
+    bench.controller.close()
 
 
 def test_a_saved_session_repeats_headless_to_the_same_files(tmp_path: Path) -> None:
-    desk = Kept(tmp_path)
-    walk_about(desk)
-    desk.controller.handle(Save(tmp_path / "page"))
-    while not desk.see().saved:
-        desk.controller.work()
+    bench = Kept(tmp_path)
+    walk_about(bench)
+    bench.controller.handle(Save(tmp_path / "page"))
+    while not bench.see().saved:
+        bench.controller.work()
         time.sleep(0.01)
-    desk.controller.close()
+    bench.controller.close()
     file = tmp_path / "page" / f"session{SUFFIX}"
     result = CliRunner().invoke(cli, ["replay", str(file), "--out", str(tmp_path / "again")])
     assert result.exit_code == 0, result.output
@@ -273,13 +273,13 @@ def _until(engine: EngineProcess, wanted: Callable[[Snapshot], bool]) -> Snapsho
 
 
 def test_a_session_file_opens_in_the_page_too(tmp_path: Path) -> None:
-    desk = Kept(tmp_path)
-    desk.do(SetSpeed(0.5), Seek(20), SetParams({"ground.sigma": 0.02}), StepFrame(3))
+    bench = Kept(tmp_path)
+    bench.do(SetSpeed(0.5), Seek(20), SetParams({"ground.sigma": 0.02}), StepFrame(3))
     other = Kept(tmp_path)
-    there = other.do(OpenRecording(desk.session_file))
+    there = other.do(OpenRecording(bench.session_file))
     assert there.transport.frame == 23 and there.params.ground.sigma == 0.02
     assert other.do(Play()).transport.playing
-    desk.controller.close()
+    bench.controller.close()
     other.controller.close()
 
 

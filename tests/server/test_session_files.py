@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import server_fakes as fakes
-from session_desk import Desk, last_notice
+from session_bench import Bench, last_notice
 
 from app.mapping.breakpoints import Breakpoints
 from app.server.protocol import (
@@ -28,62 +28,62 @@ from app.slam.trajectory import Trajectory, write_tum
 
 # --- recordings ----------------------------------------------------------------------------------
 def test_opening_another_recording_empties_the_scene_and_pauses() -> None:
-    desk = Desk()
-    desk.do(Play())
-    desk.pass_time(1.0)
-    snapshot = desk.do(OpenRecording(Path("walk-30.mcap")))
+    bench = Bench()
+    bench.do(Play())
+    bench.pass_time(1.0)
+    snapshot = bench.do(OpenRecording(Path("walk-30.mcap")))
     assert snapshot.recording is not None and snapshot.recording.path == Path("walk-30.mcap")
     assert snapshot.transport.frame == 0 and not snapshot.transport.playing
     assert snapshot.trajectory is not None and len(snapshot.trajectory) == 1 and len(snapshot.chunks) == 1
 
 
 def test_a_file_that_can_not_be_opened_leaves_the_session_as_it_is() -> None:
-    desk = Desk()
-    desk.do(Play())
-    desk.pass_time(1.0)
-    snapshot = desk.do(OpenRecording(Path("notes.txt")))
+    bench = Bench()
+    bench.do(Play())
+    bench.pass_time(1.0)
+    snapshot = bench.do(OpenRecording(Path("notes.txt")))
     assert last_notice(snapshot) == "notes.txt is not a recording; choose another file."
     assert snapshot.session == 1 and snapshot.progress is None and snapshot.transport.playing
     before = snapshot.transport.frame
-    assert desk.pass_time(1.0).transport.frame > before
+    assert bench.pass_time(1.0).transport.frame > before
 
 
 def test_another_recording_brings_its_own_device_but_keeps_what_was_tuned() -> None:
     def resolve(path: Path) -> Params:
         return Params().with_values({"sensor.translation": (1.0, 0.0, 0.0)} if path.stem == "walk-30" else {})
 
-    desk = Desk(resolve=resolve)
-    desk.do(SetParams({"ground.alpha": 33, "sensor.translation": (0.0, 0.0, 5.0)}))
-    snapshot = desk.do(OpenRecording(Path("walk-30.mcap")))
+    bench = Bench(resolve=resolve)
+    bench.do(SetParams({"ground.alpha": 33, "sensor.translation": (0.0, 0.0, 5.0)}))
+    snapshot = bench.do(OpenRecording(Path("walk-30.mcap")))
     assert snapshot.params.sensor.translation == (1.0, 0.0, 0.0)
     assert snapshot.params.ground.alpha == 33
     assert snapshot.pending_restart == ()
 
 
 def test_a_recording_damaged_in_the_middle_keeps_what_was_read() -> None:
-    snapshot = Desk("broken-60-20.mcap").do(SetSpeed(math.inf), Play())
+    snapshot = Bench("broken-60-20.mcap").do(SetSpeed(math.inf), Play())
     assert "damaged at frame 20" in last_notice(snapshot)
     assert snapshot.transport.frame == 19 and not snapshot.transport.playing and snapshot.transport.finished
     assert snapshot.trajectory is not None and len(snapshot.trajectory) == 20
 
 
 def test_an_engine_that_fails_on_a_frame_pauses_and_can_go_on() -> None:
-    desk = Desk("failing-60-20.mcap")
-    snapshot = desk.do(SetSpeed(math.inf), Play())
+    bench = Bench("failing-60-20.mcap")
+    snapshot = bench.do(SetSpeed(math.inf), Play())
     assert "FloatingPointError: the covariance is not positive" in last_notice(snapshot)
     assert snapshot.transport.frame == 19 and not snapshot.transport.playing
-    assert desk.do(Play()).transport.frame == 58, "one of 60 was left out"
+    assert bench.do(Play()).transport.frame == 58, "one of 60 was left out"
 
 
 def test_a_dropped_scan_is_counted_and_explained() -> None:
-    snapshot = Desk("dropped-60-20.mcap").do(SetSpeed(math.inf), Play())
+    snapshot = Bench("dropped-60-20.mcap").do(SetSpeed(math.inf), Play())
     assert snapshot.transport.dropped == 1 and snapshot.transport.frame == 58
     assert any("no IMU samples cover it" in notice.text for notice in snapshot.notices)
 
 
 @pytest.mark.parametrize("command", [Play(), StepFrame(), Seek(3), Restart(), Save(Path("x"))])
 def test_without_a_recording_a_command_asks_for_one(command: Command) -> None:
-    assert "No recording is open" in last_notice(Desk(recording=None).do(command))
+    assert "No recording is open" in last_notice(Bench(recording=None).do(command))
 
 
 # --- truth and results ---------------------------------------------------------------------------
@@ -101,9 +101,9 @@ def truth_file(folder: Path, frames: int, wobble: float = 0.0) -> Path:
 
 
 def test_the_error_to_truth_is_what_remains_after_alignment(tmp_path: Path) -> None:
-    desk = Desk(truth=truth_file(tmp_path, 60))
-    snapshot = desk.do(Seek(59))
-    first = desk.do(Seek(0))
+    bench = Bench(truth=truth_file(tmp_path, 60))
+    snapshot = bench.do(Seek(59))
+    first = bench.do(Seek(0))
     assert first.T_map_truth is None and np.isnan(first.series["error_m"]).all(), "nothing to align yet"
     np.testing.assert_allclose(snapshot.series["error_m"], 0.0, atol=1e-6)
     assert snapshot.T_map_truth is not None
@@ -113,18 +113,18 @@ def test_the_error_to_truth_is_what_remains_after_alignment(tmp_path: Path) -> N
 
 
 def test_an_error_of_a_centimetre_is_reported_as_such(tmp_path: Path) -> None:
-    snapshot = Desk(truth=truth_file(tmp_path, 60, wobble=0.01)).do(Seek(59))
+    snapshot = Bench(truth=truth_file(tmp_path, 60, wobble=0.01)).do(Seek(59))
     assert snapshot.series["error_m"][-1] == pytest.approx(0.01, rel=0.1)
 
 
 def test_a_session_is_reopened_with_its_speed_and_breakpoints(tmp_path: Path) -> None:
     recording = tmp_path / "walk-60.mcap"
     recording.write_bytes(b"something to hash")
-    desk = Desk(str(recording), session_folder=tmp_path / "sessions")
+    bench = Bench(str(recording), session_folder=tmp_path / "sessions")
     chosen = Breakpoints(no_ground=True, error=0.2)
-    snapshot = desk.do(SetBreakpoints(chosen), SetSpeed(math.inf), Seek(30))
-    desk.controller.close()
-    again = Desk(str(snapshot.session_file)).see()
+    snapshot = bench.do(SetBreakpoints(chosen), SetSpeed(math.inf), Seek(30))
+    bench.controller.close()
+    again = Bench(str(snapshot.session_file)).see()
     assert (again.breakpoints, again.transport.speed, again.transport.frame) == (chosen, math.inf, 30)
     assert not again.transport.playing
 
@@ -132,11 +132,11 @@ def test_a_session_is_reopened_with_its_speed_and_breakpoints(tmp_path: Path) ->
 def test_results_are_written_while_replay_goes_on(tmp_path: Path) -> None:
     recording = tmp_path / "walk-60.mcap"
     recording.write_bytes(b"something to hash")
-    desk = Desk(str(recording))
-    desk.do(Seek(30))
-    snapshot = desk.do(Save(tmp_path / "out"), Save(tmp_path / "short", trajectory_only=True))
+    bench = Bench(str(recording))
+    bench.do(Seek(30))
+    snapshot = bench.do(Save(tmp_path / "out"), Save(tmp_path / "short", trajectory_only=True))
     while len(snapshot.saved) < 2:
-        snapshot = desk.do(StepFrame())
+        snapshot = bench.do(StepFrame())
     assert [saved.error for saved in snapshot.saved] == ["", ""]
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
         "trajectory.tum", "timings.csv", "map.ply", "report.json", "session.hemislam",
@@ -147,55 +147,55 @@ def test_results_are_written_while_replay_goes_on(tmp_path: Path) -> None:
 
 def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    desk = Desk()
-    desk.controller.handle(Save(tmp_path / "file"))
-    while not desk.see().saved:
-        desk.controller.work()
-    assert str(tmp_path / "file") in desk.see().saved[0].error
-    assert str(tmp_path / "file") in last_notice(desk.see())
+    bench = Bench()
+    bench.controller.handle(Save(tmp_path / "file"))
+    while not bench.see().saved:
+        bench.controller.work()
+    assert str(tmp_path / "file") in bench.see().saved[0].error
+    assert str(tmp_path / "file") in last_notice(bench.see())
 
 
 def test_a_walk_is_compared_with_another_trajectory_without_being_walked_again(tmp_path: Path) -> None:
-    desk, truth = Desk(), truth_file(tmp_path, 60, wobble=0.01)
-    before = desk.do(Seek(59), Seek(40))
+    bench, truth = Bench(), truth_file(tmp_path, 60, wobble=0.01)
+    before = bench.do(Seek(59), Seek(40))
     assert np.isnan(before.series["error_m"]).all()
-    compared = desk.do(CompareWith(truth))
+    compared = bench.do(CompareWith(truth))
     assert len(compared.series["error_m"]) == 41 and compared.transport.frame == 40
     assert compared.series["error_m"] == pytest.approx(0.01, rel=0.2), "of frames that were walked before, too"
     np.testing.assert_array_equal(compared.series["stamp_s"], before.series["stamp_s"])
     np.testing.assert_array_equal(compared.trajectory, before.trajectory)
     assert compared.recording is not None and compared.recording.truth == truth
     assert compared.T_map_truth is not None
-    later = desk.do(Seek(59), StepFrame(-1))
+    later = bench.do(Seek(59), StepFrame(-1))
     assert later.series["error_m"] == pytest.approx(0.01, rel=0.2), "of those gone back over, and when stepping back"
-    nothing = desk.do(CompareWith(None))
+    nothing = bench.do(CompareWith(None))
     assert np.isnan(nothing.series["error_m"]).all() and nothing.T_map_truth is None
 
 
 def test_a_trajectory_of_another_time_is_refused_and_the_one_before_stays(tmp_path: Path) -> None:
     truth = truth_file(tmp_path, 60)
-    desk = Desk(truth=truth)
-    desk.do(Seek(20))
+    bench = Bench(truth=truth)
+    bench.do(Seek(20))
     elsewhere = tmp_path / "later.tum"
     write_tum(elsewhere, Trajectory.from_poses(10**18 + np.arange(9) * fakes.FRAME_NS, np.tile(np.eye(4), (9, 1, 1))))
-    snapshot = desk.do(CompareWith(elsewhere))
+    snapshot = bench.do(CompareWith(elsewhere))
     assert "later.tum covers 1000000000.0 s to" in last_notice(snapshot)
     assert snapshot.recording is not None and snapshot.recording.truth == truth
     assert np.isfinite(snapshot.series["error_m"][-1])
-    opened = Desk(truth=elsewhere).see()
+    opened = Bench(truth=elsewhere).see()
     assert "later.tum covers" in last_notice(opened), "also when it is opened with the recording"
 
 
 def test_a_session_remembers_what_it_was_compared_with_and_opens_without_it_if_that_is_gone(tmp_path: Path) -> None:
     recording, truth = tmp_path / "walk-60.mcap", truth_file(tmp_path, 60, wobble=0.01)
     recording.write_bytes(b"something to hash")
-    desk = Desk(str(recording), session_folder=tmp_path / "sessions")
-    snapshot = desk.do(Seek(30), CompareWith(truth))
+    bench = Bench(str(recording), session_folder=tmp_path / "sessions")
+    snapshot = bench.do(Seek(30), CompareWith(truth))
     assert snapshot.session_file is not None
-    desk.controller.close()
-    again = Desk(str(snapshot.session_file)).see()
+    bench.controller.close()
+    again = Bench(str(snapshot.session_file)).see()
     assert again.series["error_m"][-1] == pytest.approx(0.01, rel=0.2)
     truth.unlink()
-    without = Desk(str(snapshot.session_file)).see()
+    without = Bench(str(snapshot.session_file)).see()
     assert without.transport.frame == 30 and np.isnan(without.series["error_m"]).all()
     assert "truth.tum, which is gone" in last_notice(without)

@@ -12,7 +12,7 @@ from app.server.protocol import Command, Snapshot
 from app.slam.params import Params
 
 
-class Desk:
+class Bench:
     """A session, its clock, and the page's view of it."""
 
     def __init__(self, recording: str | None = "walk-60.mcap", truth: Path | None = None, **kwargs: object) -> None:
