@@ -25,7 +25,7 @@ class Setup:
         resolve: parameters for recordings opened later; None keeps the present ones.
         play: begin at once. speed: to play at. breakpoints: where to pause.
         chunk_voxel: m, see `Controller`. point_budget: most points of the map that are held for pages;
-            see `app.server.chunks.room`.
+            see `app.server.chunks`.
         checkpoint_bytes: see `app.mapping.checkpoints`.
         live_folder: where a live run keeps what a process that takes over needs. revive: it is that process.
         live: where to take scans from while `recording` is `app.server.protocol.LIVE`.
