@@ -336,7 +336,7 @@ class LoopBackend:
             self._solve()
 
     def _tell_idle(self) -> None:
-        """At the end: which edits found nothing to act on; each is said once."""
+        """At the end, report each edit without effect once."""
         idle = [in_words(entry.edit) for entry in self._edits if entry.pair and entry.pair not in self.by_pair]
         new = [words for words in idle if words not in self._idle]
         self._notices += [f"{words} has no effect: there is no such loop; loops.csv lists all." for words in new]
