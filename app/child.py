@@ -17,7 +17,6 @@ import os
 import pickle
 import queue
 import signal
-import struct
 import sys
 import threading
 import time
@@ -31,7 +30,6 @@ from types import ModuleType
 from typing import Any, Final
 
 from app.logs import process_logs
-from app.packing import Parts, pack, unpack
 from app.slam.errors import HemislamError
 
 PRELOADED: Final = ("app.server.engine_process", "app.fork_server")
@@ -89,11 +87,11 @@ class Link:
         self._writer.start()
 
     def send(self, message: object) -> None:
-        """Send a message, whose arrays must not change any more. Never waits; lost if the other end is gone."""
+        """Send a message, which must not change any more. Never waits; lost if the other end is gone."""
         self._unsent.put(message)
 
     def receive(self, timeout: float | None = None) -> Any:
-        """The next message; None if none comes within the time (s). Large arrays in it are read-only.
+        """The next message; None if none comes within the time (s). Arrays that were read-only still are.
 
         Raises:
             LinkClosed: there will be none.
@@ -101,14 +99,12 @@ class Link:
         try:
             if not self._connection.poll(timeout):
                 return None
-            head = self._connection.recv_bytes()
-            if not head:
-                raise LinkClosed
-            (arrays,) = struct.unpack_from("<I", head)
-            parts: Parts = [memoryview(head)[4:], *(self._connection.recv_bytes() for _ in range(arrays))]
+            packed = self._connection.recv_bytes()
         except (EOFError, OSError):
             raise LinkClosed from None
-        return unpack(parts)
+        if not packed:
+            raise LinkClosed
+        return pickle.loads(packed)
 
     def close(self) -> None:
         """Have the other end's `receive` raise `LinkClosed` once it has received everything sent before."""
@@ -121,10 +117,7 @@ class Link:
     def _write(self) -> None:
         try:
             while (message := self._unsent.get()) is not _END:
-                body, *arrays = pack(message)
-                self._connection.send_bytes(struct.pack("<I", len(arrays)) + body)
-                for array in arrays:
-                    self._connection.send_bytes(array)
+                self._connection.send_bytes(pickle.dumps(message, protocol=5))
             self._connection.send_bytes(b"")
         except OSError:
             pass  # the other end is gone, which `receive` reports

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -162,15 +163,17 @@ def until_gone(pid: int) -> None:
         time.sleep(0.02)
 
 
-def test_messages_arrive_in_order_and_large_arrays_are_read_only() -> None:
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_messages_arrive_in_order_and_read_only_arrays_stay_read_only(order: Literal["C", "F"]) -> None:
     child = echoing()
-    rows = np.arange(500_000)
+    rows = np.arange(500_000, dtype=np.int32).reshape(-1, 4).copy(order=order)
+    rows.setflags(write=False)
     child.send(1)
     child.send({"rows": rows})
     assert child.receive(TIMEOUT_S) == "hello"
     assert child.receive(TIMEOUT_S) == 1
     got = child.receive(TIMEOUT_S)["rows"]
-    assert np.array_equal(got, rows) and not got.flags.writeable
+    assert np.array_equal(got, rows) and got.dtype == rows.dtype and not got.flags.writeable
     assert child.receive(0.05) is None, "nothing more was sent"
     child.close()
     assert not alive(child.pid)
