@@ -6,8 +6,7 @@ import viser
 
 from app.ui.colours import COLOUR_BY, Limits, legend
 from app.ui.html import panel
-from app.ui.view import View
-from app.ui.widgets import show
+from app.ui.widgets import View, choose_next, show
 
 _LAYERS: Final = (
     ("ceilings", "ceilings", "Hidden, you can look into a building from above. Ceilings labelled ground stay."),
@@ -43,7 +42,7 @@ class AppearancePanel:
         gui.add_command("Follow the sensor or look freely", hotkey="F").on_trigger(
             lambda _: show(self._follow, not self._follow.value)
         )
-        gui.add_command("Next colour mode", hotkey="C").on_trigger(lambda _: self._next_colouring())
+        gui.add_command("Next colour mode", hotkey="C").on_trigger(lambda _: choose_next(self._colour_by))
 
     @property
     def view(self) -> View:
@@ -64,6 +63,3 @@ class AppearancePanel:
         self._legend.content = legend(view.colour_by, limits)
         words = f"{points:,} map points in the page, at most {budget:,}, and fewer the longer the trajectory."
         self._count.content = panel("note", f"{words} The engine keeps the whole map.")
-
-    def _next_colouring(self) -> None:
-        show(self._colour_by, COLOUR_BY[(COLOUR_BY.index(self._colour_by.value) + 1) % len(COLOUR_BY)])

@@ -12,15 +12,20 @@ import numpy.typing as npt
 import viser
 
 from app.server.protocol import Chunk
-from app.slam.types import F32, F64, U8
-from app.ui.ceiling import below_ceiling
+from app.slam.types import F32, F64, NON_GROUND, U8
 from app.ui.colours import HEIGHT, MODES, Limits, PointSet, colours, grown
 from app.ui.geometry import STILL_M
 from app.ui.nodes import add_points, place
-from app.ui.view import View
+from app.ui.widgets import View
 
 _STILL: Final[F32] = np.array([5e-5, 5e-5, 5e-5, STILL_M], np.float32)
 """Largest change of a pose's rotation and position (m) that is not sent: each loop moves most of the map by less."""
+_CONE: Final = float(np.cos(np.radians(35.0)))
+_HIGHEST_M: Final = 8.0
+_LEAST_SHARE: Final = 0.004
+_FLATNESS_M: Final = 0.12
+"""Most median deviation of the points overhead from their median height: treetops are rougher."""
+_MARGIN_M: Final = 0.25
 Chosen: TypeAlias = npt.NDArray[np.bool_] | slice
 """Which points of a chunk."""
 
@@ -175,3 +180,21 @@ def _same(drawn: Chunk, chunk: Chunk) -> bool:
     return (drawn.index, drawn.frame, drawn.stamp_ns) == (chunk.index, chunk.frame, chunk.stamp_ns) and (
         drawn.level + drawn.joined < chunk.level + chunk.joined
     )
+
+
+def below_ceiling(points: F32, labels: U8, up: F64) -> npt.NDArray[np.bool_] | None:
+    """Which points stay when the ceiling above a keyframe is hidden; None where nothing flat is overhead.
+
+    Points labelled ground always stay: a ceiling mistaken for ground must be visible.
+
+    Args:
+        points: (n, 3) m, LiDAR frame. labels: (n,). up: (3,) unit, LiDAR frame.
+    """
+    height = points @ up.astype(np.float32)
+    overhead = height[height > _CONE * np.linalg.norm(points, axis=1)]
+    if len(overhead) < max(30.0, _LEAST_SHARE * len(points)):
+        return None
+    ceiling = float(np.median(overhead))
+    if ceiling > _HIGHEST_M or float(np.median(np.abs(overhead - ceiling))) > _FLATNESS_M:
+        return None
+    return np.asarray((height < ceiling - _MARGIN_M) | (labels != NON_GROUND))

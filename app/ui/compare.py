@@ -3,7 +3,7 @@
 `Sides` decides which of the two the parameters belong to; `ComparePanel` shows both.
 """
 
-from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,14 +19,22 @@ from app.slam.errors import HemislamError
 from app.slam.types import F64, U8, StepResult
 from app.ui import compare_maths as maths
 from app.ui.html import css, heading, panel
-from app.ui.nodes import NO_COLOURS, NO_POINTS, add_points, place
-from app.ui.paths import Trajectory
+from app.ui.nodes import NO_COLOURS, NO_POINTS, Trajectory, add_points, place
 from app.ui.sensor import SCAN_POINT_SCALE, shown_of
-from app.ui.view import View
-from app.ui.widgets import ROOT, Page, by_user, chart, show, unchanged
+from app.ui.widgets import (
+    PANEL_PERIOD_S,
+    ROOT,
+    SCENE_PERIOD_S,
+    Changes,
+    Page,
+    View,
+    by_user,
+    chart,
+    dialog,
+    notify_error,
+    show,
+)
 
-_SCENE_PERIOD_S: Final = 1 / 15
-_PANEL_PERIOD_S: Final = 1 / 4
 _RECENT: Final = 16
 """Frames of A that are kept until B reaches them."""
 _SWAP, _KEEP, _DISCARD = "swap", "keep", "discard"
@@ -51,7 +59,7 @@ class Sides:
         """A or B."""
         show(self._choice, side)
 
-    def tick(self, b: Snapshot | None) -> None:
+    def draw(self, b: Snapshot | None) -> None:
         """Show the choice while there is a fork."""
         self._choice.visible = b is not None
 
@@ -117,15 +125,13 @@ class ComparePanel:
         gui = page.gui
         self._forks = forks
         self._sides = sides
-        self._now: Callable[[], float] = page.now
         self._scene = CompareScene(page.scene)
         self._recent: dict[tuple[int, int], StepResult] = {}
         self._pair: tuple[StepResult, StepResult] | None = None
         self._covering = False
         self._ground: U8 = _NO_POINTS
-        self._in_scene: tuple[Any, ...] = ()
-        self._in_panel: tuple[Any, ...] = ()
-        self._scene_at = self._panel_at = -1e9
+        self._scene_changes, self._pair_changes = Changes(page.now, SCENE_PERIOD_S), Changes()
+        self._panel_changes = Changes(page.now, PANEL_PERIOD_S)
 
         self._status = gui.add_html(maths.status(None, None, ("", ""), -1))
         self._name = gui.add_text("name", "", hint="Of the fork, and of its file when you keep it.")
@@ -168,10 +174,13 @@ class ComparePanel:
         """The view without the scan, while it is drawn here in other colours."""
         return replace(view, scan=False) if self._covering else view
 
-    def tick(self, a: Snapshot, view: View) -> None:
+    def draw(self, a: Snapshot, view: View) -> None:
         """Called by the drawing thread, often, with the view that all other panels leave."""
-        now, b = self._now(), self._forks.other
-        self._show_controls(b)
+        b = self._forks.other
+        self._sides.draw(b)
+        self._fork.visible = self._open.visible = b is None
+        for control in (self._what, self._by_ground, self._legend, self._numbers):
+            control.visible = b is not None
         if b is None:
             self._recent.clear()
         elif a.result is not None:
@@ -179,12 +188,9 @@ class ComparePanel:
             while len(self._recent) > _RECENT:
                 del self._recent[next(iter(self._recent))]
         look = (a, b, view.point_size, view.scan, view.path, self._by_ground.value)
-        if not unchanged(self._in_scene, look) and (now - self._scene_at >= _SCENE_PERIOD_S or b is None):
-            self._in_scene, self._scene_at = look, now
+        if self._scene_changes(*look, at_once=b is None):
             self._draw_scene(a, b, view)
-        told = (a, b, self._scene_at)  # the scene finds the frame that both have, maybe after the panel was drawn
-        if not unchanged(self._in_panel, told) and (now - self._panel_at >= _PANEL_PERIOD_S or b is None):
-            self._in_panel, self._panel_at = told, now
+        if self._panel_changes(a, b, self._pair, at_once=b is None):
             self._draw_panel(a, b)
 
     # --- what is drawn ---------------------------------------------------------------------------
@@ -195,9 +201,11 @@ class ComparePanel:
         at = positions[-1] if len(positions) else None
         self._scene.draw_b(positions[max(self._forks.forked_at, 0) :], at, view.path)
         pair = self._matching(a, b) if b is not None else None
-        if pair is not None and not unchanged(self._pair or (), pair):
+        if pair is None:
+            self._pair = None
+        elif self._pair_changes(*pair) or self._pair is None:
+            self._pair = pair
             self._ground = maths.ground_difference(pair[0].cloud, pair[1].cloud)
-        self._pair = pair
         self._covering = pair is not None and view.scan and bool(self._by_ground.value) and len(pair[0].cloud) > 0
         self._scene.draw_ground(pair[0] if pair and self._covering else None, self._ground, view.point_size)
 
@@ -225,12 +233,6 @@ class ComparePanel:
             if curve is not None:
                 plot.data = curve
 
-    def _show_controls(self, b: Snapshot | None) -> None:
-        self._sides.tick(b)
-        self._fork.visible = self._open.visible = b is None
-        for control in (self._what, self._by_ground, self._legend, self._numbers):
-            control.visible = b is not None
-
     # --- what is asked for -----------------------------------------------------------------------
     def _act(self, what: Any, client: viser.ClientHandle) -> None:
         try:
@@ -248,20 +250,18 @@ class ComparePanel:
                     self._forks.fork(self._name.value)
                     self._sides.choose("B")
         except HemislamError as error:
-            client.add_notification("Error", str(error), color="red", auto_close_seconds=None)
+            notify_error(client, error)
 
     def _choose(self, client: viser.ClientHandle) -> None:
         """A dialog with the sessions that can be opened as B."""
         kept = self._forks.kept()
-        with client.gui.add_modal("Open a session as B") as modal:
+        with dialog(client, "Open a session as B") as close:
             if not kept:
                 client.gui.add_html(panel("text", "This recording has no other session yet; fork, then keep the fork."))
             buttons = [(path, client.gui.add_button(path.stem, color="gray")) for path in kept]
-            cancel = client.gui.add_button("Cancel", color="gray")
-        cancel.on_click(lambda _: modal.close())
 
         def chosen(path: Path, _: object) -> None:
-            modal.close()
+            close()
             self._act(path, client)
 
         for path, button in buttons:
@@ -269,10 +269,8 @@ class ComparePanel:
 
     def _swap_if_any(self) -> None:
         if self._forks.other is not None:
-            try:
+            with suppress(HemislamError):  # B has no frame yet: its status says so
                 self._forks.swap()
-            except HemislamError:
-                return  # B has no frame yet: its status says so
 
 
 def _curves(found: maths.Difference) -> "list[tuple[Any, ...] | None]":

@@ -12,7 +12,7 @@ from app.slam import lie
 from app.slam.types import F64, I64, NON_GROUND, U8, Cloud
 from app.ui.colours import LABEL_COLOURS, Rgb
 from app.ui.html import BAD, WARN, Tile, number, panel
-from app.ui.paths import PATH_COLOUR
+from app.ui.nodes import PATH_COLOUR
 
 A_COLOUR: Final[Rgb] = PATH_COLOUR
 B_COLOUR: Final[Rgb] = (77, 163, 255)

@@ -15,7 +15,7 @@ from app.slam.errors import HemislamError
 from app.slam.results import EXPORTS
 from app.slam.trajectory import truth_beside
 from app.ui.html import panel
-from app.ui.widgets import Page, by_user
+from app.ui.widgets import Page, by_user, dialog
 
 _MOST_ENTRIES: Final = 60
 
@@ -102,14 +102,13 @@ class FilesPanel:
         if recording is None:
             return
         gui = client.gui
-        with gui.add_modal("Save results") as modal:
+        with dialog(client, "Save results") as close:
             names = [export.name for export in EXPORTS]
             gui.add_html(panel("save", names, f"session{SUFFIX}", str(self._results)))
             name = gui.add_text("folder", result_folder_name(recording.path, datetime.now()))
             everything = gui.add_checkbox("all files", True, hint="Off: only trajectory.tum, which takes no time.")
             problem = gui.add_html("", visible=False)
             save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
-            cancel = gui.add_button("Cancel", color="gray")
 
         def confirmed(_: object) -> None:
             chosen = Path(name.value.strip())
@@ -118,10 +117,9 @@ class FilesPanel:
                 problem.visible = True
                 return
             self._page.send(Save(self._results / chosen, trajectory_only=not everything.value))
-            modal.close()
+            close()
 
         save.on_click(confirmed)
-        cancel.on_click(lambda _: modal.close())
 
 
 class FileBrowser:

@@ -108,15 +108,9 @@ class LivePanel:
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._html = gui.add_html("", visible=False)
-        self._drawn: LiveState | None = None
-        self._ended = False
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the source's newest readings."""
-        ended = snapshot.transport.finished
-        if snapshot.live is self._drawn and ended == self._ended:
-            return
-        self._drawn, self._ended = snapshot.live, ended
         self._html.visible = snapshot.live is not None
         if snapshot.live is not None:
-            self._html.content = live_html(snapshot.live, ended=ended)
+            self._html.content = live_html(snapshot.live, ended=snapshot.transport.finished)

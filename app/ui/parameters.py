@@ -1,14 +1,13 @@
 """The parameter panel, generated from the one declaration (`app.slam.params.leaves`).
 
-Every number with a range has a slider with that range; a number without one has a box. M, α, σ and the voxel size
-come first, the others in a folder per section.
+A number has a slider over its range, or a box where the range has too many steps for a slider. M, α, σ and the voxel
+size come first, the others in a folder per section.
 
 Browsers and the engine may both change a value. What a user set is sent as a command; the snapshot's value flows back,
 except into a control that was touched a moment ago: an older snapshot must not move the slider under the hand.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import viser
@@ -17,12 +16,14 @@ from app.server.fork import engine_number
 from app.server.protocol import LoadParams, Restart, SetParams, Snapshot
 from app.slam.params import Effect, Leaf, Params, leaves
 from app.ui.html import panel
-from app.ui.widgets import Page, as_set, by_user, show
+from app.ui.widgets import Edit, Page, as_set, by_user, dialog, show
 
 PRIMARY: Final = ("ground.scan_lines", "ground.alpha", "ground.sigma", "ground.voxel_size")
 """The paper's parameters, above all others."""
 
 MARK: Final[dict[Effect, str]] = {"now": "", "frame": " ▸", "restart": " ↻"}
+_MOST_STEPS: Final = 2000
+"""Of a slider. The IMU's noise spans decades: its usual values would share the first few pixels."""
 _TYPING_S: Final = 0.5
 """A value that can be typed is sent after this long without a change: "0.05" begins with "0"."""
 _HOLD_S: Final = 1.0
@@ -71,28 +72,19 @@ def add_control(gui: viser.GuiApi, leaf: Leaf, value: Any) -> Control:
         return gui.add_vector3(text, value, step=leaf.step, hint=hint)
     kind = type(leaf.default)
     low, high, step = (None if limit is None else kind(limit) for limit in (leaf.minimum, leaf.maximum, leaf.step))
-    if low is not None and high is not None and step is not None:
+    if low is not None and high is not None and step is not None and high - low <= _MOST_STEPS * step:
         return gui.add_slider(text, low, high, step, value, hint=hint)
     return gui.add_number(text, value, min=low, max=high, step=step, hint=hint)
 
 
-@dataclass(slots=True)
-class _Edit:
-    """A value that a user set, when, and whether it was sent to the engine."""
-
-    value: Any
-    at: float
-    sent: bool
-
-
 class ParameterPanel:
-    """A control for every parameter; `tick` sends what was typed and shows what the snapshot says."""
+    """A control for every parameter; `draw` sends what was typed and shows what the snapshot says."""
 
     def __init__(self, page: Page, params: Params) -> None:
         gui = self._gui = page.gui
         self._send = page.send
         self._now = page.now
-        self._edits: dict[str, _Edit] = {}
+        self._edits: dict[str, Edit] = {}
         self._engine = 0
         self._controls: dict[str, Control] = {}
         self._resets: dict[str, viser.GuiButtonGroupHandle] = {}
@@ -113,7 +105,7 @@ class ParameterPanel:
                 self._add_reset(section)
         gui.add_html(panel("quiet", "▸ acts from the next frame · ↻ acts on restart"))
 
-    def tick(self, snapshot: Snapshot) -> None:
+    def draw(self, snapshot: Snapshot) -> None:
         """Called by the drawing thread, often: send typed values that no longer change, show the snapshot's."""
         now = self._now()
         if engine_number(snapshot) != self._engine:  # what was set was meant for the other engine
@@ -145,7 +137,7 @@ class ParameterPanel:
         self._controls[leaf.path] = control
 
         def changed(value: Any, _: viser.ClientHandle) -> None:
-            self._edits[leaf.path] = _Edit(value, self._now(), sent=at_once)
+            self._edits[leaf.path] = Edit(value, self._now(), sent=at_once)
             if at_once:
                 self._send(SetParams({leaf.path: value}))
 
@@ -206,20 +198,15 @@ def _show_yaml(client: viser.ClientHandle, params: Params) -> None:
 
 
 def _load_yaml(client: viser.ClientHandle, page: Page) -> None:
-    with client.gui.add_modal("Load parameters") as modal:
+    with dialog(client, "Load parameters") as close:
         client.gui.add_html(panel("text", "Paste YAML or choose a file. Parameters it omits return to their defaults."))
         text = client.gui.add_text("yaml", "", multiline=True)
         upload = client.gui.add_upload_button("Choose a file", icon=viser.Icon.UPLOAD, mime_type=".yaml,.yml,text/yaml")
         apply = client.gui.add_button("Apply", icon=viser.Icon.CHECK)
-        cancel = client.gui.add_button("Cancel", color="gray")
-
-    def uploaded(_: Any) -> None:
-        show(text, upload.value.content.decode("utf-8", errors="replace"))
 
     def applied(_: Any) -> None:
         page.send(LoadParams(text.value))
-        modal.close()
+        close()
 
-    upload.on_upload(uploaded)
+    upload.on_upload(lambda _: show(text, upload.value.content.decode("utf-8", errors="replace")))
     apply.on_click(applied)
-    cancel.on_click(lambda _: modal.close())

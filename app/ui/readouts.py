@@ -3,13 +3,12 @@
 from typing import Any, Final
 
 import numpy as np
-import viser
 
 from app.server.protocol import Snapshot
 from app.slam.types import F64, I64, STAGES, StepResult
 from app.ui.colours import Rgb
 from app.ui.html import BAD, GOOD, WARN, Tile, css, heading, number, panel
-from app.ui.widgets import chart
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, chart
 
 HISTORY: Final = 300
 """Most frames in a plot."""
@@ -131,14 +130,15 @@ def stacked_stages(series: dict[str, F64], *, whole: bool = False) -> tuple[F64,
 class ReadoutPanel:
     """Tiles and plots in the caller's container."""
 
-    def __init__(self, gui: viser.GuiApi) -> None:
+    def __init__(self, page: Page) -> None:
+        gui = page.gui
+        self._changes = Changes(page.now, PANEL_PERIOD_S)
         self._tiles = gui.add_html("")
         self._time = gui.add_html("")
         colours = [css(STAGE_COLOURS[stage]) for stage in reversed(STAGES)]
         self._whole = gui.add_checkbox(
             "all frames", False, hint="In the plots; where frames share a place, the worst is drawn. Off: the last 300."
         )
-        self._drawn_whole = False
         gui.add_html(heading("Frame time by stage, ms (peaks cut)"))
         layers = [{"stroke": colour, "width": 0, "fill": colour} for colour in colours]
         self._stages = chart(gui, stacked_stages({}), layers)
@@ -152,13 +152,11 @@ class ReadoutPanel:
         self._error = chart(gui, nothing, [{"stroke": "#ff5c8d", "width": 1.5}])
         self._error.visible = False
 
-    @property
-    def stale(self) -> bool:
-        """Whether the user has asked for other plots than are drawn."""
-        return self._whole.value != self._drawn_whole
-
     def draw(self, snapshot: Snapshot) -> None:
         """Show the snapshot's numbers and plots."""
+        dropped = snapshot.transport.dropped
+        if not self._changes(snapshot.result, snapshot.series, snapshot.params, dropped, self._whole.value):
+            return
         result = snapshot.result
         if result is None:
             self._tiles.content = panel("quiet", "Numbers appear with the first frame.")
@@ -175,7 +173,7 @@ class ReadoutPanel:
 
     def _draw_plots(self, snapshot: Snapshot) -> None:
         series = snapshot.series
-        whole = self._drawn_whole = self._whole.value
+        whole = self._whole.value
 
         def curve(name: str) -> tuple[F64, ...]:
             return worst(series, name, name) if whole else recent(series, name)

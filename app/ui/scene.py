@@ -10,13 +10,12 @@ import numpy as np
 import viser
 
 from app.server.protocol import Snapshot
-from app.slam.types import F64
+from app.slam.types import F64, StepResult
 from app.ui.chunks import MapChunks
 from app.ui.colours import Limits
-from app.ui.paths import Trajectory, Truth
+from app.ui.nodes import Trajectory, Truth
 from app.ui.sensor import SensorScene
-from app.ui.view import View
-from app.ui.widgets import ROOT, poses_of
+from app.ui.widgets import ROOT, Changes, View, poses_of
 
 _FOLLOWED_M: Final = 1e-3
 _FOLLOW_RATE: Final = 0.3
@@ -48,6 +47,9 @@ class Scene:
             shadow_opacity=0.0,
             position=(0.0, 0.0, _GROUND_BEFORE_SEEN_M),
         )
+        self._session = -1
+        self._shown: StepResult | None = None
+        self._changes = Changes()
         self._chunks = MapChunks(scene, f"{ROOT}/keyframes")
         self._sensor = SensorScene(scene, f"{ROOT}/sensor")
         self._trajectory = Trajectory(scene, f"{ROOT}/trajectory")
@@ -70,17 +72,16 @@ class Scene:
         """Ends of a colour map as drawn; None for labels and before there is anything to colour."""
         return self._chunks.limits.get(by)
 
-    def draw(self, previous: Snapshot | None, current: Snapshot, view: View, previous_view: View | None) -> None:
-        """Make the scene show `current` seen as `view`, given that it shows `previous` seen as `previous_view`."""
+    def draw(self, current: Snapshot, view: View) -> None:
+        """Make the scene show `current` seen as `view`."""
         with self._server.atomic():
-            before = previous if previous is not None and previous.session == current.session else None
             recording, result = current.recording, current.result
             start_ns = recording.start_ns if recording else 0
-            if before is None:
+            if current.session != self._session:
+                self._session, self._shown = current.session, None
                 self._chunks.clear(start_ns, recording.duration_s if recording else 1.0)
                 self._sensor.clear()
             poses = poses_of(current)
-            limits_before = self.limits(view.colour_by)
             self._chunks.draw(current.chunks[: len(poses)], poses, view)
             self._trajectory.draw(current.trajectory if current.trajectory is not None else np.empty((0, 3)), view.path)
             self._truth.draw(recording.truth_positions if recording else None, current.T_map_truth, view.path)
@@ -88,22 +89,14 @@ class Scene:
             if result is None:
                 return
             limits = self.limits(view.colour_by)
-            unchanged = (
-                before is not None
-                and before.result is result
-                and before.params == current.params
-                and view == previous_view
-                and limits == limits_before
-            )
-            if not unchanged:
-                self._sensor.draw(
-                    before.result if before is not None else None, result, current.params, view, limits, start_ns
-                )
+            if self._changes(result, current.params, view, limits):
+                self._sensor.draw(self._shown, result, current.params, view, limits, start_ns)
             z = self._sensor.ground_z
             if z is not None and abs(z - self._grid.position[2]) > _GRID_STEP_M:  # smaller steps would make it shiver
                 self._grid.position = (0.0, 0.0, z)
             if view.follow:
-                self._follow(result.T_map_imu[:3, 3], jump=before is None or before.result is None)
+                self._follow(result.T_map_imu[:3, 3], jump=self._shown is None)
+            self._shown = result
 
     def _follow(self, position: F64, jump: bool) -> None:
         behind = -position - self._root.position

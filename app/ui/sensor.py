@@ -10,7 +10,7 @@ from app.slam.types import F64, GROUND, SEED, StepResult
 from app.ui.colours import LABEL_COLOURS, Limits, PointSet, colours
 from app.ui.geometry import disc, field_of_view, foot, ring_elevations, rotation_to, seed_wedge, wxyz
 from app.ui.nodes import NO_COLOURS, NO_LINES, NO_POINTS, add_lines, add_points, add_surface, place
-from app.ui.view import View
+from app.ui.widgets import View
 
 MOST_SCAN_POINTS: Final = 30_000
 """Of a denser scan every k-th point is drawn. A scan is sent to every browser with every frame: 2.7 MB/s at 10 Hz."""

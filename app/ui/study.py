@@ -4,33 +4,99 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
 
+import numpy as np
 import viser
 
 from app.server.protocol import Snapshot
-from app.slam import study
+from app.slam import lie, study
 from app.slam.types import F64, StepResult
 from app.ui.colours import LABEL_COLOURS
+from app.ui.geometry import disc, rotation_to
 from app.ui.html import css, heading, panel
+from app.ui.nodes import add_lines, add_points, add_surface, place
+from app.ui.sensor import SCAN_POINT_SCALE, shown_of
 from app.ui.study_maths import (
     AS_MAP,
     HEADROOM,
+    RESIDUAL,
     STUDY_BY,
+    STUDY_MODES,
     Curve,
     Picked,
     curve,
     describe,
     nearest_to_ray,
     pick,
+    study_colours,
     study_legend,
 )
-from app.ui.study_scene import StudyScene
-from app.ui.view import View
-from app.ui.widgets import Page, by_user, chart, show, unchanged
+from app.ui.widgets import PANEL_PERIOD_S, ROOT, SCENE_PERIOD_S, Changes, Page, View, by_user, chart, choose_next
 
-_PERIOD_S: Final = 1 / 15
-_CURVE_PERIOD_S: Final = 0.25
+_POINT: Final = (255, 255, 255)
+_NEIGHBOURS: Final = (255, 92, 141)
+_MAP: Final = (64, 184, 240)
+_LEAST_RADIUS_M: Final = 0.1
 _THRESHOLD: Final = (255, 107, 107)
 _ASK: Final = "Pause and click a point of the scan."
+
+
+class StudyScene:
+    """The frame in colours of its own, the point clicked, its neighbours and planes; nodes below the map's."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        self._map = f"{ROOT}/study"
+        self._lidar = scene.add_frame(self._map, show_axes=False)
+        self._cloud: viser.PointCloudHandle | None = None
+        self._marks: list[Any] = []
+
+    def draw_cloud(self, result: StepResult | None, by: str, size: float) -> None:
+        """The frame coloured by a number; nothing for `AS_MAP`."""
+        points = STUDY_MODES[by].points(result) if result is not None and by != AS_MAP else ()
+        if result is None or len(points) == 0:
+            if self._cloud is not None:
+                self._cloud.remove()
+                self._cloud = None
+            return
+        place(self._lidar, result.T_map_imu @ result.state.T_imu_lidar)
+        shown = shown_of(len(points))
+        self._cloud = add_points(
+            self._scene,
+            f"{self._map}/cloud",
+            np.asarray(points)[shown],
+            study_colours(result, by)[shown],
+            size * (2.2 if by == RESIDUAL else SCAN_POINT_SCALE),
+        )
+
+    def draw_picked(self, result: StepResult | None, picked: Picked | None, size: float) -> None:
+        """Mark a point, its neighbours, the plane through them and the map's plane nearby."""
+        for mark in self._marks:
+            mark.remove()
+        self._marks.clear()
+        if result is None or picked is None:
+            return
+        place(self._lidar, result.T_map_imu @ result.state.T_imu_lidar)
+        points, patch = result.cloud.points, picked.patch
+        for name, chosen, colour, scale in (
+            ("neighbours", patch.indices[1:], _NEIGHBOURS, 2.0),
+            ("point", patch.indices[:1], _POINT, 3.0),
+        ):
+            mark = add_points(self._scene, f"{self._map}/{name}", points[chosen], colour, scale * size)
+            self._marks.append(mark)
+        radius = max(patch.radius, _LEAST_RADIUS_M)
+        self._plane("patch", patch.center, patch.normal, radius, _NEIGHBOURS)
+        match = picked.match
+        if match is not None and match.center is not None and match.normal is not None:
+            T_lidar_odom = lie.inverse(result.state.T_odom_imu @ result.state.T_imu_lidar)
+            R = T_lidar_odom[:3, :3]
+            self._plane("map_patch", R @ match.center + T_lidar_odom[:3, 3], R @ match.normal, radius, _MAP)
+
+    def _plane(self, name: str, center: F64, normal: F64, radius: float, colour: tuple[int, int, int]) -> None:
+        vertices, faces, rim = disc(radius, 40)
+        stem = np.array([[[0, 0, 0], [0, 0, radius]]], dtype=np.float32)
+        T, node = lie.transform(rotation_to(normal), center), f"{self._map}/{name}"
+        self._marks.append(add_surface(self._scene, node, vertices, faces, colour, 0.25, T))
+        self._marks.append(add_lines(self._scene, f"{node}_rim", np.concatenate((rim, stem)), colour, 2.0, T))
 
 
 class StudyPanel:
@@ -46,10 +112,10 @@ class StudyPanel:
         self._scene = StudyScene(page.scene)
         self._clicked: tuple[F64, F64] | None = None  # the newest click's ray, in the map
         self._picked: Picked | None = None
-        self._drawn: tuple[Any, ...] = ()
-        self._marked: tuple[Any, ...] = ()
-        self._curve_of: tuple[Any, ...] = ()
-        self._drawn_at = self._curve_at = -1e9
+        self._of: StepResult | None = None  # the frame of the picked point
+        self._scene_changes = Changes(page.now, SCENE_PERIOD_S)
+        self._point_changes = Changes()
+        self._curve_changes = Changes(page.now, PANEL_PERIOD_S)
 
         self._by = gui.add_dropdown(
             "colour scan by", STUDY_BY, initial_value=AS_MAP, hint="Of the newest frame only. V: the next."
@@ -65,56 +131,47 @@ class StudyPanel:
         gui.add_html(heading("Download this frame with all its points' numbers"))
         self._save = gui.add_button_group("save", ("PLY", "PCD"), hint="In the LiDAR frame.")
         self._save.on_click(by_user(self._download))
-        gui.add_command("Next colour mode of the frame under study", hotkey="V").on_trigger(lambda _: self._next())
+        gui.add_command("Next colour mode of the frame under study", hotkey="V").on_trigger(
+            lambda _: choose_next(self._by)
+        )
         page.scene.on_click()(self._click)
 
     def seen(self, view: View) -> View:
         """The view without what stands in the way of the study."""
         return replace(view, scan=view.scan and self._by.value == AS_MAP, map=view.map and not self._alone.value)
 
-    def tick(self, snapshot: Snapshot, view: View) -> None:
+    def draw(self, snapshot: Snapshot, view: View) -> None:
         """Called by the drawing thread, often."""
-        now, result, by = self._page.now(), snapshot.result, self._by.value
-        look = (result, by, view.point_size)
-        due = now - self._drawn_at >= _PERIOD_S or by != self._drawn[1]
-        if not unchanged(self._drawn, look) and due:
-            self._drawn, self._drawn_at = look, now
+        result, by = snapshot.result, self._by.value
+        if self._scene_changes(result, by, view.point_size):
             self._scene.draw_cloud(result, by, view.point_size)
             self._legend.content = study_legend(result, by)
-        self._tick_point(snapshot, view)
-        self._tick_curve(snapshot, now)
+        self._draw_point(snapshot, view)
+        if self._curve_changes(result, snapshot.params.ground.sigma):
+            self._draw_curve(result, snapshot.params.ground.sigma)
 
-    def _tick_point(self, snapshot: Snapshot, view: View) -> None:
+    def _draw_point(self, snapshot: Snapshot, view: View) -> None:
         result, sigma, count = snapshot.result, snapshot.params.ground.sigma, int(self._neighbours.value)
         clicked, self._clicked = self._clicked, None
+        before, self._of = self._of, result
         index = self._picked.index if self._picked is not None else None
-        before: StepResult | None = self._marked[0] if self._marked else None
         if result is None or before is None or result.cloud.points is not before.cloud.points:
             index = None  # that point was of another frame
-        look = (result, sigma, count, view.point_size)
         if clicked is not None and result is not None and not snapshot.transport.playing:
             T = result.T_map_imu @ result.state.T_imu_lidar
             origin, direction = T[:3, :3].T @ (clicked[0] - T[:3, 3]), T[:3, :3].T @ clicked[1]
             index = nearest_to_ray(result.cloud.points, origin, direction)
-        elif unchanged(self._marked, look):
+        if not self._point_changes(result if index is not None else None, index, sigma, count, view.point_size):
             return
-        self._marked = look
-        if index is None and self._picked is None:
-            return
-        self._picked = pick(result, index, sigma, count) if index is not None and result is not None else None
-        if result is not None:
-            self._scene.draw_picked(result, self._picked, view.point_size)
-        known = self._picked is not None and result is not None
-        self._point.content = describe(result, self._picked) if known else panel("quiet", _ASK)  # type: ignore[arg-type]
+        if result is None or index is None:
+            self._picked, text = None, panel("quiet", _ASK)
+        else:
+            self._picked = pick(result, index, sigma, count)
+            text = describe(result, self._picked)
+        self._point.content = text
+        self._scene.draw_picked(result, self._picked, view.point_size)
 
-    def _tick_curve(self, snapshot: Snapshot, now: float) -> None:
-        """Draw the curve of the newest frame; of what plays only the first."""
-        result, sigma = snapshot.result, snapshot.params.ground.sigma
-        if unchanged(self._curve_of, (result, sigma)) or now - self._curve_at < _CURVE_PERIOD_S:
-            return
-        if snapshot.transport.playing and self._curve_of and self._curve_of[0] is not None:
-            return
-        self._curve_of, self._curve_at = (result, sigma), now
+    def _draw_curve(self, result: StepResult | None, sigma: float) -> None:
         drawn = curve(result, sigma)
         self._plot.scales = _scales(drawn)
         self._plot.data = (drawn.range, drawn.threshold, drawn.under, drawn.over)
@@ -131,9 +188,6 @@ class StudyPanel:
         ray = self._page.in_map(event)
         if not self._taken(*ray):
             self._clicked = ray
-
-    def _next(self) -> None:
-        show(self._by, STUDY_BY[(STUDY_BY.index(self._by.value) + 1) % len(STUDY_BY)])
 
     def _download(self, kind: Any, client: viser.ClientHandle) -> None:
         snapshot = self._page.snapshot()

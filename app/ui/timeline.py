@@ -1,17 +1,234 @@
-"""Why did it drift: strips of what was measured at every frame of the recording; a click goes there."""
+"""Why did it drift: strips of what was measured at every frame of the recording; a click goes there.
 
+Frames are thinned to columns in which spikes stay visible.
+"""
+
+import base64
 import json
-from typing import Any, Final
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
 
-from app.server.protocol import Seek, Snapshot
+import numpy as np
+
+from app.server.protocol import Chunk, Seek, Snapshot
+from app.slam.loops.types import LoopEdge, Pair, Verdict
+from app.slam.types import F64, I64
 from app.ui.html import BAD, GOOD, QUIET, panel, source
-from app.ui.strips import History, limits, message
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import Page, unchanged
+from app.ui.widgets import Changes, Page
 
 _PERIOD_S: Final = 0.5
 _WIDE_FROM_PX: Final = 700
 """Where the scene is at least this wide, the strips lie along its lower edge; else under the transport."""
+COLUMNS: Final = 480
+"""Most columns that a recording is thinned to, however long."""
+DEGENERATE_CM: Final = 5.0
+"""A direction more uncertain than this is called degenerate (`app.slam.iekf.DEGENERATE_SIGMA`)."""
+_NOTES: Final = 50
+_NOTE_LETTERS: Final = 120
+_UNKNOWN: Final = 65535
+_STEPS: Final = 65534
+
+Series = dict[str, F64]
+
+
+@dataclass(frozen=True, slots=True)
+class Strip:
+    """One row of the timeline.
+
+    Attributes:
+        name, unit, hint: for people. digits: after the point. colour: CSS.
+        least: the scale ends here at least. value: (n,) in the strip's unit, nan where there is none.
+        limit: from where on a value is bad. worse: which way is bad. bars: single events, not a curve.
+    """
+
+    key: str
+    name: str
+    unit: str
+    digits: int
+    colour: str
+    least: float
+    hint: str
+    value: Callable[[Series], F64]
+    limit: Callable[[Snapshot], float] | None = None
+    worse: Literal["high", "low"] = "high"
+    bars: bool = False
+
+
+def _inliers(series: Series) -> F64:
+    return 100 * series["inliers"] / np.where(series["used"] > 0, series["used"], np.nan)
+
+
+def _uncertainty(series: Series) -> F64:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(100 / np.sqrt(series["degeneracy"]))
+
+
+def _period_ms(snapshot: Snapshot) -> float:
+    recording = snapshot.recording
+    return 1e3 * recording.duration_s / max(recording.frames, 1) if recording else float("inf")
+
+
+STRIPS: Final = (
+    Strip("residual", "residual", "mm", 1, "#40b8f0", 20.0, "Distance of the points to the map's planes, RMS.",
+          lambda s: 1e3 * s["residual_rms"]),
+    Strip("inliers", "inliers", "%", 0, "#6384ff", 100.0, "Points that found a plane in the map.",
+          _inliers, worse="low"),
+    Strip("uncertain", "degeneracy", "cm", 1, "#ce70dc", 6.0,
+          "How uncertain this scan alone leaves the direction it constrains least; over 5 cm is degenerate.",
+          _uncertainty, lambda _: DEGENERATE_CM),
+    Strip("ground", "ground", "%", 0, "#34c7aa", 100.0, "Points labelled ground. Red: no plane was found.",
+          lambda s: 1e2 * s["ground_share"], lambda _: 1e-9, worse="low"),
+    Strip("gap", "IMU gap", "ms", 0, "#98cd5a", 20.0, "Longest time between the IMU samples of the frame.",
+          lambda s: 1e3 * s["imu_gap_s"], lambda snapshot: 1e3 * snapshot.params.imu.max_gap),
+    Strip("dropped", "dropped", "scans", 0, "#ff785c", 1.0, "Scans left out just before the frame.",
+          lambda s: s["dropped"], lambda _: 0.5, bars=True),
+    Strip("took", "frame time", "ms", 1, "#b8c0cc", 20.0, "Of the engine. Red: slower than the sensor.",
+          lambda s: s["total_ms"], _period_ms),
+    Strip("error", "error", "cm", 1, "#ff5c8d", 5.0, "Distance to the truth, aligned to the trajectory so far.",
+          lambda s: 1e2 * s["error_m"]),
+)  # fmt: skip
+"""In the order shown; the loops' row comes last."""
+
+_STAMP: Final = "stamp"
+_VALUES: Final[dict[str, Callable[[Series], F64]]] = {
+    **{strip.key: strip.value for strip in STRIPS},
+    _STAMP: lambda s: s["stamp_s"],
+}
+
+
+def limits(snapshot: Snapshot) -> dict[str, float]:
+    """From where on a strip's value is bad, by key: above it, or below it where low is worse."""
+    return {strip.key: strip.limit(snapshot) for strip in STRIPS if strip.limit is not None}
+
+
+class History:
+    """Every frame seen in a session. Frames that were gone back over stay until they are processed again.
+
+    Attributes:
+        total: frames of the recording. present: the newest frame of the snapshot seen last, or -1.
+    """
+
+    def __init__(self) -> None:
+        self.total = 1
+        self.present = -1
+        self._session = -1
+        self._truth: Path | None = None
+        self._columns: dict[str, F64] = {}  # (total,) by strip and for stamps, nan where unknown
+        self._loops: dict[Pair, tuple[int, Verdict]] = {}
+
+    def see(self, snapshot: Snapshot) -> None:
+        """Take in what a snapshot says of all frames up to its newest."""
+        recording, series = snapshot.recording, snapshot.series
+        if snapshot.session != self._session:
+            self._session, self._columns, self._loops = snapshot.session, {}, {}
+        self.total = max(recording.frames if recording else 1, 1)
+        count = min(len(series.get("stamp_s", ())), self.total)
+        truth = recording.truth if recording else None
+        for key, value in _VALUES.items():
+            column, before = np.full(self.total, np.nan), self._columns.get(key, np.empty(0))[: self.total]
+            column[: len(before)] = before
+            if count:
+                column[:count] = value(series)[:count]
+            self._columns[key] = column
+        if truth != self._truth:
+            self._columns["error"][count:] = np.nan  # they are distances to another truth
+        later = {pair: entry for pair, entry in self._loops.items() if entry[0] >= count}
+        self._loops = later | loop_frames(snapshot.loops.edges, snapshot.chunks)
+        self._truth, self.present = truth, count - 1
+
+    def columns(self, most: int = COLUMNS) -> "Columns":
+        """Everything, thinned to at most so many columns of equally many frames."""
+        count = min(self.total, most)
+        starts = np.arange(count) * self.total // count
+        loops: dict[str, list[int]] = {verdict: [0] * count for verdict in Verdict}
+        for frame, verdict in self._loops.values():
+            loops[verdict][int(np.searchsorted(starts, frame, side="right")) - 1] += 1
+        low = {strip.key: np.fmin.reduceat(self._columns[strip.key], starts) for strip in STRIPS}
+        high = {strip.key: np.fmax.reduceat(self._columns[strip.key], starts) for strip in STRIPS}
+        return Columns(starts=starts, stamps=self._columns[_STAMP][starts], low=low, high=high, loops=loops)
+
+    def troubles(self, limits: dict[str, float]) -> list[int]:
+        """Frames at which a value becomes bad, or a loop was decided; ascending."""
+        frames = {frame for frame, verdict in self._loops.values() if verdict is not Verdict.CANDIDATE}
+        for strip in STRIPS:
+            if strip.key in self._columns and (limit := limits.get(strip.key)) is not None:
+                column = self._columns[strip.key]
+                bad = column > limit if strip.worse == "high" else column < limit
+                frames |= set(np.flatnonzero(bad & ~np.concatenate(([False], bad[:-1]))).tolist())
+        return sorted(frames)
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Attributes:
+    starts: (c,) first frame of each column. stamps: (c,) s since the recording's start.
+    low, high: (c,) least and greatest value of a column by `Strip.key`, nan where there is none.
+    loops: how many of each verdict.
+    """
+
+    starts: I64
+    stamps: F64
+    low: dict[str, F64]
+    high: dict[str, F64]
+    loops: dict[str, list[int]]
+
+
+def loop_frames(edges: tuple[LoopEdge, ...], chunks: tuple[Chunk, ...]) -> dict[Pair, tuple[int, Verdict]]:
+    """The frame at which each candidate got its verdict, and the verdict; without those of keyframes not here yet."""
+    return {edge.pair: (chunks[edge.decided_at].frame, edge.verdict) for edge in edges if edge.decided_at < len(chunks)}
+
+
+def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
+    """What the page's script draws (`templates/timeline.js`), as JSON-ready values.
+
+    Numbers are whole steps of 1/65534 of a strip's largest value, 65535 for none.
+    """
+    columns, bad = history.columns(), limits(snapshot)
+    recording = snapshot.recording
+    strips = []
+    for strip in STRIPS:
+        low, high = columns.low[strip.key], columns.high[strip.key]
+        if not np.isfinite(high).any() and strip.key == "error":
+            continue  # no truth, no strip
+        largest = float(np.fmax.reduce(high, initial=0.0))
+        finite = high[np.isfinite(high)]
+        usual = float(np.percentile(finite, 98)) if len(finite) else 0.0
+        strips.append(
+            {
+                "name": strip.name,
+                "unit": strip.unit,
+                "digits": strip.digits,
+                "colour": strip.colour,
+                "hint": strip.hint,
+                "low": strip.worse == "low",
+                "bars": strip.bars,
+                "top": strip.least if strip.worse == "low" else max(strip.least, 1.2 * usual),
+                "limit": bad.get(strip.key),
+                "largest": largest,
+                "data": packed(np.concatenate((low, high)), largest),
+            }
+        )
+    duration = recording.duration_s if recording else 1.0
+    return {
+        "frames": history.total,
+        "present": history.present,
+        "duration": duration,
+        "starts": columns.starts.tolist(),
+        "stamps": packed(columns.stamps, duration),
+        "strips": strips,
+        "loops": {name: counts for name, counts in columns.loops.items() if any(counts)},
+        "notes": [[note.frame, note.text[:_NOTE_LETTERS]] for note in snapshot.notes[-_NOTES:]],
+    }
+
+
+def packed(numbers: F64, largest: float) -> str:
+    """Base64 of little-endian 16-bit steps."""
+    with np.errstate(invalid="ignore"):
+        steps = np.round(np.clip(numbers / max(largest, 1e-12), 0.0, 1.0) * _STEPS)
+    return base64.b64encode(np.where(np.isfinite(steps), steps, _UNKNOWN).astype("<u2").tobytes()).decode()
 
 
 class TimelinePanel:
@@ -21,9 +238,8 @@ class TimelinePanel:
         gui = page.gui
         self._page = page
         self._history = History()
-        self._drawn: tuple[Any, ...] = ()
-        self._latest: Snapshot | None = None
-        self._drawn_at = -1e9
+        self._changes = Changes(page.now, _PERIOD_S)
+        self._latest = Snapshot()
         self._bridge = Bridge(gui, "timeline", lambda word, _: self._asked(word))
         colours = {"bad": BAD, "good": GOOD, "quiet": QUIET}
         gui.add_html(self._bridge.live(panel("timeline", colours, _WIDE_FROM_PX, source("timeline.js"))))
@@ -33,14 +249,13 @@ class TimelinePanel:
 
     def draw(self, snapshot: Snapshot) -> None:
         """Called often; sends what changed, at most twice a second."""
-        now, latest = self._page.now(), self._latest
-        if latest is not None and snapshot.transport.frame < latest.transport.frame:
-            self._history.see(latest)  # the last frames before going back
+        if snapshot.transport.frame < self._latest.transport.frame:
+            self._history.see(self._latest)  # the last frames before going back
         self._latest = snapshot
-        shown = (snapshot.result, snapshot.loops.edges, snapshot.notes, snapshot.recording, snapshot.params.imu)
-        if now - self._drawn_at < _PERIOD_S or unchanged(self._drawn, shown):
+        if not self._changes(
+            snapshot.result, snapshot.loops.edges, snapshot.notes, snapshot.recording, snapshot.params.imu
+        ):
             return
-        self._drawn, self._drawn_at = shown, now
         self._history.see(snapshot)
         text = json.dumps(message(self._history, snapshot), separators=(",", ":")) if snapshot.result else ""
         self._data.content = panel("timeline_data", text)

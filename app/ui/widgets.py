@@ -1,7 +1,8 @@
 """What every panel needs: the page it is on, and helpers for viser's widgets."""
 
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final
@@ -11,9 +12,34 @@ import viser
 
 from app.server.protocol import Command, Snapshot
 from app.slam.types import F64
+from app.ui.colours import LABEL, Limits
 
+SCENE_PERIOD_S: Final = 1 / 15
+PANEL_PERIOD_S: Final = 1 / 4
+"""The scene and the panels are drawn at most this often."""
 ROOT: Final = "/map"
 """Scene node of the map. It is moved while the sensor is followed; everything in the map's frame hangs below it."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """How the session is looked at: shared by every browser, unknown to the engine.
+
+    Attributes:
+        colour_by: a name of `app.ui.colours.COLOUR_BY`. point_size: m. follow: keep the sensor in the middle.
+        ceilings: show points above the ceiling too. map, scan, wedge, plane, path, grid: whether shown.
+    """
+
+    colour_by: str = LABEL
+    point_size: float = 0.02
+    follow: bool = True
+    ceilings: bool = False
+    map: bool = True
+    scan: bool = True
+    wedge: bool = True
+    plane: bool = True
+    path: bool = True
+    grid: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,23 +75,68 @@ def poses_of(snapshot: Snapshot) -> F64:
     return snapshot.keyframe_poses if snapshot.keyframe_poses is not None else np.empty((0, 4, 4))
 
 
-_PLAIN: Final = (str, int, float, Enum, frozenset)
+_PLAIN: Final = (str, int, float, Enum, frozenset, View, Limits)
 
 
-def unchanged(before: tuple[object, ...], now: tuple[object, ...]) -> bool:
-    """Whether all parts are still the same objects, or equal words and numbers.
+class Changes:
+    """Whether something is to be drawn again: what it depends on differs from the last time, and a period has passed.
 
-    Parts of a snapshot that did not change are the same objects in the next one.
+    Parts of a snapshot that did not change are the same objects in the next one. Words and numbers are compared.
     """
-    return len(before) == len(now) and all(
-        a is b or (isinstance(a, _PLAIN) and a == b) for a, b in zip(before, now, strict=True)
-    )
+
+    def __init__(self, now: Callable[[], float] = time.monotonic, period_s: float = 0.0) -> None:
+        self._now, self._period = now, period_s
+        self._drawn: tuple[object, ...] = ()
+        self._at = -1e9
+
+    def __call__(self, *parts: object, at_once: bool = False) -> bool:
+        """True where `parts` are to be drawn now. at_once: without waiting for the period."""
+        now, drawn = self._now(), self._drawn
+        if not at_once and now - self._at < self._period:
+            return False
+        if len(drawn) == len(parts) and all(map(_same, drawn, parts)):
+            return False
+        self._drawn, self._at = parts, now
+        return True
+
+
+@dataclass(slots=True)
+class Edit:
+    """A value that a user set, when, and whether it was sent to the engine. Older snapshots must not undo it."""
+
+    value: Any
+    at: float
+    sent: bool = False
+
+
+def _same(before: object, now: object) -> bool:
+    return before is now or (isinstance(before, _PLAIN) and before == now)
 
 
 def show(control: Any, value: Any) -> None:
     """Make a control show `value`. Its callbacks then run with `client=None`; `by_user` ignores those."""
     if control.value != value:
         control.value = value
+
+
+def choose_next(dropdown: viser.GuiDropdownHandle[str]) -> None:
+    """Choose the option after the present one; the first after the last."""
+    options = dropdown.options
+    show(dropdown, options[(options.index(dropdown.value) + 1) % len(options)])
+
+
+@contextmanager
+def dialog(client: viser.ClientHandle, title: str) -> Iterator[Callable[[], None]]:
+    """A dialog in one browser, to be filled by the caller, with a Cancel button at its end; yields what closes it."""
+    with client.gui.add_modal(title) as modal:
+        yield modal.close
+        cancel = client.gui.add_button("Cancel", color="gray")
+    cancel.on_click(lambda _: modal.close())
+
+
+def notify_error(client: viser.ClientHandle, error: object) -> None:
+    """Show one browser why something was refused, until the notification is closed."""
+    client.add_notification("Error", str(error), color="red", auto_close_seconds=None)
 
 
 def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callable[[viser.GuiEvent[Any]], None]:

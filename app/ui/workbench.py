@@ -20,31 +20,24 @@ from app.server.fork import RunningEngine, Workspace
 from app.server.protocol import Snapshot
 from app.server.setup import POINT_BUDGET, Setup
 from app.ui.appearance import AppearancePanel
-from app.ui.breakpoints import BreakpointPanel
 from app.ui.compare import ComparePanel, Sides
-from app.ui.doctor import DoctorPanel
 from app.ui.files import FilesPanel
-from app.ui.header import HeaderPanel
 from app.ui.html import heading, render
 from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
-from app.ui.notes import NotesPanel
-from app.ui.notices import NoticePanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.readouts import ReadoutPanel
 from app.ui.scene import Scene
+from app.ui.status import DoctorPanel, HeaderPanel, NoticePanel
 from app.ui.study import StudyPanel
 from app.ui.timeline import TimelinePanel
-from app.ui.transport import TransportPanel
-from app.ui.view import View
+from app.ui.transport import BreakpointPanel, NotesPanel, TransportPanel
 from app.ui.viser_adapter import prepare_page
-from app.ui.widgets import Page
+from app.ui.widgets import PANEL_PERIOD_S, SCENE_PERIOD_S, Changes, Page, View
 
 log = logging.getLogger(__name__)
 
 ACCENT: Final = (38, 166, 154)
-_SCENE_PERIOD_S: Final = 1 / 15
-_PANEL_PERIOD_S: Final = 1 / 4
 _TICK_S: Final = 0.04
 """How long the drawing thread waits for a snapshot before it looks at the page's own controls."""
 
@@ -73,7 +66,6 @@ class Workbench:
         self._server = server
         self._engine = engine
         self._budget = point_budget
-        self._now = now
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=ACCENT)
         gui.set_panel_label("hemislam")
@@ -83,9 +75,7 @@ class Workbench:
         page = Page(server, engine.send, lambda: engine.snapshot, now, lambda: self._scene.offset)
 
         prepare_page(gui)
-        self._header = HeaderPanel(gui)
-        self._transport = TransportPanel(page)
-        self._timeline = TimelinePanel(page)
+        self._header, self._transport, self._timeline = HeaderPanel(gui), TransportPanel(page), TimelinePanel(page)
         with gui.add_folder("Pause when", expand_by_default=False):
             self._breakpoints = BreakpointPanel(page)
         with gui.add_folder("Notes", expand_by_default=False):
@@ -107,7 +97,7 @@ class Workbench:
 
         left = gui.add_panel()
         with left.add_tab("Readouts", viser.Icon.CHART_LINE):
-            self._readouts = ReadoutPanel(gui)
+            self._readouts = ReadoutPanel(page)
         with left.add_tab("Recording", viser.Icon.STETHOSCOPE):
             self._live = LivePanel(gui)
             gui.add_html(heading("Recording doctor"))
@@ -121,10 +111,12 @@ class Workbench:
         left.dock_left()
         left.set_width(300)
 
+        self._panels = (
+            self._transport, self._breakpoints, self._notes, self._notices, self._header, self._timeline,
+            self._readouts, self._doctor, self._live, self._files,
+        )  # fmt: skip
         self._drawn: Snapshot | None = None
-        self._drawn_view: View | None = None
-        self._scene_drawn_at = self._panels_drawn_at = -1e9
-        self._panels_due = True
+        self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="workbench", daemon=True)
 
@@ -147,55 +139,28 @@ class Workbench:
                 self.draw(snapshot)
             except Exception:  # the page must survive a snapshot that cannot be drawn
                 log.exception("Snapshot %d could not be drawn", snapshot.revision)
-                time.sleep(_PANEL_PERIOD_S)
+                time.sleep(PANEL_PERIOD_S)
 
     def draw(self, current: Snapshot) -> None:
-        """Bring the page up to `current`: at once what a user waits for, the rest at the rate that eyes follow."""
+        """Bring the page up to `current`: the scene first, since changed parameters show there."""
         view = self._study.seen(self._loops.seen(self._appearance.view))
-        self._compare.tick(current, view)
+        self._compare.draw(current, view)
         view = self._compare.seen(view)
-        self._transport.tick(current)
-        self._breakpoints.tick(current)
-        self._notes.draw(current)
-        self._parameters.tick(self._sides.tuned(current))
-        self._notices.draw(current)
-        self._header.draw(current)
-        self._loops.tick(current, view)
+        self._parameters.draw(self._sides.tuned(current))
+        self._loops.draw(current, view)
         self._draw_scene(current, view)
-        self._study.tick(current, view)
-        self._timeline.draw(current)
-        self._draw_panels(current, view)
+        self._study.draw(current, view)
+        for panel in self._panels:
+            panel.draw(current)
 
     def _draw_scene(self, current: Snapshot, view: View) -> None:
-        now, drawn = self._now(), self._drawn
-        awaited = drawn is not None and _changed_by_user(drawn, current)
-        due = awaited or now - self._scene_drawn_at >= _SCENE_PERIOD_S
-        if (drawn is current or not due) and view == self._drawn_view:
-            return
-        if current.result is not None and (drawn is None or drawn.result is None):
-            self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
-        self._scene.draw(drawn, current, view, self._drawn_view)
-        self._drawn, self._drawn_view, self._scene_drawn_at = current, view, now
-        self._panels_due = True
-        if awaited:  # the user waits for this before anything else
-            self._server.flush()
-            self._panels_drawn_at = now
-
-    def _draw_panels(self, current: Snapshot, view: View) -> None:
-        now = self._now()
-        due = self._panels_due or self._readouts.stale
-        if not due or now - self._panels_drawn_at < _PANEL_PERIOD_S:
-            return
-        self._panels_due, self._panels_drawn_at = False, now
-        self._readouts.draw(current)
-        self._doctor.draw(current)
-        self._live.draw(current)
-        self._files.draw(current)
-        self._appearance.draw(view, self._scene.limits(view.colour_by), self._scene.points, self._budget)
-
-
-def _changed_by_user(drawn: Snapshot, current: Snapshot) -> bool:
-    """Whether parameters changed, or labels of the frame that is drawn."""
-    before, after = drawn.result, current.result
-    relabelled = before is not after and before is not None and after is not None and before.index == after.index
-    return relabelled or drawn.params != current.params
+        drawn = self._drawn
+        tuned = drawn is None or drawn.params != current.params
+        if self._scene_due(current, view, at_once=tuned):
+            if current.result is not None and (drawn is None or drawn.result is None):
+                self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
+            self._scene.draw(current, view)
+            self._drawn = current
+        if self._legend_due(current, view):
+            limits = self._scene.limits(view.colour_by)
+            self._appearance.draw(view, limits, self._scene.points, self._budget)

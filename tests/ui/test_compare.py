@@ -25,7 +25,7 @@ from app.ui.compare_maths import (
     thinned,
     turn,
 )
-from app.ui.paths import PATH_COLOUR
+from app.ui.nodes import PATH_COLOUR
 from app.ui.workbench import Workbench
 from tests.ui.conftest import Clock, Wire, user_clicks, user_sets
 from tests.ui.fake_engine import FakeEngine
@@ -228,7 +228,7 @@ def test_the_scan_tells_who_calls_a_point_ground(page: Page, server: viser.Viser
 def test_whose_ground_it_is_is_told_though_the_scene_is_drawn_after_the_panel(page: Page) -> None:
     page.forks.fork("", {"ground.sigma": 0.15})
     eventually(lambda: (b := page.forks.other) is not None and b.transport.frame == 20)
-    page.panel._scene_at = page.clock.now + 1.0  # the scene was drawn just now, without B
+    page.panel._scene_changes._at = page.clock.now + 1.0  # the scene was drawn just now, without B
     page.draw()
     assert page.panel._numbers.content and "only in A" not in page.panel._numbers.content
     page.draw()

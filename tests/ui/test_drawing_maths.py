@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from app.slam.types import GROUND, NON_GROUND
-from app.ui.ceiling import below_ceiling
+from app.ui.chunks import below_ceiling
 from app.ui.colours import HEIGHT, MODES, TABLES, Limits, grown, label_colours, value_colours
 from app.ui.geometry import field_of_view, foot, ring_elevations, rotation_to, seed_wedge, wxyz
-from app.ui.paths import BLOCK, segments
+from app.ui.nodes import BLOCK, segments
 from app.ui.sensor import MOST_SCAN_POINTS, shown_of
 
 clouds = hnp.arrays(np.float32, st.tuples(st.integers(1, 200), st.just(3)), elements=st.floats(-50, 50, width=32))

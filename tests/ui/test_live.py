@@ -104,11 +104,11 @@ def test_nothing_is_sent_while_nothing_changes(server: viser.ViserServer, engine
 
 def test_a_live_session_cannot_go_back_and_the_page_says_why(server: viser.ViserServer, engine: FakeEngine) -> None:
     panel = TransportPanel(page_of(server, engine.send, lambda: engine.snapshot, now=Clock()))
-    panel.tick(replace(engine.snapshot, live=WELL))
+    panel.draw(replace(engine.snapshot, live=WELL))
     assert panel._slider.disabled and panel._speed.disabled and not panel._frames.visible
     assert not panel._play.disabled
     assert "--record" in panel._where.content
-    panel.tick(engine.snapshot)
+    panel.draw(engine.snapshot)
     assert not panel._slider.disabled and not panel._speed.disabled and panel._frames.visible
     assert "--record" not in panel._where.content
 

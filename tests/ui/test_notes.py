@@ -7,7 +7,7 @@ import viser
 
 from app.mapping.session_file import Note
 from app.server.protocol import AddNote, Command, Snapshot
-from app.ui.notes import _SHOWN, NotesPanel
+from app.ui.transport import _SHOWN_NOTES, NotesPanel
 from tests.ui.conftest import BusyThreads, Wire, browser_sends, page_of, user_clicks, user_sets
 
 
@@ -68,7 +68,9 @@ def test_the_newest_is_on_top_with_its_frame_and_without_notes_there_is_no_list(
 
 def test_of_many_the_last_are_shown(notes: Notes) -> None:
     shown = notes.show(*(Note(frame, f"remark {frame}.") for frame in range(100)))
-    assert shown.count("remark") == _SHOWN and "remark 99." in shown and f"remark {99 - _SHOWN}." not in shown
+    assert (
+        shown.count("remark") == _SHOWN_NOTES and "remark 99." in shown and f"remark {99 - _SHOWN_NOTES}." not in shown
+    )
 
 
 def test_a_remark_is_no_html(notes: Notes) -> None:

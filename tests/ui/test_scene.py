@@ -12,7 +12,7 @@ from app.server.protocol import Seek, SetParams, Snapshot, StepFrame
 from app.ui.chunks import MapChunks
 from app.ui.colours import COLOUR_BY, LABEL_COLOURS
 from app.ui.scene import Scene
-from app.ui.view import View
+from app.ui.widgets import View
 from tests.ui.conftest import Cloud, Wire, clouds
 from tests.ui.fake_engine import FakeEngine
 
@@ -38,7 +38,7 @@ class Drawn:
             assert snapshot.keyframe_poses is not None and result is not None
             chunks = within_budget(chunks, snapshot.keyframe_poses, result.T_map_imu[:3, 3], self.budget)
             snapshot = replace(snapshot, chunks=chunks)
-        self.scene.draw(self.snapshot, snapshot, view, self.view)
+        self.scene.draw(snapshot, view)
         self.snapshot, self.view = snapshot, view
 
 

@@ -6,7 +6,7 @@ import viser
 
 from app.server.protocol import StepFrame
 from app.slam import lie
-from app.ui.view import View
+from app.ui.widgets import View
 from tests.ui.conftest import Wire
 from tests.ui.fake_engine import FakeEngine
 from tests.ui.test_scene import Drawn, chunk_nodes

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from app.server.protocol import SERIES, Chunk, LoopsView, OpenedRecording, Snapshot, Transport
 from app.slam import iekf
 from app.slam.loops.types import Evidence, LoopEdge, Measured, Verdict
-from app.ui import strips
-from app.ui.strips import COLUMNS, DEGENERATE_CM, STRIPS, History, limits, message, packed
+from app.ui.timeline import COLUMNS, DEGENERATE_CM, STRIPS, History, limits, message, packed
 from tests.ui.fake_engine import START_NS
 
 HOUR = 36_000
@@ -148,5 +147,5 @@ def test_a_message_is_small_however_long_the_recording_and_without_truth_has_no_
     long = snapshot(HOUR, HOUR, error_m=np.full(HOUR, np.nan))
     sent = message(seen(long), long)
     assert len(json.dumps(sent)) < 40_000
-    assert [strip["name"] for strip in sent["strips"]] == [s.name for s in strips.STRIPS if s.key != "error"]
+    assert [strip["name"] for strip in sent["strips"]] == [s.name for s in STRIPS if s.key != "error"]
     assert sent["present"] == HOUR - 1

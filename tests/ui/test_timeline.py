@@ -12,8 +12,8 @@ import viser
 from app.mapping.breakpoints import Breakpoints
 from app.server.folders import Folders
 from app.server.protocol import Command, Seek, SetBreakpoints, SetParams, Snapshot, StepFrame
-from app.ui.breakpoints import BreakpointPanel
 from app.ui.timeline import TimelinePanel
+from app.ui.transport import BreakpointPanel
 from app.ui.workbench import Workbench
 from tests.ui.conftest import Clock, Wire, page_of, user_sets
 from tests.ui.fake_engine import FakeEngine
@@ -135,7 +135,7 @@ def test_switches_and_limits_are_sent_in_si_units(server: viser.ViserServer) -> 
 def test_what_another_page_chose_is_shown_and_not_sent_back(server: viser.ViserServer) -> None:
     sent: list[Command] = []
     panel = BreakpointPanel(page_of(server, sent.append))
-    panel.tick(Snapshot(breakpoints=Breakpoints(dropped=True, error=0.25)))
+    panel.draw(Snapshot(breakpoints=Breakpoints(dropped=True, error=0.25)))
     switch, number = panel._limits["error"]
     assert panel._switches["dropped"].value and switch.value and number.visible and number.value == 25.0
     assert sent == []
@@ -144,5 +144,5 @@ def test_what_another_page_chose_is_shown_and_not_sent_back(server: viser.ViserS
 def test_a_switch_stays_while_the_engine_has_not_heard_of_it(server: viser.ViserServer) -> None:
     panel = BreakpointPanel(page_of(server))
     user_sets(panel._switches["no_ground"], True)
-    panel.tick(Snapshot())
+    panel.draw(Snapshot())
     assert panel._switches["no_ground"].value

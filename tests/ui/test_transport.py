@@ -25,7 +25,7 @@ class Transporting:
 
     def tick(self, seconds: float = 0.0) -> None:
         self.clock.now += seconds
-        self.panel.tick(self.engine.snapshot)
+        self.panel.draw(self.engine.snapshot)
 
 
 @pytest.fixture

@@ -16,12 +16,10 @@ from app.server.protocol import (
     Transport,
 )
 from app.ui.colours import LABEL, Limits, legend
-from app.ui.doctor import findings_html, verdicts
 from app.ui.files import result_folder_name, size_text
-from app.ui.header import title
 from app.ui.html import Tile, panel
-from app.ui.notices import log_html
 from app.ui.readouts import HISTORY, recent, stacked_stages, worst
+from app.ui.status import findings_html, log_html, title, verdicts
 from tests.ui.fake_engine import FINDINGS, FakeEngine
 
 

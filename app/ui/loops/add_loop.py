@@ -15,10 +15,9 @@ from app.ui.geometry import wxyz
 from app.ui.html import panel
 from app.ui.loops.edges import nearest
 from app.ui.loops.inspector import MOST_POINTS, Overlay, Pairing
-from app.ui.loops.kinds import NEWER, OLDER
+from app.ui.loops.words import NEWER, OLDER
 from app.ui.nodes import add_exact_points
-from app.ui.view import View
-from app.ui.widgets import ROOT, Page, by_user, poses_of, show, unchanged
+from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of, show
 
 _REST_S: Final = 0.4
 """The guess is tried after the gizmo has rested this long."""
@@ -92,7 +91,7 @@ class AddLoopPanel:
         self._overlay = Overlay(page.scene, f"{_NODE}/clouds")
         self._gizmo = Gizmo(page.scene, f"{_NODE}/gizmo")
         self._dots: viser.PointCloudHandle | None = None
-        self._dotted: tuple[object, ...] = ()
+        self._changes = Changes()  # of the dots
         self._picked: list[int] | None = None
         self._start: tuple[Pair, Pairing, F64, F64] | None = None
         self._moved: tuple[F64, float] | None = None
@@ -211,10 +210,8 @@ class AddLoopPanel:
     def _draw_picking(self, snapshot: Snapshot) -> None:
         picked = self._picked
         self._pick.label = _PICK if picked is None else (_SECOND if picked else _FIRST)
-        asked = (snapshot.keyframe_poses, -1 if picked is None else len(picked))
-        if unchanged(self._dotted, asked):
+        if not self._changes(snapshot.keyframe_poses, -1 if picked is None else len(picked)):
             return
-        self._dotted = asked
         if self._dots is not None:
             self._dots.remove()
             self._dots = None

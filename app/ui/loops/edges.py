@@ -14,9 +14,9 @@ from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.geometry import STILL_M
-from app.ui.loops.kinds import EDITED, KINDS, kind_of, name
+from app.ui.loops.words import EDITED, KINDS, kind_of, name
 from app.ui.nodes import add_exact_points, add_lines
-from app.ui.widgets import unchanged
+from app.ui.widgets import Changes
 
 _RISE: Final = (0.7, 0.12)
 """Height of a knob above the edge's middle: m, and its share of the edge's length."""
@@ -61,7 +61,7 @@ class LoopEdges:
         self._root = root
         self._nodes: dict[str, list[viser.SceneNodeHandle]] = {}
         self._drawn: dict[str, tuple[str, F32]] = {}
-        self._asked: tuple[object, ...] = ()
+        self._changes = Changes()
         self._pickable: tuple[list[Pair], F32] = ([], np.empty((0, 3, 3), np.float32))
 
     def draw(self, edges: tuple[LoopEdge, ...], poses: F64, shown: frozenset[str], chosen: Pair | None) -> None:
@@ -70,10 +70,8 @@ class LoopEdges:
         Args:
             poses: (k, 4, 4) T_map_imu of the keyframes; edges of later ones are left out.
         """
-        asked = (edges, poses, shown, chosen)
-        if unchanged(self._asked, asked):
+        if not self._changes(edges, poses, shown, chosen):
             return
-        self._asked = asked
         there = [edge for edge in edges if edge.newer < len(poses)]
         seen = [edge for edge in there if kind_of(edge).name in shown or edge.pair == chosen]
         lines = arches(seen, poses)

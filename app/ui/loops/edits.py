@@ -13,11 +13,9 @@ from app.slam.loops.types import Accept, LoopEdge, LoopEdit, Pair, Reject, SetWe
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.html import panel
-from app.ui.loops.kinds import describe_edit
-from app.ui.loops.words import forecast, headline
-from app.ui.nodes import add_lines
-from app.ui.paths import segments
-from app.ui.widgets import ROOT, Page, by_user, poses_of, show, unchanged
+from app.ui.loops.words import describe_edit, forecast, headline
+from app.ui.nodes import add_lines, segments
+from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, notify_error, poses_of, show
 
 _REST_S: Final = 0.3
 _GHOST: Final[Rgb] = (206, 176, 255)
@@ -31,14 +29,12 @@ class Ghost:
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
         self._nodes: list[viser.LineSegmentsHandle] = []
-        self._drawn: tuple[object, ...] = ()
+        self._changes = Changes()
 
     def draw(self, tried: F64 | None, present: F64) -> None:
         """Show (k, 4, 4) poses `tried` beside the present ones; None removes them."""
-        drawn = (tried, present if tried is not None else None)
-        if unchanged(self._drawn, drawn):
+        if not self._changes(tried, present if tried is not None else None):
             return
-        self._drawn = drawn
         for node in self._nodes:
             node.remove()
         self._nodes.clear()
@@ -70,7 +66,7 @@ class Proposal:
             cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
         self.command: LoopEdit | None = None
         self._last_notice = 0
-        self._told: tuple[object, ...] = ()
+        self._changes = Changes()
         self._commit.on_click(by_user(lambda _, __: self.commit()))
         cancel.on_click(by_user(lambda _, __: self.cancel()))
 
@@ -102,10 +98,8 @@ class Proposal:
         poses = poses_of(snapshot)
         self._ghost.draw(preview.poses if command is not None and preview is not None else None, poses)
         problem = self._problem(snapshot) if preview is None else ""
-        told = (command, preview, snapshot.loops.residuals, problem)
-        if unchanged(self._told, told):
+        if not self._changes(command, preview, snapshot.loops.residuals, problem):
             return
-        self._told = told
         self._folder.visible = command is not None
         if command is not None:
             self._commit.disabled = preview is None
@@ -124,7 +118,7 @@ class VerdictPanel:
         gui = page.gui
         self._propose, self._now = propose, page.now
         self._pair: Pair | None = None
-        self._dragged: tuple[float, float] | None = None
+        self._dragged: Edit | None = None
         self._headline = gui.add_html("")
         self._accept = gui.add_button("Accept it …", icon=viser.Icon.THUMB_UP, color="teal")
         self._reject = gui.add_button("Reject it …", icon=viser.Icon.THUMB_DOWN, color="red")
@@ -149,12 +143,12 @@ class VerdictPanel:
         if dragged is None:
             value = edge.weight if weighing is None else weighing
             show(self._weight, min(max(value, 0.1), 10.0))
-        elif self._now() - dragged[1] >= _REST_S:
+        elif self._now() - dragged.at >= _REST_S:
             self._dragged = None
-            self._propose(SetWeight(edge.older, edge.newer, dragged[0]))
+            self._propose(SetWeight(edge.older, edge.newer, dragged.value))
 
     def _drag(self, weight: float) -> None:
-        self._dragged = (weight, self._now())
+        self._dragged = Edit(weight, self._now())
 
     def _propose_for_pair(self, verb: type[Accept] | type[Reject]) -> None:
         if self._pair is not None:
@@ -231,7 +225,7 @@ class EditsPanel:
             commands = edit_files.read(content.decode(errors="replace"), "The file")
         except HemislamError as error:
             if client is not None:
-                client.add_notification("Error", str(error), color="red", auto_close_seconds=None)
+                notify_error(client, error)
             return
         for command in commands:
             self._send(EditLoop(command))

@@ -1,5 +1,6 @@
 """The Loops tab, and loops in the scene: what is chosen and what is shown."""
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
@@ -14,15 +15,16 @@ from app.ui.html import panel
 from app.ui.loops.add_loop import AddLoopPanel
 from app.ui.loops.edges import LoopEdges
 from app.ui.loops.edits import EditsPanel, Proposal, SolvePanel, VerdictPanel
-from app.ui.loops.fly import fly
 from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
-from app.ui.loops.kinds import KINDS
 from app.ui.loops.table import COLUMNS, Order, chips, listed, table
-from app.ui.loops.words import largest_factors
-from app.ui.view import View
+from app.ui.loops.words import KINDS, largest_factors
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Page, poses_of, unchanged
+from app.ui.widgets import ROOT, Changes, Page, View, poses_of
 
+_STEPS: Final = 14
+_STEP_S: Final = 0.03
+_LEAST_SLOPE: Final = 0.9
+"""Least steepness of the view downwards (z over the horizontal), to see into a building."""
 _NONE_YET: Final = (
     "No loops yet. They are searched for where the trajectory comes back to a place that it left at least 15 s before; "
     "the parameters are under Tune, Loops."
@@ -46,7 +48,7 @@ class LoopsPanel:
         self._asked: tuple[object, ...] = ()
         self._shown: frozenset[str] = frozenset(KINDS) - {"rejected"}
         self._order = Order()
-        self._told: tuple[object, ...] = ()
+        self._changes = Changes()
         self._edges = LoopEdges(page.scene, f"{ROOT}/loops")
         self._bridge = Bridge(gui, "loops", self._act)
         self._table = gui.add_html(panel("quiet", _NONE_YET))
@@ -88,7 +90,7 @@ class LoopsPanel:
             if pair is not None:
                 self._add_loop.suggest_pair(pair)
 
-    def tick(self, snapshot: Snapshot, view: View) -> None:
+    def draw(self, snapshot: Snapshot, view: View) -> None:
         """Called by the drawing thread, often."""
         poses = poses_of(snapshot)
         if snapshot.session != self._session:
@@ -112,10 +114,8 @@ class LoopsPanel:
 
     def _draw_tables(self, snapshot: Snapshot) -> None:
         loops = snapshot.loops
-        told = (loops.edges, loops.residuals, self._shown, self._order, self._chosen)
-        if unchanged(self._told, told):
+        if not self._changes(loops.edges, loops.residuals, self._shown, self._order, *(self._chosen or ())):
             return
-        self._told = told
         if not loops.edges:
             self._table.content = panel("quiet", _NONE_YET)
         else:
@@ -190,3 +190,27 @@ class LoopsPanel:
         self._add_loop.done()
         if (pair := pair_of(command)) is not None:
             self._chosen = self._coming = pair  # a loop added by hand arrives later
+
+
+def stand(position: F64, look_at: F64, target: F64, distance: float) -> F64:
+    """(3,) where the camera must be to see `target` from `distance` (m), on the side it looked from before."""
+    back = position - look_at
+    flat = back[:2] if np.linalg.norm(back[:2]) > 1e-6 else np.array([-1.0, -1.0])
+    flat = flat / np.linalg.norm(flat)
+    slope = max(float(back[2] / max(np.linalg.norm(back[:2]), 1e-6)), _LEAST_SLOPE)
+    way = np.array([*flat, min(slope, 3.0)])
+    return np.asarray(target + distance * way / np.linalg.norm(way))
+
+
+def fly(client: viser.ClientHandle, target: F64, distance: float) -> None:
+    """Move one browser's camera to `target` (3,), in the scene's frame, within half a second."""
+    camera = client.camera
+    position, look_at = np.array(camera.position), np.array(camera.look_at)
+    there = stand(position, look_at, target, distance)
+    for step in range(1, _STEPS + 1):
+        share = step / _STEPS
+        share = share * share * (3 - 2 * share)
+        with client.atomic():
+            camera.position = (1 - share) * position + share * there
+            camera.look_at = (1 - share) * look_at + share * target
+        time.sleep(_STEP_S)

@@ -7,7 +7,7 @@ from typing import Final
 
 from app.slam.loops.types import LoopEdge, Pair
 from app.ui.html import number, panel, source
-from app.ui.loops.kinds import EDITED, KINDS, SIGNS, kind_of, name
+from app.ui.loops.words import EDITED, KINDS, SIGNS, kind_of, name
 
 MOST_ROWS: Final = 300
 

@@ -1,15 +1,28 @@
-"""What the page says of one loop, of the graph's residuals and of what an edit would change."""
+"""How the page tells loops apart, and what it says of them, of edits and of the graph's residuals."""
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops.types import FactorResidual, LoopEdge, LoopEdit, Preview, Solve
+from app.slam.loops.types import (
+    Accept,
+    Add,
+    FactorResidual,
+    LoopEdge,
+    LoopEdit,
+    Origin,
+    Pair,
+    Preview,
+    SetWeight,
+    Solve,
+    Verdict,
+)
 from app.slam.params import LoopsParams
 from app.slam.types import F64
+from app.ui.colours import Rgb
 from app.ui.html import BAD, GOOD, Tile, number, panel
-from app.ui.loops.kinds import describe_edit, kind_of, name
 
 _LARGEST: Final = 12
 _COMPARED: Final = 3
@@ -17,6 +30,63 @@ _ODOMETRY: Final = "#5b8def"
 _LEAST_MOVE_M: Final = 5e-4
 _LEAST_TURN_DEG: Final = 5e-3
 _NOTHING: Final = ("", "")
+
+
+@dataclass(frozen=True, slots=True)
+class LoopKind:
+    """Attributes:
+    width: of an arch that is in the graph, px. out_width: of one that is not. knob_m: diameter of its knob.
+    """
+
+    name: str
+    colour: Rgb
+    width: float
+    out_width: float
+    knob_m: float
+
+
+EDITED: Final = "by hand"
+KINDS: Final[dict[str, LoopKind]] = {
+    kind.name: kind
+    for kind in (
+        LoopKind("accepted", (62, 207, 154), 3.0, 1.0, 0.1),
+        LoopKind("candidate", (255, 190, 60), 2.0, 2.0, 0.1),
+        LoopKind("rejected", (214, 84, 92), 1.0, 1.0, 0.07),
+        LoopKind(EDITED, (178, 136, 255), 3.5, 1.0, 0.12),
+    )
+}
+"""By the search's verdict, or by the fact that a person had the last word; in the order shown."""
+SIGNS: Final = {Verdict.ACCEPTED: "✓", Verdict.CANDIDATE: "?", Verdict.REJECTED: "✕"}
+"""Of a verdict in the table, in the order sorted."""
+
+OLDER: Final[Rgb] = (70, 170, 255)
+NEWER: Final[Rgb] = (255, 150, 60)
+"""Of the two submaps, wherever they are shown."""
+
+
+def kind_of(edge: LoopEdge) -> LoopKind:
+    return KINDS[EDITED if edge.edited or edge.origin is Origin.USER else edge.verdict.value]
+
+
+def name(pair: Pair) -> str:
+    """`12–340`: older, newer keyframe."""
+    return f"{pair[0]}–{pair[1]}"
+
+
+def describe_edit(command: LoopEdit) -> str:
+    """An edit in a few words."""
+    if isinstance(command, Solve):
+        return "solve all at once"
+    pair = name((command.older, command.newer))
+    match command:
+        case Accept():
+            return f"accept {pair}"
+        case SetWeight(weight=weight):
+            return f"weigh {pair} by {weight:g}"
+        case Add(register=register):
+            return f"add {pair}" + ("" if register else " as it lies")
+        case _:
+            return f"reject {pair}"
 
 
 def headline(edge: LoopEdge) -> str:

@@ -8,10 +8,18 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from app.slam import lie
 from app.slam.loops.scan_context import RINGS, SECTORS, YAWS
-from app.ui.loops.charts import UNSEEN, best_yaw, contexts_image, disc, histogram, shift_curve
 from app.ui.loops.edges import nearest
-from app.ui.loops.fly import stand
-from app.ui.loops.inspector import on_the_way, without_ceiling
+from app.ui.loops.inspector import (
+    UNSEEN,
+    best_yaw,
+    contexts_image,
+    disc,
+    histogram,
+    on_the_way,
+    shift_curve,
+    without_ceiling,
+)
+from app.ui.loops.panel import stand
 
 angles = st.tuples(*(st.floats(-1.5, 1.5) for _ in range(3)))
 places = st.tuples(*(st.floats(-50, 50) for _ in range(3)))

@@ -8,7 +8,7 @@ import numpy as np
 
 from app.server.protocol import InspectLoop, LoopsView
 from app.slam.loops.types import Verdict
-from app.ui.loops.kinds import KINDS
+from app.ui.loops.words import KINDS
 from tests.ui.conftest import SOMEONE, Wire
 from tests.ui.loops.conftest import GOOD, Page
 

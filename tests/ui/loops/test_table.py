@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.server.protocol import InspectLoop, LoopsView
-from app.ui.loops.kinds import KINDS
+from app.ui.loops.words import KINDS
 from tests.ui.conftest import SOMEONE
 from tests.ui.loops.conftest import GOOD, Page, rejected
 

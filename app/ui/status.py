@@ -1,0 +1,122 @@
+"""What is going on: the head of the page, the recording doctor's findings and the engine's notices."""
+
+from typing import Final, Literal
+
+import numpy as np
+import viser
+
+from app.sensors.doctor import Finding
+from app.server.protocol import Notice, Snapshot
+from app.slam.types import FrameStatus
+from app.ui.html import BAD, GOOD, QUIET, WARN, panel
+
+_LOG_LINES: Final = 20
+_LOOKS: Final = {"fine": ("✓ fine", GOOD), "corrected": ("↻ corrected", WARN), "needs you": ("! needs you", BAD)}
+_LEVELS: Final[dict[str, tuple[str, str, Literal["blue", "yellow", "red"], float | None]]] = {
+    "info": ("Note", QUIET, "blue", 6.0),
+    "warning": ("Warning", WARN, "yellow", 12.0),
+    "error": ("Error", BAD, "red", None),
+}
+"""Title, colours in the log and of the notification, and seconds until that closes. An error stays."""
+
+
+def status(snapshot: Snapshot) -> tuple[str, str]:
+    """What is going on, in a word or two, and its colour."""
+    transport, result = snapshot.transport, snapshot.result
+    if not snapshot.engine_alive:
+        return "engine stopped", BAD
+    if snapshot.progress is not None:
+        return "busy", WARN
+    if snapshot.recording is None:
+        return "no recording", QUIET
+    if result is not None and result.status is FrameStatus.LOST:
+        return "lost", BAD
+    if transport.finished:
+        return "finished", QUIET
+    if result is not None and result.status is FrameStatus.INITIALISING:
+        return "initialising", WARN
+    return ("playing", GOOD) if transport.playing else ("paused", QUIET)
+
+
+def title(snapshot: Snapshot) -> str:
+    """The recording's name, the status, the doctor's verdicts and, before the first frame, what to do."""
+    recording = snapshot.recording
+    hint = first = ""
+    if not snapshot.engine_alive:
+        hint = "dead"
+    elif recording is None and snapshot.progress is None:
+        hint = "none"
+    elif recording is not None and snapshot.transport.frame < 0 and snapshot.progress is None:
+        first = "live" if snapshot.live is not None and snapshot.transport.playing else "file"
+    name = recording.path.name if recording else "hemislam"
+    return panel("header", name, *status(snapshot), hint, verdicts(recording.findings if recording else ()), first)
+
+
+class HeaderPanel:
+    """Title, status and, during long work, what it is and how far it got."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._title = gui.add_html("")
+        self._work = gui.add_html("", visible=False)
+        self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Show the snapshot's recording, status and progress."""
+        self._title.content = title(snapshot)
+        progress = snapshot.progress
+        self._work.visible = self._bar.visible = progress is not None
+        if progress is not None:
+            known = bool(np.isfinite(progress.fraction))
+            percent = 100 * min(max(progress.fraction, 0.0), 1.0) if known else 100.0
+            self._work.content = panel("text", progress.title + (f" · {percent:.0f} %" if known else " …"))
+            self._bar.value = percent  # type: ignore[misc]  # mypy overlooks viser's setter
+
+
+def findings_html(findings: tuple[Finding, ...]) -> str:
+    """The findings, those that need the user first."""
+    order = list(_LOOKS)[::-1]
+    ranked = sorted(findings, key=lambda finding: order.index(finding.verdict))
+    return panel("findings", [(finding, *_LOOKS[finding.verdict]) for finding in ranked])
+
+
+def verdicts(findings: tuple[Finding, ...]) -> list[tuple[str, str]]:
+    """How many findings there are of each verdict, in words, and its colour."""
+    counts = {verdict: sum(finding.verdict == verdict for finding in findings) for verdict in _LOOKS}
+    return [(f"{_LOOKS[verdict][0]} {count}", _LOOKS[verdict][1]) for verdict, count in counts.items() if count]
+
+
+def log_html(notices: tuple[Notice, ...]) -> str:
+    """The newest notices, newest first."""
+    return panel("log", [(notice.text, _LEVELS[notice.level][1]) for notice in reversed(notices[-_LOG_LINES:])])
+
+
+class DoctorPanel:
+    """The findings of the open recording."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._html = gui.add_html(findings_html(()))
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Show the open recording's findings."""
+        self._html.content = findings_html(snapshot.recording.findings if snapshot.recording else ())
+
+
+class NoticePanel:
+    """The engine's notices: a notification in every browser, and a log for those that connect later."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._log = server.gui.add_html(log_html(()))
+        self._shown: set[int] = set()
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Notify every browser of what is new since the call before."""
+        new = [notice for notice in snapshot.notices if notice.number not in self._shown]
+        if not new:
+            return
+        self._shown |= {notice.number for notice in new}
+        self._log.content = log_html(snapshot.notices)
+        for client in self._server.get_clients().values():
+            for notice in new:
+                title, _, colour, seconds = _LEVELS[notice.level]
+                client.add_notification(title, notice.text, color=colour, auto_close_seconds=seconds)
