@@ -92,14 +92,14 @@ class _Timed(Checkpoints):
 
 
 def cost(path: Path, budget: int, frames: int | None = None) -> list[Line]:
-    """The share of the time that goes into checkpoints, and what they hold within a budget of memory (bytes).
+    """The share of the time that goes into checkpoints, and what they take with a budget of memory (bytes).
 
     Args:
         frames: to play; None: all.
     """
     params = resolve_params(path, None, None, [])
     compile_kernels()
-    steps, memory, disk = 0.0, [0.0], [0.0]
+    steps, held = 0.0, [0.0]
     checkpoints = _Timed(budget)
     session = Session(open_file(path, params), Engine(params), loops=RestartingLoops, checkpoints=checkpoints)
     if session.loops:
@@ -111,13 +111,11 @@ def cost(path: Path, budget: int, frames: int | None = None) -> list[Line]:
                 begin = time.perf_counter()
                 session.advance()
                 steps += time.perf_counter() - begin
-                memory.append(checkpoints.memory / MIB)
-                disk.append(checkpoints.disk / MIB)
+                held.append(checkpoints.nbytes / MIB)
                 bar.update()
     on = f"{path.stem}: {session.frame + 1:,} frames, checkpoints within {budget // MIB} MiB of memory"
     session.close()
     return [
         Line.of("share of the frame time", on, "%", [100 * checkpoints.seconds / (steps - checkpoints.seconds)]),
-        Line.of("in memory", on, "MiB", memory),
-        Line.of("on disk", on, "MiB", disk),
+        Line.of("in memory and on disk", on, "MiB", held),
     ]

@@ -1,16 +1,16 @@
-"""Sessions on a live source: a feed without an end, and the files by which another process takes a session over."""
+"""Sessions on a live source: a feed without an end, and a file by which another process takes a session over."""
 
 import contextlib
 import logging
 import pickle
+import sqlite3
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from app.mapping.feed import Feed, FeedInfo, Quiet
 from app.mapping.loops import RestartingLoops
-from app.mapping.session import Checkpoint, Session
+from app.mapping.session import Session
 from app.sensors.live.process import LiveAddress, LiveClient
 from app.sensors.live.status import LiveState
 from app.slam.engine import Engine
@@ -18,7 +18,6 @@ from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.keyframe_log import KeyframeLog
 from app.slam.loops.messages import LoopClient
-from app.slam.loops.types import LoopEdit
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
@@ -26,7 +25,7 @@ POLL_S = 0.02
 """How long to wait for the next scan before looking for commands."""
 EVERY = 10
 """Frames between two checkpoints. The receiving process can give six seconds of scans again."""
-KEYFRAMES, CHECKPOINT, ROWS = "keyframes", "checkpoint", "rows"
+KEYFRAMES, HANDOVER = "keyframes", "handover.sqlite"
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +54,7 @@ class LiveFeed(Feed):
         self._client.place, start_ns = place
         self._info = replace(self._info, start_ns=start_ns)
 
-    def forget_before(self) -> None:
+    def acknowledge(self) -> None:
         """Scans up to here are not asked for again."""
         with contextlib.suppress(HemislamError):  # the source has ended; the next scan that is asked for tells
             self._client.kept()
@@ -67,93 +66,65 @@ class LiveFeed(Feed):
         self._client.close()
 
 
-@dataclass(frozen=True, slots=True)
-class _Kept:
-    """What a file holds beside keyframes and rows, which are appended to files of their own: what is written
-    each time must not grow with the session. rows_end: bytes of the file of rows that belong to it.
+class LiveSession(Session):
+    """A session on a live source. It only goes on, and another process can take it over if this one dies.
+
+    Args:
+        folder: for what must outlive the process.
+        loops: makes the client that looks for loops; None: odometry alone.
     """
 
-    checkpoint: Checkpoint
-    params: Params
-    history: tuple[tuple[int, Params], ...]
-    edits: tuple[tuple[LoopEdit, ...], tuple[LoopEdit, ...]]
-    rows_end: int
+    def __init__(
+        self, feed: LiveFeed, params: Params, folder: Path, loops: Callable[[KeyframeLog], LoopClient] | None
+    ) -> None:
+        self._live = feed
+        self._written = 0  # frames
+        self._file = sqlite3.connect(folder / HANDOVER, isolation_level=None)
+        self._file.executescript(
+            "PRAGMA synchronous = OFF; CREATE TABLE IF NOT EXISTS frames (pickled BLOB);"
+            "CREATE TABLE IF NOT EXISTS kept (id INTEGER PRIMARY KEY, pickled BLOB)"
+        )
+        super().__init__(feed, Engine(params, KeyframeStore(folder / KEYFRAMES)), loops=loops)
 
-
-class Handover:
-    """Writes now and then what another process needs to take a live session over, and reads it there.
-
-    It stands in the place of checkpoints, but there is no going back by it.
-    """
-
-    def __init__(self, session: Session, feed: LiveFeed, folder: Path) -> None:
-        self._session, self._feed, self._folder = session, feed, folder
-        self._rows_end = self._rows_written = 0
-
-    def wanted(self, frame: int, *, near: bool = False) -> bool:
-        return frame >= 0 and frame % EVERY == 0
-
-    def add(self, frame: int, checkpoint: Checkpoint) -> None:
-        """Write the session as it is."""
-        session, part = self._session, self._folder / f"{CHECKPOINT}.part"
+    def _remember(self, *, near: bool = False) -> None:
+        """Write what another process needs to go on from here. What is written must not grow with the session."""
+        if self.frame < 0 or self.frame % EVERY:
+            return
+        kept = (self.checkpoint(), self.params, self.history, self.edits)
         try:
-            self._append_rows()
-            kept = _Kept(checkpoint, session.params, session.history, session.edits, self._rows_end)
-            with part.open("wb") as file:
-                pickle.dump(kept, file, protocol=5)
-            part.replace(self._folder / CHECKPOINT)
-        except OSError as error:
+            with self._file:
+                self._file.execute("BEGIN")
+                frames = ((pickle.dumps(frame),) for frame in self.frames[self._written :])
+                self._file.executemany("INSERT INTO frames VALUES (?)", frames)
+                self._file.execute("REPLACE INTO kept VALUES (0, ?)", (pickle.dumps(kept),))
+        except sqlite3.Error as error:
             log.warning("A checkpoint for another process cannot be written: %s", error)
         else:
-            self._feed.forget_before()
+            self._written = len(self.frames)
+            self._live.acknowledge()
 
     def take_over(self) -> bool:
         """Go on where a process that died was. False if it left nothing to go on from."""
-        session = self._session
         try:
-            with (self._folder / CHECKPOINT).open("rb") as file:
-                kept = pickle.load(file)
-            assert isinstance(kept, _Kept)
-            if kept.checkpoint.engine.keyframes > len(session.engine.keyframes):
-                return False
-            self._read_rows(kept.rows_end)
-        except (OSError, EOFError, pickle.UnpicklingError):
+            ((pickled,),) = self._file.execute("SELECT pickled FROM kept")
+            checkpoint, params, history, edits = pickle.loads(pickled)
+            frames = [pickle.loads(row) for (row,) in self._file.execute("SELECT pickled FROM frames ORDER BY rowid")]
+        except (sqlite3.Error, ValueError, pickle.UnpicklingError):
             return False
-        session.return_to(kept.checkpoint)
-        session.choose(kept.params)
-        session.history = kept.history
-        if any(kept.edits):
-            session.edit_loops(*kept.edits)
+        if checkpoint.engine.keyframes > len(self.engine.keyframes):
+            return False
+        self.frames.extend(frames)
+        self._written = len(frames)
+        self.return_to(checkpoint)
+        self.choose(params)
+        self.history = history
+        if any(edits):
+            self.edit_loops(*edits)
         return True
 
-    def before(self, frame: int) -> None:
-        return None
-
-    def get(self, frame: int) -> Any:
-        raise KeyError(frame)
-
-    def forget_after(self, frame: int) -> None:
-        """Parameters that change from here on do not change what was written."""
-
     def close(self) -> None:
-        """The files stay."""
-
-    def _append_rows(self) -> None:
-        """Behind the rows that are there. A process that died may have left a piece behind them, which is cut off."""
-        with (self._folder / ROWS).open("r+b" if self._rows_end else "wb") as file:
-            file.seek(self._rows_end)
-            file.truncate()
-            session, first = self._session, self._rows_written
-            pickle.dump(session.frames[first:], file, protocol=5)
-            self._rows_end, self._rows_written = file.tell(), len(session.frames)
-
-    def _read_rows(self, end: int) -> None:
-        with (self._folder / ROWS).open("rb") as file:
-            while file.tell() < end:
-                frames = pickle.load(file)
-                self._session.frames.extend(frames)
-                self._rows_written += len(frames)
-        self._rows_end = end
+        super().close()
+        self._file.close()
 
 
 def open_live_session(
@@ -164,7 +135,7 @@ def open_live_session(
     *,
     loops: Callable[[KeyframeLog], LoopClient] = RestartingLoops,
     take_over: bool = False,
-) -> Session:
+) -> LiveSession:
     """Map what comes from now on, or go on where a process that died was.
 
     Args:
@@ -174,29 +145,23 @@ def open_live_session(
     Raises:
         HemislamError: the receiving process has ended.
     """
+
+    def begin() -> tuple[LiveSession, LiveFeed]:
+        feed = LiveFeed(LiveClient(address), name)
+        return LiveSession(feed, params, folder, loops if params.loops.enabled else None), feed
+
+    def clear() -> None:
+        for file in (KEYFRAMES, HANDOVER, f"{HANDOVER}-journal"):
+            (folder / file).unlink(missing_ok=True)
+
     if not take_over:
-        _clear(folder)
-    session, feed, handover = _begin(address, name, params, folder, loops)
-    if take_over and not handover.take_over():
+        clear()
+    session, feed = begin()
+    if take_over and not session.take_over():
         session.close()
-        _clear(folder)
-        session, feed, handover = _begin(address, name, params, folder, loops)
+        clear()
+        session, feed = begin()
         feed.go_to((0, 0))  # all that was given to the process that died before its first checkpoint
     elif not take_over:
-        feed.forget_before()  # scans of an earlier session
+        feed.acknowledge()  # scans of an earlier session
     return session
-
-
-def _begin(
-    address: LiveAddress, name: Path, params: Params, folder: Path, loops: Callable[[KeyframeLog], LoopClient]
-) -> tuple[Session, LiveFeed, Handover]:
-    feed = LiveFeed(LiveClient(address), name)
-    engine = Engine(params, KeyframeStore(folder / KEYFRAMES))
-    session = Session(feed, engine, loops=loops if params.loops.enabled else None)
-    session.checkpoints = handover = Handover(session, feed, folder)
-    return session, feed, handover
-
-
-def _clear(folder: Path) -> None:
-    for name in (KEYFRAMES, CHECKPOINT, ROWS):
-        (folder / name).unlink(missing_ok=True)

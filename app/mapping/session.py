@@ -1,21 +1,20 @@
 """A session: a feed of measurements, the engine at work on it, loops, and the log of what came of it so far."""
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from app.mapping.checkpoints import NEAR
+from app.mapping import truth as truths
+from app.mapping.checkpoints import NEAR, Checkpoints
 from app.mapping.feed import Feed, Quiet
-from app.mapping.labels import LabelLayer
+from app.mapping.labels import LabelEdit, LabelledKeyframes
 from app.mapping.log import Log
-from app.mapping.saver import Saver
-from app.mapping.session_file import Opened, SavedSession, State, size_of
-from app.mapping.truth import align, distances, interpolated
+from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
 from app.sensors.findings import Finding
 from app.slam import engine
 from app.slam.engine import Engine
@@ -27,7 +26,7 @@ from app.slam.loops.schedule import LoopSchedule
 from app.slam.loops.types import Edits, LoopEdit
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params, leaves
-from app.slam.results import RunInfo, RunLog
+from app.slam.results import EXPORTS, Results, RunInfo, RunLog, save_results
 from app.slam.trajectory import read_tum, time_apart
 from app.slam.types import F64, DroppedScan, Measurement, StepResult
 
@@ -42,17 +41,6 @@ class Checkpoint:
     frame: int
     engine: engine.Checkpoint
     place: Any
-
-
-class Memory(Protocol):
-    """Where checkpoints are kept (`app.mapping.checkpoints.Checkpoints`)."""
-
-    def wanted(self, frame: int, *, near: bool = False) -> bool: ...
-    def add(self, frame: int, checkpoint: Checkpoint, /) -> None: ...
-    def before(self, frame: int) -> int | None: ...
-    def get(self, frame: int) -> Any: ...
-    def forget_after(self, frame: int) -> None: ...
-    def close(self) -> None: ...
 
 
 class Session:
@@ -75,7 +63,7 @@ class Session:
         history: from which frame on which parameters were in force, ascending.
         params: for frames not yet processed; set them with `choose`.
         ended: whether the feed has no more to give.
-        labels: of the keyframes' points.
+        label_edits: of the keyframes' points, in the order in which they were made.
 
     Raises:
         HemislamError: the truth cannot be read.
@@ -88,7 +76,7 @@ class Session:
         *,
         loops: Callable[[KeyframeLog], LoopClient] | None = None,
         truth: Path | None = None,
-        checkpoints: Memory | None = None,
+        checkpoints: Checkpoints | None = None,
     ) -> None:
         self.truth = read_tum(truth) if truth else None
         self.truth_path = truth
@@ -103,11 +91,11 @@ class Session:
         self.history: tuple[tuple[int, Params], ...] = ()
         self.ended = False
         self.frames: Log[Frame] = Log()
-        self.labels = LabelLayer()
+        self.label_edits: tuple[LabelEdit, ...] = ()
         self.checkpoints = checkpoints
         self._waiting: Measurement | None = None
         self._dropped: tuple[str, ...] = ()  # why scans since the newest frame were
-        self._saver = Saver()
+        self._saves = ThreadPoolExecutor(max_workers=1, thread_name_prefix="save")
         self._remember()
 
     # --- going on --------------------------------------------------------------------------------
@@ -162,9 +150,9 @@ class Session:
 
     def _step(self, measurement: Measurement, frame: int, params: Params) -> StepResult:
         """The engine's step, and the loops that come into effect before it."""
-        watch = _LoopsWatch()
-        with watch:
-            news = self.loops.due(frame) if self.loops else ()
+        begin = perf_counter()
+        news = self.loops.due(frame) if self.loops else ()
+        loops_s = perf_counter() - begin
         self.engine.params = params
         try:
             result = self.engine.step(measurement.scan, measurement.imu)
@@ -172,11 +160,13 @@ class Session:
             self.engine.params = self.params
         notices = (*measurement.notices, *result.notices)
         if self.loops:
-            with watch:
-                if result.keyframe is not None:
-                    self.loops.add(result.keyframe, params.loops)
-                notices = (*notices, *self.loops.take_notices())
-            result = replace(result, T_map_odom=self.map_frame.newest, loops=news, timings_ms=watch.added_to(result))
+            begin = perf_counter()
+            if result.keyframe is not None:
+                self.loops.add(result.keyframe, params.loops)
+            notices = (*notices, *self.loops.take_notices())
+            loops_ms = (loops_s + perf_counter() - begin) * 1e3
+            timings = result.timings_ms | {"loops": loops_ms, "total": result.timings_ms["total"] + loops_ms}
+            result = replace(result, T_map_odom=self.map_frame.newest, loops=news, timings_ms=timings)
         return replace(result, notices=notices, dropped=len(self._dropped))
 
     @property
@@ -210,7 +200,7 @@ class Session:
 
     def params_of(self, frame: int) -> Params | None:
         """Those in force at a known or planned frame; of a later one, those of the last."""
-        return in_force(self.history, frame)
+        return next((params for first, params in reversed(self.history) if first <= frame), None)
 
     def edit_loops(self, edits: tuple[LoopEdit, ...], undone: tuple[LoopEdit, ...] = ()) -> None:
         """Put these edits over the loops that are found, now and later; the undone ones can be redone.
@@ -268,11 +258,7 @@ class Session:
             if nearest is None or self.checkpoints is None:
                 raise HemislamError("This session only goes on; open its recording to go back in it.")
             self.finish_saves()
-            try:
-                checkpoint = self.checkpoints.get(nearest)
-            except OSError as error:
-                raise HemislamError(f"A checkpoint cannot be read: {error.strerror}.") from error
-            self.return_to(checkpoint)
+            self.return_to(self.checkpoints.get(nearest))
         self.heading = heading
 
     def stay(self) -> None:
@@ -306,13 +292,14 @@ class Session:
     def _forget_after(self, frame: int) -> None:
         """What comes after a frame will be different."""
         self.frames.truncate(frame + 1)
-        self.labels.forget(sum(one.keyframe for one in self.frames))
+        keyframes = sum(one.keyframe for one in self.frames)
+        self.label_edits = tuple(edit for edit in self.label_edits if edit.keyframe < keyframes)
         self.planned, self.heading = min(self.planned, frame), min(self.heading, frame)
         self.history = tuple(entry for entry in self.history if entry[0] <= frame)
         if self.loops:
             self.loops.forget_after(frame)
         if self.checkpoints:
-            self.checkpoints.forget_after(frame)
+            self.checkpoints.drop([other for other in self.checkpoints.frames if other > frame])
 
     def _remember(self, *, near: bool = False) -> None:
         if self.checkpoints and self.checkpoints.wanted(self.frame, near=near):
@@ -349,9 +336,7 @@ class Session:
         """(frame + 1,) m, distances of the frames so far to the truth, which is aligned to them; nan without truth."""
         if self.truth is None:
             return np.full(self.frame + 1, np.nan)
-        ours = self.map_frame.trajectory(self.log.odometry)
-        there = interpolated(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns)
-        return distances(align(there, ours.positions), there, ours.positions)
+        return truths.errors(self.truth, self.map_frame.trajectory(self.log.odometry))
 
     def save(
         self,
@@ -375,45 +360,27 @@ class Session:
         """
         info = self.feed.info
         made_from = RunInfo(info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped)
-        loops = self.loops.results() if self.loops else None
-        if trajectory_only:
-            return self._saver.save_trajectory(folder, self.log, loops)
-        keyframes = self.labels.over(self.engine.keyframes)
-        return self._saver.save(folder, self.log, keyframes, made_from, loops, session, replace=replace)
+        keyframes = LabelledKeyframes(self.engine.keyframes, self.label_edits)
+        results = Results(self.log, keyframes, made_from, self.loops.results() if self.loops else None)
+
+        def write() -> dict[str, Any]:
+            report = save_results(folder, results, EXPORTS[:1] if trajectory_only else EXPORTS, replace=replace)
+            if session is not None:
+                write_session(folder / f"session{SUFFIX}", session)
+            return report
+
+        return self._saves.submit(write)
 
     def finish_saves(self) -> None:
         """Wait until no save is under way."""
-        self._saver.finish()
+        self._saves.submit(lambda: None).result()  # they are done one after the other
 
     def close(self) -> None:
         """Finish the saves and release what is held."""
-        self._saver.close()
+        self._saves.shutdown()
         self.feed.close()
         if self.loops:
             self.loops.close()
         self.engine.close()
         if self.checkpoints:
             self.checkpoints.close()
-
-
-def in_force(history: Sequence[tuple[int, Params]], frame: int) -> Params | None:
-    """The parameters of a frame by a history as in `Session.history`; None before its first."""
-    return next((params for first, params in reversed(history) if first <= frame), None)
-
-
-class _LoopsWatch:
-    """Milliseconds spent on loops in one frame. What it reads never influences a result."""
-
-    def __init__(self) -> None:
-        self._ms = self._begin = 0.0
-
-    def __enter__(self) -> None:
-        self._begin = perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        self._ms += (perf_counter() - self._begin) * 1e3
-
-    def added_to(self, result: StepResult) -> dict[str, float]:
-        """The timings of a frame with those of its loops."""
-        total = result.timings_ms["total"] + self._ms
-        return {**result.timings_ms, "loops": self._ms, "total": total}

@@ -170,10 +170,14 @@ def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) ->
 
 
 def write_session(path: Path, session: SavedSession) -> None:
-    """Write a session file as a whole. Raises OSError."""
+    """Write a session file as a whole; its folder need not exist yet. Raises HemislamError: that is not possible."""
     state = _place(session.frame, session.ended) | {"state": _state_tree(session.state)}
-    entries = [_head(session.opened), state]
-    path.write_text("".join(json.dumps(entry, ensure_ascii=False) + "\n" for entry in entries), encoding="utf-8")
+    lines = [json.dumps(entry, ensure_ascii=False) + "\n" for entry in (_head(session.opened), state)]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("".join(lines), encoding="utf-8")
+    except OSError as error:
+        raise HemislamError(f"The session cannot be written to {path}: {error.strerror}.") from error
 
 
 def read_session(path: Path) -> SavedSession:

@@ -4,6 +4,7 @@ import numpy as np
 
 from app.slam.errors import HemislamError
 from app.slam.metrics import MAX_TRUTH_GAP_S, umeyama
+from app.slam.trajectory import Trajectory
 from app.slam.types import F64, I64
 
 LEAST_EXTENT_M = 0.5
@@ -42,3 +43,9 @@ def interpolated(truth_stamps_ns: I64, truth_positions: F64, stamps_ns: I64) -> 
     outside = (stamps_ns < truth_stamps_ns[0]) | (stamps_ns > truth_stamps_ns[-1])
     positions[outside | (after - before > MAX_TRUTH_GAP_S * 1e9)] = np.nan
     return positions
+
+
+def errors(truth: Trajectory, ours: Trajectory) -> F64:
+    """(n,) m from each pose to the truth, which is aligned to all of them; nan where there is none."""
+    there = interpolated(truth.stamps_ns, truth.positions, ours.stamps_ns)
+    return distances(align(there, ours.positions), there, ours.positions)

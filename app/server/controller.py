@@ -176,7 +176,7 @@ class Controller:
                 self._open_soon(self._need_session().feed.info.path, self._reopen)
             case Save(folder, trajectory_only):
                 session = self._need_session()
-                saved = session.saved(self._state(session))
+                saved = None if trajectory_only else session.saved(self._state(session))
                 save = session.save(folder, session=saved, trajectory_only=trajectory_only)
                 self._saves.append((folder, save))
             case EditLoop() | UndoLoop() | RedoLoop() | TryLoop() | InspectLoop():

@@ -149,11 +149,7 @@ class Workspace:
             a, folder = self._place(name)
             session = forked(a.engine.snapshot, values or {})
             file = folder / f"start{SUFFIX}"
-            try:
-                folder.mkdir(parents=True)
-                write_session(file, session)
-            except OSError as error:
-                raise HemislamError(f"The fork cannot be written to {folder}: {error.strerror}.") from None
+            write_session(file, session)
             self._begin(file, session, name, folder, session.frame)
             changed = ", ".join(f"{path} = {value}" for path, value in (values or {}).items())
             a.engine.send(AddNote(f"Forked as {self.names[1]}{f' with {changed}' if changed else ''}."))
@@ -229,12 +225,9 @@ class Workspace:
             stem = f"{session.opened.recording.stem}-{_plain(name.strip() or b.name)}"
             path = free_path(self._setup.session_folder / stem, SUFFIX)
             try:
-                path.parent.mkdir(parents=True, exist_ok=True)
                 write_session(path, session)
-            except OSError as error:
-                raise HemislamError(
-                    f"The fork cannot be kept as {path}: {error.strerror}; it still is in {session_file}."
-                ) from None
+            except HemislamError as error:
+                raise HemislamError(f"{error} The fork still is in {session_file}.") from None
             if b.folder is not None:
                 shutil.rmtree(b.folder, ignore_errors=True)
             self.send(AddNote(f"Kept {b.name} as {path.name}."))

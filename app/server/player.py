@@ -105,7 +105,7 @@ class Player:
             self.halt()
             start = session.frame
         frame = max(start + frames, 0)
-        self._go_to(session, frame, frame if frame < max(session.heading, session.frame) else None, stepping=True)
+        self._aim(session, frame, frame if frame < max(session.heading, session.frame) else None, stepping=True)
 
     def seek(self, session: Session, frame: int) -> None:
         """Go to a frame as fast as possible, then go on as before. Raises HemislamError: the source is live."""
@@ -113,13 +113,13 @@ class Player:
         if not session.feed.repeatable or frames is None:
             raise HemislamError(ONLY_ON)
         frame = max(0, min(frame, frames - 1))
-        self._go_to(session, frame, frame)
+        self._aim(session, frame, frame)
 
     def resume(self, session: Session, frame: int, *, to_end: bool) -> None:
         """Go to the frame that a session file was at. to_end: on to the end of the recording from there."""
-        self._go_to(session, max(frame, 0) + to_end, frame)
+        self._aim(session, max(frame, 0) + to_end, frame)
 
-    def _go_to(self, session: Session, frame: int, as_it_was: int | None, *, stepping: bool = False) -> None:
+    def _aim(self, session: Session, frame: int, as_it_was: int | None, *, stepping: bool = False) -> None:
         """Aim at a frame. as_it_was: frames up to this one are repeated, later ones processed anew; None: all anew."""
         if as_it_was is not None:
             try:

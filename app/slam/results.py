@@ -228,15 +228,9 @@ def prepare_folder(folder: Path, *, replace: bool = False) -> None:
 
 
 def save_results(
-    folder: Path,
-    log: RunLog,
-    keyframes: Keyframes,
-    info: RunInfo,
-    loops: LoopResults | None = None,
-    *,
-    replace: bool = False,
+    folder: Path, results: Results, exports: Sequence[Export] = EXPORTS, *, replace: bool = False
 ) -> dict[str, Any]:
-    """Write all result files and return what report.json holds.
+    """Write these result files and return what report.json holds.
 
     Older results in the folder stay until all new files are complete.
 
@@ -244,13 +238,12 @@ def save_results(
         HemislamError: as `prepare_folder`, or the disk is full or fails.
     """
     prepare_folder(folder, replace=replace)
-    results = Results(log, keyframes, info, loops)
-    written = [export for export in EXPORTS if loops or not export.of_loops]
+    written = [export for export in exports if results.loops or not export.of_loops]
     parts = {export.name: folder / f".{export.name}.part" for export in written}
     try:
         for export in written:
             export.write(parts[export.name], results)
-        for export in EXPORTS:
+        for export in exports:
             if export in written:
                 parts[export.name].replace(folder / export.name)
             else:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.mapping.labels import LabelLayer
+from app.mapping.labels import LabelEdit, LabelledKeyframes
 from app.slam.errors import HemislamError
 from app.slam.map_frame import MapFrame
 from app.slam.ply import write_map
@@ -36,54 +36,44 @@ ALL_GROUND = np.full(POINTS, GROUND, np.uint8)
 @given(st.lists(st.one_of(st.none(), st.tuples(st.integers(0, 2), st.integers(0, 2))), max_size=12))
 def test_the_newest_edit_counts_and_undo_brings_the_one_before_back(steps: list[tuple[int, int] | None]) -> None:
     """A step is an edit (keyframe, label) or an undo (None)."""
-    layer, edits = LabelLayer(), []
+    label_edits: tuple[LabelEdit, ...] = ()
+    edits: list[tuple[int, int]] = []
     for step in steps:
         if step is None:
-            layer.undo()
-            edits = edits[:-1]
+            label_edits, edits = label_edits[:-1], edits[:-1]
         else:
-            layer.edit(KEYFRAMES[step[0]], np.full(POINTS, step[1], np.uint8))
-            edits = [*edits, step]
+            edit = LabelEdit.of(KEYFRAMES[step[0]], np.full(POINTS, step[1], np.uint8))
+            label_edits, edits = (*label_edits, edit), [*edits, step]
     expected = dict.fromkeys(range(3), NON_GROUND) | dict(edits)
-    seen = layer.over(KEYFRAMES)
+    seen = LabelledKeyframes(KEYFRAMES, label_edits)
     assert {index: int(seen[index].cloud.labels[0]) for index in range(len(seen))} == expected
     assert all((one.cloud.labels == NON_GROUND).all() for one in KEYFRAMES)
 
 
-def test_an_export_under_way_does_not_see_later_keyframes_and_edits() -> None:
-    layer, keyframes = LabelLayer(), KEYFRAMES[:2]
-    seen = layer.over(keyframes)
-    layer.edit(KEYFRAMES[0], ALL_GROUND)
+def test_an_export_under_way_does_not_see_later_keyframes() -> None:
+    keyframes = KEYFRAMES[:2]
+    seen = LabelledKeyframes(keyframes, [LabelEdit.of(KEYFRAMES[1], ALL_GROUND)])
     keyframes.append(KEYFRAMES[2])
     assert len(seen) == 2 and (seen[0].cloud.labels == NON_GROUND).all()
     with pytest.raises(IndexError):
         seen[2]
 
 
-def test_edits_of_keyframes_that_are_gone_are_dropped() -> None:
-    layer = LabelLayer()
-    for one in KEYFRAMES:
-        layer.edit(one, ALL_GROUND)
-    layer.forget(1)
-    assert [edit.keyframe for edit in layer.edits] == [0]
-
-
 def test_labels_for_another_number_of_points_are_refused() -> None:
     with pytest.raises(HemislamError, match="Keyframe 0 has 4 points; 3 labels do not fit"):
-        LabelLayer().edit(KEYFRAMES[0], ALL_GROUND[:3])
+        LabelEdit.of(KEYFRAMES[0], ALL_GROUND[:3])
 
 
 def test_labels_are_kept_as_they_were_given() -> None:
-    layer, labels = LabelLayer(), ALL_GROUND.copy()
-    layer.edit(KEYFRAMES[0], labels)
+    labels = ALL_GROUND.copy()
+    edit = LabelEdit.of(KEYFRAMES[0], labels)
     labels[:] = NON_GROUND
-    assert (layer.over(KEYFRAMES)[0].cloud.labels == GROUND).all()
+    assert (edit.labels == GROUND).all() and not edit.labels.flags.writeable
 
 
 def test_the_map_is_written_with_edited_labels(tmp_path: Path) -> None:
-    layer, path = LabelLayer(), tmp_path / "map.ply"
-    layer.edit(KEYFRAMES[1], ALL_GROUND)
-    write_map(path, layer.over(KEYFRAMES), MapFrame())
+    path = tmp_path / "map.ply"
+    write_map(path, LabelledKeyframes(KEYFRAMES, [LabelEdit.of(KEYFRAMES[1], ALL_GROUND)]), MapFrame())
     edited = path.read_bytes()
     relabelled = [replace(one, cloud=replace(one.cloud, labels=ALL_GROUND)) for one in KEYFRAMES[1:2]]
     write_map(path, [KEYFRAMES[0], *relabelled, KEYFRAMES[2]], MapFrame())

@@ -14,7 +14,7 @@ from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.ply import VERTEX, write_map
 from app.slam.report import summarise
-from app.slam.results import EXPORTS, RunInfo, RunLog, save_results
+from app.slam.results import EXPORTS, Results, RunInfo, RunLog, save_results
 from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import (
     GROUND,
@@ -118,7 +118,7 @@ def read_ply(path: Path) -> np.ndarray:
 
 def test_a_run_writes_its_four_files(tmp_path: Path, recording: Path) -> None:
     folder = tmp_path / "out"
-    report = save_results(folder, logged(), [keyframe(0, [[1, 0, 0]], [GROUND])], RunInfo(recording, Params()))
+    report = save_results(folder, Results(logged(), [keyframe(0, [[1, 0, 0]], [GROUND])], RunInfo(recording, Params())))
     assert sorted(path.name for path in folder.iterdir()) == sorted(
         export.name for export in EXPORTS if not export.of_loops
     )
@@ -126,7 +126,7 @@ def test_a_run_writes_its_four_files(tmp_path: Path, recording: Path) -> None:
 
 
 def test_the_trajectory_has_a_pose_at_every_scans_end(tmp_path: Path, recording: Path) -> None:
-    save_results(tmp_path / "out", logged(), [], RunInfo(recording, Params()))
+    save_results(tmp_path / "out", Results(logged(), [], RunInfo(recording, Params())))
     lines = (tmp_path / "out" / "trajectory.tum").read_text().splitlines()
     assert lines[0] == (
         "1700000000.150000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 0.707106781 0.707106781"
@@ -135,7 +135,7 @@ def test_the_trajectory_has_a_pose_at_every_scans_end(tmp_path: Path, recording:
 
 
 def test_timings_hold_every_processed_frame(tmp_path: Path, recording: Path) -> None:
-    save_results(tmp_path / "out", logged(), [], RunInfo(recording, Params()))
+    save_results(tmp_path / "out", Results(logged(), [], RunInfo(recording, Params())))
     rows = list(csv.DictReader((tmp_path / "out" / "timings.csv").open()))
     assert [float(row["total_ms"]) for row in rows] == [7, 8, 9, 10, 11, 12]
     assert [row["frame"] for row in rows] == ["0", "1", "2", "3", "4", "5"]
@@ -143,7 +143,7 @@ def test_timings_hold_every_processed_frame(tmp_path: Path, recording: Path) -> 
 
 
 def test_the_report_counts_frames_ground_and_the_input(tmp_path: Path, recording: Path) -> None:
-    report = save_results(tmp_path / "out", logged(), [], RunInfo(recording, Params()))
+    report = save_results(tmp_path / "out", Results(logged(), [], RunInfo(recording, Params())))
     assert report["recording"]["sha256"] == hashlib.sha256(b"a recording").hexdigest()
     assert report["frames"] == {
         "processed": 6,
@@ -164,7 +164,7 @@ def test_the_report_measures_against_truth(tmp_path: Path, recording: Path) -> N
     log = logged(8)
     ours = log.odometry
     shifted = Trajectory(ours.stamps_ns, ours.positions + np.array([5.0, 0, 0]), ours.quaternions)
-    report = save_results(tmp_path / "out", log, [], RunInfo(recording, Params(), truth=shifted))
+    report = save_results(tmp_path / "out", Results(log, [], RunInfo(recording, Params(), truth=shifted)))
     assert report["accuracy"]["ate_m"]["rmse"] < 1e-9
     assert report["accuracy"]["poses"] == 8
     assert report["accuracy"]["rpe"]["50 m"] is None
@@ -176,7 +176,7 @@ def test_degrees_that_positions_do_not_fix_are_withheld_with_the_reason(tmp_path
     bent = Trajectory(ours.stamps_ns, ours.positions, ours.quaternions)
     nearly_straight = Trajectory(ours.stamps_ns, ours.positions * [1.0, 0.001, 1.0], ours.quaternions)
     told, withheld = (
-        save_results(tmp_path / name, log, [], RunInfo(recording, Params(), truth=truth))
+        save_results(tmp_path / name, Results(log, [], RunInfo(recording, Params(), truth=truth)))
         for name, truth in (("told", bent), ("withheld", nearly_straight))
     )
     assert told["accuracy"]["ate_deg"]["rmse"] < 1e-4 and told["accuracy"]["ate_deg_withheld"] is None
@@ -190,12 +190,14 @@ def test_degrees_that_positions_do_not_fix_are_withheld_with_the_reason(tmp_path
 def test_a_truth_that_does_not_fit_is_told_in_the_report(tmp_path: Path, recording: Path) -> None:
     log = logged(8)
     other_day = Trajectory(log.odometry.stamps_ns + 10**14, log.odometry.positions, log.odometry.quaternions)
-    report = save_results(tmp_path / "out", log, [], RunInfo(recording, Params(), truth=other_day))
+    report = save_results(tmp_path / "out", Results(log, [], RunInfo(recording, Params(), truth=other_day)))
     assert "same clock" in report["accuracy"]["error"]
 
 
 def test_a_run_without_a_single_frame_still_has_a_report(tmp_path: Path, recording: Path) -> None:
-    report = save_results(tmp_path / "out", RunLog([]), [], RunInfo(recording, Params(), stopped="It was cut."))
+    report = save_results(
+        tmp_path / "out", Results(RunLog([]), [], RunInfo(recording, Params(), stopped="It was cut."))
+    )
     assert report["stopped_early"] == "It was cut."
     assert report["ground"]["share"] is None
     assert (tmp_path / "out" / "trajectory.tum").read_text() == ""
@@ -217,12 +219,12 @@ def test_the_map_holds_every_keyframe_where_loops_lay_it(tmp_path: Path) -> None
 
 def test_results_are_not_overwritten_unless_asked(tmp_path: Path, recording: Path) -> None:
     info = RunInfo(recording, Params())
-    save_results(tmp_path / "out", logged(4), [], info)
+    save_results(tmp_path / "out", Results(logged(4), [], info))
     before = (tmp_path / "out" / "trajectory.tum").read_bytes()
     with pytest.raises(HemislamError, match="already holds results"):
-        save_results(tmp_path / "out", logged(9), [], info)
+        save_results(tmp_path / "out", Results(logged(9), [], info))
     assert (tmp_path / "out" / "trajectory.tum").read_bytes() == before
-    save_results(tmp_path / "out", logged(9), [], info, replace=True)
+    save_results(tmp_path / "out", Results(logged(9), [], info), replace=True)
     assert len(read_tum(tmp_path / "out" / "trajectory.tum")) == 9
 
 
@@ -236,15 +238,15 @@ def test_older_results_survive_a_write_that_fails(tmp_path: Path, recording: Pat
 
     info = RunInfo(recording, Params())
     folder = tmp_path / "out"
-    save_results(folder, logged(4), [], info)
+    save_results(folder, Results(logged(4), [], info))
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(HemislamError, match="No space left"):
-        save_results(folder, logged(9), BrokenDisk(), info, replace=True)
+        save_results(folder, Results(logged(9), BrokenDisk(), info), replace=True)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
 def test_a_file_in_the_place_of_the_folder_is_named(tmp_path: Path, recording: Path) -> None:
     (tmp_path / "out").write_text("mine")
     with pytest.raises(HemislamError, match="out cannot be made"):
-        save_results(tmp_path / "out", logged(), [], RunInfo(recording, Params()))
+        save_results(tmp_path / "out", Results(logged(), [], RunInfo(recording, Params())))
     assert (tmp_path / "out").read_text() == "mine"
