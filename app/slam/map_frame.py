@@ -32,12 +32,6 @@ class MapFrame:
         """(4, 4) T_map_odom at the last keyframe."""
         return self.at(len(self.T_map_odom))
 
-    def first_change(self, before: "MapFrame") -> int:
-        """The first keyframe whose correction may differ from the one that it had `before` in the same session."""
-        count = min(len(self.T_map_odom), len(before.T_map_odom))
-        differ = (self.T_map_odom[:count] != before.T_map_odom[:count]).any(axis=(1, 2))
-        return int(np.argmax(differ)) if differ.any() else count
-
     def poses(self, T_odom_imu: F64) -> F64:
         """(k, 4, 4) T_map_imu of the first k keyframes from their (k, 4, 4) T_odom_imu."""
         count = min(len(T_odom_imu), len(self.T_map_odom))

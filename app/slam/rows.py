@@ -37,10 +37,6 @@ class Rows(Generic[T]):
         self._table[self._length : needed] = rows
         self._length = needed
 
-    def go_to(self, length: int) -> None:
-        """Go back to so many rows, or forth again to as many as there were. Views handed out may then change."""
-        self._length = min(length, len(self._table))
-
     def truncate(self, length: int) -> None:
         """Keep the first `length` rows. Views handed out stay as they are."""
         if length < self._length:

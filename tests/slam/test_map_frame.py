@@ -39,13 +39,3 @@ def test_a_piece_of_a_trajectory_lies_where_it_does_in_the_whole() -> None:
     np.testing.assert_array_equal(
         frame.trajectory(ODOMETRY.since(37)).positions, frame.trajectory(ODOMETRY).positions[37:]
     )
-
-
-def test_the_first_change_is_where_corrections_begin_to_differ() -> None:
-    stamps_ns, T_map_odom = ODOMETRY.stamps_ns[KEYFRAMES], se3.exp(RNG.normal(0, 0.1, (10, 6)))
-    frame, longer = MapFrame(stamps_ns, T_map_odom[:8]), MapFrame(stamps_ns, T_map_odom)
-    assert longer.first_change(frame) == frame.first_change(longer) == 8
-    other = T_map_odom.copy()
-    other[5, 0, 3] += 1.0
-    assert MapFrame(stamps_ns, other).first_change(longer) == 5
-    assert MapFrame().first_change(longer) == longer.first_change(MapFrame()) == 0

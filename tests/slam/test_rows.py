@@ -18,12 +18,3 @@ def test_views_stay_as_they_are_when_rows_are_added_or_truncated(steps: list[tup
     for view, then in seen:
         np.testing.assert_array_equal(view, then)
         assert not view.flags.writeable
-
-
-def test_one_goes_forth_again_over_rows_that_were_not_replaced() -> None:
-    rows = Rows((), np.int64, range(5))
-    rows.go_to(2)
-    assert rows.view().tolist() == [0, 1]
-    rows.go_to(4)
-    rows.append(9)
-    assert rows.view().tolist() == [0, 1, 2, 3, 9]
