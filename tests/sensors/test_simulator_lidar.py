@@ -8,8 +8,7 @@ from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
 from app.sensors.simulator.mesh import Mesh, MeshBuilder
 from app.sensors.simulator.raycast import Mover, Raycaster
 from app.sensors.simulator.scenes import SCENES, build_scene
-from app.sensors.simulator.scenes.plan import rectangle
-from app.sensors.simulator.scenes.props import pedestrian
+from app.sensors.simulator.scenes.props import pedestrian, rectangle
 from app.sensors.simulator.trajectory import R_BODY_IMU, SmoothTrajectory, Walker, seconds, walk
 from app.slam.errors import HemislamError
 from app.slam.types import F64, I64, Scan

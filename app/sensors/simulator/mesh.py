@@ -3,7 +3,7 @@
 World frame: x, y level, z up, metres.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,10 +76,10 @@ class MeshBuilder:
         corners = (_BOX_CORNERS * np.asarray(size)) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T
         self.add(_turned(corners, yaw) + np.asarray(centre), _BOX_FACES, reflectivity)
 
-    def block(self, low: Vector, high: Vector, reflectivity: float) -> None:
-        """A closed axis-aligned box between two corners."""
-        low_, high_ = np.asarray(low, np.float64), np.asarray(high, np.float64)
-        self.add(_BOX_CORNERS * (high_ - low_) + (low_ + high_) / 2, _BOX_FACES, reflectivity)
+    def boxes(self, centres: Iterable[Vector], size: Vector, reflectivity: float, yaw: float = 0.0) -> None:
+        """Equal boxes at several places."""
+        for centre in centres:
+            self.box(centre, size, reflectivity, yaw)
 
     def cylinder(
         self,
@@ -98,15 +98,9 @@ class MeshBuilder:
         vertices = np.vstack([ring * radius, ring * top + axis[1], axis])
         i = np.arange(sides)
         j = (i + 1) % sides
-        faces = np.vstack(
-            [
-                np.column_stack([i, j, j + sides]),
-                np.column_stack([i, j + sides, i + sides]),
-                np.column_stack([j, i, np.full(sides, 2 * sides)]),
-                np.column_stack([i + sides, j + sides, np.full(sides, 2 * sides + 1)]),
-            ]
-        )
-        self.add(vertices + np.asarray(base), faces, reflectivity)
+        bottom = np.column_stack([j, i, np.full(sides, 2 * sides)])
+        lid = np.column_stack([i + sides, j + sides, np.full(sides, 2 * sides + 1)])
+        self.add(vertices + np.asarray(base), np.vstack([band_faces(sides), bottom, lid]), reflectivity)
 
     def ellipsoid(self, centre: Vector, radii: Vector, reflectivity: float, yaw: float = 0.0) -> None:
         u = np.linspace(0, 2 * np.pi, 13)
@@ -165,10 +159,7 @@ class MeshBuilder:
             start, end: (x, y) of the wall's middle line.
             openings: (from, to, bottom, top) each: metres along the wall and above its base.
         """
-        a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
-        length = float(np.linalg.norm(b - a))
-        along = (b - a) / length
-        yaw = float(np.arctan2(along[1], along[0]))
+        a, along, length, yaw = line_through(start, end)
 
         def piece(s0: float, s1: float, z0: float, z1: float) -> None:
             if s1 - s0 > 1e-6 and z1 - z0 > 1e-6:
@@ -182,6 +173,21 @@ class MeshBuilder:
             piece(s0, s1, z1, height)
             s = s1
         piece(s, length, 0.0, height)
+
+
+def band_faces(count: int) -> Faces:
+    """The faces between a ring of `count` vertices and an equal ring of the vertices that follow."""
+    i = np.arange(count, dtype=np.int32)
+    j = (i + 1) % count
+    return np.vstack([np.column_stack([i, j, j + count]), np.column_stack([i, j + count, i + count])])
+
+
+def line_through(start: Vector, end: Vector) -> tuple[F64, F64, float, float]:
+    """Of a line in plan: its start, its unit direction, its length and its yaw."""
+    a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
+    length = float(np.linalg.norm(b - a))
+    along = (b - a) / length
+    return a, along, length, float(np.arctan2(along[1], along[0]))
 
 
 def _turned(points: F64, yaw: float) -> F64:

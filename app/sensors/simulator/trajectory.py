@@ -107,14 +107,13 @@ def walk(
     line, arc = _unrolled(path, closed, travelled[-1] + 5.0)
     if not closed:
         travelled = _brake(travelled, arc[-1])
-    xy = np.column_stack([np.interp(travelled, arc, line[:, k]) for k in (0, 1)])
+    xy = places_at(travelled, arc, line)
     xy = np.column_stack([_smoothed(xy[:, k], 0.4 * _SAMPLE_HZ) for k in (0, 1)])
 
     # The walker looks half a metre ahead, and turns over about as much.
     step = 0.05
     s = np.arange(0.0, arc[-1], step)
-    fine = np.column_stack([np.interp(s, arc, line[:, k]) for k in (0, 1)])
-    directions = np.unwrap(np.arctan2(*np.gradient(fine, axis=0).T[::-1]))
+    directions = np.unwrap(np.arctan2(*np.gradient(places_at(s, arc, line), axis=0).T[::-1]))
     directions = _smoothed(directions, 0.6 / step)
     heading = np.interp(travelled + 0.5, s, directions)
     heading = _smoothed(heading, 0.2 * _SAMPLE_HZ)
@@ -177,8 +176,17 @@ def _unrolled(path: F64, closed: bool, length: float) -> tuple[F64, F64]:
         lap = np.vstack([line, line[:1]])
         lap_length = float(np.linalg.norm(np.diff(lap, axis=0), axis=1).sum())
         line = np.vstack([line] * (int(length / lap_length) + 2))
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    return line, arc
+    return line, arc_lengths(line)
+
+
+def arc_lengths(line: F64) -> F64:
+    """(n,) m along a polyline, at each of its vertices."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def places_at(lengths: F64, arc: F64, line: F64) -> F64:
+    """(k, 2) places on a polyline at these arc lengths; `arc` is `arc_lengths(line)`."""
+    return np.column_stack([np.interp(lengths, arc, line[:, axis]) for axis in (0, 1)])
 
 
 def _brake(travelled: F64, end: float) -> F64:

@@ -6,13 +6,10 @@ from collections.abc import Callable
 import numpy as np
 
 from app.sensors.simulator.raycast import SimulatedScene
-from app.sensors.simulator.scenes.building import building
-from app.sensors.simulator.scenes.corridor import corridor
-from app.sensors.simulator.scenes.identical import identical
 from app.sensors.simulator.scenes.museum import museum
-from app.sensors.simulator.scenes.outdoor import outdoor
-from app.sensors.simulator.scenes.paper import indoor_1, indoor_2, outdoor_1, outdoor_2, outdoor_3, outdoor_4
-from app.sensors.simulator.scenes.room import room
+from app.sensors.simulator.scenes.offices import building, corridor
+from app.sensors.simulator.scenes.outdoors import outdoor, outdoor_1, outdoor_2, outdoor_3, outdoor_4
+from app.sensors.simulator.scenes.rooms import identical, indoor_1, indoor_2, room
 from app.slam.errors import HemislamError
 
 _BUILDERS: dict[str, Callable[[np.random.Generator], SimulatedScene]] = {

@@ -5,7 +5,7 @@ import numpy as np
 from app.sensors.simulator.mesh import MeshBuilder
 from app.sensors.simulator.raycast import SimulatedScene
 from app.sensors.simulator.scenes import props
-from app.sensors.simulator.scenes.plan import level, tiled
+from app.sensors.simulator.scenes.props import level, on_ground, tiled
 from app.slam.types import F64
 
 HALL = (-9.0, 9.0, 6.0, 15.0)
@@ -47,9 +47,7 @@ def _court(mesh: MeshBuilder, rng: np.random.Generator) -> None:
         street = y < -17.0
         return np.where(street, 0.16, np.where(paved | (np.abs(y + 8.0) < 1.5), tiled(0.3, 0.5)(xy), 0.45))
 
-    def at(x: float, y: float) -> tuple[float, float, float]:
-        return x, y, float(_terrain(np.array([[x, y]]))[0])
-
+    at = on_ground(_terrain)
     mesh.surface(np.arange(-40.0, 40.01, 0.5), np.arange(-35.0, HALL[2] + 0.01, 0.5), _terrain, shade)
 
     mesh.cylinder(at(0.0, -4.0), 1.7, 0.45, 0.5, sides=24)  # the fountain

@@ -1,14 +1,66 @@
-"""Furniture, plants, vehicles and people of scenes. Sizes in metres, `at` is (x, y, floor z), yaw in radians."""
+"""What scenes are built of: floors and walls, furniture, plants, vehicles and people.
 
-from collections.abc import Callable
+Sizes in metres, `at` is (x, y, floor z), yaw in radians.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise, product
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from app.sensors.simulator.mesh import Mesh, MeshBuilder, Vector
+from app.sensors.simulator.mesh import Mesh, MeshBuilder, Vector, band_faces
 from app.sensors.simulator.raycast import Mover
-from app.sensors.simulator.scenes.plan import Corners, stroll
+from app.sensors.simulator.trajectory import arc_lengths
 from app.slam.types import F64
+
+Point = tuple[float, float]
+Corners = Sequence[Point] | F64
+"""A closed polygon in plan, m."""
+
+
+def rectangle(x0: float, y0: float, x1: float, y1: float) -> list[Point]:
+    """Corners, counter-clockwise."""
+    return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+
+
+def sides(corners: Sequence[Point]) -> list[tuple[Point, Point]]:
+    """Start and end of each side of a closed polygon."""
+    return list(pairwise([*corners, corners[0]]))
+
+
+def grid(xs: Iterable[float], ys: Iterable[float], z: float) -> list[tuple[float, float, float]]:
+    """All places with these x and y, at one height."""
+    return [(x, y, z) for x, y in product(xs, ys)]
+
+
+def on_ground(height: Callable[[F64], F64]) -> Callable[[float, float], tuple[float, float, float]]:
+    """From a place in plan to the point of the terrain there."""
+    return lambda x, y: (x, y, float(height(np.array([[x, y]]))[0]))
+
+
+def level(xy: F64) -> F64:
+    """The height of a flat floor."""
+    return np.zeros(len(xy))
+
+
+def tiled(reflectivity: float, size: float = 0.6) -> Callable[[F64], F64]:
+    """The reflectivity of floor tiles, each other one a little brighter."""
+
+    def shade(xy: F64) -> F64:
+        odd = np.floor(xy / size).sum(axis=1) % 2
+        return np.asarray(reflectivity * (1.0 + 0.2 * odd))
+
+    return shade
+
+
+def storey(
+    mesh: MeshBuilder, corners: Sequence[Point], height: float, step: float, floor: Callable[[F64], F64], ceiling: float
+) -> None:
+    """A floor with a grid of `step`, and the ceiling above it; no walls."""
+    (x0, y0), (x1, y1) = corners[0], corners[2]
+    mesh.surface(np.arange(x0, x1 + 0.01, step), np.arange(y0, y1 + 0.01, step), level, floor)
+    mesh.quad([(x, y, height) for x, y in corners], ceiling)
 
 
 def _place(at: Vector, yaw: float) -> Callable[[float, float, float], tuple[float, float, float]]:
@@ -21,9 +73,8 @@ def table(mesh: MeshBuilder, at: Vector, yaw: float = 0.0, size: tuple[float, fl
     p = _place(at, yaw)
     length, width, height = size
     mesh.box(p(0, 0, height - 0.02), (length, width, 0.04), 0.55, yaw)
-    for x in (-length / 2 + 0.06, length / 2 - 0.06):
-        for y in (-width / 2 + 0.06, width / 2 - 0.06):
-            mesh.box(p(x, y, (height - 0.04) / 2), (0.06, 0.06, height - 0.04), 0.35, yaw)
+    legs = grid((-length / 2 + 0.06, length / 2 - 0.06), (-width / 2 + 0.06, width / 2 - 0.06), (height - 0.04) / 2)
+    mesh.boxes([p(*leg) for leg in legs], (0.06, 0.06, height - 0.04), 0.35, yaw)
 
 
 def chair(mesh: MeshBuilder, at: Vector, yaw: float = 0.0) -> None:
@@ -31,9 +82,7 @@ def chair(mesh: MeshBuilder, at: Vector, yaw: float = 0.0) -> None:
     p = _place(at, yaw)
     mesh.box(p(0, 0, 0.45), (0.45, 0.45, 0.05), 0.4, yaw)
     mesh.box(p(-0.21, 0, 0.72), (0.04, 0.45, 0.5), 0.4, yaw)
-    for x in (-0.19, 0.19):
-        for y in (-0.19, 0.19):
-            mesh.box(p(x, y, 0.21), (0.04, 0.04, 0.43), 0.3, yaw)
+    mesh.boxes([p(*leg) for leg in grid((-0.19, 0.19), (-0.19, 0.19), 0.21)], (0.04, 0.04, 0.43), 0.3, yaw)
 
 
 def shelf(
@@ -43,8 +92,7 @@ def shelf(
     p = _place(at, yaw)
     width, height = size
     mesh.box(p(-0.16, 0, height / 2), (0.02, width, height), 0.5, yaw)
-    for y in (-width / 2, width / 2):
-        mesh.box(p(0, y, height / 2), (0.32, 0.03, height), 0.5, yaw)
+    mesh.boxes([p(0, y, height / 2) for y in (-width / 2, width / 2)], (0.32, 0.03, height), 0.5, yaw)
     for z in np.arange(0.1, height + 0.01, 0.38):
         mesh.box(p(0, 0, z), (0.32, width, 0.03), 0.5, yaw)
         y = -width / 2 + 0.05
@@ -59,8 +107,7 @@ def sofa(mesh: MeshBuilder, at: Vector, yaw: float = 0.0, width: float = 1.9) ->
     p = _place(at, yaw)
     mesh.box(p(0, 0, 0.22), (0.85, width, 0.44), 0.3, yaw)
     mesh.box(p(-0.36, 0, 0.55), (0.2, width, 0.5), 0.3, yaw)
-    for y in (-width / 2, width / 2):
-        mesh.box(p(0, y, 0.32), (0.85, 0.18, 0.64), 0.28, yaw)
+    mesh.boxes([p(0, y, 0.32) for y in (-width / 2, width / 2)], (0.85, 0.18, 0.64), 0.28, yaw)
 
 
 def plant(mesh: MeshBuilder, at: Vector, rng: np.random.Generator) -> None:
@@ -109,22 +156,17 @@ def car(mesh: MeshBuilder, at: Vector, yaw: float, rng: np.random.Generator) -> 
     )
     count = len(side)
     vertices = np.array([p(x, y, z) for y in (-0.87, 0.87) for x, z in side])
-    i = np.arange(count)
-    j = (i + 1) % count
-    skin = np.vstack([np.column_stack([i, j, j + count]), np.column_stack([i, j + count, i + count])])
     fan = np.array([[0, k, k + 1] for k in range(1, count - 1)])
-    mesh.add(vertices, np.vstack([skin, fan, fan + count]), paint)
-    for x in (-1.3, 1.35):
-        for y in (-0.8, 0.8):
-            mesh.ellipsoid(p(x, y, 0.32), (0.32, 0.12, 0.32), 0.08, yaw)
+    mesh.add(vertices, np.vstack([band_faces(count), fan, fan + count]), paint)
+    for wheel in grid((-1.3, 1.35), (-0.8, 0.8), 0.32):
+        mesh.ellipsoid(p(*wheel), (0.32, 0.12, 0.32), 0.08, yaw)
 
 
 def bench(mesh: MeshBuilder, at: Vector, yaw: float = 0.0) -> None:
     p = _place(at, yaw)
     mesh.box(p(0, 0, 0.44), (0.45, 1.6, 0.06), 0.5, yaw)
     mesh.box(p(-0.25, 0, 0.72), (0.05, 1.6, 0.3), 0.5, yaw)
-    for y in (-0.65, 0.65):
-        mesh.box(p(0, y, 0.2), (0.4, 0.08, 0.42), 0.3, yaw)
+    mesh.boxes([p(0, y, 0.2) for y in (-0.65, 0.65)], (0.4, 0.08, 0.42), 0.3, yaw)
 
 
 def lamp_post(mesh: MeshBuilder, at: Vector, height: float = 4.5) -> None:
@@ -150,9 +192,9 @@ def pedestrian(
     corners: Corners, speed: float, start: float = 0.0, height: Callable[[F64], F64] | None = None, size: float = 1.75
 ) -> Mover:
     """A person who walks round a closed polygon without end, `start` metres along it at time 0."""
-    path = stroll(corners)
+    path = _rounded(np.array(corners, np.float64))
     loop = np.vstack([path, path[:1]])
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(loop, axis=0), axis=1))])
+    arc = arc_lengths(loop)
     curve = make_interp_spline(arc, loop, k=3, bc_type="periodic")
     tangent = curve.derivative()
 
@@ -164,6 +206,15 @@ def pedestrian(
         return np.column_stack([xy, z]), np.arctan2(ahead[:, 1], ahead[:, 0])
 
     return Mover(person_mesh(size), pose)
+
+
+def _rounded(outline: F64) -> F64:
+    """(n, 2) waypoints a metre apart round a closed polygon, its corners cut."""
+    points: list[F64] = []
+    for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        length = float(np.linalg.norm(b - a))
+        points.extend(a + (b - a) / length * s for s in np.arange(0.7, length - 0.5, 1.0))
+    return np.array(points)
 
 
 def building(mesh: MeshBuilder, at: Vector, size: Vector, yaw: float = 0.0) -> None:
@@ -178,8 +229,7 @@ def building(mesh: MeshBuilder, at: Vector, size: Vector, yaw: float = 0.0) -> N
                 mesh.box(p(x, y, z), (1.2, 0.06, 1.5), 0.03, yaw)
                 mesh.box(p(x, y * (1 + 0.14 / depth), z - 0.8), (1.4, 0.16, 0.08), 0.5, yaw)
         for y in np.arange(-depth / 2 + 1.6, depth / 2 - 1.0, 2.6):
-            for x in (-length / 2, length / 2):
-                mesh.box(p(x, y, z), (0.06, 1.2, 1.5), 0.03, yaw)
+            mesh.boxes([p(x, y, z) for x in (-length / 2, length / 2)], (0.06, 1.2, 1.5), 0.03, yaw)
     eave, ridge = height, height + 0.3 * min(length, depth)
     a, b = length / 2 + 0.4, depth / 2 + 0.4
     along = (length / 2 - 0.2, 0.0) if length > depth else (0.0, depth / 2 - 0.2)

@@ -1,10 +1,10 @@
-"""Twins of the places of the paper's six sequences (Table 1): a garage, an office, and four paths outdoors.
+"""Places under the open sky: a campus, and twins of the four paths outdoors of the paper (Table 1).
 
-Each path begins with a small lap, so that the first minute already returns to its start; outdoor_4 never returns, as in
-the paper.
+Each of the paper's paths begins with a small lap, so that the first minute already returns to its start; outdoor_4
+never returns, as in the paper.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,85 +13,77 @@ from scipy.spatial import KDTree
 from app.sensors.simulator.mesh import MeshBuilder
 from app.sensors.simulator.raycast import Mover, SimulatedScene
 from app.sensors.simulator.scenes import props
-from app.sensors.simulator.scenes.plan import level, rectangle, tiled
+from app.sensors.simulator.scenes.props import Point, on_ground
+from app.sensors.simulator.trajectory import arc_lengths, places_at
 from app.slam.types import F64
 
 _ASPHALT, _GRASS = 0.18, 0.42
 _EDGE = 45.0
 """m of ground around the path; beyond it a laser sees the sky."""
 
-Path = Sequence[tuple[float, float]]
+_CAMPUS = [
+    *((-14.0, -13.0), (0.0, -15.0), (14.0, -12.0), (22.0, -3.0), (19.0, 8.0)),
+    *((8.0, 13.0), (-7.0, 11.0), (-20.0, 12.0), (-25.0, 2.0), (-22.0, -8.0)),
+]
 
 
-def indoor_1(rng: np.random.Generator) -> SimulatedScene:
-    """A parking garage of 44 x 26 m: pillars, beams, rows of cars, two lanes and a cross lane, 232 m a lap."""
-    length, depth, height = 44.0, 26.0, 2.6
+def outdoor(rng: np.random.Generator) -> SimulatedScene:
+    """A campus with slopes, buildings, trees, hedges, parked cars and people who walk about."""
     mesh = MeshBuilder()
-    mesh.surface(np.arange(0, length + 0.01, 1.0), np.arange(0, depth + 0.01, 1.0), level, tiled(0.3, 2.0))
-    mesh.quad([(x, y, height) for x, y in rectangle(0, 0, length, depth)], 0.5)
-    corners = rectangle(0, 0, length, depth)
-    for k in range(4):
-        doors = [(s, s + 0.9, 0.0, 2.1) for s in (6.0, 21.0)]
-        mesh.wall(corners[k], corners[(k + 1) % 4], height, 0.55, doors)
-    for x in np.arange(4.0, length, 6.0):
-        for y in (4.6, 9.4, 13.0, 16.6, 21.4):
-            if abs(x - 17.0) > 2.2 or y in (4.6, 21.4):
-                mesh.box((x, y, height / 2), (0.4, 0.4, height), 0.6)
-        mesh.box((x, depth / 2, height - 0.2), (0.35, depth, 0.4), 0.55)
-    for y in (3.2, 11.2, 14.9, 22.9):  # pipes and cable trays
-        mesh.box((length / 2, y, height - 0.35), (length, rng.uniform(0.1, 0.4), 0.12), rng.uniform(0.3, 0.8))
-    for y, yaw in ((2.5, np.pi / 2), (11.1, -np.pi / 2), (14.9, np.pi / 2), (23.5, -np.pi / 2)):
-        for x in np.arange(2.4, length - 1.5, 2.7):
-            inner = 10.0 < y < 16.0
-            if rng.random() < 0.6 and not (inner and (abs(x - 17.0) < 3.4 or x < 8.0 or x > length - 8.0)):
-                props.car(mesh, (x, y + rng.normal(scale=0.15), 0.0), yaw + rng.normal(scale=0.03), rng)
-    for x, y in ((1.0, 13.0), (43.0, 12.0), (30.0, 13.0)):
-        mesh.box((x, y, 0.6), (0.6, 1.0, 1.2), 0.5)
-        props.extinguisher(mesh, (x, y + 0.8, 0.0))
-    for x in np.arange(3.0, length, 6.0):
-        for y in (7.0, 19.0):
-            mesh.box((x, y, height - 0.06), (0.15, 1.3, 0.12), 0.9)
+    path = np.array(_CAMPUS)
+    phase = rng.uniform(0, 2 * np.pi, 4)
 
-    small = [(5.0, 7.0), (17.0, 7.0), (17.0, 19.0), (5.0, 19.0), (5.0, 7.0)]
-    rest = [(39.0, 7.0), (39.0, 19.0), (5.0, 19.0), (5.0, 7.0), (17.0, 7.0), (17.0, 19.0), (39.0, 19.0), (39.0, 7.0)]
-    someone = props.pedestrian(rectangle(20.0, 6.0, 41.0, 20.2), 1.1)
-    return SimulatedScene(mesh.build(), (someone,), np.array([*small, *rest]))
+    def height(xy: F64) -> F64:
+        x, y = xy.T
+        slopes = 1.3 * np.sin(x / 17.0 + phase[0]) + 1.0 * np.cos(y / 13.0 + phase[1]) + 0.015 * x
+        bumps = 0.03 * np.sin(x / 1.3 + phase[2]) * np.sin(y / 1.7 + phase[3])
+        return np.asarray(slopes + bumps)
 
+    def shade(xy: F64) -> F64:
+        return np.where(_distance_to_path(xy, path) < 1.6, _ASPHALT, _GRASS)
 
-def indoor_2(rng: np.random.Generator) -> SimulatedScene:
-    """An open-plan office of 14 x 10 m: islands of desks, chairs at all angles, shelves, sofas, 24 m a lap."""
-    length, depth, height = 14.0, 10.0, 2.8
-    mesh = MeshBuilder()
-    mesh.surface(np.arange(0, length + 0.01, 0.5), np.arange(0, depth + 0.01, 0.5), level, tiled(0.4, 0.5))
-    mesh.quad([(x, y, height) for x, y in rectangle(0, 0, length, depth)], 0.75)
-    corners = rectangle(0, 0, length, depth)
-    windows = [(s, s + 1.5, 0.9, 2.3) for s in np.arange(1.0, length - 2.0, 2.6)]
-    for k in range(4):
-        mesh.wall(corners[k], corners[(k + 1) % 4], height, 0.65, windows if k == 2 else [(2.0, 2.9, 0.0, 2.1)])
-    for start, _, bottom, top in windows:
-        mesh.box((length - start - 0.75, depth + 0.05, (bottom + top) / 2), (1.5, 0.02, top - bottom), 0.02)
-    islands = [(x, y) for x in (4.4, 6.0, 7.6) for y in (3.9, 5.1)]
-    islands += [(x, y) for x in (3.0, 5.4, 7.8) for y in (0.7, 9.2)] + [(12.6, y) for y in (2.0, 4.6, 7.2)]
-    for x, y in islands:
-        yaw = rng.uniform(-0.04, 0.04) + (np.pi / 2 if x > 12 else 0.0)
-        props.table(mesh, (x, y, 0.0), yaw, (1.4, 0.75, 0.74))
-        mesh.box((x + rng.uniform(-0.3, 0.3), y, 0.95), (0.5, 0.05, 0.35), 0.1, yaw + rng.uniform(-0.3, 0.3))
-        if 3 < y < 6 and x < 12:
+    at = on_ground(height)
+    mesh.surface(np.arange(-60.0, 60.01, 0.75), np.arange(-50.0, 50.01, 0.75), height, shade)
+
+    for x, y, size, yaw in (
+        (-4.0, 27.0, (26.0, 10.0, 9.0), 0.05),
+        (38.0, 10.0, (12.0, 24.0, 12.0), -0.1),
+        (-40.0, 6.0, (10.0, 22.0, 7.0), 0.08),
+        (12.0, -32.0, (30.0, 10.0, 8.0), -0.04),
+        (-28.0, -28.0, (14.0, 11.0, 6.0), 0.5),
+        (-1.0, -1.0, (9.0, 7.0, 4.5), 0.2),
+    ):
+        props.building(mesh, at(x, y), size, yaw)
+    for k in range(7):
+        props.car(mesh, at(-12.0 + 2.9 * k, -20.5 + 0.1 * k), np.pi / 2 + rng.normal(scale=0.04), rng)
+    for x, y in ((27.0, -14.0), (28.5, 3.0)):
+        props.car(mesh, at(x, y), rng.uniform(0, np.pi), rng)
+
+    planted = 0
+    while planted < 26:
+        x, y = rng.uniform((-34, -26), (32, 21))
+        off = float(_distance_to_path(np.array([[x, y]]), path)[0])
+        if off < 2.2 or (abs(x + 1) < 7 and abs(y + 1) < 6) or (y < -17 and abs(x + 3) < 13):
             continue
-        inward = (-0.75, 0.0) if x > 12 else (0.0, 0.7 if y < 5 else -0.7)
-        props.chair(mesh, (x + inward[0], y + inward[1], 0.0), rng.uniform(-np.pi, np.pi))
-    for y in (3.2, 6.0):
-        props.shelf(mesh, (0.27, y, 0.0), 0.0, rng)
-    props.sofa(mesh, (0.6, 8.6, 0.0))
-    for x, y in ((0.5, 0.6), (13.4, 0.6), (13.4, 9.4), (10.9, 4.5)):
-        props.plant(mesh, (x, y, 0.0), rng)
-    mesh.box((11.0, 5.6, height / 2), (0.4, 0.4, height), 0.6)
-    for x in np.arange(1.5, length, 3.0):
-        for y in (2.5, 7.5):
-            mesh.box((x, y, height - 0.03), (1.2, 0.6, 0.06), 0.9)
-    path = np.array(rectangle(2.4, 2.3, 9.6, 7.3))
-    pacing = props.pedestrian(rectangle(10.4, 1.5, 11.6, 8.5), 0.7)
-    return SimulatedScene(mesh.build(), (pacing,), path)
+        if rng.random() < 0.7:
+            props.tree(mesh, at(x, y), rng, rng.uniform(4.5, 9.0))
+        else:
+            props.bush(mesh, at(x, y), rng, rng.uniform(0.6, 1.2))
+        planted += 1
+    for start, end in (((-16.0, 15.5), (2.0, 16.5)), ((24.5, 6.0), (20.0, 14.0))):
+        props.hedge(mesh, at(*start), at(*end), rng)
+    for k in (0, 2, 4, 6, 8):
+        middle = (path[k] + path[(k + 1) % len(path)]) / 2
+        outward = middle / np.linalg.norm(middle)
+        props.lamp_post(mesh, at(*(middle + 2.3 * outward)))
+        props.bench(mesh, at(*(middle - 2.4 * outward)), float(np.arctan2(outward[1], outward[0])))
+
+    people = (
+        props.pedestrian(path * 1.04 + [0.0, 0.4], 1.1, 40.0, height),
+        props.pedestrian(path[::-1] * 0.94, 1.3, 25.0, height, 1.65),
+        props.pedestrian([(-8.0, 17.5), (8.0, 18.0), (9.0, 19.5), (-8.0, 19.0)], 1.2, 0.0, height, 1.8),
+    )
+    return SimulatedScene(mesh.build(), people, path, height=height)
 
 
 def outdoor_1(rng: np.random.Generator) -> SimulatedScene:
@@ -136,7 +128,7 @@ def outdoor_4(rng: np.random.Generator) -> SimulatedScene:
     return _streets(rng, [(float(a), float(b)) for a, b in path], closed=False, built=0.5)
 
 
-def _streets(rng: np.random.Generator, way: Path, *, closed: bool = True, built: float = 0.7) -> SimulatedScene:
+def _streets(rng: np.random.Generator, way: list[Point], *, closed: bool = True, built: float = 0.7) -> SimulatedScene:
     """Rolling ground with buildings (where `built`, 0-1, has them), trees, cars and people along a path."""
     mesh, path = MeshBuilder(), np.array(way)
     phase = rng.uniform(0, 2 * np.pi, 4)
@@ -152,12 +144,10 @@ def _streets(rng: np.random.Generator, way: Path, *, closed: bool = True, built:
         """m to the path, good to 0.1 m."""
         return float(way_points.query([x, y])[0])
 
-    def at(x: float, y: float) -> tuple[float, float, float]:
-        return x, y, float(height(np.array([[x, y]]))[0])
-
     def shade(xy: F64) -> F64:
         return np.where(way_points.query(xy)[0] < 2.0, _ASPHALT, _GRASS)
 
+    at = on_ground(height)
     low, high = path.min(axis=0) - _EDGE, path.max(axis=0) + _EDGE
     mesh.surface(np.arange(low[0], high[0], 1.0), np.arange(low[1], high[1], 1.0), height, shade)
 
@@ -212,10 +202,10 @@ def _people(rng: np.random.Generator, places: F64, headings: F64, height: Callab
 def _along(path: F64, closed: bool, step: float) -> tuple[F64, F64]:
     """Places every `step` m of the path and the heading there."""
     line = np.vstack([path, path[:1]]) if closed else path
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    arc = arc_lengths(line)
     s = np.arange(0.0, arc[-1], step)
-    places = np.column_stack([np.interp(s, arc, line[:, k]) for k in (0, 1)])
-    ahead = np.column_stack([np.interp(np.minimum(s + 0.5, arc[-1]), arc, line[:, k]) for k in (0, 1)]) - places
+    places = places_at(s, arc, line)
+    ahead = places_at(np.minimum(s + 0.5, arc[-1]), arc, line) - places
     return places, np.arctan2(ahead[:, 1], ahead[:, 0])
 
 
@@ -232,3 +222,12 @@ def _footprint(size: tuple[float, float, float]) -> list[tuple[float, float]]:
     """Points of a building's outline in its own axes, its corners and edges."""
     a, b = size[0] / 2, size[1] / 2
     return [(u * a, v * b) for u in (-1.0, -0.5, 0.0, 0.5, 1.0) for v in (-1.0, 0.0, 1.0)]
+
+
+def _distance_to_path(xy: F64, path: F64) -> F64:
+    """(n,) m from (n, 2) points to a closed polyline of (m, 2) waypoints."""
+    nearest = np.full(len(xy), np.inf)
+    for a, b in zip(path, np.roll(path, -1, axis=0), strict=True):
+        share = np.clip((xy - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+        nearest = np.minimum(nearest, np.linalg.norm(xy - a - share[:, None] * (b - a), axis=1))
+    return nearest

@@ -1,0 +1,153 @@
+"""Storeys of an office building: a loop of corridors, and two wings with a lobby."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from app.sensors.simulator.mesh import MeshBuilder, line_through
+from app.sensors.simulator.raycast import SimulatedScene
+from app.sensors.simulator.scenes import props
+from app.sensors.simulator.scenes.props import Point, grid, rectangle, sides, storey, tiled
+from app.slam.types import F64
+
+HEIGHT = 2.7
+WIDTH = 2.4
+"""m, of the corridors."""
+LENGTH, DEPTH, LOBBY = 42.0, 15.0, 6.0
+"""m, of `building`."""
+
+
+def corridor(rng: np.random.Generator) -> SimulatedScene:
+    """A 24 x 14 m loop of office corridors: doors, open rooms, pillars, ceiling lamps, a person walking."""
+    length, depth = 24.0, 14.0
+    mesh = MeshBuilder()
+    reach = 4.2  # rooms behind the outer walls
+    storey(mesh, rectangle(-reach, -reach, length + reach, depth + reach), HEIGHT, 0.6, tiled(0.38), 0.7)
+    outer = rectangle(0, 0, length, depth)
+    inner = rectangle(WIDTH, WIDTH, length - WIDTH, depth - WIDTH)
+    for outside, inside in zip(sides(outer), sides(inner), strict=True):
+        _outer_wall(mesh, *outside, rng)
+        _inner_wall(mesh, *inside, rng)
+
+    middle = WIDTH / 2
+    mesh.boxes(grid(np.arange(3.0, length, 4.5), (middle, depth - middle), HEIGHT - 0.03), (1.2, 0.3, 0.06), 0.9)
+    for y in np.arange(3.5, depth, 4.0):
+        mesh.boxes(grid((middle, length - middle), [y], HEIGHT - 0.03), (0.3, 1.2, 0.06), 0.9)
+    for x in np.arange(5.5, length - 3, 6.0):  # beams and a cable tray break the ceiling
+        mesh.box((x, middle, HEIGHT - 0.15), (0.3, WIDTH, 0.3), 0.6)
+        mesh.box((x + 1.5, depth - middle, HEIGHT - 0.15), (0.3, WIDTH, 0.3), 0.6)
+    mesh.box((length / 2, WIDTH - 0.25, HEIGHT - 0.2), (length - 2 * WIDTH, 0.25, 0.08), 0.3)
+
+    first, *others = rectangle(middle, middle, length - middle, depth - middle)
+    path = np.array([(middle + 4.0, middle), *others, first])
+    someone = props.pedestrian(rectangle(1.85, 1.85, length - 1.85, depth - 1.85)[::-1], 1.1)
+    return SimulatedScene(mesh.build(), (someone,), path)
+
+
+def building(rng: np.random.Generator) -> SimulatedScene:
+    """Two wings of office corridors that share one, 138 m a lap: one lap, a turn in the lobby, and all of it back."""
+    mesh = MeshBuilder()
+    reach = 4.2  # rooms behind the outer walls
+    storey(mesh, rectangle(-reach, -LOBBY - 0.3, LENGTH + reach, DEPTH + reach), HEIGHT, 0.6, tiled(0.38), 0.7)
+    middle, half = LENGTH / 2, WIDTH / 2
+    south_wall, *other_walls = sides(rectangle(0, 0, LENGTH, DEPTH))
+    _outer_wall(mesh, south_wall[0], (middle - half, 0.0), rng)  # the lobby's entrance stays open
+    _outer_wall(mesh, (middle + half, 0.0), south_wall[1], rng)
+    for wall in other_walls:
+        _outer_wall(mesh, *wall, rng)
+    for west, east in ((WIDTH, middle - half), (middle + half, LENGTH - WIDTH)):
+        for wall in sides(rectangle(west, WIDTH, east, DEPTH - WIDTH)):
+            _inner_wall(mesh, *wall, rng)
+    _lobby(mesh, middle, rng)
+
+    mesh.boxes(grid(np.arange(2.5, LENGTH, 4.5), (half, DEPTH - half), HEIGHT - 0.03), (1.2, 0.3, 0.06), 0.9)
+    for x in np.cumsum(rng.uniform(3.0, 7.0, 6)):  # beams and cable trays break the ceiling
+        mesh.box((x, half, HEIGHT - 0.15), (0.3, WIDTH, 0.3), 0.6)
+        mesh.box((LENGTH - x, DEPTH - half, HEIGHT - 0.15), (0.3, WIDTH, 0.3), 0.6)
+
+    south, north, west, east = half, DEPTH - half, half, LENGTH - half
+    lap = [
+        *((middle, south), (east, south), (east, north), (middle, north), (middle, south)),
+        *((west, south), (west, north), (middle, north), (middle, south)),
+    ]
+    turn = [(middle - 0.3, -1.6), (middle - 1.2, -2.9), (middle, -4.2), (middle + 1.2, -2.9), (middle + 0.3, -1.6)]
+    someone = props.pedestrian(rectangle(1.85, 1.85, middle - 1.85, DEPTH - 1.85)[::-1], 1.1)
+    # down the shared corridor twice, once from either wing; then the same lap the other way
+    return SimulatedScene(mesh.build(), (someone,), np.array([*lap, *turn, *lap[::-1][:-1]]))
+
+
+def _outer_wall(mesh: MeshBuilder, start: Point, end: Point, rng: np.random.Generator) -> None:
+    """Doors every few metres, some open to a furnished room; pillars and odds and ends between them."""
+    a, along, length, yaw = line_through(start, end)
+    outward = np.array([along[1], -along[0]])
+    openings = []
+    s = rng.uniform(1.6, 2.4)
+    while s < length - 3.0:
+        openings.append((s, s + 0.9, 0.0, 2.1))
+        hinge = a + along * s
+        if rng.random() < 0.45:
+            props.door_leaf(mesh, (*(hinge + outward * 0.1), 0.0), yaw - rng.uniform(0.9, 1.7))
+            _office(mesh, a + along * (s + 0.45), along, outward, rng)
+        else:
+            props.door_leaf(mesh, (*(hinge + outward * 0.05), 0.0), yaw)
+        beside = s + rng.uniform(1.4, 2.0)
+        thing = rng.integers(5)
+        at = a + along * beside - outward * 0.2
+        if thing == 0:
+            mesh.box((*at, HEIGHT / 2), (0.4, 0.4, HEIGHT), 0.6, yaw)
+        elif thing == 1:
+            props.extinguisher(mesh, (*at, 0.0))
+        elif thing == 2:
+            mesh.box((*(a + along * beside - outward * 0.1), 1.5), (1.0, 0.04, 0.8), 0.35, yaw)
+        elif thing == 3:
+            props.plant(mesh, (*(at - outward * 0.15), 0.0), rng)
+        else:
+            props.bench(mesh, (*(at - outward * 0.2), 0.0), yaw + np.pi / 2)
+        s += rng.uniform(3.4, 4.6)
+    mesh.wall(start, end, HEIGHT, 0.65, openings)
+
+
+def _inner_wall(mesh: MeshBuilder, start: Point, end: Point, rng: np.random.Generator) -> None:
+    """Shallow niches with closed doors or panes, radiators under them."""
+    a, along, length, yaw = line_through(start, end)
+    inward = np.array([-along[1], along[0]])
+    openings = []
+    s = rng.uniform(0.8, 2.0)
+    while s < length - 2.2:
+        middle = a + along * (s + 0.7)
+        if rng.random() < 0.5:
+            openings.append((s, s + 1.4, 0.9, 2.2))
+            mesh.box((*(middle + inward * 0.05), 1.55), (1.4, 0.02, 1.3), 0.02, yaw)
+            mesh.box((*(middle - inward * 0.13), 0.45), (1.2, 0.1, 0.6), 0.6, yaw)
+        else:
+            openings.append((s + 0.25, s + 1.15, 0.0, 2.1))
+            mesh.box((*(middle + inward * 0.05), 1.05), (0.9, 0.04, 2.1), rng.uniform(0.3, 0.6), yaw)
+        s += rng.uniform(2.6, 4.0)
+    mesh.wall(start, end, HEIGHT, 0.6, openings)
+
+
+def _office(mesh: MeshBuilder, door: F64, along: F64, outward: F64, rng: np.random.Generator) -> None:
+    """A small room behind a door, closed all round."""
+    half, depth = 1.65, rng.uniform(3.0, 3.8)
+    yaw = float(np.arctan2(outward[1], outward[0]))
+    left, right = door - along * half, door + along * half
+    for start, end in pairwise([left, left + outward * depth, right + outward * depth, right]):
+        mesh.wall(start, end, HEIGHT, 0.6, thickness=0.1)
+    desk = door + outward * (depth - 1.0) + along * rng.uniform(-0.6, 0.6)
+    props.table(mesh, (*desk, 0.0), yaw + np.pi / 2)
+    props.chair(mesh, (*(desk - outward * 0.7), 0.0), yaw + rng.uniform(-0.6, 0.6))
+    props.shelf(mesh, (*(door + outward * 1.6 + along * (half - 0.25)), 0.0), yaw + np.pi / 2, rng, (1.0, 1.9))
+
+
+def _lobby(mesh: MeshBuilder, middle: float, rng: np.random.Generator) -> None:
+    west, east = middle - 3.6, middle + 3.6
+    mesh.wall((west, 0.0), (west, -LOBBY), HEIGHT, 0.6)
+    mesh.wall((west, -LOBBY), (east, -LOBBY), HEIGHT, 0.5, [(2.4, 4.8, 0.0, 2.2)])
+    mesh.box((middle, -LOBBY - 0.1, 1.1), (2.4, 0.04, 2.2), 0.05)
+    mesh.wall((east, -LOBBY), (east, 0.0), HEIGHT, 0.6)
+    mesh.wall((west, 0.0), (middle - WIDTH / 2, 0.0), HEIGHT, 0.6)
+    mesh.wall((middle + WIDTH / 2, 0.0), (east, 0.0), HEIGHT, 0.6)
+    mesh.box((west + 0.8, -3.2, 0.55), (0.7, 2.6, 1.1), 0.5)  # the porter's desk
+    props.sofa(mesh, (east - 0.6, -3.0, 0.0), np.pi)
+    for at in ((west + 0.5, -5.4, 0.0), (east - 0.5, -5.4, 0.0), (east - 0.5, -0.6, 0.0)):
+        props.plant(mesh, at, rng)
