@@ -148,7 +148,7 @@ def test_coordinates_can_be_rounded(tmp_path: Path) -> None:
         ({"rate_hz": 15}, "turns at 10 or 20 Hz, not 15"),
         ({"duration_s": 0.0}, "duration_s cannot be 0; choose 0.5"),
         ({"every_block": 0}, "every_block cannot be 0; choose 1 to 90"),
-        ({"range_noise": float("nan")}, "range_noise cannot be nan"),
+        ({"range_step": float("nan")}, "range_step cannot be nan"),
         ({"out": "walk.bag"}, r"must be named \*\.mcap, not `walk\.bag`"),
         ({"out": "absent/walk.mcap"}, "absent does not exist"),
     ],

@@ -1,7 +1,7 @@
 """What a laser beam hits: the static part of a scene and the bodies that move through it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -77,10 +77,8 @@ class Raycaster:
             body = target.cast(_unturned(origins[near] - position, yaw), _unturned(directions[near], yaw))
             closer = body.distance < hits.distance[near]
             into = near[closer]
-            hits.distance[into] = body.distance[closer]
-            hits.incidence[into] = body.incidence[closer]
-            hits.reflectivity[into] = body.reflectivity[closer]
-            hits.ground[into] = body.ground[closer]
+            for column in fields(Hits):
+                getattr(hits, column.name)[into] = getattr(body, column.name)[closer]
         return hits
 
 
@@ -88,34 +86,32 @@ class _Target:
     """One mesh in open3d's ray casting scene."""
 
     def __init__(self, mesh: Mesh) -> None:
-        core, scene_type = _open3d()
-        self._core = core
+        self._open3d = _open3d()
         self._mesh = mesh
-        self._scene = scene_type()
+        self._scene = self._open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            core.Tensor(np.ascontiguousarray(mesh.vertices, np.float32)),
-            core.Tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
+            self._open3d.core.Tensor(mesh.vertices), self._open3d.core.Tensor(mesh.faces.astype(np.uint32))
         )
 
     def cast(self, origins: F64, directions: F64) -> Hits:
         rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
-        answer = self._scene.cast_rays(self._core.Tensor(rays))
+        answer = self._scene.cast_rays(self._open3d.core.Tensor(rays))
         distance = answer["t_hit"].numpy().astype(np.float64)
         face = np.where(np.isfinite(distance), answer["primitive_ids"].numpy(), 0).astype(np.int64)
         incidence = np.abs(np.einsum("ni,ni->n", answer["primitive_normals"].numpy(), rays[:, 3:]))
         return Hits(distance, incidence, self._mesh.reflectivity[face], self._mesh.ground[face])
 
 
-def _open3d() -> tuple[Any, Any]:
+def _open3d() -> Any:
     try:
         import open3d.core
-        from open3d.t.geometry import RaycastingScene
+        import open3d.t.geometry
     except (ImportError, OSError) as error:
         raise HemislamError(
             f"The simulator needs open3d, which cannot be loaded here ({error}); "
             "on Debian or Ubuntu: apt-get install libusb-1.0-0 libegl1 libgl1."
         ) from error
-    return open3d.core, RaycastingScene
+    return open3d
 
 
 def _sphere(mesh: Mesh) -> tuple[float, float]:

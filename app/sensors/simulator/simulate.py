@@ -17,6 +17,7 @@ from app.sensors.simulator.raycast import Raycaster, SimulatedScene
 from app.sensors.simulator.scenes import build_scene
 from app.sensors.simulator.trajectory import SmoothTrajectory, Walker, seconds, walk
 from app.slam.errors import HemislamError
+from app.slam.trajectory import Trajectory, write_tum
 from app.slam.types import I64
 
 START_NS = 1_700_000_000_000_000_000
@@ -37,13 +38,11 @@ class SimulationSummary:
     """What was written.
 
     Attributes:
-        recording, truth, params: the three files. scans, points, imu_samples: how many.
-        duration_s, distance_m: of the trajectory. bytes: size of the recording.
+        recording: the file. bytes: its size. scans, points, imu_samples: how many it holds.
+        duration_s, distance_m: of the trajectory.
     """
 
     recording: Path
-    truth: Path
-    params: Path
     scans: int
     points: int
     imu_samples: int
@@ -61,10 +60,8 @@ def simulate(
     rate_hz: int = 10,
     every_block: int = 1,
     range_step: float = BPEARL.range_step,
-    range_noise: float = 0.005,
     coordinate_step: float = 0.0,
     walker: Walker | None = None,
-    imu_noise: ImuNoise | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulationSummary:
     """Simulate a person who carries an RS-Bpearl and an IMU, and write it as a ROS 2 recording.
@@ -81,10 +78,9 @@ def simulate(
         rate_hz: 10 or 20 revolutions a second. every_block: fire every k-th azimuth block only,
             so that a scan has 57,632 / k firings at 10 Hz and the file is small.
         range_step: m, rounding of distances: 0.005, or 0.0025 for a newer unit; 0 = none.
-        range_noise: m, standard deviation of a distance.
         coordinate_step: m, rounding of x, y, z; 0 = none. A power of two near the noise, such as
             0.00390625, makes the file a third smaller.
-        walker, imu_noise: how the person walks, how good the IMU is; None = as their defaults.
+        walker: how the person walks; None = the defaults.
         progress: called with (scans done, scans in all).
 
     Raises:
@@ -92,22 +88,18 @@ def simulate(
             or open3d that cannot be loaded.
     """
     out = Path(out)
-    _check(
-        out,
-        rate_hz,
-        duration_s=duration_s,
-        every_block=every_block,
-        range_step=range_step,
-        range_noise=range_noise,
-        coordinate_step=coordinate_step,
-    )
-    walker = walker or Walker()
+    _check(out, rate_hz)
+    _check_range("duration_s", duration_s, 0.5, 86_400.0, "s")
+    _check_range("every_block", every_block, 1, 90, "blocks")
+    _check_range("range_step", range_step, 0.0, 0.1, "m")
+    _check_range("coordinate_step", coordinate_step, 0.0, 0.1, "m")
     place = build_scene(scene, seed)
-    trajectory = trajectory_through(place, duration_s, seed, walker)
+    trajectory = trajectory_through(place, duration_s, seed, walker or Walker())
     caster = Raycaster(place.mesh, place.movers)
-    lidar = Lidar(firing_pattern(BPEARL, rate_hz, every_block), range_noise, range_step, coordinate_step)
+    pattern = firing_pattern(BPEARL, rate_hz, every_block)
+    lidar = Lidar(pattern, range_step=range_step, coordinate_step=coordinate_step)
     imu_stamps = START_NS + np.arange(round(duration_s * imu_model.RATE_HZ) + 1, dtype=np.int64) * _IMU_PERIOD_NS
-    imu = imu_model.measure(trajectory, imu_stamps, START_NS, imu_noise or ImuNoise(), _random(seed, _IMU))
+    imu = imu_model.measure(trajectory, imu_stamps, START_NS, ImuNoise(), _random(seed, _IMU))
 
     total = int((duration_s - _FIRST_TURN_S) * rate_hz + 1e-6)
     points = written = 0
@@ -138,7 +130,7 @@ def simulate(
                 progress(index + 1, total)
             add_imu(len(imu))
             recording.finish()
-        truth.write_text(_tum(trajectory, np.array(ends, np.int64)))
+        _write_truth(truth, trajectory, np.array(ends, np.int64))
         params.write_text(_SIDECAR + yaml.safe_dump({"sensor": {"translation": P_IMU_LIDAR.tolist()}}))
         unfinished.replace(out)
     except OSError as error:
@@ -149,8 +141,6 @@ def simulate(
     path = trajectory.poses(np.arange(0.0, duration_s, 0.02))[0]
     return SimulationSummary(
         recording=out,
-        truth=truth,
-        params=params,
         scans=len(ends),
         points=points,
         imu_samples=len(imu),
@@ -166,41 +156,27 @@ def trajectory_through(place: SimulatedScene, duration_s: float, seed: int, walk
     return walk(place.path, duration_s, rng, walker=walker, closed=place.closed, height=place.height)
 
 
-_SIDECAR = "# Mounting of the simulated scanner (as H2LID); read by itself with the recording beside it.\n"
+_SIDECAR = "# Mounting of the simulated scanner (as H2LID); read with the recording beside it.\n"
 
 
 def _random(seed: int, *stream: int) -> np.random.Generator:
     return np.random.default_rng([seed, *stream])
 
 
-def _tum(trajectory: SmoothTrajectory, stamps_ns: I64) -> str:
-    """TUM lines: absolute seconds, x y z, quaternion x y z w."""
+def _write_truth(path: Path, trajectory: SmoothTrajectory, stamps_ns: I64) -> None:
     positions, rotations = trajectory.poses(seconds(stamps_ns - START_NS))
-    quaternions = Rotation.from_matrix(rotations).as_quat()
-    lines = [
-        f"{ns // 1_000_000_000}.{ns % 1_000_000_000:09d} " + " ".join(f"{v:.9f}" for v in (*p, *q))
-        for ns, p, q in zip(stamps_ns.tolist(), positions, quaternions, strict=True)
-    ]
-    return "\n".join(lines) + "\n"
+    write_tum(path, Trajectory(stamps_ns, positions, Rotation.from_matrix(rotations).as_quat()))
 
 
-_LIMITS = {
-    "duration_s": (0.5, 86_400.0, "s"),
-    "every_block": (1, 90, "blocks"),
-    "range_step": (0.0, 0.1, "m"),
-    "range_noise": (0.0, 1.0, "m"),
-    "coordinate_step": (0.0, 0.1, "m"),
-}
-
-
-def _check(out: Path, rate_hz: int, **numbers: float) -> None:
+def _check(out: Path, rate_hz: int) -> None:
     if out.suffix != ".mcap":
         raise HemislamError(f"The recording must be named *.mcap, not `{out.name}`.")
     if not out.parent.is_dir():
         raise HemislamError(f"The folder {out.parent} does not exist; make it first or choose another.")
     if rate_hz not in ROTATION_RATES_HZ:
         raise HemislamError(f"The RS-Bpearl turns at 10 or 20 Hz, not {rate_hz}; choose one of these.")
-    for name, value in numbers.items():
-        low, high, unit = _LIMITS[name]
-        if not low <= value <= high:
-            raise HemislamError(f"The simulator's {name} cannot be {value:g}; choose {low:g} to {high:g} {unit}.")
+
+
+def _check_range(name: str, value: float, low: float, high: float, unit: str) -> None:
+    if not low <= value <= high:
+        raise HemislamError(f"The simulator's {name} cannot be {value:g}; choose {low:g} to {high:g} {unit}.")

@@ -85,7 +85,8 @@ def make_twin(
     duration_s = min(SHORT_S, twin.duration_s) if short else twin.duration_s
     wanted = {"twin": asdict(twin), "seed": seed, "duration_s": duration_s, "every_block": every_block}
     wanted["simulator"] = _digest()
-    if out.is_file() and (there := _noted(note)) is not None and there["made"] == wanted:
+    there = _noted(note) if out.is_file() else {}
+    if there.get("made") == wanted:
         return Made(out, False, there["distance_m"])
     made = simulate(
         twin.scene,
@@ -120,12 +121,13 @@ def find_suite(name: str) -> tuple[Twin, ...]:
     return SUITES[name]
 
 
-def _noted(path: Path) -> dict[str, Any] | None:
+def _noted(path: Path) -> dict[str, Any]:
+    """What the note beside a recording says; {} if there is none."""
     try:
-        noted: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        noted = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return None
-    return noted if {"made", "distance_m"} <= noted.keys() else None
+        return {}
+    return noted if isinstance(noted, dict) and {"made", "distance_m"} <= noted.keys() else {}
 
 
 def _digest() -> str:

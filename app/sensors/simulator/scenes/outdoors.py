@@ -140,9 +140,9 @@ def _streets(rng: np.random.Generator, way: list[Point], *, closed: bool = True,
 
     way_points: Any = KDTree(_along(path, closed, 0.2)[0])  # type: ignore[no-untyped-call]  # scipy ships no types
 
-    def off(x: float, y: float) -> float:
-        """m to the path, good to 0.1 m."""
-        return float(way_points.query([x, y])[0])
+    def off(*places: tuple[float, float]) -> float:
+        """m from the nearest of these to the path, good to 0.1 m."""
+        return float(way_points.query(places)[0].min())
 
     def shade(xy: F64) -> F64:
         return np.where(way_points.query(xy)[0] < 2.0, _ASPHALT, _GRASS)
@@ -163,7 +163,7 @@ def _streets(rng: np.random.Generator, way: list[Point], *, closed: bool = True,
             away, wanted = size[1] / 2 + rng.uniform(5.0, 10.0), rng.random() < built
             x, y = _beside(places[k], headings[k], side * away)
             radius = float(np.hypot(size[0], size[1]) / 2)
-            clear = all(off(*_turned(x, y, headings[k], u, v)) > 3.2 for u, v in _footprint(size))
+            clear = off(*_footprint(x, y, headings[k], size)) > 3.2
             if wanted and clear and free(x, y, radius):
                 props.building(mesh, at(x, y), size, headings[k] + rng.normal(scale=0.05))
                 taken.append((x, y, radius))
@@ -171,10 +171,10 @@ def _streets(rng: np.random.Generator, way: list[Point], *, closed: bool = True,
         side, kind = float(rng.choice([-1.0, 1.0])), rng.random()
         x, y = _beside(places[k], headings[k], side * rng.uniform(2.6, 7.0))
         near_car = _beside(places[k], headings[k], side * 3.6)
-        if kind < 0.2 and off(*near_car) > 3.3 and free(*near_car, 2.5):
+        if kind < 0.2 and off(near_car) > 3.3 and free(*near_car, 2.5):
             props.car(mesh, at(*near_car), headings[k] + rng.normal(scale=0.05), rng)
             taken.append((*near_car, 2.5))
-        elif off(x, y) < 2.4 or not free(x, y, 1.0):
+        elif off((x, y)) < 2.4 or not free(x, y, 1.0):
             continue
         elif kind < 0.65:
             props.tree(mesh, at(x, y), rng, rng.uniform(4.5, 9.0))
@@ -213,15 +213,11 @@ def _beside(place: F64, heading: float, left: float) -> tuple[float, float]:
     return float(place[0] - left * np.sin(heading)), float(place[1] + left * np.cos(heading))
 
 
-def _turned(x: float, y: float, heading: float, u: float, v: float) -> tuple[float, float]:
+def _footprint(x: float, y: float, heading: float, size: tuple[float, float, float]) -> list[Point]:
+    """Points of a building's outline: its corners, and some of its edges."""
     c, s = float(np.cos(heading)), float(np.sin(heading))
-    return x + c * u - s * v, y + s * u + c * v
-
-
-def _footprint(size: tuple[float, float, float]) -> list[tuple[float, float]]:
-    """Points of a building's outline in its own axes, its corners and edges."""
-    a, b = size[0] / 2, size[1] / 2
-    return [(u * a, v * b) for u in (-1.0, -0.5, 0.0, 0.5, 1.0) for v in (-1.0, 0.0, 1.0)]
+    outline = [(u * size[0] / 2, v * size[1] / 2) for u in (-1.0, -0.5, 0.0, 0.5, 1.0) for v in (-1.0, 0.0, 1.0)]
+    return [(x + c * u - s * v, y + s * u + c * v) for u, v in outline]
 
 
 def _distance_to_path(xy: F64, path: F64) -> F64:
