@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.sensors.clocks import TOLERANCE_S, clock_finding, clock_offset_s, offset_spread_s
+from app.sensors.clocks import clock_finding
 from app.sensors.findings import Finding as Finding
 from app.sensors.findings import Verdict
 from app.sensors.recording import ImuEntry, Recording, ScanEntry, open_recording
@@ -55,7 +55,7 @@ def examine(
             *(finding for finding in recording.findings if finding.subject not in known),
             _rate("scan rate", scans[:, 1], 4.0),
             _rate("IMU rate", imu[:, 1], 90.0),
-            _clocks(scans, imu, params.recording.imu_time_offset),
+            clock_finding(scans, imu, params.recording.imu_time_offset),
             _imu_gaps(counts, params.imu.max_gap),
             _imu_time(counts),
             *_scan_time(scans),
@@ -122,21 +122,6 @@ def _rate(subject: str, stamps: I64, least: float) -> Finding:
     if rate < least:
         text += f"; that is little: mapping by hand needs {least:g} Hz or more"
     return Finding(subject, "fine" if rate >= least else "needs you", text)
-
-
-def _clocks(scans: I64, imu: I64, applied_s: float) -> Finding:
-    if not len(scans) or not len(imu):
-        return Finding("clocks", "needs you", "there are no scans and IMU samples to compare")
-    times = scans[:, 0], scans[:, 2], imu[:, 0], imu[:, 1]
-    spread = offset_spread_s(*times)
-    if spread > TOLERANCE_S:
-        text = (
-            f"the offset between the LiDAR's and the IMU's stamps changes by {spread:.3f} s on the way: a clock "
-            "was set or drifts; use a part before that (--start, --duration), and one clock for both next time"
-        )
-        return Finding("clocks", "needs you", text)
-    copied = np.all(np.abs(scans[:, 0] - scans[:, 2]) < 2_000) and np.all(np.abs(imu[:, 0] - imu[:, 1]) < 2_000)
-    return clock_finding(clock_offset_s(*times), applied_s, not copied)
 
 
 def _imu_gaps(counts: Counts, limit_s: float) -> Finding:

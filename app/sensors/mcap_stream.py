@@ -6,10 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Footer, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.reader import NonSeekingReader
 
-from app.sensors.findings import Finding
 from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type
 
 
@@ -18,11 +16,10 @@ class McapStream:
 
     Attributes:
         counts: topic -> (type as in ROS 2, number of messages). start_ns, end_ns: log times.
-        complete: whether the file has its end. findings: none; whoever opens the file knows why.
+        complete: whether the file has its end.
     """
 
     by_log_time = False
-    findings: tuple[Finding, ...] = ()
 
     def __init__(self, path: Path) -> None:
         """Reads the file once, to count."""
@@ -53,27 +50,18 @@ class McapStream:
 
     def _records(self) -> Iterator[tuple[str, str, int, str, bytes]]:
         """(topic, type, log time, encoding, bytes) up to the end or to where the file is cut."""
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, tuple[Channel, str]] = {}
+        known: dict[int, str] = {}
         with self._path.open("rb") as file:
-            records = iter(StreamReader(file, validate_crcs=False, record_size_limit=1 << 30).records)
-            while True:
-                try:
-                    record = next(records, None)
-                except (EndOfFile, McapError, struct.error):  # the last of a record that is cut in its middle
-                    return
-                if record is None or isinstance(record, Footer):
-                    self.complete = True
-                    return
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel) and record.message_encoding in ENCODINGS:
-                    schema = schemas.get(record.schema_id)
-                    kind = ros2_type(schema.name) if schema else ""
-                    if schema:
-                        text = schema.data.decode(errors="replace")
-                        self._deserialiser.learn(kind, text, record.message_encoding)
-                    channels[record.id] = record, kind
-                elif isinstance(record, Message) and record.channel_id in channels:
-                    channel, kind = channels[record.channel_id]
-                    yield channel.topic, kind, record.log_time, channel.message_encoding, record.data
+            reader = NonSeekingReader(file, record_size_limit=1 << 30)
+            try:
+                for schema, channel, message in reader.iter_messages(log_time_order=False):
+                    encoding = channel.message_encoding
+                    if encoding not in ENCODINGS:
+                        continue
+                    if channel.id not in known:
+                        kind = known[channel.id] = ros2_type(schema.name) if schema else ""
+                        self._deserialiser.learn(kind, schema.data.decode(errors="replace") if schema else "", encoding)
+                    yield channel.topic, known[channel.id], message.log_time, encoding, message.data
+            except (EndOfFile, McapError, struct.error):  # the last of a record that is cut in its middle
+                return
+        self.complete = True

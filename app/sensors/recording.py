@@ -9,10 +9,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from app.sensors.clocks import clock_finding, clock_offset_s
+from app.sensors.clocks import clock_finding
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
 from app.sensors.findings import Finding
-from app.sensors.layout import ImuProbe, gravity_findings, settle_cloud, settle_imu
+from app.sensors.layout import gravity_findings, settle_cloud, settle_imu
 from app.sensors.pointcloud import decode, read_scan
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu
 from app.sensors.ros import Vector, stamp_ns
@@ -75,7 +75,9 @@ class Recording:
         self.start_ns = scans[0].stamp_ns
         self._log_after_stamp_ns = probes[0].log_ns - self.start_ns
         self.duration_s = max((source.end_ns - probes[0].log_ns) / 1e9, 0.0) + (scans[0].end_ns - self.start_ns) / 1e9
-        self._clocks = self._compare_clocks(probes, scans, imu)
+        scan_times = [(probe.log_ns, scan.stamp_ns, scan.end_ns) for probe, scan in zip(probes, scans, strict=True)]
+        imu_times = np.column_stack([imu.log_ns, imu.stamps_ns])
+        self._clocks = clock_finding(np.array(scan_times, np.int64), imu_times, chosen.imu_time_offset)
         self.findings: tuple[Finding, ...] = (
             *source.findings,
             lidar_finding,
@@ -150,14 +152,6 @@ class Recording:
                 f"; {advice or 'check the recording.time_* settings'}."
             )
         return [probe for probe, _ in decoded], [scan for _, scan in decoded]
-
-    def _compare_clocks(self, probes: list[Probe], scans: list[Scan], imu: ImuProbe) -> Finding:
-        scan_logs = np.array([probe.log_ns for probe in probes], np.int64)
-        ends = np.array([scan.end_ns for scan in scans], np.int64)
-        offset = clock_offset_s(scan_logs, ends, imu.log_ns, imu.stamps_ns)
-        headers = np.array([probe.cloud.stamp_ns for probe in probes], np.int64)
-        copied = np.all(np.abs(scan_logs - headers) < 2_000) and np.all(np.abs(imu.log_ns - imu.stamps_ns) < 2_000)
-        return clock_finding(offset, self._params.recording.imu_time_offset, not copied)
 
     def nothing_usable(self, reasons: Counter[str], start_s: float, duration_s: float | None) -> str:
         """Why a reading gave no measurement, in a sentence; `reasons` of the scans that were left out."""

@@ -60,12 +60,11 @@ class Stream(Protocol):
 
     Attributes:
         counts: topic -> (type, number of messages). start_ns, end_ns: log times of the first and last message.
-        findings: what is unusual about the file. by_log_time: whether messages come sorted by log time.
+        by_log_time: whether messages come sorted by log time.
     """
 
     by_log_time: bool
     counts: dict[str, tuple[str, int]]
-    findings: tuple[Finding, ...]
     start_ns: int
     end_ns: int
 
@@ -78,7 +77,6 @@ class RosbagsStream:
     """What the rosbags library reads: a ROS 1 bag, a ROS 2 folder or single file. See `Stream`."""
 
     by_log_time = True
-    findings: tuple[Finding, ...] = ()
 
     def __init__(self, files: list[Path]) -> None:
         """Raises whatever the library raises for a file that it cannot read."""
