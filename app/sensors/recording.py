@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -51,14 +50,14 @@ class Recording:
     """An open recording, made by `open_recording`. A context manager.
 
     Attributes:
-        path: as given. topics: all there are. lidar_topic, imu_topic: the ones used.
+        path, params: as given. topics: all there are. lidar_topic, imu_topic: the ones used.
         scan_count: messages on the LiDAR topic. findings: of the first messages.
         start_ns: first point of the first usable scan. duration_s: from there to the last message.
     """
 
     def __init__(self, source: Source, params: Params) -> None:
         self._source = source
-        self._params = params
+        self.params = params
         self.path = source.path
         self.topics = source.topics
         chosen = params.recording
@@ -89,11 +88,6 @@ class Recording:
             self._clocks,
             *gravity_findings(imu, self._accel_scale, params),
         )
-
-    @property
-    def max_imu_gap_s(self) -> float:
-        """The longest interval between IMU samples that does not count as a gap."""
-        return self._params.imu.max_gap
 
     def measurements(
         self, start_s: float = 0.0, duration_s: float | None = None, *, after: "Place | None" = None
@@ -134,7 +128,7 @@ class Recording:
     def _imu_entry(self, message: Any, log_ns: int) -> ImuEntry:
         stamp = stamp_ns(message.header.stamp) if self._imu_stamped else log_ns
         w, a, k = message.angular_velocity, message.linear_acceleration, self._accel_scale
-        offset = round(self._params.recording.imu_time_offset * 1e9)
+        offset = round(self.params.recording.imu_time_offset * 1e9)
         return ImuEntry(log_ns, stamp + offset, (w.x, w.y, w.z), (k * a.x, k * a.y, k * a.z))
 
     def _decode_probes(self, probes: list[Probe], findings: list[Finding]) -> tuple[list[Probe], list[Scan]]:
@@ -168,7 +162,7 @@ class Recording:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -193,7 +187,7 @@ class Measurements(Iterator[Measurement | DroppedScan]):
         self._recording = recording
         self._part = (start_s, duration_s)
         self._message = after.message if after else None
-        self._sequencer = after.sequencer.copy() if after else Sequencer(recording.max_imu_gap_s)
+        self._sequencer = after.sequencer.copy() if after else Sequencer(recording.params.imu.max_gap)
         self._reasons = after.reasons.copy() if after else Counter[str]()
         self._ended = after is not None and after.ended
         self._entries = self._read()

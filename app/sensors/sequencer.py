@@ -8,6 +8,7 @@ steps back in time are detected, counted and reported.
 import bisect
 import math
 from collections.abc import Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -30,14 +31,12 @@ MAX_HELD = 10_000
 class Counts:
     """What the sequencer met so far."""
 
-    imu_samples: int = 0
     imu_duplicates: int = 0
     imu_back_steps: int = 0
     imu_invalid: int = 0
     imu_gaps: int = 0
     longest_imu_gap_s: float = 0.0
     paired: int = 0
-    dropped: int = 0
 
 
 @dataclass(slots=True)
@@ -66,16 +65,7 @@ class Sequencer:
 
     def copy(self) -> "Sequencer":
         """An independent copy in the same state. Scans and samples are shared: they never change."""
-        return replace(
-            self,
-            counts=replace(self.counts),
-            _stamps=self._stamps.copy(),
-            _values=self._values.copy(),
-            _waiting=self._waiting.copy(),
-            _held=self._held.copy(),
-            _notices=self._notices.copy(),
-            _intervals_ns=self._intervals_ns.copy(),
-        )
+        return replace(self, **{column.name: copy(getattr(self, column.name)) for column in fields(self)})
 
     def tail(self) -> "Sequencer":
         """A sequencer that takes over after this one's last scan, and notices what is missing in between."""
@@ -125,7 +115,6 @@ class Sequencer:
         if gap_s > self.max_gap_s:
             self.counts.imu_gaps += 1
             self.counts.longest_imu_gap_s = max(self.counts.longest_imu_gap_s, gap_s)
-        self.counts.imu_samples += 1
         self._stamps.append(stamp_ns)
         self._values.append(values)
 
@@ -161,7 +150,6 @@ class Sequencer:
     def _take(self, scan: Scan | DroppedScan) -> Measurement | DroppedScan:
         reason = scan.reason if isinstance(scan, DroppedScan) else self._objection(scan)
         if reason or isinstance(scan, DroppedScan):
-            self.counts.dropped += 1
             return DroppedScan(scan.stamp_ns, reason)
         end_ns = scan.end_ns
         begin_ns = self._stamps[0] if self._last_end_ns is None else self._last_end_ns

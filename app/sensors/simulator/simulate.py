@@ -10,12 +10,18 @@ from scipy.spatial.transform import Rotation
 
 from app.sensors.ros import RecordingWriter
 from app.sensors.rsbpearl import BPEARL, ROTATION_RATES_HZ
-from app.sensors.simulator import imu as imu_model
-from app.sensors.simulator.imu import ImuNoise
 from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
 from app.sensors.simulator.raycast import Raycaster, SimulatedScene
 from app.sensors.simulator.scenes import build_scene
-from app.sensors.simulator.trajectory import SmoothTrajectory, Walker, seconds, walk
+from app.sensors.simulator.trajectory import (
+    IMU_RATE_HZ,
+    ImuNoise,
+    SmoothTrajectory,
+    Walker,
+    measured,
+    seconds,
+    walk,
+)
 from app.slam.errors import HemislamError
 from app.slam.trajectory import Trajectory, write_tum
 from app.slam.types import I64
@@ -27,7 +33,7 @@ TRANSPORT_NS = 4_000_000
 """A cloud reaches the recorder this long after its last point."""
 
 _FIRST_TURN_S = 0.05
-_IMU_PERIOD_NS = 1_000_000_000 // imu_model.RATE_HZ
+_IMU_PERIOD_NS = 1_000_000_000 // IMU_RATE_HZ
 
 _TRAJECTORY, _IMU, _LIDAR = 1, 2, 3
 """Streams of random numbers that do not disturb one another (0 is the scene's)."""
@@ -38,14 +44,13 @@ class SimulationSummary:
     """What was written.
 
     Attributes:
-        recording: the file. bytes: its size. scans, points, imu_samples: how many it holds.
+        recording: the file. bytes: its size. scans, points: how many it holds.
         duration_s, distance_m: of the trajectory.
     """
 
     recording: Path
     scans: int
     points: int
-    imu_samples: int
     duration_s: float
     distance_m: float
     bytes: int
@@ -98,8 +103,8 @@ def simulate(
     caster = Raycaster(place.mesh, place.movers)
     pattern = firing_pattern(BPEARL, rate_hz, every_block)
     lidar = Lidar(pattern, range_step=range_step, coordinate_step=coordinate_step)
-    imu_stamps = START_NS + np.arange(round(duration_s * imu_model.RATE_HZ) + 1, dtype=np.int64) * _IMU_PERIOD_NS
-    imu = imu_model.measure(trajectory, imu_stamps, START_NS, ImuNoise(), _random(seed, _IMU))
+    imu_stamps = START_NS + np.arange(round(duration_s * IMU_RATE_HZ) + 1, dtype=np.int64) * _IMU_PERIOD_NS
+    imu = measured(trajectory, imu_stamps, START_NS, ImuNoise(), _random(seed, _IMU))
 
     total = int((duration_s - _FIRST_TURN_S) * rate_hz + 1e-6)
     points = written = 0
@@ -143,7 +148,6 @@ def simulate(
         recording=out,
         scans=len(ends),
         points=points,
-        imu_samples=len(imu),
         duration_s=duration_s,
         distance_m=float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
         bytes=out.stat().st_size,

@@ -1,4 +1,4 @@
-"""The trajectory of a handheld scanner as one smooth curve, and what an ideal IMU on it measures.
+"""The trajectory of a handheld scanner as one smooth curve, and what an IMU on it measures.
 
 The curve is a quintic spline through samples of (x, y, z, yaw, pitch, roll), so that every derivative is exact: poses,
 angular rates and specific forces belong to the same curve.
@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
-from app.slam.types import F64, I64
+from app.slam.types import F64, I64, ImuSamples
 
 GRAVITY = 9.81
+IMU_RATE_HZ = 200
 R_BODY_IMU: F64 = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 _SAMPLE_HZ = 50.0
@@ -41,10 +42,6 @@ class SmoothTrajectory:
         values = self._spline(t)
         return values[:, :3], _rotation(values[:, 3:]) @ R_BODY_IMU
 
-    def velocities(self, t: F64) -> F64:
-        """(n, 3) m/s, world frame."""
-        return np.asarray(self._rate(t)[:, :3])
-
     def motion(self, t: F64) -> tuple[F64, F64]:
         """What a perfect IMU reads: angular rate (n, 3) rad/s and specific force (n, 3) m/s^2, IMU frame."""
         _, pitch, roll = self._spline(t)[:, 3:].T
@@ -59,6 +56,35 @@ class SmoothTrajectory:
         _, R_world_imu = self.poses(t)
         force = self._acceleration(t)[:, :3] + np.array([0.0, 0.0, GRAVITY])
         return body_rate @ R_BODY_IMU, np.einsum("nji,nj->ni", R_world_imu, force)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuNoise:
+    """The errors of the paper's Owllmo IMU3910; gyroscope in rad/s, accelerometer in m/s^2.
+
+    Attributes:
+        gyro, accel: spread of a sample's white noise (paper 2.1, in the units it prints).
+        gyro_bias, accel_bias: spread of the constant bias each axis starts with.
+        gyro_walk, accel_walk: growth of the bias's random walk, per sqrt(s) (paper 2.1).
+    """
+
+    gyro: float = 1.2e-3
+    accel: float = 1.3e-2
+    gyro_bias: float = 5e-3
+    accel_bias: float = 3e-2
+    gyro_walk: float = 2.5e-5
+    accel_walk: float = 1.0e-4
+
+
+def measured(
+    trajectory: SmoothTrajectory, stamps_ns: I64, start_ns: int, noise: ImuNoise, rng: np.random.Generator
+) -> ImuSamples:
+    """What the IMU reads at `stamps_ns`; the trajectory's time 0 is `start_ns`."""
+    t = seconds(stamps_ns - start_ns)
+    rate, force = trajectory.motion(t)
+    gyro = rate + _errors(len(t), noise.gyro, noise.gyro_bias, noise.gyro_walk, rng)
+    accel = force + _errors(len(t), noise.accel, noise.accel_bias, noise.accel_walk, rng)
+    return ImuSamples(stamps_ns, gyro, accel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,3 +220,9 @@ def _brake(travelled: F64, end: float) -> F64:
     limit = end - 1.0
     over = np.maximum(travelled - (limit - 1.0), 0.0)
     return np.where(travelled > limit - 1.0, limit - 1.0 + np.tanh(over), travelled)
+
+
+def _errors(count: int, white: float, bias: float, walk: float, rng: np.random.Generator) -> F64:
+    start = rng.normal(scale=1.0, size=3) * bias
+    steps = rng.normal(size=(count, 3)) * (walk / np.sqrt(IMU_RATE_HZ))
+    return np.asarray(start + np.cumsum(steps, axis=0) + rng.normal(size=(count, 3)) * white)
