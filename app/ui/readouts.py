@@ -93,35 +93,29 @@ def _vector(v: F64, digits: int) -> str:
     return "  ".join(f"{component:+.{digits}f}" for component in v)
 
 
-def recent(series: dict[str, F64], *names: str) -> tuple[F64, ...]:
-    """The last `HISTORY` values of series, and of `stamp_s` first; one zero each before the first frame."""
-    return _chosen(series, slice(-HISTORY, None), names)
+def plotted(series: dict[str, F64], *names: str, worst: str = "") -> tuple[F64, ...]:
+    """Stamps and series for a plot of at most `HISTORY` frames; one zero each before the first frame.
 
-
-def worst(series: dict[str, F64], by: str, *names: str) -> tuple[F64, ...]:
-    """As `recent`, but from all frames: `HISTORY` of them, each the one with the greatest `by` in its part."""
+    Args:
+        worst: "" for the newest frames; else all frames in as many parts, of each that with the greatest `worst`.
+    """
     count = len(series.get("stamp_s", ()))
-    if count <= HISTORY:
-        return recent(series, *names)
-    starts = np.arange(HISTORY + 1) * count // HISTORY
-    part = np.repeat(np.arange(HISTORY), np.diff(starts))
-    order = np.lexsort((np.nan_to_num(series[by], nan=-np.inf), part))
-    return _chosen(series, order[starts[1:] - 1], names)
-
-
-def _chosen(series: dict[str, F64], frames: slice | I64, names: tuple[str, ...]) -> tuple[F64, ...]:
-    if not len(series.get("stamp_s", ())):
-        return tuple(np.zeros(1) for _ in range(1 + len(names)))
+    if not count:
+        return (np.zeros(1),) * (1 + len(names))
+    frames: slice | I64 = slice(-HISTORY, None)
+    if worst and count > HISTORY:
+        starts = np.arange(HISTORY + 1) * count // HISTORY
+        part = np.repeat(np.arange(HISTORY), np.diff(starts))
+        frames = np.lexsort((np.nan_to_num(series[worst], nan=-np.inf), part))[starts[1:] - 1]
     return tuple(series[name][frames] for name in ("stamp_s", *names))
 
 
-def stacked_stages(series: dict[str, F64], *, whole: bool = False) -> tuple[F64, ...]:
-    """Stamps, then running sums of the stages' milliseconds from the highest down, for filled areas.
+def stacked_stages(series: dict[str, F64], worst: str = "") -> tuple[F64, ...]:
+    """Stamps, then running sums of the stages' milliseconds from the highest down, for filled areas; as `plotted`.
 
     Peaks are cut at four times the median: the first frame's would flatten all others.
     """
-    names = [f"{stage}_ms" for stage in STAGES]
-    stamps, *stages = worst(series, "total_ms", *names) if whole else recent(series, *names)
+    stamps, *stages = plotted(series, *(f"{stage}_ms" for stage in STAGES), worst=worst)
     sums = np.cumsum(np.nan_to_num(np.array(stages)), axis=0)
     sums = np.minimum(sums, 4 * np.median(sums[-1]))
     return (stamps, *sums[::-1])
@@ -143,7 +137,7 @@ class ReadoutPanel:
         layers = [{"stroke": colour, "width": 0, "fill": colour} for colour in colours]
         self._stages = chart(gui, stacked_stages({}), layers)
         gui.add_html(heading("λ3/λ2 of the seeds and its limit"))
-        nothing = recent({}, "planarity")
+        nothing = plotted({}, "planarity")
         limit: dict[str, Any] = {"stroke": "#ff6b6b", "width": 1.0}
         self._planarity = chart(gui, (*nothing, np.zeros(1)), [{"stroke": "#3ecf9a", "width": 1.5}, limit])
         gui.add_html(heading("Residual (RMS), mm"))
@@ -169,20 +163,12 @@ class ReadoutPanel:
             ]
             self._tiles.content = panel("readouts", sections, "Time")
             self._time.content = times_html(snapshot, result)
-        self._draw_plots(snapshot)
-
-    def _draw_plots(self, snapshot: Snapshot) -> None:
-        series = snapshot.series
-        whole = self._whole.value
-
-        def curve(name: str) -> tuple[F64, ...]:
-            return worst(series, name, name) if whole else recent(series, name)
-
-        self._stages.data = stacked_stages(series, whole=whole)
-        stamps, planarity = curve("planarity")
+        series, whole = snapshot.series, self._whole.value
+        self._stages.data = stacked_stages(series, "total_ms" if whole else "")
+        stamps, planarity = plotted(series, "planarity", worst="planarity" if whole else "")
         self._planarity.data = (stamps, planarity, np.full(len(stamps), snapshot.params.ground.planarity))
-        stamps, residual = curve("residual_rms")
+        stamps, residual = plotted(series, "residual_rms", worst="residual_rms" if whole else "")
         self._residual.data = (stamps, 1000 * residual)
-        stamps, error = curve("error_m")
+        stamps, error = plotted(series, "error_m", worst="error_m" if whole else "")
         self._error.visible = self._error_title.visible = bool(np.isfinite(error).any() and len(error) > 1)
         self._error.data = (stamps, 100 * error)

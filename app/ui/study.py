@@ -85,11 +85,11 @@ class StudyScene:
             self._marks.append(mark)
         radius = max(patch.radius, _LEAST_RADIUS_M)
         self._plane("patch", patch.center, patch.normal, radius, _NEIGHBOURS)
-        match = picked.match
-        if match is not None and match.center is not None and match.normal is not None:
-            T_lidar_odom = lie.inverse(result.state.T_odom_imu @ result.state.T_imu_lidar)
-            R = T_lidar_odom[:3, :3]
-            self._plane("map_patch", R @ match.center + T_lidar_odom[:3, 3], R @ match.normal, radius, _MAP)
+        matches, i = result.registration.matches, picked.match
+        if matches is not None and i >= 0 and matches.normals[i].any():
+            T = lie.inverse(result.state.T_odom_imu @ result.state.T_imu_lidar)
+            center, normal = T[:3, :3] @ matches.centers[i] + T[:3, 3], T[:3, :3] @ matches.normals[i]
+            self._plane("map_patch", center, normal, radius, _MAP)
 
     def _plane(self, name: str, center: F64, normal: F64, radius: float, colour: tuple[int, int, int]) -> None:
         vertices, faces, rim = disc(radius, 40)

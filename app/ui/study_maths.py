@@ -171,23 +171,12 @@ def nearest_to_ray(points: F32, origin: F64, direction: F64) -> int | None:
 
 
 @dataclass(frozen=True, slots=True)
-class NearestMatch:
-    """The point that the filter used nearest to the one clicked, with the plane that the map gave for it.
+class Picked:
+    """A point under study. Lengths m, angles rad; `patch` in the LiDAR frame.
 
     Attributes:
-        away: m from the point clicked. residual: signed m; nan where the plane was not accepted.
-        center, normal: (3,) m, odom frame; None where there was no plane.
+        match: which of the result's matches is the nearest point that the filter used, -1 without one. away: to it.
     """
-
-    away: float
-    residual: float
-    center: F64 | None
-    normal: F64 | None
-
-
-@dataclass(frozen=True, slots=True)
-class Picked:
-    """A point under study. Lengths m, angles rad; `patch` in the LiDAR frame."""
 
     index: int
     range: float
@@ -195,7 +184,8 @@ class Picked:
     distance: float
     threshold: float
     patch: Patch
-    match: NearestMatch | None
+    match: int
+    away: float
 
 
 def pick(result: StepResult, index: int, sigma: float, neighbours: int) -> Picked:
@@ -204,8 +194,9 @@ def pick(result: StepResult, index: int, sigma: float, neighbours: int) -> Picke
     Args:
         sigma: of the ground threshold, m per m of range. neighbours: how many points its patch has.
     """
-    point = result.cloud.points[index]
-    numbers = point_numbers(point[None], result)
+    point = result.cloud.points[index : index + 1]
+    numbers = point_numbers(point, result)
+    (match,), (away,) = nearest_match(point, result)
     return Picked(
         index=index,
         range=float(numbers.range[0]),
@@ -213,21 +204,8 @@ def pick(result: StepResult, index: int, sigma: float, neighbours: int) -> Picke
         distance=float(numbers.distance[0]),
         threshold=sigma * float(numbers.range[0]),
         patch=neighbourhood(result.cloud.points, index, neighbours),
-        match=_match(result, point),
-    )
-
-
-def _match(result: StepResult, point: F32) -> NearestMatch | None:
-    matches = result.registration.matches
-    (nearest,), (away,) = nearest_match(point[None], result)
-    if matches is None or nearest < 0:
-        return None
-    found = bool(np.any(matches.normals[nearest]))
-    return NearestMatch(
+        match=int(match),
         away=float(away),
-        residual=float(matches.residuals[nearest]),
-        center=matches.centers[nearest].astype(np.float64) if found else None,
-        normal=matches.normals[nearest].astype(np.float64) if found else None,
     )
 
 
@@ -256,18 +234,18 @@ def describe(result: StepResult, picked: Picked) -> str:
             f"this point {off:+.1f} mm off",
             width="half",
         ),
-        _match_tile(picked.match),
+        _match_tile(result, picked),
     ]
     return panel("tile_grid", tiles)
 
 
-def _match_tile(match: NearestMatch | None) -> Tile:
-    name = "nearest point that the filter used"
-    if match is None:
+def _match_tile(result: StepResult, picked: Picked) -> Tile:
+    name, matches, i = "nearest point that the filter used", result.registration.matches, picked.match
+    if matches is None or i < 0:
         return Tile(name, "none", f"within {100 * MATCH_M:.0f} cm", width="wide")
-    away = f"{100 * match.away:.1f} cm away"
-    if match.normal is None:
+    away = f"{100 * picked.away:.1f} cm away"
+    if not matches.normals[i].any():
         return Tile(name, "no plane in the map", note=away, width="wide")
-    if np.isnan(match.residual):
+    if np.isnan(matches.residuals[i]):
         return Tile(name, "not used", note=f"{away}; its plane is too far off", width="wide")
-    return Tile(name, f"{1e3 * match.residual:+.1f}", "mm to the map's plane", away, width="wide")
+    return Tile(name, f"{1e3 * matches.residuals[i]:+.1f}", "mm to the map's plane", away, width="wide")

@@ -144,9 +144,10 @@ def test_a_file_says_of_a_point_what_the_panel_does() -> None:
         picked, row = pick(MATCHED, index, SIGMA, 8), table[index]
         assert row["distance"] == pytest.approx(picked.distance, abs=1e-6, nan_ok=True)
         assert row["angle"] == pytest.approx(np.degrees(picked.angle), abs=1e-4)
-        match = picked.match
-        assert row["residual"] == pytest.approx(match.residual if match else np.nan, nan_ok=True)
-        assert row["residual_away"] == pytest.approx(match.away if match else np.nan, nan_ok=True)
+        residuals = MATCHED.registration.matches.residuals  # type: ignore[union-attr]
+        residual = residuals[picked.match] if picked.match >= 0 else np.nan
+        assert row["residual"] == pytest.approx(residual, nan_ok=True)
+        assert row["residual_away"] == pytest.approx(picked.away, nan_ok=True)
     assert np.isfinite(table["residual"]).any() and np.isnan(table["residual"]).any()
 
 

@@ -18,7 +18,7 @@ from app.server.protocol import (
 from app.ui.colours import LABEL, Limits, legend
 from app.ui.files import result_folder_name, size_text
 from app.ui.html import Tile, panel
-from app.ui.readouts import HISTORY, recent, stacked_stages, worst
+from app.ui.readouts import HISTORY, plotted, stacked_stages
 from app.ui.status import findings_html, log_html, title, verdicts
 from tests.ui.fake_engine import FINDINGS, FakeEngine
 
@@ -70,7 +70,7 @@ def test_sizes_read_as_people_say_them(size: int, text: str) -> None:
 
 def test_plots_show_the_newest_frames_only(engine: FakeEngine) -> None:
     engine.send(StepFrame(HISTORY + 20))
-    stamps, planarity = recent(engine.snapshot.series, "planarity")
+    stamps, planarity = plotted(engine.snapshot.series, "planarity")
     assert len(stamps) == len(planarity) == HISTORY
     assert stamps[-1] == pytest.approx(0.1 * (HISTORY + 19))
 
@@ -80,7 +80,7 @@ def test_plots_of_all_frames_keep_every_peak_and_cover_the_whole_trajectory() ->
     error = np.full(count, np.nan)  # not known for most frames
     error[[5, 900]] = 3.0, 2.0
     series = {"stamp_s": np.arange(count) * 0.1, "error_m": error, "total_ms": np.full(count, 9.0)}
-    stamps, errors, total = worst(series, "error_m", "error_m", "total_ms")
+    stamps, errors, total = plotted(series, "error_m", "total_ms", worst="error_m")
     assert len(stamps) == HISTORY and (np.diff(stamps) > 0).all()
     assert stamps[0] < 0.5 and stamps[-1] > 0.1 * (count - 5)
     known = np.isfinite(errors)

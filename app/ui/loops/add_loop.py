@@ -1,6 +1,7 @@
 """Adding a loop by hand: which two keyframes, from which guess, and whether they are registered."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -17,7 +18,7 @@ from app.ui.loops.edges import nearest
 from app.ui.loops.inspector import MOST_POINTS, Overlay, Pairing
 from app.ui.loops.words import NEWER, OLDER
 from app.ui.nodes import add_exact_points
-from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of, show
+from app.ui.widgets import ROOT, Changes, Edit, Page, View, by_user, poses_of, show
 
 _REST_S: Final = 0.4
 """The guess is tried after the gizmo has rested this long."""
@@ -46,33 +47,31 @@ def surroundings(chunks: tuple[Chunk, ...], poses: F64, index: int, ceilings: bo
     return np.concatenate(parts).astype(np.float32)
 
 
-class Gizmo:
-    """Arrows and rings with which a person moves the newer cloud."""
+@dataclass(slots=True)
+class Nudging:
+    """Two clouds of which a person moves the newer one, by arrows and rings.
 
-    def __init__(self, scene: viser.SceneApi, node: str) -> None:
-        self._scene = scene
-        self._node = node
-        self._handle: viser.TransformControlsHandle | None = None
+    Attributes:
+        T_map_older, T_map_newer: (4, 4) of the keyframes when it began.
+        guess: where the newer cloud was last; not sent while it is being moved.
+    """
 
-    def show(self, T_map: F64) -> None:
-        """Put it at a pose (4, 4)."""
-        self.hide()
-        self._handle = self._scene.add_transform_controls(
-            self._node, scale=1.6, depth_test=False, wxyz=wxyz(T_map[:3, :3]), position=T_map[:3, 3]
-        )
-
-    def hide(self) -> None:
-        if self._handle is not None:
-            self._handle.remove()
-            self._handle = None
+    pair: Pair
+    clouds: Pairing
+    T_map_older: F64
+    T_map_newer: F64
+    gizmo: viser.TransformControlsHandle
+    guess: Edit
 
     @property
-    def pose(self) -> F64 | None:
-        """(4, 4) where it was moved to; None while it is hidden."""
-        handle = self._handle
-        if handle is None:
-            return None
-        return lie.transform(lie.matrix(np.asarray(handle.wxyz)[[1, 2, 3, 0]]), np.array(handle.position))
+    def T_map(self) -> F64:
+        """(4, 4) where the newer cloud is now."""
+        return lie.transform(lie.matrix(np.asarray(self.gizmo.wxyz)[[1, 2, 3, 0]]), np.array(self.gizmo.position))
+
+    @property
+    def T_older_newer(self) -> F64:
+        """(4, 4) of the keyframes, with the newer one moved as its cloud was."""
+        return lie.inverse(self.T_map_older) @ self.T_map @ lie.inverse(upright(self.T_map_newer)) @ self.T_map_newer
 
 
 class AddLoopPanel:
@@ -89,12 +88,10 @@ class AddLoopPanel:
         gui = page.gui
         self._page, self._propose, self._fly = page, propose, fly
         self._overlay = Overlay(page.scene, f"{_NODE}/clouds")
-        self._gizmo = Gizmo(page.scene, f"{_NODE}/gizmo")
         self._dots: viser.PointCloudHandle | None = None
         self._changes = Changes()  # of the dots
         self._picked: list[int] | None = None
-        self._start: tuple[Pair, Pairing, F64, F64] | None = None
-        self._moved: tuple[F64, float] | None = None
+        self._nudging: Nudging | None = None
         gui.add_html(panel("text", "Tell the graph that two keyframes see the same place, whatever the search found."))
         self._older = gui.add_number("older keyframe", 0, min=0, step=1)
         self._newer = gui.add_number("newer keyframe", 0, min=0, step=1)
@@ -120,7 +117,7 @@ class AddLoopPanel:
     @property
     def nudging(self) -> bool:
         """Whether its two clouds are in the scene."""
-        return self._start is not None
+        return self._nudging is not None
 
     @property
     def pair(self) -> Pair:
@@ -160,43 +157,40 @@ class AddLoopPanel:
     def draw_scene(self, snapshot: Snapshot, view: View) -> None:
         """Called by the drawing thread, often: dots to pick from, the two clouds, and the guess once it rests."""
         self._draw_picking(snapshot)
-        poses = poses_of(snapshot)
-        older, newer = pair = self.pair
-        wanted = self._nudge.value and 0 <= older < newer < len(poses)
-        if self._start is not None and (not wanted or self._start[0] != pair):
-            self._gizmo.hide()
+        poses, pair, nudging = poses_of(snapshot), self.pair, self._nudging
+        wanted = self._nudge.value and 0 <= pair[0] < pair[1] < len(poses)
+        if nudging is not None and (not wanted or nudging.pair != pair):
+            nudging.gizmo.remove()
             self._overlay.draw(None, None, view.point_size)
-            self._start = self._moved = None
+            self._nudging = nudging = None
         if not wanted:
             return
-        if self._start is None:
-            pairing = Pairing(
-                surroundings(snapshot.chunks, poses, older, view.ceilings),
-                surroundings(snapshot.chunks, poses, newer, view.ceilings),
-                upright(poses[older]),
-            )
-            self._start = (pair, pairing, poses[older], poses[newer])
-            self._gizmo.show(upright(poses[newer]))
-        T = self._gizmo.pose
-        self._overlay.draw(self._start[1], T, view.point_size)
-        if T is None:
-            return
-        now = self._page.now()
-        if self._moved is None or not np.array_equal(T, self._moved[0]):
-            untouched = self._moved is None
-            self._moved = (T, np.inf if untouched else now)
-        elif now - self._moved[1] >= _REST_S:
-            self._moved = (T, np.inf)
+        if nudging is None:
+            nudging = self._nudging = self._begin(snapshot.chunks, poses, view)
+        T, now, guess = nudging.T_map, self._page.now(), nudging.guess
+        self._overlay.draw(nudging.clouds, T, view.point_size)
+        if not np.array_equal(T, guess.value):
+            nudging.guess = Edit(T, now)
+        elif not guess.sent and now - guess.at >= _REST_S:
+            guess.sent = True
             self.suggest()
+
+    def _begin(self, chunks: tuple[Chunk, ...], poses: F64, view: View) -> Nudging:
+        older, newer = self.pair
+        T = upright(poses[newer])
+        gizmo = self._page.scene.add_transform_controls(
+            f"{_NODE}/gizmo", scale=1.6, depth_test=False, wxyz=wxyz(T[:3, :3]), position=T[:3, 3]
+        )
+        there, here = (surroundings(chunks, poses, index, view.ceilings) for index in self.pair)
+        pairing = Pairing(there, here, upright(poses[older]))
+        nudging = Nudging(self.pair, pairing, poses[older], poses[newer], gizmo, Edit(T, 0.0, sent=True))
+        nudging.guess.value = nudging.T_map
+        return nudging
 
     def _guess(self) -> tuple[tuple[float, ...], ...] | None:
         """T_older_newer of the IMU frames as the gizmo has it; None: as the graph has it."""
-        start, T = self._start, self._gizmo.pose
-        if start is None or T is None or start[0] != self.pair:
-            return None
-        _, _, T_map_older, T_map_newer = start
-        nudged = T @ lie.inverse(upright(T_map_newer)) @ T_map_newer
-        return rows(lie.inverse(T_map_older) @ nudged)
+        nudging = self._nudging
+        return rows(nudging.T_older_newer) if nudging is not None and nudging.pair == self.pair else None
 
     def _look(self, nudging: bool, client: viser.ClientHandle) -> None:
         """Fly to the cloud to nudge."""

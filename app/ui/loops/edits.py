@@ -9,10 +9,9 @@ import viser
 from app.server.protocol import EditLoop, RedoLoop, Snapshot, TryLoop, UndoLoop
 from app.slam.errors import HemislamError
 from app.slam.loops import edit_files
-from app.slam.loops.types import Accept, LoopEdge, LoopEdit, Pair, Reject, SetWeight, Solve, Verdict
+from app.slam.loops.types import Accept, LoopEdge, LoopEdit, Pair, Reject, SetWeight, Verdict
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
-from app.ui.html import panel
 from app.ui.loops.words import describe_edit, forecast, headline
 from app.ui.nodes import add_lines, segments
 from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, notify_error, poses_of, show
@@ -153,29 +152,6 @@ class VerdictPanel:
     def _propose_for_pair(self, verb: type[Accept] | type[Reject]) -> None:
         if self._pair is not None:
             self._propose(verb(*self._pair))
-
-
-class SolvePanel:
-    """Solves for all factors at once, on request."""
-
-    def __init__(self, gui: viser.GuiApi, propose: Callable[[LoopEdit], None]) -> None:
-        self._button = gui.add_button(
-            "Solve all at once …",
-            icon=viser.Icon.MATH_FUNCTION,
-            color="gray",
-            hint="Levenberg-Marquardt over all factors, instead of one keyframe after the other. You first see what it"
-            " would change.",
-        )
-        self._where = gui.add_html(
-            panel("text", "What it would change is shown above, under “Before you decide”."), visible=False
-        )
-        self._button.on_click(by_user(lambda _, __: propose(Solve())))
-
-    def draw(self, snapshot: Snapshot, considered: bool) -> None:
-        """Disable it when it was the last edit, or there is no loop. considered: whether it is proposed now."""
-        loops = snapshot.loops
-        self._where.visible = considered
-        self._button.disabled = Solve() in loops.undo or not any(edge.counts for edge in loops.edges)
 
 
 class EditsPanel:

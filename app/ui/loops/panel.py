@@ -14,17 +14,20 @@ from app.slam.types import F64
 from app.ui.html import panel
 from app.ui.loops.add_loop import AddLoopPanel
 from app.ui.loops.edges import LoopEdges
-from app.ui.loops.edits import EditsPanel, Proposal, SolvePanel, VerdictPanel
+from app.ui.loops.edits import EditsPanel, Proposal, VerdictPanel
 from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
 from app.ui.loops.table import COLUMNS, Order, chips, listed, table
 from app.ui.loops.words import KINDS, largest_factors
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, poses_of
+from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of
 
 _STEPS: Final = 14
 _STEP_S: Final = 0.03
 _LEAST_SLOPE: Final = 0.9
 """Least steepness of the view downwards (z over the horizontal), to see into a building."""
+_SOLVE_HINT: Final = (
+    "Levenberg-Marquardt over all factors, instead of one keyframe after the other. You first see what it would change."
+)
 _NONE_YET: Final = (
     "No loops yet. They are searched for where the trajectory comes back to a place that it left at least 15 s before; "
     "the parameters are under Tune, Loops."
@@ -62,7 +65,13 @@ class LoopsPanel:
         with gui.add_folder("Edits"):
             self._edits = EditsPanel(page)
         with gui.add_folder("Graph residuals", expand_by_default=False):
-            self._solve = SolvePanel(gui, self._proposal.propose)
+            self._solve = gui.add_button(
+                "Solve all at once …", icon=viser.Icon.MATH_FUNCTION, color="gray", hint=_SOLVE_HINT
+            )
+            self._solving = gui.add_html(
+                panel("text", "What it would change is shown above, under “Before you decide”."), visible=False
+            )
+            self._solve.on_click(by_user(lambda _, __: self._proposal.propose(Solve())))
             self._factors = gui.add_html("")
         gui.add_command("Next loop of the table", hotkey="J").on_trigger(lambda _: self._step(1))
         gui.add_command("Previous loop of the table", hotkey="K").on_trigger(lambda _: self._step(-1))
@@ -108,7 +117,9 @@ class LoopsPanel:
         self._inspector.draw(snapshot, edge)
         self._proposal.draw(snapshot)
         self._edits.draw(snapshot)
-        self._solve.draw(snapshot, isinstance(command, Solve))
+        loops = snapshot.loops
+        self._solving.visible = isinstance(command, Solve)
+        self._solve.disabled = Solve() in loops.undo or not any(edge.counts for edge in loops.edges)
         self._folder.visible = edge is not None
         self._draw_tables(snapshot)
 

@@ -23,14 +23,14 @@ def test_all_is_solved_at_once_in_two_steps_with_cost_and_change_said_between(pa
     page.choose(GOOD)
     before = page.engine.snapshot.keyframe_poses
     page.engine.sent.clear()
-    user_clicks(solve._button)
+    user_clicks(solve)
     page.draw()
     assert page.engine.sent == [TryLoop(Solve())]
     preview = page.engine.snapshot.loops.tried
     assert preview is not None and before is not None
     moved = 100 * np.linalg.norm(preview[1].poses[:, :3, 3] - before[:, :3, 3], axis=1).max()
     costs = [sum(f.cost for f in side) for side in (page.engine.snapshot.loops.residuals, preview[1].residuals)]
-    assert solve._where.visible, "the panel is long"
+    assert page.loops._solving.visible, "the panel is long"
     words = proposal._words.content
     assert "Solve all at once" in words
     assert f"move by up to <b>{moved:.1f} cm</b>" in words
@@ -40,11 +40,11 @@ def test_all_is_solved_at_once_in_two_steps_with_cost_and_change_said_between(pa
     page.draw()
     assert page.engine.sent[1:] == [EditLoop(Solve()), TryLoop(None)]
     assert page.loops.chosen == GOOD, "it is of no loop in particular"
-    assert solve._button.disabled
+    assert solve.disabled
     assert page.loops._edits._undo.label == "Undo: solve all at once"
     user_clicks(page.loops._edits._undo)
     page.draw()
-    assert page.engine.sent[-1] == UndoLoop() and not solve._button.disabled
+    assert page.engine.sent[-1] == UndoLoop() and not solve.disabled
 
 
 def test_poses_at_the_optimum_are_said_to_be_there() -> None:
@@ -57,7 +57,7 @@ def test_poses_at_the_optimum_are_said_to_be_there() -> None:
 
 
 def test_a_graph_without_loops_has_nothing_to_be_solved(page: Page) -> None:
-    assert not page.loops._solve._button.disabled
+    assert not page.loops._solve.disabled
     page.engine.publish(loops=type(page.engine.snapshot.loops)())
     page.draw()
-    assert page.loops._solve._button.disabled
+    assert page.loops._solve.disabled
