@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from app.evaluation.truth import read_truth
 from app.evaluation.truth_match import match
-from app.evaluation.truth_sources import read_truth
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.slam import lie

@@ -6,8 +6,8 @@ python examples/two_variants.py sample_data/museum.mcap FOLDER
 import sys
 from pathlib import Path
 
-from app.evaluation.evaluate import Plan, Subject, evaluate
-from app.evaluation.truth_sources import read_truth
+from app.evaluation.evaluate import Subject, evaluate
+from app.evaluation.truth import read_truth
 from app.evaluation.variants import Variant
 from app.slam.params import Params
 
@@ -20,6 +20,6 @@ if __name__ == "__main__":  # the runs have processes of their own, which import
         Variant("fine", {"scan.voxel_size": 0.2}, "finer voxels for the filter"),
     )
     subject = Subject(recording.stem, recording, params, truth)
-    findings, failed = evaluate(Plan((subject,), variants, folder, parallel=2, threads=1, duration_s=10.0))
+    findings, failed = evaluate([subject], variants, folder, parallel=2, threads=1, duration_s=10.0)
     print(*findings, *failed.values(), sep="\n")
     print((folder / "report.md").read_text())

@@ -84,9 +84,9 @@ def evaluate(
     """
     from app.cli.run import compile_behind_bar
     from app.cli.suite import make_suite
-    from app.evaluation.evaluate import Plan, Subject
+    from app.evaluation.evaluate import Subject
     from app.evaluation.evaluate import evaluate as run_evaluation
-    from app.evaluation.truth_sources import read_truth
+    from app.evaluation.truth import read_truth
     from app.evaluation.variants import choose_variants, parse_variant
 
     if suite is None and (short or seeds):
@@ -112,15 +112,13 @@ def evaluate(
     parallel = max(1, min(jobs or cores, len(chosen) * len(subjects)))
     compile_behind_bar()
     findings, failures = run_evaluation(
-        Plan(
-            subjects=tuple(subjects),
-            variants=tuple(chosen),
-            folder=out,
-            parallel=parallel,
-            threads=max(1, cores // parallel),
-            start_s=start,
-            duration_s=duration,
-        )
+        subjects,
+        chosen,
+        out,
+        parallel=parallel,
+        threads=max(1, cores // parallel),
+        start_s=start,
+        duration_s=duration,
     )
     for finding in findings:
         typer.echo(finding)

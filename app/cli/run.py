@@ -63,7 +63,7 @@ def run(
       hemislam run walk.mcap --set ground.alpha=30 --start 10 --duration 60 --truth walk.tum
       hemislam run walk.mcap --loops edits.yaml
     """
-    from app.evaluation.truth_sources import read_poses
+    from app.evaluation.truth import read_poses
     from app.mapping.opening import open_session
     from app.slam.results import prepare_folder
     from app.slam.trajectory import time_apart, truth_beside

@@ -103,7 +103,7 @@ def serve(
 
     start_logging(json_lines=log_json)
     fork_context()  # it imports the engine while this process imports the rest
-    from app.evaluation.truth_sources import read_poses
+    from app.evaluation.truth import read_poses
     from app.mapping.session_file import SUFFIX, read_session
     from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording

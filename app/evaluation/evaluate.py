@@ -36,23 +36,21 @@ class Subject:
     compared: tuple[tuple[str, Trajectory], ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """Attributes:
-    parallel: runs at a time; each has cores / parallel threads. start_s, duration_s: the part to use.
-    """
-
-    subjects: tuple[Subject, ...]
-    variants: tuple[Variant, ...]
-    folder: Path
-    parallel: int
-    threads: int
-    start_s: float = 0.0
-    duration_s: float | None = None
-
-
-def evaluate(plan: Plan) -> tuple[list[str], dict[tuple[str, str], str]]:
+def evaluate(
+    subjects: Sequence[Subject],
+    variants: Sequence[Variant],
+    folder: Path,
+    *,
+    parallel: int,
+    threads: int,
+    start_s: float = 0.0,
+    duration_s: float | None = None,
+) -> tuple[list[str], dict[tuple[str, str], str]]:
     """Run what is not finished and write the report.
+
+    Args:
+        folder: for the report and the runs. parallel: runs at a time. threads: of each.
+        start_s, duration_s: the part of each recording to use.
 
     Returns:
         The findings, and why runs failed, by (recording, variant).
@@ -62,7 +60,7 @@ def evaluate(plan: Plan) -> tuple[list[str], dict[tuple[str, str], str]]:
     """
     jobs: dict[tuple[str, str], Job] = {}
     hashes: dict[str, str] = {}
-    for subject in plan.subjects:
+    for subject in subjects:
         with open_recording(subject.recording, subject.params) as recording:
             if subject.truth is not None:
                 check_overlap(subject.truth, recording.start_ns, recording.duration_s)
@@ -70,38 +68,33 @@ def evaluate(plan: Plan) -> tuple[list[str], dict[tuple[str, str], str]]:
         if digest is None:
             raise HemislamError(f"{subject.recording} cannot be read; check its permissions.")
         hashes[subject.name] = digest
-        for variant in plan.variants:
+        for variant in variants:
             jobs[subject.name, variant.name] = Job(
                 recording=subject.recording,
                 sha256=digest,
                 name=subject.name,
                 variant=variant.name,
                 params=variant.applied(subject.params),
-                folder=plan.folder / "runs" / subject.name / variant.name,
-                threads=plan.threads,
-                start_s=plan.start_s,
-                duration_s=plan.duration_s,
+                folder=folder / "runs" / subject.name / variant.name,
+                threads=threads,
+                start_s=start_s,
+                duration_s=duration_s,
             )
-    failures = run_jobs(list(jobs.values()), plan.parallel, plan.folder / "runs")
-    evaluated = [_evaluated(plan, subject, jobs, failures, hashes[subject.name]) for subject in plan.subjects]
-    return write_report(plan.folder, evaluated), failures
+    failures = run_jobs(list(jobs.values()), parallel, folder / "runs")
+    evaluated = []
+    for subject in subjects:
+        outcomes = [
+            Outcome(variant.name, variant.meaning, missing=failures[subject.name, variant.name])
+            if (subject.name, variant.name) in failures
+            else load(jobs[subject.name, variant.name], variant.meaning)
+            for variant in variants
+        ]
+        outcomes += [Outcome(name, "a trajectory from elsewhere", trajectory=other) for name, other in subject.compared]
+        evaluated.append(_measured(subject, hashes[subject.name], outcomes))
+    return write_report(folder, evaluated), failures
 
 
-def _evaluated(
-    plan: Plan,
-    subject: Subject,
-    jobs: dict[tuple[str, str], Job],
-    failures: dict[tuple[str, str], str],
-    sha256: str,
-) -> Evaluated:
-    outcomes: list[Outcome] = []
-    for variant in plan.variants:
-        which = (subject.name, variant.name)
-        if missing := failures.get(which, ""):
-            outcomes.append(Outcome(variant.name, variant.meaning, missing=missing))
-        else:
-            outcomes.append(load(jobs[which], variant.meaning))
-    outcomes += [Outcome(name, "a trajectory from elsewhere", trajectory=other) for name, other in subject.compared]
+def _measured(subject: Subject, sha256: str, outcomes: list[Outcome]) -> Evaluated:
     truth = subject.truth
     outcomes, matched, problem = measure(outcomes, truth)
     return Evaluated(

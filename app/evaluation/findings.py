@@ -1,11 +1,11 @@
 """What the tables show, in sentences: where they confirm the paper and where they contradict it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from app.evaluation.measured import START_S, Evaluated, Outcome
+from app.evaluation.measured import START_S, Evaluated
 
 LIKE = 0.02
 """Two values that differ by less than this share count as equal."""
@@ -36,8 +36,8 @@ def findings(recordings: Sequence[Evaluated]) -> list[str]:
                 missing.setdefault(f"{outcome.name}: {outcome.missing}", []).append(recording.name)
             elif outcome.unmeasured:
                 found.append(f"{who}: the error cannot be measured. {outcome.unmeasured}")
-            elif outcome.accuracy and outcome.accuracy.doubt:
-                found.append(f"{who}: no rotation error. {outcome.accuracy.doubt}")
+            elif doubt := outcome.value("accuracy/ate_deg_withheld"):
+                found.append(f"{who}: no rotation error. {doubt}")
             if run.get("lost"):
                 found.append(f"{who}: lost in {run['lost']} of {run['frames']} frames.")
             if run.get("dropped"):
@@ -47,41 +47,31 @@ def findings(recordings: Sequence[Evaluated]) -> list[str]:
     return [sentence for sentence in found if sentence]
 
 
-def _ate(outcome: Outcome) -> float | None:
-    return outcome.accuracy.ate_m["rmse"] if outcome.accuracy else None
-
-
-def _later(outcome: Outcome) -> float | None:
-    return outcome.accuracy.later_m if outcome.accuracy else None
-
-
-def _time(outcome: Outcome) -> float | None:
-    """CPU time, which other programs on the machine disturb least."""
-    return float(outcome.runtime["cpu"]["mean"]) if outcome.runtime else None
-
-
 @dataclass(frozen=True, slots=True)
 class _Metric:
     """Attributes:
-    where: how the names of the recordings begin that the paper speaks of.
+    path: of its value, as for `Outcome.value`. where: how the names of the recordings begin that the paper speaks of.
     promised: whether the paper found that the value falls.
     """
 
     name: str
-    value: Callable[[Outcome], float | None]
+    path: str
     unit: str
     digits: str
     where: str = ""
     promised: bool = True
 
 
+_ATE = "accuracy/ate_m/rmse"
+_CPU = "runtime_ms/cpu/mean"
+"""CPU time, which other programs on the machine disturb least."""
 _METRICS = (
-    _Metric("error (ATE)", _ate, "m", ".3g"),
-    _Metric("error (ATE) outdoors", _ate, "m", ".3g", where="outdoor"),
-    _Metric(f"error (ATE) without the first {START_S:g} s", _later, "m", ".3g"),
-    _Metric("CPU time per frame", _time, "ms", ".2f", promised=False),
+    _Metric("error (ATE)", _ATE, "m", ".3g"),
+    _Metric("error (ATE) outdoors", _ATE, "m", ".3g", where="outdoor"),
+    _Metric(f"error (ATE) without the first {START_S:g} s", "accuracy/ate_after_start_m", "m", ".3g"),
+    _Metric("CPU time per frame", _CPU, "ms", ".2f", promised=False),
     # Table 3: outdoors, where much is ground, thinning it should make up for most of what it costs
-    _Metric("CPU time per frame outdoors", _time, "ms", ".2f", where="outdoor", promised=False),
+    _Metric("CPU time per frame outdoors", _CPU, "ms", ".2f", where="outdoor", promised=False),
 )
 
 
@@ -91,7 +81,7 @@ def _claim(recordings: Sequence[Evaluated], name: str, base: str, what: str, met
     for recording in recordings:
         outcomes = {outcome.name: outcome for outcome in recording.outcomes}
         if name in outcomes and base in outcomes:
-            ours, theirs = metric.value(outcomes[name]), metric.value(outcomes[base])
+            ours, theirs = (outcomes[system].value(metric.path) for system in (name, base))
             if ours is not None and theirs is not None:
                 pairs.append((recording.name, ours, theirs))
     if not pairs:

@@ -1,7 +1,7 @@
 """What a finished run achieved: its files read back and measured against the truth."""
 
-import csv
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,36 +24,22 @@ BUDGETS_MS = (50.0, 100.0)
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """Errors against truth. Errors of rotation are None if the truth has no orientations or does not fix them.
+    """Errors against truth.
 
     Attributes:
-        ate_m, ate_deg, rpe[over]["m" | "deg"]: {"rmse", "mean", "max"}. distance_m: true length.
+        errors: what `compare` found, ratios of the RMSE to the length of the true path, and `ate_after_start_m`: the
+            RMSE of the positions after START_S, aligned without those before; None if there are too few.
         times_s, errors_m: (n,) position error of each pose after the alignment.
-        aligned: (n, 3) the estimate in the truth's world. poses: compared.
-        later_m: RMSE of the positions after START_S, aligned without those before; None if there are too few.
-        doubt: why the rotation error is withheld, in a sentence; "" if it is not.
+        aligned: (n, 3) the estimate in the truth's world.
     """
 
-    ate_m: dict[str, float]
-    ate_deg: dict[str, float] | None
-    rpe: dict[str, dict[str, Any] | None]
-    poses: int
-    distance_m: float
+    errors: dict[str, Any]
     times_s: F64
     errors_m: F64
     aligned: F64
-    later_m: float | None
-    doubt: str = ""
-
-    def errors(self) -> dict[tuple[str, str], dict[str, float] | None]:
-        """All errors by ("ATE" | "RPE over ...", "m" | "deg"), each {"rmse", "mean", "max"}."""
-        found: dict[tuple[str, str], dict[str, float] | None] = {("ATE", "m"): self.ate_m, ("ATE", "deg"): self.ate_deg}
-        for over, error in self.rpe.items():
-            found |= {(f"RPE over {over}", unit): error[unit] if error else None for unit in ("m", "deg")}
-        return found
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Outcome:
     """One variant, or another system's trajectory, on one recording.
 
@@ -74,19 +60,39 @@ class Outcome:
     unmeasured: str = ""
     crops: dict[str, U16] = field(default_factory=dict)
 
-    @property
-    def runtime(self) -> dict[str, Any] | None:
+    @cached_property
+    def results(self) -> dict[str, Any]:
+        """What results.json holds of it. Tables and findings read it by `value`."""
+        run, scores = self.run or {}, self.ground or []
+        return {
+            "variant": self.name,
+            "meaning": self.meaning,
+            "missing": self.missing or None,
+            "accuracy": self.accuracy.errors if self.accuracy else None,
+            "unmeasured": self.unmeasured or None,
+            "runtime_ms": self._runtime(),
+            "map_sharpness": run.get("map_sharpness"),
+            "ground": [asdict(s) | {"precision": s.precision, "recall": s.recall, "f1": s.f1} for s in scores] or None,
+            **{name: run.get(name) for name in ("frames", "lost", "dropped", "distance_m", "ground_share")},
+            "parameters": run.get("parameters"),
+        }
+
+    def value(self, path: str) -> Any:
+        """An entry of `results`, such as `accuracy/ate_m/rmse`; None where it or what should hold it is missing."""
+        tree: Any = self.results
+        for name in path.split("/"):
+            tree = tree.get(name) if tree else None
+        return tree
+
+    def _runtime(self) -> dict[str, Any] | None:
         """Milliseconds per frame by stage, and shares of frames within BUDGETS_MS."""
         if self.timings_ms is None or self.cpu_ms is None or self.run is None or not len(self.timings_ms):
             return None
-        total = self.timings_ms[:, -1]
         return {
-            **{stage: spread(self.timings_ms[:, index]) for index, stage in enumerate(TIMINGS)},
+            **{stage: spread(times) for stage, times in zip(TIMINGS, self.timings_ms.T, strict=True)},
             "cpu": spread(self.cpu_ms),
-            **{f"under_{budget:g}_ms": float(np.mean(total < budget)) for budget in BUDGETS_MS},
-            "peak_memory_mb": self.run["peak_memory_mb"],
-            "threads": self.run["threads"],
-            "load": self.run["load"],
+            **{f"under_{budget:g}_ms": float(np.mean(self.timings_ms[:, -1] < budget)) for budget in BUDGETS_MS},
+            **{name: self.run[name] for name in ("peak_memory_mb", "threads", "load")},
         }
 
     @property
@@ -119,9 +125,8 @@ def load(job: Job, meaning: str) -> Outcome:
     """The files of a finished job."""
     run = finished(job)
     assert run is not None
-    with (job.folder / "timings.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(file))[1:]
-    table = np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, len(TIMINGS) + 1)
+    columns = range(2, len(TIMINGS) + 3)
+    table = np.loadtxt(job.folder / "timings.csv", delimiter=",", skiprows=1, usecols=columns, ndmin=2)
     with np.load(job.folder / "crops.npz") as stored:
         crops = {name: stored[name] for name in stored.files}
     return Outcome(
@@ -165,18 +170,29 @@ def measure(outcomes: list[Outcome], truth: TruePoses | None) -> tuple[list[Outc
 def _accuracy(estimate: Trajectory, matched: Matched) -> Accuracy:
     truth = matched.trajectory
     errors = compare(estimate, truth, rotations=matched.has_rotation)
-    doubt = errors.pop("ate_deg_withheld")
     ours, theirs = paired(estimate, truth)
     T = ate(estimate, truth).T_truth_estimate
     aligned = ours.positions @ T[:3, :3].T + T[:3, 3]
     return Accuracy(
-        **errors,
+        errors=errors | ratios(errors) | {"ate_after_start_m": _later(estimate, truth)},
         times_s=(ours.stamps_ns - estimate.stamps_ns[0]) * 1e-9,
         errors_m=np.linalg.norm(aligned - theirs.positions, axis=1),
         aligned=aligned,
-        later_m=_later(estimate, truth),
-        doubt=doubt or "",
     )
+
+
+def ratios(errors: dict[str, Any]) -> dict[str, Any]:
+    """RMSE of all errors that `compare` found, divided by the length of the true path."""
+
+    def ratio(error: dict[str, float] | None) -> float | None:
+        return error["rmse"] / errors["distance_m"] if error else None
+
+    return {
+        "ate_ratio": ratio(errors["ate_m"]),
+        "ate_ratio_deg_per_m": ratio(errors["ate_deg"]),
+        "rpe_ratio": {over: error and ratio(error["m"]) for over, error in errors["rpe"].items()},
+        "rpe_ratio_deg_per_m": {over: error and ratio(error["deg"]) for over, error in errors["rpe"].items()},
+    }
 
 
 def _later(estimate: Trajectory, truth: Trajectory) -> float | None:
@@ -185,44 +201,3 @@ def _later(estimate: Trajectory, truth: Trajectory) -> float | None:
         return ate(estimate.chosen(later), truth).position.rmse
     except HemislamError:
         return None
-
-
-def as_json(outcome: Outcome) -> dict[str, Any]:
-    """What results.json holds of an outcome."""
-    run, scores = outcome.run or {}, outcome.ground
-    return {
-        "variant": outcome.name,
-        "meaning": outcome.meaning,
-        "missing": outcome.missing or None,
-        "accuracy": _accuracy_json(outcome.accuracy) if outcome.accuracy else None,
-        "unmeasured": outcome.unmeasured or None,
-        "runtime_ms": outcome.runtime,
-        "map_sharpness": run.get("map_sharpness"),
-        "ground": [
-            {**asdict(score), "precision": score.precision, "recall": score.recall, "f1": score.f1} for score in scores
-        ]
-        if scores
-        else None,
-        **{name: run.get(name) for name in ("frames", "lost", "dropped", "distance_m", "ground_share", "parameters")},
-    }
-
-
-def _accuracy_json(accuracy: Accuracy) -> dict[str, Any]:
-    """Errors, and their RMSE as ratios to the length of the true path."""
-
-    def ratio(error: dict[str, float] | None) -> float | None:
-        return error["rmse"] / accuracy.distance_m if error else None
-
-    return {
-        "ate_m": accuracy.ate_m,
-        "ate_deg": accuracy.ate_deg,
-        "ate_deg_withheld": accuracy.doubt or None,
-        "ate_after_start_m": accuracy.later_m,
-        "ate_ratio": ratio(accuracy.ate_m),
-        "rpe": accuracy.rpe,
-        "ate_ratio_deg_per_m": ratio(accuracy.ate_deg),
-        "rpe_ratio": {over: error and ratio(error["m"]) for over, error in accuracy.rpe.items()},
-        "rpe_ratio_deg_per_m": {over: error and ratio(error["deg"]) for over, error in accuracy.rpe.items()},
-        "poses": accuracy.poses,
-        "distance_m": accuracy.distance_m,
-    }

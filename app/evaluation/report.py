@@ -12,7 +12,7 @@ from app import __version__
 from app.evaluation.figures import render
 from app.evaluation.findings import findings
 from app.evaluation.job import GROUND_RANGES_M, code_digest
-from app.evaluation.measured import Evaluated, as_json
+from app.evaluation.measured import Evaluated
 from app.evaluation.pictures import CROP_NOTE, colours, pictures
 from app.evaluation.tables import make_tables
 from app.slam.errors import HemislamError
@@ -69,7 +69,7 @@ def _results(recordings: Sequence[Evaluated], machine: dict[str, Any], found: li
                 "sha256": recording.sha256,
                 "truth": recording.truth or None,
                 "notes": list(recording.notes),
-                "variants": [as_json(outcome) for outcome in recording.outcomes],
+                "variants": [outcome.results for outcome in recording.outcomes],
             }
             for recording in recordings
         ],

@@ -1,19 +1,20 @@
 """The tables of the report as plain rows. A table is a list of indicators: a label, a value, and its format."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 
 from app.evaluation import paper
 from app.evaluation.job import GROUND_RANGES_M
-from app.evaluation.measured import START_S, Accuracy, Evaluated, Outcome
+from app.evaluation.measured import START_S, Evaluated
 from app.slam.metrics import RPE_OVER, GroundScore
 from app.slam.types import TIMINGS
 
 Number = float | None
+_SPREAD = ("rmse", "mean", "max")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +42,17 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Indicator:
-    """One row of a table for each recording. `ranked`: the smallest value is the best."""
+    """One row of a table for each recording.
+
+    Attributes:
+        path: of the value, as for `Outcome.value`. scale: multiplies it. ranked: the smallest is the best.
+    """
 
     label: str
-    value: Callable[[Outcome], Number]
+    path: str
     form: str
     ranked: bool = True
+    scale: float = 1.0
 
 
 def make_tables(recordings: Sequence[Evaluated]) -> list[Table]:
@@ -58,26 +64,15 @@ def make_tables(recordings: Sequence[Evaluated]) -> list[Table]:
 
 def accuracy(recordings: Sequence[Evaluated]) -> Table:
     """As the paper's Table 2."""
-
-    def of(value: Callable[[Accuracy], Number]) -> Callable[[Outcome], Number]:
-        return lambda outcome: value(outcome.accuracy) if outcome.accuracy else None
-
-    def rpe(over: str) -> Callable[[Outcome], Number]:
-        return of(lambda a: _rmse(a, over))
-
-    def rpe_ratio(a: Accuracy) -> Number:
-        error = _rmse(a, RPE_OVER[0])
-        return None if error is None else error / a.distance_m
-
     indicators = [
-        Indicator("ATE, RMSE (m)", of(lambda a: a.ate_m["rmse"]), ".4f"),
-        Indicator("ATE, mean (m)", of(lambda a: a.ate_m["mean"]), ".4f"),
-        Indicator("ATE, max (m)", of(lambda a: a.ate_m["max"]), ".4f"),
-        Indicator(f"ATE, RMSE after {START_S:g} s (m)", of(lambda a: a.later_m), ".4f"),
-        Indicator("ATE, rotation RMSE (°)", of(lambda a: a.ate_deg["rmse"] if a.ate_deg else None), ".3f"),
-        Indicator("ATE ratio error", of(lambda a: a.ate_m["rmse"] / a.distance_m), ".2e"),
-        *(Indicator(f"RPE over {over} (m)", rpe(over), ".4f") for over in RPE_OVER),
-        Indicator("RPE ratio error", of(rpe_ratio), ".2e"),
+        Indicator("ATE, RMSE (m)", "accuracy/ate_m/rmse", ".4f"),
+        Indicator("ATE, mean (m)", "accuracy/ate_m/mean", ".4f"),
+        Indicator("ATE, max (m)", "accuracy/ate_m/max", ".4f"),
+        Indicator(f"ATE, RMSE after {START_S:g} s (m)", "accuracy/ate_after_start_m", ".4f"),
+        Indicator("ATE, rotation RMSE (°)", "accuracy/ate_deg/rmse", ".3f"),
+        Indicator("ATE ratio error", "accuracy/ate_ratio", ".2e"),
+        *(Indicator(f"RPE over {over} (m)", f"accuracy/rpe/{over}/m/rmse", ".4f") for over in RPE_OVER),
+        Indicator("RPE ratio error", f"accuracy/rpe_ratio/{RPE_OVER[0]}", ".2e"),
     ]
     names = _names(recordings)
     return Table(
@@ -94,26 +89,25 @@ def accuracy(recordings: Sequence[Evaluated]) -> Table:
 def all_errors(recordings: Sequence[Evaluated]) -> Table:
     """Every error of position and of rotation, and each as a ratio to the path length."""
     names = _names(recordings)
+    paths = {"ATE": "accuracy/ate_", **{f"RPE over {over}": f"accuracy/rpe/{over}/" for over in RPE_OVER}}
+    units = (("m", "position", "m", ".4f", ""), ("deg", "rotation", "°", ".3f", " (°/m)"))
     rows: list[TableRow] = []
     for recording in recordings:
-        measured = [outcome.accuracy if outcome else None for outcome in _by_name(recording, names)]
-        found = [a.errors() if a else {} for a in measured]
-        lengths = [a.distance_m if a else None for a in measured]
-        for of, unit in dict.fromkeys(key for entry in found for key in entry):
-            what, shown, form = {"m": ("position", "m", ".4f"), "deg": ("rotation", "°", ".3f")}[unit]
-            spreads = [entry.get((of, unit)) for entry in found]
+        lengths = _values(recording, names, "accuracy/distance_m")
+        if not any(lengths):
+            continue
+        for (of, path), (unit, what, shown, form, per_metre) in product(paths.items(), units):
+            spreads = _values(recording, names, path + unit)
             ratios = [
-                {kind: value / length for kind, value in spread.items()} if spread and length else None
+                {kind: spread[kind] / length for kind in _SPREAD} if spread and length else None
                 for spread, length in zip(spreads, lengths, strict=True)
             ]
             rows.append(_spreads(recording.name, f"{of}, {what} ({shown})", spreads, form))
             if any(ratios):
-                per_metre = " (°/m)" if unit == "deg" else ""
                 rows.append(_spreads(recording.name, f"{of}, {what} / path length{per_metre}", ratios, ".2e"))
-        if any(lengths):
-            poses = [float(a.poses) if a else None for a in measured]
-            rows.append(_row(recording.name, "true path length (m)", lengths, ".2f", ranked=False))
-            rows.append(_row(recording.name, "poses compared", poses, ".0f", ranked=False))
+        rows.append(_row(recording.name, "true path length (m)", lengths, ".2f", ranked=False))
+        poses = _values(recording, names, "accuracy/poses")
+        rows.append(_row(recording.name, "poses compared", poses, ".0f", ranked=False))
     return Table(
         "All errors, RMSE / mean / max",
         names,
@@ -127,21 +121,17 @@ def all_errors(recordings: Sequence[Evaluated]) -> Table:
 
 def runtime(recordings: Sequence[Evaluated]) -> Table:
     """As the paper's Table 3."""
-
-    def of(*path: str, scale: float = 1.0) -> Callable[[Outcome], Number]:
-        return lambda outcome: scale * _at(outcome.runtime, *path) if outcome.runtime else None
-
     indicators = [
-        Indicator("median (ms)", of("total", "median"), ".2f"),
-        Indicator("95 % (ms)", of("total", "p95"), ".2f"),
-        Indicator("max (ms)", of("total", "max"), ".2f", ranked=False),
-        Indicator("mean (ms)", of("total", "mean"), ".2f"),
-        Indicator("CPU time per frame, mean (ms)", of("cpu", "mean"), ".2f"),
-        Indicator("under 50 ms (%)", of("under_50_ms", scale=100), ".1f", ranked=False),
-        Indicator("under 100 ms (%)", of("under_100_ms", scale=100), ".1f", ranked=False),
-        Indicator("peak memory (MB)", of("peak_memory_mb"), ".0f", ranked=False),
+        Indicator("median (ms)", "runtime_ms/total/median", ".2f"),
+        Indicator("95 % (ms)", "runtime_ms/total/p95", ".2f"),
+        Indicator("max (ms)", "runtime_ms/total/max", ".2f", ranked=False),
+        Indicator("mean (ms)", "runtime_ms/total/mean", ".2f"),
+        Indicator("CPU time per frame, mean (ms)", "runtime_ms/cpu/mean", ".2f"),
+        Indicator("under 50 ms (%)", "runtime_ms/under_50_ms", ".1f", ranked=False, scale=100),
+        Indicator("under 100 ms (%)", "runtime_ms/under_100_ms", ".1f", ranked=False, scale=100),
+        Indicator("peak memory (MB)", "runtime_ms/peak_memory_mb", ".0f", ranked=False),
     ]
-    times = [outcome.runtime for recording in recordings for outcome in recording.outcomes if outcome.runtime]
+    times = [time for r in recordings for outcome in r.outcomes if (time := outcome.value("runtime_ms"))]
     threads = " or ".join(str(number) for number in sorted({time["threads"] for time in times}))
     names = _names(recordings, run=True)
     return Table(
@@ -160,7 +150,7 @@ def stages(recordings: Sequence[Evaluated]) -> Table:
     rows = []
     for recording in recordings:
         for outcome in recording.outcomes:
-            if time := outcome.runtime:
+            if time := outcome.value("runtime_ms"):
                 cells = (
                     " / ".join(f"{time[stage][what]:.2f}" for what in ("median", "p95", "max")) for stage in TIMINGS
                 )
@@ -170,18 +160,11 @@ def stages(recordings: Sequence[Evaluated]) -> Table:
 
 
 def map_sharpness(recordings: Sequence[Evaluated]) -> Table:
-    def of(name: str, scale: float = 1.0) -> Callable[[Outcome], Number]:
-        def value(outcome: Outcome) -> Number:
-            number = outcome.run["map_sharpness"][name] if outcome.run else None
-            return None if number is None else scale * number
-
-        return value
-
     indicators = [
-        Indicator("mean map entropy (nats)", of("entropy"), ".3f"),
-        Indicator("plane thickness (mm)", of("thickness", 1e3), ".1f"),
-        Indicator("revisit gap, median (mm)", of("revisit_median", 1e3), ".1f"),
-        Indicator("revisit gap, 95 % (mm)", of("revisit_p95", 1e3), ".1f"),
+        Indicator("mean map entropy (nats)", "map_sharpness/entropy", ".3f"),
+        Indicator("plane thickness (mm)", "map_sharpness/thickness", ".1f", scale=1e3),
+        Indicator("revisit gap, median (mm)", "map_sharpness/revisit_median", ".1f", scale=1e3),
+        Indicator("revisit gap, 95 % (mm)", "map_sharpness/revisit_p95", ".1f", scale=1e3),
     ]
     names = _names(recordings, run=True)
     return Table(
@@ -211,24 +194,23 @@ def ground(recordings: Sequence[Evaluated]) -> Table:
 
 def beside_paper(recordings: Sequence[Evaluated]) -> Table:
     """Ours and the paper's own, for the simulated twins of its sequences."""
-
-    def of_paper(values: dict[str, float]) -> Callable[[Outcome], Number]:
-        return lambda outcome: values.get(outcome.name)
-
     names = ("FAST-LIO", "FAST-LIO-GD", "FAST-LIO-L", "Ours")
     rows: list[TableRow] = []
     for recording in recordings:
         if (sequence := paper.SEQUENCES.get(recording.name.partition("-")[0])) is None:
             continue
-        indicators = [
-            Indicator("ATE (m), here", lambda o: o.accuracy.ate_m["rmse"] if o.accuracy else None, ".4f"),
-            Indicator("ATE (m), paper", of_paper(sequence.ate_m), ".2f"),
-            Indicator("RPE (m), here, per frame", lambda o: _rmse(o.accuracy, RPE_OVER[0]), ".4f"),
-            Indicator("RPE (m), paper", of_paper(sequence.rpe_m), ".2f"),
-            Indicator("ms per frame, here", lambda o: _at(o.runtime, "total", "median"), ".1f"),
-            Indicator("ms per frame, paper", of_paper(sequence.runtime_ms), ".1f"),
-        ]
-        rows += _rows([recording], names, indicators)
+        run = {outcome.name for outcome in recording.outcomes}
+        for label, path, form, theirs, their_label, their_form in (
+            ("ATE (m), here", "accuracy/ate_m/rmse", ".4f", sequence.ate_m, "ATE (m), paper", ".2f"),
+            (
+                "RPE (m), here, per frame", f"accuracy/rpe/{RPE_OVER[0]}/m/rmse", ".4f",
+                sequence.rpe_m, "RPE (m), paper", ".2f",
+            ),
+            ("ms per frame, here", "runtime_ms/total/median", ".1f", sequence.runtime_ms, "ms per frame, paper", ".1f"),
+        ):  # fmt: skip
+            rows += _rows([recording], names, [Indicator(label, path, form)])
+            values = [theirs.get(name) if name in run else None for name in names]
+            rows += [_row(recording.name, their_label, values, their_form)] if any(values) else []
     return Table("Beside the paper", names, rows, paper.NOT_COMPARABLE)
 
 
@@ -238,20 +220,20 @@ def _names(recordings: Iterable[Evaluated], *, run: bool = False) -> tuple[str, 
     return tuple(dict.fromkeys(o.name for o in outcomes if not run or o.run is not None or o.missing))
 
 
-def _by_name(recording: Evaluated, names: Sequence[str]) -> list[Outcome | None]:
+def _values(recording: Evaluated, names: Sequence[str], path: str) -> list[Any]:
+    """The value of each named outcome; None where there is none."""
     outcomes = {outcome.name: outcome for outcome in recording.outcomes}
-    return [outcomes.get(name) for name in names]
+    return [outcomes[name].value(path) if name in outcomes else None for name in names]
 
 
 def _rows(recordings: Iterable[Evaluated], names: Sequence[str], indicators: Sequence[Indicator]) -> list[TableRow]:
     """A row for each recording and indicator that has a value."""
     rows = []
-    for recording in recordings:
-        outcomes = _by_name(recording, names)
-        for indicator in indicators:
-            values = [indicator.value(outcome) if outcome else None for outcome in outcomes]
-            if any(value is not None for value in values):
-                rows.append(_row(recording.name, indicator.label, values, indicator.form, ranked=indicator.ranked))
+    for recording, indicator in product(recordings, indicators):
+        found = _values(recording, names, indicator.path)
+        values = [None if value is None else indicator.scale * value for value in found]
+        if any(value is not None for value in values):
+            rows.append(_row(recording.name, indicator.label, values, indicator.form, ranked=indicator.ranked))
     return rows
 
 
@@ -267,20 +249,5 @@ def _row(group: str, label: str, values: Sequence[Number], form: str, *, ranked:
 def _spreads(group: str, label: str, spreads: Sequence[dict[str, float] | None], form: str) -> TableRow:
     """RMSE, mean and maximum in one cell; ranked by the RMSE."""
     ranked = _row(group, label, [spread["rmse"] if spread else None for spread in spreads], form)
-    cells = (
-        " / ".join(format(spread[kind], form) for kind in ("rmse", "mean", "max")) if spread else "–"
-        for spread in spreads
-    )
+    cells = (" / ".join(format(spread[kind], form) for kind in _SPREAD) if spread else "–" for spread in spreads)
     return replace(ranked, cells=tuple(cells))
-
-
-def _rmse(accuracy: Accuracy | None, over: str) -> Number:
-    """RMSE of the relative position error, m."""
-    error = accuracy.rpe[over] if accuracy else None
-    return float(error["m"]["rmse"]) if error else None
-
-
-def _at(tree: Any, *path: str) -> Any:
-    for name in path:
-        tree = tree[name] if tree else None
-    return tree

@@ -1,15 +1,38 @@
-"""True poses as they were read, and the checks that every one of them passes."""
+"""True poses from files (TUM, KITTI, the GNSS/INS table of H2LID) and from topics of a recording, checked."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from app.sensors.source import Source
 from app.slam.errors import HemislamError
-from app.slam.trajectory import time_apart
+from app.slam.text_tables import as_numbers, read_rows
+from app.slam.trajectory import Trajectory, read_tum, time_apart
 from app.slam.types import F64, I64
 
 JUMP_M, JUMP_M_S, JUMP_TIMES = 1.0, 15.0, 5.0
 """A step over both limits, and so many times faster than those around it, is a jump of the frame, not a motion."""
+GNSS_COLUMNS = 13
+H2LID_LEVER = (-0.034, -0.283, 0.342)
+"""m from the IMU to the GNSS antenna; x right, y forward, z up (README of the data set)."""
+_FORMATS = (
+    "TUM has 8 columns (stamp x y z qx qy qz qw), KITTI 12 (a 3x4 matrix), the GNSS/INS table of H2LID 13"
+    " (GPSTime Easting Northing Height Heading Pitch Roll Latitude Longitude VEast VNorth VUp Q)"
+)
+_EARTH_A, _EARTH_E2 = 6_378_137.0, 6.694379990141316e-3
+"""WGS84: m, and squared eccentricity."""
+
+_POSES: dict[str, Callable[[Any], Any]] = {
+    "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
+    "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
+}
+_FIX = "sensor_msgs/msg/NavSatFix"
+TYPES = (*_POSES, _FIX)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,3 +91,162 @@ def check_overlap(truth: TruePoses, begin_ns: int, duration_s: float) -> None:
         return
     if apart := time_apart(truth.source, truth.stamps_ns, begin_ns, duration_s):
         raise HemislamError(apart)
+
+
+def read_truth(text: str, recording: Path | None = None, lever: tuple[float, float, float] | None = None) -> TruePoses:
+    """Read a file, or `topic:/name` in the recording; `lever` replaces the lever arm that the format implies.
+
+    Raises:
+        HemislamError: it cannot be read, is not what it should be, or jumps.
+    """
+    if text.startswith("topic:"):
+        if recording is None:
+            raise HemislamError(f"`--truth {text}` names a topic, but there is no recording to read it from.")
+        truth = _read_topic(recording, text.removeprefix("topic:"))
+    else:
+        truth = _read_file(Path(text))
+    if lever is not None:
+        truth = replace(truth, lever=lever)
+    check(truth)
+    return truth
+
+
+def read_poses(path: Path) -> Trajectory:
+    """A TUM file of poses of the IMU itself. Raises HemislamError as `read_truth`."""
+    poses = read_tum(path)
+    check(TruePoses(f"The truth {path}", "TUM", poses.stamps_ns, poses.positions, poses.quaternions))
+    return poses
+
+
+def _read_file(path: Path) -> TruePoses:
+    """Read a truth file. The number of columns tells its format.
+
+    Raises:
+        HemislamError: it cannot be read, or is none of the formats, or holds NaN.
+    """
+    rows = read_rows(path, _FORMATS)
+    if rows and rows[0][1][0].lower().startswith("gpstime"):
+        rows = rows[1:]  # the table's heading
+    if not rows:
+        raise HemislamError(f"The truth {path} holds no poses; {_FORMATS}.")
+    columns = len(rows[0][1])
+    if columns == 8:
+        trajectory = read_tum(path)
+        return TruePoses(f"The truth {path}", "TUM", trajectory.stamps_ns, trajectory.positions, trajectory.quaternions)
+    if columns == 12:
+        return _kitti(path, as_numbers(path, rows, 12, _FORMATS))
+    if columns == GNSS_COLUMNS:
+        return _gnss(path, as_numbers(path, rows, GNSS_COLUMNS, _FORMATS))
+    raise HemislamError(f"{path}, line {rows[0][0]} has {columns} columns; {_FORMATS}.")
+
+
+def _kitti(path: Path, table: F64) -> TruePoses:
+    """Rows of a 3x4 matrix T_world_body. Their times are in `<stem>_times.txt` or `times.txt` beside it, if any."""
+    poses = table.reshape(-1, 3, 4)
+    rotations = poses[:, :, :3]
+    odd = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 0.01
+    odd |= np.linalg.det(rotations) < 0
+    if odd.any():
+        raise HemislamError(
+            f"{path}, pose {int(np.argmax(odd)) + 1}: the left 3x3 of its 3x4 matrix is not a rotation; KITTI's rows"
+            " are r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz."
+        )
+    stamps = None
+    for beside in (path.with_name(f"{path.stem}_times.txt"), path.with_name("times.txt")):
+        if beside.is_file():
+            stamps = _times(beside, len(poses))
+            break
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    # Times that count from zero are not a date: the clock is the truth's own.
+    own = stamps is not None and bool(stamps[0] < 1e17)
+    return TruePoses(f"The truth {path}", "KITTI", stamps, poses[:, :, 3].copy(), quaternions, own_clock=own)
+
+
+def _times(path: Path, poses: int) -> I64:
+    layout = "it holds one time per line, in seconds"
+    seconds = as_numbers(path, read_rows(path, layout), 1, layout)[:, 0]
+    if len(seconds) != poses:
+        raise HemislamError(f"{path} holds {len(seconds)} times for {poses} poses; there must be one per pose.")
+    return np.rint(seconds * 1e9).astype(np.int64)
+
+
+def _gnss(path: Path, table: F64) -> TruePoses:
+    """Seconds of the GPS week, grid coordinates, and heading (clockwise from north), pitch, roll in degrees.
+
+    The body has x right, y forward, z up; the world is east, north, up.
+    """
+    seconds, positions, (heading, pitch, roll) = table[:, 0], table[:, 1:4], table[:, 4:7].T
+    if (seconds < 0).any() or (seconds > 604_800).any():
+        raise HemislamError(f"The first column of {path} is not in seconds of the GPS week (0 to 604800).")
+    rotations = Rotation.from_euler("ZXY", np.column_stack([-heading, pitch, roll]), degrees=True)
+    return TruePoses(
+        f"The truth {path}",
+        "GNSS/INS (seconds of the GPS week, grid coordinates)",
+        np.rint(seconds * 1e9).astype(np.int64),
+        positions - positions[0],  # grid coordinates are millions of metres
+        rotations.as_quat(),
+        own_clock=True,
+        own_axes=True,
+        lever=H2LID_LEVER,
+    )
+
+
+def _read_topic(recording: Path, topic: str) -> TruePoses:
+    """All poses of a topic.
+
+    Raises:
+        HemislamError: there is no such topic, or it holds no poses.
+    """
+    with Source(recording) as source:
+        kinds = {entry.name: entry.type for entry in source.topics}
+        if topic not in kinds:
+            usable = [name for name, kind in kinds.items() if kind in TYPES]
+            hint = f"it has {', '.join(usable)}" if usable else "none of its topics holds poses or fixes"
+            raise HemislamError(f"{recording} has no topic {topic} to take as truth; {hint}.")
+        kind = kinds[topic]
+        if kind not in TYPES:
+            raise HemislamError(
+                f"Topic {topic} is of type {kind}, which is not a truth; use one of type {', '.join(TYPES)}."
+            )
+        stamps, rows = [], []
+        for _, _, message in source.messages((topic,)):
+            row = _fix(message) if kind == _FIX else _pose(_POSES[kind](message))
+            if row is not None:
+                stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+                rows.append(row)
+    table = np.array(rows, dtype=np.float64)
+    stamps_ns = np.array(stamps, dtype=np.int64)
+    name = f"Topic {topic}"
+    if not len(table):
+        raise HemislamError(f"Topic {topic} of {recording} holds no usable pose.")
+    if kind == _FIX:
+        return TruePoses(name, "satellite fixes", stamps_ns, _east_north_up(table), None)
+    lengths = np.linalg.norm(table[:, 3:], axis=1)
+    if not (np.abs(lengths - 1) <= 0.01).all():  # also refuses nan
+        raise HemislamError(
+            f"Topic {topic} holds orientations that are not unit quaternions; it cannot be used as truth."
+        )
+    return TruePoses(name, "poses of a topic", stamps_ns, table[:, :3], table[:, 3:], own_axes=True)
+
+
+def _pose(pose: Any) -> list[float]:
+    p, q = pose.position, pose.orientation
+    return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+
+
+def _fix(message: Any) -> list[float] | None:
+    """Latitude and longitude in degrees, height in m; None if there was no fix."""
+    row = [message.latitude, message.longitude, message.altitude]
+    return row if message.status.status >= 0 and np.isfinite(row).all() else None
+
+
+def _east_north_up(fixes: F64) -> F64:
+    """Geodetic (n, 3) degrees, degrees, m on WGS84 to metres east, north, up of the first."""
+    latitude, longitude = np.radians(fixes[:, 0]), np.radians(fixes[:, 1])
+    radius = _EARTH_A / np.sqrt(1 - _EARTH_E2 * np.sin(latitude) ** 2)
+    flat = (radius + fixes[:, 2]) * np.cos(latitude)
+    z = (radius * (1 - _EARTH_E2) + fixes[:, 2]) * np.sin(latitude)
+    earth = np.column_stack([flat * np.cos(longitude), flat * np.sin(longitude), z])
+    s, c, sl, cl = np.sin(latitude[0]), np.cos(latitude[0]), np.sin(longitude[0]), np.cos(longitude[0])
+    R_enu_earth = np.array([[-sl, cl, 0.0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
+    return np.asarray((earth - earth[0]) @ R_enu_earth.T)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.evaluation.measured import Accuracy, Evaluated, Outcome
+from app.evaluation.measured import Accuracy, Evaluated, Outcome, ratios
 from app.evaluation.report import write_report
 from app.slam.types import TIMINGS
 
@@ -27,18 +27,16 @@ def column(name: str, size: float, *, bent: bool = True) -> Outcome:
         over: {"pairs": 9, "m": spread(size * k), "deg": spread(10 * size * k)}
         for k, over in ((0.1, "1 frame"), (0.2, "1 m"), (0.5, "10 m"))
     }
-    accuracy = Accuracy(
-        ate_m=spread(size),
-        ate_deg=spread(20 * size) if bent else None,
-        rpe=rpe | {"50 m": None},
-        poses=100,
-        distance_m=LENGTH_M,
-        times_s=np.arange(2.0),
-        errors_m=np.ones(2),
-        aligned=np.zeros((2, 3)),
-        later_m=size,
-        doubt="" if bent else "It lies on one straight line.",
-    )
+    errors = {
+        "ate_m": spread(size),
+        "ate_deg": spread(20 * size) if bent else None,
+        "ate_deg_withheld": None if bent else "It lies on one straight line.",
+        "rpe": rpe | {"50 m": None},
+        "poses": 100,
+        "distance_m": LENGTH_M,
+        "ate_after_start_m": size,
+    }
+    accuracy = Accuracy(errors | ratios(errors), times_s=np.arange(2.0), errors_m=np.ones(2), aligned=np.zeros((2, 3)))
     run = {
         "peak_memory_mb": 100.0, "threads": 1, "load": 0.5, "ground": None, "parameters": {},
         "map_sharpness": dict.fromkeys(("entropy", "thickness", "revisit_median", "revisit_p95")),

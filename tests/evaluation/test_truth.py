@@ -10,10 +10,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from app.evaluation.alignment import find_offset
-from app.evaluation.truth import TruePoses, check_overlap
-from app.evaluation.truth_match import match
-from app.evaluation.truth_sources import H2LID_LEVER, read_truth
+from app.evaluation.truth import H2LID_LEVER, TruePoses, check_overlap, read_truth
+from app.evaluation.truth_match import find_offset, match
 from app.slam.errors import HemislamError
 from app.slam.metrics import ate, rpe
 from app.slam.trajectory import Trajectory, write_tum
