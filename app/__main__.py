@@ -95,18 +95,10 @@ def info(
       hemislam info walk.mcap
       hemislam info indoor1.bag --preset h2lid
     """
-    from tqdm import tqdm
-
     from app.sensors.doctor import DAMAGE, examine
 
     params = options.resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
-    with tqdm(
-        total=1.0, desc="Reading", leave=False, disable=None, bar_format="{desc}: {percentage:3.0f}% |{bar}|"
-    ) as bar:
-
-        def show(fraction: float) -> None:
-            bar.update(fraction - bar.n)
-
+    with options.progress_bar("Reading", total=1.0, bar_format="{desc}: {percentage:3.0f}% |{bar}|") as show:
         findings = examine(recording, params, progress=show)
     width = max((len(finding.subject) for finding in findings), default=0)
     for finding in findings:
@@ -158,8 +150,6 @@ def simulate(
       hemislam simulate room --out small.mcap --duration 20 --every-block 6
       hemislam simulate --suite paper --out suite/
     """
-    from tqdm import tqdm
-
     from app.cli.suite import make_suite
     from app.sensors.simulator import SCENES, simulate
 
@@ -177,12 +167,7 @@ def simulate(
         raise HemislamError(f"Name a SCENE, one of {', '.join(SCENES)}, or use --suite paper.")
     if out.exists() and not force:
         raise HemislamError(f"{out} exists already; choose another --out, or add --force to replace it.")
-    with tqdm(desc="Simulating", unit=" scans", leave=False, disable=None) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with options.progress_bar("Simulating", unit=" scans") as show:
         made = simulate(
             scene,
             out,

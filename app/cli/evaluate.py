@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic, Preset, Start, resolve
+from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic, Preset, Start, make_folder, resolve
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def evaluate(
         raise HemislamError("--short and --seed belong to --suite; with a RECORDING, --duration shortens it.")
     chosen = choose_variants([parse_variant(text) for text in variants or []], ablation=ablation)
     paths = list(recordings or [])
-    _make_folder(out)
+    make_folder(out)
     if suite is not None:
         paths += make_suite(suite, out / "recordings", seeds or [0], short=short)
     if not paths:
@@ -126,13 +126,6 @@ def evaluate(
     if failures:
         (recording, name), why = next(iter(failures.items()))
         raise HemislamError(f"{len(failures)} of {len(chosen) * len(subjects)} runs failed; {recording}, {name}: {why}")
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HemislamError(f"The folder {folder} cannot be created: {error.strerror}; choose another one.") from None
 
 
 def _names(paths: list[Path]) -> list[str]:

@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic, Preset, RecordingPath, resolve
+from app.cli.options import (
+    Assignments,
+    Config,
+    Duration,
+    ImuTopic,
+    LidarTopic,
+    Preset,
+    RecordingPath,
+    progress_bar,
+    resolve,
+)
 from app.slam.errors import HemislamError
 
 
@@ -40,8 +50,6 @@ def feed(
       hemislam feed walk.mcap --to rsbpearl://127.0.0.1:6699,7788 --imu-to imu-udp://127.0.0.1:6700
       hemislam feed walk.mcap --to foxglove://127.0.0.1:8765 --speed 2
     """
-    from tqdm import tqdm
-
     from app.sensors.live.feed import Pace
     from app.sensors.live.feed import feed as play
     from app.sensors.live.urls import parse_address
@@ -59,11 +67,7 @@ def feed(
         typer.echo(f"IMU samples go to imu-udp://{target.host}:{beside.ports[0]}")
     if target.scheme == "foxglove":
         typer.echo(f"Waiting at {to} for a receiver; Ctrl+C ends it.")
-    with tqdm(desc="Playing", unit=" s", leave=False, disable=None, bar_format="{desc}: {n:.1f} s") as bar:
-
-        def show(seconds: float) -> None:
-            bar.update(seconds - bar.n)
-
+    with progress_bar("Playing", bar_format="{desc}: {n:.1f} s") as show:
         count = play(
             recording, params, target, beside, pace=Pace(speed or math.inf, progress=show), duration_s=duration
         )

@@ -1,10 +1,14 @@
-"""Options that several commands share, and what becomes of them."""
+"""What several commands share: options, what becomes of them, and a progress bar."""
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
     from app.slam.params import Params
@@ -59,3 +63,26 @@ def resolve(
     topics = {"recording.lidar_topic": lidar_topic, "recording.imu_topic": imu_topic}
     flags = [f"{name}={json.dumps(topic)}" for name, topic in topics.items() if topic is not None]
     return resolve_params(recording, preset, config, [*(assignments or []), *flags])
+
+
+@contextmanager
+def progress_bar(description: str, **options: Any) -> Iterator[Callable[..., None]]:
+    """A bar on stderr that goes away at the end, as a function of what is done and, once that is known, of how much
+    there is to do. `options` are those of tqdm."""
+    from tqdm import tqdm
+
+    with tqdm(desc=description, leave=False, disable=None, **options) as bar:
+
+        def show(done: float, total: float | None = None) -> None:
+            bar.total = bar.total if total is None else total
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def make_folder(folder: Path) -> None:
+    """Raises HemislamError if the folder cannot be created."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HemislamError(f"The folder {folder} cannot be created: {error.strerror}; choose another one.") from None

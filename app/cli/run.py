@@ -17,6 +17,7 @@ from app.cli.options import (
     RecordingPath,
     Start,
     Truth,
+    progress_bar,
     resolve,
 )
 from app.slam.errors import HemislamError
@@ -146,18 +147,11 @@ def free_folder(recording: Path) -> Path:
 
 def compile_behind_bar() -> None:
     """Compile the kernels behind a progress bar; a moment only, once they are in the cache."""
-    from tqdm import tqdm
-
     from app.slam.warmup import compile_kernels
 
     bar_format = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}"
-    with tqdm(total=1.0, desc="Compiling, first start only", leave=False, disable=None, bar_format=bar_format) as bar:
-
-        def show(name: str, fraction: float) -> None:
-            bar.n = fraction
-            bar.set_postfix_str(name)
-
-        compile_kernels(show)
+    with progress_bar("Compiling, first start only", total=1.0, bar_format=bar_format) as show:
+        compile_kernels(lambda name, fraction: show(fraction))
 
 
 def process(session: "Session", *, until: int | None = None) -> BaseException | None:

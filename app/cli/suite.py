@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from app.slam.errors import HemislamError
+from app.cli.options import make_folder, progress_bar
 
 
 def make_suite(
@@ -15,24 +15,14 @@ def make_suite(
     Raises:
         HemislamError: there is no such suite, or the recordings cannot be written.
     """
-    from tqdm import tqdm
-
     from app.sensors.simulator.suite import find_suite, make_twin
 
     twins = find_suite(name)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HemislamError(f"The folder {folder} cannot be created: {error.strerror}; choose another one.") from None
+    make_folder(folder)
     recordings = []
     for seed in seeds:
         for twin in twins:
-            with tqdm(desc=f"{twin.scene}, seed {seed}", unit=" scans", leave=False, disable=None) as bar:
-
-                def show(done: int, total: int, bar: "tqdm[None]" = bar) -> None:  # type: ignore[assignment]
-                    bar.total = total
-                    bar.update(done - bar.n)
-
+            with progress_bar(f"{twin.scene}, seed {seed}", unit=" scans") as show:
                 made = make_twin(twin, folder, seed=seed, short=short, every_block=every_block, progress=show)
             state = "made" if made.new else "exists already"
             typer.echo(f"{made.recording}: {made.distance_m:.1f} m walked, {state}")

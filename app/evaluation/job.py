@@ -140,7 +140,7 @@ def _facts(job: Job, session: Session, ground: list[GroundScore], memory_mb: flo
         "dropped": dict(log.dropped.most_common()),
         "distance_m": session.map_frame.trajectory(log.odometry).distance,
         "loops": None if session.loops is None else session.loops.accepted,
-        "ground_share": log.ground_points / log.points if log.points else None,
+        "ground_share": log.ground_share,
         "ground": None if log.ground_score is None else [asdict(score) for score in ground],
         "peak_memory_mb": memory_mb,
         "threads": job.threads,

@@ -19,41 +19,35 @@ class Sequence:
 
 
 _SYSTEMS = ("LOAM", "LIOM", "FAST-LIO", "FAST-LIO-GD", "FAST-LIO-L", "Ours")
-
-
-def _times(fast_lio: float, ours: float) -> dict[str, float]:
-    return {"FAST-LIO": fast_lio, "Ours": ours}
-
-
-def _errors(*values: float) -> dict[str, float]:
-    return dict(zip(_SYSTEMS, values, strict=True))
-
+_ATE_M = {
+    "outdoor_3": (35.55, 32.98, 5.04, 4.53, 3.47, 3.45),
+    "outdoor_4": (30.22, 1.25, 2.20, 0.85, 2.67, 0.87),
+}
+_RPE_M = {"outdoor_3": (0.31, 0.25, 0.19, 0.18, 0.19, 0.18), "outdoor_4": (0.24, 0.32, 0.16, 0.03, 0.09, 0.03)}
+"""In the order of _SYSTEMS. The paper gives errors only for the two sequences with GNSS."""
+_TABLES_1_AND_3 = {
+    "indoor_1": (2266, 226.63, 218.39, 28.97, 35.81),
+    "indoor_2": (1252, 125.29, 54.63, 27.33, 34.11),
+    "outdoor_1": (3306, 330.72, 335.59, 33.93, 33.46),
+    "outdoor_2": (3414, 341.45, 422.25, 32.89, 33.88),
+    "outdoor_3": (9530, 953.00, 869.16, 21.47, 24.36),
+    "outdoor_4": (5667, 566.75, 573.64, 19.24, 21.17),
+}
+"""Frames, duration in s, length in m; ms per frame of FAST-LIO and of Ours."""
 
 SEQUENCES: dict[str, Sequence] = {
-    "indoor_1": Sequence("Indoor 1", 2266, 226.63, 218.39, {}, {}, _times(28.97, 35.81)),
-    "indoor_2": Sequence("Indoor 2", 1252, 125.29, 54.63, {}, {}, _times(27.33, 34.11)),
-    "outdoor_1": Sequence("Outdoor 1", 3306, 330.72, 335.59, {}, {}, _times(33.93, 33.46)),
-    "outdoor_2": Sequence("Outdoor 2", 3414, 341.45, 422.25, {}, {}, _times(32.89, 33.88)),
-    "outdoor_3": Sequence(
-        "Outdoor 3",
-        9530,
-        953.00,
-        869.16,
-        _errors(35.55, 32.98, 5.04, 4.53, 3.47, 3.45),
-        _errors(0.31, 0.25, 0.19, 0.18, 0.19, 0.18),
-        _times(21.47, 24.36),
-    ),
-    "outdoor_4": Sequence(
-        "Outdoor 4",
-        5667,
-        566.75,
-        573.64,
-        _errors(30.22, 1.25, 2.20, 0.85, 2.67, 0.87),
-        _errors(0.24, 0.32, 0.16, 0.03, 0.09, 0.03),
-        _times(19.24, 21.17),
-    ),
+    name: Sequence(
+        name.replace("_", " ").capitalize(),
+        frames,
+        duration_s,
+        length_m,
+        ate_m=dict(zip(_SYSTEMS, _ATE_M.get(name, ()), strict=False)),
+        rpe_m=dict(zip(_SYSTEMS, _RPE_M.get(name, ()), strict=False)),
+        runtime_ms={"FAST-LIO": fast_lio, "Ours": ours},
+    )
+    for name, (frames, duration_s, length_m, fast_lio, ours) in _TABLES_1_AND_3.items()
 }
-"""By the name of our simulated twin. The paper gives errors only for the two sequences with GNSS."""
+"""By the name of our simulated twin."""
 
 NOT_COMPARABLE = (
     "The paper ran LOAM, LIOM and FAST-LIO on real recordings, on an Intel i7-8565U. Ours are simulated twins with the"

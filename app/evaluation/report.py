@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from app import __version__
-from app.evaluation.figures import render
+from app.evaluation.figures import CROP_NOTE, colours, pictures, render
 from app.evaluation.findings import findings
 from app.evaluation.job import GROUND_RANGES_M, code_digest
 from app.evaluation.measured import Evaluated
-from app.evaluation.pictures import CROP_NOTE, colours, pictures
 from app.evaluation.tables import make_tables
 from app.slam.errors import HemislamError
 from app.slam.provenance import describe_machine

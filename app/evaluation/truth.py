@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from app.sensors.source import Source
 from app.slam.errors import HemislamError
-from app.slam.text_tables import as_numbers, read_rows
 from app.slam.trajectory import Trajectory, read_tum, time_apart
 from app.slam.types import F64, I64
+from app.slam.user_text import as_numbers, read_rows
 
 JUMP_M, JUMP_M_S, JUMP_TIMES = 1.0, 15.0, 5.0
 """A step over both limits, and so many times faster than those around it, is a jump of the frame, not a motion."""

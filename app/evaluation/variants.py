@@ -7,7 +7,7 @@ from typing import Any
 
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.yaml_text import read_assignments
+from app.slam.user_text import read_assignments
 
 LOOPS = "loops.enabled"
 

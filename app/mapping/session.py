@@ -39,7 +39,7 @@ class Checkpoint:
     """A session after a frame. The frames themselves are in the session's log."""
 
     frame: int
-    engine: engine.Checkpoint
+    engine: engine.EngineState
     place: Any
 
 

@@ -16,17 +16,29 @@ from app.slam.voxel import VoxelGrid, spread
 
 
 @dataclass(frozen=True, slots=True)
-class Checkpoint:
+class Progress:
+    """What one frame hands to the next, besides the map.
+
+    Attributes:
+        frame: index of the next one. belief: None until the start is over. still: samples of the rest so far.
+        T_odom_keyframe: T_odom_imu of the last keyframe.
+    """
+
+    frame: int = 0
+    belief: Belief | None = None
+    still: ImuSamples | None = None
+    status: FrameStatus = FrameStatus.INITIALISING
+    T_odom_keyframe: F64 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EngineState:
     """All that the engine's future depends on. Restoring it restores every later result exactly."""
 
     params: Params
-    frame: int
-    belief: Belief | None
-    still: ImuSamples | None
-    status: FrameStatus
+    progress: Progress
     map: MapState
     keyframes: int
-    T_odom_keyframe: F64 | None
 
 
 class Engine:
@@ -49,22 +61,18 @@ class Engine:
         self.keyframes = KeyframeStore() if keyframes is None else keyframes
         self._map = LocalMap(params.map)
         self._grid = VoxelGrid()
-        self._belief: Belief | None = None  # None until the start is over
-        self._still: ImuSamples | None = None
-        self._status = FrameStatus.INITIALISING
-        self._frame = 0
-        self._T_odom_keyframe: F64 | None = None  # the last one's T_odom_imu
+        self._progress = Progress()
 
     def step(self, scan: Scan, samples: ImuSamples) -> StepResult:
         """Process one scan with the samples that cover the time from the previous scan's end to its own."""
-        p, watch = self.params, _Stopwatch()
+        p, before, watch = self.params, self._progress, _Stopwatch()
         end_ns, notices = scan.end_ns, []
         scan = _in_range(scan, p.sensor.min_range, p.sensor.max_range)
 
-        belief, waiting = self._belief, False
+        belief, still, waiting = before.belief, before.still, False
         if belief is None:
-            started = start.proceed(self._still, scan, samples, p)
-            belief, waiting, self._still = started.belief, started.waiting, started.still
+            started = start.proceed(still, scan, samples, p)
+            belief, still, waiting = started.belief, started.still, started.waiting
             notices += [started.notice] if started.notice else []
         predicted, path = imu.propagate(belief, samples, end_ns, p.imu)
         predicted = rest.hold(predicted, samples)
@@ -88,7 +96,6 @@ class Engine:
         watch.lap("update")
 
         if not waiting:
-            self._belief = posterior
             self._insert(posterior, sampled.points)
         watch.lap("insert")
 
@@ -98,10 +105,10 @@ class Engine:
         keyframe = None if waiting else self._keyframe(posterior, cloud)
         watch.lap("keyframe")
 
-        if status is not self._status and FrameStatus.LOST in (status, self._status):
+        if status is not before.status and FrameStatus.LOST in (status, before.status):
             notices.append(f"Lost: {registration.reason}." if status is FrameStatus.LOST else "Tracking again.")
         result = StepResult(
-            index=self._frame,
+            index=before.frame,
             stamp_ns=end_ns,
             status=status,
             state=posterior.state,
@@ -118,8 +125,8 @@ class Engine:
             truth_ground=scan.truth_ground,
             imu_gap_s=float(np.diff(samples.stamps_ns).max(initial=0)) * 1e-9,
         )
-        self._status = status
-        self._frame += 1
+        T_odom_keyframe = before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu
+        self._progress = Progress(before.frame + 1, None if waiting else posterior, still, status, T_odom_keyframe)
         return result
 
     def relabel(self, result: StepResult) -> StepResult:
@@ -132,29 +139,15 @@ class Engine:
             result, cloud=replace(cloud, labels=surface.labels), ground=surface, points_reduced=len(reduced.points)
         )
 
-    def checkpoint(self) -> Checkpoint:
+    def checkpoint(self) -> EngineState:
         """The present state; of the keyframes only their number, since the store keeps them."""
-        return Checkpoint(
-            params=self.params,
-            frame=self._frame,
-            belief=self._belief,
-            still=self._still,
-            status=self._status,
-            map=self._map.checkpoint(),
-            keyframes=len(self.keyframes),
-            T_odom_keyframe=self._T_odom_keyframe,
-        )
+        return EngineState(self.params, self._progress, self._map.checkpoint(), len(self.keyframes))
 
-    def restore(self, checkpoint: Checkpoint) -> None:
+    def restore(self, state: EngineState) -> None:
         """Go back to (or, in another engine of the same recording, on from) a checkpoint."""
-        self.params = checkpoint.params
-        self._frame = checkpoint.frame
-        self._belief = checkpoint.belief
-        self._still = checkpoint.still
-        self._status = checkpoint.status
-        self._map.restore(checkpoint.map)
-        self.keyframes.truncate(checkpoint.keyframes)
-        self._T_odom_keyframe = checkpoint.T_odom_keyframe
+        self.params, self._progress = state.params, state.progress
+        self._map.restore(state.map)
+        self.keyframes.truncate(state.keyframes)
 
     def close(self) -> None:
         """Give the disk space of the keyframes back."""
@@ -166,11 +159,11 @@ class Engine:
 
     def _keyframe(self, belief: Belief, cloud: Cloud) -> Keyframe | None:
         state = belief.state
-        if not keyframes.is_due(self._T_odom_keyframe, state.T_odom_imu, self.params.keyframe):
+        if not keyframes.is_due(self._progress.T_odom_keyframe, state.T_odom_imu, self.params.keyframe):
             return None
         keyframe = Keyframe(
             index=len(self.keyframes),
-            frame=self._frame,
+            frame=self._progress.frame,
             stamp_ns=state.stamp_ns,
             T_odom_imu=state.T_odom_imu,
             T_imu_lidar=state.T_imu_lidar,
@@ -178,7 +171,6 @@ class Engine:
             cloud=cloud,
         )
         self.keyframes.append(keyframe)
-        self._T_odom_keyframe = keyframe.T_odom_imu
         return keyframe
 
 

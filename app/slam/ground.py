@@ -1,10 +1,12 @@
 """Seed-point ground segmentation (paper 2.2, eq. 1-3)."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from app.slam.kernels import ground as kernels
 from app.slam.params import GroundParams
-from app.slam.types import F32, F64, NON_GROUND, U8, U16, GroundResult
+from app.slam.types import F32, F64, NON_GROUND, U16, GroundResult
 
 MIN_SEEDS = 20
 """Least number of seeds for a plane."""
@@ -23,10 +25,21 @@ def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundRe
     """
     labels = np.zeros(len(points), dtype=np.uint8)
     down = down / np.linalg.norm(down)
+    none = GroundResult(
+        labels=labels,
+        found=False,
+        reason="",
+        normal=-down,
+        centroid=np.full(3, np.nan),
+        down=down,
+        planarity=float("nan"),
+        seeds=0,
+        share=0.0,
+    )
     if not params.enabled:
-        return _none(labels, down, "ground segmentation is switched off")
+        return replace(none, reason="ground segmentation is switched off")
     if len(points) == 0:
-        return _none(labels, down, "the scan has no points")
+        return replace(none, reason="the scan has no points")
 
     present = np.zeros(int(ring.max()) + 1, dtype=np.bool_)
     present[ring] = True
@@ -36,7 +49,7 @@ def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundRe
     seeds = kernels.seed_moments(points, ring, candidate, down, np.cos(np.radians(params.alpha)), labels, sums)
     if seeds < MIN_SEEDS:
         labels[:] = NON_GROUND
-        return _none(labels, down, f"only {seeds} seed points; a plane takes {MIN_SEEDS}", seeds=seeds)
+        return replace(none, reason=f"only {seeds} seed points; a plane takes {MIN_SEEDS}", seeds=seeds)
 
     # eq. 1: principal components of the seeds
     mean = sums[3:6] / seeds
@@ -46,48 +59,14 @@ def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundRe
     planarity = float(max(values[0], 0.0) / values[1]) if values[1] > 0 else 1.0
     normal = vectors[:, 0] * -np.sign(vectors[:, 0] @ down or -1.0)
     centroid = sums[:3] + mean
-    if planarity >= params.planarity:
-        labels[:] = NON_GROUND
-        reason = f"λ3/λ2 of the seeds is {planarity:.2f}, not below {params.planarity:g}: they form no plane"
-        return _none(labels, down, reason, normal, centroid, planarity, seeds)
-
+    result = replace(none, normal=normal, centroid=centroid, planarity=planarity, seeds=seeds)
     slope = float(np.degrees(np.arccos(np.clip(-normal @ down, -1.0, 1.0))))
-    if slope > params.max_slope:
-        labels[:] = NON_GROUND
+    if planarity >= params.planarity:
+        reason = f"λ3/λ2 of the seeds is {planarity:.2f}, not below {params.planarity:g}: they form no plane"
+    elif slope > params.max_slope:
         reason = f"the seeds' plane is {slope:.0f}° steep, over {params.max_slope:g}°"
-        return _none(labels, down, reason, normal, centroid, planarity, seeds)
-
-    kernels.label(points, centroid, normal, params.sigma, labels)
-    return GroundResult(
-        labels=labels,
-        found=True,
-        reason="",
-        normal=normal,
-        centroid=centroid,
-        down=down,
-        planarity=planarity,
-        seeds=seeds,
-        share=float(np.count_nonzero(labels)) / len(points),
-    )
-
-
-def _none(
-    labels: U8,
-    down: F64,
-    reason: str,
-    normal: F64 | None = None,
-    centroid: F64 | None = None,
-    planarity: float = float("nan"),
-    seeds: int = 0,
-) -> GroundResult:
-    return GroundResult(
-        labels=labels,
-        found=False,
-        reason=reason,
-        normal=-down if normal is None else normal,
-        centroid=np.full(3, np.nan) if centroid is None else centroid,
-        down=down,
-        planarity=planarity,
-        seeds=seeds,
-        share=0.0,
-    )
+    else:
+        kernels.label(points, centroid, normal, params.sigma, labels)
+        return replace(result, found=True, share=float(np.count_nonzero(labels)) / len(points))
+    labels[:] = NON_GROUND
+    return replace(result, reason=reason)

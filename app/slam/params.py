@@ -23,7 +23,7 @@ from app.slam.sections import (
     Section,
     SensorParams,
 )
-from app.slam.yaml_text import read_assignments, read_yaml
+from app.slam.user_text import read_assignments, read_yaml
 
 __all__ = [
     "Effect",

@@ -37,7 +37,7 @@ def make_report(log: "RunLog", trajectory: Trajectory, info: "RunInfo") -> dict[
         },
         "distance_m": trajectory.distance,
         "ground": {
-            "share": log.ground_points / log.points if log.points else None,
+            "share": log.ground_share,
             "precision": score.precision if score else None,
             "recall": score.recall if score else None,
             "f1": score.f1 if score else None,

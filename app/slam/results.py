@@ -104,12 +104,10 @@ class RunLog:
         return notices
 
     @property
-    def points(self) -> int:
-        return sum(frame.points for frame in self.frames)
-
-    @property
-    def ground_points(self) -> int:
-        return sum(frame.ground_points for frame in self.frames)
+    def ground_share(self) -> float | None:
+        """Share of all points that are ground, 0-1; None without a point."""
+        points = sum(frame.points for frame in self.frames)
+        return sum(frame.ground_points for frame in self.frames) / points if points else None
 
     @property
     def ground_score(self) -> GroundScore | None:
@@ -153,20 +151,8 @@ class Export:
 
     name: str
     meaning: str
-    write: Callable[[Path, Results], None]
+    write: Callable[[Path, Results], object]
     of_loops: bool = False
-
-
-def _write_trajectory(path: Path, results: Results) -> None:
-    write_tum(path, results.trajectory)
-
-
-def _write_odometry(path: Path, results: Results) -> None:
-    write_tum(path, results.log.odometry)
-
-
-def _write_timings(path: Path, results: Results) -> None:
-    path.write_text(timings_csv(results.log), encoding="utf-8")
 
 
 def _write_map(path: Path, results: Results) -> None:
@@ -196,12 +182,23 @@ def _write_report(path: Path, results: Results) -> None:
 
 EXPORTS = (
     Export(
-        "trajectory.tum", "pose of the IMU in the map at each scan's end: stamp x y z qx qy qz qw", _write_trajectory
+        "trajectory.tum",
+        "pose of the IMU in the map at each scan's end: stamp x y z qx qy qz qw",
+        lambda path, results: write_tum(path, results.trajectory),
     ),
-    Export("trajectory_odometry.tum", "the same by odometry alone, without loops", _write_odometry, of_loops=True),
+    Export(
+        "trajectory_odometry.tum",
+        "the same by odometry alone, without loops",
+        lambda path, results: write_tum(path, results.log.odometry),
+        of_loops=True,
+    ),
     Export("loops.csv", "every loop candidate: verdict, measurements and reason", _write_loops, of_loops=True),
     Export("graph.g2o", "the pose graph of the keyframes", _write_graph, of_loops=True),
-    Export("timings.csv", "milliseconds of each stage in each frame, without reading the file", _write_timings),
+    Export(
+        "timings.csv",
+        "milliseconds of each stage in each frame, without reading the file",
+        lambda path, results: path.write_text(timings_csv(results.log), encoding="utf-8"),
+    ),
     Export("map.ply", "the map: x y z intensity ground", _write_map),
     Export("report.json", "parameters, counts of frames, ground share, errors against truth", _write_report),
 )

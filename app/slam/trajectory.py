@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from app.slam.errors import HemislamError
-from app.slam.text_tables import as_numbers, read_rows
 from app.slam.types import F64, I64
+from app.slam.user_text import as_numbers, read_rows
 
 
 @dataclass(frozen=True, slots=True)

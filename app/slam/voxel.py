@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.slam.kernels import voxels as kernels
+from app.slam.kernels import clouds
 from app.slam.types import F32, I32, U8
 
 _STEPS = np.sqrt([6.0, 11.0, 14.0]) % 1.0
@@ -57,7 +57,7 @@ class VoxelGrid:
         self._generation += 1
         if chosen is None:
             chosen = np.ones(n, dtype=np.uint8)
-        m = kernels.centroids(
+        m = clouds.centroids(
             points, chosen, voxel_size, self._table, self._stamp, self._generation, self._cells, self._sums, self._order
         )
         return Downsampled(self._sums[:m, :3].astype(np.float32), self._order[:m].copy())

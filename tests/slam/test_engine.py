@@ -235,6 +235,6 @@ def test_parameters_act_from_the_next_frame_on() -> None:
         ),
         ({"sensor.max_range": 100.0, "filter.max_iterations": 1}, lambda r: r.registration.iterations == 1),
     ):
-        m = room_walk()[engine.checkpoint().frame]
+        m = room_walk()[engine.checkpoint().progress.frame]
         engine.params = engine.params.with_values(values)
         assert observe(engine.step(m.scan, m.imu)), values

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from app.slam import kernels
-from app.slam.engine import Checkpoint, Engine
+from app.slam.engine import Engine, EngineState
 from app.slam.params import Params
 from app.slam.types import StepResult
 from tests.slam.engine_runs import ALONG, FRAMES, REAL, assert_all_same, room_walk, run
@@ -115,7 +115,7 @@ def test_a_restored_engine_goes_on_as_if_it_had_never_stopped(at: int) -> None:
     whole = run_with_changes(Engine(params_for(REAL)))
     engine = Engine(params_for(REAL))
     run_with_changes(engine, 0, at)
-    checkpoint: Checkpoint = engine.checkpoint()
+    checkpoint: EngineState = engine.checkpoint()
     run_with_changes(engine, at, FRAMES)
     engine.restore(checkpoint)
     assert_all_same(run_with_changes(engine, at, FRAMES), whole[at:])

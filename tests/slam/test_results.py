@@ -101,7 +101,7 @@ def test_a_log_adds_up_what_its_frames_hold() -> None:
     first, second = Frame.of(frame(0), ("too far", "no IMU")), Frame.of(frame(1, truth=[1, 0, 1, 0]), ("no IMU",))
     log = RunLog([first, second], ("no IMU",))
     assert log.dropped == {"no IMU": 3, "too far": 1}
-    assert (log.points, log.ground_points) == (2 * first.points, first.ground_points + second.ground_points)
+    assert log.ground_share == 0.5 and RunLog([]).ground_share is None
     assert log.ground_score == second.ground_score is not None
     assert RunLog([first]).ground_score is None and not RunLog([]).dropped
     assert log.stamps_ns.tolist() == [first.stamp_ns, second.stamp_ns] and not log.stamps_ns.flags.writeable

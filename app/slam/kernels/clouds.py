@@ -1,8 +1,13 @@
-"""Whole-cloud passes."""
+"""Passes over whole clouds: the range of points, and voxel-grid downsampling over a reusable hash table."""
+
+import math
 
 from numba import njit, prange
 
 from app.slam.kernels.small import CHUNKS
+
+PRIME_X, PRIME_Y, PRIME_Z = 73856093, 19349669, 83492791
+"""Teschner et al. 2003, "Optimized spatial hashing"."""
 
 
 @njit(cache=True, parallel=True)
@@ -20,3 +25,49 @@ def in_range(points, nearest, farthest, keep):
             inside += keep[j]
         count += inside
     return count
+
+
+@njit(cache=True)
+def centroids(points, chosen, voxel, table, stamp, generation, cells, sums, order):
+    """Replace the chosen points of each voxel by their centroid; copy the others unchanged.
+
+    points (n, 3) f32 and voxel in the same unit; chosen (n,) u8, non-zero where a point takes part. Scratch: table
+    (2^k,) i32 and stamp (2^k,) i32, where `generation` marks live slots, so that nothing has to be cleared; cells
+    (n, 3) i32. Out: sums (n, 4) f64: x y z count, in order of first appearance; order (n,) i32: the first point of each
+    output. Returns the number of outputs.
+    """
+    mask = len(table) - 1
+    inverse = 1.0 / voxel
+    m = 0
+    for j in range(len(points)):
+        x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
+        if chosen[j] == 0:
+            sums[m, 0], sums[m, 1], sums[m, 2], sums[m, 3] = x, y, z, 1.0
+            order[m] = j
+            m += 1
+            continue
+        a, b, c = math.floor(x * inverse), math.floor(y * inverse), math.floor(z * inverse)
+        h = ((a * PRIME_X) ^ (b * PRIME_Y) ^ (c * PRIME_Z)) & mask
+        while True:
+            if stamp[h] != generation:
+                stamp[h] = generation
+                table[h] = m
+                cells[m, 0], cells[m, 1], cells[m, 2] = a, b, c
+                sums[m, 0], sums[m, 1], sums[m, 2], sums[m, 3] = x, y, z, 1.0
+                order[m] = j
+                m += 1
+                break
+            k = table[h]
+            if cells[k, 0] == a and cells[k, 1] == b and cells[k, 2] == c:
+                sums[k, 0] += x
+                sums[k, 1] += y
+                sums[k, 2] += z
+                sums[k, 3] += 1.0
+                break
+            h = (h + 1) & mask
+    for k in range(m):
+        s = 1.0 / sums[k, 3]
+        sums[k, 0] *= s
+        sums[k, 1] *= s
+        sums[k, 2] *= s
+    return m

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from app.slam.kernels.clouds import PRIME_X, PRIME_Y, PRIME_Z
 from app.slam.kernels.small import CHUNKS, plane_of
-from app.slam.kernels.voxels import PRIME_X, PRIME_Y, PRIME_Z
 
 
 @njit(cache=True, inline="always")

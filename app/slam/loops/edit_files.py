@@ -25,7 +25,7 @@ import yaml
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import check
 from app.slam.loops.types import Accept, Add, LoopEdit, Pair, Reject, SetWeight, Solve, rows
-from app.slam.yaml_text import read_yaml
+from app.slam.user_text import read_yaml
 
 _VERBS: Final[dict[str, type[LoopEdit]]] = {
     "accept": Accept, "reject": Reject, "weigh": SetWeight, "add": Add, "solve": Solve
