@@ -18,7 +18,8 @@ from app.sensors.rings import settle_rings
 from app.sensors.timing import Timing, settle_timing
 from app.slam import lie
 from app.slam.errors import HemislamError
-from app.slam.params import Params, RecordingParams
+from app.slam.params import Params
+from app.slam.sections import RecordingParams
 from app.slam.types import F32, F64, I64, U16
 
 STANDARD_GRAVITY = 9.80665

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from app.sensors.cloud_types import CloudType, Probe
 from app.sensors.findings import Finding, Verdict
-from app.slam.params import RecordingParams
+from app.slam.sections import RecordingParams
 
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 

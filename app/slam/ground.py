@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from app.slam.kernels import ground as kernels
-from app.slam.params import GroundParams
+from app.slam.sections import GroundParams
 from app.slam.types import F32, F64, NON_GROUND, U16, GroundResult
 
 MIN_SEEDS = 20

@@ -11,7 +11,7 @@ from app.slam.imu import DIM, POS, ROT, Belief
 from app.slam.kernels import manifold
 from app.slam.kernels import registration as kernels
 from app.slam.local_map import LocalMap, Planes
-from app.slam.params import FilterParams
+from app.slam.sections import FilterParams
 from app.slam.types import F32, F64, Matches, NavState, Registration
 
 RESEARCH_ROTATION = 1e-3

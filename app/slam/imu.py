@@ -6,7 +6,7 @@ import numpy as np
 
 from app.slam import lie
 from app.slam.kernels import manifold, motion
-from app.slam.params import ImuParams
+from app.slam.sections import ImuParams
 from app.slam.types import F32, F64, ImuSamples, NavState, Scan
 
 DIM = 23

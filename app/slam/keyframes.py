@@ -14,7 +14,7 @@ from typing import IO
 import numpy as np
 
 from app.slam import lie
-from app.slam.params import KeyframeParams
+from app.slam.sections import KeyframeParams
 from app.slam.types import F64, Cloud, Keyframe
 
 _HEAD = np.dtype(

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.slam.kernels import map as kernels
-from app.slam.params import FilterParams, MapParams
+from app.slam.sections import FilterParams, MapParams
 from app.slam.types import F32, F64, I32, U8
 
 LEAST_SCATTER = 2.0

@@ -25,23 +25,6 @@ from app.slam.sections import (
 )
 from app.slam.user_text import read_assignments, read_yaml
 
-__all__ = [
-    "Effect",
-    "FilterParams",
-    "GroundParams",
-    "ImuParams",
-    "KeyframeParams",
-    "Leaf",
-    "LoopsParams",
-    "MapParams",
-    "Params",
-    "RecordingParams",
-    "ScanParams",
-    "SensorParams",
-    "leaves",
-    "params_markdown",
-]
-
 WHEN: dict[Effect, str] = {"now": "at once", "frame": "from the next frame", "restart": "on restart"}
 """When a change of a parameter takes effect, in words."""
 

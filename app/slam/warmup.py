@@ -7,7 +7,8 @@ import numpy as np
 from app.slam import ground, iekf, imu, start
 from app.slam.engine import Engine
 from app.slam.local_map import LocalMap
-from app.slam.params import MapParams, Params
+from app.slam.params import Params
+from app.slam.sections import MapParams
 from app.slam.types import ImuSamples, Scan
 from app.slam.voxel import VoxelGrid
 

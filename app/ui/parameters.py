@@ -14,7 +14,8 @@ import viser
 
 from app.server.fork import engine_number
 from app.server.protocol import LoadParams, Restart, SetParams, Snapshot
-from app.slam.params import Effect, Leaf, Params, leaves
+from app.slam.params import Leaf, Params, leaves
+from app.slam.sections import Effect
 from app.ui.html import panel
 from app.ui.widgets import Edit, Page, as_set, by_user, dialog, show
 

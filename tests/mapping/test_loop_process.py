@@ -15,7 +15,7 @@ from app.slam import lie
 from app.slam.loops.messages import Added, AddKeyframe, ApplyEdit, Ask, LoopState, Request, Target
 from app.slam.loops.service import LoopService
 from app.slam.loops.types import Add, Edits, Reject, difference, rows
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import NON_GROUND, Cloud, Keyframe
 
 PARAMS = LoopsParams(submap_keyframes=1, min_time=1.0, support=0)

@@ -10,7 +10,7 @@ from app.mapping.loops import MOST_DEATHS, MOST_PENDING
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.messages import AddKeyframe, ApplyEdit, Failure
 from app.slam.loops.types import Accept, LoopEdit
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from tests.slam.loops.held_session import EVERY, HeldSession, a_keyframe, shift_at
 
 

@@ -8,7 +8,8 @@ from app.sensors.findings import Finding
 from app.sensors.layout import ImuProbe, gravity_findings, settle_cloud, settle_imu
 from app.sensors.pointcloud import CloudLayout, decode
 from app.slam.errors import HemislamError
-from app.slam.params import Params, RecordingParams
+from app.slam.params import Params
+from app.slam.sections import RecordingParams
 from tests.sensors import rig
 
 XYZ = [("x", "f4", "x"), ("y", "f4", "y"), ("z", "f4", "z")]

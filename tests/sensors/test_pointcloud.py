@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from app.sensors.cloud_types import CloudError, Probe, read_point_cloud_2
 from app.sensors.layout import settle_cloud
 from app.sensors.pointcloud import CloudLayout, decode
-from app.slam.params import RecordingParams
+from app.slam.sections import RecordingParams
 from tests.sensors import rig
 
 UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}

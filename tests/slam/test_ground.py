@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from app.slam import ground
-from app.slam.params import GroundParams
+from app.slam.sections import GroundParams
 from app.slam.types import GROUND, NON_GROUND, SEED, GroundResult, Scan
 
 from .scenes import FORWARD, Rig, Scene, Walk, box, corridor, furnished_room, sweep

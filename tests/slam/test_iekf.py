@@ -14,7 +14,7 @@ from app.slam.iekf import boxminus, boxplus
 from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
 from app.slam.kernels.registration import RESIDUAL_HUBER, SHARED
 from app.slam.local_map import LocalMap
-from app.slam.params import FilterParams, MapParams
+from app.slam.sections import FilterParams, MapParams
 from app.slam.types import NavState
 
 from .scenes import START_NS, Rig, Scene, Walk, box, furnished_room, mounted, pose_error, sweep

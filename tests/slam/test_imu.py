@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from app.slam import imu
 from app.slam.iekf import boxminus, boxplus
 from app.slam.imu import DIM, POS, ROT, VEL, Belief
-from app.slam.params import ImuParams
+from app.slam.sections import ImuParams
 from app.slam.types import ImuSamples, NavState
 
 from .scenes import (

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from app.slam.keyframes import KeyframeStore, is_due
-from app.slam.params import KeyframeParams
+from app.slam.sections import KeyframeParams
 from app.slam.types import Cloud, Keyframe
 
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from app.slam.kernels.map import BINS, MOST
 from app.slam.local_map import LEAST_SCATTER, LocalMap, MapState, Planes
-from app.slam.params import FilterParams, MapParams
+from app.slam.sections import FilterParams, MapParams
 
 SMALL = MapParams(max_voxels=5000)
 LOOSE = FilterParams(plane_tilt=20.0)

@@ -38,7 +38,7 @@ from app.slam.loops.types import (
     rows,
 )
 from app.slam.loops.verdicts import by_hand, worth_correcting
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe
 
 

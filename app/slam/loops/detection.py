@@ -18,7 +18,7 @@ from app.slam.loops.drift import Expectation
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.submap import Submap, Submaps
 from app.slam.loops.verification import Fit, Prepared
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F64, I64, Keyframe
 
 NEAR_M = 3.0

@@ -7,7 +7,7 @@ from app.slam.loops.factors import Factor, Step
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.search import Found
 from app.slam.loops.types import LoopEdge
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import numpy as np
 
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.messages import AddKeyframe, Target
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import I64, Keyframe
 
 

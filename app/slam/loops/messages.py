@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from app.slam.loops.types import Edits, FactorResidual, LoopDetail, LoopEdge, LoopEdit, Pair, Preview
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe
 
 

@@ -34,7 +34,7 @@ from app.slam.loops.messages import (
 )
 from app.slam.loops.types import Edits, LoopEdge, Verdict, difference
 from app.slam.map_frame import MapFrame
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import Keyframe
 
 STATES: Final = 512

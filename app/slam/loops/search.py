@@ -9,7 +9,7 @@ from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.support import placed, settle
 from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.loops.verdicts import judge
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F64
 
 SURE_M = 0.3

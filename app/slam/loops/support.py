@@ -13,7 +13,7 @@ from app.slam import lie
 from app.slam.loops import se3
 from app.slam.loops.drift import Drift, agree
 from app.slam.loops.types import LOOP_HUBER, LoopEdge, Origin, Pair, Verdict
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F64
 
 NEIGHBOURHOOD_M = 15.0

@@ -11,7 +11,7 @@ from app.slam.loops.detection import Detector, Sighting
 from app.slam.loops.drift import Expectation
 from app.slam.loops.types import Evidence, LoopEdge, Measured, Origin, Verdict
 from app.slam.loops.verification import Fit
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F64
 
 FARTHEST_M = 10.0

@@ -11,7 +11,7 @@ from app.server.protocol import Snapshot
 from app.slam import lie
 from app.slam.loops.scan_context import YAWS
 from app.slam.loops.types import LoopDetail, LoopEdge, Pair
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F32, F64, NON_GROUND, U8
 from app.ui.chunks import below_ceiling
 from app.ui.colours import TABLES

@@ -19,7 +19,7 @@ from app.slam.loops.types import (
     Solve,
     Verdict,
 )
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F64
 from app.ui.colours import Rgb
 from app.ui.html import BAD, GOOD, Tile, number, panel

@@ -8,7 +8,7 @@ import pytest
 
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.types import Edits, LoopEdge, LoopEdit, Verdict
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe
 from tests.slam.loops.walks import Walk, drive, take
 

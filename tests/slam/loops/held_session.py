@@ -11,7 +11,7 @@ from app.slam.loops.keyframe_log import KeyframeLog
 from app.slam.loops.messages import Added, AddKeyframe, ApplyEdit, AskG2o, G2o, LoopState, Reply, Request
 from app.slam.loops.schedule import LoopSchedule
 from app.slam.loops.types import Edits, Evidence, LoopEdge, Measured, Verdict
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import Cloud, Keyframe
 
 LOOPS = LoopsParams()

@@ -14,7 +14,7 @@ from app.slam.loops.backend import LoopBackend
 from app.slam.loops.files import loops_csv
 from app.slam.loops.types import Add, Edits, Origin, Solve, Verdict, rows
 from app.slam.metrics import umeyama
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F64
 from tests.slam.loops.conftest import PARAMS, Walked, accepted, same
 from tests.slam.loops.walks import drive, error, revisits, take

@@ -13,7 +13,7 @@ from app.sensors.simulator.trajectory import Walker, walk
 from app.slam import lie
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.types import LoopEdge
-from app.slam.params import LoopsParams
+from app.slam.sections import LoopsParams
 from app.slam.types import F64, NON_GROUND, Cloud, Keyframe
 
 EPOCH_NS = 1_700_000_000_000_000_000
