@@ -18,9 +18,9 @@ from app.mapping.opening import open_session
 from app.mapping.session import Session
 from app.sensors.presets import resolve_params
 from app.server.controller import Controller
-from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import Command, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.publisher import Publisher
 from app.slam.loops.types import Verdict
 from app.slam.params import Params
 from app.slam.warmup import compile_kernels
@@ -49,8 +49,8 @@ class Walk:
 
     def __init__(self, path: Path) -> None:
         self.params = resolve_params(path, None, None, [])
-        self._outbox, self._fold = Outbox(self.params), Fold(Snapshot(params=self.params))
-        self.controller = Controller(self._outbox, self.params, self._open)
+        self._page, self._fold = Publisher(self.params), Fold(Snapshot(params=self.params))
+        self.controller = Controller(self._page, self.params, self._open)
         self.controller.open(path, None)
         self.do(SetSpeed(math.inf))
 
@@ -68,9 +68,9 @@ class Walk:
         self.controller.handle(command)
         while (wait := self.controller.work()) is not None:
             time.sleep(wait)
-            if self._outbox.filled:
-                self._fold.apply(self._outbox.take())
-        self._fold.apply(self._outbox.take())
+            if self._page.filled:
+                self._fold.apply(self._page.take())
+        self._fold.apply(self._page.take())
         return self._fold.snapshot
 
     def on_to_the_end(self, plan: Plan) -> Snapshot:

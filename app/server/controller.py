@@ -20,7 +20,6 @@ from app.mapping.session_file import (
     new_path,
     read_session,
 )
-from app.server.delta import Outbox
 from app.server.loop_commands import LoopCommands
 from app.server.player import Player
 from app.server.protocol import (
@@ -77,7 +76,7 @@ class Controller:
     """The open session and its transport. One thread calls `handle` and `work`.
 
     Args:
-        outbox: takes everything that changes.
+        page: takes everything that changes.
         params: to begin with.
         open_session: opens a recording.
         resolve: parameters that a recording is opened with, before changes by hand; None: the present ones.
@@ -87,7 +86,7 @@ class Controller:
 
     def __init__(
         self,
-        outbox: Outbox,
+        page: Publisher,
         params: Params,
         open_session: OpenSession,
         *,
@@ -95,10 +94,9 @@ class Controller:
         session_folder: Path | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._outbox = outbox
-        self._page = Publisher(outbox)
-        self._loops = LoopCommands(outbox)
-        self._player = Player(outbox, self._page, clock)
+        self._page = page
+        self._loops = LoopCommands(page)
+        self._player = Player(page, clock)
         self._saves: deque[tuple[Path, Future[Any]]] = deque()
         self._session_folder = session_folder
         self._writer: SessionWriter | None = None
@@ -139,7 +137,7 @@ class Controller:
             if self._writer is not None and self._player.session is not None:
                 self._writer.did(self._player.session.frame, command)
         except HemislamError as error:
-            self._outbox.notice("error", str(error))
+            self._page.notice("error", str(error))
 
     def _handle(self, command: Command) -> None:
         match command:
@@ -171,7 +169,7 @@ class Controller:
             case CompareWith(trajectory):
                 session = self._need_session()
                 session.compare_with(trajectory)
-                self._page.compared(session)
+                self._page.put(recording=OpenedRecording.of(session), urgent=True)
             case Restart():
                 self._open_soon(self._need_session().feed.info.path, self._reopen)
             case Save(folder, trajectory_only):
@@ -190,20 +188,21 @@ class Controller:
         if self._player.session is not None:
             self._player.session.choose(params)
             self._player.relabelling |= any(EFFECT[path] == "now" for path in changed)
-        self._page.params(params, self._pending_restart())
+        self._show_params()
 
     def _set_breakpoints(self, breakpoints: Breakpoints) -> None:
         self._player.breakpoints = breakpoints
-        self._outbox.put(breakpoints=breakpoints, urgent=True)
+        self._page.put(breakpoints=breakpoints, urgent=True)
 
     def _show_notes(self, notes: tuple[Note, ...]) -> None:
         self._notes = notes
-        self._outbox.put(notes=notes, urgent=True)
+        self._page.put(notes=notes, urgent=True)
 
-    def _pending_restart(self) -> tuple[str, ...]:
-        """Names of parameters of which the engine still has another value, since they act on restart."""
+    def _show_params(self) -> None:
+        """Show the parameters, and of which the engine still has another value, since they act on restart."""
         session = self._player.session
-        return tuple(session.params.changed(self._params)) if session is not None else ()
+        pending = tuple(session.params.changed(self._params)) if session is not None else ()
+        self._page.put(params=self._params, pending_restart=pending, urgent=True)
 
     def _need_session(self) -> Session:
         if self._player.session is None:
@@ -265,7 +264,7 @@ class Controller:
                 self._player.fail("Nothing more comes live", error)
                 self._page.show(finished=True)
                 return None
-            self._outbox.put(live=state, recording=OpenedRecording.of(session))
+            self._page.put(live=state, recording=OpenedRecording.of(session))
         return SOURCE_PERIOD_S
 
     def _look_at_loops(self, session: Session) -> float | None:
@@ -294,7 +293,7 @@ class Controller:
     def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
         """Leave the opening to `work`, so that the page can say first that it takes a moment."""
         self._opening, self._after_opening = opening, []
-        self._outbox.put(progress=Progress(f"Opening {path.name}", math.nan), urgent=True)
+        self._page.put(progress=Progress(f"Opening {path.name}", math.nan), urgent=True)
 
     def _do_opening(self, opening: Callable[[], None]) -> None:
         """Open; if that is not possible, everything stays as it is."""
@@ -302,10 +301,10 @@ class Controller:
         try:
             opening()
         except HemislamError as error:
-            self._outbox.notice("error", str(error))
+            self._page.notice("error", str(error))
         except Exception as error:
             self._player.fail("The recording cannot be opened", error)
-        self._outbox.put(progress=None, urgent=True)
+        self._page.put(progress=None, urgent=True)
         waiting, self._after_opening = self._after_opening, []
         for command in waiting:
             self.handle(command)
@@ -349,7 +348,7 @@ class Controller:
         self._set_breakpoints(state.breakpoints)
         self._player.set_speed(state.speed)
         if gone:
-            self._outbox.notice("warning", f"The session was compared with {state.truth}, which is gone.")
+            self._page.notice("warning", f"The session was compared with {state.truth}, which is gone.")
 
     def _take(self, session: Session, saved: SavedSession | None = None) -> None:
         """Let go of the present session and show the first frame of this one, or that at which it was saved."""
@@ -368,20 +367,20 @@ class Controller:
             session.resume(saved)
             self._player.resume(session, saved.frame, to_end=saved.ended)
             self._resuming = saved
-        self._page.params(self._params, self._pending_restart())
+        self._show_params()
 
     def _begin_file(self, session: Session) -> None:
         """Begin a session file; a session that cannot be repeated has none."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-        self._outbox.put(session_file=None)
+        self._page.put(session_file=None)
         if self._session_folder is not None and session.feed.repeatable:
             path = new_path(self._session_folder, session.feed.info.path)
             self._writer = SessionWriter(path, session.opened)
-            self._outbox.put(session_file=path)
+            self._page.put(session_file=path)
             if self._writer.error:
-                self._outbox.notice("warning", self._writer.error)
+                self._page.notice("warning", self._writer.error)
 
     def _resumed(self, session: Session) -> None:
         """A reopened session is where it was, or the user has left its way."""

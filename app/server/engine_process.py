@@ -9,8 +9,8 @@ from app.mapping.live import open_live_session
 from app.mapping.opening import open_session
 from app.mapping.session import Session
 from app.server.controller import Controller, OpenSession
-from app.server.delta import Outbox
 from app.server.protocol import ACKNOWLEDGED, LIVE, Command, Progress, SetBreakpoints, SetSpeed
+from app.server.publisher import Publisher
 from app.server.setup import Setup
 from app.slam.params import Params
 from app.slam.warmup import compile_kernels
@@ -25,8 +25,8 @@ class Updates:
     All methods raise `LinkClosed` when the owner is gone or asks the engine to end.
     """
 
-    def __init__(self, owner: Link, outbox: Outbox) -> None:
-        self._owner, self._outbox = owner, outbox
+    def __init__(self, owner: Link, page: Publisher) -> None:
+        self._owner, self._page = owner, page
         self._inbox: list[Command] = []
         self._acknowledged = True
         self._published = 0.0
@@ -39,14 +39,14 @@ class Updates:
             case its acknowledgement wakes `commands`.
         """
         self._receive(0.0)
-        if not self._acknowledged or not self._outbox.filled:
+        if not self._acknowledged or not self._page.filled:
             return None
-        wait = 0.0 if self._outbox.urgent else self._published + FRAME_PERIOD_S - time.monotonic()
+        wait = 0.0 if self._page.urgent else self._published + FRAME_PERIOD_S - time.monotonic()
         if wait > 0:
             return wait
         self._published = time.monotonic()
         self._acknowledged = False
-        self._owner.send(self._outbox.take())
+        self._owner.send(self._page.take())
         return None
 
     def commands(self, wait: float | None) -> list[Command]:
@@ -89,7 +89,7 @@ def run_loop(
     prepare: Callable[[Callable[[str, float], None]], None] | None = None,
 ) -> None:
     """As `main`, with the function that opens a recording and one that prepares it, reporting (name, fraction)."""
-    outbox = Outbox(
+    page = Publisher(
         setup.params,
         chunk_voxel=setup.chunk_voxel,
         session=setup.session,
@@ -97,9 +97,9 @@ def run_loop(
         frames=setup.frames,
         chunks=setup.chunks,
     )
-    updates = Updates(owner, outbox)
+    updates = Updates(owner, page)
     controller = Controller(
-        outbox,
+        page,
         setup.params,
         opener,
         resolve=setup.resolve,
@@ -110,11 +110,11 @@ def run_loop(
     if prepare is not None:
 
         def progress(name: str, fraction: float) -> None:
-            outbox.put(progress=Progress(f"Compiling {name}", fraction))
+            page.put(progress=Progress(f"Compiling {name}", fraction))
             updates.publish()
 
         prepare(progress)
-        outbox.put(progress=None)
+        page.put(progress=None)
     if setup.recording is not None:
         controller.open(setup.recording, setup.truth, play=setup.play)
     wait: float | None = 0.0

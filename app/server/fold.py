@@ -12,8 +12,7 @@ import numpy as np
 
 from app.mapping import truth
 from app.server.chunks import within_budget
-from app.server.delta import Delta
-from app.server.protocol import Chunk, Notice, OpenedRecording, Snapshot
+from app.server.protocol import Chunk, Delta, Notice, OpenedRecording, Snapshot
 from app.server.setup import POINT_BUDGET
 from app.slam.frames import FRAME, READOUTS, as_table
 from app.slam.loops.types import changed_by

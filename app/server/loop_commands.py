@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from app.server.delta import Outbox
 from app.server.protocol import EditLoop, InspectLoop, LoopCommand, LoopsView, RedoLoop, TryLoop, UndoLoop
+from app.server.publisher import Publisher
 from app.slam.loops.messages import (
     ApplyEdit,
     AskResiduals,
@@ -24,15 +24,15 @@ from app.slam.loops.types import LoopEdge
 class LoopCommands:
     """Passes commands on to the loops of the open session, and shows what comes of them."""
 
-    def __init__(self, outbox: Outbox) -> None:
-        self._outbox = outbox
+    def __init__(self, page: Publisher) -> None:
+        self._page = page
         self._view = LoopsView()
         self._state: LoopState | None = None
 
     def clear(self) -> None:
         """Another session begins."""
         self._view, self._state = LoopsView(), None
-        self._outbox.put(loops=self._view)
+        self._page.put(loops=self._view)
 
     def handle(self, command: LoopCommand, loops: LoopSchedule) -> None:
         """Pass a command on; `update` brings the answer."""
@@ -70,9 +70,9 @@ class LoopCommands:
                 case Residuals(residuals):
                     view = replace(view, residuals=residuals)
                 case Failure(text):
-                    self._outbox.notice("error", text)
+                    self._page.notice("error", text)
         for notice in (*loops.take_notices(), *loops.take_alarms()):
-            self._outbox.notice("warning", notice)
+            self._page.notice("warning", notice)
         state, moved = loops.state, show and loops.state is not self._state
         self._state = state if show else self._state
         if state is not None and moved:
@@ -86,7 +86,7 @@ class LoopCommands:
     def _show(self, view: LoopsView) -> None:
         if view is not self._view:
             self._view = view
-            self._outbox.put(loops=view, urgent=True)
+            self._page.put(loops=view, urgent=True)
 
 
 def _same(a: tuple[LoopEdge, ...], b: tuple[LoopEdge, ...]) -> bool:

@@ -9,7 +9,6 @@ from typing import Literal
 from app.mapping.breakpoints import Breakpoints, Moment, reasons
 from app.mapping.feed import Quiet
 from app.mapping.session import EFFECT, Session
-from app.server.delta import Outbox
 from app.server.pacing import Pacer
 from app.server.protocol import Progress
 from app.server.publisher import Publisher
@@ -53,8 +52,7 @@ class Player:
         relabelling: whether the ground of the frame shown is to be segmented again, with the present parameters.
     """
 
-    def __init__(self, outbox: Outbox, page: Publisher, clock: Callable[[], float] = time.monotonic) -> None:
-        self._outbox = outbox
+    def __init__(self, page: Publisher, clock: Callable[[], float] = time.monotonic) -> None:
         self._page = page
         self._pacer = Pacer(clock)
         self.session: Session | None = None
@@ -81,7 +79,7 @@ class Player:
         """Stay at the present frame, also if one was being sought."""
         if self._target is not None:
             self._target = None
-            self._outbox.put(progress=None)
+            self._page.put(progress=None)
         if self.session is not None:
             self.session.stay()
         self._catch_up()
@@ -155,7 +153,7 @@ class Player:
             log.error("%s", what, exc_info=error)
             reason = f"{type(error).__name__}: {error}"
         self.halt()
-        self._outbox.notice("error", f"{what}. {reason}")
+        self._page.notice("error", f"{what}. {reason}")
 
     def _advance(self, session: Session, target: Target | None) -> float | None:
         """Process the next frame if it is due."""
@@ -173,7 +171,7 @@ class Player:
         if isinstance(entry, Quiet):
             if entry.status is not None:
                 level: Literal["warning", "info"] = "warning" if entry.status.kind in _WARNINGS else "info"
-                self._outbox.notice(level, f"Live: {entry.status.text}.")
+                self._page.notice(level, f"Live: {entry.status.text}.")
             return 0.0
         if isinstance(entry, DroppedScan):
             if not revisited:
@@ -207,7 +205,7 @@ class Player:
             before, self._moment = replace(before, error=errors[-2]), replace(self._moment, error=errors[-1])
         if played and (why := reasons(self.breakpoints, before, self._moment)):
             self.halt()
-            self._outbox.notice("info", f"Paused at frame {session.frame:,}. {' '.join(why)}")
+            self._page.notice("info", f"Paused at frame {session.frame:,}. {' '.join(why)}")
 
     def _catch_up(self) -> None:
         """Show the frame that the session is at, if the page does not."""
@@ -234,10 +232,10 @@ class Player:
         if frame >= target.frame:
             self._target = None
             self._pacer.release()
-            self._outbox.put(progress=None, urgent=True)
+            self._page.put(progress=None, urgent=True)
         elif target.frame - target.origin > LONG_SEEK:
             fraction = (frame - target.origin) / (target.frame - target.origin)
-            self._outbox.put(progress=Progress(f"Going to frame {target.frame}", fraction))
+            self._page.put(progress=Progress(f"Going to frame {target.frame}", fraction))
 
     def _relabel(self, session: Session) -> None:
         self.relabelling = False

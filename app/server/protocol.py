@@ -12,7 +12,7 @@ from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import Note
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
-from app.slam.frames import READOUTS
+from app.slam.frames import READOUTS, Frame
 from app.slam.loops import types as loops
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
@@ -343,3 +343,24 @@ class Snapshot:
     engine_alive: bool = True
     session_file: Path | None = None
     live: LiveState | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Delta:
+    """Changes since the delta before.
+
+    Attributes:
+        replaced: new values of fields of `Snapshot`; `loops` without its edges. With `session`, another session
+            begins: the reader drops its edges.
+        edges: what has changed of the loops' edges.
+        keep: the reader keeps so many of its frames and appends `frames`.
+        chunks: of the next keyframes whose cloud the reader does not have.
+        notices: new since then.
+    """
+
+    replaced: dict[str, Any]
+    edges: loops.LoopChange | None
+    keep: int
+    frames: tuple[Frame, ...]
+    chunks: tuple[Chunk, ...]
+    notices: tuple[Notice, ...]

@@ -1,51 +1,147 @@
-"""What the page is told while frames are processed."""
+"""What the page is told while frames are processed: collected in the engine's process, and sent as deltas.
+
+Fields of the snapshot that are replaced as a whole are sent in their newest value only. Frames are followed by a
+cursor, and the clouds of keyframes are read from disk when they are sent. So a slow reader never holds up the
+engine, misses nothing, and nothing piles up for it.
+"""
 
 import re
+from bisect import bisect_left
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
+from app.mapping.log import Cursor, Log
 from app.mapping.session import Session
-from app.server.delta import Outbox
-from app.server.protocol import OpenedRecording, Saved, Transport
+from app.server.chunks import thinned
+from app.server.protocol import Delta, LoopsView, Notice, OpenedRecording, Saved, Transport
+from app.slam.frames import Frame
+from app.slam.loops.types import LoopEdge, difference
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
+from app.slam.ply import Keyframes
 from app.slam.types import StepResult
 
+CHUNKS_AT_ONCE = 20
+"""Most clouds in one delta, so that a reader far behind sees the map grow."""
 REPEAT_AFTER_S = 10.0
 """The same kind of notice is shown again only after so much of the recording's time."""
 SAVED_KEPT = 10
 
 
 class Publisher:
-    """Turns a session's events into changes in its outbox.
+    """Turns a session's events into deltas.
+
+    Args:
+        chunk_voxel: edge of the voxels (m) in which clouds are thinned.
+        session, notices, frames, chunks: how many the reader already has from an earlier process.
 
     Attributes:
+        urgent: asks for the next delta at once, whatever the rate limit.
         transport: as last shown. result: of the frame that is shown, without its keyframe.
     """
 
-    def __init__(self, outbox: Outbox) -> None:
-        self.outbox = outbox
+    def __init__(
+        self,
+        params: Params,
+        *,
+        chunk_voxel: float = 0.05,
+        session: int = 0,
+        notices: int = 0,
+        frames: int = 0,
+        chunks: int = 0,
+    ) -> None:
         self.transport = Transport()
         self.result: StepResult | None = None
+        self.urgent = True
+        self._session, self._notices_given, self._chunk_voxel = session, notices, chunk_voxel
+        self._replaced: dict[str, Any] = {"params": params}
         self._corrections = MapFrame()
         self._noticed: dict[str, int] = {}
         self._saved: tuple[Saved, ...] = ()
+        self._notices: list[Notice] = []
+        self._frames: Log[Frame] = Log()
+        self._clouds: Keyframes = ()
+        # What the reader has:
+        self._edges: tuple[LoopEdge, ...] = ()
+        self._cursor = Cursor(0, frames)
+        self._keyframes: list[int] = []  # their frames
+        self._chunks = chunks
 
+    # --- what is sent ----------------------------------------------------------------------------
+    def put(self, *, urgent: bool = False, **values: Any) -> None:
+        """Set fields of the snapshot. Only the newest value of each is sent."""
+        self._replaced |= values
+        self.urgent |= urgent
+
+    def notice(self, level: Literal["info", "warning", "error"], text: str) -> None:
+        self._notices_given += 1
+        self._notices.append(Notice(self._notices_given, level, text))
+        self.urgent = True
+
+    def notice_once(self, text: str, stamp_ns: int) -> None:
+        """Warn, unless the same sentence, apart from its numbers, was shown a moment ago."""
+        kind = re.sub(r"[\d.]+", "#", text)
+        last = self._noticed.get(kind)
+        if last is None or abs(stamp_ns - last) > REPEAT_AFTER_S * 1e9:
+            self._noticed[kind] = stamp_ns
+            self.notice("warning", text)
+
+    def begin(self, frames: Log[Frame], keyframes: Keyframes) -> None:
+        """Follow another session, or, if it has frames already, the one that an earlier process began."""
+        self._frames, self._clouds, self._edges = frames, keyframes, ()
+        self._keyframes = [index for index, frame in enumerate(frames) if frame.keyframe]
+        if len(frames):
+            self._cursor = Cursor(0, min(self._cursor.length, len(frames)))
+            self._chunks = min(self._chunks, len(self._keyframes))
+        else:
+            self._session += 1
+            self._cursor, self._chunks = Cursor(), 0
+        self.put(urgent=True, session=self._session, result=None, corrections=MapFrame(), loops=LoopsView())
+
+    @property
+    def filled(self) -> bool:
+        """Whether there is anything to take."""
+        behind = self._frames.cursor != self._cursor or self._chunks < self._chunks_ready
+        return bool(self._replaced or self._notices or behind)
+
+    @property
+    def _chunks_ready(self) -> int:
+        """Keyframes whose cloud can be read. After a seek back, later ones can be read again once they are passed."""
+        return min(len(self._keyframes), len(self._clouds))
+
+    def take(self) -> Delta:
+        """All changes since the last call."""
+        edges = None
+        if "loops" in self._replaced:
+            loops: LoopsView = self._replaced["loops"]
+            edges, self._edges = difference(self._edges, loops.edges), loops.edges
+            self._replaced["loops"] = replace(loops, edges=())
+        keep, frames, self._cursor = self._frames.since(self._cursor)
+        kept = bisect_left(self._keyframes, keep)
+        self._keyframes[kept:] = [keep + index for index, frame in enumerate(frames) if frame.keyframe]
+        self._chunks = first = min(self._chunks, kept)
+        self._chunks = max(first, min(self._chunks_ready, first + CHUNKS_AT_ONCE))
+        chunks = tuple(thinned(self._clouds[index], self._chunk_voxel) for index in range(first, self._chunks))
+        delta = Delta(self._replaced, edges, keep, frames, chunks, tuple(self._notices))
+        self._replaced, self._notices, self.urgent = {}, [], False
+        return delta
+
+    # --- events ----------------------------------------------------------------------------------
     def opened(self, session: Session) -> None:
         """Show another session, from its first frame on, or from where an earlier process left it."""
-        self.outbox.begin(session.frames, session.engine.keyframes)
+        self.begin(session.frames, session.engine.keyframes)
         self.result, self._corrections, self._noticed = None, MapFrame(), {}
-        self.outbox.put(recording=OpenedRecording.of(session))
+        self.put(recording=OpenedRecording.of(session))
         self.show(frame=session.frame, stamp_ns=0, finished=False, frames_per_second=0.0, dropped=session.dropped)
         if session.frame < 0:
             for finding in session.findings:
                 if finding.verdict == "needs you":
-                    self.outbox.notice("warning", " ".join(filter(None, (finding.text, finding.option))))
+                    self.notice("warning", " ".join(filter(None, (finding.text, finding.option))))
 
     def show(self, *, urgent: bool = True, **changes: Any) -> None:
         """Change fields of the transport."""
         self.transport = replace(self.transport, **changes)
-        self.outbox.put(transport=self.transport, urgent=urgent)
+        self.put(transport=self.transport, urgent=urgent)
 
     def frame(self, session: Session, result: StepResult) -> None:
         """Show the next frame, which was just processed."""
@@ -66,37 +162,22 @@ class Publisher:
 
     def _show_frame(self, session: Session, result: StepResult | None) -> None:
         self.result = result and replace(result, keyframe=None)
-        self.outbox.put(result=self.result)
+        self.put(result=self.result)
         self.map_moved(session)
 
     def map_moved(self, session: Session) -> None:
         """Loops may have moved keyframes."""
         if session.map_frame is not self._corrections:
             self._corrections = session.map_frame
-            self.outbox.put(corrections=self._corrections)
-
-    def compared(self, session: Session) -> None:
-        """The session is compared with another trajectory."""
-        self.outbox.put(recording=OpenedRecording.of(session), urgent=True)
+            self.put(corrections=self._corrections)
 
     def relabelled(self, result: StepResult) -> None:
         """The newest frame got other labels."""
         self.result = result
-        self.outbox.put(result=result, urgent=True)
-
-    def params(self, params: Params, pending_restart: tuple[str, ...]) -> None:
-        self.outbox.put(params=params, pending_restart=pending_restart, urgent=True)
+        self.put(result=result, urgent=True)
 
     def saved(self, saved: Saved) -> None:
         self._saved = (*self._saved, saved)[-SAVED_KEPT:]
-        self.outbox.put(saved=self._saved, urgent=True)
+        self.put(saved=self._saved, urgent=True)
         if saved.error:
-            self.outbox.notice("error", saved.error)
-
-    def notice_once(self, text: str, stamp_ns: int) -> None:
-        """Warn, unless the same sentence, apart from its numbers, was shown a moment ago."""
-        kind = re.sub(r"[\d.]+", "#", text)
-        last = self._noticed.get(kind)
-        if last is None or abs(stamp_ns - last) > REPEAT_AFTER_S * 1e9:
-            self._noticed[kind] = stamp_ns
-            self.outbox.notice("warning", text)
+            self.notice("error", saved.error)

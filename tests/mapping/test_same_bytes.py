@@ -14,9 +14,9 @@ from app.mapping.session import Session
 from app.mapping.session_file import SUFFIX
 from app.sensors.presets import resolve_params
 from app.server.controller import Controller
-from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import Command, EditLoop, Play, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.publisher import Publisher
 from app.slam.loops.types import LoopEdge, Reject, Verdict
 from app.slam.params import Params
 
@@ -31,8 +31,8 @@ class Workbench:
 
     def __init__(self) -> None:
         self._params = resolve_params(SAMPLE, None, None, [])
-        self._outbox, self._fold = Outbox(self._params), Fold()
-        self.controller = Controller(self._outbox, self._params, self._open)
+        self._page, self._fold = Publisher(self._params), Fold()
+        self.controller = Controller(self._page, self._params, self._open)
         self.controller.open(SAMPLE, None)
         self.do(SetSpeed(math.inf))
 
@@ -48,8 +48,8 @@ class Workbench:
             while (wait := self.controller.work()) is not None:
                 assert time.monotonic() < deadline
                 time.sleep(wait)
-        if self._outbox.filled:
-            self._fold.apply(self._outbox.take())
+        if self._page.filled:
+            self._fold.apply(self._page.take())
         return self._fold.snapshot
 
     def saved(self, folder: Path) -> dict[str, bytes]:

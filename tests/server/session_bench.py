@@ -6,9 +6,9 @@ import server_fakes as fakes
 
 from app.mapping.session import Session
 from app.server.controller import Controller
-from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import Command, Snapshot
+from app.server.publisher import Publisher
 from app.slam.params import Params
 
 
@@ -18,9 +18,9 @@ class Bench:
     def __init__(self, recording: str | None = "walk-60.mcap", truth: Path | None = None, **kwargs: object) -> None:
         self.now = 0.0
         self.sessions: list[Session] = []
-        self.outbox = Outbox(Params())
+        self.page = Publisher(Params())
         self.fold = Fold()
-        self.controller = Controller(self.outbox, Params(), self._open, clock=lambda: self.now, **kwargs)  # type: ignore[arg-type]
+        self.controller = Controller(self.page, Params(), self._open, clock=lambda: self.now, **kwargs)  # type: ignore[arg-type]
         if recording:
             self.controller.open(Path(recording), truth)
             self.settle()
@@ -39,8 +39,8 @@ class Bench:
         return self.see()
 
     def see(self) -> Snapshot:
-        if self.outbox.filled:
-            self.fold.apply(self.outbox.take())
+        if self.page.filled:
+            self.fold.apply(self.page.take())
         return self.fold.snapshot
 
     def do(self, *commands: Command) -> Snapshot:

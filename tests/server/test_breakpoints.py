@@ -15,9 +15,9 @@ import server_fakes as fakes
 from app.mapping.breakpoints import Breakpoints, Moment, reasons
 from app.mapping.session import Session
 from app.server.controller import Controller
-from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import Pause, Play, Restart, Seek, SetBreakpoints, SetSpeed, Snapshot, StepFrame
+from app.server.publisher import Publisher
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
@@ -120,8 +120,8 @@ def test_a_limit_that_is_no_limit_is_refused_by_name(value: float) -> None:
 class Bench:
     def __init__(self, name: str = f"walk-{FRAMES}.mcap") -> None:
         self.now = 0.0
-        self.outbox, self.fold = Outbox(Params()), Fold()
-        self.controller = Controller(self.outbox, Params(), self._open, clock=lambda: self.now)
+        self.page, self.fold = Publisher(Params()), Fold()
+        self.controller = Controller(self.page, Params(), self._open, clock=lambda: self.now)
         self.controller.open(Path(name), None)
         self.settle()
 
@@ -133,7 +133,7 @@ class Bench:
     def settle(self) -> Snapshot:
         while self.controller.work() == 0:
             pass
-        return self.fold.apply(self.outbox.take()) if self.outbox.filled else self.fold.snapshot
+        return self.fold.apply(self.page.take()) if self.page.filled else self.fold.snapshot
 
     def do(self, *commands: object) -> Snapshot:
         for command in commands:

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from app.mapping.log import Log
 from app.server import chunks as chunks_module
 from app.server.chunks import COARSEST_LEVEL, MOST_SHOWN, coarser, next_to_thin, voxel_of_level, within_budget
-from app.server.delta import CHUNKS_AT_ONCE, Outbox
 from app.server.fold import Fold
 from app.server.protocol import Chunk, Transport
+from app.server.publisher import CHUNKS_AT_ONCE, Publisher
 from app.slam.frames import READOUTS, Frame
 from app.slam.params import Params
 from app.slam.types import Cloud, Keyframe
@@ -84,8 +84,8 @@ class Session:
     def __init__(self, budget: int) -> None:
         self.frames: Log[Frame] = Log()
         self.keyframes: list[Keyframe] = []
-        self.outbox, self.fold = Outbox(Params()), Fold(point_budget=budget)
-        self.outbox.begin(self.frames, self.keyframes)
+        self.page, self.fold = Publisher(Params()), Fold(point_budget=budget)
+        self.page.begin(self.frames, self.keyframes)
 
     def add(self) -> None:
         T = walk(len(self.frames) + 1)[-1]
@@ -96,9 +96,9 @@ class Session:
 
     def show(self, frames: int) -> tuple[Chunk, ...]:
         """Everything that the reader shows at this frame."""
-        self.outbox.put(transport=Transport(frame=frames - 1))
-        while self.outbox.filled:
-            self.fold.apply(self.outbox.take())
+        self.page.put(transport=Transport(frame=frames - 1))
+        while self.page.filled:
+            self.fold.apply(self.page.take())
         return self.fold.snapshot.chunks
 
 
@@ -132,10 +132,10 @@ def test_a_reader_far_behind_gets_some_clouds_at_a_time() -> None:
     session = Session(10**9)
     for _ in range(3 * CHUNKS_AT_ONCE):
         session.add()
-    session.outbox.put(transport=Transport(frame=3 * CHUNKS_AT_ONCE - 1))
+    session.page.put(transport=Transport(frame=3 * CHUNKS_AT_ONCE - 1))
     counts = []
-    while session.outbox.filled:
-        counts.append(len(session.fold.apply(session.outbox.take()).chunks))
+    while session.page.filled:
+        counts.append(len(session.fold.apply(session.page.take()).chunks))
     assert counts == [CHUNKS_AT_ONCE, 2 * CHUNKS_AT_ONCE, 3 * CHUNKS_AT_ONCE]
 
 

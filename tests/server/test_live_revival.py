@@ -22,9 +22,9 @@ from app.sensors.live.status import LiveState
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.server.controller import Controller
-from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import LIVE, Snapshot
+from app.server.publisher import Publisher
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
@@ -64,7 +64,7 @@ class Bench:
 
     def begin(self, *, revive: bool = True) -> None:
         page = self.page
-        self.outbox = Outbox(
+        self.publisher = Publisher(
             self._params,
             session=page.session,
             frames=0 if page.trajectory is None else len(page.trajectory),
@@ -75,7 +75,7 @@ class Bench:
             self.session = open_live_session(self._address, LIVE, self._params, self._folder, take_over=revive)
             return self.session
 
-        self.controller = Controller(self.outbox, self._params, opened, clock=lambda: 0.0)
+        self.controller = Controller(self.publisher, self._params, opened, clock=lambda: 0.0)
         self.controller.open(LIVE, None, play=True)
 
     def kill(self, *, asking: bool) -> None:
@@ -89,8 +89,8 @@ class Bench:
 
     def tell(self) -> None:
         """The page hears what there is to hear."""
-        if self.outbox.filled:
-            self.fold.apply(self.outbox.take())
+        if self.publisher.filled:
+            self.fold.apply(self.publisher.take())
 
 
 @pytest.fixture(scope="module")

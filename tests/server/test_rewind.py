@@ -10,7 +10,7 @@ import pytest
 import server_fakes as fakes
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from test_delta import content
+from test_fold import content
 
 from app.mapping.checkpoints import DEFAULT_BYTES, START
 from app.mapping.feed import open_file
@@ -19,9 +19,9 @@ from app.mapping.opening import open_session
 from app.mapping.session import Session
 from app.sensors.presets import resolve_params
 from app.server.controller import Controller
-from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import SERIES, Command, Pause, Play, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.publisher import Publisher
 from app.slam.params import Params
 from app.slam.types import DroppedScan
 
@@ -35,7 +35,7 @@ class Bench:
     """A session that works whenever it is told something, and the page's view of it."""
 
     def __init__(self, params: Params, opener: Callable[..., Session], path: Path, *, settle: bool = True) -> None:
-        self.params, self.outbox, self.fold = params, Outbox(params), Fold()
+        self.params, self.page, self.fold = params, Publisher(params), Fold()
         self.sessions: list[Session] = []
 
         def opening(path: Path, truth: Path | None, params: Params, part: object = None) -> Session:
@@ -48,7 +48,7 @@ class Bench:
             self.settle()
 
     def _controller(self, opener: Callable[..., Session]) -> Controller:
-        return Controller(self.outbox, self.params, opener, clock=lambda: 0.0)
+        return Controller(self.page, self.params, opener, clock=lambda: 0.0)
 
     @property
     def session(self) -> Session:
@@ -65,8 +65,8 @@ class Bench:
             pass
 
     def see(self) -> Snapshot:
-        if self.outbox.filled:
-            self.fold.apply(self.outbox.take())
+        if self.page.filled:
+            self.fold.apply(self.page.take())
         return self.fold.snapshot
 
 
@@ -144,7 +144,7 @@ def test_going_back_sends_nothing_that_the_page_has() -> None:
     bench.do(Seek(50))
     bench.controller.handle(Seek(33))
     bench.settle()
-    delta = bench.outbox.take()
+    delta = bench.page.take()
     assert (delta.keep, delta.frames, delta.chunks) == (51, (), ())
     assert len(bench.fold.apply(delta).chunks) == 7
 
@@ -155,7 +155,7 @@ def test_going_forth_again_sends_no_keyframe_that_the_page_had() -> None:
     assert len(bench.do(Seek(20)).chunks) == 5
     bench.controller.handle(Seek(43))
     bench.settle()
-    delta = bench.outbox.take()
+    delta = bench.page.take()
     assert (delta.keep, delta.frames, delta.chunks) == (51, (), ())
     again = bench.fold.apply(delta).chunks
     assert len(again) == 9 and all(one is other for one, other in zip(again, had, strict=False))

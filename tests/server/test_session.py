@@ -172,7 +172,7 @@ def test_a_ground_slider_relabels_the_present_frame_at_once_and_the_engine_uses_
     if playing:
         bench.do(Play())
     bench.controller.handle(SetParams({"ground.sigma": 0.2}))
-    assert bench.outbox.urgent
+    assert bench.page.urgent
     frame = bench.see().transport.frame
     bench.controller.work()
     snapshot = bench.see()

@@ -146,7 +146,7 @@ class Kept(Bench):
         super().__init__(resolve_params(SAMPLE, None, None, []), open_whole, path)
 
     def _controller(self, opener: Callable[..., Session]) -> Controller:
-        return Controller(self.outbox, self.params, opener, session_folder=self.folder, clock=lambda: 0.0)
+        return Controller(self.page, self.params, opener, session_folder=self.folder, clock=lambda: 0.0)
 
     @property
     def session_file(self) -> Path:

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from app.mapping.log import Log
 from app.server.chunks import one_per_voxel
 from app.server.controller import Controller
-from app.server.delta import Outbox
 from app.server.fold import Fold
 from app.server.protocol import (
     Command,
@@ -28,6 +27,7 @@ from app.server.protocol import (
     StepFrame,
     Transport,
 )
+from app.server.publisher import Publisher
 from app.slam.frames import READOUTS, Frame
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
@@ -74,19 +74,19 @@ def test_a_reader_that_misses_updates_ends_with_the_same_snapshot(
     script: list[tuple[Command, int]], data: st.DataObject
 ) -> None:
     def drive(take_after: list[bool]) -> Snapshot:
-        outbox, fold, now = Outbox(Params()), Fold(), 0.0
-        controller = Controller(outbox, Params(), fakes.open_fake, clock=lambda: now)
+        page, fold, now = Publisher(Params()), Fold(), 0.0
+        controller = Controller(page, Params(), fakes.open_fake, clock=lambda: now)
         controller.open(Path("walk-40.mcap"), None)
         for (command, pieces), take in zip(script, take_after, strict=True):
             controller.handle(command)
             for _ in range(pieces):
                 controller.work()
                 now += 0.05
-                if take and outbox.filled:
-                    fold.apply(outbox.take())
+                if take and page.filled:
+                    fold.apply(page.take())
         controller.close()
-        if outbox.filled:
-            fold.apply(outbox.take())
+        if page.filled:
+            fold.apply(page.take())
         return fold.snapshot
 
     attentive = drive([True] * len(script))
@@ -99,8 +99,8 @@ class Frames:
 
     def __init__(self) -> None:
         self.log: Log[Frame] = Log()
-        self.outbox, self.fold = Outbox(Params()), Fold()
-        self.outbox.begin(self.log, [])
+        self.page, self.fold = Publisher(Params()), Fold()
+        self.page.begin(self.log, [])
 
     def add(self, count: int = 1, *, keyframes: bool = False) -> None:
         for _ in range(count):
@@ -109,8 +109,8 @@ class Frames:
             self.log.append(Frame(at, keyframes, position, turn, np.full(len(READOUTS), float(at))))
 
     def see(self, **changes: Any) -> Snapshot:
-        self.outbox.put(transport=Transport(frame=len(self.log) - 1), **changes)
-        return self.fold.apply(self.outbox.take())
+        self.page.put(transport=Transport(frame=len(self.log) - 1), **changes)
+        return self.fold.apply(self.page.take())
 
 
 def test_poses_that_stay_are_the_same_object() -> None:
@@ -128,8 +128,8 @@ def test_a_loop_closure_sends_corrections_and_no_frame() -> None:
     before = frames.see()
     up = np.tile(np.eye(4), (10, 1, 1))
     up[:, 2, 3] = np.arange(10.0)
-    frames.outbox.put(corrections=MapFrame(np.arange(10), up))
-    delta = frames.outbox.take()
+    frames.page.put(corrections=MapFrame(np.arange(10), up))
+    delta = frames.page.take()
     assert (delta.keep, delta.frames, delta.chunks) == (10, (), ())
     after = frames.fold.apply(delta)
     assert before.trajectory is not None and after.trajectory is not None and after.keyframe_poses is not None
@@ -177,10 +177,10 @@ def test_the_error_to_the_truth_follows_from_the_trajectory_that_is_shown() -> N
 def test_nothing_is_kept_for_a_reader_that_has_it() -> None:
     frames = Frames()
     frames.add()
-    frames.outbox.notice("info", "one")
-    assert frames.outbox.filled
+    frames.page.notice("info", "one")
+    assert frames.page.filled
     frames.see()
-    assert not frames.outbox.filled and not frames.outbox.urgent
+    assert not frames.page.filled and not frames.page.urgent
 
 
 @given(seed=st.integers(0, 1000), size=st.sampled_from([0.05, 0.3, 1.0]), shift=st.floats(-500, 500))
