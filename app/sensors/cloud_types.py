@@ -145,8 +145,7 @@ class Probe:
 
     @cached_property
     def _valid(self) -> tuple[F32, npt.NDArray[np.intp]]:
-        points, index = valid_points(self.cloud.xyz())
-        return points, np.arange(len(self.cloud)) if index is None else index
+        return valid_points(self.cloud.xyz())
 
     @property
     def points(self) -> F32:
@@ -170,14 +169,12 @@ def stamped(probes: list[Probe]) -> list[Probe]:
     return [Probe(probe.log_ns, replace(probe.cloud, stamp_ns=probe.log_ns), stamped=False) for probe in probes]
 
 
-def valid_points(xyz: F32, time: Column | None = None) -> tuple[F32, npt.NDArray[np.intp] | None]:
-    """Points with a return (finite, not all zero, with a finite time), and their indices; None if all are valid."""
+def valid_points(xyz: F32, time: Column | None = None) -> tuple[F32, npt.NDArray[np.intp]]:
+    """Points with a return (finite, not all zero, with a finite time), and their indices."""
     x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
     # An overflow is not finite either, so one sum tests all three.
     valid = np.isfinite(x + y + z) & ((x != 0) | (y != 0) | (z != 0))
     if time is not None and time.dtype.kind == "f":
         valid &= np.isfinite(time)
-    if valid.all():
-        return np.ascontiguousarray(xyz), None
     index = np.flatnonzero(valid)
     return xyz.take(index, axis=0), index

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from app.sensors.azimuth import Spin
 from app.sensors.cloud_types import POINT_CLOUD_2, CloudError, CloudMessage, CloudType, valid_points
 from app.sensors.rings import Rings
 from app.sensors.ros import stamp_ns
-from app.sensors.timing import Timing
-from app.slam.types import I64, DroppedScan, Scan
+from app.sensors.timing import Timing, exact_ns
+from app.slam.types import DroppedScan, Scan
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,15 +61,12 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
     if not len(points):
         raise CloudError(_nothing_left(cloud))
 
-    def kept(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        return values if index is None else values.take(index, axis=0)
-
     ring = layout.rings.of(cloud, points, index)
     if time is None:
         assert layout.spin is not None
         base_ns, times_ns = 0, layout.spin.times_ns(points, ring)
     else:
-        base_ns, times_ns = exact_ns(kept(time), timing.unit_ns)
+        base_ns, times_ns = exact_ns(time.take(index), timing.unit_ns)
     earliest, latest = int(times_ns.min()), int(times_ns.max())
     if latest - earliest > np.iinfo(np.int32).max:
         raise CloudError("its points are more than 2 s apart, which is no single scan")
@@ -85,25 +81,15 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
             begin_ns = cloud.stamp_ns - (latest - earliest)
     offsets_ns = (times_ns - earliest).astype(np.int32)
     intensity = (
-        kept(cloud.column(layout.intensity_field)).astype(np.float32)
+        cloud.column(layout.intensity_field).take(index).astype(np.float32)
         if layout.intensity_field
         else np.zeros(len(points), np.float32)
     )
-    ground = (kept(cloud.column(layout.ground_field)) != 0).astype(np.uint8) if layout.ground_field else None
+    ground = (cloud.column(layout.ground_field).take(index) != 0).astype(np.uint8) if layout.ground_field else None
     for array in (points, offsets_ns, intensity, ring, ground):
         if array is not None:
             array.setflags(write=False)
     return Scan(begin_ns, points, offsets_ns, intensity, ring, ground)
-
-
-def exact_ns(time: npt.NDArray[Any], unit_ns: int) -> tuple[int, I64]:
-    """Times of any type as (base, (n,) int64 after it), ns, without losing digits of large values."""
-    if time.dtype.kind == "f":
-        values = time.astype(np.float64)
-        whole = float(np.floor(values.min()))
-        return int(whole) * unit_ns, np.rint((values - whole) * unit_ns).astype(np.int64)
-    least = time.min()
-    return int(least) * unit_ns, (time - least).astype(np.int64) * unit_ns
 
 
 def _nothing_left(cloud: CloudMessage) -> str:

@@ -37,15 +37,13 @@ class Rings:
     bounds: F64 | None = None
     centre: tuple[float, float] = (0.0, 0.0)
 
-    def of(self, cloud: CloudMessage, points: F32, index: npt.NDArray[np.intp] | None) -> U16:
+    def of(self, cloud: CloudMessage, points: F32, index: npt.NDArray[np.intp]) -> U16:
         """(n,) uint16 ring of the kept points, whose places in the message are `index`."""
         if self.field is not None:
-            raw = cloud.column(self.field)
-            raw = (raw if index is None else raw.take(index)).astype(np.uint16)
+            raw = cloud.column(self.field).take(index).astype(np.uint16)
         elif self.place is not None:
             step, lines = self.place
-            where = np.arange(len(cloud)) if index is None else index
-            raw = (where // step % lines).astype(np.uint16)
+            raw = (index // step % lines).astype(np.uint16)
         elif self.bounds is not None:
             return np.searchsorted(self.bounds, elevation(points, self.centre)).astype(np.uint16)
         else:

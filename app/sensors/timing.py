@@ -14,6 +14,7 @@ import numpy.typing as npt
 from app.sensors.cloud_types import CloudType, Probe
 from app.sensors.findings import Finding, Verdict
 from app.slam.sections import RecordingParams
+from app.slam.types import I64
 
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
@@ -114,9 +115,9 @@ def _settle_reference(
     name: str, unit_ns: int, clouds: list[Probe], chosen: RecordingParams, period_ns: int
 ) -> tuple[Timing, list[Finding]]:
     """What the field counts from, and which point the header belongs to."""
-    # Python integers: nanoseconds since 1970 do not fit a float exactly.
-    least = [_to_ns(probe.column(name).min(), unit_ns) for probe in clouds]
-    most = [_to_ns(probe.column(name).max(), unit_ns) for probe in clouds]
+    times = [exact_ns(probe.column(name), unit_ns) for probe in clouds]
+    least = [base + int(after.min()) for base, after in times]
+    most = [base + int(after.max()) for base, after in times]
     stamps = [probe.cloud.stamp_ns for probe in clouds]
     to_first = float(np.median([s - t for s, t in zip(stamps, least, strict=True)]))
     to_last = float(np.median([s - t for s, t in zip(stamps, most, strict=True)]))
@@ -240,8 +241,11 @@ def _without_field(
     return Timing(None, 1, "header", shift, period_ns), [finding, stamp_finding]
 
 
-def _to_ns(value: npt.NDArray[Any] | Any, unit_ns: int) -> int:
-    if isinstance(value, np.integer):
-        return int(value) * unit_ns
-    whole = int(np.floor(value))
-    return whole * unit_ns + round((float(value) - whole) * unit_ns)
+def exact_ns(time: npt.NDArray[Any], unit_ns: int) -> tuple[int, I64]:
+    """Times of any type as (base, (n,) int64 after it), ns, without losing digits of large values."""
+    if time.dtype.kind == "f":
+        values = time.astype(np.float64)
+        whole = float(np.floor(values.min()))
+        return int(whole) * unit_ns, np.rint((values - whole) * unit_ns).astype(np.int64)
+    least = time.min()
+    return int(least) * unit_ns, (time - least).astype(np.int64) * unit_ns
