@@ -16,7 +16,7 @@ from app.slam.voxel import VoxelGrid, spread
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class EngineProgress:
     """What one frame hands to the next, besides the map.
 
     Attributes:
@@ -36,7 +36,7 @@ class EngineState:
     """All that the engine's future depends on. Restoring it restores every later result exactly."""
 
     params: Params
-    progress: Progress
+    progress: EngineProgress
     map: MapState
     keyframes: int
 
@@ -61,7 +61,7 @@ class Engine:
         self.keyframes = KeyframeStore() if keyframes is None else keyframes
         self._map = LocalMap(params.map)
         self._grid = VoxelGrid()
-        self._progress = Progress()
+        self._progress = EngineProgress()
 
     def step(self, scan: Scan, samples: ImuSamples) -> StepResult:
         """Process one scan with the samples that cover the time from the previous scan's end to its own."""
@@ -126,7 +126,9 @@ class Engine:
             imu_gap_s=float(np.diff(samples.stamps_ns).max(initial=0)) * 1e-9,
         )
         T_odom_keyframe = before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu
-        self._progress = Progress(before.frame + 1, None if waiting else posterior, still, status, T_odom_keyframe)
+        self._progress = EngineProgress(
+            before.frame + 1, None if waiting else posterior, still, status, T_odom_keyframe
+        )
         return result
 
     def relabel(self, result: StepResult) -> StepResult:
