@@ -217,7 +217,7 @@ def test_an_unknown_scene_is_named_with_what_there_is() -> None:
         build_scene("corridr", 0)
 
 
-def test_an_open3d_that_can_not_be_loaded_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_open3d_that_cannot_be_loaded_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "open3d.core", None)
     with pytest.raises(HemislamError, match=r"libusb-1.0-0 libegl1 libgl1"):
         Raycaster(wall_at(1.0))

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from app.sensors.simulator.mesh import MeshBuilder
 from app.sensors.simulator.raycast import Mover, SimulatedScene
 from app.sensors.simulator.scenes import props
-from app.sensors.simulator.scenes.props import Point, on_ground
+from app.sensors.simulator.scenes.props import Corners, Point, on_ground
 from app.sensors.simulator.trajectory import arc_lengths, places_at
 from app.slam.types import F64
 
@@ -24,6 +24,19 @@ _EDGE = 45.0
 _CAMPUS = [
     *((-14.0, -13.0), (0.0, -15.0), (14.0, -12.0), (22.0, -3.0), (19.0, 8.0)),
     *((8.0, 13.0), (-7.0, 11.0), (-20.0, 12.0), (-25.0, 2.0), (-22.0, -8.0)),
+]
+_TWO_BLOCKS = [
+    *((0.0, 0.0), (15.0, 0.0), (15.0, 11.0), (0.0, 11.0), (0.0, 0.0), (-32.0, 3.0)),
+    *((-36.0, 40.0), (-20.0, 62.0), (34.0, 58.0), (42.0, 24.0), (15.0, 0.0)),
+]
+_FIGURE_OF_EIGHT = [
+    *((0.0, 0.0), (16.0, 2.0), (14.0, 13.0), (-1.0, 12.0), (0.0, 0.0), (28.0, -30.0), (64.0, -26.0)),
+    *((66.0, 14.0), (34.0, 22.0), (0.0, 0.0), (-30.0, -30.0), (-66.0, -18.0), (-62.0, 22.0), (-28.0, 30.0)),
+]
+_THREE_ROUNDS = [
+    *((0.0, 0.0), (15.0, 0.0), (15.0, 10.0), (0.0, 10.0), (0.0, 0.0), (-60.0, -8.0), (-95.0, 30.0)),
+    *((-70.0, 80.0), (-10.0, 70.0), (0.0, 10.0), (0.0, 0.0), (50.0, -40.0), (110.0, -30.0), (115.0, 35.0)),
+    *((60.0, 62.0), (15.0, 10.0), (15.0, 0.0), (40.0, -70.0), (-20.0, -85.0), (-60.0, -50.0)),
 ]
 
 
@@ -88,47 +101,27 @@ def outdoor(rng: np.random.Generator) -> SimulatedScene:
 
 def outdoor_1(rng: np.random.Generator) -> SimulatedScene:
     """Streets of a campus: round a small block, then round the large one, 290 m a lap."""
-    return _streets(
-        rng,
-        [
-            *((0.0, 0.0), (15.0, 0.0), (15.0, 11.0), (0.0, 11.0), (0.0, 0.0), (-32.0, 3.0)),
-            *((-36.0, 40.0), (-20.0, 62.0), (34.0, 58.0), (42.0, 24.0), (15.0, 0.0)),
-        ],
-    )
+    return _streets(rng, _TWO_BLOCKS)
 
 
 def outdoor_2(rng: np.random.Generator) -> SimulatedScene:
     """Streets of a campus: a figure of eight after a small block, 440 m a lap."""
-    return _streets(
-        rng,
-        [
-            *((0.0, 0.0), (16.0, 2.0), (14.0, 13.0), (-1.0, 12.0), (0.0, 0.0), (28.0, -30.0), (64.0, -26.0)),
-            *((66.0, 14.0), (34.0, 22.0), (0.0, 0.0), (-30.0, -30.0), (-66.0, -18.0), (-62.0, 22.0), (-28.0, 30.0)),
-        ],
-    )
+    return _streets(rng, _FIGURE_OF_EIGHT)
 
 
 def outdoor_3(rng: np.random.Generator) -> SimulatedScene:
     """An open campus with wide lawns, 950 m a lap through three rounds that share streets."""
-    return _streets(
-        rng,
-        [
-            *((0.0, 0.0), (15.0, 0.0), (15.0, 10.0), (0.0, 10.0), (0.0, 0.0), (-60.0, -8.0), (-95.0, 30.0)),
-            *((-70.0, 80.0), (-10.0, 70.0), (0.0, 10.0), (0.0, 0.0), (50.0, -40.0), (110.0, -30.0), (115.0, 35.0)),
-            *((60.0, 62.0), (15.0, 10.0), (15.0, 0.0), (40.0, -70.0), (-20.0, -85.0), (-60.0, -50.0)),
-        ],
-        built=0.45,
-    )
+    return _streets(rng, _THREE_ROUNDS, built=0.45)
 
 
 def outdoor_4(rng: np.random.Generator) -> SimulatedScene:
     """One long winding road, 640 m, that never comes back."""
     x = np.arange(0.0, 520.0, 10.0)
     path = np.column_stack([x, 38.0 * np.sin(x / 34.0) + 12.0 * np.sin(x / 71.0)])
-    return _streets(rng, [(float(a), float(b)) for a, b in path], closed=False, built=0.5)
+    return _streets(rng, path, closed=False, built=0.5)
 
 
-def _streets(rng: np.random.Generator, way: list[Point], *, closed: bool = True, built: float = 0.7) -> SimulatedScene:
+def _streets(rng: np.random.Generator, way: Corners, *, closed: bool = True, built: float = 0.7) -> SimulatedScene:
     """Rolling ground with buildings (where `built`, 0-1, has them), trees, cars and people along a path."""
     mesh, path = MeshBuilder(), np.array(way)
     phase = rng.uniform(0, 2 * np.pi, 4)

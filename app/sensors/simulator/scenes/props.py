@@ -16,7 +16,7 @@ from app.slam.types import F64
 
 Point = tuple[float, float]
 Corners = Sequence[Point] | F64
-"""A closed polygon in plan, m."""
+"""A polygon or polyline in plan, m."""
 
 
 def rectangle(x0: float, y0: float, x1: float, y1: float) -> list[Point]:
