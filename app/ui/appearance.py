@@ -46,7 +46,6 @@ class AppearancePanel:
 
     @property
     def view(self) -> View:
-        """As the widgets say now."""
         return View(
             colour_by=self._colour_by.value,
             point_size=self._point_size.value / 100,
@@ -55,7 +54,6 @@ class AppearancePanel:
         )
 
     def look_freely(self) -> None:
-        """Stop following, so that a camera stays where it is put."""
         show(self._follow, False)
 
     def draw(self, view: View, limits: Limits | None, points: int, budget: int) -> None:

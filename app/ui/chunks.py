@@ -60,12 +60,10 @@ class MapChunks:
 
     @property
     def limits(self) -> dict[str, Limits]:
-        """Ends of the colour maps, as drawn."""
         return self._drawn[-1].limits if self._drawn else self._fixed
 
     @property
     def points(self) -> int:
-        """Points drawn now."""
         return sum(drawn.count for drawn in self._drawn)
 
     def clear(self, start_ns: int, duration_s: float) -> None:
@@ -103,7 +101,6 @@ class MapChunks:
                     drawn.handle.colors = self._colours(self._shown(chunk, T))
 
     def _keep(self, count: int) -> None:
-        """Remove all keyframes but the first so many."""
         for drawn in self._drawn[count:]:
             if drawn.handle is not None:
                 drawn.handle.remove()
@@ -118,7 +115,6 @@ class MapChunks:
         return moved
 
     def _grown(self, chunk: Chunk, T_map_imu: F64) -> dict[str, Limits]:
-        """The limits with one more keyframe."""
         limits, cloud = self.limits, self._cloud(chunk, T_map_imu)
         for name, mode in MODES.items():
             wider = grown(limits.get(name), mode, mode.values(cloud)) if mode.fixed is None else None
@@ -137,7 +133,6 @@ class MapChunks:
         )
 
     def _shown(self, chunk: Chunk, T_map_imu: F64) -> PointSet:
-        """The points that the view shows."""
         return self._cloud(chunk, T_map_imu, shown_points(chunk, T_map_imu @ chunk.T_imu_lidar, self._view.ceilings))
 
     def _send(self, drawn: _Drawn, T_map_imu: F64) -> None:

@@ -154,7 +154,6 @@ def grown(limits: Limits | None, mode: ColourMode, values: npt.ArrayLike) -> Lim
 
 
 def legend(by: str, limits: Limits | None) -> str:
-    """What the colours mean, with units."""
     if by == LABEL:
         return panel("keys", [(LABEL_COLOURS[label], name) for label, name in LABEL_NAMES.items()])
     mode = MODES[by]

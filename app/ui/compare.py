@@ -56,20 +56,16 @@ class Sides:
         return self._choice.value == "B" and self._forks.other is not None
 
     def choose(self, side: str) -> None:
-        """A or B."""
         show(self._choice, side)
 
     def draw(self, b: Snapshot | None) -> None:
-        """Show the choice while there is a fork."""
         self._choice.visible = b is not None
 
     def tuned(self, a: Snapshot) -> Snapshot:
-        """The snapshot whose parameters are shown."""
         other = self._forks.other
         return other if other is not None and self.on_b else a
 
     def send(self, command: Command) -> None:
-        """To the side chosen."""
         if self.on_b:
             self._forks.send_other(command)
         else:
@@ -253,7 +249,6 @@ class ComparePanel:
             notify_error(client, error)
 
     def _choose(self, client: viser.ClientHandle) -> None:
-        """A dialog with the sessions that can be opened as B."""
         kept = self._forks.kept()
         with dialog(client, "Open a session as B") as close:
             if not kept:

@@ -153,7 +153,6 @@ def how(a: Snapshot, b: Snapshot) -> tuple[str, str]:
 
 
 def legend() -> str:
-    """Of the scan's colours."""
     names = ("ground only in A", "only in B", "both", "neither")
     return panel("keys", list(zip((A_COLOUR, B_COLOUR, LABEL_COLOURS[1], LABEL_COLOURS[0]), names, strict=True)), True)
 

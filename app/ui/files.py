@@ -64,7 +64,6 @@ class FilesPanel:
         self._save.on_click(by_user(lambda _, client: self._ask_where(client)))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Enable what is possible now; say where the newest results are."""
         self._save.disabled = snapshot.result is None
         self._compare.disabled = snapshot.recording is None or snapshot.live is not None
         done = [saved.folder for saved in snapshot.saved if not saved.error]
@@ -73,29 +72,37 @@ class FilesPanel:
             self._saved.content = panel("path", "Saved in ", str(done[-1]))
 
     def _browse(self, _: Any, client: viser.ClientHandle) -> None:
-        browser = FileBrowser(client, self._folders, "Open a recording")
-        with_truth = browser.checkbox(
-            "with truth", "Also load the trajectory (.tum) beside the recording, if there is one."
-        )
-
         def choose(path: Path) -> None:
             path = self._folders.openable(path)
             self._page.send(OpenRecording(path, truth_beside(path) if with_truth.value else None))
 
-        browser.show(RECORDINGS, "No recordings (.bag, .mcap, .db3, .pcap, ROS 2 folders) or sessions here.", choose)
+        with dialog(client, "Open a recording") as close:
+            nothing = "No recordings (.bag, .mcap, .db3, .pcap, ROS 2 folders) or sessions here."
+            FileList(client.gui, self._folders, RECORDINGS, nothing, choose, close)
+            with_truth = client.gui.add_checkbox(
+                "with truth", True, hint="Also load the trajectory (.tum) beside the recording, if there is one."
+            )
 
     def _browse_trajectories(self, _: Any, client: viser.ClientHandle) -> None:
-        results = [self._results] if self._results.is_dir() else []
-        folders = Folders([*self._folders.roots, *results])
-        browser = FileBrowser(client, folders, "Compare with a trajectory")
-        recording = self._page.snapshot().recording
-        if recording is not None and recording.truth is not None:
-            browser.button(f"Stop comparing with {recording.truth.name}", lambda: self._page.send(CompareWith(None)))
-        browser.show(
-            TRAJECTORIES,
-            "No trajectories (.tum) here. “Save results…” writes one, as most SLAM programs do.",
-            lambda path: self._page.send(CompareWith(folders.inside(path))),
-        )
+        folders = Folders([*self._folders.roots, *([self._results] if self._results.is_dir() else [])])
+        recording, gui = self._page.snapshot().recording, client.gui
+
+        def stop(_: object) -> None:
+            self._page.send(CompareWith(None))
+            close()
+
+        with dialog(client, "Compare with a trajectory") as close:
+            nothing = "No trajectories (.tum) here. “Save results…” writes one, as most SLAM programs do."
+            FileList(
+                gui,
+                folders,
+                TRAJECTORIES,
+                nothing,
+                lambda path: self._page.send(CompareWith(folders.inside(path))),
+                close,
+            )
+            if recording is not None and recording.truth is not None:
+                gui.add_button(f"Stop comparing with {recording.truth.name}", color="gray").on_click(stop)
 
     def _ask_where(self, client: viser.ClientHandle) -> None:
         recording = self._page.snapshot().recording
@@ -122,85 +129,72 @@ class FilesPanel:
         save.on_click(confirmed)
 
 
-class FileBrowser:
-    """A dialog in one browser to go through folders and choose a file. Add further controls before `show`."""
+class FileList:
+    """Folders to go through and files to choose from, in a dialog.
 
-    def __init__(self, client: viser.ClientHandle, folders: Folders, title: str) -> None:
-        self._gui = client.gui
-        self._folders = folders
-        self._suffixes: tuple[str, ...] = ()
-        self._nothing = ""
-        self._choose: Callable[[Path], None] = lambda _: None
-        self._modal = self._gui.add_modal(title)
-        with self._modal:
-            self._here = self._gui.add_html("")
-            self._list = self._gui.add_folder(None)
+    Args:
+        suffixes: of the files that may be chosen. nothing: shown for a folder without such files.
+        choose: called with the file, and `close` after it; a HemislamError that it raises is shown instead.
+    """
 
-    def checkbox(self, label: str, hint: str) -> viser.GuiCheckboxHandle:
-        with self._modal:
-            return self._gui.add_checkbox(label, True, hint=hint)
-
-    def button(self, text: str, act: Callable[[], None]) -> None:
-        """Another way out of the dialog."""
-        with self._modal:
-            button = self._gui.add_button(text, color="gray")
-
-        def clicked(_: object) -> None:
-            act()
-            self._modal.close()
-
-        button.on_click(clicked)
-
-    def show(self, suffixes: tuple[str, ...], nothing: str, choose: Callable[[Path], None]) -> None:
-        """List the folders.
-
-        Args:
-            suffixes: of the files that may be chosen. nothing: shown for a folder without such files.
-            choose: called with the file; a HemislamError that it raises is shown.
-        """
-        self._suffixes, self._nothing, self._choose = suffixes, nothing, choose
-        self.button("Cancel", lambda: None)
-        roots = self._folders.roots
-        self._go(roots[0] if len(roots) == 1 else None)
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        folders: Folders,
+        suffixes: tuple[str, ...],
+        nothing: str,
+        choose: Callable[[Path], None],
+        close: Callable[[], None],
+    ) -> None:
+        self._gui, self._folders, self._suffixes, self._nothing = gui, folders, suffixes, nothing
+        self._choose, self._close = choose, close
+        self._here = gui.add_html("")
+        self._place = gui.add_folder(None)
+        self._rows: list[viser.GuiButtonHandle | viser.GuiHtmlHandle] = []
+        self._go(folders.roots[0] if len(folders.roots) == 1 else None)
 
     def _go(self, folder: Path | None) -> None:
         """List a folder; None lists the roots."""
-        order = self._list.order
-        self._list.remove()
-        with self._modal:
-            self._list = self._gui.add_folder(None, order=order)
-        with self._list:
-            if folder is None:
-                self._here.content = panel("text", "Folders that this server was started with:")
-                for root in self._folders.roots:
-                    self._button(str(root), viser.Icon.FOLDER, partial(self._go, root))
-                return
-            self._here.content = panel("path", "", str(folder))
-            try:
-                entries = self._folders.listing(folder, self._suffixes)
-            except HemislamError as error:
-                self._gui.add_html(panel("path", "", str(error)))
-                entries = []
-            at_root = folder in self._folders.roots
-            if not at_root or len(self._folders.roots) > 1:
-                self._button("..", viser.Icon.CORNER_LEFT_UP, lambda: self._go(None if at_root else folder.parent))
-            for entry in entries[:_MOST_ENTRIES]:
-                self._entry(entry)
-            if not entries:
-                self._gui.add_html(panel("text", self._nothing))
-            if len(entries) > _MOST_ENTRIES:
-                more = f"{len(entries) - _MOST_ENTRIES} more are not shown; name the file on the command line."
-                self._gui.add_html(panel("text", more))
+        for row in self._rows:
+            row.remove()
+        self._rows.clear()
+        roots = self._folders.roots
+        if folder is None:
+            self._here.content = panel("text", "Folders that this server was started with:")
+            for root in roots:
+                self._button(str(root), viser.Icon.FOLDER, partial(self._go, root))
+            return
+        self._here.content = panel("path", "", str(folder))
+        entries: list[Entry] = []
+        try:
+            entries = self._folders.listing(folder, self._suffixes)
+        except HemislamError as error:
+            self._text(panel("path", "", str(error)))
+        if folder not in roots:
+            self._button("..", viser.Icon.CORNER_LEFT_UP, partial(self._go, folder.parent))
+        elif len(roots) > 1:
+            self._button("..", viser.Icon.CORNER_LEFT_UP, partial(self._go, None))
+        for entry in entries[:_MOST_ENTRIES]:
+            if entry.is_choice:
+                text = f"{entry.path.name}   {size_text(entry.size)}"
+                self._button(text, viser.Icon.FILE_DATABASE, partial(self._chosen, entry.path))
+            else:
+                self._button(entry.path.name, viser.Icon.FOLDER, partial(self._go, entry.path))
+        if not entries:
+            self._text(panel("text", self._nothing))
+        if len(entries) > _MOST_ENTRIES:
+            more = f"{len(entries) - _MOST_ENTRIES} more are not shown; name the file on the command line."
+            self._text(panel("text", more))
 
-    def _entry(self, entry: Entry) -> None:
-        path = entry.path
-        if entry.is_choice:
-            self._button(f"{path.name}   {size_text(entry.size)}", viser.Icon.FILE_DATABASE, lambda: self._chosen(path))
-        else:
-            self._button(path.name, viser.Icon.FOLDER, lambda: self._go(path))
+    def _text(self, html: str) -> None:
+        with self._place:
+            self._rows.append(self._gui.add_html(html))
 
     def _button(self, text: str, icon: viser.IconName, act: Callable[[], None]) -> None:
-        self._gui.add_button(text, icon=icon, color="gray").on_click(lambda _: act())
+        with self._place:
+            button = self._gui.add_button(text, icon=icon, color="gray")
+        button.on_click(lambda _: act())
+        self._rows.append(button)
 
     def _chosen(self, path: Path) -> None:
         try:
@@ -208,4 +202,4 @@ class FileBrowser:
         except HemislamError as error:
             self._here.content = panel("path", "", str(error))
             return
-        self._modal.close()
+        self._close()

@@ -95,7 +95,6 @@ def _tiles(state: LiveState) -> Iterator[Tile]:
 
 
 def unusable(counted: Counters) -> int:
-    """Packets and messages that could not be read."""
     return counted.foreign + counted.truncated + counted.unreadable + counted.imu_foreign
 
 
@@ -110,7 +109,6 @@ class LivePanel:
         self._html = gui.add_html("", visible=False)
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the source's newest readings."""
         self._html.visible = snapshot.live is not None
         if snapshot.live is not None:
             self._html.content = live_html(snapshot.live, ended=snapshot.transport.finished)

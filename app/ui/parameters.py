@@ -52,7 +52,6 @@ Control = (
 
 
 def label(leaf: Leaf) -> str:
-    """Symbol or name, unit, and the mark of when a change takes effect."""
     name = leaf.name.replace("_", " ")
     if leaf.path in PRIMARY:
         name = leaf.symbol if leaf.symbol == "voxel" else f"{leaf.symbol} {name if leaf.symbol == 'M' else ''}".strip()
@@ -61,7 +60,6 @@ def label(leaf: Leaf) -> str:
 
 
 def add_control(gui: viser.GuiApi, leaf: Leaf, value: Any) -> Control:
-    """The widget that fits a parameter's type and range."""
     text, hint = label(leaf), leaf.help
     if leaf.choices:
         return gui.add_dropdown(text, leaf.choices, initial_value=value, hint=hint)
@@ -107,7 +105,6 @@ class ParameterPanel:
         gui.add_html(panel("quiet", "▸ acts from the next frame · ↻ acts on restart"))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Called by the drawing thread, often: send typed values that no longer change, show the snapshot's."""
         now = self._now()
         if engine_number(snapshot) != self._engine:  # what was set was meant for the other engine
             self._engine = engine_number(snapshot)

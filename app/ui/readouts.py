@@ -26,7 +26,6 @@ STAGE_COLOURS: Final[dict[str, Rgb]] = {
 
 
 def ground_tiles(result: StepResult, limit: float) -> list[Tile]:
-    """Ground segmentation of the newest frame."""
     ground = result.ground
     flat = ground.found and ground.planarity < limit
     counts = f"{result.points_in:,} → {result.points_reduced:,} → {result.points_filter:,}"
@@ -39,7 +38,6 @@ def ground_tiles(result: StepResult, limit: float) -> list[Tile]:
 
 
 def filter_tiles(result: StepResult) -> list[Tile]:
-    """How the filter's update went."""
     update = result.registration
     share = update.inliers / update.used if update.used else np.nan
     smallest = float(update.eigenvalues[0]) if len(update.eigenvalues) else np.nan
@@ -55,7 +53,6 @@ def filter_tiles(result: StepResult) -> list[Tile]:
 
 
 def state_tiles(snapshot: Snapshot, result: StepResult) -> list[Tile]:
-    """Motion, biases and the error to truth."""
     state, series = result.state, snapshot.series
     speed = float(np.linalg.norm(state.v_odom_imu))
     gyro, accel = 1000 * state.b_gyro, 1000 * state.b_accel
@@ -147,7 +144,6 @@ class ReadoutPanel:
         self._error.visible = False
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the snapshot's numbers and plots."""
         dropped = snapshot.transport.dropped
         if not self._changes(snapshot.result, snapshot.series, snapshot.params, dropped, self._whole.value):
             return

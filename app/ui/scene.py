@@ -65,7 +65,6 @@ class Scene:
 
     @property
     def points(self) -> int:
-        """Map points in the page."""
         return self._chunks.points
 
     def limits(self, by: str) -> Limits | None:
@@ -73,7 +72,6 @@ class Scene:
         return self._chunks.limits.get(by)
 
     def draw(self, current: Snapshot, view: View) -> None:
-        """Make the scene show `current` seen as `view`."""
         with self._server.atomic():
             recording, result = current.recording, current.result
             start_ns = recording.start_ns if recording else 0

@@ -47,7 +47,6 @@ class SensorScene:
         self.ground_z: float | None = None
 
     def clear(self) -> None:
-        """Hide the scan of the session before."""
         self._imu.visible = False
         self._elevations = np.empty(0)
         self._height = 1.3

@@ -61,7 +61,6 @@ class HeaderPanel:
         self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the snapshot's recording, status and progress."""
         self._title.content = title(snapshot)
         progress = snapshot.progress
         self._work.visible = self._bar.visible = progress is not None
@@ -97,7 +96,6 @@ class DoctorPanel:
         self._html = gui.add_html(findings_html(()))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the open recording's findings."""
         self._html.content = findings_html(snapshot.recording.findings if snapshot.recording else ())
 
 

@@ -37,6 +37,7 @@ _NEIGHBOURS: Final = (255, 92, 141)
 _MAP: Final = (64, 184, 240)
 _LEAST_RADIUS_M: Final = 0.1
 _THRESHOLD: Final = (255, 107, 107)
+_PAUSE: Final = "Drawn for the frame at which you pause."
 _ASK: Final = "Pause and click a point of the scan."
 
 
@@ -124,7 +125,7 @@ class StudyPanel:
         self._alone = gui.add_checkbox("only this frame", False, hint="Hide the map.")
         gui.add_html(heading("Distance to the ground plane over range, and σ · range"))
         self._plot = _plot(gui, curve(None, 0.025))
-        self._summary = gui.add_html("")
+        self._summary = gui.add_html(panel("quiet", _PAUSE))
         gui.add_html(heading("A point"))
         self._neighbours = gui.add_number("neighbours", 20, min=4, max=200, step=1, hint="Nearest points of this scan.")
         self._point = gui.add_html(panel("quiet", _ASK))
@@ -141,13 +142,13 @@ class StudyPanel:
         return replace(view, scan=view.scan and self._by.value == AS_MAP, map=view.map and not self._alone.value)
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
-        """Called by the drawing thread, often."""
         result, by = snapshot.result, self._by.value
         if self._scene_changes(result, by, view.point_size):
             self._scene.draw_cloud(result, by, view.point_size)
             self._legend.content = study_legend(result, by)
         self._draw_point(snapshot, view)
-        if self._curve_changes(result, snapshot.params.ground.sigma):
+        # The page builds this plot anew for every scale, and would show none of ten a second.
+        if not snapshot.transport.playing and self._curve_changes(result, snapshot.params.ground.sigma):
             self._draw_curve(result, snapshot.params.ground.sigma)
 
     def _draw_point(self, snapshot: Snapshot, view: View) -> None:
@@ -176,7 +177,7 @@ class StudyPanel:
         self._plot.scales = _scales(drawn)
         self._plot.data = (drawn.range, drawn.threshold, drawn.under, drawn.over)
         if result is None:
-            self._summary.content = ""
+            self._summary.content = panel("quiet", _PAUSE)
         elif not drawn.points_under + drawn.points_over:
             self._summary.content = panel("note", f"No plane: {result.ground.reason}.")
         else:

@@ -89,7 +89,6 @@ def study_colours(result: StepResult, by: str) -> U8:
 
 
 def study_legend(result: StepResult | None, by: str) -> str:
-    """What the colours mean, with units."""
     if by == AS_MAP or result is None:
         return panel("note", "The scan is coloured like the map; see the tab View.")
     mode = STUDY_MODES[by]
@@ -210,7 +209,6 @@ def pick(result: StepResult, index: int, sigma: float, neighbours: int) -> Picke
 
 
 def describe(result: StepResult, picked: Picked) -> str:
-    """Tiles of one point."""
     cloud, i, patch = result.cloud, picked.index, picked.patch
     under = abs(picked.distance) < picked.threshold
     tilt = np.degrees(np.arccos(min(abs(float(patch.normal @ result.ground.down)), 1.0)))

@@ -75,7 +75,6 @@ class TransportPanel:
         self._send(Pause() if transport.playing else Play())
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Called by the drawing thread, often."""
         transport, now, edit = snapshot.transport, self._now(), self._edit
         if edit is not None and not edit.sent and now - edit.at >= _DRAG_REST_S:
             self._edit = Edit(edit.value, now, sent=True)
@@ -151,7 +150,6 @@ class BreakpointPanel:
             control.on_update(as_set(lambda _value, _client: self._changed()))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Called by the drawing thread, often."""
         now = snapshot.breakpoints
         if now == self._shown:  # a control just set stays until the engine has heard of it
             return
@@ -185,7 +183,6 @@ class NotesPanel:
         self._add.on_click(by_user(lambda _value, _client: self._note()))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the session's notes, the newest first."""
         self._list.content = panel("notes", snapshot.notes[-_SHOWN_NOTES:][::-1])
         self._list.visible = bool(snapshot.notes)
 

@@ -2,7 +2,8 @@
 
 Callbacks of the page only enqueue commands for the engine. One thread draws: it waits for snapshots
 and sends what differs between the last one drawn and the newest. Everything is drawn on the server's
-scene and panels, which viser keeps for every browser, also those that connect or reload later.
+scene and panels, which viser keeps for every browser, also those that connect or reload later. Every
+panel has a `draw` that this thread calls often; a panel sends only what differs from what it shows.
 """
 
 import logging
@@ -121,7 +122,6 @@ class Workbench:
         self._thread = threading.Thread(target=self._run, name="workbench", daemon=True)
 
     def start(self) -> None:
-        """Begin to draw."""
         self._thread.start()
 
     def close(self) -> None:

@@ -83,7 +83,7 @@ def test_while_playing_each_panel_is_sent_at_most_four_times_a_second(page: Page
         page.draw(0.04)
     counts = Counter((m.uuid, *m.updates) for m in wire.messages if isinstance(m, GuiUpdateMessage))
     assert max(counts.values()) <= 40
-    assert counts.total() <= 480
+    assert counts.total() <= 400
     scene = Counter(type(m).__name__ for m in wire.messages if not isinstance(m, GuiUpdateMessage))
     assert scene.total() <= 1200
 

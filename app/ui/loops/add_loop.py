@@ -65,7 +65,6 @@ class Nudging:
 
     @property
     def T_map(self) -> F64:
-        """(4, 4) where the newer cloud is now."""
         return lie.transform(lie.matrix(np.asarray(self.gizmo.wxyz)[[1, 2, 3, 0]]), np.array(self.gizmo.position))
 
     @property
@@ -116,7 +115,6 @@ class AddLoopPanel:
 
     @property
     def nudging(self) -> bool:
-        """Whether its two clouds are in the scene."""
         return self._nudging is not None
 
     @property
@@ -124,7 +122,6 @@ class AddLoopPanel:
         return int(self._older.value), int(self._newer.value)
 
     def suggest_pair(self, pair: Pair) -> None:
-        """Fill in the two keyframes."""
         show(self._older, pair[0])
         show(self._newer, pair[1])
 
@@ -133,7 +130,6 @@ class AddLoopPanel:
         show(self._nudge, False)
 
     def suggest(self) -> None:
-        """Propose what the widgets say."""
         older, newer = self.pair
         count = len(poses_of(self._page.snapshot()))
         good = 0 <= older < newer < count
@@ -193,7 +189,6 @@ class AddLoopPanel:
         return rows(nudging.T_older_newer) if nudging is not None and nudging.pair == self.pair else None
 
     def _look(self, nudging: bool, client: viser.ClientHandle) -> None:
-        """Fly to the cloud to nudge."""
         poses, newer = poses_of(self._page.snapshot()), self.pair[1]
         if nudging and newer < len(poses):
             self._fly(client, poses[newer][:3, 3], _FROM_M)

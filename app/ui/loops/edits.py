@@ -70,14 +70,12 @@ class Proposal:
         cancel.on_click(by_user(lambda _, __: self.cancel()))
 
     def propose(self, command: LoopEdit) -> None:
-        """Ask the engine what it would change."""
         notices = self._snapshot().notices
         self._last_notice = notices[-1].number if notices else 0
         self.command = command
         self._send(TryLoop(command))
 
     def commit(self) -> None:
-        """Make the edit."""
         command, self.command = self.command, None
         if command is not None:
             self._send(EditLoop(command))
@@ -85,13 +83,11 @@ class Proposal:
             self._committed(command)
 
     def cancel(self) -> None:
-        """Drop the proposal."""
         if self.command is not None:
             self.command = None
             self._send(TryLoop(None))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Panel and ghost; called by the drawing thread, often."""
         command, tried = self.command, snapshot.loops.tried
         preview = tried[1] if tried is not None and tried[0] == command else None
         poses = poses_of(snapshot)
@@ -180,7 +176,6 @@ class EditsPanel:
         )
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Say what would be undone and redone."""
         for button, verb, commands in (
             (self._undo, "Undo", snapshot.loops.undo),
             (self._redo, "Redo", snapshot.loops.redo),

@@ -149,7 +149,6 @@ class Inspector:
 
     @property
     def alone(self) -> bool:
-        """Whether the submaps are in the scene and hide everything else."""
         return self._pairing is not None and self._alone.value
 
     def draw(self, snapshot: Snapshot, edge: LoopEdge | None) -> None:

@@ -100,7 +100,6 @@ class LoopsPanel:
                 self._add_loop.suggest_pair(pair)
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
-        """Called by the drawing thread, often."""
         poses = poses_of(snapshot)
         if snapshot.session != self._session:
             self._session, self._coming = snapshot.session, None
@@ -152,7 +151,6 @@ class LoopsPanel:
             self._send(InspectLoop(edge.pair if edge is not None else None))
 
     def _act(self, word: str, _: viser.ClientHandle) -> None:
-        """A click on HTML."""
         match word.split(" ", 1):
             case ["show", kind] if kind in KINDS:
                 self._shown = self._shown ^ {kind}
@@ -164,7 +162,6 @@ class LoopsPanel:
                     self.choose(None if named[text] == self._chosen else named[text])
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
-        """A click in the scene."""
         origin, direction = self._page.in_map(event)
         if self._add_loop.picking:
             self._add_loop.pick(origin, direction)
@@ -193,7 +190,6 @@ class LoopsPanel:
             self._fly(client, ends.mean(axis=0), 7.0 + 1.2 * float(np.linalg.norm(ends[1] - ends[0])))
 
     def _fly(self, client: viser.ClientHandle, place: F64, distance: float) -> None:
-        """Move a browser's camera to a place (3,) of the map."""
         self._look_freely()
         fly(client, place + self._page.offset(), distance)
 

@@ -74,7 +74,6 @@ def name(pair: Pair) -> str:
 
 
 def describe_edit(command: LoopEdit) -> str:
-    """An edit in a few words."""
     if isinstance(command, Solve):
         return "solve all at once"
     pair = name((command.older, command.newer))
@@ -90,7 +89,6 @@ def describe_edit(command: LoopEdit) -> str:
 
 
 def headline(edge: LoopEdge) -> str:
-    """Which loop, its verdict and why."""
     return panel("loops.headline", edge, kind_of(edge).colour)
 
 
@@ -196,7 +194,6 @@ def _largest_first(residuals: tuple[FactorResidual, ...]) -> list[FactorResidual
 
 
 def _cost(residuals: tuple[FactorResidual, ...]) -> float:
-    """What the solver minimises."""
     return float(sum(factor.cost for factor in residuals))
 
 
