@@ -1,14 +1,20 @@
-"""The loop search in a worker that may die: it is replaced by a new one, which is sent what it lacks."""
+"""The loop search in a process of its own, so that the frame loop never waits for it. One that dies is replaced."""
 
+import os
 from collections import deque
 from collections.abc import Callable
-from typing import Final, Protocol
+from dataclasses import replace
+from typing import Final
 
-from app.child import ChildDied, RestartLimit
-from app.mapping.loop_process import LoopProcess
+from app.child import Child, ChildDied, Link, RestartLimit
 from app.slam.loops.keyframe_log import Follower, KeyframeLog
-from app.slam.loops.messages import Added, Answer, Ask, Failure, Reply, Request
+from app.slam.loops.messages import Added, Answer, Ask, Failure, LoopState, Reply, Request
+from app.slam.loops.types import LoopChange, LoopEdge, changed_by, difference
 
+NICENESS: Final = 10
+"""The frame loop comes first."""
+_ONE_THREAD: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "NUMBA", "OPENBLAS", "MKL")}
+"""More threads would compete with the frame loop for the cores."""
 MOST_DEATHS: Final = 3
 """A worker is replaced this many times; after that, loops stay as they are."""
 GIVEN_UP: Final = "Loops are no longer looked for; restart to try again."
@@ -16,41 +22,58 @@ MOST_PENDING: Final = 4
 """Requests that a new worker is sent at a time, so that keyframes do not pile up in memory."""
 
 
-class LoopWorker(Protocol):
-    """Answers requests one by one, in order; for example a process."""
+class LoopProcess:
+    """A process that answers requests one by one, in order. Used by one thread."""
+
+    def __init__(self) -> None:
+        self._child = Child(
+            main, name="loops", title="The process that looks for loops", environment=_ONE_THREAD, grace_s=0.0
+        )
+        self._edges: tuple[LoopEdge, ...] = ()
 
     @property
-    def pending(self) -> int:
-        """Requests whose replies were not received yet."""
+    def pid(self) -> int:
+        return self._child.pid
 
     def send(self, request: Request) -> None:
-        """Hand a request over. Never waits for the answer."""
+        """Send a request, whose arrays must not change any more. Never waits, not even if the process is dead."""
+        self._child.send(request)
 
     def receive(self, timeout: float | None = None) -> Reply | None:
-        """The reply to the oldest pending request; None if there is none within the time (s).
+        """The reply to the oldest request that has none yet; None if there is none within the time (s).
 
         Raises:
-            ChildDied: there will be no answer.
+            ChildDied: it will never come.
         """
+        message: tuple[Reply, LoopChange | None] | None = self._child.receive(timeout)
+        if message is None:
+            return None
+        reply, change = message
+        if not isinstance(reply, LoopState) or change is None:
+            return reply
+        if any(change):
+            self._edges = changed_by(change, self._edges)
+        return replace(reply, edges=self._edges)
 
     def close(self) -> None:
-        """Release all resources; pending requests are dropped."""
+        """End the process; unanswered requests are dropped."""
+        self._child.close()
 
 
 class RestartingLoops:
-    """A `LoopClient` whose worker is replaced when it dies.
+    """A `LoopClient` whose process is replaced when it dies.
 
     Args:
-        log: the keyframes that it follows. make: makes a worker.
+        log: the keyframes that it follows. make: starts a process.
     """
 
-    def __init__(self, log: KeyframeLog, make: Callable[[], LoopWorker] = LoopProcess) -> None:
+    def __init__(self, log: KeyframeLog, make: Callable[[], LoopProcess] = LoopProcess) -> None:
         self._make, self._log = make, log
-        self._worker, self._follower = make(), Follower(log)
+        self._process, self._follower = make(), Follower(log)
         self._unsent: deque[Ask] = deque()
         self._sent: deque[Ask | None] = deque()  # None: a keyframe
         self._limit, self._given_up = RestartLimit(MOST_DEATHS), False
-        self._lost = 0  # keyframes that the worker before had been sent
+        self._lost = 0  # keyframes that the process before had been sent
         self._alarms: list[str] = []
 
     def send(self, ask: Ask) -> None:
@@ -60,7 +83,7 @@ class RestartingLoops:
     def receive(self, timeout: float | None = None) -> Answer | None:
         while self._sent and not self._given_up:
             try:
-                reply = self._worker.receive(timeout)
+                reply = self._process.receive(timeout)
             except ChildDied as error:
                 self._replace(error)
                 return None
@@ -82,34 +105,52 @@ class RestartingLoops:
         return taken
 
     def close(self) -> None:
-        self._worker.close()
+        self._process.close()
 
     @property
     def catching_up(self) -> bool:
-        """Whether a new worker has yet to be sent what the one before had."""
+        """Whether a new process has yet to be sent what the one before had."""
         return bool(self._unsent) and self._follower.length < max(self._lost, self._log.stored)
 
     def _feed(self) -> None:
-        """Send the questions, each after the keyframes that the worker lacks for it."""
+        """Send the questions, each after the keyframes that the process lacks for it."""
         if self._given_up:
             return
         while self._unsent:
             target = self._unsent[0].target
-            if self.catching_up and self._worker.pending >= MOST_PENDING:
+            if self.catching_up and len(self._sent) >= MOST_PENDING:
                 return
             keyframe = self._follower.next(target)
             self._sent.append(None if keyframe is not None else self._unsent[0])
-            self._worker.send(keyframe or self._unsent.popleft())
+            self._process.send(keyframe or self._unsent.popleft())
 
     def _replace(self, error: ChildDied) -> None:
-        """Begin again with a new worker: what was not answered is asked again."""
+        """Begin again with a new process: what was not answered is asked again."""
         self._given_up = not self._limit.allows()
-        self._worker.close()
+        self._process.close()
         self._unsent.extendleft(reversed([ask for ask in self._sent if ask is not None]))
         self._sent.clear()
         if self._given_up:
             self._alarms.append(f"{error} Loops stay as they are from here on; restart to look for them again.")
             return
         self._alarms.append(f"{error} It is started again; loops follow once it has caught up.")
-        self._worker, self._lost, self._follower = self._make(), self._follower.length, Follower(self._log)
+        self._process, self._lost, self._follower = self._make(), self._follower.length, Follower(self._log)
         self._feed()
+
+
+def main(owner: Link) -> None:
+    """The process: answers requests in their order."""
+    if hasattr(os, "nice"):
+        os.nice(NICENESS)
+    from app.slam.loops.service import LoopService, warm_up  # the owner does not need the solver
+
+    warm_up()
+    service = LoopService()
+    edges: tuple[LoopEdge, ...] = ()
+    while True:
+        reply = service.handle(owner.receive())
+        if isinstance(reply, LoopState):
+            change, edges = difference(edges, reply.edges), reply.edges
+            owner.send((replace(reply, edges=()), change))
+        else:
+            owner.send((reply, None))

@@ -13,15 +13,15 @@ from app.mapping import truth as truths
 from app.mapping.checkpoints import NEAR, Checkpoints
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelEdit, LabelledKeyframes
-from app.mapping.log import Log
 from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
 from app.sensors.findings import Finding
 from app.slam import engine
 from app.slam.engine import Engine
 from app.slam.errors import HemislamError
 from app.slam.frames import Frame
+from app.slam.log import Log
 from app.slam.loops.keyframe_log import KeyframeLog
-from app.slam.loops.messages import LoadEdits, LoopClient
+from app.slam.loops.messages import LoopClient
 from app.slam.loops.schedule import LoopSchedule
 from app.slam.loops.types import Edits, LoopEdit
 from app.slam.map_frame import MapFrame
@@ -210,7 +210,7 @@ class Session:
         """
         if self.loops is None:
             raise HemislamError("Loops are not looked for, so there are none to edit; set loops.enabled.")
-        self.loops.command(LoadEdits(Edits(edits, undone)))
+        self.loops.command(lambda _: Edits(edits, undone))
 
     def resume(self, saved: SavedSession) -> None:
         """Plan to repeat a session of this recording: `go_to` its frame repeats it as it went.

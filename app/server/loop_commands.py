@@ -5,20 +5,16 @@ from dataclasses import replace
 from app.server.protocol import EditLoop, InspectLoop, LoopCommand, LoopsView, RedoLoop, TryLoop, UndoLoop
 from app.server.publisher import Publisher
 from app.slam.loops.messages import (
+    Answered,
     ApplyEdit,
     AskResiduals,
     Failure,
     Inspect,
-    Inspected,
     LoopState,
-    Redo,
-    Residuals,
-    Tried,
     TryOut,
-    Undo,
 )
 from app.slam.loops.schedule import LoopSchedule
-from app.slam.loops.types import LoopEdge
+from app.slam.loops.types import Edits, LoopDetail, LoopEdge, Preview
 
 
 class LoopCommands:
@@ -42,9 +38,9 @@ class LoopCommands:
                 loops.command(ApplyEdit(edit))
                 view = replace(view, tried=None)
             case UndoLoop():
-                loops.command(Undo())
+                loops.command(Edits.undo)
             case RedoLoop():
-                loops.command(Redo())
+                loops.command(Edits.redo)
             case TryLoop(tried) if tried is not None:
                 loops.command(TryOut(tried))
             case TryLoop():
@@ -63,11 +59,11 @@ class LoopCommands:
         view = self._view
         for answer in loops.take_answers():
             match answer:
-                case Inspected(pair, detail):
-                    view = replace(view, inspected=(pair, detail))
-                case Tried(command, preview):
+                case Answered(Inspect(older, newer), LoopDetail() as detail):
+                    view = replace(view, inspected=((older, newer), detail))
+                case Answered(TryOut(command), Preview() as preview):
                     view = replace(view, tried=(command, preview))
-                case Residuals(residuals):
+                case Answered(AskResiduals(), tuple() as residuals):
                     view = replace(view, residuals=residuals)
                 case Failure(text):
                     self._page.notice("error", text)

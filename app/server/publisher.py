@@ -10,11 +10,11 @@ from bisect import bisect_left
 from dataclasses import replace
 from typing import Any, Literal
 
-from app.mapping.log import Cursor, Log
 from app.mapping.session import Session
 from app.server.chunks import thinned
 from app.server.protocol import Delta, LoopsView, Notice, OpenedRecording, Saved, Transport
 from app.slam.frames import Frame
+from app.slam.log import Cursor, Log
 from app.slam.loops.types import LoopEdge, difference
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params

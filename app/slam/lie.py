@@ -111,3 +111,43 @@ def inverse(T: F64) -> F64:
     out[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
     out[..., 3, 3] = 1.0
     return out
+
+
+def exp_se3(v: F64) -> F64:
+    """Exponential map of SE(3), rotation vector then translation. v: (..., 6) rad and m; returns (..., 4, 4)."""
+    v = np.asarray(v, dtype=np.float64)
+    t2 = np.sum(v[..., :3] ** 2, axis=-1)[..., None, None]
+    small = t2 < _SMALL
+    safe = np.where(small, 1.0, t2)
+    t = np.sqrt(safe)
+    b = np.where(small, 0.5 - t2 / 24.0, (1.0 - np.cos(t)) / safe)
+    c = np.where(small, 1.0 / 6.0 - t2 / 120.0, (t - np.sin(t)) / (safe * t))
+    K = hat(v[..., :3])
+    V = np.eye(3) + b * K + c * (K @ K)
+    out = np.zeros((*v.shape[:-1], 4, 4))
+    out[..., :3, :3] = exp(v[..., :3])
+    out[..., :3, 3] = (V @ v[..., 3:, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def log_se3(T: F64) -> F64:
+    """Logarithm of SE(3), angle in [0, pi]. T: (..., 4, 4); returns (..., 6) rad and m, rotation first."""
+    w = log(T[..., :3, :3])
+    t2 = np.sum(w**2, axis=-1)[..., None, None]
+    small = t2 < _SMALL
+    safe = np.where(small, 1.0, t2)
+    t = np.sqrt(safe)
+    a = np.where(small, 1.0 / 12.0 + t2 / 720.0, 1.0 / safe - 0.5 / (t * np.tan(t / 2)))
+    K = hat(w)
+    V_inverse = np.eye(3) - 0.5 * K + a * (K @ K)
+    return np.concatenate([w, (V_inverse @ T[..., :3, 3:])[..., 0]], axis=-1)
+
+
+def adjoint(T: F64) -> F64:
+    """(..., 4, 4) to (..., 6, 6): exp_se3(adjoint(T) @ v) @ T is T @ exp_se3(v) (Barfoot 2017)."""
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., 3:, :3] = hat(T[..., :3, 3]) @ R
+    return out

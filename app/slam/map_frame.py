@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops import se3
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64, I64
 
@@ -71,4 +70,4 @@ def corrected(stamps_ns: I64, T_odom_imu: F64, keyframe_stamps_ns: I64, correcti
     here[:, :3, :3] = np.eye(3)
     first = lie.inverse(here) @ corrections[before] @ here
     change = lie.inverse(first) @ lie.inverse(here) @ corrections[after] @ here
-    return np.asarray(here @ first @ se3.exp(share[:, None] * se3.log(change)) @ lie.inverse(here) @ T_odom_imu)
+    return np.asarray(here @ first @ lie.exp_se3(share[:, None] * lie.log_se3(change)) @ lie.inverse(here) @ T_odom_imu)

@@ -21,7 +21,7 @@ from app.server.publisher import Publisher
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
-from app.slam.loops.types import Evidence, LoopEdge, Measured, Origin, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.params import Params
 from app.slam.types import ImuSamples, Scan, StepResult
 
@@ -49,8 +49,7 @@ def frame(**changes: object) -> StepResult:
 
 
 def edge(verdict: Verdict, newer: int = 9) -> LoopEdge:
-    measured = Measured(np.eye(4), np.eye(6), Evidence())
-    return LoopEdge(2, newer, newer, measured, verdict, "overlap 0.2 is below 0.5")
+    return LoopEdge(2, newer, newer, np.eye(4), np.eye(6), Evidence(), verdict, "overlap 0.2 is below 0.5")
 
 
 GOOD = frame()

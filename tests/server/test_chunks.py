@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from app.mapping.log import Log
 from app.server import chunks as chunks_module
 from app.server.chunks import COARSEST_LEVEL, MOST_SHOWN, coarser, next_to_thin, voxel_of_level, within_budget
 from app.server.fold import Fold
 from app.server.protocol import Chunk, Transport
 from app.server.publisher import CHUNKS_AT_ONCE, Publisher
 from app.slam.frames import READOUTS, Frame
+from app.slam.log import Log
 from app.slam.params import Params
 from app.slam.types import Cloud, Keyframe
 

@@ -9,7 +9,6 @@ import server_fakes as fakes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.mapping.log import Log
 from app.server.chunks import one_per_voxel
 from app.server.controller import Controller
 from app.server.fold import Fold
@@ -29,6 +28,7 @@ from app.server.protocol import (
 )
 from app.server.publisher import Publisher
 from app.slam.frames import READOUTS, Frame
+from app.slam.log import Log
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 

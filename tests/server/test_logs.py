@@ -41,7 +41,7 @@ def test_what_ends_the_engine_is_one_line_of_json() -> None:
 LOOPS = """
 import pytest
 from app.logs import start_logging
-from app.mapping.loop_process import LoopProcess
+from app.mapping.loops import LoopProcess
 from app.child import ChildDied
 
 start_logging(json_lines=True)

@@ -13,8 +13,7 @@ from test_rewind import SAMPLE, Bench, open_whole
 from typer.testing import CliRunner
 
 from app.__main__ import cli
-from app.mapping.loop_process import LoopProcess
-from app.mapping.loops import RestartingLoops
+from app.mapping.loops import LoopProcess, RestartingLoops
 from app.sensors.presets import resolve_params
 from app.server.protocol import (
     EditLoop,

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from app.slam.loops import se3
+from app.slam import lie
 from app.slam.map_frame import MapFrame
 from app.slam.trajectory import Trajectory
 
@@ -23,19 +23,19 @@ def test_without_corrections_the_map_frame_is_the_odometry_frame() -> None:
 
 
 def test_a_keyframe_lies_in_the_trajectory_where_its_pose_is() -> None:
-    frame = MapFrame(ODOMETRY.stamps_ns[KEYFRAMES], se3.exp(RNG.normal(0, 0.1, (10, 6))))
+    frame = MapFrame(ODOMETRY.stamps_ns[KEYFRAMES], lie.exp_se3(RNG.normal(0, 0.1, (10, 6))))
     laid = frame.trajectory(ODOMETRY).poses
     np.testing.assert_allclose(laid[KEYFRAMES], frame.poses(ODOMETRY.poses[KEYFRAMES]), atol=1e-9)
 
 
 def test_later_frames_take_the_last_correction() -> None:
-    frame = MapFrame(ODOMETRY.stamps_ns[KEYFRAMES], se3.exp(RNG.normal(0, 0.1, (5, 6))))
+    frame = MapFrame(ODOMETRY.stamps_ns[KEYFRAMES], lie.exp_se3(RNG.normal(0, 0.1, (5, 6))))
     np.testing.assert_allclose(frame.trajectory(ODOMETRY).poses[41:], frame.newest @ ODOMETRY.poses[41:], atol=1e-9)
     np.testing.assert_array_equal(frame.at(7), frame.newest)
 
 
 def test_a_piece_of_a_trajectory_lies_where_it_does_in_the_whole() -> None:
-    frame = MapFrame(ODOMETRY.stamps_ns[KEYFRAMES], se3.exp(RNG.normal(0, 0.1, (10, 6))))
+    frame = MapFrame(ODOMETRY.stamps_ns[KEYFRAMES], lie.exp_se3(RNG.normal(0, 0.1, (10, 6))))
     np.testing.assert_array_equal(
         frame.trajectory(ODOMETRY.since(37)).positions, frame.trajectory(ODOMETRY).positions[37:]
     )

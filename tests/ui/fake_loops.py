@@ -33,7 +33,6 @@ from app.slam.loops.types import (
     FactorResidual,
     LoopDetail,
     LoopEdge,
-    Measured,
     Origin,
     Pair,
     Verdict,
@@ -200,7 +199,7 @@ class LoopEngine(FakeEngine):
                 super()._obey(command)
 
     def _check(self, command: loops.LoopEdit) -> None:
-        pair = loops.pair_of(command)
+        pair = command.pair
         if pair and not isinstance(command, Add) and pair not in {edge.pair for edge in self._edges(self._done)}:
             raise HemislamError(f"There is no loop candidate of keyframes {pair[0]} and {pair[1]}.")
 
@@ -228,7 +227,7 @@ class LoopEngine(FakeEngine):
                 T = lie.inverse(self.truth[pair[0]]) @ self.truth[pair[1]]
                 if not command.register and command.guess is not None:
                     T = np.array(command.guess)
-                edges[pair] = LoopEdge(*pair, pair[1], _measured(T), Verdict.ACCEPTED, "tied by hand", Origin.USER)
+                edges[pair] = LoopEdge(*pair, pair[1], *_measured(T), Verdict.ACCEPTED, "tied by hand", Origin.USER)
             elif isinstance(command, loops.SetWeight):
                 edges[pair] = replace(edges[pair], weight=command.weight)
             else:
@@ -260,15 +259,15 @@ class LoopEngine(FakeEngine):
         return tuple(out)
 
 
-def _measured(T_older_newer: np.ndarray, evidence: Evidence = Evidence()) -> Measured:  # noqa: B008 - a value
-    return Measured(T_older_newer, 1e-4 * np.eye(6), evidence)
+def _measured(T_older_newer: np.ndarray, evidence: Evidence = Evidence()) -> tuple[np.ndarray, np.ndarray, Evidence]:  # noqa: B008 - a value
+    return T_older_newer, 1e-4 * np.eye(6), evidence
 
 
 def _found(truth: np.ndarray, rng: np.random.Generator) -> dict[Pair, LoopEdge]:
     def edge(pair: Pair, verdict: Verdict, reason: str, off: float, evidence: Evidence) -> LoopEdge:
         T = lie.inverse(truth[pair[0]]) @ truth[pair[1]]
         T[:3, 3] += rng.normal(0, off, 3)
-        return LoopEdge(*pair, min(pair[1] + 8, KEYFRAMES - 1), _measured(T, evidence), verdict, reason)
+        return LoopEdge(*pair, min(pair[1] + 8, KEYFRAMES - 1), *_measured(T, evidence), verdict, reason)
 
     edges = []
     for older in (4, 12, 27, 41, 55, 66):

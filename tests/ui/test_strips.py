@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from app.server.protocol import SERIES, Chunk, LoopsView, OpenedRecording, Snapshot, Transport
 from app.slam import iekf
-from app.slam.loops.types import Evidence, LoopEdge, Measured, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Verdict
 from app.ui.timeline import COLUMNS, DEGENERATE_CM, STRIPS, History, limits, message, packed
 from tests.ui.fake_engine import START_NS
 
@@ -106,8 +106,7 @@ def test_another_session_forgets() -> None:
 
 
 def edge(newer: int, decided_at: int, verdict: Verdict) -> LoopEdge:
-    measured = Measured(np.eye(4), np.eye(6), Evidence())
-    return LoopEdge(0, newer, decided_at, measured, verdict, "fits")
+    return LoopEdge(0, newer, decided_at, np.eye(4), np.eye(6), Evidence(), verdict, "fits")
 
 
 def test_loops_are_where_they_were_decided_and_stay_there_when_going_back() -> None:

@@ -7,22 +7,20 @@ nothing from the history, but later keyframes are looked at with the loops as th
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from app.slam import lie
 from app.slam.errors import HemislamError
-from app.slam.loops import inspection
 from app.slam.loops.detection import Detector, Head
 from app.slam.loops.drift import Drift
 from app.slam.loops.edits import EditList, Entry, check, in_words
-from app.slam.loops.factors import Factor, odometry_factor
-from app.slam.loops.history import History, Record
+from app.slam.loops.factors import Closing, Factor, PositionPrior, loop_factors, odometry_factor, residuals
 from app.slam.loops.messages import Target
-from app.slam.loops.pose_graph import g2o_text, optimise
+from app.slam.loops.pose_graph import PoseGraph
 from app.slam.loops.search import Found, search
-from app.slam.loops.solution import Solution, loop_factors
+from app.slam.loops.solvers import g2o_text, optimise
 from app.slam.loops.types import (
     Add,
     Edits,
@@ -34,12 +32,25 @@ from app.slam.loops.types import (
     Preview,
     Solve,
     Verdict,
-    pair_of,
     rows,
 )
 from app.slam.loops.verdicts import by_hand, worth_correcting
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe
+
+
+@dataclass(slots=True)
+class _Record:
+    """What came with one keyframe.
+
+    Attributes:
+        odometry: to it; None for the first. priors: measured of it alone. found: None until loops were looked for.
+    """
+
+    params: LoopsParams
+    odometry: Factor | None
+    priors: tuple[PositionPrior, ...]
+    found: Found | None = None
 
 
 class LoopBackend:
@@ -49,17 +60,18 @@ class LoopBackend:
     """
 
     def __init__(self) -> None:
-        self._history = History()
+        self._history: list[_Record] = []
+        self._ends: dict[int, Found] = {}  # found in addition where the session ended, by the number of keyframes
         self._edits = EditList()
         self._start = LoopsParams()  # for what acts on restart
         self._detector = Detector(self._start)
-        self._solution = Solution()
+        self._graph = PoseGraph(np.eye(4))
+        self._broken: frozenset[Pair] = frozenset()  # loops that the solver failed with; they are not in the graph
         self._found: dict[Pair, LoopEdge] = {}
         self._by_pair: dict[Pair, LoopEdge] | None = None  # as they count; None: not up to date
         self._finished = False
-        self._idle: set[str] = set()  # edits reported to have no effect
         self._notices: list[str] = []
-        self._said: set[str] = set()  # reported failures of the solver
+        self._said: set[str] = set()  # all notices ever
 
     def __len__(self) -> int:
         return len(self._detector)
@@ -77,45 +89,46 @@ class LoopBackend:
         self._detector.close()
 
     # --- the session -----------------------------------------------------------------------------
-    def add(self, keyframe: Keyframe, params: LoopsParams) -> None:
+    def add(self, keyframe: Keyframe, params: LoopsParams, priors: tuple[PositionPrior, ...] = ()) -> None:
         """Take the next keyframe, and look for loops of the newest one whose surroundings are complete.
 
         If the history has the same keyframe next, nothing is computed again. Raises HemislamError if one is missing.
+
+        Args:
+            priors: what was measured of this keyframe alone.
         """
-        if keyframe.index != len(self):
-            raise HemislamError(f"Keyframe {keyframe.index} cannot follow on {len(self)} keyframes; one is missing.")
-        self.go_to(len(self))
+        index = len(self)
+        if keyframe.index != index:
+            raise HemislamError(f"Keyframe {keyframe.index} cannot follow on {index} keyframes; one is missing.")
+        self.go_to(index)
         if self._is_known(keyframe, params):
-            self.go_to(len(self) + 1)
+            self.go_to(index + 1)
             return
         self.forget()
-        if not self.known:
-            self._begin(params)
+        if not index:
+            self._detector.close()
+            self._start, self._detector = params, Detector(params)
+            self._graph = PoseGraph(keyframe.T_odom_imu, params.window)
         self._detector.take(keyframe)
-        index, head = len(self), self._detector.head
-        odometry = odometry_factor(index, head(index - 1), head(index), _drift(params)) if index else None
-        self._step(odometry)
-        found = Found()
-        if params.enabled:
-            complete = len(self) - 1 - self._start.submap_keyframes
-            found = self._look(max(complete, self._detector.described), complete + 1, params)
-        self._history.append(Record(params, found, odometry))
-        self._learn(found)
+        before, after = self._detector.head(max(index - 1, 0)), self._detector.head(index)
+        odometry = odometry_factor(index, before, after, Drift.of(params)) if index else None
+        self._history.append(_Record(params, odometry, priors))
+        self._next()
         self._reach(self.known)
 
     def finish(self) -> None:
         """The session ends here: look for loops of the last keyframes too. `add` and `go_to` take that back."""
         if self._finished or not len(self):
             return
-        count, params = len(self), self._history[len(self) - 1].params
-        if count not in self._history.ends:
-            self._history.ends[count] = (
-                self._look(self._detector.described, count, params) if params.enabled else Found()
-            )
+        count = len(self)
+        if count not in self._ends:
+            self._ends[count] = self._look(self._detector.described, count)
         self._finished = True
         self._stand(count)
         self._reach(max(self.known + 1, self._edits.latest) if count == self.known else 0)
-        self._tell_idle()
+        for entry in self._edits:
+            if entry.edit.pair and entry.edit.pair not in self.by_pair:
+                self._say(f"{in_words(entry.edit)} has no effect: there is no such loop; loops.csv lists all.")
 
     def go_to(self, count: int) -> None:
         """Go to the state after `count` keyframes of the history. Raises HemislamError if it has fewer."""
@@ -124,11 +137,8 @@ class LoopBackend:
         if self._finished or not len(self) <= count <= len(self) + 1:
             self._finished = False
             self._stand(count)
-        elif count == len(self) + 1:  # as `_stand` would, but quicker
-            found = self._history[len(self)].found
-            self._step(self._history[len(self)].odometry)
-            self._detector.learn(found.contexts)
-            self._learn(found)
+        elif count == len(self) + 1:
+            self._next()
         self._resolve()
 
     def forget(self) -> None:
@@ -136,7 +146,8 @@ class LoopBackend:
         count = len(self)
         if count == self.known:
             return
-        self._history.truncate(count)
+        del self._history[count:]
+        self._ends = {end: found for end, found in self._ends.items() if end <= count}
         self._detector.forget()
         self._edits.cut(count, self._start.submap_keyframes)
         self._stand(count)
@@ -156,70 +167,65 @@ class LoopBackend:
             self._solve()
         self._resolve()
 
-    def _begin(self, params: LoopsParams) -> None:
-        self._detector.close()
-        self._start, self._detector = params, Detector(params)
-
-    def _stand(self, count: int) -> None:
-        """Read from the history what was found with the first `count` keyframes, and solve."""
-        self._detector.stand(count, self._history.contexts(count, finished=self._finished))
-        self._found = {edge.pair: edge for edge in self._history.updates(count, finished=self._finished)}
-        self._solve()
-
     def _is_known(self, keyframe: Keyframe, params: LoopsParams) -> bool:
         """Whether the history has this keyframe next, with the same parameters."""
         index = len(self)
         looked = index < self.known and self._history[index].params == params
         return looked and self._detector.head(index).same(Head.of(keyframe))
 
-    def _step(self, odometry: Factor | None) -> None:
-        """Add the next keyframe to the graph."""
+    def _stand(self, count: int) -> None:
+        """Read from the history what was found with the first `count` keyframes, and solve."""
+        found = [record.found for record in self._history[:count] if record.found is not None]
+        found += [self._ends[count]] if self._finished else []
+        self._detector.stand(count, [context for one in found for context in one.contexts])
+        self._found = {edge.pair: edge for one in found for edge in one.updates}
+        self._solve()
+
+    def _next(self) -> None:
+        """Go to the next keyframe of the history, as `_stand` would, and look for loops if nobody has yet."""
+        record = self._history[len(self)]
         self._detector.go_on()
         self._by_pair = None
-        if odometry is None:
-            self._solution.begin(self._detector.poses[0], self._start.window)
+        if record.odometry is not None:
+            self._report(self._graph.extend(record.odometry))
+        self._report(self._graph.close(record.priors))
+        if record.found is None:
+            complete = len(self) - 1 - self._start.submap_keyframes
+            record.found = self._look(max(complete, self._detector.described), complete + 1)
         else:
-            self._solution.extend(odometry)
-
-    def _learn(self, found: Found) -> None:
-        """Put into effect what was found with the newest keyframe."""
-        self._found.update((edge.pair, edge) for edge in found.updates)
-        self._by_pair, newest = None, len(self) - 1
-        decided = [edge for edge in self.edges if edge.decided_at == newest]
-        broken = self._solution.broken
-        self._solution.close(self._loops(decided, self.by_pair))
-        if self._solution.broken != broken:
+            self._detector.learn(record.found.contexts)
+        self._found.update((edge.pair, edge) for edge in record.found.updates)
+        self._by_pair = None
+        decided = [edge for edge in self.edges if edge.decided_at == len(self) - 1]
+        if self._report(self._graph.close(self._loops(decided, self.by_pair))):
             self._by_pair = None
 
-    def _look(self, first: int, end: int, params: LoopsParams) -> Found:
+    def _look(self, first: int, end: int) -> Found:
         """Look for loops of the keyframes `first` to `end` - 1, without changing the graph."""
-        keyframes = range(first, max(end, 0))
-        return search(self._detector, keyframes, self._found, self._edges, self._solution.poses, _drift(params), params)
+        params = self._history[len(self) - 1].params
+        if not params.enabled:
+            return Found()
+        return search(self._detector, range(first, max(end, 0)), self._found, self._edges, self._solved, params)
 
     # --- results --------------------------------------------------------------------------------
     @property
     def poses(self) -> F64:
         """(k, 4, 4) T_map_imu of all keyframes."""
-        if not self._edits.solving:
-            return self._solution.poses
-        try:
-            return self._optimum(self.edges)
-        except HemislamError as error:
-            if str(error) not in self._said:
-                self._said.add(str(error))
-                self._notices.append(str(error))
-            return self._solution.poses
+        if self._edits.solving:
+            try:
+                return self._optimum(self.edges)
+            except HemislamError as error:
+                self._say(str(error))
+        return self._solved
 
     @property
     def corrections(self) -> F64:
         """(k, 4, 4) T_map_odom at each keyframe; identity while odometry agrees with the loops."""
-        if self._edits.solving or worth_correcting(self.edges, self._detector.poses):
-            return self.corrections_of(self.poses)
+        odometry = self._detector.poses
+        measured = any(record.priors for record in self._history[: len(self)])
+        if measured or self._edits.solving or worth_correcting(self.edges, odometry):
+            return np.asarray(self.poses @ lie.inverse(odometry))
         return np.tile(np.eye(4), (len(self), 1, 1))
-
-    def corrections_of(self, poses: F64) -> F64:
-        """(k, 4, 4) T_map_odom at each keyframe, for these T_map_imu."""
-        return poses @ lie.inverse(self._detector.poses)
 
     @property
     def edges(self) -> tuple[LoopEdge, ...]:
@@ -234,13 +240,13 @@ class LoopBackend:
         return self._by_pair
 
     def take_notices(self) -> tuple[str, ...]:
-        """What went wrong since the last call, in sentences."""
+        """What went wrong since the last call, in sentences. Each is said once."""
         notices, self._notices = self._notices, []
-        return (*self._solution.take_notices(), *notices)
+        return tuple(notices)
 
     def factor_residuals(self) -> tuple[FactorResidual, ...]:
         """The residual of every factor of the graph, odometry first."""
-        return inspection.residuals(self._factors(self.edges), self.poses)
+        return residuals(self._factors(self.edges), self.poses)
 
     def detail(self, older: int, newer: int) -> LoopDetail:
         """What the inspector shows of two keyframes. Raises HemislamError if one does not exist."""
@@ -249,7 +255,7 @@ class LoopBackend:
         measured = None if edge is None else edge.T_older_newer
         counts = edge is not None and edge.verdict is Verdict.ACCEPTED
         poses = self._detector.poses if counts else self.poses  # the graph already includes it
-        return inspection.detail(self._detector, older, newer, poses, measured)
+        return self._detector.detail(older, newer, poses, measured)
 
     def g2o(self) -> str:
         """The graph as the text of a g2o file."""
@@ -269,14 +275,13 @@ class LoopBackend:
     def apply(self, edit: LoopEdit) -> None:
         """Add an edit. Those undone before can no longer be redone. Raises HemislamError if it makes no sense."""
         check(edit)
-        pair = pair_of(edit)
         if isinstance(edit, Add):
             there = edit.newer < len(self)
             if there and edit.guess is None:  # as it is now, so that it is the same when repeated
                 edit = replace(edit, guess=rows(self._present(edit.older, edit.newer)))
         else:
-            there = pair is None or pair in self.by_pair
-        self._edits.give(self._fitting(self._entry(replace(edit, since=self._edits.reached if there else 0))))
+            there = edit.pair is None or edit.pair in self.by_pair
+        self._edits.give(self._entry(replace(edit, since=self._edits.reached if there else 0)))
         self._solve()
         if not there:
             self._notices.append(f"{in_words(edit)} waits until there is such a loop.")
@@ -298,25 +303,23 @@ class LoopBackend:
         check(edit)
         if not isinstance(edit, Solve):
             self._check_there(edit.older, edit.newer)
-            if not isinstance(edit, Add) and pair_of(edit) not in self.by_pair:
+            if not isinstance(edit, Add) and edit.pair not in self.by_pair:
                 raise HemislamError(f"There is no loop candidate of keyframes {edit.older} and {edit.newer}.")
-        edges = tuple(self._edges(self._found, self._fitting(self._entry(replace(edit, since=0)))).values())
+        edges = tuple(self._edges(self._found, self._entry(replace(edit, since=0))).values())
         poses = self._optimum(edges)
-        return Preview(poses, inspection.residuals(self._factors(edges), poses))
+        return Preview(poses, residuals(self._factors(edges), poses))
 
     def _entry(self, edit: LoopEdit) -> Entry:
-        there = isinstance(edit, Add) and edit.newer < len(self)
-        return Entry(edit, self._made(edit) if isinstance(edit, Add) and there else None)
-
-    def _fitting(self, entry: Entry) -> Entry:
-        """The same entry. Raises HemislamError if its registration found nothing in common."""
-        edge = entry.added
-        if edge is not None and isinstance(entry.edit, Add) and entry.edit.register and not edge.evidence.overlap:
+        """With the loop that it adds. Raises HemislamError if its registration found nothing in common."""
+        if not isinstance(edit, Add) or edit.newer >= len(self):
+            return Entry(edit)
+        edge = self._made(edit)
+        if edit.register and not edge.evidence.overlap:
             raise HemislamError(
                 f"The surroundings of keyframes {edge.older} and {edge.newer} have nothing in common from there;"
                 " nudge one nearer to where it belongs, or tie them without registration."
             )
-        return entry
+        return Entry(edit, edge)
 
     def _made(self, edit: Add) -> LoopEdge:
         older, newer = edit.older, edit.newer
@@ -335,13 +338,6 @@ class LoopBackend:
         if self._edits.resolve(count, complete, self._made):
             self._solve()
 
-    def _tell_idle(self) -> None:
-        """At the end, report each edit without effect once."""
-        idle = [in_words(entry.edit) for entry in self._edits if entry.pair and entry.pair not in self.by_pair]
-        new = [words for words in idle if words not in self._idle]
-        self._notices += [f"{words} has no effect: there is no such loop; loops.csv lists all." for words in new]
-        self._idle = set(idle)
-
     def _check_there(self, older: int, newer: int) -> None:
         if not 0 <= older < newer < len(self):
             raise HemislamError(
@@ -350,37 +346,46 @@ class LoopBackend:
             )
 
     # --- the graph -------------------------------------------------------------------------------
+    @property
+    def _solved(self) -> F64:
+        """(k, 4, 4) T_map_imu by the incremental solver."""
+        return self._graph.poses[: len(self)]
+
     def _edges(self, found: dict[Pair, LoopEdge], extra: Entry | None = None) -> dict[Pair, LoopEdge]:
         edges = self._edits.lay_over(found, len(self), extra)
-        for pair in self._solution.broken & edges.keys():
+        for pair in self._broken & edges.keys():
             edges[pair] = replace(edges[pair], verdict=Verdict.REJECTED, reason="the solver failed with it")
         return edges
 
     def _solve(self) -> None:
         """Solve the graph again, in the order in which keyframes and loops came."""
-        self._by_pair = None
-        if not len(self):
-            self._solution.clear()
-            return
-        edges = self._edits.lay_over(self._found, len(self))
+        self._by_pair, self._broken = None, frozenset()
+        edges = self._edges(self._found)
         arrivals: dict[int, list[LoopEdge]] = {}
         for edge in edges.values():
-            if edge.counts:
-                arrivals.setdefault(edge.decided_at, []).append(edge)
+            arrivals.setdefault(edge.decided_at, []).append(edge)
         loops = {index: self._loops(arrived, edges) for index, arrived in arrivals.items()}
-        steps = self._history.steps(len(self), loops)
-        self._solution.solve(self._detector.poses[0], self._start.window, steps)
+        steps = [
+            step
+            for index, record in enumerate(self._history[: len(self)])
+            for step in (record.odometry, record.priors, tuple(loops.get(index, ())))
+            if step
+        ]
+        self._report(self._graph.replay(steps))
 
-    def _factors(self, edges: tuple[LoopEdge, ...]) -> list[Factor]:
-        by_pair = {edge.pair: edge for edge in edges}
-        return self._history.odometry(len(self)) + self._loops(edges, by_pair)
+    def _factors(self, edges: Iterable[LoopEdge]) -> list[Closing]:
+        """All of the graph: odometry, priors, loops."""
+        records = self._history[: len(self)]
+        odometry = [record.odometry for record in records if record.odometry is not None]
+        priors = [prior for record in records for prior in record.priors]
+        return [*odometry, *priors, *self._loops(edges, {edge.pair: edge for edge in edges})]
 
     def _loops(self, edges: Iterable[LoopEdge], by_pair: Mapping[Pair, LoopEdge]) -> list[Factor]:
         return loop_factors(edges, by_pair, self._detector.poses, window=self._start.window)
 
     def _optimum(self, edges: tuple[LoopEdge, ...]) -> F64:
         """(k, 4, 4) T_map_imu by all factors at once. Raises HemislamError if the solver fails."""
-        poses = self._solution.poses
+        poses = self._solved
         if len(poses) < 2:
             return poses
         try:
@@ -388,6 +393,20 @@ class LoopBackend:
         except ArithmeticError as error:
             raise HemislamError(f"The solver fails with this graph ({error}); reject the loop added last.") from error
 
+    def _report(self, failed: Iterable[Closing]) -> bool:
+        """Say which factors the solver failed with. Returns whether there are loops among them."""
+        loops = {factor.name for factor in failed if isinstance(factor, Factor) and factor.robust}
+        self._broken |= loops
+        for factor in failed:
+            if isinstance(factor, PositionPrior):
+                self._say(f"The solver failed with the position of keyframe {factor.keyframe.index}; it is left out.")
+            elif factor.robust:
+                self._say(f"The solver failed with the loop {'{}-{}'.format(*factor.name)}; the graph goes on without.")
+            else:
+                self._say(f"The solver failed with the step to keyframe {factor.second.index}; it now says little.")
+        return bool(loops)
 
-def _drift(params: LoopsParams) -> Drift:
-    return Drift(params.drift_translation / 100, np.radians(params.drift_rotation))
+    def _say(self, notice: str) -> None:
+        if notice not in self._said:
+            self._said.add(notice)
+            self._notices.append(notice)

@@ -9,7 +9,6 @@ right perturbations, carried by the adjoint, Barfoot 2017).
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops import se3
 from app.slam.rows import Rows
 from app.slam.types import F64, I64
 
@@ -64,10 +63,10 @@ class Chain:
             walked = np.cumsum(np.concatenate([np.zeros((1, 6, 6)), steps]), axis=0)
             starts = walked[ends - first]  # of each stretch; the last one starts none
             expected = T_ends[:-1] @ lie.inverse(poses[ends[:-1]]) @ poses[ends[1:]]
-            missed = se3.log(lie.inverse(expected) @ T_ends[1:])
+            missed = lie.log_se3(lie.inverse(expected) @ T_ends[1:])
             pull = np.linalg.solve(np.diff(starts, axis=0), missed[..., None])[..., 0]
             shares = np.einsum("nij,nj->ni", walked[1:] - starts[stretch], pull[stretch])
-            out[1 : last - first + 1] = expected[stretch] @ se3.exp(shares) @ T_end_each
+            out[1 : last - first + 1] = expected[stretch] @ lie.exp_se3(shares) @ T_end_each
         out[ends - first] = T_ends
         return out
 
@@ -80,5 +79,5 @@ class Chain:
         own = slice(before + 1, before + 1 + len(ends))
         poses = self._poses.view()
         T_end_own = lie.inverse(poses[ends]) @ poses[own]
-        carry = se3.adjoint(T_end_own)
+        carry = lie.adjoint(T_end_own)
         return T_end_own, carry @ self._covariances.view()[own] @ np.swapaxes(carry, -1, -2)

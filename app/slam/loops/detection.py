@@ -17,6 +17,7 @@ from app.slam.loops import scan_context, verification
 from app.slam.loops.drift import Expectation
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.submap import Submap, Submaps
+from app.slam.loops.types import LoopDetail
 from app.slam.loops.verification import Fit, Prepared
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, I64, Keyframe
@@ -182,6 +183,28 @@ class Detector:
 
     def slide(self, older: int, newer: int, fit: Fit) -> float:
         return verification.slide(*self._both(older, newer), fit)
+
+    def detail(self, older: int, newer: int, poses: F64, T_older_newer: F64 | None) -> LoopDetail:
+        """Both places, and how they fit at a loop's measurement; None: as the graph has them.
+
+        Args:
+            poses: (k, 4, 4) T_map_imu.
+        """
+        guess = T = self.guess(older, newer, poses)
+        if T_older_newer is not None:
+            T = self.T_level_imu(older) @ T_older_newer @ lie.inverse(self.T_level_imu(newer))
+        a, b = self.context(older), self.context(newer)
+        return LoopDetail(
+            older=self.submap(older).submap.points,
+            newer=self.submap(newer).submap.points,
+            T_imu_level=lie.inverse(self.T_level_imu(older)),
+            T_guess=guess,
+            T_registered=T,
+            older_context=np.where(a.seen, a.cells, np.float32(np.nan)),
+            newer_context=np.where(b.seen, b.cells, np.float32(np.nan)),
+            shift_distances=scan_context.shift_distances(a, b),
+            residuals=self.assess(older, newer, T).residuals,
+        )
 
     def _both(self, older: int, newer: int) -> tuple[Prepared, Prepared]:
         """Their submaps; the newer one first, since it is needed again next."""

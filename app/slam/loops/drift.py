@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from app.slam import lie
 from app.slam.loops.types import LoopEdge
+from app.slam.sections import LoopsParams
 from app.slam.types import F64
 
 POSITION_M, ROTATION = 0.05, np.radians(0.5)
@@ -29,6 +30,10 @@ class Drift:
 
     translation: float
     rotation: float
+
+    @classmethod
+    def of(cls, params: LoopsParams) -> "Drift":
+        return cls(params.drift_translation / 100, np.radians(params.drift_rotation))
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,18 +89,18 @@ def _edit(entry: object) -> LoopEdit:
     if kind is Solve:
         if entry[verb] != _AT_ONCE:
             raise HemislamError(f"solve is {entry[verb]!r}; it can only be `{_AT_ONCE}`.")
-        return Solve(since)
+        return Solve(since=since)
     older, newer = _pair(verb, entry[verb])
     edit: LoopEdit
     if kind is SetWeight:
-        edit = SetWeight(older, newer, _weight(entry.get("weight")), since)
+        edit = SetWeight(older, newer, _weight(entry.get("weight")), since=since)
     elif kind is Add:
         register = entry.get("register", True)
         if not isinstance(register, bool):
             raise HemislamError(f"register is {register!r}; it must be true or false.")
-        edit = Add(older, newer, _guess(entry.get("guess")), register, since)
+        edit = Add(older, newer, _guess(entry.get("guess")), register, since=since)
     else:
-        edit = (Accept if kind is Accept else Reject)(older, newer, since)
+        edit = (Accept if kind is Accept else Reject)(older, newer, since=since)
     check(edit)
     return edit
 

@@ -23,7 +23,6 @@ from app.slam.loops.types import (
     Solve,
     Verdict,
     loses,
-    pair_of,
 )
 from app.slam.types import F64
 
@@ -34,10 +33,6 @@ class Entry:
 
     edit: LoopEdit
     added: LoopEdge | None = None
-
-    @property
-    def pair(self) -> Pair | None:
-        return pair_of(self.edit)
 
 
 class EditList:
@@ -52,7 +47,6 @@ class EditList:
         self.reached = 0
         self._done: list[Entry] = []
         self._undone: list[Entry] = []
-        self._used = False  # ever; if not, no loop can have been placed by one that no longer counts
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._done)
@@ -79,7 +73,6 @@ class EditList:
     def give(self, entry: Entry) -> None:
         self._done.append(entry)
         self._undone.clear()
-        self._used = True
 
     def reach(self, reached: int) -> bool:
         """The session has come this far. Returns whether edits act from now on that did not before."""
@@ -96,7 +89,6 @@ class EditList:
 
         before, self._done = self._done, [entry_of(edit) for edit in edits.done]
         self._undone = [entry_of(edit) for edit in edits.undone]
-        self._used = self._used or bool(self._done)
         same = len(before) == len(self._done) and all(map(operator.is_, before, self._done))
         return not same
 
@@ -138,11 +130,9 @@ class EditList:
             count: number of keyframes; loops by hand beyond them do not count.
         """
         entries = [*self._done, *([extra] if extra else [])]
-        if not (self._used or entries):
-            return {pair: found[pair] for pair in sorted(found)}
         edges = dict(found)
         for entry in entries:
-            pair = entry.pair
+            pair = entry.edit.pair
             if pair is None or entry.edit.since > self.reached:
                 continue
             if entry.added is not None:
@@ -177,7 +167,7 @@ def _is_rigid(T: F64) -> bool:
 
 def in_words(edit: LoopEdit) -> str:
     """An edit's name and pair, to begin a sentence with."""
-    pair = pair_of(edit)
+    pair = edit.pair
     return f"{type(edit).__name__} {pair[0]}-{pair[1]}" if pair else type(edit).__name__
 
 

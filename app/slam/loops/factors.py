@@ -1,5 +1,6 @@
 """Factors of the pose graph: what was measured between two keyframes, or of one."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,8 @@ import numpy as np
 from app.slam import lie
 from app.slam.loops.detection import Head
 from app.slam.loops.drift import Drift
+from app.slam.loops.support import laid
+from app.slam.loops.types import FactorResidual, LoopEdge, Pair
 from app.slam.types import F64, KeyframeId
 
 
@@ -99,3 +102,39 @@ def _own_axes(head: Head) -> F64:
     turn[3:, 3:] = head.T_odom_imu[:3, :3].T
     out = turn @ head.covariance @ turn.T
     return out if np.isfinite(out).all() else np.zeros((6, 6))
+
+
+def loop_factors(
+    edges: Iterable[LoopEdge], by_pair: Mapping[Pair, LoopEdge], T_odom_imu: F64, *, window: int
+) -> list[Factor]:
+    """The factors of the loops that count.
+
+    Args:
+        by_pair: all loops, including those that others repeat. T_odom_imu: (k, 4, 4). window: of the solver. With one,
+            each factor is between its own keyframes, as those of the loop that it repeats may have left the window.
+    """
+    factors = []
+    for edge in edges:
+        if edge.counts:
+            first = by_pair[edge.repeats] if edge.repeats and not window else edge
+            T, covariance = edge.T_older_newer, edge.covariance
+            if first is not edge:
+                T, covariance = laid(edge, first, T_odom_imu)
+            factors.append(between(first.older, first.newer, T, covariance / edge.weight, True, edge.pair))
+    return factors
+
+
+def residuals(graph: Iterable[Closing], poses: F64) -> tuple[FactorResidual, ...]:
+    """Of every factor between two keyframes, by poses (k, 4, 4)."""
+    factors = [factor for factor in graph if isinstance(factor, Factor)]
+    if not factors:
+        return ()
+    first, second = np.array([(f.first.index, f.second.index) for f in factors]).T
+    measured = np.array([f.T_first_second for f in factors])
+    errors = lie.log_se3(lie.inverse(measured) @ lie.inverse(poses[first]) @ poses[second])
+    whitened = np.linalg.solve(np.array([f.covariance for f in factors]), errors[..., None])[..., 0]
+    sigmas = np.sqrt(np.einsum("ni,ni->n", errors, whitened))
+    turned = np.degrees(np.linalg.norm(errors[:, :3], axis=1))
+    moved = np.linalg.norm(errors[:, 3:], axis=1)
+    rows = zip(factors, turned.tolist(), moved.tolist(), sigmas.tolist(), strict=True)
+    return tuple(FactorResidual(f.name, f.robust, r, t, s) for f, r, t, s in rows)

@@ -8,7 +8,7 @@ request has one reply, in order. What cannot be done is answered by a `Failure`,
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from app.slam.loops.types import Edits, FactorResidual, LoopDetail, LoopEdge, LoopEdit, Pair, Preview
+from app.slam.loops.types import Edits, FactorResidual, LoopDetail, LoopEdge, LoopEdit, Preview
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe
 
@@ -57,14 +57,14 @@ class ApplyEdit:
 
 @dataclass(frozen=True, slots=True)
 class TryOut:
-    """What would the graph become by this edit? Answered by `Tried`."""
+    """What would the graph become by this edit? The answer is a `Preview`."""
 
     edit: LoopEdit
 
 
 @dataclass(frozen=True, slots=True)
 class Inspect:
-    """All there is about two keyframes, a candidate or not. Answered by `Inspected`."""
+    """All there is about two keyframes, a candidate or not. The answer is a `LoopDetail`."""
 
     older: int
     newer: int
@@ -72,12 +72,12 @@ class Inspect:
 
 @dataclass(frozen=True, slots=True)
 class AskResiduals:
-    """How far is every factor of the graph from being met? Answered by `Residuals`."""
+    """How far is every factor of the graph from being met? The answer is their `FactorResidual`s, odometry first."""
 
 
 @dataclass(frozen=True, slots=True)
 class AskG2o:
-    """The graph as the text of a g2o file. Answered by `G2o`."""
+    """The graph as the text of a g2o file."""
 
 
 Question = AskState | ApplyEdit | TryOut | Inspect | AskResiduals | AskG2o
@@ -90,27 +90,6 @@ class Ask:
 
 
 Request = AddKeyframe | Ask
-
-
-# --- what only the schedule is asked -------------------------------------------------------------
-@dataclass(frozen=True, slots=True)
-class Undo:
-    """Take the last edit back."""
-
-
-@dataclass(frozen=True, slots=True)
-class Redo:
-    """Apply the edit again that was taken back last."""
-
-
-@dataclass(frozen=True, slots=True)
-class LoadEdits:
-    """Replace all edits by these."""
-
-    edits: Edits
-
-
-UserRequest = ApplyEdit | Undo | Redo | LoadEdits | TryOut | Inspect | AskResiduals | AskG2o
 
 
 # --- replies -------------------------------------------------------------------------------------
@@ -145,29 +124,11 @@ class LoopState:
 
 
 @dataclass(frozen=True, slots=True)
-class Tried:
-    """Poses T_map_imu of all keyframes and residuals, as they would be with the edit."""
+class Answered:
+    """What a question that leads to no other state has for an answer."""
 
-    edit: LoopEdit
-    preview: Preview
-
-
-@dataclass(frozen=True, slots=True)
-class Inspected:
-    pair: Pair
-    detail: LoopDetail
-
-
-@dataclass(frozen=True, slots=True)
-class Residuals:
-    """Odometry first, then loops."""
-
-    residuals: tuple[FactorResidual, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class G2o:
-    text: str
+    question: Question
+    value: Preview | LoopDetail | tuple[FactorResidual, ...] | str
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +138,7 @@ class Failure:
     text: str
 
 
-Answer = LoopState | Tried | Inspected | Residuals | G2o | Failure
+Answer = LoopState | Answered | Failure
 Reply = Added | Answer
 
 

@@ -1,41 +1,21 @@
-"""The factor graph of keyframe poses (paper 2.4, eq. 8). The only place where gtsam is used.
+"""The graph of keyframe poses (paper 2.4, eq. 8), solved incrementally, and sound whatever the solver fails with.
 
 A list keeps every step that was done to the graph. To take a factor out, or to recover from an exception (after which
 gtsam's solver stays broken), the rest of the list is done again. The poses are a function of the list, to the last bit.
-
-A pose is T_map_imu of a keyframe; its error is a right perturbation, rotation then translation.
 """
 
-import tempfile
-from bisect import bisect_left
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
-import gtsam
 import numpy as np
 
-from app.slam import lie
-from app.slam.loops import se3
-from app.slam.loops.chain import Chain
-from app.slam.loops.factors import Closing, Factor, PositionPrior, Step, between
-from app.slam.loops.types import LOOP_HUBER
-from app.slam.rows import Rows
-from app.slam.types import F64, KeyframeId
-
-RELINEARISE = 0.05
-"""Change of a pose (rad, m) from which its factors are linearised again."""
-MOST_UPDATES = 5
-"""After a loop the update is repeated while the newest pose moves more than that, at most this often."""
-SESSION_BITS = 40
-"""The lower bits of a key of gtsam hold the index of the keyframe, those above its session."""
-_HELD = 1e-6
-"""Standard deviation (rad, m) with which the first pose is held."""
+from app.slam.loops.factors import Closing, Factor, Step
+from app.slam.loops.solvers import Incremental, Windowed
+from app.slam.types import F64
 
 
 class PoseGraph:
-    """Poses tied by factors, solved incrementally (iSAM2; Kaess et al. 2012).
+    """Poses tied by factors.
 
     Args:
         first: (4, 4), the first pose, which is held. window: how many of the newest poses are
@@ -77,7 +57,7 @@ class PoseGraph:
 
     def _reset(self) -> None:
         self._steps: list[Step] = []
-        self._solver: _All | _Window = _Window(self._first, self._window) if self._window else _All(self._first)
+        self._solver = Windowed(self._first, self._window) if self._window else Incremental(self._first)
 
     def _do(self, step: Step) -> tuple[Closing, ...]:
         try:
@@ -99,263 +79,3 @@ class PoseGraph:
         self._solver.update(step)
         if not np.isfinite(self._solver.newest).all():
             raise ArithmeticError("a pose is not finite")
-
-
-def optimise(first: F64, factors: Sequence[Closing], start: Sequence[F64] | F64) -> F64:
-    """(n, 4, 4) the optimum of all factors at once, by Levenberg-Marquardt from (n, 4, 4) `start`.
-
-    Raises:
-        ArithmeticError: the solver failed.
-    """
-    graph, values = _start(first)
-    for factor in factors:
-        graph.add(_gtsam(factor))
-    for key in range(1, len(start)):
-        values.insert(key, gtsam.Pose3(start[key]))
-    params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(1e-12)
-    params.setAbsoluteErrorTol(1e-12)
-    try:
-        return _matrices(gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize())
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise ArithmeticError(str(error)) from error
-
-
-def g2o_text(poses: F64, factors: Sequence[Factor]) -> str:
-    """Poses (n, 4, 4) and factors as the text of a g2o file."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for factor in factors:
-        graph.add(_gtsam(replace(factor, robust=False)))  # the g2o format has no robust loss
-    for key, pose in enumerate(poses):
-        values.insert(key, gtsam.Pose3(pose))
-    with tempfile.TemporaryDirectory(prefix="hemislam-") as folder:  # gtsam writes files only
-        path = Path(folder) / "graph.g2o"
-        gtsam.writeG2o(graph, values, str(path))
-        return path.read_text(encoding="utf-8")
-
-
-class _All:
-    """Every pose is solved for. The solver holds the poses that loops tie; odometry between two of them is one factor.
-
-    All other poses follow from these (`Chain`), so the cost grows with the loops, not with the length of the session.
-    Loops between the same two poses are also one factor, their mean.
-
-    Attributes:
-        count: of poses. newest: (4, 4), the last of them.
-    """
-
-    def __init__(self, first: F64) -> None:
-        self.count, self.newest = 1, first
-        self._isam = gtsam.ISAM2(_params())
-        self._isam.update(*_start(first))
-        self._factors = 1  # ever given to the solver
-        self._chain = Chain(first)
-        self._tied = [0]
-        self._odometry: dict[tuple[int, int], int] = {}  # number of the factor between two of these
-        self._loops: dict[tuple[KeyframeId, ...], _Mean] = {}
-        self._poses: Rows[np.float64] | None = Rows((4, 4), np.float64, [first])  # None: loops have moved them since
-        self._ahead: list[F64] = []  # the poses after those
-
-    def update(self, step: Step) -> None:
-        """Raises what gtsam raises, IndexError, ValueError and ArithmeticError; the solver is broken then."""
-        if isinstance(step, Factor):
-            if not np.isfinite(np.linalg.cholesky(step.covariance)).all():
-                raise ArithmeticError("a covariance is not finite")  # or the next loop would fail, and be blamed
-            self._chain.append(step.T_first_second, step.covariance)
-            self.newest = self.newest @ step.T_first_second
-            self.count += 1
-            (self._ahead if self._poses is None else self._poses).append(self.newest)
-            return
-        if not all(0 <= keyframe.index < self.count for factor in step for keyframe in factor.keyframes):
-            raise IndexError("a factor ties a pose that does not exist")
-        self._poses, self._ahead = None, []
-        T_last, odometry = self._tie(step), self._chain.poses
-        self.newest = T_last @ lie.inverse(odometry[self._tied[-1]]) @ odometry[-1]
-
-    def poses(self) -> F64:
-        if self._poses is None:
-            ends = np.array(self._tied)
-            T_ends = _matrices(self._isam.calculateEstimate())
-            self._poses = Rows((4, 4), np.float64)
-            self._poses.extend(self._chain.laid(ends, T_ends, self.count - len(self._ahead)))
-            for pose in self._ahead:
-                self._poses.append(pose)
-        return self._poses.view()
-
-    def _tie(self, factors: Sequence[Closing]) -> F64:
-        """Solve with more factors. Returns the last pose (4, 4) that one ties."""
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        new = sorted({keyframe.index for factor in factors for keyframe in factor.keyframes}.difference(self._tied))
-        expected = {key: self._expected(key) for key in new}
-        removed, added = [], dict[tuple[int, int], None]()
-        for key, pose in expected.items():
-            values.insert(key, gtsam.Pose3(pose))
-            at = bisect_left(self._tied, key)
-            before, after = self._tied[at - 1], self._tied[at : at + 1]
-            self._tied.insert(at, key)
-            added[before, key] = None
-            for end in after:  # odometry from `before` to `end` becomes two factors
-                added[key, end] = None
-                if (before, end) in added:
-                    del added[before, end]
-                else:
-                    removed.append(self._odometry.pop((before, end)))
-        for first, second in added:
-            self._odometry[first, second] = self._factors + graph.size()
-            graph.add(_gtsam(between(first, second, *self._chain.between(first, second))))
-        means: dict[_Mean, None] = {}  # in the order of their first loops
-        for factor in factors:
-            if isinstance(factor, PositionPrior):
-                graph.add(_gtsam(factor))
-            elif (mean := self._loops.get(factor.keyframes)) is not None:
-                mean.take(factor)
-                means[mean] = None
-            else:
-                means[self._loops.setdefault(factor.keyframes, _Mean(factor))] = None
-        for mean in means:
-            if mean.number is not None:
-                removed.append(mean.number)
-            mean.number = self._factors + graph.size()
-            graph.add(_gtsam(mean.factor, mean.times))
-        self._factors += graph.size()
-        last = self._tied[-1]
-        T_last = expected[last] if last in expected else _estimate(self._isam, last)
-        self._isam.update(graph, values, removed)
-        return _settled(self._isam, self._isam.update, last, T_last)
-
-    def _expected(self, key: int) -> F64:
-        """(4, 4) of a pose that no loop has tied so far."""
-        at = bisect_left(self._tied, key)
-        ends = self._tied[at - 1 : at + 1]
-        T_ends = np.array([_estimate(self._isam, end) for end in ends])
-        return np.asarray(self._chain.laid(np.array(ends), T_ends, max(key, ends[-1]) + 1)[key - ends[0]])
-
-
-class _Mean:
-    """Loops between the same two poses as one factor: their squared errors add up to that of the mean, plus a constant.
-
-    Attributes:
-        factor: their mean, each by its information. times: how many they are. number: the solver's.
-    """
-
-    def __init__(self, loop: Factor) -> None:
-        self.factor, self.times = loop, 1
-        self.number: int | None = None
-
-    def take(self, loop: Factor) -> None:
-        """One more."""
-        before, own = np.linalg.inv(self.factor.covariance), np.linalg.inv(loop.covariance)
-        covariance = np.linalg.inv(before + own)
-        T = self.factor.T_first_second
-        step = covariance @ own @ se3.log(lie.inverse(T) @ loop.T_first_second)
-        covariance = (covariance + covariance.T) / 2
-        self.factor = replace(self.factor, T_first_second=T @ se3.exp(step), covariance=covariance)
-        self.times += 1
-
-
-class _Window:
-    """Only the newest poses are solved for; older ones are marginalised (the paper's fixed number of nodes)."""
-
-    def __init__(self, first: F64, size: int) -> None:
-        self.count, self.newest = 1, first
-        self._size = size
-        self._left: list[F64] = []  # the poses that are no longer solved for
-        self._smoother = gtsam.IncrementalFixedLagSmoother(float(size - 1), _params())
-        self._smoother.update(*_start(first), {0: 0.0})
-
-    def update(self, step: Step) -> None:
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        stamps: dict[Any, Any] = {}
-        closing: tuple[Closing, ...] = ()
-        if isinstance(step, Factor):
-            self.newest = _add(step, self.newest, graph, values)
-            stamps[self.count] = float(self.count)
-            if self.count - len(self._left) == self._size:
-                self._left.append(_estimate(self._smoother, len(self._left)))
-            self.count += 1
-        else:
-            closing = step
-        for factor in closing:
-            first, last = factor.keyframes[0].index, factor.keyframes[-1]
-            if first >= len(self._left):
-                graph.add(_gtsam(factor))
-            elif isinstance(factor, Factor) and last.index >= len(self._left):  # the older pose stays where it was left
-                where = gtsam.Pose3(self._left[first] @ factor.T_first_second)
-                graph.add(gtsam.PriorFactorPose3(_key(last), where, _noise(factor)))
-        self._smoother.update(graph, values, stamps)
-        if closing:
-            self.newest = _settled(self._smoother, self._smoother.update, self.count - 1, self.newest)
-
-    def poses(self) -> F64:
-        return np.array(self._left + [_estimate(self._smoother, key) for key in range(len(self._left), self.count)])
-
-
-def _settled(solver: Any, update: Callable[[], object], newest: int, before: F64) -> F64:
-    """The newest pose, after updates as long as they move it so far that it has to be linearised again."""
-    for _ in range(MOST_UPDATES):
-        after = _estimate(solver, newest)
-        if not np.abs(after - before).max() > RELINEARISE:
-            return after
-        before = after
-        update()
-    return _estimate(solver, newest)
-
-
-def _estimate(solver: Any, key: int) -> F64:
-    return np.asarray(solver.calculateEstimatePose3(key).matrix())
-
-
-def _start(first: F64) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(first), gtsam.noiseModel.Isotropic.Sigma(6, _HELD)))
-    values.insert(0, gtsam.Pose3(first))
-    return graph, values
-
-
-def _add(odometry: Factor, newest: F64, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> F64:
-    """Put a step in the graph. Returns the pose after it, as it is before loops."""
-    after = newest @ odometry.T_first_second
-    values.insert(_key(odometry.second), gtsam.Pose3(after))
-    graph.add(_gtsam(odometry))
-    return after
-
-
-def _params() -> gtsam.ISAM2Params:
-    params = gtsam.ISAM2Params()
-    params.setRelinearizeThreshold(RELINEARISE)
-    params.relinearizeSkip = 1
-    exact = gtsam.ISAM2GaussNewtonParams()
-    exact.setWildfireThreshold(0.0)  # otherwise looking at the estimate would change the next one
-    params.setOptimizationParams(exact)
-    return params
-
-
-def _noise(factor: Factor, times: int = 1) -> gtsam.noiseModel.Base:
-    """times: how many loops it is the mean of. Huber's limit grows so that they pull as far as each would alone."""
-    noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
-    if not factor.robust:
-        return noise
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(LOOP_HUBER * times**0.5), noise)
-
-
-def _gtsam(factor: Closing, times: int = 1) -> gtsam.NonlinearFactor:
-    """The factor as gtsam has it."""
-    if isinstance(factor, PositionPrior):
-        noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
-        return gtsam.GPSFactor(_key(factor.keyframe), factor.p_map_imu, noise)
-    T = gtsam.Pose3(factor.T_first_second)
-    return gtsam.BetweenFactorPose3(_key(factor.first), _key(factor.second), T, _noise(factor, times))
-
-
-def _key(keyframe: KeyframeId) -> int:
-    """gtsam's key of a pose; the index itself in session 0."""
-    return (keyframe.session << SESSION_BITS) | keyframe.index
-
-
-def _matrices(values: Any) -> F64:
-    """(n, 4, 4) poses in the order of their keys."""
-    flat = np.asarray(gtsam.utilities.extractPose3(values))
-    out = np.tile(np.eye(4), (len(flat), 1, 1))
-    out[:, :3, :3] = flat[:, :9].reshape(-1, 3, 3)
-    out[:, :3, 3] = flat[:, 9:]
-    return out

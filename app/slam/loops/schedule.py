@@ -7,36 +7,36 @@ A frame waits only if an answer is late. What the user asks takes effect as soon
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
+from app.slam.log import Cursor
 from app.slam.loops.files import LoopResults
-from app.slam.loops.keyframe_log import KeyframeLog
+from app.slam.loops.keyframe_log import Entry, KeyframeLog
 from app.slam.loops.messages import (
     Answer,
+    Answered,
     ApplyEdit,
     Ask,
     AskG2o,
     AskState,
     Failure,
-    G2o,
-    LoadEdits,
     LoopClient,
     LoopState,
-    Redo,
+    Question,
     Target,
-    Undo,
-    UserRequest,
 )
 from app.slam.loops.types import Edits, LoopEdge, Verdict, difference
 from app.slam.map_frame import MapFrame
 from app.slam.sections import LoopsParams
 from app.slam.types import Keyframe
 
+Request = Question | Callable[[Edits], Edits]
+"""What the user asks, or makes of the edits: `Edits.undo`, for example, which may raise HemislamError."""
 STATES: Final = 512
 """States that are kept, so that going back need not solve the graph again."""
 
@@ -58,19 +58,11 @@ class _Asked:
         version: of the keyframe log. visit: counts how often the session had gone to another frame.
     """
 
-    ask: Ask
+    moment: Moment
     user: bool
     edits: bool
     version: int
     visit: int
-
-    @property
-    def moment(self) -> Moment:
-        return Moment(self.ask.target.count, self.ask.target.finished)
-
-
-class _Finish:
-    """The session has ended."""
 
 
 class LoopSchedule:
@@ -101,7 +93,7 @@ class LoopSchedule:
         self._wanted = Moment(0)  # what should be in effect
         self._shown: Moment | None = self._wanted  # what is; None if that is with other edits
         self._asked: deque[_Asked] = deque()
-        self._requests: deque[UserRequest | _Finish] = deque()  # of the user, not yet sent
+        self._requests: deque[Request] = deque()  # of the user, not yet sent
         self._visit = 0
         self._reported: tuple[LoopEdge, ...] | None = ()  # candidates at the frame before; None after going elsewhere
         self._answers: list[Answer] = []
@@ -135,7 +127,7 @@ class LoopSchedule:
         self._finished, self._params = False, params
         if not self._log.holds(keyframe):
             self._forget(keyframe.index)
-            self._log.append(keyframe.frame, keyframe.stamp_ns, params)
+            self._log.append(Entry(keyframe.frame, keyframe.stamp_ns, params))
         self._ask_next()
 
     def go_to(self, frame: int) -> None:
@@ -145,7 +137,7 @@ class LoopSchedule:
         """
         self._finished = False
         self._visit += 1
-        self._requests = deque(request for request in self._requests if not isinstance(request, _Finish))
+        self._requests = deque(request for request in self._requests if not isinstance(request, AskState))
         self._log.take_stored(self._params)
         self._wanted = Moment(min(self._log.until(frame - 1 - self._start.latency), self._log.count))
         self._reported = None
@@ -169,7 +161,7 @@ class LoopSchedule:
     def finish(self) -> None:
         """The session has ended: look for loops at the last keyframes too, and put all that comes into effect."""
         self._finished = True
-        self._requests.append(_Finish())
+        self._requests.append(AskState())
         self._ask_next()
 
     def wait_ready(self) -> None:
@@ -178,8 +170,8 @@ class LoopSchedule:
         self._settle()
 
     # --- the user --------------------------------------------------------------------------------
-    def command(self, request: UserRequest) -> None:
-        """Ask on behalf of the user; `poll` until it is `idle` brings the answer."""
+    def command(self, request: Request) -> None:
+        """Ask on behalf of the user, or change the edits; `poll` until it is `idle` brings the answer."""
         self._requests.append(request)
         self._ask_next()
 
@@ -226,10 +218,10 @@ class LoopSchedule:
         self.command(AskG2o())
         self._settle()
         state = self._states.get(Moment(self._log.count, self._finished), self.state)
-        texts = [answer.text for answer in self._answers if isinstance(answer, G2o)]
-        self._answers = [answer for answer in self._answers if not isinstance(answer, G2o)]
+        graphs = [answer for answer in self._answers if isinstance(answer, Answered) and answer.question == AskG2o()]
+        self._answers = [answer for answer in self._answers if answer not in graphs]
         frame, edges = (MapFrame(), ()) if state is None else (self._lay(state), state.edges)
-        return LoopResults(frame, self._log.stamps_ns(self._log.count), edges, texts[-1] if texts else "")
+        return LoopResults(frame, self._log.stamps_ns(self._log.count), edges, str(graphs[-1].value) if graphs else "")
 
     def close(self) -> None:
         self._client.close()
@@ -251,27 +243,20 @@ class LoopSchedule:
             if moment != self._shown and moment not in self._states and moment not in outstanding:
                 self._ask(Ask(Target(moment.count, self._edits, moment.finished)))
 
-    def _ask_for_user(self, request: UserRequest | _Finish) -> None:
-        target = Target(self._log.count, self._edits, self._finished)
+    def _ask_for_user(self, request: Request) -> None:
+        edits, question = self._edits, request if isinstance(request, Question) else AskState()
         try:
-            match request:
-                case Undo():
-                    self._ask(Ask(replace(target, edits=self._edits.undo())), user=True, edits=True)
-                case Redo():
-                    self._ask(Ask(replace(target, edits=self._edits.redo())), user=True, edits=True)
-                case LoadEdits(edits):
-                    self._ask(Ask(replace(target, edits=edits)), user=True, edits=True)
-                case ApplyEdit():
-                    self._ask(Ask(target, request), user=True, edits=True)
-                case _Finish():
-                    self._ask(Ask(target, AskState()), user=True)
-                case _:
-                    self._ask(Ask(target, request), user=True)
+            if not isinstance(request, Question):
+                edits = request(edits)
         except HemislamError as error:
             self._answers.append(Failure(str(error)))
+        else:
+            changes = edits is not self._edits or isinstance(question, ApplyEdit)
+            self._ask(Ask(Target(self._log.count, edits, self._finished), question), user=True, edits=changes)
 
     def _ask(self, ask: Ask, *, user: bool = False, edits: bool = False) -> None:
-        self._asked.append(_Asked(ask, user, edits, self._log.version, self._visit))
+        moment = Moment(ask.target.count, ask.target.finished)
+        self._asked.append(_Asked(moment, user, edits, self._log.cursor.version, self._visit))
         self._client.send(ask)
 
     # --- answers ---------------------------------------------------------------------------------
@@ -311,7 +296,7 @@ class LoopSchedule:
                 self._edits = self._edits.cut(len(self._log), self._start.submap_keyframes)
             self._forget_states()
         self._acting = state.acting
-        if self._log.keep(asked.version, state.count) < state.count:
+        if self._log.keep(Cursor(asked.version, state.count)) < state.count:
             return  # of keyframes that were replaced since
         moment = Moment(state.count, state.finished)
         self._states[moment] = state

@@ -32,7 +32,6 @@ def search(
     found: Edges,
     counting: Callable[[Edges], Edges],
     poses: F64,
-    drift: Drift,
     params: LoopsParams,
 ) -> Found:
     """Look for loops of some keyframes; those before the last that lack a context get one.
@@ -41,6 +40,7 @@ def search(
         found: candidates so far. counting: returns them as they count with the user's edits.
         poses: (k, 4, 4) T_map_imu.
     """
+    drift = Drift.of(params)
     described, updates, now = detector.described, Edges(), len(detector) - 1
     while detector.described < keyframes.stop:
         detector.learn([detector.describe(detector.described)])

@@ -13,20 +13,16 @@ from app.slam.loops.messages import (
     Added,
     AddKeyframe,
     Answer,
+    Answered,
     ApplyEdit,
     Ask,
     AskG2o,
     AskResiduals,
     Failure,
-    G2o,
     Inspect,
-    Inspected,
     LoopState,
-    Question,
     Reply,
     Request,
-    Residuals,
-    Tried,
     TryOut,
 )
 from app.slam.loops.pose_graph import PoseGraph
@@ -57,23 +53,17 @@ class LoopService:
 
     def answer(self, ask: Ask) -> Answer:
         """Raises HemislamError if it cannot be done."""
-        self._backend.stand(ask.target)
-        return self._answer(ask.question)
-
-    def close(self) -> None:
-        self._backend.close()
-
-    def _answer(self, question: Question) -> Answer:
-        backend = self._backend
+        backend, question = self._backend, ask.question
+        backend.stand(ask.target)
         match question:
             case TryOut(edit):
-                return Tried(edit, backend.preview(edit))
+                return Answered(question, backend.preview(edit))
             case Inspect(older, newer):
-                return Inspected((older, newer), backend.detail(older, newer))
+                return Answered(question, backend.detail(older, newer))
             case AskResiduals():
-                return Residuals(backend.factor_residuals())
+                return Answered(question, backend.factor_residuals())
             case AskG2o():
-                return G2o(backend.g2o())
+                return Answered(question, backend.g2o())
             case ApplyEdit(edit):
                 backend.apply(edit)
         corrections = backend.corrections
@@ -88,6 +78,9 @@ class LoopService:
             acting=backend.acting,
             notices=backend.take_notices(),
         )
+
+    def close(self) -> None:
+        self._backend.close()
 
 
 class InlineLoops:

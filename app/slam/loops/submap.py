@@ -13,11 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.slam.types import F32, F64, I64, Keyframe
+from app.slam.types import F32, F64, Keyframe
 from app.slam.voxel import VoxelGrid
-
-AT_ONCE = 1 << 17
-"""Points of a submap before thinning that the buffers hold: by default 17 clouds of some thousands."""
 
 _POINT_BYTES = 12
 
@@ -33,41 +30,8 @@ class Submap:
     eyes: F32
 
 
-class Clouds:
-    """Point clouds (n, 3) float32 in an unnamed temporary file, appended. Reading takes microseconds a cloud."""
-
-    def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile(prefix="hemislam-loops-")  # noqa: SIM115 - closed by close()
-        self._ends = array("q", [0])  # file offset after each cloud
-
-    def between(self, first: int, end: int, room: F32) -> tuple[F32, I64]:
-        """Those from `first` to before `end`, one after the other, read into `room` if that is large enough.
-
-        Returns:
-            (n, 3), and (end - first + 1,) at which point each begins and the last one ends.
-        """
-        offsets = np.array(self._ends[first : end + 1])
-        begins = (offsets - offsets[0]) // _POINT_BYTES
-        points = room[: begins[-1]] if begins[-1] <= len(room) else np.empty((begins[-1], 3), np.float32)
-        os.preadv(self._file.fileno(), [points.data], int(offsets[0]))
-        return points, begins
-
-    def append(self, points: F32) -> None:
-        self._file.seek(self._ends[-1])
-        self._file.write(np.ascontiguousarray(points).tobytes())
-        self._file.flush()
-        self._ends.append(self._ends[-1] + points.nbytes)
-
-    def truncate(self, count: int) -> None:
-        """Keep the first `count`."""
-        del self._ends[count + 1 :]
-
-    def close(self) -> None:
-        self._file.close()
-
-
 class Submaps:
-    """Makes submaps from thinned clouds, which it keeps on disk.
+    """Makes submaps from thinned clouds, which it keeps in an unnamed temporary file.
 
     Args:
         voxel_size: m, of the thinning. radius: m around the keyframe that a submap reaches.
@@ -75,20 +39,24 @@ class Submaps:
 
     def __init__(self, voxel_size: float, radius: float) -> None:
         self._voxel_size, self._radius = voxel_size, radius
-        self._grid = VoxelGrid(AT_ONCE)
-        self._room: F32 = np.empty((AT_ONCE, 3), np.float32)
-        self._clouds = Clouds()
+        self._grid = VoxelGrid()
+        self._file = tempfile.TemporaryFile(prefix="hemislam-loops-")  # noqa: SIM115 - closed by close()
+        self._ends = array("q", [0])  # points up to the end of each cloud
 
     def append(self, keyframe: Keyframe) -> None:
         """Take the cloud of the next keyframe."""
-        self._clouds.append(self._level(keyframe))
+        points = self._level(keyframe)
+        self._file.seek(self._ends[-1] * _POINT_BYTES)
+        self._file.write(points.tobytes())
+        self._file.flush()
+        self._ends.append(self._ends[-1] + len(points))
 
     def truncate(self, count: int) -> None:
         """Forget all clouds but the first `count`."""
-        self._clouds.truncate(count)
+        del self._ends[count + 1 :]
 
     def close(self) -> None:
-        self._clouds.close()
+        self._file.close()
 
     def around(self, index: int, poses: F64, first: int, last: int) -> Submap:
         """The submap about a keyframe, from the clouds of keyframes `first` to `last`, both included.
@@ -96,7 +64,10 @@ class Submaps:
         Args:
             poses: (k, 4, 4) T_odom_imu of all keyframes.
         """
-        points, begins = self._clouds.between(first, last + 1, self._room)
+        ends = np.array(self._ends[first : last + 2])
+        begins = ends - ends[0]
+        raw = os.pread(self._file.fileno(), int(begins[-1]) * _POINT_BYTES, int(ends[0]) * _POINT_BYTES)
+        points = np.frombuffer(bytearray(raw), np.float32).reshape(-1, 3)
         eyes = (poses[first : last + 1, :3, 3] - poses[index, :3, 3]).astype(np.float32)
         for eye, begin, end in zip(eyes, begins[:-1], begins[1:], strict=True):
             points[begin:end] += eye

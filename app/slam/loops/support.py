@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops import se3
 from app.slam.loops.drift import Drift, agree
 from app.slam.loops.types import LOOP_HUBER, LoopEdge, Origin, Pair, Verdict
 from app.slam.sections import LoopsParams
@@ -60,16 +59,15 @@ def settle(
         support = len({other.newer for other, yes in zip(others, verdicts, strict=True) if yes} - {edge.newer})
         against = verdicts.count(False)
         evidence = replace(edge.evidence, support=support)
-        measured = replace(edge.measured, evidence=evidence)
         if support >= params.support and support > 2 * against:
             reason = f"{evidence.summary}; {support} others agree"
             out[edge.pair] = replace(
-                edge, verdict=Verdict.ACCEPTED, reason=reason, measured=measured, decided_at=now, weight=1.0
+                edge, verdict=Verdict.ACCEPTED, reason=reason, evidence=evidence, decided_at=now, weight=1.0
             )
         elif edge.pair in out:
             waits = f"{evidence.summary}; {support} of {params.support} others agree"
             contradicted = f", {against} contradict it" if against else ""
-            out[edge.pair] = replace(edge, reason=waits + contradicted, measured=measured, weight=1.0)
+            out[edge.pair] = replace(edge, reason=waits + contradicted, evidence=evidence, weight=1.0)
     return list(out.values())
 
 
@@ -130,7 +128,7 @@ def laid(edge: LoopEdge, first: LoopEdge, T_odom_imu: F64) -> tuple[F64, F64]:
     """
     older = lie.inverse(T_odom_imu[first.older]) @ T_odom_imu[edge.older]
     newer = lie.inverse(T_odom_imu[edge.newer]) @ T_odom_imu[first.newer]
-    turn = se3.adjoint(lie.inverse(newer))
+    turn = lie.adjoint(lie.inverse(newer))
     covariance = turn @ edge.covariance @ turn.T
     return older @ edge.T_older_newer @ newer, (covariance + covariance.T) / 2
 
@@ -142,5 +140,5 @@ def _apart(a: LoopEdge, b: LoopEdge) -> int:
 
 def _off(edge: LoopEdge, T_older_newer: F64, covariance: F64 | float = 0.0) -> float:
     """Standard deviations between a loop's measurement and this one. covariance: (6, 6) of this one; 0 if exact."""
-    missed = se3.log(lie.inverse(edge.T_older_newer) @ T_older_newer)
+    missed = lie.log_se3(lie.inverse(edge.T_older_newer) @ T_older_newer)
     return float(np.sqrt(missed @ np.linalg.solve(edge.covariance + covariance, missed)))

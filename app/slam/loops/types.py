@@ -77,29 +77,13 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
-    """What registration measured of a loop.
-
-    Attributes:
-        T_older_newer: (4, 4) of the IMU frames. covariance: (6, 6), rotation then translation, in the newer's IMU
-            frame (right perturbation).
-    """
-
-    T_older_newer: F64
-    covariance: F64
-    evidence: Evidence
-
-    def __post_init__(self) -> None:
-        self.T_older_newer.setflags(write=False)
-        self.covariance.setflags(write=False)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class LoopEdge:
     """One loop candidate and its verdict. Compared by identity; `same` compares values.
 
     Attributes:
         older, newer: the keyframes. decided_at: the newest keyframe when the verdict fell.
+        T_older_newer: (4, 4) of the IMU frames, as registered, read-only.
+        covariance: (6, 6) of that, rotation then translation, in the newer's IMU frame (right perturbation), read-only.
         verdict, reason: the reason in words and numbers.
         origin: who proposed it. edited: whether the verdict is the user's.
         weight: divides the covariance in the graph; only of this loop, not of those that repeat it.
@@ -112,7 +96,9 @@ class LoopEdge:
     older: int
     newer: int
     decided_at: int
-    measured: Measured
+    T_older_newer: F64
+    covariance: F64
+    evidence: Evidence
     verdict: Verdict
     reason: str
     origin: Origin = Origin.DETECTED
@@ -125,19 +111,9 @@ class LoopEdge:
     def pair(self) -> Pair:
         return self.older, self.newer
 
-    @property
-    def T_older_newer(self) -> F64:
-        """(4, 4), read-only."""
-        return self.measured.T_older_newer
-
-    @property
-    def covariance(self) -> F64:
-        """(6, 6), read-only."""
-        return self.measured.covariance
-
-    @property
-    def evidence(self) -> Evidence:
-        return self.measured.evidence
+    def __post_init__(self) -> None:
+        self.T_older_newer.setflags(write=False)
+        self.covariance.setflags(write=False)
 
     @property
     def counts(self) -> bool:
@@ -177,38 +153,50 @@ def changed_by(change: LoopChange, before: Iterable[LoopEdge]) -> tuple[LoopEdge
 
 
 # --- the user's edits ----------------------------------------------------------------------------
-# `since` of each: how many keyframes the session had when the edit was made, one more after its end. When a session is
-# repeated, the edit acts from there on; 0: from the start.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Edit:
+    """Attributes:
+    since: how many keyframes the session had when the edit was made, one more after its end. When a session is
+        repeated, the edit acts from there on; 0: from the start.
+    """
+
+    since: int = field(default=0, compare=False)
+
+    @property
+    def pair(self) -> Pair | None:
+        """The loop that it edits; None: the graph as a whole."""
+        return None
+
+
 @dataclass(frozen=True, slots=True)
-class Accept:
+class _PairEdit(_Edit):
+    older: int
+    newer: int
+
+    @property
+    def pair(self) -> Pair:
+        return self.older, self.newer
+
+
+@dataclass(frozen=True, slots=True)
+class Accept(_PairEdit):
     """Make a candidate a factor of the graph, whatever its verdict."""
 
-    older: int
-    newer: int
-    since: int = field(default=0, compare=False)
-
 
 @dataclass(frozen=True, slots=True)
-class Reject:
+class Reject(_PairEdit):
     """Take a loop out of the graph."""
 
-    older: int
-    newer: int
-    since: int = field(default=0, compare=False)
-
 
 @dataclass(frozen=True, slots=True)
-class SetWeight:
+class SetWeight(_PairEdit):
     """Divide a loop's covariance by `weight` (> 0); 1 leaves it as registered."""
 
-    older: int
-    newer: int
     weight: float
-    since: int = field(default=0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Add:
+class Add(_PairEdit):
     """Tie two keyframes together by hand.
 
     Attributes:
@@ -217,21 +205,16 @@ class Add:
         register: False takes the guess as it is.
     """
 
-    older: int
-    newer: int
     guess: tuple[tuple[float, ...], ...] | None = None
     register: bool = True
-    since: int = field(default=0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Solve:
+class Solve(_Edit):
     """From here on, take the poses from all factors solved at once (Levenberg-Marquardt).
 
     They differ from the incremental ones where those only came near the optimum, and with a window.
     """
-
-    since: int = field(default=0, compare=False)
 
 
 LoopEdit = Accept | Reject | SetWeight | Add | Solve
@@ -325,11 +308,6 @@ class LoopDetail:
     residuals: F64
 
 
-def pair_of(edit: LoopEdit) -> Pair | None:
-    """The pair that an edit names; None: the graph as a whole."""
-    return None if isinstance(edit, Solve) else (edit.older, edit.newer)
-
-
 def rows(T: F64) -> tuple[tuple[float, ...], ...]:
     """A matrix as an edit holds it."""
     return tuple(tuple(float(value) for value in row) for row in np.asarray(T))
@@ -337,5 +315,4 @@ def rows(T: F64) -> tuple[tuple[float, ...], ...]:
 
 def loses(edit: LoopEdit, count: int, half: int) -> bool:
     """Whether an edit's submaps, of `half` keyframes on either side, reach beyond the first `count` keyframes."""
-    pair = pair_of(edit)
-    return pair is not None and pair[1] + half >= count
+    return edit.pair is not None and edit.pair[1] + half >= count

@@ -9,7 +9,7 @@ from app.slam import lie
 from app.slam.loops.ambiguity import nearest_alternative
 from app.slam.loops.detection import Detector, Sighting
 from app.slam.loops.drift import Expectation
-from app.slam.loops.types import Evidence, LoopEdge, Measured, Origin, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.loops.verification import Fit
 from app.slam.sections import LoopsParams
 from app.slam.types import F64
@@ -33,7 +33,7 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
 
     def edge(T_older_newer: F64, covariance: F64, evidence: Evidence, reason: str) -> LoopEdge:
         verdict = Verdict.REJECTED if reason else Verdict.CANDIDATE
-        return LoopEdge(older, newer, now, Measured(T_older_newer, covariance, evidence), verdict, reason)
+        return LoopEdge(older, newer, now, T_older_newer, covariance, evidence, verdict, reason)
 
     if sighting.distance > params.context_distance:
         reason = (
@@ -69,8 +69,8 @@ def by_hand(older: int, newer: int, detector: Detector, T_older_newer: F64, *, r
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
     reason = f"added by hand: overlap {fit.overlap:.2f}, residual {fit.residual_rms * 1e3:.0f} mm"
     T = _imu(detector, older, newer, fit.T_target_source) if register else T_older_newer
-    measured = Measured(T, covariance(detector, newer, fit), evidence)
-    return LoopEdge(older, newer, newer, measured, Verdict.ACCEPTED, reason, Origin.USER, edited=True)
+    sigma = covariance(detector, newer, fit)
+    return LoopEdge(older, newer, newer, T, sigma, evidence, Verdict.ACCEPTED, reason, Origin.USER, edited=True)
 
 
 def covariance(detector: Detector, newer: int, fit: Fit) -> F64:

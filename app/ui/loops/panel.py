@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from app.server.protocol import InspectLoop, Seek, Snapshot
-from app.slam.loops.types import LoopEdge, LoopEdit, Pair, SetWeight, Solve, pair_of
+from app.slam.loops.types import LoopEdge, LoopEdit, Pair, SetWeight, Solve
 from app.slam.types import F64
 from app.ui.html import panel
 from app.ui.loops.add_loop import AddLoopPanel
@@ -195,7 +195,7 @@ class LoopsPanel:
 
     def _committed(self, command: LoopEdit) -> None:
         self._add_loop.done()
-        if (pair := pair_of(command)) is not None:
+        if (pair := command.pair) is not None:
             self._chosen = self._coming = pair  # a loop added by hand arrives later
 
 

@@ -8,9 +8,9 @@ from app.child import ChildDied
 from app.mapping.loops import RestartingLoops
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.keyframe_log import KeyframeLog
-from app.slam.loops.messages import Added, AddKeyframe, ApplyEdit, AskG2o, G2o, LoopState, Reply, Request
+from app.slam.loops.messages import Added, AddKeyframe, Answered, ApplyEdit, AskG2o, LoopState, Reply, Request
 from app.slam.loops.schedule import LoopSchedule
-from app.slam.loops.types import Edits, Evidence, LoopEdge, Measured, Verdict
+from app.slam.loops.types import Edits, Evidence, LoopEdge, Verdict
 from app.slam.sections import LoopsParams
 from app.slam.types import Cloud, Keyframe
 
@@ -52,7 +52,7 @@ class Worker:
         edits = request.target.edits
         match request.question:
             case AskG2o():
-                self._pending.append(G2o(f"graph of {count}"))
+                self._pending.append(Answered(request.question, f"graph of {count}"))
                 return
             case ApplyEdit(edit):
                 edits = Edits((*edits.done, edit))
@@ -82,7 +82,7 @@ def state(count: int, edits: Edits, *, finished: bool) -> LoopState:
 
 
 def edge(newer: int) -> LoopEdge:
-    return LoopEdge(0, newer, newer, Measured(np.eye(4), np.eye(6), Evidence()), Verdict.ACCEPTED, "it fits")
+    return LoopEdge(0, newer, newer, np.eye(4), np.eye(6), Evidence(), Verdict.ACCEPTED, "it fits")
 
 
 class HeldSession:

@@ -11,11 +11,12 @@ import pytest
 
 from app.slam.errors import HemislamError
 from app.slam.loops.backend import LoopBackend
+from app.slam.loops.factors import PositionPrior
 from app.slam.loops.files import loops_csv
 from app.slam.loops.types import Add, Edits, Origin, Solve, Verdict, rows
 from app.slam.metrics import umeyama
 from app.slam.sections import LoopsParams
-from app.slam.types import F64
+from app.slam.types import F64, KeyframeId
 from tests.slam.loops.conftest import PARAMS, Walked, accepted, same
 from tests.slam.loops.walks import drive, error, revisits, take
 
@@ -233,3 +234,24 @@ def test_places_with_nothing_in_common_are_not_tied_by_registration(walked: Walk
         with pytest.raises(HemislamError, match="nothing in common"):
             act(Add(5, 62, rows(far)))
     assert same(backend.edges, before) and backend.edits == Edits()
+
+
+def test_measured_positions_of_keyframes_pull_the_map_and_take_part_in_every_solution(walked: Walked) -> None:
+    def aside(index: int) -> F64:
+        return walked.keyframes[index].T_odom_imu[:3, 3] + np.array([0.0, 0.0, 2.0])
+
+    backend = LoopBackend()
+    for keyframe in walked.keyframes[:20]:
+        priors = (PositionPrior(KeyframeId(0, 15), aside(15), 1e-6 * np.eye(3)),) if keyframe.index == 15 else ()
+        backend.add(keyframe, PARAMS, priors)
+    poses = backend.poses
+    np.testing.assert_allclose(poses[15, :3, 3], aside(15), atol=0.05)
+    assert backend.corrections[15, 2, 3] != 0.0
+    backend.go_to(3)
+    backend.go_to(20)
+    assert backend.poses.tobytes() == poses.tobytes()
+    np.testing.assert_allclose(backend.preview(Solve()).poses[15, :3, 3], aside(15), atol=0.05)
+    backend.go_to(15)
+    assert (backend.corrections == np.eye(4)).all()
+    assert backend.take_notices() == ()
+    backend.close()

@@ -4,7 +4,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from app.slam import lie
-from app.slam.loops import se3
 from app.slam.loops.chain import Chain
 from app.slam.types import F64
 
@@ -13,10 +12,10 @@ def walk(count: int, seed: int, spread: float = 0.3) -> tuple[Chain, list[F64], 
     """A chain of poses that turn and go on at random, its steps and their covariances."""
     rng = np.random.default_rng(seed)
     steps, covariances = [], []
-    chain = Chain(se3.exp(rng.normal(scale=0.5, size=6)))
+    chain = Chain(lie.exp_se3(rng.normal(scale=0.5, size=6)))
     for _ in range(count - 1):
         A = rng.normal(size=(6, 6))
-        steps.append(se3.exp(rng.normal(scale=spread, size=6) + np.array([0, 0, 0, 1.0, 0, 0])))
+        steps.append(lie.exp_se3(rng.normal(scale=spread, size=6) + np.array([0, 0, 0, 1.0, 0, 0])))
         covariances.append(1e-4 * (A @ A.T / 6 + np.eye(6)))
         chain.append(steps[-1], covariances[-1])
     return chain, steps, covariances
@@ -24,9 +23,9 @@ def walk(count: int, seed: int, spread: float = 0.3) -> tuple[Chain, list[F64], 
 
 def test_the_adjoint_carries_a_perturbation_to_the_other_side() -> None:
     rng = np.random.default_rng(0)
-    T, v = se3.exp(rng.normal(size=(5, 6))), rng.normal(scale=0.1, size=(5, 6))
-    carried = (se3.adjoint(T) @ v[..., None])[..., 0]
-    np.testing.assert_allclose(se3.exp(carried) @ T, T @ se3.exp(v), atol=1e-12)
+    T, v = lie.exp_se3(rng.normal(size=(5, 6))), rng.normal(scale=0.1, size=(5, 6))
+    carried = (lie.adjoint(T) @ v[..., None])[..., 0]
+    np.testing.assert_allclose(lie.exp_se3(carried) @ T, T @ lie.exp_se3(v), atol=1e-12)
 
 
 def test_the_covariance_of_a_stretch_is_what_many_noisy_walks_scatter_by() -> None:
@@ -35,8 +34,8 @@ def test_the_covariance_of_a_stretch_is_what_many_noisy_walks_scatter_by() -> No
     rng = np.random.default_rng(2)
     noisy = np.tile(np.eye(4), (40_000, 1, 1))
     for step, own in zip(steps[2:8], covariances[2:8], strict=True):
-        noisy = noisy @ step @ se3.exp(rng.multivariate_normal(np.zeros(6), 1e-2 * own, size=len(noisy)))
-    scatter = np.cov(se3.log(lie.inverse(T) @ noisy).T)
+        noisy = noisy @ step @ lie.exp_se3(rng.multivariate_normal(np.zeros(6), 1e-2 * own, size=len(noisy)))
+    scatter = np.cov(lie.log_se3(lie.inverse(T) @ noisy).T)
     sigmas = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(
         1e2 * scatter / np.outer(sigmas, sigmas), covariance / np.outer(sigmas, sigmas), atol=0.03
@@ -45,16 +44,16 @@ def test_the_covariance_of_a_stretch_is_what_many_noisy_walks_scatter_by() -> No
 
 def test_poses_between_known_ones_are_those_that_need_the_least_error_of_the_steps() -> None:
     chain, steps, covariances = walk(7, seed=3)
-    first, last = chain.poses[0], chain.poses[6] @ se3.exp(np.array([0.01, -0.02, 0.015, 0.05, -0.08, 0.03]))
+    first, last = chain.poses[0], chain.poses[6] @ lie.exp_se3(np.array([0.01, -0.02, 0.015, 0.05, -0.08, 0.03]))
 
     def errors(x: F64) -> F64:
-        poses = [first, *(chain.poses[1:6] @ se3.exp(x.reshape(-1, 6))), last]
-        missed = [se3.log(lie.inverse(a @ step) @ b) for a, b, step in zip(poses, poses[1:], steps, strict=False)]
+        poses = [first, *(chain.poses[1:6] @ lie.exp_se3(x.reshape(-1, 6))), last]
+        missed = [lie.log_se3(lie.inverse(a @ step) @ b) for a, b, step in zip(poses, poses[1:], steps, strict=False)]
         return np.concatenate(
             [np.linalg.solve(np.linalg.cholesky(C), e) for C, e in zip(covariances, missed, strict=True)]
         )
 
-    best = chain.poses[1:6] @ se3.exp(least_squares(errors, np.zeros(30), xtol=1e-14, ftol=1e-14).x.reshape(-1, 6))
+    best = chain.poses[1:6] @ lie.exp_se3(least_squares(errors, np.zeros(30), xtol=1e-14, ftol=1e-14).x.reshape(-1, 6))
     laid = chain.laid(np.array([0, 6]), np.array([first, last]), 7)
     assert np.abs(laid[1:6] - chain.poses[1:6]).max() > 0.02
     np.testing.assert_allclose(laid[1:6], best, atol=1e-3)
@@ -63,7 +62,7 @@ def test_poses_between_known_ones_are_those_that_need_the_least_error_of_the_ste
 
 def test_ends_that_odometry_meets_leave_every_pose_where_it_has_it() -> None:
     chain, _, _ = walk(30, seed=4)
-    moved = se3.exp(np.array([0.3, -1.0, 2.0, 5.0, 6.0, -7.0]))
+    moved = lie.exp_se3(np.array([0.3, -1.0, 2.0, 5.0, 6.0, -7.0]))
     ends = np.array([3, 4, 11, 25])
     np.testing.assert_allclose(chain.laid(ends, moved @ chain.poses[ends], 30), moved @ chain.poses[3:], atol=1e-9)
 
@@ -72,7 +71,7 @@ def test_stretches_do_not_know_of_one_another() -> None:
     chain, _, _ = walk(30, seed=5)
     rng = np.random.default_rng(6)
     ends = np.array([0, 7, 8, 20])
-    T_ends = chain.poses[ends] @ se3.exp(rng.normal(scale=0.02, size=(4, 6)))
+    T_ends = chain.poses[ends] @ lie.exp_se3(rng.normal(scale=0.02, size=(4, 6)))
     together = chain.laid(ends, T_ends, 30)
     for at in range(3):
         first, last = ends[at], ends[at + 1]

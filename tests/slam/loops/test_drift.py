@@ -3,7 +3,7 @@ import pytest
 
 from app.slam import lie
 from app.slam.loops.drift import POSITION_M, ROTATION, Drift, agree, expect
-from app.slam.loops.types import Evidence, LoopEdge, Measured, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Verdict
 from app.slam.types import F64
 
 DRIFT = Drift(0.01, np.radians(0.02))
@@ -23,7 +23,7 @@ def square(side: float = 10.0, step: float = 0.5) -> F64:
 def loop(older: int, newer: int, poses: F64, off: tuple[float, float, float] = (0, 0, 0)) -> LoopEdge:
     T = lie.inverse(poses[older]) @ poses[newer]
     T[:3, 3] += off
-    return LoopEdge(older, newer, newer, Measured(T, np.eye(6) * 1e-4, Evidence()), Verdict.ACCEPTED, "")
+    return LoopEdge(older, newer, newer, T, np.eye(6) * 1e-4, Evidence(), Verdict.ACCEPTED, "")
 
 
 def test_doubt_grows_with_the_way_not_with_the_distance() -> None:

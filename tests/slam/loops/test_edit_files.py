@@ -25,12 +25,12 @@ def _edits(draw: st.DrawFn) -> LoopEdit:
     return draw(
         st.sampled_from(
             (
-                Accept(older, newer, since),
-                Reject(older, newer, since),
-                SetWeight(older, newer, weight, since),
-                Add(older, newer, None, register, since),
-                Add(older, newer, rows(guess), register, since),
-                Solve(since),
+                Accept(older, newer, since=since),
+                Reject(older, newer, since=since),
+                SetWeight(older, newer, weight, since=since),
+                Add(older, newer, None, register, since=since),
+                Add(older, newer, rows(guess), register, since=since),
+                Solve(since=since),
             )
         )
     )

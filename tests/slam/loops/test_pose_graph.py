@@ -8,10 +8,10 @@ from scipy.optimize import least_squares
 
 from app.slam import lie
 from app.slam.kernels import manifold
-from app.slam.loops import se3
-from app.slam.loops.factors import Factor, PositionPrior, Step, between
-from app.slam.loops.inspection import residuals
-from app.slam.loops.pose_graph import LOOP_HUBER, PoseGraph, _key, g2o_text, optimise
+from app.slam.loops.factors import Factor, PositionPrior, Step, between, residuals
+from app.slam.loops.pose_graph import PoseGraph
+from app.slam.loops.solvers import _key, g2o_text, optimise
+from app.slam.loops.types import LOOP_HUBER
 from app.slam.types import F64, KeyframeId
 
 
@@ -80,7 +80,7 @@ def test_loops_between_the_same_two_poses_are_one_factor_that_says_what_they_say
     again = [
         replace(
             loops[1],
-            T_first_second=loops[1].T_first_second @ se3.exp(rng.normal(0.0, 0.01, 6)),
+            T_first_second=loops[1].T_first_second @ lie.exp_se3(rng.normal(0.0, 0.01, 6)),
             covariance=loops[1].covariance * weight,
             robust=robust,
         )

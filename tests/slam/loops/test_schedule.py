@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from app.slam.loops.messages import ApplyEdit, Failure, LoadEdits, Redo, Undo
+from app.slam.loops.messages import ApplyEdit, Failure
 from app.slam.loops.types import Accept, Edits
 from tests.slam.loops.held_session import LATENCY, HeldSession, shift_at
 
@@ -99,14 +99,14 @@ def test_an_edit_takes_effect_when_it_is_answered_and_holds(session: HeldSession
 
 
 def test_edits_given_without_waiting_are_applied_in_their_order(session: HeldSession) -> None:
-    for request in (ApplyEdit(Accept(0, 1)), ApplyEdit(Accept(0, 2)), Undo(), Undo(), Redo()):
+    for request in (ApplyEdit(Accept(0, 1)), ApplyEdit(Accept(0, 2)), Edits.undo, Edits.undo, Edits.redo):
         session.loops.command(request)
         session.step()
     session.until_idle()
     assert session.loops.state is not None
     assert (session.loops.state.undo, session.loops.state.redo) == ((Accept(0, 1),), (Accept(0, 2),))
-    session.loops.command(LoadEdits(Edits()))
-    session.loops.command(Undo())
+    session.loops.command(lambda _: Edits())
+    session.loops.command(Edits.undo)
     session.until_idle()
     assert session.loops.take_answers() == [Failure("There is no edit to undo.")]
 

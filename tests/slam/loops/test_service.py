@@ -4,27 +4,24 @@ import numpy as np
 import pytest
 
 from app.slam.keyframes import KeyframeStore
-from app.slam.loops.keyframe_log import KeyframeLog
+from app.slam.loops.keyframe_log import Entry, KeyframeLog
 from app.slam.loops.messages import (
     Added,
     AddKeyframe,
+    Answered,
     ApplyEdit,
     Ask,
     AskG2o,
     AskResiduals,
     Failure,
-    G2o,
     Inspect,
-    Inspected,
     LoopState,
     Question,
-    Residuals,
     Target,
-    Tried,
     TryOut,
 )
 from app.slam.loops.service import InlineLoops, LoopService
-from app.slam.loops.types import Accept, Add, Edits, Reject, Solve, Verdict, difference
+from app.slam.loops.types import Accept, Add, Edits, LoopDetail, Preview, Reject, Solve, Verdict, difference
 from tests.slam.loops.conftest import PARAMS, Walked, same
 
 ALL = 10_000
@@ -93,19 +90,16 @@ def test_questions_change_nothing(service: LoopService) -> None:
     edge = next(edge for edge in before.edges if edge.verdict is Verdict.ACCEPTED)
     questions = (TryOut(Reject(*edge.pair)), Inspect(*edge.pair), AskResiduals(), TryOut(Solve()), AskG2o())
     replies = [service.handle(Ask(end(), question)) for question in questions]
-    assert [type(reply) for reply in replies] == [Tried, Inspected, Residuals, Tried, G2o]
-    tried, inspected, residuals, solved, g2o = replies
-    assert isinstance(tried, Tried)
-    assert tried.edit == Reject(*edge.pair)
-    assert isinstance(inspected, Inspected)
-    assert inspected.pair == edge.pair
-    assert isinstance(residuals, Residuals)
+    assert [reply.question for reply in replies if isinstance(reply, Answered)] == list(questions)
+    tried, inspected, residuals, solved, g2o = (reply.value for reply in replies if isinstance(reply, Answered))
+    assert isinstance(tried, Preview) and isinstance(solved, Preview)
+    assert tried.poses.shape == solved.poses.shape == (before.count, 4, 4)
+    assert isinstance(inspected, LoopDetail)
+    assert len(inspected.residuals) > 0
+    assert isinstance(residuals, tuple) and isinstance(g2o, str)
     loops = sum(edge.counts for edge in before.edges)
-    assert len(residuals.residuals) == before.count - 1 + loops
-    assert isinstance(solved, Tried)
-    assert solved.preview.poses.shape == (before.count, 4, 4)
-    assert isinstance(g2o, G2o)
-    assert g2o.text.count("\nEDGE_SE3:QUAT") == before.count - 1 + loops
+    assert len(residuals) == before.count - 1 + loops
+    assert g2o.count("\nEDGE_SE3:QUAT") == before.count - 1 + loops
     after = state(service, end())
     assert after.corrections.tobytes() == before.corrections.tobytes()
     assert after.edges == before.edges
@@ -176,13 +170,13 @@ def test_inline_loops_follow_the_log_and_answer_in_order(walked: Walked) -> None
     assert loops.receive() is None
     for keyframe in walked.keyframes[:3]:
         store.append(keyframe)
-        log.append(keyframe.frame, keyframe.stamp_ns, PARAMS)
+        log.append(Entry(keyframe.frame, keyframe.stamp_ns, PARAMS))
         loops.send(Ask(Target(keyframe.index + 1)))
     log.truncate(1)
     store.truncate(1)
     loops.send(Ask(Target(ALL)))
     store.append(walked.keyframes[1])
-    log.append(walked.keyframes[1].frame, 0, PARAMS)
+    log.append(Entry(walked.keyframes[1].frame, 0, PARAMS))
     loops.send(Ask(Target(2)))
     replies = [loops.receive() for _ in range(5)]
     assert [reply.count for reply in replies if isinstance(reply, LoopState)] == [1, 2, 3, 3, 2]

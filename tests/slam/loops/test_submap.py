@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.slam.loops import submap as submap_module
 from app.slam.loops.submap import Submap, Submaps
 from app.slam.types import F32, F64, Cloud, Keyframe
 from app.slam.voxel import VoxelGrid
@@ -52,13 +51,9 @@ def submaps() -> Iterator[Submaps]:
 
 
 @settings(deadline=None, max_examples=40)
-@given(
-    sizes=st.lists(st.sampled_from([0, 0, 1, 40, 700]), min_size=1, max_size=8), room=st.sampled_from([1, 500, 9000])
-)
-def test_a_submap_is_that_of_its_clouds_one_by_one(sizes: list[int], room: int) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(submap_module, "AT_ONCE", room)  # points that are read into memory that is there
-        made = Submaps(VOXEL, RADIUS)
+@given(sizes=st.lists(st.sampled_from([0, 0, 1, 40, 700]), min_size=1, max_size=8))
+def test_a_submap_is_that_of_its_clouds_one_by_one(sizes: list[int]) -> None:
+    made = Submaps(VOXEL, RADIUS)
     poses, clouds = walk(len(sizes)), [cloud_of(size, seed) for seed, size in enumerate(sizes)]
     for index, (cloud, T) in enumerate(zip(clouds, poses, strict=True)):
         made.append(keyframe(index, cloud, T))

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 from app.slam import lie
-from app.slam.loops import se3
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.edits import EditList, Entry
-from app.slam.loops.factors import between
-from app.slam.loops.pose_graph import optimise
-from app.slam.loops.solution import loop_factors
+from app.slam.loops.factors import between, loop_factors
+from app.slam.loops.solvers import optimise
 from app.slam.loops.support import laid, placed
-from app.slam.loops.types import Add, Evidence, LoopEdge, Measured, Origin, Reject, SetWeight, Verdict
+from app.slam.loops.types import Add, Evidence, LoopEdge, Origin, Reject, SetWeight, Verdict
 from app.slam.loops.verdicts import FLOOR_M, FLOOR_RAD
 from app.slam.types import F64
 from tests.slam.loops.conftest import Walked, accepted
@@ -40,7 +38,7 @@ def loop(older: int, off: F64 | None = None) -> LoopEdge:
     T = lie.inverse(POSES[older]) @ POSES[newer]
     T[:3, 3] += np.zeros(3) if off is None else off
     covariance = np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
-    return LoopEdge(older, newer, newer, Measured(T, covariance, Evidence()), Verdict.ACCEPTED, "")
+    return LoopEdge(older, newer, newer, T, covariance, Evidence(), Verdict.ACCEPTED, "")
 
 
 def come(loops: list[LoopEdge], poses: F64 = POSES, in_map: F64 | None = None) -> dict[int, LoopEdge]:
@@ -89,7 +87,7 @@ def test_to_another_time_at_a_place_a_loop_counts_if_it_is_news_or_the_last_is_l
     older, newer = 2 * TURN - 1 - 31, 2 * TURN + 30 + on
     T = lie.inverse(third[older]) @ third[newer]
     T[1, 3] += off_m
-    second = replace(first, older=older, newer=newer, measured=Measured(T, loop(30).covariance, Evidence()))
+    second = replace(first, older=older, newer=newer, T_older_newer=T)
     (edge,) = placed([second], [first], third, third, HALF)
     assert edge.counts is not told and edge.represented_by == (first.pair if told else None)
 
@@ -102,16 +100,16 @@ def test_what_measured_another_thing_ties_poses_of_its_own(off_m: float, same: b
 
 def test_a_loop_laid_on_other_keyframes_errs_there_by_what_its_error_becomes() -> None:
     rng = np.random.default_rng(3)
-    poses = se3.exp(rng.normal(0.0, 1.0, (8, 6)))
+    poses = lie.exp_se3(rng.normal(0.0, 1.0, (8, 6)))
     half = rng.normal(0.0, 0.1, (6, 6))
     ends = {"older": 1, "newer": 6, "decided_at": 6}
-    edge = replace(loop(40), **ends, measured=Measured(se3.exp(rng.normal(0.0, 1.0, 6)), half @ half.T, Evidence()))
+    edge = replace(loop(40), **ends, T_older_newer=lie.exp_se3(rng.normal(0.0, 1.0, 6)), covariance=half @ half.T)
     T, covariance = laid(edge, replace(edge, older=0, newer=7), poses)
     errors = 1e-6 * np.linalg.cholesky(edge.covariance).T  # their squares add up to the covariance
     there = []
     for error in errors:
-        off = replace(edge, measured=Measured(edge.T_older_newer @ se3.exp(error), edge.covariance, Evidence()))
-        there.append(se3.log(lie.inverse(T) @ laid(off, replace(off, older=0, newer=7), poses)[0]))
+        off = replace(edge, T_older_newer=edge.T_older_newer @ lie.exp_se3(error))
+        there.append(lie.log_se3(lie.inverse(T) @ laid(off, replace(off, older=0, newer=7), poses)[0]))
     np.testing.assert_allclose(1e12 * np.transpose(there) @ there, covariance, atol=1e-3 * np.abs(covariance).max())
     own = lie.inverse(poses[0]) @ poses[1] @ edge.T_older_newer @ lie.inverse(poses[6]) @ poses[7]
     np.testing.assert_allclose(T, own, atol=1e-12)
@@ -132,7 +130,7 @@ def test_repeated_loops_hold_two_ways_together_nearly_as_well_as_each_by_itself(
         rng = np.random.default_rng(seed)
         steps, odometry = [], [POSES[0]]
         for k, (before, after) in enumerate(pairwise(POSES)):
-            T = lie.inverse(before) @ after @ se3.exp(rng.normal(0.0, sigmas))
+            T = lie.inverse(before) @ after @ lie.exp_se3(rng.normal(0.0, sigmas))
             steps.append(between(k, k + 1, T, np.diag(sigmas**2)))
             odometry.append(odometry[-1] @ T)
         each_errs = rng.normal(0.0, 0.02 * np.sqrt(2 * HALF + 1), (TURN + 2 * HALF, 3))

@@ -8,16 +8,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.slam.loops.types import Evidence, LoopEdge, Measured, Verdict, changed_by, difference
+from app.slam.loops.types import Evidence, LoopEdge, Verdict, changed_by, difference
 
 
 def edge(newer: int, verdict: Verdict = Verdict.CANDIDATE) -> LoopEdge:
-    return LoopEdge(0, newer, newer, Measured(np.eye(4), np.eye(6), Evidence(0.5)), verdict, "it fits")
+    return LoopEdge(0, newer, newer, np.eye(4), np.eye(6), Evidence(0.5), verdict, "it fits")
 
 
 def test_a_measurement_is_read_only_and_survives_pickling() -> None:
     rng = np.random.default_rng(0)
-    measured = Measured(rng.normal(size=(4, 4)), rng.normal(size=(6, 6)), Evidence(0.1, support=3))
+    measured = replace(
+        edge(10),
+        T_older_newer=rng.normal(size=(4, 4)),
+        covariance=rng.normal(size=(6, 6)),
+        evidence=Evidence(0.1, support=3),
+    )
     with pytest.raises(ValueError, match="read-only"):
         measured.T_older_newer[0, 3] = 1.0
     with pytest.raises(ValueError, match="read-only"):
@@ -40,7 +45,7 @@ def test_the_difference_lists_new_changed_and_lost_candidates() -> None:
 
 def test_a_candidate_differs_if_its_place_in_the_graph_or_its_measurement_does() -> None:
     one = edge(10)
-    moved = replace(one, measured=Measured(np.diag([2.0, 1.0, 1.0, 1.0]), np.eye(6), Evidence()))
+    moved = replace(one, T_older_newer=np.diag([2.0, 1.0, 1.0, 1.0]))
     for other in (replace(one, weight=2.0), replace(one, represented_by=(0, 9)), moved, replace(one, reason="other")):
         assert difference((one,), (other,)) == ((other,), ())
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.slam.loops.types import Evidence, LoopEdge, Measured, Origin, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.loops.verdicts import FLOOR_M, FLOOR_RAD, worth_correcting
 
 POSES = np.tile(np.eye(4), (60, 1, 1))
@@ -22,7 +22,7 @@ def loops(off_m: float, verdict: Verdict = Verdict.ACCEPTED, sideways_m: float =
     for newer in range(50, 60):
         T = np.linalg.inv(POSES[newer - 50]) @ POSES[newer]
         T[1, 3] += off_m
-        edges.append(LoopEdge(newer - 50, newer, newer, Measured(T, covariance, Evidence()), verdict, ""))
+        edges.append(LoopEdge(newer - 50, newer, newer, T, covariance, Evidence(), verdict, ""))
     return edges
 
 

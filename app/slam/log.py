@@ -65,7 +65,11 @@ class Log(Generic[T]):
             del self._rows[length:]
             self._cuts.append(length)
 
+    def keep(self, cursor: Cursor) -> int:
+        """How many of the first rows are still the same since this cursor was given."""
+        return min(cursor.length, len(self._rows), *self._cuts[cursor.version :])
+
     def since(self, cursor: Cursor) -> Change[T]:
         """What has changed since this cursor was given."""
-        keep = min(cursor.length, len(self._rows), *self._cuts[cursor.version :])
+        keep = self.keep(cursor)
         return Change(keep, tuple(self._rows[keep:]), self.cursor)

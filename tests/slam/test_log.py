@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.mapping.log import Cursor, Log
+from app.slam.log import Cursor, Log
 
 APPEND, TRUNCATE, SYNC = "append", "truncate", "sync"
 STEPS = st.lists(
