@@ -6,7 +6,7 @@ from pathlib import Path
 
 APP = Path(__file__).resolve().parents[1] / "app"
 GOES_BACK = re.compile(r"_?(go_to|go_back|take_back|return_to|rewind|restore|truncate|cut|forget(_\w+)?)")
-KNOW = {"mapping/log.py", "mapping/session.py", "slam/loops/schedule.py"}
+KNOW = {"slam/log.py", "mapping/session.py", "slam/loops/schedule.py"}
 """The store that can be cut, the session that goes back, and when loops take effect."""
 ONE_VALUE = {
     "slam/engine.py": "sets the engine to a checkpoint, a value",
@@ -18,10 +18,9 @@ ONE_VALUE = {
 STORES = {
     "slam/rows.py": "an array that grows",
     "slam/keyframes.py": "the file of keyframes",
-    "slam/loops/keyframe_log.py": "what loop back ends follow",
 }
 """Containers with `truncate`, which others call."""
-LOOP_BACK_END = {f"slam/loops/{name}.py" for name in ("backend", "detection", "edits", "history", "submap", "types")}
+LOOP_BACK_END = {f"slam/loops/{name}.py" for name in ("backend", "detection", "edits", "submap", "types")}
 """What is derived from keyframes and edits. It is brought to another number of keyframes by `backend.py` alone."""
 OTHER = {"sensors/live/receiver.py"}
 """`_forget` releases scans that are not asked for again."""
@@ -35,6 +34,6 @@ def test_only_a_few_files_know_how_to_go_back() -> None:
             found[path.relative_to(APP).as_posix()] = going_back
     allowed = KNOW | ONE_VALUE.keys() | STORES.keys() | LOOP_BACK_END | OTHER
     assert not {path: names for path, names in found.items() if path not in allowed}, (
-        "follow a cursor instead (app/mapping/log.py)"
+        "follow a cursor instead (app/slam/log.py)"
     )
     assert found.keys() >= KNOW, "the list of files is out of date"

@@ -106,6 +106,8 @@ class RestartingLoops:
 
     def close(self) -> None:
         self._process.close()
+        self._sent.clear()
+        self._unsent.clear()
 
     @property
     def catching_up(self) -> bool:

@@ -154,7 +154,6 @@ def test_closing_ends_it_even_while_it_works(process: LoopProcess) -> None:
         process.send(AddKeyframe(keyframe, PARAMS))
     process.close()
     assert not alive(process.pid)
-    assert process.receive() is None
 
 
 # --- a process that dies ---
