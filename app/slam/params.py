@@ -42,17 +42,12 @@ class Params(Section):
     keyframe: KeyframeParams = KeyframeParams()
     loops: LoopsParams = LoopsParams()
 
-    @classmethod
-    def parse(cls, tree: Mapping[str, Any]) -> "Params":
-        """Build from a nested mapping; missing names take their defaults.
+    def merged(self, tree: Mapping[str, Any]) -> "Params":
+        """This, with the values of a (partial) nested mapping laid over it.
 
         Raises:
             HemislamError: naming the parameter that is unknown or out of range, its range and unit.
         """
-        return cls().merged(tree)
-
-    def merged(self, tree: Mapping[str, Any]) -> "Params":
-        """This, with the values of a (partial) nested mapping laid over it. Raises as `parse`."""
         if not isinstance(tree, Mapping):
             raise HemislamError(
                 f"Parameters must be a mapping of sections, not {type(tree).__name__}; `hemislam params` prints one."
@@ -77,7 +72,7 @@ class Params(Section):
             raise HemislamError(_explain(error, values)) from None
 
     def with_values(self, values: Mapping[str, Any]) -> "Params":
-        """This, with dotted names set: `params.with_values({"ground.alpha": 30})`. Raises as `parse`."""
+        """This, with dotted names set: `params.with_values({"ground.alpha": 30})`. Raises as `merged`."""
         tree: dict[str, dict[str, Any]] = {}
         for path, value in values.items():
             section, dot, name = path.partition(".")
@@ -101,16 +96,14 @@ class Params(Section):
             leaf.path: other.value(leaf.path) for leaf in leaves() if self.value(leaf.path) != other.value(leaf.path)
         }
 
-    def to_yaml(self, *, comments: bool = True) -> str:
+    def to_yaml(self) -> str:
         """The whole tree as YAML that `merged_yaml` reads back to the same value."""
         lines: list[str] = []
         for name, section in self:
-            lines += [f"# {section.summary()}"] if comments else []
-            lines.append(f"{name}:")
+            lines += [f"# {section.summary()}", f"{name}:"]
             for leaf in leaves():
                 if leaf.section == name:
-                    lines += [f"  # {leaf.help}"] if comments else []
-                    lines.append(f"  {leaf.name}: {_yaml(self.value(leaf.path))}")
+                    lines += [f"  # {leaf.help}", f"  {leaf.name}: {_yaml(self.value(leaf.path))}"]
         return "\n".join(lines) + "\n"
 
     def merged_yaml(self, text: str, source: str = "the YAML text") -> "Params":

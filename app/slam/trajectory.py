@@ -53,10 +53,6 @@ class Trajectory:
         """Only the poses where `which` (n,) is true."""
         return Trajectory(self.stamps_ns[which], self.positions[which], self.quaternions[which])
 
-    def since(self, first: int) -> "Trajectory":
-        """Only the poses from index `first` on."""
-        return Trajectory(self.stamps_ns[first:], self.positions[first:], self.quaternions[first:])
-
     @classmethod
     def from_poses(cls, stamps_ns: npt.ArrayLike, poses: npt.ArrayLike) -> "Trajectory":
         """From (n, 4, 4) matrices T_world_imu."""

@@ -9,7 +9,7 @@ from app.sensors.findings import Finding
 from app.slam.params import Params
 from tests.sensors import rig
 
-MOUNTED = Params.parse({"sensor": {"translation": [0.1, 0.0, 0.0]}})
+MOUNTED = Params().merged({"sensor": {"translation": [0.1, 0.0, 0.0]}})
 
 
 def by_subject(path: Path, params: Params = MOUNTED) -> dict[str, Finding]:

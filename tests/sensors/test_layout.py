@@ -266,7 +266,7 @@ def test_a_gyroscope_in_degrees_is_suspected() -> None:
 
 def test_down_is_reported_in_the_lidar_frame_through_the_mount() -> None:
     """IMU upright, LiDAR pitched by +90 deg: its x axis then points down."""
-    params = Params.parse({"sensor": {"rotation": [0, 90, 0], "translation": [0, 0, 0.1]}})
+    params = Params().merged({"sensor": {"rotation": [0, 90, 0], "translation": [0, 0, 0.1]}})
     gravity, mount = gravity_findings(imu_probe((0, 0, 9.81)), 1.0, params)
     assert "0 deg from the LiDAR's +x axis" in gravity.text
     assert (gravity.verdict, mount.verdict) == ("fine", "fine")

@@ -11,7 +11,7 @@ from app.slam.params import Params
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_every_preset_is_a_valid_set_of_parameters(name: str) -> None:
-    assert resolve_params(None, name, None, []) == Params.parse(PRESETS[name])
+    assert resolve_params(None, name, None, []) == Params().merged(PRESETS[name])
 
 
 def test_h2lid_is_mounted_as_its_authors_say() -> None:

@@ -67,7 +67,7 @@ def test_every_number_has_a_range_and_a_step_for_its_slider(leaf: Leaf) -> None:
 def test_what_is_printed_is_read_back_to_the_last_digit(values: dict[str, Any]) -> None:
     params = Params().with_values(values)
     assert Params().merged_yaml(params.to_yaml()) == params
-    assert Params.parse(yaml.safe_load(params.to_yaml(comments=False))) == params
+    assert Params().merged(yaml.safe_load(params.to_yaml())) == params
     assert Params().changed(params).keys() <= values.keys()
     assert Params().with_values(Params().changed(params)) == params
 
