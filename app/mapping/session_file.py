@@ -17,7 +17,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -95,6 +95,13 @@ class SavedSession:
     def first_params(self) -> Params:
         """Those that the first frame was processed with."""
         return self.state.history[0][1] if self.state.history else self.state.params
+
+    def forked(self, frame: int, params: Params) -> "SavedSession":
+        """The session that was the same up to this frame, and goes on with these parameters."""
+        history = tuple(entry for entry in self.state.history if entry[0] <= frame)
+        notes = tuple(note for note in self.state.notes if note.frame <= frame)
+        state = replace(self.state, params=params, history=history, notes=notes)
+        return SavedSession(self.opened, state, frame, ended=self.ended and frame == self.frame)
 
 
 class SessionWriter:
@@ -217,6 +224,15 @@ def read_session(path: Path) -> SavedSession:
         gone = "is a different file now" if opened.recording.exists() else "is gone"
         raise HemislamError(f"The recording {opened.recording} of the session {path} {gone}; put it back there.")
     return SavedSession(opened, state, frame, ended)
+
+
+def recording_of(path: Path) -> Path | None:
+    """What a session file says that it opened; None if that cannot be told."""
+    try:
+        with path.open(encoding="utf-8") as lines:
+            return Path(json.loads(lines.readline())["recording"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def size_of(recording: Path) -> int:

@@ -24,7 +24,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 from app.mapping.breakpoints import BREAKPOINTS, Breakpoint, Breakpoints
 from app.mapping.session_file import SUFFIX
 from app.server.folders import Folders
-from app.server.fork import RunningEngine
 from app.server.protocol import (
     AddNote,
     Command,
@@ -44,6 +43,7 @@ from app.server.protocol import (
     UndoLoop,
 )
 from app.server.views import LoopsState, Speed, StateView, loops_state, state_view
+from app.server.worker import RunningEngine
 from app.slam.loops.types import Accept, Add, LoopEdit, Reject, SetWeight, Solve
 from app.slam.params import Params
 from app.slam.results import EXPORTS

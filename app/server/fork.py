@@ -4,7 +4,7 @@ The engine is deterministic, so a fork is a session file: where A is, with other
 engine's process that opens the file and then seeks to whatever frame A is at. A never waits for B.
 """
 
-import json
+import re
 import shutil
 import threading
 import time
@@ -12,13 +12,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.session_file import SUFFIX, SavedSession, free_path, read_session, write_session
-from app.server.follower import Follower, same_recording
+from app.mapping.session_file import SUFFIX, SavedSession, free_path, read_session, recording_of, write_session
 from app.server.protocol import AddNote, Command, CompareWith, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
 from app.server.setup import Setup
+from app.server.worker import RunningEngine
 from app.slam.errors import HemislamError
 
 MAIN = "main"
@@ -26,22 +26,12 @@ FOLDER = "forks"
 """Below the folder of session files: forks that are neither kept nor discarded."""
 PERIOD_S = 0.02
 """How often to look where A is."""
+AGAIN_S = 1.0
+"""B is told again where to go after so long: a process that dies loses its commands."""
 APART = 1_000_000
 """Between the session and notice numbers of one engine and the next, so that the page never takes one for another."""
 _MOST_KEPT = 30
 _NOT_KEPT = "This session is not kept in a file, so it cannot be forked; serve keeps one."
-
-
-class RunningEngine(Protocol):
-    """An engine's process as its users know it (`app.server.worker.EngineProcess`)."""
-
-    @property
-    def snapshot(self) -> Snapshot: ...
-    @property
-    def pid(self) -> int | None: ...
-    def send(self, command: Command) -> None: ...
-    def wait(self, after_revision: int, timeout: float) -> Snapshot: ...
-    def close(self) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +58,24 @@ def forked(a: Snapshot, values: Mapping[str, Any]) -> SavedSession:
         raise HemislamError("A live source cannot be forked; record it, and open the recording.")
     if a.session_file is None:
         raise HemislamError(_NOT_KEPT)
-    saved = read_session(a.session_file)
-    history = tuple(entry for entry in saved.state.history if entry[0] <= frame)
-    notes = tuple(note for note in saved.state.notes if note.frame <= frame)
-    state = replace(saved.state, params=a.params.with_values(dict(values)), history=history, notes=notes)
-    return SavedSession(saved.opened, state, frame, ended=saved.ended and frame == saved.frame)
+    return read_session(a.session_file).forked(frame, a.params.with_values(dict(values)))
+
+
+def same_recording(a: Snapshot, b: Snapshot) -> bool:
+    """Whether frames of one can be compared with those of the other."""
+    if a.recording is None or b.recording is None:
+        return False
+    return a.recording.path.resolve() == b.recording.path.resolve() and a.recording.start_ns == b.recording.start_ns
+
+
+def follow(a: Snapshot, b: Snapshot) -> Seek | None:
+    """What brings B to A's frame, if it is elsewhere; at the end of A to its own end, where the last loops are found."""
+    wanted, here = a.transport.frame, b.transport.frame
+    if wanted < 0 or not same_recording(a, b) or (b.transport.finished and here <= wanted):
+        return None
+    if wanted == here:
+        return Seek(wanted + 1) if a.transport.finished else None
+    return Seek(wanted)
 
 
 def engine_number(snapshot: Snapshot) -> int:
@@ -96,7 +99,6 @@ class Workspace:
         self._sides: tuple[Side, Side | None] = (Side(engine, MAIN), None)
         self._lock = threading.Lock()
         self._ended = threading.Event()
-        self._follower = Follower(-1)
         self._forks = 0
         self.forked_at = -1
 
@@ -179,7 +181,7 @@ class Workspace:
             file for file in folder.glob(f"*{SUFFIX}") if a.session_file is None or file.name != a.session_file.name
         ]
         newest = sorted(files, key=lambda file: file.stat().st_mtime, reverse=True)[:_MOST_KEPT]
-        return [file for file in newest if _recording_of(file) == a.recording.path.resolve()]
+        return [file for file in newest if recording_of(file) == a.recording.path.resolve()]
 
     def swap(self) -> None:
         """B becomes A: it goes on where A is, as A did, and A follows. Raises HemislamError without a fork."""
@@ -195,7 +197,6 @@ class Workspace:
                 b.engine.send(Seek(before.transport.frame))
             if before.transport.playing:
                 b.engine.send(Play())
-            self._follower = Follower(before.transport.frame)
             self._sides = (b, a)
             b.engine.send(AddNote(f"Swapped: goes on in place of {a.name}."))
 
@@ -241,7 +242,6 @@ class Workspace:
                 if side is not None:
                     side.engine.close()
 
-    # --- inside ----------------------------------------------------------------------------------
     def _place(self, name: str) -> tuple[Side, Path]:
         """A, and a folder for a new B, which is not there yet."""
         a, b = self._sides
@@ -269,7 +269,7 @@ class Workspace:
                 live_folder=None,
             )
         )
-        self.forked_at, self._follower = forked_at, Follower(max(session.frame, 0))
+        self.forked_at = forked_at
         self._sides = (self._sides[0], Side(engine, name.strip() or f"fork {self._forks}", folder))
         self._ended = threading.Event()
         threading.Thread(target=self._follow, args=(self._ended,), name="fork", daemon=True).start()
@@ -288,25 +288,20 @@ class Workspace:
         return b
 
     def _follow(self, ended: threading.Event) -> None:
+        sent, sent_at = None, 0.0
         while not ended.wait(PERIOD_S):
             with self._lock:
                 a, b = self._sides
                 if b is None or ended.is_set():
                     return
-                command = self._follower.next(a.engine.snapshot, b.engine.snapshot, time.monotonic())
-                if command is not None:
+                now, there = time.monotonic(), b.engine.snapshot
+                command = follow(a.engine.snapshot, there)
+                lost = there.progress is None and now - sent_at >= AGAIN_S
+                if command is not None and (command != sent or lost):
                     b.engine.send(command)
-
-
-def _recording_of(session: Path) -> Path | None:
-    """What a session file says that it opened; None if that cannot be told."""
-    try:
-        with session.open(encoding="utf-8") as lines:
-            return Path(json.loads(lines.readline())["recording"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+                    sent, sent_at = command, now
 
 
 def _plain(name: str) -> str:
     """A name that any file system takes."""
-    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name).strip(".-")[:60] or "fork"
+    return re.sub(r"[^\w.-]", "-", name).strip(".-")[:60] or "fork"

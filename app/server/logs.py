@@ -3,7 +3,7 @@
 import logging
 from typing import Final
 
-from app.server.fork import RunningEngine
+from app.server.worker import RunningEngine
 
 _LEVEL: Final = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
 

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -9,7 +10,6 @@ from typing import Literal
 from app.mapping.breakpoints import Breakpoints, Moment, reasons
 from app.mapping.feed import Quiet
 from app.mapping.session import EFFECT, Session
-from app.server.pacing import Pacer
 from app.server.protocol import Progress
 from app.server.publisher import Publisher
 from app.slam.errors import HemislamError
@@ -18,11 +18,45 @@ from app.slam.types import DroppedScan, StepResult
 log = logging.getLogger(__name__)
 
 SLOWEST = 0.1
+LONGEST_LAG_S = 0.5
+"""Playing that is later than this does not catch up; it goes on from where it is."""
 LONG_SEEK = 20
 """Frames to process on the way to a frame, from which on progress is shown."""
 ONLY_ON = "A live source can only go on; record it, and open the recording to go back in it."
 _WARNINGS = ("disconnected", "silent", "jump", "recording", "units", "restarted")
 """Kinds of `Status` that are a warning, not only news."""
+
+
+class Pacer:
+    """When the next frame is due: maps stamps of the recording to the clock at a chosen speed."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self.speed = 1.0
+        self._anchor: tuple[float, int] | None = None
+        self._processed: deque[float] = deque(maxlen=100)
+
+    def release(self) -> None:
+        """After a pause, a jump or a change of speed the next frame is due at once."""
+        self._anchor = None
+
+    def wait(self, stamp_ns: int) -> float:
+        """Seconds until a frame of this stamp is due; 0 if it is."""
+        now = self._clock()
+        started, first_ns = self._anchor or (now, stamp_ns)
+        due = started + (stamp_ns - first_ns) * 1e-9 / self.speed
+        late = due < now - LONGEST_LAG_S
+        self._anchor = (now, stamp_ns) if late else (started, first_ns)
+        return max(0.0, due - now)
+
+    def tick(self) -> float:
+        """Count a processed frame; returns the frames per second over about the last second."""
+        now = self._clock()
+        self._processed.append(now)
+        while len(self._processed) > 2 and self._processed[0] < now - 1.0:
+            self._processed.popleft()
+        elapsed = now - self._processed[0]
+        return (len(self._processed) - 1) / elapsed if 0 < elapsed < 10 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +124,7 @@ class Player:
         if not factor >= SLOWEST:
             raise HemislamError(f"The speed cannot be {factor}; choose one from {SLOWEST} to inf.")
         self._pacer.speed = factor
+        self._pacer.release()
         self._page.show(speed=factor)
 
     def step(self, session: Session, frames: int) -> None:
@@ -106,11 +141,14 @@ class Player:
         self._aim(session, frame, frame if frame < max(session.heading, session.frame) else None, stepping=True)
 
     def seek(self, session: Session, frame: int) -> None:
-        """Go to a frame as fast as possible, then go on as before. Raises HemislamError: the source is live."""
-        frames = session.feed.info.frames
-        if not session.feed.repeatable or frames is None:
+        """Go to a frame, or to the end if there are fewer, as fast as possible, then go on as before.
+
+        Raises:
+            HemislamError: the source is live.
+        """
+        if not session.feed.repeatable:
             raise HemislamError(ONLY_ON)
-        frame = max(0, min(frame, frames - 1))
+        frame = max(0, frame)
         self._aim(session, frame, frame)
 
     def resume(self, session: Session, frame: int, *, to_end: bool) -> None:

@@ -29,11 +29,11 @@ from app.server.address import has_display, links, listen
 from app.server.api import make_router
 from app.server.bridge import bridge
 from app.server.folders import Folders
-from app.server.fork import RunningEngine, Workspace
+from app.server.fork import Workspace
 from app.server.logs import log_notices
 from app.server.setup import Setup
 from app.server.viser_adapter import Viser, page_html, start_viser, viewer_html
-from app.server.worker import EngineProcess
+from app.server.worker import EngineProcess, RunningEngine
 from app.slam.errors import HemislamError
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ import math
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from app.child import Child, ChildDied, Link, RestartLimit
 from app.server.fold import Fold
@@ -25,6 +25,18 @@ def _run_engine(owner: Link, setup: Setup) -> None:
     from app.server.engine_process import main  # this process has no need of the engine and its compiler
 
     main(owner, setup)
+
+
+class RunningEngine(Protocol):
+    """An engine's process as its users know it: `EngineProcess`, or the workspace of two."""
+
+    @property
+    def snapshot(self) -> Snapshot: ...
+    @property
+    def pid(self) -> int | None: ...
+    def send(self, command: Command) -> None: ...
+    def wait(self, after_revision: int, timeout: float) -> Snapshot: ...
+    def close(self) -> None: ...
 
 
 class EngineProcess:

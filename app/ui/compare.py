@@ -12,8 +12,7 @@ from typing import Any, Final
 import numpy as np
 import viser
 
-from app.server.follower import same_recording
-from app.server.fork import Workspace
+from app.server.fork import Workspace, same_recording
 from app.server.protocol import Command, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.types import F64, U8, StepResult

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from app.server.follower import same_recording
+from app.server.fork import same_recording
 from app.server.protocol import Snapshot
 from app.slam import lie
 from app.slam.types import F64, I64, NON_GROUND, U8, Cloud

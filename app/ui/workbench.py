@@ -17,9 +17,10 @@ from typing import Final
 import viser
 
 from app.server.folders import Folders
-from app.server.fork import RunningEngine, Workspace
+from app.server.fork import Workspace
 from app.server.protocol import Snapshot
 from app.server.setup import POINT_BUDGET, Setup
+from app.server.worker import RunningEngine
 from app.ui.appearance import AppearancePanel
 from app.ui.compare import ComparePanel, Sides
 from app.ui.files import FilesPanel

@@ -15,16 +15,15 @@ import server_fakes as fakes
 from app.mapping.opening import open_session
 from app.mapping.session_file import Note, Opened, SessionWriter, State, read_session
 from app.sensors.presets import resolve_params
-from app.server.follower import STUCK_S, Follower
-from app.server.fork import Workspace, forked
+from app.server.fork import Workspace, follow, forked
 from app.server.protocol import (
     SERIES,
     AddNote,
+    Command,
     OpenedRecording,
     OpenRecording,
     Pause,
     Play,
-    Progress,
     Seek,
     SetBreakpoints,
     SetParams,
@@ -59,62 +58,71 @@ def both_at(workspace: Workspace, frame: int) -> tuple[Snapshot, Snapshot]:
     return until(lambda: workspace.snapshot, there), until(lambda: workspace.other, there)
 
 
+class Recorder:
+    """An engine that keeps the commands sent to it."""
+
+    pid = None
+
+    def __init__(self, snapshot: Snapshot) -> None:
+        self.snapshot = snapshot
+        self.sent: list[Command] = []
+
+    def send(self, command: Command) -> None:
+        self.sent.append(command)
+
+    def wait(self, after_revision: int, timeout: float) -> Snapshot:
+        return self.snapshot
+
+    def close(self) -> None:
+        pass
+
+
 # --- what B is told ------------------------------------------------------------------------------
-def at(frame: int, revision: int = 1, *, frames: int = 100, name: str = "walk", busy: bool = False) -> Snapshot:
+def at(frame: int, *, frames: int = 100, name: str = "walk") -> Snapshot:
     session = fakes.open_fake(Path(f"walk-{frames}.mcap"), None, Params())
     opened = replace(OpenedRecording.of(session), path=Path(f"{name}.mcap"))
     return Snapshot(
-        revision=revision,
         recording=opened,
         transport=Transport(frame=frame),
-        progress=Progress("Going to frame 50", 0.5) if busy else None,
     )
 
 
-def test_b_is_led_from_place_to_place_not_pushed_on_the_way() -> None:
-    follower = Follower(10)
-    assert follower.next(at(10), at(4), 0.0) is None, "it comes to the frame of the fork by itself"
-    assert follower.next(at(12), at(7, 2), 0.1) is None
-    assert follower.next(at(14), at(10, 3), 0.2) == Seek(14)
-    assert follower.next(at(17), at(12, 4), 0.3) is None, "on its way"
-    assert follower.next(at(20), at(14, 5), 0.4) == Seek(20), "however far A has come meanwhile"
-    assert follower.next(at(20), at(20, 6), 0.5) is None
+def test_b_is_sent_to_where_a_is() -> None:
+    assert follow(at(14), at(10)) == Seek(14)
+    assert follow(at(8), at(20)) == Seek(8)
+    assert follow(at(20), at(20)) is None
+    assert follow(at(-1), at(0)) is None, "A has no frame yet"
+    assert follow(at(101, frames=100), at(99, frames=100)) == Seek(101), "the number of frames is an estimate"
 
 
-def test_b_goes_back_at_once_with_a() -> None:
-    follower = Follower(50)
-    assert follower.next(at(8), at(20), 0.0) == Seek(8)
-    assert follower.next(at(8), at(21, 2), 0.1) is None
-    assert follower.next(at(8), at(8, 3), 0.2) is None
-
-
-def test_a_journey_that_comes_to_nothing_is_begun_again_but_not_one_that_takes_long() -> None:
-    follower = Follower(0)
-    assert follower.next(at(5), at(0), 0.0) == Seek(5)
-    assert follower.next(at(5), at(2, 2), 0.1) is None
-    assert follower.next(at(5), at(2, 3, busy=True), 9.0) is None
-    assert follower.next(at(5), at(2, 3, busy=True), 20.0) is None
-    assert follower.next(at(5), at(2, 4), 20.1) is None
-    assert follower.next(at(5), at(2, 4), 20.1 + STUCK_S) == Seek(5)
-
-
-def test_beyond_the_number_of_frames_that_was_expected_b_steps() -> None:
-    follower = Follower(90)
-    assert follower.next(at(101, frames=100), at(90, frames=100), 0.0) == Seek(99)
-    assert follower.next(at(101, frames=100), at(99, 2, frames=100), 0.1) == StepFrame(2)
-    assert follower.next(at(101, frames=100), at(101, 3, frames=100), 0.2) is None
-
-
-def test_at_the_end_b_is_told_once_that_it_is_the_end() -> None:
-    follower, b = Follower(99), at(99)
-    a = replace(b, transport=replace(b.transport, finished=True))
-    assert follower.next(b, b, 0.0) is None
-    assert [follower.next(a, b, 0.1), follower.next(a, b, 0.2)] == [StepFrame(1), None]
-    assert follower.next(a, a, 0.3) is None
+def test_at_the_end_of_a_b_goes_to_its_end() -> None:
+    b = at(99)
+    ended = replace(b, transport=replace(b.transport, finished=True))
+    assert follow(ended, b) == Seek(100)
+    assert follow(ended, ended) is None
+    shorter = replace(ended, transport=replace(ended.transport, frame=97))
+    assert follow(ended, shorter) is None, "it has no more frames"
+    assert follow(at(50), ended) == Seek(50)
 
 
 def test_another_recording_is_nothing_to_follow() -> None:
-    assert Follower(3).next(at(50, name="other"), at(3), 0.0) is None
+    assert follow(at(50, name="other"), at(3)) is None
+
+
+def test_a_command_that_a_dying_b_lost_is_sent_again(tmp_path: Path) -> None:
+    a, b = Recorder(at(5)), Recorder(at(0))
+    workspace = Workspace(a, Setup(session_folder=tmp_path), lambda setup: b)
+    writer = SessionWriter(tmp_path / "a.hemislam", Opened(tmp_path / "walk.mcap"))
+    writer.write(5, State(Params()))
+    writer.close()
+    (tmp_path / "walk.mcap").touch()
+    a.snapshot = replace(a.snapshot, session_file=tmp_path / "a.hemislam")
+    workspace.fork("b")
+    deadline = time.monotonic() + PATIENCE_S
+    while b.sent.count(Seek(5)) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    workspace.close()
 
 
 def test_a_fork_knows_only_what_came_before_it(tmp_path: Path) -> None:
