@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import yaml
 
@@ -107,18 +107,25 @@ class SavedSession:
 class SessionWriter:
     """Writes a session file while the session goes on. A disk that fails ends the file, not the session.
 
+    Args:
+        path, opened: None: nothing is written.
+
     Attributes:
         path: of the file. error: why it cannot be written any more, in a sentence; "" if it can.
     """
 
-    def __init__(self, path: Path, opened: Opened, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, path: Path | None = None, opened: Opened | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.path = path
         self.error = ""
         self._clock = clock
         self._written_at = -1e9
         self._state: State | None = None
         self._at: tuple[int, bool] | None = None
-        self._file = None
+        self._file: IO[str] | None = None
+        if path is None or opened is None:
+            return
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("x", encoding="utf-8")

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, Protocol, assert_never
+from typing import Any, Protocol
 
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session import EFFECT, Session
@@ -20,35 +20,12 @@ from app.mapping.session_file import (
     new_path,
     read_session,
 )
+from app.server import protocol
 from app.server.loop_commands import LoopCommands
 from app.server.player import Player
-from app.server.protocol import (
-    AddNote,
-    Command,
-    CompareWith,
-    EditLoop,
-    InspectLoop,
-    LoadParams,
-    OpenedRecording,
-    OpenRecording,
-    Pause,
-    Play,
-    Progress,
-    RedoLoop,
-    Restart,
-    Save,
-    Saved,
-    Seek,
-    SetBreakpoints,
-    SetParams,
-    SetSpeed,
-    StepFrame,
-    TryLoop,
-    UndoLoop,
-)
+from app.server.protocol import Command
 from app.server.publisher import Publisher
 from app.slam.errors import HemislamError
-from app.slam.loops.schedule import LoopSchedule
 from app.slam.params import Params
 
 log = logging.getLogger(__name__)
@@ -59,9 +36,10 @@ POLL_S = 0.02
 MOST_NOTES = 1000
 """Of a session: every page and every answer by REST has all of them."""
 
-_AT_ONCE = OpenRecording | Restart | SetSpeed | SetBreakpoints
+_AT_ONCE = protocol.OpenRecording | protocol.Restart | protocol.SetSpeed | protocol.SetBreakpoints
 """Commands that do not wait until what is being opened is open."""
-_FOR_THE_FRAME = EditLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop | AddNote | CompareWith | Save
+_FOR_THE_FRAME = protocol.LoopCommand | protocol.AddNote | protocol.CompareWith | protocol.Save
+"""Commands that wait until a reopened session is at its frame again."""
 
 
 class OpenSession(Protocol):
@@ -99,26 +77,21 @@ class Controller:
         self._player = Player(page, clock)
         self._saves: deque[tuple[Path, Future[Any]]] = deque()
         self._session_folder = session_folder
-        self._writer: SessionWriter | None = None
+        self._writer = SessionWriter()
         self._clock, self._looked_at_source = clock, -1e9
         self._open_session = open_session
         self._resolve = resolve
         self._params = self._base = params
         self._notes: tuple[Note, ...] = ()
         self._resuming: SavedSession | None = None  # what is still being repeated
-        # What is wanted but not done yet:
-        self._opening: Callable[[], None] | None = None
-        self._after_opening: list[Command] = []
-        self._after_resuming: list[Command] = []
+        self._opening: Callable[[], None] | None = None  # what is to be opened
+        self._waiting: list[Command] = []  # for that, or for the end of the repetition
 
     def open(self, path: Path, truth: Path | None, *, play: bool = False) -> None:
         """Open a recording with exactly the parameters given so far, or a session file with its own."""
 
         def opening() -> None:
-            if path.suffix == SUFFIX:
-                self._resume(path)
-            else:
-                self._take(self._open_session(path, truth, self._params))
+            self._open(path, truth, self._params)
             self._page.show(playing=play)
 
         self._open_soon(path, opening)
@@ -126,61 +99,60 @@ class Controller:
     # --- commands --------------------------------------------------------------------------------
     def handle(self, command: Command) -> None:
         """Take in a command. What cannot be done becomes a notice; nothing is raised."""
-        if self._opening is not None and not isinstance(command, _AT_ONCE):
-            self._after_opening.append(command)  # it is meant for what will be open then
-            return
-        if self._resuming is not None and isinstance(command, _FOR_THE_FRAME):
-            self._after_resuming.append(command)  # it is meant for the frame that the session goes to
+        opening = self._opening is not None and not isinstance(command, _AT_ONCE)
+        if opening or (self._resuming is not None and isinstance(command, _FOR_THE_FRAME)):
+            self._waiting.append(command)  # it is meant for what is open then, or the frame that is shown then
             return
         try:
             self._handle(command)
-            if self._writer is not None and self._player.session is not None:
+            if self._player.session is not None:
                 self._writer.did(self._player.session.frame, command)
         except HemislamError as error:
             self._page.notice("error", str(error))
 
     def _handle(self, command: Command) -> None:
         match command:
-            case Play():
+            case protocol.Play():
                 if self._need_session().ended:
-                    self._handle(Restart())
+                    self._handle(protocol.Restart())
                 self._player.play()
-            case Pause():
+            case protocol.Pause():
                 self._player.halt()
-            case StepFrame(frames):
+            case protocol.StepFrame(frames):
                 self._player.step(self._need_session(), frames)
-            case SetSpeed(factor):
+            case protocol.SetSpeed(factor):
                 self._player.set_speed(factor)
-            case Seek(frame):
+            case protocol.Seek(frame):
                 self._player.seek(self._need_session(), frame)
-            case SetBreakpoints(breakpoints):
+            case protocol.SetBreakpoints(breakpoints):
                 self._set_breakpoints(breakpoints)
-            case AddNote(text):
+            case protocol.AddNote(text):
                 if len(self._notes) >= MOST_NOTES:
                     raise HemislamError(f"A session keeps {MOST_NOTES:,} notes; this one was not kept.")
                 if text.strip():
                     self._show_notes((*self._notes, Note(self._need_session().frame, text.strip())))
-            case SetParams(values):
+            case protocol.SetParams(values):
                 self._set_params(self._params.with_values(values))
-            case LoadParams(text):
+            case protocol.LoadParams(text):
                 self._set_params(Params().merged_yaml(text))
-            case OpenRecording(path, truth):
-                self._open_soon(path, lambda: self._open_other(path, truth))
-            case CompareWith(trajectory):
+            case protocol.OpenRecording(path, truth):
+                self._open_soon(path, lambda: self._open(path, truth))
+            case protocol.CompareWith(trajectory):
                 session = self._need_session()
                 session.compare_with(trajectory)
-                self._page.put(recording=OpenedRecording.of(session), urgent=True)
-            case Restart():
+                self._page.put(recording=protocol.OpenedRecording.of(session), urgent=True)
+            case protocol.Restart():
                 self._open_soon(self._need_session().feed.info.path, self._reopen)
-            case Save(folder, trajectory_only):
+            case protocol.Save(folder, trajectory_only):
                 session = self._need_session()
                 saved = None if trajectory_only else session.saved(self._state(session))
                 save = session.save(folder, session=saved, trajectory_only=trajectory_only)
                 self._saves.append((folder, save))
-            case EditLoop() | UndoLoop() | RedoLoop() | TryLoop() | InspectLoop():
-                self._loops.handle(command, self._need_loops())
             case _:
-                assert_never(command)
+                loops = self._need_session().loops
+                if loops is None:
+                    raise HemislamError("Loops are not looked for; set loops.enabled and restart.")
+                self._loops.handle(command, loops)
 
     def _set_params(self, params: Params) -> None:
         changed = self._params.changed(params)
@@ -209,12 +181,6 @@ class Controller:
             raise HemislamError("No recording is open; open one first.")
         return self._player.session
 
-    def _need_loops(self) -> LoopSchedule:
-        loops = self._need_session().loops
-        if loops is None:
-            raise HemislamError("Loops are not looked for; set loops.enabled and restart.")
-        return loops
-
     # --- work ------------------------------------------------------------------------------------
     def work(self) -> float | None:
         """Do the next piece of due work.
@@ -225,13 +191,17 @@ class Controller:
         """
         wait = self._work()
         session = self._player.session
-        if self._writer is not None and session is not None and self._resuming is None:
+        if session is not None and self._resuming is None:
             self._writer.write(session.frame, self._state(session), ended=session.ended, settled=wait is None)
         return wait
 
     def _work(self) -> float | None:
         while self._saves and self._saves[0][1].done():
-            self._report(*self._saves.popleft())
+            folder, save = self._saves.popleft()
+            error = save.exception()
+            if error is not None and not isinstance(error, HemislamError):
+                log.error("Saving to %s failed", folder, exc_info=error)
+            self._page.saved(protocol.Saved(folder, "" if error is None else str(error) or type(error).__name__))
         if self._opening is not None:
             self._do_opening(self._opening)
             return 0.0
@@ -243,13 +213,6 @@ class Controller:
         saving = POLL_S if self._saves else None
         waits = [wait, saving, self._look_at_loops(session), self._look_at_source(session)]
         return min((seconds for seconds in waits if seconds is not None), default=None)
-
-    def _report(self, folder: Path, save: "Future[Any]") -> None:
-        """Show that a save has ended."""
-        error = save.exception()
-        if error is not None and not isinstance(error, HemislamError):
-            log.error("Saving to %s failed", folder, exc_info=error)
-        self._page.saved(Saved(folder, "" if error is None else str(error) or type(error).__name__))
 
     def _look_at_source(self, session: Session) -> float | None:
         """Show now and then how a live source is doing. Returns when (s) to look again."""
@@ -264,7 +227,7 @@ class Controller:
                 self._player.fail("Nothing more comes live", error)
                 self._page.show(finished=True)
                 return None
-            self._page.put(live=state, recording=OpenedRecording.of(session))
+            self._page.put(live=state, recording=protocol.OpenedRecording.of(session))
         return SOURCE_PERIOD_S
 
     def _look_at_loops(self, session: Session) -> float | None:
@@ -292,8 +255,8 @@ class Controller:
     # --- opening ---------------------------------------------------------------------------------
     def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
         """Leave the opening to `work`, so that the page can say first that it takes a moment."""
-        self._opening, self._after_opening = opening, []
-        self._page.put(progress=Progress(f"Opening {path.name}", math.nan), urgent=True)
+        self._opening, self._waiting = opening, []
+        self._page.put(progress=protocol.Progress(f"Opening {path.name}", math.nan), urgent=True)
 
     def _do_opening(self, opening: Callable[[], None]) -> None:
         """Open; if that is not possible, everything stays as it is."""
@@ -305,24 +268,19 @@ class Controller:
         except Exception as error:
             self._player.fail("The recording cannot be opened", error)
         self._page.put(progress=None, urgent=True)
-        waiting, self._after_opening = self._after_opening, []
-        for command in waiting:
-            self.handle(command)
+        self._handle_waiting()
 
-    def _open_other(self, path: Path, truth: Path | None) -> None:
-        """Open another recording with its own parameters, and on top those changed by hand.
+    def _open(self, path: Path, truth: Path | None, base: Params | None = None) -> None:
+        """Open a recording with its own parameters, or `base`, and on top those changed by hand; or a session file.
 
         What was changed by hand about the device stays with the recording it was meant for.
         """
         if path.suffix == SUFFIX:
             self._resume(path)
             return
-        base = self._resolve(path) if self._resolve else self._params
-        by_hand = {
-            name: value
-            for name, value in self._base.changed(self._params).items()
-            if name.partition(".")[0] not in ("recording", "sensor")
-        }
+        base = base or (self._resolve(path) if self._resolve else self._params)
+        changed = self._base.changed(self._params).items()
+        by_hand = {name: value for name, value in changed if name.partition(".")[0] not in ("recording", "sensor")}
         params = base.with_values(by_hand)
         session = self._open_session(path, truth, params)
         self._base, self._params = base, params
@@ -355,14 +313,12 @@ class Controller:
         if self._player.session is not None:
             self._player.session.close()
         self._begin_file(session)
-        if saved is not None and self._writer is not None:
-            self._writer.write(
-                saved.frame, saved.state, ended=saved.ended
-            )  # at once: it may be killed on the way there
+        if saved is not None:  # at once: it may be killed on the way there
+            self._writer.write(saved.frame, saved.state, ended=saved.ended)
         self._loops.clear()
         self._player.take(session)
         self._show_notes(saved.state.notes if saved is not None else ())
-        self._resuming, self._after_resuming = None, []
+        self._resuming = None
         if saved is not None:
             session.resume(saved)
             self._player.resume(session, saved.frame, to_end=saved.ended)
@@ -371,22 +327,22 @@ class Controller:
 
     def _begin_file(self, session: Session) -> None:
         """Begin a session file; a session that cannot be repeated has none."""
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-        self._page.put(session_file=None)
+        self._writer.close()
+        self._writer = SessionWriter()
         if self._session_folder is not None and session.feed.repeatable:
-            path = new_path(self._session_folder, session.feed.info.path)
-            self._writer = SessionWriter(path, session.opened)
-            self._page.put(session_file=path)
-            if self._writer.error:
-                self._page.notice("warning", self._writer.error)
+            self._writer = SessionWriter(new_path(self._session_folder, session.feed.info.path), session.opened)
+        self._page.put(session_file=self._writer.path)
+        if self._writer.error:
+            self._page.notice("warning", self._writer.error)
 
     def _resumed(self, session: Session) -> None:
         """A reopened session is where it was, or the user has left its way."""
         self._resuming = None
         self._player.settle_labels(session)
-        waiting, self._after_resuming = self._after_resuming, []
+        self._handle_waiting()
+
+    def _handle_waiting(self) -> None:
+        waiting, self._waiting = self._waiting, []
         for command in waiting:
             self.handle(command)
 
@@ -395,12 +351,9 @@ class Controller:
         session = self._player.session
         if session is not None:
             session.finish_saves()
-            if self._writer is not None:
-                self._writer.write(session.frame, self._state(session), ended=session.ended, settled=True)
-        if self._writer is not None:
-            self._writer.close()
-        if session is not None:
+            self._writer.write(session.frame, self._state(session), ended=session.ended, settled=True)
             session.close()
+        self._writer.close()
 
 
 def _is_over(saved: SavedSession, session: Session) -> bool:

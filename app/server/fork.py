@@ -69,7 +69,7 @@ def same_recording(a: Snapshot, b: Snapshot) -> bool:
 
 
 def follow(a: Snapshot, b: Snapshot) -> Seek | None:
-    """What brings B to A's frame, if it is elsewhere; at the end of A to its own end, where the last loops are found."""
+    """What brings B to A's frame, if it is elsewhere; at A's end to its own end, where the last loops are found."""
     wanted, here = a.transport.frame, b.transport.frame
     if wanted < 0 or not same_recording(a, b) or (b.transport.finished and here <= wanted):
         return None
