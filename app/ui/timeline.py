@@ -28,8 +28,6 @@ DEGENERATE_CM: Final = 5.0
 """A direction more uncertain than this is called degenerate (`app.slam.iekf.DEGENERATE_SIGMA`)."""
 _NOTES: Final = 50
 _NOTE_LETTERS: Final = 120
-_UNKNOWN: Final = 65535
-_STEPS: Final = 65534
 
 Series = dict[str, F64]
 
@@ -182,10 +180,7 @@ def loop_frames(edges: tuple[LoopEdge, ...], chunks: tuple[Chunk, ...]) -> dict[
 
 
 def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
-    """What the page's script draws (`templates/timeline.js`), as JSON-ready values.
-
-    Numbers are whole steps of 1/65534 of a strip's largest value, 65535 for none.
-    """
+    """What the page's script draws (`templates/timeline.js`), as JSON-ready values."""
     columns, bad = history.columns(), limits(snapshot)
     recording = snapshot.recording
     strips = []
@@ -193,7 +188,6 @@ def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
         low, high = columns.low[strip.key], columns.high[strip.key]
         if not np.isfinite(high).any() and strip.key == "error":
             continue  # no truth, no strip
-        largest = float(np.fmax.reduce(high, initial=0.0))
         finite = high[np.isfinite(high)]
         usual = float(np.percentile(finite, 98)) if len(finite) else 0.0
         strips.append(
@@ -207,28 +201,24 @@ def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
                 "bars": strip.bars,
                 "top": strip.least if strip.worse == "low" else max(strip.least, 1.2 * usual),
                 "limit": bad.get(strip.key),
-                "largest": largest,
-                "data": packed(np.concatenate((low, high)), largest),
+                "data": packed(np.concatenate((low, high))),
             }
         )
-    duration = recording.duration_s if recording else 1.0
     return {
         "frames": history.total,
         "present": history.present,
-        "duration": duration,
+        "duration": recording.duration_s if recording else 1.0,
         "starts": columns.starts.tolist(),
-        "stamps": packed(columns.stamps, duration),
+        "stamps": packed(columns.stamps),
         "strips": strips,
         "loops": {name: counts for name, counts in columns.loops.items() if any(counts)},
         "notes": [[note.frame, note.text[:_NOTE_LETTERS]] for note in snapshot.notes[-_NOTES:]],
     }
 
 
-def packed(numbers: F64, largest: float) -> str:
-    """Base64 of little-endian 16-bit steps."""
-    with np.errstate(invalid="ignore"):
-        steps = np.round(np.clip(numbers / max(largest, 1e-12), 0.0, 1.0) * _STEPS)
-    return base64.b64encode(np.where(np.isfinite(steps), steps, _UNKNOWN).astype("<u2").tobytes()).decode()
+def packed(numbers: F64) -> str:
+    """Base64 of little-endian 32-bit floats."""
+    return base64.b64encode(numbers.astype("<f4").tobytes()).decode()
 
 
 class TimelinePanel:

@@ -10,18 +10,15 @@ let d = null, text = '', hover = null, scrubbing = false, said = 0;
 const scene = () => [...document.querySelectorAll('canvas')].filter((c) => c !== canvas)
   .sort((a, b) => b.width * b.height - a.width * a.height)[0];
 
-const unpack = (data, largest) => {
-  const steps = new Uint16Array(Uint8Array.from(atob(data), (c) => c.charCodeAt(0)).buffer);
-  return Float64Array.from(steps, (s) => s === 65535 ? NaN : s / 65534 * largest);
-};
+const unpack = (data) => new Float32Array(Uint8Array.from(atob(data), (c) => c.charCodeAt(0)).buffer);
 const read = () => {
   const node = document.querySelector('.hs-tl-data');
   if (!node || node.textContent === text) return;
   text = node.textContent;
   d = text ? JSON.parse(text) : null;
   if (d) {
-    d.stamps = unpack(d.stamps, d.duration);
-    for (const s of d.strips) s.data = unpack(s.data, s.largest);
+    d.stamps = unpack(d.stamps);
+    for (const s of d.strips) s.data = unpack(s.data);
   }
   draw();
 };
