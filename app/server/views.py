@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from app.mapping.session_file import Note
 from app.sensors.findings import Finding
-from app.sensors.live.counters import Counters
+from app.sensors.live.status import Counters
 from app.server.protocol import LoopsView, Notice, Snapshot
 from app.slam.loops import edit_files
 from app.slam.types import StepResult

@@ -5,8 +5,7 @@ from typing import Final
 
 import viser
 
-from app.sensors.live.counters import Counters
-from app.sensors.live.status import LiveState
+from app.sensors.live.status import Counters, LiveState
 from app.server.protocol import Snapshot
 from app.ui.files import size_text
 from app.ui.html import BAD, GOOD, QUIET, WARN, Tile, number, panel

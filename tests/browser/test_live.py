@@ -4,8 +4,7 @@ from dataclasses import replace
 
 from playwright.sync_api import expect
 
-from app.sensors.live.counters import Counters
-from app.sensors.live.status import LiveState
+from app.sensors.live.status import Counters, LiveState
 from app.server.protocol import StepFrame
 from tests.browser.conftest import Bench
 

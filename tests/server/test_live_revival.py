@@ -37,13 +37,9 @@ class Script:
 
     def __init__(self, events: list[Event]) -> None:
         self.left = events.copy()
-        self.absent = True
 
     def poll(self, _timeout_s: float) -> Event | None:
         return self.left.pop(0) if self.left else None
-
-    def set_absent(self, absent: bool) -> None:
-        self.absent = absent
 
     def state(self) -> LiveState:
         return LiveState()

@@ -17,7 +17,6 @@ from test_rewind import SAMPLE
 
 from app.mapping.opening import open_session
 from app.sensors.live.feed import Pace, feed
-from app.sensors.live.intake import MAX_BACKLOG
 from app.sensors.live.process import LiveClient, LiveProcess
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
@@ -78,11 +77,11 @@ class Live:
         return thread
 
     def _wait_for_engine(self, played_s: float) -> None:
-        """Until fewer scans wait than may; those of the first second are held back until the clocks are compared."""
+        """Until only a second of scans waits; those of the first second are held back until the clocks are compared."""
         deadline = time.monotonic() + PATIENCE_S
         while played_s > 1.4 and time.monotonic() < deadline:
             transport = self.engine.snapshot.transport
-            if not transport.playing or transport.frame + transport.dropped > 10 * played_s - MAX_BACKLOG // 2:
+            if not transport.playing or transport.frame + transport.dropped > 10 * played_s - 10:
                 return
             time.sleep(0.02)
 

@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import viser
 
-from app.sensors.live.counters import Counters
-from app.sensors.live.status import LiveState
+from app.sensors.live.status import Counters, LiveState
 from app.ui.html import BAD, GOOD, WARN
 from app.ui.live import LivePanel, live_html, verdict
 from app.ui.transport import TransportPanel

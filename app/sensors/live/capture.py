@@ -17,12 +17,12 @@ from app.sensors import ros
 from app.sensors.clocks import TOLERANCE_S
 from app.sensors.findings import Finding
 from app.sensors.live.clock import JUMP_NS, ClockMap
-from app.sensors.live.counters import Counters
 from app.sensors.live.difop import DIFOP_ID, Difop, read_angles, read_difop
 from app.sensors.live.frames import Assembler, Frame
 from app.sensors.live.imu_udp import IMU_MAGIC, ImuOrder, ImuSample
 from app.sensors.live.msop import MSOP_ID
 from app.sensors.live.pcap import Capture
+from app.sensors.live.status import Counters
 from app.slam.types import I64, Scan
 
 SUFFIXES = (".pcap", ".pcapng")

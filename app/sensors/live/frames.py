@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.sensors.live.counters import Counters
 from app.sensors.live.msop import BLOCKS, MSOP_ID, PACKET_BYTES, TURN, azimuths_of, index_of, model_of, stamp_of
+from app.sensors.live.status import Counters
 from app.sensors.rsbpearl import Model
 from app.slam.types import I64, U8
 

@@ -33,7 +33,7 @@ Stamp each sample when it is measured, not when it is sent, and by the LiDAR's c
 import struct
 from dataclasses import dataclass, field
 
-from app.sensors.live.counters import Counters
+from app.sensors.live.status import Counters
 from app.sensors.ros import Vector
 
 IMU_PORT = 6700

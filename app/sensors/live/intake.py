@@ -10,23 +10,21 @@ from collections import deque
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
 from app.sensors.clocks import TOLERANCE_S
 from app.sensors.layout import ImuProbe, settle_imu
 from app.sensors.live.clock import JUMP_NS, ClockMap, OffsetEstimate
-from app.sensors.live.counters import Counters
-from app.sensors.live.status import Kind, LiveState, Status
+from app.sensors.live.recorder import Recorder
+from app.sensors.live.status import Counters, Kind, LiveState, Status
+from app.sensors.ros import Vector
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan
 
-MAX_BACKLOG = 20
-"""Scans that may wait for the engine: two seconds of them at 10 Hz, and more than are held back at the start."""
-MAX_BACKLOG_ABSENT = 100
-"""The same while the engine is started again; it will then be faster than the sensor. While it catches up, it may
-fall behind by `MAX_BACKLOG` more, since its first frame takes long."""
+MAX_BACKLOG = 100
+"""Scans that may wait for the engine: ten seconds of them at 10 Hz, enough to start another engine."""
 MAX_WAITING = 600_000
 """IMU samples and news that may wait: twenty minutes at 500 Hz. The oldest are removed, as nobody reads them."""
 MAX_HELD = 50_000
@@ -36,7 +34,6 @@ _SETTLE_SCANS = 3
 BUSY, NO_IMU = "the engine was too busy", "no IMU sample came to cover it"
 
 Clock = Literal["auto", "sensor", "host"]
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,14 +67,6 @@ class Settled:
     accel_scale: float
 
 
-class Tap(Protocol):
-    """Sees everything that comes, stamped in the engine's time: the recorder."""
-
-    def add_scan(self, scan: Scan, arrival_ns: int) -> None: ...
-
-    def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, arrival_ns: int) -> None: ...
-
-
 class Intake:
     """Receiving threads call `put_...`; one reader calls `take`.
 
@@ -88,6 +77,7 @@ class Intake:
         counters: shared with the receiving threads. sensor: what the LiDAR reports about itself.
 
     Args:
+        recorder: gets everything that comes, stamped in the engine's time.
         counters, settled: of an intake that this one continues.
     """
 
@@ -95,7 +85,7 @@ class Intake:
         self,
         params: Params,
         clock: Clock = "auto",
-        tap: Tap | None = None,
+        recorder: Recorder | None = None,
         counters: Counters | None = None,
         settled: Settled | None = None,
     ) -> None:
@@ -103,15 +93,13 @@ class Intake:
         self.sensor = ""
         self._params = params
         self._clock: Clock = clock
-        self._tap = tap
+        self._recorder = recorder
         self._changed = threading.Condition()
-        self._scans: deque[LiveScan] = deque()
+        self._scans: deque[Scan] = deque()
         self._rest: deque[LiveImu | DroppedScan | Status] = deque()
         self._held: deque[LiveScan | LiveImu] | None = deque()
         self._suspect: LiveImu | None = None
         self._still_reported = False
-        self._absent = False
-        self._limit = MAX_BACKLOG
         self._maps = {"LiDAR": ClockMap(), "IMU": ClockMap()}
         self._offset = OffsetEstimate()
         self._arrivals: dict[str, deque[int]] = {"LiDAR": deque(maxlen=50), "IMU": deque(maxlen=1000)}
@@ -154,14 +142,7 @@ class Intake:
                 self._changed.wait_for(some, timeout_s)
             rest = list(self._rest)
             self._rest.clear()
-            found = self._scans.popleft().scan if scan and self._scans else None
-            assert not isinstance(found, DroppedScan)
-            return rest, found
-
-    def set_absent(self, absent: bool) -> None:
-        """Say whether the reader is away. The scans that waited for it are not dropped when it is back."""
-        with self._changed:
-            self._absent = absent
+            return rest, self._scans.popleft() if scan and self._scans else None
 
     def settled(self) -> Settled | None:
         """What another intake can continue with; None while it is not known."""
@@ -268,8 +249,8 @@ class Intake:
         x, y, z = entry.accel
         k = self._accel_scale
         accel = (k * x, k * y, k * z)
-        if self._tap is not None:
-            self._tap.add_imu(stamp, entry.gyro, accel, entry.arrival_ns)
+        if self._recorder is not None:
+            self._recorder.add_imu(stamp, entry.gyro, accel, entry.arrival_ns)
         self._rest.append(LiveImu(stamp, entry.gyro, accel, entry.arrival_ns))
 
     def _release_scan(self, entry: LiveScan) -> None:
@@ -279,9 +260,9 @@ class Intake:
             return
         shift = self._mapped("LiDAR", scan.end_ns, entry.arrival_ns) - scan.end_ns
         scan = replace(scan, stamp_ns=scan.stamp_ns + shift) if shift else scan
-        if self._tap is not None:
-            self._tap.add_scan(scan, entry.arrival_ns)
-        self._scans.append(LiveScan(scan, entry.arrival_ns))
+        if self._recorder is not None:
+            self._recorder.add_scan(scan, entry.arrival_ns)
+        self._scans.append(scan)
 
     def _mapped(self, name: Literal["LiDAR", "IMU"], stamp_ns: int, arrival_ns: int) -> int:
         clock_map, other = self._maps[name], self._maps["IMU" if name == "LiDAR" else "LiDAR"]
@@ -299,13 +280,11 @@ class Intake:
         self._rest.append(Status(kind, sensor, text, time.time_ns()))
 
     def _bound(self) -> None:
-        behind = len(self._scans) + MAX_BACKLOG
-        self._limit = MAX_BACKLOG_ABSENT if self._absent else max(MAX_BACKLOG, min(self._limit, behind))
-        while len(self._scans) > self._limit:
+        while len(self._scans) > MAX_BACKLOG:
             oldest = self._scans.popleft()
             times = self._arrivals["IMU"]
             silent = not times or time.time_ns() - times[-1] > 500_000_000
-            self._rest.append(DroppedScan(oldest.scan.stamp_ns, NO_IMU if silent else BUSY))
+            self._rest.append(DroppedScan(oldest.stamp_ns, NO_IMU if silent else BUSY))
             self.counters.dropped += 1
         while len(self._rest) > MAX_WAITING:
             self._rest.popleft()

@@ -21,7 +21,6 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from app.child import Child, ChildDied, Link, RestartLimit
-from app.sensors.live.counters import Counters
 from app.sensors.live.recorder import further
 from app.sensors.live.source import Event, Known
 from app.sensors.live.status import LiveState
@@ -77,7 +76,7 @@ class LiveProcess:
         self.address = LiveAddress(str(Path(self._folder.name) / "live"), secrets.token_bytes(16))
         self._source = (lidar, params, imu)
         self._record = record
-        self._known = Known(time.time_ns(), Counters())
+        self._known = Known(time.time_ns(), LiveState())
         self._restarts = RestartLimit(MOST_RESTARTS, WITHIN_S)
         self._closing = False
         try:
@@ -133,8 +132,9 @@ class LiveProcess:
                 times = f"{self._restarts.most + 1} times within a minute (last: {death})"
                 self.address.end(f"{TITLE} ended unexpectedly {times}; start hemislam again.")
                 return False
-            counters = replace(self._known.counters, restarts=self._known.counters.restarts + 1)
-            self._known = replace(self._known, counters=counters)
+            state = self._known.state
+            counters = replace(state.counters, restarts=state.counters.restarts + 1)
+            self._known = replace(self._known, state=replace(state, counters=counters))
             try:
                 self._child = self._start(death)
                 return True
@@ -159,7 +159,7 @@ def _receive(owner: Link, *arguments: Any) -> None:
 class LiveClient:
     """Polls a `LiveProcess` as one would a `LiveSource`. One engine at a time; `state` from anywhere.
 
-    While nobody polls, more scans may wait. While the process is started again, there are none.
+    While the process is started again, there are no scans.
 
     Attributes:
         place: number of the scan that was given last; the receiving process counts, whoever polls. Set it to that of

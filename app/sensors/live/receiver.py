@@ -51,8 +51,7 @@ def receive(
     log.info("Receiving from %s", ", ".join(filter(None, (lidar, imu))))
     if death:
         source.tell("restarted", _restarted(death, known, record))
-    server = ScanServer(source, known.counters.restarts * _NUMBERS)
-    source.set_absent(True)
+    server = ScanServer(source, known.state.counters.restarts * _NUMBERS)
     Path(address.path).unlink(missing_ok=True)  # of the process before
     with source, Listener(address.path, authkey=address.key) as listener:
         threading.Thread(target=accept, args=(listener, server), daemon=True).start()
@@ -64,7 +63,8 @@ def receive(
 def _restarted(death: str, known: Known, record: Path | None) -> str:
     silent = f"the receiving process died ({death}) and was started again; nothing was received for "
     silent += f"{(time.time_ns() - known.at_ns) * 1e-9:.1f} s"
-    lost = f"; scans lost that waited for the engine: {known.waiting} by the last count" if known.waiting else ""
+    waiting = known.state.backlog
+    lost = f"; scans lost that waited for the engine: {waiting} by the last count" if waiting else ""
     into = f"; the recording continues in {record}" if record else ""
     return f"{silent}{lost}{into}"
 
@@ -96,34 +96,17 @@ class ScanServer:
         self._given: dict[int, Measurement | DroppedScan] = {}  # without a gap
         self._scans: deque[int] = deque()  # which of them are scans that were not dropped
         self._last = first
-        self._polling = 0
 
     def serve(self, connection: "Connection[Any, Any]") -> None:
         """Answer a client until it leaves or dies."""
-        polls = False
-        try:
-            with connection:
-                while True:
-                    request = connection.recv()
-                    if request[0] == "poll" and not polls:
-                        polls = True
-                        self._count(1)
-                    connection.send(self._answer(*request))
-        except (OSError, EOFError):
-            return
-        finally:
-            if polls:
-                self._count(-1)
+        with contextlib.suppress(OSError, EOFError), connection:
+            while True:
+                connection.send(self._answer(*connection.recv()))
 
     def known(self) -> Known:
         """What the source knows."""
         with self._lock:
             return self._source.known()
-
-    def _count(self, change: int) -> None:
-        with self._lock:
-            self._polling += change
-            self._source.set_absent(self._polling == 0)
 
     def _answer(self, what: str, place: int = 0, timeout_s: float = 0.0) -> Any:
         if what == "state":

@@ -6,7 +6,6 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.sensors.live.counters import Counters
 from app.sensors.live.intake import Intake, LiveImu, Receive, Settled
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Kind, LiveState, Status
@@ -25,17 +24,14 @@ class Known:
     """What a source knows, for another one that takes its place.
 
     Attributes:
-        at_ns: the time of this, by the host's clock. settled: units and clocks, None while they are not settled.
-        pairing: the sequencer with its newest samples. recorded: bytes written so far.
-        waiting: scans that nobody has taken yet.
+        at_ns: the time of this, by the host's clock. state: counts, bytes recorded, scans that wait.
+        settled: units and clocks, None while they are not settled. pairing: the sequencer with its newest samples.
     """
 
     at_ns: int
-    counters: Counters
+    state: LiveState
     settled: Settled | None = None
     pairing: Sequencer | None = None
-    recorded: int = 0
-    waiting: int = 0
 
 
 class LiveSource:
@@ -57,7 +53,7 @@ class LiveSource:
     ) -> None:
         self._intake = intake
         self._recorder = recorder
-        self._recorded_before = before.recorded if before else 0
+        self._recorded_before = (before and before.state.recorded) or 0
         self._sequencer = (before and before.pairing) or Sequencer(params.imu.max_gap)
         self._stop = threading.Event()
         self._events: deque[Event] = deque()
@@ -91,18 +87,11 @@ class LiveSource:
 
     def known(self) -> Known:
         """What another source needs to take the place of this one. Not while another thread polls."""
-        state = self.state()
-        pairing = self._sequencer.tail()
-        recorded, waiting = state.recorded or 0, state.backlog
-        return Known(time.time_ns(), state.counters, self._intake.settled(), pairing, recorded, waiting)
+        return Known(time.time_ns(), self.state(), self._intake.settled(), self._sequencer.tail())
 
     def tell(self, kind: Kind, text: str) -> None:
         """Add news for the thread that polls."""
         self._intake.put_status(kind, "source", text)
-
-    def set_absent(self, absent: bool) -> None:
-        """Say whether the engine that polls is away but will be back: then more scans may wait."""
-        self._intake.set_absent(absent)
 
     def close(self) -> None:
         self._stop.set()

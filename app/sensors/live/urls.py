@@ -133,5 +133,5 @@ def open_live(
     receivers += [FoxgloveReceiver(*at, sensors, params) for at, sensors in wanted.items()]
     recorder = Recorder(record) if record else None
     clock = cast(Clock, address.options.get("clock", "auto"))
-    known = (before.counters, before.settled) if before else ()
+    known = (before.state.counters, before.settled) if before else ()
     return LiveSource(receivers, Intake(params, clock, recorder, *known), params, recorder, before)

@@ -5,9 +5,9 @@ import random
 import numpy as np
 import pytest
 
-from app.sensors.live.counters import Counters
 from app.sensors.live.decoder import Decoder
 from app.sensors.live.frames import Assembler, Frame
+from app.sensors.live.status import Counters
 from app.slam.types import Scan
 from tests.sensors.live import sensor
 

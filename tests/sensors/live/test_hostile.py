@@ -15,8 +15,7 @@ from websockets.sync.server import ServerConnection, serve
 
 from app.sensors import ros
 from app.sensors.cloud_types import POINT_CLOUD_2
-from app.sensors.live.clouds import CloudReader
-from app.sensors.live.foxglove import SUBPROTOCOLS
+from app.sensors.live.foxglove import SUBPROTOCOLS, CloudReader
 from app.sensors.live.intake import MAX_HELD, Intake
 from app.sensors.live.source import Event
 from app.sensors.live.status import Status
@@ -145,11 +144,11 @@ def test_clouds_that_contradict_themselves_are_reported_and_take_no_memory() -> 
                 arrived = reader.add(_odd_cloud(luck, number), sensor.START_NS, sensor.START_NS)
             except HemislamError:
                 continue
-            assert all(isinstance(one.scan, DroppedScan) or len(one.scan) <= 2400 for one in arrived)
+            assert all(isinstance(scan, DroppedScan) or len(scan) <= 2400 for scan, _ in arrived)
     nothing = ros.cloud_message(Scan(0, np.ones((5, 3), np.float32), *(np.zeros(5, k) for k in ("i4", "f4", "u2"))))
     nothing.point_step, nothing.width = 0, 2_000_000_000
-    (arrived,) = CloudReader(Params(), "/points", POINT_CLOUD_2).add(nothing, 0, 0)
-    assert isinstance(arrived.scan, DroppedScan) and "of 0 bytes" in arrived.scan.reason
+    ((scan, _),) = CloudReader(Params(), "/points", POINT_CLOUD_2).add(nothing, 0, 0)
+    assert isinstance(scan, DroppedScan) and "of 0 bytes" in scan.reason
 
 
 def _channels(*channels: str) -> str:

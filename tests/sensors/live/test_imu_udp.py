@@ -10,9 +10,9 @@ import threading
 import time
 
 from app.sensors.live import imu_udp
-from app.sensors.live.counters import Counters
 from app.sensors.live.imu_udp import ImuOrder, ImuSample, read_imu, write_imu
 from app.sensors.live.intake import Intake
+from app.sensors.live.status import Counters
 from app.sensors.live.udp import ImuReceiver
 from app.slam.params import Params
 from tests.sensors.live import ports
