@@ -14,7 +14,7 @@ OLD_S: Final = 0.5
 SILENT_S: Final = 2.0
 """Time since the last arrival after which a sensor is late, or silent. The slowest one sends five times a second."""
 BUSY_BACKLOG: Final = 5
-"""Scans waiting: half a second at 10 Hz. At 20 the oldest are dropped."""
+"""Scans waiting: half a second at 10 Hz. At 100 the oldest are dropped."""
 OFFSET_S: Final = 0.05
 """Largest harmless offset between the sensors' clocks; more is visible in the map when the device turns."""
 LOST_SHARE: Final = 0.001

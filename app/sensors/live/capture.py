@@ -21,7 +21,7 @@ from app.sensors.live.difop import DIFOP_ID, Difop, read_angles, read_difop
 from app.sensors.live.frames import Assembler, Frame
 from app.sensors.live.imu_udp import IMU_MAGIC, ImuOrder, ImuSample
 from app.sensors.live.msop import MSOP_ID
-from app.sensors.live.pcap import Capture
+from app.sensors.live.pcap import Capture, Place
 from app.sensors.live.status import Counters
 from app.slam.types import I64, Scan
 
@@ -53,7 +53,7 @@ class CaptureStream:
         self._decoder = Decoder(read_angles(sidecar) if sidecar.is_file() else None)
         self._angles = f"from {sidecar.name}" if sidecar.is_file() else ""
         self._devices: list[tuple[int, Difop]] = []
-        self._complete_at: list[tuple[int, int]] = []
+        self._complete_at: list[tuple[int, Place]] = []
         self._counters = Counters()
         self._index()
         self.complete = self._capture.complete
@@ -61,10 +61,10 @@ class CaptureStream:
 
     def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
         """(topic, log time ns, message) of what was logged within [start, stop), by log time."""
-        number = bisect.bisect_left(self._complete_at, (start_ns, 0)) - _RUN_IN
-        running_ns, position = self._complete_at[number] if number >= 0 else (0, None)
+        number = bisect.bisect_left(self._complete_at, start_ns, key=lambda row: row[0]) - _RUN_IN
+        running_ns, place = self._complete_at[number] if number >= 0 else (0, None)
         device = None
-        for log_ns, _, content in self._read(position, running_ns, Counters()):
+        for log_ns, _, content in self._read(place, running_ns, Counters()):
             if log_ns >= stop_ns:
                 return
             if log_ns < start_ns:
@@ -87,17 +87,17 @@ class CaptureStream:
         """Nothing stays open between two readings."""
 
     def _read(
-        self, position: int | None, running_ns: int, counters: Counters
-    ) -> Iterator[tuple[int, int, Frame | ImuSample | Difop]]:
-        """Log time, position in the file, and what was complete there; from a position on, or all.
+        self, place: Place | None, running_ns: int, counters: Counters
+    ) -> Iterator[tuple[int, Place, Frame | ImuSample | Difop]]:
+        """Log time, place in the file, and what was complete there; from a place on, or all.
 
         Args:
-            running_ns: the newest log time before that position. counters: of what was lost.
+            running_ns: the newest log time before that place. counters: of what was lost.
         """
         assembler, order = Assembler(counters), ImuOrder(counters)
-        at = 0
-        for datagram in self._capture.datagrams(position):
-            at, running_ns, payload = datagram.position, max(running_ns, datagram.time_ns), datagram.payload
+        at = place or Place(0)
+        for datagram in self._capture.datagrams(place):
+            at, running_ns, payload = datagram.place, max(running_ns, datagram.time_ns), datagram.payload
             found: list[Any] = []
             if payload[:8] == MSOP_ID:
                 found = assembler.add(payload, running_ns)
@@ -115,7 +115,7 @@ class CaptureStream:
         """The first reading: times of all messages, what the device says, what is lost."""
         lidar, imu = array("q"), array("q")
         self.start_ns = self.end_ns = 0
-        for log_ns, position, content in self._read(None, 0, self._counters):
+        for log_ns, place, content in self._read(None, 0, self._counters):
             if isinstance(content, Difop):
                 self._counters.difop += 1
                 if not self._devices or not content.same(self._devices[-1][1]):
@@ -123,7 +123,7 @@ class CaptureStream:
                 continue
             if isinstance(content, Frame):
                 lidar.extend((int(content.stamps_ns[-1]), log_ns))
-                self._complete_at.append((log_ns, position))
+                self._complete_at.append((log_ns, place))
                 self._model = content.model.name
             else:
                 imu.extend((content.stamp_ns, log_ns))

@@ -2,7 +2,6 @@
 
 import heapq
 import math
-import queue
 import socket
 import threading
 import time
@@ -137,7 +136,7 @@ def _feed_packets(recording: Recording, to: Address, imu_to: Address, pace: Pace
     angles = read_angles(Path(to.options["angles"])) if "angles" in to.options else None
     number = 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for sent in _paced(_ahead(packets_of(recording, duration_s, angles=angles), pace.stop), pace):
+        for sent in _paced(packets_of(recording, duration_s, angles=angles), pace):
             try:
                 sender.sendto(sent.data, peers[sent.stream])
             except ConnectionRefusedError:  # nobody receives there yet
@@ -171,46 +170,6 @@ def _messages_of(source: Source, topics: tuple[str, str], duration_s: float | No
     stop_ns = None if duration_s is None else source.start_ns + round(duration_s * 1e9)
     for number, (topic, log_ns, message) in enumerate(source.messages(topics, None, stop_ns)):
         yield Sent(log_ns, number, topics.index(topic), ros.serialised(message))
-
-
-def _ahead(items: Iterator[Sent], stop: threading.Event) -> Iterator[Sent]:
-    """The same items, made ahead on another thread: making one scan's packets must not delay another's."""
-    made: queue.Queue[Sent | BaseException | None] = queue.Queue(4_000)
-    done = threading.Event()
-
-    def put(item: Sent | BaseException | None) -> bool:
-        """False once nobody takes any more."""
-        while not (done.is_set() or stop.is_set()):
-            try:
-                made.put(item, timeout=0.2)
-            except queue.Full:
-                continue
-            return True
-        return False
-
-    def make() -> None:
-        try:
-            if all(map(put, items)):
-                put(None)
-        except BaseException as error:  # raised again where the items are used
-            put(error)
-
-    thread = threading.Thread(target=make, daemon=True, name="feed")
-    thread.start()
-    try:
-        while not stop.is_set():
-            try:
-                item = made.get(timeout=0.2)
-            except queue.Empty:
-                continue
-            if item is None:
-                return
-            if isinstance(item, BaseException):
-                raise item
-            yield item
-    finally:
-        done.set()
-        thread.join()
 
 
 def _paced(items: Iterator[Sent], pace: Pace) -> Iterator[Sent]:

@@ -33,14 +33,12 @@ class Firings:
     Attributes:
         times_ns: (b,) absolute. azimuth: (b,) 0.01 deg. counts: (b, 32) distance in steps of the
             model, 0 = no return. intensity: (b, 32).
-        misfit_m: 95th percentile of the distance between the points and those of the packets.
     """
 
     times_ns: I64
     azimuth: U16
     counts: U16
     intensity: U8
-    misfit_m: float
 
 
 def firings_of(scan: Scan, calibration: Calibration = NOMINAL, model: Model = BPEARL, rate_hz: int = 10) -> Firings:
@@ -82,7 +80,7 @@ def firings_of(scan: Scan, calibration: Calibration = NOMINAL, model: Model = BP
             "them in a firing that has a point already): play it out as foxglove://127.0.0.1:8765 instead."
         )
     times = turn.base_ns + model.block_ns * order.astype(np.int64)
-    return Firings(times, azimuth.astype(np.uint16), counts, intensity, misfit)
+    return Firings(times, azimuth.astype(np.uint16), counts, intensity)
 
 
 def rate_of(scans: list[Scan]) -> int:

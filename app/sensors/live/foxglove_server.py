@@ -1,10 +1,11 @@
 """A Foxglove server of a few topics, to play a recording out to a program that speaks that protocol."""
 
+import contextlib
 import json
 import threading
 import time
-from dataclasses import dataclass, field
-from typing import Self
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
@@ -22,15 +23,8 @@ class Offer:
     definition: str
 
 
-@dataclass(eq=False, slots=True)
-class _Client:
-    connection: ServerConnection
-    subscriptions: dict[int, int] = field(default_factory=dict)
-    """Channel to the client's number for it."""
-
-
-class FoxgloveServer:
-    """Serves on threads of its own; `publish` waits for slow clients. A context manager.
+class FoxgloveServer(AbstractContextManager["FoxgloveServer"]):
+    """Serves on threads of its own; `publish` waits for slow clients.
 
     Attributes:
         port: where it listens; 0 asks for any.
@@ -41,7 +35,7 @@ class FoxgloveServer:
 
     def __init__(self, host: str, port: int, offers: list[Offer]) -> None:
         self._offers = offers
-        self._clients: set[_Client] = set()
+        self._clients: dict[ServerConnection, dict[int, int]] = {}  # channel to the number that the client gave it
         try:
             self._server = serve(
                 self._meet, host, port, subprotocols=SUBPROTOCOLS, max_size=MAX_MESSAGE, compression=None,
@@ -55,31 +49,25 @@ class FoxgloveServer:
 
     def publish(self, channel: int, log_ns: int, data: bytes) -> None:
         """Send to every client that asked for the channel (its place among the offers)."""
-        for client in list(self._clients):
-            number = client.subscriptions.get(channel)
-            if number is not None:
-                try:
-                    client.connection.send(MESSAGE.pack(1, number, log_ns) + data)
-                except ConnectionClosed:
-                    self._clients.discard(client)
+        for connection, subscriptions in list(self._clients.items()):
+            if (number := subscriptions.get(channel)) is not None:
+                with contextlib.suppress(ConnectionClosed):  # its thread removes it
+                    connection.send(MESSAGE.pack(1, number, log_ns) + data)
 
     def wait_for_subscribers(self, timeout_s: float) -> bool:
         """Whether some client has asked for every topic, at the latest after this time."""
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
-            if any(len(client.subscriptions) == len(self._offers) for client in list(self._clients)):
+            if any(len(subscriptions) == len(self._offers) for subscriptions in list(self._clients.values())):
                 return True
             time.sleep(0.01)
         return False
 
     def close(self) -> None:
         self._server.shutdown()
-        for client in list(self._clients):
-            client.connection.close()
+        for connection in list(self._clients):
+            connection.close()
         self._thread.join(5.0)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -94,28 +82,27 @@ class FoxgloveServer:
             }
             for number, offer in enumerate(self._offers)
         ]  # fmt: skip
-        client = _Client(connection)
-        self._clients.add(client)
+        self._clients[connection] = {}
         try:
             connection.send(json.dumps(info))
             connection.send(json.dumps({"op": "advertise", "channels": channels}))
             for message in connection:
                 if isinstance(message, str):
-                    _note(message, client)
+                    _note(message, self._clients[connection])
         except ConnectionClosed:
             return
         finally:
-            self._clients.discard(client)
+            del self._clients[connection]
 
 
-def _note(text: str, client: _Client) -> None:
-    """What a client subscribes to, or no longer wants."""
+def _note(text: str, subscriptions: dict[int, int]) -> None:
+    """Note what a client subscribes to, or no longer wants."""
     try:
         said = json.loads(text)
         if said["op"] == "subscribe":
-            client.subscriptions.update({int(s["channelId"]): int(s["id"]) for s in said["subscriptions"]})
+            subscriptions.update({int(s["channelId"]): int(s["id"]) for s in said["subscriptions"]})
         elif said["op"] == "unsubscribe":
-            gone = set(said["subscriptionIds"])
-            client.subscriptions = {c: n for c, n in client.subscriptions.items() if n not in gone}
+            for channel in [c for c, number in subscriptions.items() if number in said["subscriptionIds"]]:
+                del subscriptions[channel]
     except (ValueError, KeyError, TypeError):  # not of this protocol
         return

@@ -138,8 +138,7 @@ class Intake:
             return bool(self._rest) or (scan and bool(self._scans))
 
         with self._changed:
-            if not some():
-                self._changed.wait_for(some, timeout_s)
+            self._changed.wait_for(some, timeout_s)
             rest = list(self._rest)
             self._rest.clear()
             return rest, self._scans.popleft() if scan and self._scans else None

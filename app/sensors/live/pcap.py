@@ -26,20 +26,38 @@ class CaptureError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Datagram:
-    """One UDP datagram. position: where the captured frame that completes it begins in the file."""
+class _Interface:
+    """Type of network, time units in a second, ns to add."""
+
+    link: int
+    units: int
+    offset_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a captured frame begins in the file; byte order and interfaces there, by the headers before it."""
 
     position: int
+    order: str = "<"
+    interfaces: tuple[_Interface, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Datagram:
+    """One UDP datagram. place: of the captured frame that completes it."""
+
+    place: Place
     time_ns: int
     payload: bytes
 
 
-Captured = tuple[int, int, int, bytes]
-"""A captured frame: position in the file, time ns, type of network, bytes."""
+Captured = tuple[Place, int, int, bytes]
+"""A captured frame: place in the file, time ns, type of network, bytes."""
 
 
 class Capture:
-    """A capture file. Reading can begin at the position of any frame of an earlier reading.
+    """A capture file. Reading can begin at the place of any frame of an earlier reading.
 
     Attributes:
         complete: False once the end was found to be in the middle of a frame.
@@ -51,32 +69,31 @@ class Capture:
         self.complete = True
         with path.open("rb") as file:
             start = file.read(24)
-        self._next = start[:4] == NEXT_MAGIC
-        if not self._next and (start[:4] not in CLASSIC_MAGIC or len(start) < 24):
-            raise CaptureError("it does not begin like a capture")
-        self._order = "<" if start[:4] in (CLASSIC_MAGIC[0], CLASSIC_MAGIC[2]) else ">"
-        self._fraction_ns = 1 if start[:4] in CLASSIC_MAGIC[2:] else 1_000
-        self._link = 0 if self._next else int(struct.unpack_from(self._order + "I", start, 20)[0]) & 0xFFFF
-        self._sections: dict[int, _Section] = {}
-        """Of a .pcapng, by position; known as far as the file was read."""
+        self._frames, self._start = self._next_frames, Place(0)
+        if start[:4] != NEXT_MAGIC:
+            if start[:4] not in CLASSIC_MAGIC or len(start) < 24:
+                raise CaptureError("it does not begin like a capture")
+            order = "<" if start[:4] in (CLASSIC_MAGIC[0], CLASSIC_MAGIC[2]) else ">"
+            units = 1_000_000_000 if start[:4] in CLASSIC_MAGIC[2:] else 1_000_000
+            link = int(struct.unpack_from(order + "I", start, 20)[0]) & 0xFFFF
+            self._frames, self._start = self._classic_frames, Place(24, order, (_Interface(link, units),))
 
-    def datagrams(self, position: int | None = None) -> Iterator[Datagram]:
-        """UDP datagrams from a frame's position on, or all; up to the end, or where the file makes no sense."""
+    def datagrams(self, place: Place | None = None) -> Iterator[Datagram]:
+        """UDP datagrams from a frame's place on, or all; up to the end, or where the file makes no sense."""
         waiting: dict[bytes, _Fragments] = {}
+        place = place or self._start
         with self._path.open("rb") as file:
-            if position is not None:
-                file.seek(position)
-            for at, time_ns, link, frame in self._next_frames(file) if self._next else self._classic_frames(file):
+            file.seek(place.position)
+            for at, time_ns, link, frame in self._frames(file, place):
                 packet = _ip_packet(link, frame)
                 if packet and 0 <= time_ns < _FAR_NS:
                     payload = _udp_payload(packet, waiting)
                     if payload is not None:
                         yield Datagram(at, time_ns, payload)
 
-    def _classic_frames(self, file: BinaryIO) -> Iterator[Captured]:
-        if file.tell() < 24:
-            file.seek(24)
-        header = struct.Struct(self._order + "4I")
+    def _classic_frames(self, file: BinaryIO, place: Place) -> Iterator[Captured]:
+        header = struct.Struct(place.order + "4I")
+        (interface,) = place.interfaces
         while True:
             position = file.tell()
             raw = file.read(16)
@@ -88,12 +105,12 @@ class Capture:
             data = file.read(length) if length <= MAX_RECORD else b""
             if len(data) < length:
                 break
-            yield position, seconds * 1_000_000_000 + fraction * self._fraction_ns, self._link, data
+            time_ns = seconds * 1_000_000_000 + fraction * 1_000_000_000 // interface.units
+            yield Place(position, place.order, place.interfaces), time_ns, interface.link, data
         self.complete = False
 
-    def _next_frames(self, file: BinaryIO) -> Iterator[Captured]:
-        begin = file.tell()
-        section = self._sections[max(at for at in self._sections if at <= begin)] if begin else _Section("<")
+    def _next_frames(self, file: BinaryIO, place: Place) -> Iterator[Captured]:
+        order, interfaces = place.order, place.interfaces
         while True:
             position = file.tell()
             raw = file.read(8)
@@ -102,41 +119,23 @@ class Capture:
             if len(raw) < 8:
                 break
             if raw[:4] == NEXT_MAGIC:  # a section begins, perhaps in another byte order
-                order = "<" if file.read(4) == b"\x4d\x3c\x2b\x1a" else ">"
+                order, interfaces = "<" if file.read(4) == b"\x4d\x3c\x2b\x1a" else ">", ()
                 file.seek(position + 8)
-                section = self._sections.setdefault(position, _Section(order))
-            kind, length = struct.unpack(section.order + "2I", raw)
+            kind, length = struct.unpack(order + "2I", raw)
             if not 12 <= length <= MAX_RECORD or length % 4:
                 break
             body = file.read(length - 8)
             if len(body) < length - 8:
                 break
-            if kind == 1 and raw[:4] != NEXT_MAGIC and len(body) >= 12:
-                section.interfaces.setdefault(position, _interface(body, section.order))
+            if kind == 1 and len(body) >= 12:
+                interfaces = (*interfaces, _interface(body, order))
             elif kind == 6 and len(body) >= 24:
-                number, high, low, captured, _ = struct.unpack_from(section.order + "5I", body)
-                if number < len(section.interfaces):
-                    interface = list(section.interfaces.values())[number]
+                number, high, low, captured, _ = struct.unpack_from(order + "5I", body)
+                if number < len(interfaces):
+                    interface = interfaces[number]
                     time_ns = (high << 32 | low) * 1_000_000_000 // interface.units + interface.offset_ns
-                    yield position, time_ns, interface.link, body[20 : 20 + captured]
+                    yield Place(position, order, interfaces), time_ns, interface.link, body[20 : 20 + captured]
         self.complete = False
-
-
-@dataclass(frozen=True, slots=True)
-class _Interface:
-    """Type of network, time units in a second, ns to add."""
-
-    link: int
-    units: int
-    offset_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Section:
-    """Byte order, and interfaces by the position of their block."""
-
-    order: str
-    interfaces: dict[int, _Interface] = field(default_factory=dict)
 
 
 def _interface(body: bytes, order: str) -> _Interface:

@@ -14,11 +14,11 @@ import secrets
 import tempfile
 import threading
 import time
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Client, Connection
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from app.child import Child, ChildDied, Link, RestartLimit
 from app.sensors.live.recorder import further
@@ -59,8 +59,8 @@ class LiveAddress:
             return "" if Path(self.path).parent.is_dir() else ENDED
 
 
-class LiveProcess:
-    """Receives, and records, until `close`. A context manager.
+class LiveProcess(AbstractContextManager["LiveProcess"]):
+    """Receives, and records, until `close`.
 
     A process that dies is replaced by another one, which records into a further file (`further`).
 
@@ -143,10 +143,7 @@ class LiveProcess:
                 time.sleep(_RETRY_S)
         return True
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections import deque
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -34,10 +35,10 @@ class Known:
     pairing: Sequencer | None = None
 
 
-class LiveSource:
+class LiveSource(AbstractContextManager["LiveSource"]):
     """Receives on threads of its own; `poll` gives scans paired with IMU samples, and news.
 
-    One thread may poll. A context manager; `close` ends the threads and the recording.
+    One thread may poll. `close` ends the threads and the recording.
 
     Args:
         before: what a source knew that this one takes the place of.
@@ -58,7 +59,7 @@ class LiveSource:
         self._stop = threading.Event()
         self._events: deque[Event] = deque()
         self._pairing = False
-        self._silent: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": None, "IMU": None}
+        self._silent_since: dict[str, float] = {}
         self._watched_at = 0.0
         self._failure_reported = False
         self._threads = [
@@ -100,9 +101,6 @@ class LiveSource:
         if self._recorder is not None:
             self._recorder.close()
 
-    def __enter__(self) -> "LiveSource":
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
@@ -136,16 +134,14 @@ class LiveSource:
                 self._events.append(Status("recording", "source", trouble, time.time_ns()))
         ages: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": state.lidar_age_s, "IMU": state.imu_age_s}
         for sensor, age in ages.items():
-            since = self._silent[sensor]
-            if age is None:
+            if age is None or (age > SILENCE_S) == (sensor in self._silent_since):
                 continue
-            if age > SILENCE_S and since is None:
-                self._silent[sensor] = now - age
+            if age > SILENCE_S:
+                self._silent_since[sensor] = now - age
                 text = f"the {sensor} has been silent for {age:.1f} s"
                 self._events.append(Status("silent", sensor, text, time.time_ns()))
-            elif age <= SILENCE_S and since is not None:
-                self._silent[sensor] = None
-                text = f"the {sensor} is back after {now - since:.1f} s"
+            else:
+                text = f"the {sensor} is back after {now - self._silent_since.pop(sensor):.1f} s"
                 self._events.append(Status("back", sensor, text, time.time_ns()))
 
 
