@@ -62,10 +62,8 @@ class Difop:
 
     def same(self, other: "Difop") -> bool:
         """Whether all that matters for decoding is equal."""
-        if self.calibration is None or other.calibration is None:
-            angles = self.calibration is other.calibration
-        else:
-            angles = self.calibration.same(other.calibration)
+        ours, theirs = self.calibration, other.calibration
+        angles = ours is theirs or (ours is not None and theirs is not None and ours.same(theirs))
         return angles and self.describe() == other.describe()
 
     def describe(self) -> str:

@@ -1,6 +1,6 @@
 """Plays a recording as a live sensor would send it, as packets or through a Foxglove server, to try live mapping."""
 
-import heapq
+import bisect
 import math
 import socket
 import threading
@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import count, islice
+from operator import attrgetter
 from pathlib import Path
 
 from app.sensors import ros
@@ -30,14 +31,13 @@ _FITTED = 5
 """Scans from which the unit's angles are read."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
+@dataclass(frozen=True, slots=True)
 class Sent:
     """Something to be sent: when, by the sensor's clock, on which stream, what."""
 
     time_ns: int
-    number: int
     stream: int
-    data: bytes = field(compare=False)
+    data: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +69,9 @@ def packets_of(
     difop = Difop(rpm=60 * rate, serial="68656d690001", calibration=own)
     writer = PacketWriter(model)
     waiting: list[Sent] = []
-    numbers, samples = count(), count()
+    by_time = attrgetter("time_ns")
+    samples = count()
     device_ns = 0
-
-    def push(time_ns: int, stream: int, data: bytes) -> None:
-        heapq.heappush(waiting, Sent(time_ns, next(numbers), stream, data))
-
     for entry in recording.entries():
         if isinstance(entry, ScanEntry):
             scan = entry.scan
@@ -83,19 +80,20 @@ def packets_of(
             if not isinstance(scan, Scan) or scan.stamp_ns >= stop_ns:
                 continue
             firings = firings_of(scan, calibration, model, rate)
-            for time_ns, packet in writer.add(firings.times_ns, firings.azimuth, firings.counts, firings.intensity):
-                push(time_ns, LIDAR, packet)
+            packets = writer.add(firings.times_ns, firings.azimuth, firings.counts, firings.intensity)
+            waiting += [Sent(time_ns, LIDAR, packet) for time_ns, packet in packets]
             if scan.stamp_ns - device_ns > _DEVICE_PERIOD_NS:
                 device_ns = scan.stamp_ns
-                push(device_ns, DEVICE, write_difop(difop, device_ns))
-            while waiting and waiting[0].time_ns <= scan.end_ns:
-                yield heapq.heappop(waiting)
+                waiting.append(Sent(device_ns, DEVICE, write_difop(difop, device_ns)))
+            waiting.sort(key=by_time)
+            due = bisect.bisect_right(waiting, scan.end_ns, key=by_time)
+            yield from waiting[:due]
+            del waiting[:due]
         elif entry.stamp_ns < stop_ns + 2e8:
-            push(entry.stamp_ns, IMU, write_imu(ImuSample(next(samples), entry.stamp_ns, entry.gyro, entry.accel)))
-    for time_ns, packet in writer.flush():
-        push(time_ns, LIDAR, packet)
-    while waiting:
-        yield heapq.heappop(waiting)
+            sample = ImuSample(next(samples), entry.stamp_ns, entry.gyro, entry.accel)
+            waiting.append(Sent(entry.stamp_ns, IMU, write_imu(sample)))
+    waiting += [Sent(time_ns, LIDAR, packet) for time_ns, packet in writer.flush()]
+    yield from sorted(waiting, key=by_time)
 
 
 def feed(
@@ -168,8 +166,8 @@ def _feed_foxglove(
 
 def _messages_of(source: Source, topics: tuple[str, str], duration_s: float | None) -> Iterator[Sent]:
     stop_ns = None if duration_s is None else source.start_ns + round(duration_s * 1e9)
-    for number, (topic, log_ns, message) in enumerate(source.messages(topics, None, stop_ns)):
-        yield Sent(log_ns, number, topics.index(topic), ros.serialised(message))
+    for topic, log_ns, message in source.messages(topics, None, stop_ns):
+        yield Sent(log_ns, topics.index(topic), ros.serialised(message))
 
 
 def _paced(items: Iterator[Sent], pace: Pace) -> Iterator[Sent]:

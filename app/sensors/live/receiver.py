@@ -21,10 +21,8 @@ from app.slam.types import DroppedScan, Measurement
 
 log = logging.getLogger(__name__)
 
-HISTORY = 60
-"""Scans that can be given again: six seconds of them. An engine makes a checkpoint every second."""
-MOST_GIVEN = 100_000
-"""The same including dropped scans, of which only the time is kept."""
+HISTORY = 120
+"""Scans that can be given again, dropped ones included: an engine makes a checkpoint every ten frames."""
 LOST: Final = "it was lost with the engine that had it"
 _REPORT_S = 0.2
 """How often the owner is sent what is known."""
@@ -93,9 +91,8 @@ class ScanServer:
     def __init__(self, source: LiveSource, first: int = 0) -> None:
         self._source = source
         self._lock = threading.Lock()
-        self._given: dict[int, Measurement | DroppedScan] = {}  # without a gap
-        self._scans: deque[int] = deque()  # which of them are scans that were not dropped
-        self._last = first
+        self._given: deque[Measurement | DroppedScan] = deque(maxlen=HISTORY)  # the newest
+        self._last = self._kept = first  # numbers of the newest, and of the newest that no engine needs again
 
     def serve(self, connection: "Connection[Any, Any]") -> None:
         """Answer a client until it leaves or dies."""
@@ -115,32 +112,22 @@ class ScanServer:
             if what == "poll":
                 return self._next(place, timeout_s)
             if what == "kept":
-                self._forget(place)
+                self._kept = max(self._kept, place)
+                while self._given and self._last - len(self._given) < self._kept:
+                    self._given.popleft()
             return self._last
 
     def _next(self, place: int, timeout_s: float) -> tuple[int, Event | None]:
         """The event after that place, and its own place."""
-        if self._given and place < self._last:
-            place = max(place + 1, next(iter(self._given)))
-            return place, self._given[place]
+        place = max(place, self._kept) + 1
+        if place <= self._last:
+            behind = place - 1 - self._last + len(self._given)
+            if behind >= 0:
+                return place, self._given[behind]
+            oldest = self._given[0]
+            return place, DroppedScan((oldest.scan if isinstance(oldest, Measurement) else oldest).stamp_ns, LOST)
         event = self._source.poll(timeout_s)
         if isinstance(event, Measurement | DroppedScan):
             self._last += 1
-            self._given[self._last] = event
-        if isinstance(event, Measurement):
-            self._scans.append(self._last)
-        if len(self._scans) > HISTORY:
-            oldest = self._scans.popleft()
-            self._given[oldest] = DroppedScan(_stamp(self._given[oldest]), LOST)
-        self._forget(self._last - MOST_GIVEN)
+            self._given.append(event)
         return self._last, event
-
-    def _forget(self, place: int) -> None:
-        while self._given and (first := next(iter(self._given))) <= place:
-            del self._given[first]
-        while self._scans and self._scans[0] <= place:
-            self._scans.popleft()
-
-
-def _stamp(event: Measurement | DroppedScan) -> int:
-    return event.scan.stamp_ns if isinstance(event, Measurement) else event.stamp_ns
