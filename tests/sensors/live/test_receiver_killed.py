@@ -26,10 +26,10 @@ from tests.sensors.live import sensor
 from tests.sensors.live.test_live import Wire
 
 TURN_NS = 1801 * 55_520
-PATIENCE_S = 30.0
+TIMEOUT_S = 30.0
 
 
-class Walk:
+class Sender:
     """Revolutions in real time, and what becomes of them."""
 
     def __init__(self, wire: Wire, client: LiveClient) -> None:
@@ -39,7 +39,7 @@ class Walk:
 
     def turn(self, count: int, *, polling: bool = True) -> int:
         """So many, of the sensor that turned all the time. Returns the number of the first."""
-        first = math.ceil(self._now() + 5)
+        first = math.ceil(self._now() + 15)  # making the packets takes time, and they must not be late
         packets = sensor.turns(count, start_ns=sensor.START_NS + first * TURN_NS)
         thread = threading.Thread(target=self._send, args=(first, packets))
         thread.start()
@@ -72,7 +72,7 @@ class Walk:
 
     def until(self, place: int) -> None:
         """That revolution was given."""
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not self.turns or self.turns[-1] < place:
             assert time.monotonic() < deadline, (self.turns[-5:], self._client.state())
             self.poll()
@@ -96,11 +96,11 @@ def recorded(path: Path) -> list[int]:
 
 
 @contextmanager
-def walking(record: Path) -> Iterator[tuple[LiveProcess, LiveClient, Walk]]:
+def receiving(record: Path) -> Iterator[tuple[LiveProcess, LiveClient, Sender]]:
     wire = Wire()
     with LiveProcess(wire.url, Params(), wire.imu_url, record) as process:
         client = LiveClient(process.address)
-        yield process, client, Walk(wire, client)
+        yield process, client, Sender(wire, client)
         client.close()
 
 
@@ -109,18 +109,18 @@ def kill(process: LiveProcess) -> None:
     killed = process.pid
     assert killed is not None
     os.kill(killed, signal.SIGKILL)
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while process.alive and process.pid == killed:
         assert time.monotonic() < deadline
         time.sleep(0.01)
 
 
 def test_a_receiver_that_is_killed_comes_back_and_records_into_a_further_file(tmp_path: Path) -> None:
-    record = tmp_path / "walk.mcap"
-    (tmp_path / "walk-2.mcap").write_bytes(b"of somebody else")
-    with walking(record) as (process, client, walk):
+    record = tmp_path / "session.mcap"
+    (tmp_path / "session-2.mcap").write_bytes(b"of somebody else")
+    with receiving(record) as (process, client, walk):
         walk.until(walk.turn(16) + 13)
-        last, deadline = walk.turns[-1], time.monotonic() + PATIENCE_S
+        last, deadline = walk.turns[-1], time.monotonic() + TIMEOUT_S
         while (before := client.state()).recorded == 0 or last - 1 not in recorded(record):  # the disk may be slow
             assert time.monotonic() < deadline
         time.sleep(0.5)  # what is known is told five times a second
@@ -138,19 +138,20 @@ def test_a_receiver_that_is_killed_comes_back_and_records_into_a_further_file(tm
     assert walk.turns[-6:] == list(range(first, first + 6)), "no second is waited for again to learn units and clocks"
 
     (told,) = [event for event in walk.events if isinstance(event, Status) and event.kind == "restarted"]
-    assert "signal 9" in told.text and "walk-3.mcap" in told.text and "nothing was received for" in told.text
+    assert "signal 9" in told.text and "session-3.mcap" in told.text and "nothing was received for" in told.text
     gap = next(event for event in walk.events if isinstance(event, Measurement) and turns_of([event])[0] >= first)
     assert any("no usable scan for" in notice for notice in gap.notices)
 
     assert last - 1 in recorded(record), "what was on disk stays readable"
-    assert (tmp_path / "walk-2.mcap").read_bytes() == b"of somebody else"
-    assert set(recorded(tmp_path / "walk-3.mcap")) >= set(range(first + 1, first + 6))
+    assert (tmp_path / "session-2.mcap").read_bytes() == b"of somebody else"
+    assert set(recorded(tmp_path / "session-3.mcap")) >= set(range(first + 1, first + 6))
 
 
 def test_scans_that_waited_for_the_engine_when_it_died_are_told(tmp_path: Path) -> None:
-    with walking(tmp_path / "walk.mcap") as (process, client, walk):
+    with receiving(tmp_path / "session.mcap") as (process, client, walk):
         walk.until(walk.turn(16) + 13)
         walk.turn(8, polling=False)
+        time.sleep(2.0)  # the last revolution is complete after a second of silence
         waiting = client.state().backlog
         assert waiting >= 5
         time.sleep(0.5)  # what is known is told five times a second
@@ -162,7 +163,7 @@ def test_scans_that_waited_for_the_engine_when_it_died_are_told(tmp_path: Path) 
 
 def test_a_receiver_that_keeps_dying_is_given_up_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_process, "MOST_RESTARTS", 2)
-    with walking(tmp_path / "walk.mcap") as (process, _, walk):
+    with receiving(tmp_path / "session.mcap") as (process, _, walk):
         for _ in range(3):
             kill(process)
         with pytest.raises(HemislamError, match=r"ended unexpectedly 3 times .*signal 9.*start hemislam again"):
@@ -176,7 +177,7 @@ def test_a_receiver_that_keeps_dying_is_given_up_and_says_why(tmp_path: Path, mo
 def test_deaths_far_from_one_another_are_no_reason_to_give_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_process, "MOST_RESTARTS", 1)
     monkeypatch.setattr(live_process, "WITHIN_S", 0.0)
-    with walking(tmp_path / "walk.mcap") as (process, client, _):
+    with receiving(tmp_path / "session.mcap") as (process, client, _):
         for count in (1, 2):
             kill(process)
             while client.state().counters.restarts < count:
