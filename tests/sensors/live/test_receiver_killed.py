@@ -118,28 +118,28 @@ def kill(process: LiveProcess) -> None:
 def test_a_receiver_that_is_killed_comes_back_and_records_into_a_further_file(tmp_path: Path) -> None:
     record = tmp_path / "session.mcap"
     (tmp_path / "session-2.mcap").write_bytes(b"of somebody else")
-    with receiving(record) as (process, client, walk):
-        walk.until(walk.turn(16) + 13)
-        last, deadline = walk.turns[-1], time.monotonic() + TIMEOUT_S
+    with receiving(record) as (process, client, sender):
+        sender.until(sender.turn(16) + 13)
+        last, deadline = sender.turns[-1], time.monotonic() + TIMEOUT_S
         while (before := client.state()).recorded == 0 or last - 1 not in recorded(record):  # the disk may be slow
             assert time.monotonic() < deadline
         time.sleep(0.5)  # what is known is told five times a second
         kill(process)
         while client.state().counters.restarts == 0:  # it is asked all the time, and never in vain
-            walk.poll()
-        assert walk.turns == list(range(walk.turns[0], walk.turns[-1] + 1))
-        first = walk.turn(8)
-        walk.until(first + 5)
+            sender.poll()
+        assert sender.turns == list(range(sender.turns[0], sender.turns[-1] + 1))
+        first = sender.turn(8)
+        sender.until(first + 5)
         after = client.state()
     assert after.counters.restarts == 1
     assert after.counters.frames >= before.counters.frames + 6 and after.counters.imu > before.counters.imu
     assert (after.counters.lost, after.counters.dropped, after.counters.jumps) == (0, 0, 0)
     assert before.recorded is not None and after.recorded is not None and after.recorded >= before.recorded > 0
-    assert walk.turns[-6:] == list(range(first, first + 6)), "no second is waited for again to learn units and clocks"
+    assert sender.turns[-6:] == list(range(first, first + 6)), "no second is waited for again to learn units and clocks"
 
-    (told,) = [event for event in walk.events if isinstance(event, Status) and event.kind == "restarted"]
+    (told,) = [event for event in sender.events if isinstance(event, Status) and event.kind == "restarted"]
     assert "signal 9" in told.text and "session-3.mcap" in told.text and "nothing was received for" in told.text
-    gap = next(event for event in walk.events if isinstance(event, Measurement) and turns_of([event])[0] >= first)
+    gap = next(event for event in sender.events if isinstance(event, Measurement) and turns_of([event])[0] >= first)
     assert any("no usable scan for" in notice for notice in gap.notices)
 
     assert last - 1 in recorded(record), "what was on disk stays readable"
@@ -148,27 +148,27 @@ def test_a_receiver_that_is_killed_comes_back_and_records_into_a_further_file(tm
 
 
 def test_scans_that_waited_for_the_engine_when_it_died_are_told(tmp_path: Path) -> None:
-    with receiving(tmp_path / "session.mcap") as (process, client, walk):
-        walk.until(walk.turn(16) + 13)
-        walk.turn(8, polling=False)
+    with receiving(tmp_path / "session.mcap") as (process, client, sender):
+        sender.until(sender.turn(16) + 13)
+        sender.turn(8, polling=False)
         time.sleep(2.0)  # the last revolution is complete after a second of silence
         waiting = client.state().backlog
         assert waiting >= 5
         time.sleep(0.5)  # what is known is told five times a second
         kill(process)
-        while not (told := [e for e in walk.events if isinstance(e, Status) and e.kind == "restarted"]):
-            walk.poll()
+        while not (told := [e for e in sender.events if isinstance(e, Status) and e.kind == "restarted"]):
+            sender.poll()
     assert f"scans lost that waited for the engine: {waiting} by the last count" in told[0].text
 
 
 def test_a_receiver_that_keeps_dying_is_given_up_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_process, "MOST_RESTARTS", 2)
-    with receiving(tmp_path / "session.mcap") as (process, _, walk):
+    with receiving(tmp_path / "session.mcap") as (process, _, sender):
         for _ in range(3):
             kill(process)
         with pytest.raises(HemislamError, match=r"ended unexpectedly 3 times .*signal 9.*start hemislam again"):
             for _ in range(200):
-                walk.poll()
+                sender.poll()
         with pytest.raises(HemislamError, match="3 times"):
             LiveClient(process.address)
         assert not process.alive
@@ -186,7 +186,7 @@ def test_deaths_far_from_one_another_are_no_reason_to_give_up(tmp_path: Path, mo
 
 
 def test_further_files_have_the_next_number_that_is_free(tmp_path: Path) -> None:
-    walk = tmp_path / "a.b.mcap"
-    assert further(walk) == tmp_path / "a.b-2.mcap"
-    further(walk).touch()
-    assert further(walk) == tmp_path / "a.b-3.mcap"
+    path = tmp_path / "a.b.mcap"
+    assert further(path) == tmp_path / "a.b-2.mcap"
+    further(path).touch()
+    assert further(path) == tmp_path / "a.b-3.mcap"
