@@ -61,14 +61,14 @@ class Live:
     def __post_init__(self) -> None:
         self.onlooker = LiveClient(self.source.address)
 
-    def play(self, speed: float, *, patiently: bool = True) -> threading.Thread:
+    def play(self, speed: float, *, patiently: bool = True, length_s: float = LENGTH_S) -> threading.Thread:
         """patiently: no faster than the engine takes it, so that nothing is dropped however busy the machine is."""
         pace = Pace(speed, progress=self._wait_for_engine) if patiently else Pace(speed)
 
         def send() -> None:
             try:
                 imu_to = parse_address(self.imu) if self.imu else None
-                feed(SAMPLE, self.params, parse_address(self.url), imu_to, pace=pace, duration_s=LENGTH_S)
+                feed(SAMPLE, self.params, parse_address(self.url), imu_to, pace=pace, duration_s=length_s)
             except BaseException as error:
                 self.errors.append(error)
 
@@ -200,7 +200,7 @@ def test_an_engine_that_is_killed_is_followed_by_one_that_goes_on_in_the_same_ma
 
 def test_scans_that_an_engine_is_too_slow_for_are_dropped_counted_and_told(live: Live) -> None:
     """At four times real time, and held for a while."""
-    thread = live.play(4.0, patiently=False)
+    thread = live.play(4.0, patiently=False, length_s=14.0)
     live.until(lambda s: s.transport.frame >= 5)
     assert live.engine.pid is not None
     os.kill(live.engine.pid, signal.SIGSTOP)
