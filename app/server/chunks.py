@@ -8,7 +8,7 @@ close together, one takes over the points of the one before it.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -22,6 +22,8 @@ COARSEST_LEVEL: Final = 8
 EMPTY_LEVEL: Final = COARSEST_LEVEL + 1
 MOST_SHOWN: Final = 1000
 """Most keyframes that have points. Each is a draw call in the page."""
+_BY_POINT: Final = ("points", "labels", "intensity", "ring")
+"""Arrays of a chunk and of a keyframe's cloud with one row per point."""
 _SLACK: Final = 0.97
 """A map over budget is thinned to this share of it, so that not every new keyframe thins it again."""
 
@@ -34,11 +36,8 @@ def thinned(keyframe: Keyframe, voxel_size: float) -> Chunk:
         index=keyframe.index,
         frame=keyframe.frame,
         stamp_ns=keyframe.stamp_ns,
-        points=cloud.points[chosen],
-        labels=cloud.labels[chosen],
-        intensity=cloud.intensity[chosen],
-        ring=cloud.ring[chosen],
         T_imu_lidar=keyframe.T_imu_lidar,
+        **{name: getattr(cloud, name)[chosen] for name in _BY_POINT},
     )
 
 
@@ -83,7 +82,10 @@ def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
         where = distance[[chunks[index].index for index in shown]]
         place = 1 + int(np.argmin(where[2:] - where[:-2]))
         index, after = shown.pop(place), shown[place]
-        kept[index], kept[after] = _chosen(kept[index], _NONE, EMPTY_LEVEL), _joined(kept[index], kept[after], poses)
+        kept[index], kept[after] = (
+            _chosen(kept[index], np.empty(0, np.int64), EMPTY_LEVEL),
+            _joined(kept[index], kept[after], poses),
+        )
     return tuple(kept)
 
 
@@ -91,17 +93,12 @@ def _joined(chunk: Chunk, after: Chunk, poses: F64) -> Chunk:
     """The chunk `after` with the points of `chunk`, placed by the present poses, thinned to the level of `after`."""
     T_map_lidar, T_map_after = (poses[one.index] @ one.T_imu_lidar for one in (chunk, after))
     T = lie.inverse(T_map_after) @ T_map_lidar
-    points = (chunk.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-    order = np.random.default_rng(after.index).permutation(len(points) + len(after.points))
-    both = replace(
-        after,
-        points=np.concatenate((points, after.points))[order],
-        labels=np.concatenate((chunk.labels, after.labels))[order],
-        intensity=np.concatenate((chunk.intensity, after.intensity))[order],
-        ring=np.concatenate((chunk.ring, after.ring))[order],
-        joined=chunk.joined + after.joined + 1,
-    )
-    return _at_level(both, after.level) if after.level else both
+    moved = replace(chunk, points=(chunk.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+    both: dict[str, Any] = {name: np.concatenate((getattr(moved, name), getattr(after, name))) for name in _BY_POINT}
+    joined = replace(after, joined=chunk.joined + after.joined + 1, **both)
+    order = np.random.default_rng(after.index).permutation(len(joined.points))
+    joined = _chosen(joined, order, after.level)
+    return _at_level(joined, after.level) if after.level else joined
 
 
 def coarser(chunk: Chunk) -> Chunk:
@@ -115,18 +112,8 @@ def _at_level(chunk: Chunk, level: int) -> Chunk:
     return _chosen(chunk, chosen, level)
 
 
-_NONE: Final = np.empty(0, np.int64)
-
-
 def _chosen(chunk: Chunk, chosen: I64, level: int) -> Chunk:
-    return replace(
-        chunk,
-        points=chunk.points[chosen],
-        labels=chunk.labels[chosen],
-        intensity=chunk.intensity[chosen],
-        ring=chunk.ring[chosen],
-        level=level,
-    )
+    return replace(chunk, level=level, **{name: getattr(chunk, name)[chosen] for name in _BY_POINT})
 
 
 def voxel_of_level(level: int) -> float:

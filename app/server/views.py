@@ -4,6 +4,7 @@ Fields are read from the values that `Snapshot` holds, by name; what has another
 """
 
 import math
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
@@ -17,23 +18,18 @@ from app.server.protocol import LoopsView, Notice, Snapshot
 from app.slam.loops import edit_files
 from app.slam.types import StepResult
 
-
-def _finite(value: float | None) -> float | None:
-    return float(value) if value is not None and math.isfinite(value) else None
-
-
-Finite = Annotated[float | None, BeforeValidator(_finite)]
-"""null where there is no number; JSON knows neither nan nor infinity."""
 Speed = Annotated[float, Field(ge=0.1)] | Literal["max"]
 """Times real time."""
 
 
 class View(BaseModel):
+    """Numbers that are nan become null: JSON has no nan."""
+
     model_config = ConfigDict(from_attributes=True)
 
 
 class RecordingView(View):
-    path: Annotated[str, BeforeValidator(str)]
+    path: Path
     duration_s: float
     frames: int
     findings: list[Finding]
@@ -60,20 +56,20 @@ class FrameView(View):
     velocity: list[float] = Field(description="m/s, odometry frame.")
     ground_found: bool
     ground_reason: str
-    planarity: Finite
+    planarity: float | None
     seeds: int
-    ground_share: Finite
+    ground_share: float | None
     inliers: int
-    residual_rms: Finite
+    residual_rms: float | None
     degenerate: bool
     timings_ms: dict[str, float]
-    distance: Finite = Field(description="Length of the trajectory so far, m.")
-    error: Finite = Field(description="To the truth, aligned to the trajectory so far, m.")
+    distance: float | None = Field(description="Length of the trajectory so far, m.")
+    error: float | None = Field(description="To the truth, aligned to the trajectory so far, m.")
 
 
 class ProgressView(View):
     title: str
-    fraction: Finite
+    fraction: float | None
 
 
 class LiveView(View):
@@ -127,7 +123,7 @@ class StateView(View):
     pending_restart: list[str]
     notices: list[Notice]
     live: LiveView | None
-    session_file: str | None = Field(description="The session file; opening it continues the session.")
+    session_file: Path | None = Field(description="The session file; opening it continues the session.")
     notes: list[Note]
 
 
@@ -143,31 +139,24 @@ def state_view(snapshot: Snapshot) -> StateView:
     computed = {
         "frame": _frame(snapshot.result, snapshot) if snapshot.result else None,
         "keyframes": len(snapshot.chunks),
-        "session_file": str(snapshot.session_file) if snapshot.session_file else None,
     }
     taken = {name: getattr(snapshot, name) for name in StateView.model_fields if name not in computed}
     return StateView.model_validate(taken | computed)
 
 
 def _frame(result: StepResult, snapshot: Snapshot) -> FrameView:
-    T, ground, registration = result.T_map_imu, result.ground, result.registration
+    T, ground = result.T_map_imu, result.ground
     newest = {name: column[-1] for name, column in snapshot.series.items() if len(column)}
     return FrameView(
-        index=result.index,
-        stamp_ns=result.stamp_ns,
-        status=result.status.value,
+        **{name: getattr(result, name) for name in ("index", "stamp_ns", "status", "timings_ms")},
+        **{name: getattr(ground, name) for name in ("planarity", "seeds")},
+        **{name: getattr(result.registration, name) for name in ("inliers", "residual_rms", "degenerate")},
         position=T[:3, 3].tolist(),
         quaternion=Rotation.from_matrix(T[:3, :3]).as_quat().tolist(),
         velocity=result.state.v_odom_imu.tolist(),
         ground_found=ground.found,
         ground_reason=ground.reason,
-        planarity=ground.planarity,
-        seeds=ground.seeds,
         ground_share=ground.share,
-        inliers=registration.inliers,
-        residual_rms=registration.residual_rms,
-        degenerate=registration.degenerate,
-        timings_ms=result.timings_ms,
         distance=newest.get("distance"),
         error=newest.get("error_m"),
     )
