@@ -1,24 +1,173 @@
-"""The timeline and the breakpoints as panels: what they send, and how often."""
+"""The timeline: spikes survive thinning, frames gone back over stay, and the panel sends little; breakpoints."""
 
+import base64
 import html
 import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import viser
+from hypothesis import given
+from hypothesis import strategies as st
 
 from app.mapping.breakpoints import Breakpoints
 from app.server.folders import Folders
-from app.server.protocol import Command, Seek, SetBreakpoints, SetParams, Snapshot, StepFrame
-from app.ui.timeline import TimelinePanel
+from app.server.protocol import (
+    SERIES,
+    Chunk,
+    Command,
+    LoopsView,
+    OpenedRecording,
+    Seek,
+    SetBreakpoints,
+    SetParams,
+    Snapshot,
+    StepFrame,
+    Transport,
+)
+from app.slam import iekf
+from app.slam.loops.types import Evidence, LoopEdge, Verdict
+from app.ui.timeline import COLUMNS, DEGENERATE_CM, STRIPS, History, TimelinePanel, limits, message, packed
 from app.ui.transport import BreakpointPanel
 from app.ui.workbench import Workbench
 from tests.ui.conftest import Clock, Wire, page_of, user_sets
-from tests.ui.fake_engine import FakeEngine
+from tests.ui.fake_engine import START_NS, FakeEngine
+
+HOUR = 36_000
 
 
+def snapshot(frames: int, total: int, session: int = 1, **columns: np.ndarray) -> Snapshot:
+    """Of a recording at 10 Hz; series not named are 1."""
+    series = {name: np.ones(frames) for name in SERIES} | {"stamp_s": 0.1 * np.arange(frames)} | columns
+    recording = OpenedRecording(Path("walk.mcap"), START_NS, 0.1 * total, total, ())
+    return Snapshot(session=session, recording=recording, transport=Transport(frame=frames - 1), series=series)
+
+
+def seen(*snapshots: Snapshot) -> History:
+    history = History()
+    for one in snapshots:
+        history.see(one)
+    return history
+
+
+def unpacked(text: str) -> np.ndarray:
+    """As the page's script reads it."""
+    return np.frombuffer(base64.b64decode(text), "<f4")
+
+
+@given(st.integers(0, HOUR - 1))
+def test_one_bad_frame_in_an_hour_stays_visible_at_its_place(frame: int) -> None:
+    residual = np.full(HOUR, 0.01)
+    residual[frame] = 0.5
+    columns = seen(snapshot(HOUR, HOUR, residual_rms=residual)).columns()
+    high, low = columns.high["residual"], columns.low["residual"]
+    assert len(high) <= COLUMNS
+    (at,) = np.flatnonzero(high > 499)
+    following = columns.starts[at + 1] if at + 1 < len(high) else HOUR
+    assert columns.starts[at] <= frame < following
+    assert low.max() < 11
+
+
+def test_a_short_recording_has_a_column_for_every_frame() -> None:
+    took = np.arange(50.0)
+    columns = seen(snapshot(50, 60, total_ms=took)).columns()
+    assert np.array_equal(columns.starts, np.arange(60))
+    assert np.array_equal(columns.high["took"][:50], took) and np.isnan(columns.high["took"][50:]).all()
+
+
+def test_units_are_those_on_the_label() -> None:
+    one = snapshot(
+        1, 1, residual_rms=np.array([0.012]), inliers=np.array([80.0]), used=np.array([100.0]),
+        degeneracy=np.array([1 / 0.04**2]), ground_share=np.array([0.3]), imu_gap_s=np.array([0.25]),
+        error_m=np.array([0.07]),
+    )  # fmt: skip
+    values = {key: column[0] for key, column in seen(one).columns().high.items()}
+    assert values == pytest.approx(
+        {"residual": 12, "inliers": 80, "uncertain": 4, "ground": 30, "gap": 250, "dropped": 1, "took": 1, "error": 7}
+    )
+    assert [(strip.key, strip.unit) for strip in STRIPS if strip.unit in ("mm", "cm", "ms")] == [
+        ("residual", "mm"), ("uncertain", "cm"), ("gap", "ms"), ("took", "ms"), ("error", "cm"),
+    ]  # fmt: skip
+
+
+def test_what_the_page_calls_degenerate_is_what_the_filter_does() -> None:
+    assert DEGENERATE_CM == 100 * iekf.DEGENERATE_SIGMA
+
+
+def test_frames_gone_back_over_stay_until_they_are_processed_anew() -> None:
+    first = snapshot(40, 60, total_ms=np.full(40, 5.0))
+    history = seen(first, snapshot(10, 60, total_ms=np.full(10, 5.0)))
+    assert history.present == 9
+    assert np.nanmin(history.columns().high["took"][:40]) == 5.0
+    history.see(snapshot(20, 60, total_ms=np.full(20, 7.0)))
+    took = history.columns().high["took"]
+    assert took[19] == 7.0 and took[20] == 5.0
+
+
+def test_frames_gone_back_over_twice_stay_and_another_truth_makes_their_errors_unknown() -> None:
+    history = seen(*(snapshot(n, 60, total_ms=np.full(n, float(n))) for n in (40, 30, 10, 20)))
+    took = history.columns().high["took"]
+    assert took[[0, 19, 20, 29, 30, 39]].tolist() == [20, 20, 30, 30, 40, 40] and np.isnan(took[40:]).all()
+    other = snapshot(20, 60)
+    assert other.recording is not None
+    history.see(replace(other, recording=replace(other.recording, truth=Path("other.tum"))))
+    error = history.columns().high["error"]
+    assert np.isfinite(error[:20]).all() and np.isnan(error[20:]).all()
+    assert np.isfinite(history.columns().high["took"][20:40]).all()
+
+
+def test_another_session_forgets() -> None:
+    history = seen(snapshot(40, 60), snapshot(5, 60, session=2))
+    assert np.isnan(history.columns().high["took"][5:]).all()
+
+
+def edge(newer: int, decided_at: int, verdict: Verdict) -> LoopEdge:
+    return LoopEdge(0, newer, decided_at, np.eye(4), np.eye(6), Evidence(), verdict, "fits")
+
+
+def test_loops_are_where_they_were_decided_and_stay_there_when_going_back() -> None:
+    nothing = np.empty(0)
+    chunks = tuple(Chunk(i, 10 * i, 0, nothing, nothing, nothing, nothing, np.eye(4)) for i in range(4))  # type: ignore[arg-type]
+    loops = LoopsView(edges=(edge(1, 2, Verdict.ACCEPTED), edge(2, 3, Verdict.REJECTED), edge(3, 9, Verdict.ACCEPTED)))
+    history = seen(replace(snapshot(40, 60), chunks=chunks, loops=loops))
+    found = history.columns().loops
+    assert np.flatnonzero(found["accepted"]).tolist() == [20] and np.flatnonzero(found["rejected"]).tolist() == [30]
+    history.see(replace(snapshot(5, 60), chunks=chunks[:1], loops=LoopsView()))
+    assert np.flatnonzero(history.columns().loops["accepted"]).tolist() == [20]
+    history.see(replace(snapshot(35, 60), chunks=chunks, loops=LoopsView()))
+    assert not any(history.columns().loops["accepted"])
+
+
+def test_troubles_are_where_something_begins_to_be_bad() -> None:
+    share = np.full(60, 0.3)
+    share[20:25] = 0.0
+    dropped = np.zeros(60)
+    dropped[[31, 32]] = 1
+    one = snapshot(60, 60, ground_share=share, dropped=dropped, degeneracy=np.full(60, 1e4), imu_gap_s=np.zeros(60))
+    assert seen(one).troubles(limits(one)) == [20, 31]
+
+
+def test_frames_slower_than_the_sensor_are_trouble() -> None:
+    assert limits(snapshot(1, 100))["took"] == pytest.approx(100.0)
+
+
+@given(st.lists(st.one_of(st.floats(0, 1e4), st.just(float("nan"))), min_size=1, max_size=40))
+def test_packed_numbers_come_out_as_they_went_in(numbers: list[float]) -> None:
+    np.testing.assert_allclose(unpacked(packed(np.array(numbers))), numbers, rtol=1e-6, atol=1e-30)
+
+
+def test_a_message_is_small_however_long_the_recording_and_without_truth_has_no_error() -> None:
+    long = snapshot(HOUR, HOUR, error_m=np.full(HOUR, np.nan))
+    sent = message(seen(long), long)
+    assert len(json.dumps(sent)) < 60_000
+    assert [strip["name"] for strip in sent["strips"]] == [s.name for s in STRIPS if s.key != "error"]
+    assert sent["present"] == HOUR - 1
+
+
+# --- the panel -----------------------------------------------------------------------------------
 class Bench:
     def __init__(self, server: viser.ViserServer, engine: FakeEngine) -> None:
         self.clock, self.engine = Clock(), engine
