@@ -14,7 +14,7 @@ from app.slam.loops.messages import (
     TryOut,
 )
 from app.slam.loops.schedule import LoopSchedule
-from app.slam.loops.types import Edits, LoopDetail, LoopEdge, Preview
+from app.slam.loops.types import Edits, LoopDetail, Preview
 
 
 class LoopCommands:
@@ -72,7 +72,7 @@ class LoopCommands:
         state, moved = loops.state, show and loops.state is not self._state
         self._state = state if show else self._state
         if state is not None and moved:
-            if not _same(view.edges, state.edges):
+            if view.edges != state.edges:  # an edge is compared by identity
                 view = replace(view, edges=state.edges)
             if (view.undo, view.redo) != (state.undo, state.redo):
                 view = replace(view, undo=state.undo, redo=state.redo)
@@ -83,7 +83,3 @@ class LoopCommands:
         if view is not self._view:
             self._view = view
             self._page.put(loops=view, urgent=True)
-
-
-def _same(a: tuple[LoopEdge, ...], b: tuple[LoopEdge, ...]) -> bool:
-    return len(a) == len(b) and all(one is other for one, other in zip(a, b, strict=True))

@@ -60,7 +60,7 @@ def saved(tmp_path: Path) -> SavedSession:
     state = State(
         coarse,
         ((0, Params()), (12, coarse)),
-        (Accept(1, 20, 21), Add(2, 30, None, False, 31)),
+        (Accept(1, 20), Add(2, 30, None, False)),
         (Reject(3, 9),),
         tmp_path / "truth.tum",
         (Note(12, 'the "door" opens\nand closes'),),
