@@ -1,6 +1,7 @@
 """The documentation builds without warnings, and what the program fills in is there."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -42,3 +43,10 @@ def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
     links = [part.partition(")")[0] for part in text.split("](")[1:]]
     missing = [link for link in links if not link.startswith("http") and not (ROOT / link).exists()]
     assert not missing
+
+
+def test_every_path_that_the_architecture_names_exists() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    named = re.findall(r"`((?:app|tests|examples|docs)/[\w/.]+)`", text)
+    missing = [path for path in named if not (ROOT / path).exists() and "ROOM" not in path]
+    assert len(named) > 20 and not missing
