@@ -26,7 +26,8 @@ from app.slam.loops.schedule import LoopSchedule
 from app.slam.loops.types import Edits, LoopEdit
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params, leaves
-from app.slam.results import EXPORTS, Results, RunInfo, RunLog, save_results
+from app.slam.results import EXPORTS, Results, save_results
+from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import read_tum, time_apart
 from app.slam.types import F64, DroppedScan, Measurement, StepResult
 

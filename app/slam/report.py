@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -10,14 +10,12 @@ from app import __version__
 from app.slam.errors import HemislamError
 from app.slam.metrics import compare
 from app.slam.provenance import describe_machine, hash_input, peak_memory_mb
+from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64, TIMINGS, FrameStatus
 
-if TYPE_CHECKING:
-    from app.slam.results import RunInfo, RunLog
 
-
-def make_report(log: "RunLog", trajectory: Trajectory, info: "RunInfo") -> dict[str, Any]:
+def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo) -> dict[str, Any]:
     """What report.json holds of a trajectory; numbers that do not exist are NaN or None."""
     score = log.ground_score
     return {
@@ -53,7 +51,7 @@ def make_report(log: "RunLog", trajectory: Trajectory, info: "RunInfo") -> dict[
     }
 
 
-def accuracy(trajectory: Trajectory, info: "RunInfo") -> dict[str, Any] | None:
+def accuracy(trajectory: Trajectory, info: RunInfo) -> dict[str, Any] | None:
     """Errors against the truth, or the reason why they cannot be measured; None without a truth."""
     if info.truth is None:
         return None

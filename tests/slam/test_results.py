@@ -14,7 +14,8 @@ from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.ply import VERTEX, write_map
 from app.slam.report import summarise
-from app.slam.results import EXPORTS, Results, RunInfo, RunLog, save_results
+from app.slam.results import EXPORTS, Results, save_results
+from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import (
     GROUND,
