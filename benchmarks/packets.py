@@ -6,7 +6,7 @@ import numpy as np
 
 from app.sensors.live.decoder import Decoder
 from app.sensors.live.difop import NOMINAL, Calibration, Difop
-from app.sensors.live.frames import Assembler, Frame
+from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.msop import PacketWriter
 from app.sensors.rsbpearl import BPEARL, BPV4, CHANNELS, Model
 from app.slam.types import Scan
@@ -26,7 +26,7 @@ def measure(model: Model) -> list[Line]:
     assembling: list[float] = []
     decoding: list[float] = []
     points = 0
-    frames: list[Frame] = []
+    frames: list[Revolution] = []
     for turn, packets in enumerate(_turns(model)):
         begin = time.perf_counter()
         for packet in packets:

@@ -14,7 +14,7 @@ TRAJECTORIES = (".tum",)
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class FolderEntry:
     """A line of the file browser: a file to choose, or a folder to look into."""
 
     path: Path
@@ -60,7 +60,7 @@ class Folders:
             self.inside(read_session(real).opened.recording)
         return real
 
-    def listing(self, folder: Path | str, suffixes: tuple[str, ...] = RECORDINGS) -> list[Entry]:
+    def listing(self, folder: Path | str, suffixes: tuple[str, ...] = RECORDINGS) -> list[FolderEntry]:
         """The contents of a folder inside: first its folders, then the files that may be chosen, each sorted by name.
 
         Raises:
@@ -92,11 +92,11 @@ class Folders:
         return any(real.is_relative_to(root) for root in self.roots)
 
 
-def _entry(path: Path, suffixes: tuple[str, ...]) -> Entry | None:
+def _entry(path: Path, suffixes: tuple[str, ...]) -> FolderEntry | None:
     if path.is_dir():
         is_recording = suffixes == RECORDINGS and (path / "metadata.yaml").is_file()
         size = sum(file.stat().st_size for file in path.iterdir() if file.is_file()) if is_recording else 0
-        return Entry(path, is_recording, size)
+        return FolderEntry(path, is_recording, size)
     if path.suffix in suffixes and path.is_file():
-        return Entry(path, True, path.stat().st_size)
+        return FolderEntry(path, True, path.stat().st_size)
     return None

@@ -60,7 +60,7 @@ class Pacer:
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class SeekTarget:
     """A frame that was asked for.
 
     Attributes:
@@ -92,7 +92,7 @@ class Player:
         self.session: Session | None = None
         self.breakpoints = Breakpoints()
         self.page_behind = self.relabelling = False
-        self._target: Target | None = None
+        self._target: SeekTarget | None = None
         self._moment: Moment | None = None  # the frame that the page shows
 
     # --- what is asked for -----------------------------------------------------------------------
@@ -103,7 +103,7 @@ class Player:
         self._moment = None
         self._page.opened(session)
         self._pacer.release()
-        self._target = Target(0, -1) if session.frame < 0 else None
+        self._target = SeekTarget(0, -1) if session.frame < 0 else None
 
     def play(self) -> None:
         self._pacer.release()
@@ -166,7 +166,7 @@ class Player:
                 self.fail("Cannot go back", error)
                 return
             self.page_behind |= self._page.transport.frame != session.frame
-        self._target = Target(frame, session.frame, stepping)
+        self._target = SeekTarget(frame, session.frame, stepping)
         self._pacer.release()
         self._arrive(session)
 
@@ -193,7 +193,7 @@ class Player:
         self.halt()
         self._page.notice("error", f"{what}. {reason}")
 
-    def _advance(self, session: Session, target: Target | None) -> float | None:
+    def _advance(self, session: Session, target: SeekTarget | None) -> float | None:
         """Process the next frame if it is due."""
         revisited = session.revisits
         try:

@@ -22,20 +22,20 @@ Speed = Annotated[float, Field(ge=0.1)] | Literal["max"]
 """Times real time."""
 
 
-class View(BaseModel):
+class RestModel(BaseModel):
     """Numbers that are nan become null: JSON has no nan."""
 
     model_config = ConfigDict(from_attributes=True)
 
 
-class RecordingView(View):
+class RecordingView(RestModel):
     path: Path
     duration_s: float
     frames: int
     findings: list[Finding]
 
 
-class TransportView(View):
+class TransportView(RestModel):
     playing: bool
     speed: Annotated[Speed, BeforeValidator(lambda speed: "max" if math.isinf(speed) else speed)]
     frame: int
@@ -45,7 +45,7 @@ class TransportView(View):
     dropped: int
 
 
-class FrameView(View):
+class FrameView(RestModel):
     """The newest frame, without its points."""
 
     index: int
@@ -67,12 +67,12 @@ class FrameView(View):
     error: float | None = Field(description="To the truth, aligned to the trajectory so far, m.")
 
 
-class ProgressView(View):
+class ProgressView(RestModel):
     title: str
     fraction: float | None
 
 
-class LiveView(View):
+class LiveView(RestModel):
     """How the live source is doing."""
 
     lidar_hz: float
@@ -89,7 +89,7 @@ class LiveView(View):
     counters: Counters
 
 
-class LoopView(View):
+class LoopView(RestModel):
     """A loop candidate, by keyframes."""
 
     older: int
@@ -111,7 +111,7 @@ class LoopsState(BaseModel):
     undone: list[dict[str, Any]] = Field(description="Undone edits that can be redone, the next one last.")
 
 
-class StateView(View):
+class StateView(RestModel):
     session: int
     revision: int
     engine_alive: bool

@@ -44,14 +44,14 @@ MOST_CONNECTIONS: Final = 500
 """Beyond that, requests are answered with status 503."""
 
 
-class Page(Protocol):
+class ServedPage(Protocol):
     """Draws the session into viser; implemented by `app.ui.workbench.Workbench`."""
 
     def start(self) -> None: ...
     def close(self) -> None: ...
 
 
-BuildPage = Callable[[viser.ViserServer, Workspace, Folders], Page]
+BuildPage = Callable[[viser.ViserServer, Workspace, Folders], ServedPage]
 
 
 class _AsciiJson(JSONResponse):

@@ -18,7 +18,7 @@ from app.slam.errors import HemislamError
 from app.slam.types import F64, U8, StepResult
 from app.ui import compare_maths as maths
 from app.ui.html import css, heading, panel
-from app.ui.nodes import NO_COLOURS, NO_POINTS, Trajectory, add_points, place
+from app.ui.nodes import NO_COLOURS, NO_POINTS, TrajectoryNode, add_points, place
 from app.ui.sensor import SCAN_POINT_SCALE, shown_of
 from app.ui.widgets import (
     PANEL_PERIOD_S,
@@ -78,7 +78,7 @@ class CompareScene:
     """B's trajectory and sensor, and A's scan coloured by who calls its points ground; below the map's node."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._path = Trajectory(scene, f"{ROOT}/compare_path", maths.B_COLOUR)
+        self._path = TrajectoryNode(scene, f"{ROOT}/compare_path", maths.B_COLOUR)
         self._marker = scene.add_icosphere(
             f"{ROOT}/compare_sensor",
             radius=0.07,

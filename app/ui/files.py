@@ -9,7 +9,7 @@ from typing import Any, Final
 import viser
 
 from app.mapping.session_file import SUFFIX
-from app.server.folders import RECORDINGS, TRAJECTORIES, Entry, Folders
+from app.server.folders import RECORDINGS, TRAJECTORIES, FolderEntry, Folders
 from app.server.protocol import CompareWith, OpenRecording, Save, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.results import EXPORTS
@@ -165,7 +165,7 @@ class FileList:
                 self._button(str(root), viser.Icon.FOLDER, partial(self._go, root))
             return
         self._here.content = panel("path", "", str(folder))
-        entries: list[Entry] = []
+        entries: list[FolderEntry] = []
         try:
             entries = self._folders.listing(folder, self._suffixes)
         except HemislamError as error:

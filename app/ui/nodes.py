@@ -74,7 +74,7 @@ def segments(positions: F64 | F32) -> F32:
     return np.stack((positions[:-1], positions[1:]), axis=1).astype(np.float32)
 
 
-class Trajectory:
+class TrajectoryNode:
     """The estimated path, in blocks of at most `BLOCK` segments below the node `root`."""
 
     def __init__(self, scene: viser.SceneApi, root: str, colour: Rgb = PATH_COLOUR) -> None:

@@ -13,7 +13,7 @@ from app.server.protocol import Snapshot
 from app.slam.types import F64, StepResult
 from app.ui.chunks import MapChunks
 from app.ui.colours import Limits
-from app.ui.nodes import Trajectory, Truth
+from app.ui.nodes import TrajectoryNode, Truth
 from app.ui.sensor import SensorScene
 from app.ui.widgets import ROOT, Changes, View, poses_of
 
@@ -52,7 +52,7 @@ class Scene:
         self._changes = Changes()
         self._chunks = MapChunks(scene, f"{ROOT}/keyframes")
         self._sensor = SensorScene(scene, f"{ROOT}/sensor")
-        self._trajectory = Trajectory(scene, f"{ROOT}/trajectory")
+        self._trajectory = TrajectoryNode(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
         server.initial_camera.position = (-4.0, -4.0, 9.0)  # high enough to look into a corridor without its ceiling
         server.initial_camera.look_at = (0.3, 0.2, -0.6)

@@ -18,7 +18,7 @@ from app.sensors.clocks import TOLERANCE_S
 from app.sensors.findings import Finding
 from app.sensors.live.clock import JUMP_NS, ClockMap
 from app.sensors.live.difop import DIFOP_ID, Difop, read_angles, read_difop
-from app.sensors.live.frames import Assembler, Frame
+from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.imu_udp import IMU_MAGIC, ImuOrder, ImuSample
 from app.sensors.live.msop import MSOP_ID
 from app.sensors.live.pcap import Capture, Place
@@ -72,7 +72,7 @@ class CaptureStream:
             if isinstance(content, ImuSample) and ros.IMU_TOPIC in topics:
                 stamp_ns = content.stamp_ns + _value_at(self._imu_shifts, log_ns)
                 yield ros.IMU_TOPIC, log_ns, ros.imu_message(stamp_ns, content.gyro, content.accel)
-            elif isinstance(content, Frame) and ros.LIDAR_TOPIC in topics:
+            elif isinstance(content, Revolution) and ros.LIDAR_TOPIC in topics:
                 if self._devices and (said := _value_at(self._devices, log_ns)) is not device:
                     device = said
                     self._decoder.configure(said)
@@ -88,7 +88,7 @@ class CaptureStream:
 
     def _read(
         self, place: Place | None, running_ns: int, counters: Counters
-    ) -> Iterator[tuple[int, Place, Frame | ImuSample | Difop]]:
+    ) -> Iterator[tuple[int, Place, Revolution | ImuSample | Difop]]:
         """Log time, place in the file, and what was complete there; from a place on, or all.
 
         Args:
@@ -121,7 +121,7 @@ class CaptureStream:
                 if not self._devices or not content.same(self._devices[-1][1]):
                     self._devices.append((log_ns, content))
                 continue
-            if isinstance(content, Frame):
+            if isinstance(content, Revolution):
                 lidar.extend((int(content.stamps_ns[-1]), log_ns))
                 self._complete_at.append((log_ns, place))
                 self._model = content.model.name

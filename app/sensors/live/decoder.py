@@ -3,7 +3,7 @@
 import numpy as np
 
 from app.sensors.live.difop import NOMINAL, Calibration, Difop
-from app.sensors.live.frames import Frame
+from app.sensors.live.frames import Revolution
 from app.sensors.live.kernels import decode_blocks
 from app.sensors.live.msop import BLOCK_BYTES, BLOCKS, HEADER_BYTES, PACKET_BYTES, TURN
 from app.sensors.rsbpearl import BPEARL, CHANNELS
@@ -42,10 +42,10 @@ class Decoder:
         """Compile or load the kernel before the first packet arrives."""
         packets = np.zeros((1, PACKET_BYTES), np.uint8)
         packets.setflags(write=False)
-        self.decode(Frame(BPEARL, packets, np.zeros(1, np.int64), 0, BLOCKS, 0))
+        self.decode(Revolution(BPEARL, packets, np.zeros(1, np.int64), 0, BLOCKS, 0))
         self.bad_blocks = 0
 
-    def decode(self, frame: Frame) -> Scan | DroppedScan:
+    def decode(self, frame: Revolution) -> Scan | DroppedScan:
         """The scan in firing order: block by block, in each by channel."""
         model = frame.model
         room = len(frame.packets) * BLOCKS * CHANNELS
@@ -72,7 +72,7 @@ class Decoder:
             array.setflags(write=False)
         return scan
 
-    def _step(self, frame: Frame) -> float:
+    def _step(self, frame: Revolution) -> float:
         """0.01 deg from block to block: the median, or what follows from the stated speed."""
         at = HEADER_BYTES + 2 + BLOCK_BYTES * np.arange(BLOCKS)
         azimuth = (frame.packets[:, at].astype(np.int64) << 8) | frame.packets[:, at + 1]

@@ -27,7 +27,7 @@ Pending = tuple[int, int, bytes]
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class Revolution:
     """The packets of one revolution, in order of time.
 
     Attributes:
@@ -63,7 +63,7 @@ class Assembler:
         self._sense = 0
         self._index: int | None = None
 
-    def add(self, packet: bytes, arrival_ns: int) -> list[Frame]:
+    def add(self, packet: bytes, arrival_ns: int) -> list[Revolution]:
         """Revolutions that this packet completes, mostly none. arrival_ns: by the host's clock."""
         if not self._is_msop(packet):
             return []
@@ -74,7 +74,7 @@ class Assembler:
             stamp = arrival_ns
         entry = (stamp, arrival_ns, packet)
         newest = self._pending[-1][0] if self._pending else self._given_ns
-        frames: list[Frame] = []
+        frames: list[Revolution] = []
         if newest is not None and (abs(stamp - newest) > JUMP_NS or model is not self._model):
             suspect, self._suspect = self._suspect, entry
             if suspect is None or abs(stamp - suspect[0]) > JUMP_NS or model is not model_of(suspect[2]):
@@ -93,7 +93,7 @@ class Assembler:
             frames += self._check()
         return frames
 
-    def flush(self) -> Iterator[Frame]:
+    def flush(self) -> Iterator[Revolution]:
         """The revolutions so far, complete or not: the input is over, or silent."""
         while self._checked < len(self._pending):
             yield from self._check()
@@ -146,7 +146,7 @@ class Assembler:
         else:
             self.counters.lost = max(self.counters.lost - 1, 0)
 
-    def _check(self) -> list[Frame]:
+    def _check(self) -> list[Revolution]:
         """Look for the end of a revolution in the next packet."""
         at = self._checked
         self._checked += 1
@@ -166,7 +166,7 @@ class Assembler:
             before = azimuth[block]
         return []
 
-    def _split(self, at: int, block: int) -> Frame:
+    def _split(self, at: int, block: int) -> Revolution:
         """End the revolution before this block of the packet `at`; the next one begins there."""
         frame = self._take(at + 1, block) if block else self._take(at, BLOCKS)
         self._pending = self._pending[at:]
@@ -174,13 +174,13 @@ class Assembler:
         self._checked = 0
         return frame
 
-    def _take(self, packets: int, stop: int) -> Frame:
+    def _take(self, packets: int, stop: int) -> Revolution:
         taken = self._pending[:packets]
         assert self._model is not None
         self.counters.frames += 1
         self._given_ns = taken[-1][0] if stop == BLOCKS else taken[-2][0] if len(taken) > 1 else self._given_ns
         data = np.frombuffer(b"".join(packet for _, _, packet in taken), np.uint8)
-        return Frame(
+        return Revolution(
             model=self._model,
             packets=data.reshape(len(taken), PACKET_BYTES),
             stamps_ns=np.array([stamp for stamp, _, _ in taken], np.int64),

@@ -11,7 +11,7 @@ from collections import deque
 
 from app.sensors.live.decoder import Decoder
 from app.sensors.live.difop import DIFOP_ID, Calibration, Difop, read_difop
-from app.sensors.live.frames import Assembler, Frame
+from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.imu_udp import ImuOrder
 from app.sensors.live.intake import Intake
 from app.sensors.live.msop import MSOP_ID
@@ -100,7 +100,7 @@ class RsbpearlReceiver:
         self._assembler = Assembler()
         self._wait_until_ns: int | None = None
         self._device: Difop | None = None
-        self._frames: deque[Frame] = deque()
+        self._frames: deque[Revolution] = deque()
         self._known_angles = angles is not None
         self._sensor: Peer | None = None
         self._heard_s = 0.0

@@ -15,7 +15,7 @@ from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops.detection import Detector, Head
 from app.slam.loops.drift import Drift
-from app.slam.loops.edits import EditList, Entry, check, in_words
+from app.slam.loops.edits import EditEntry, EditList, check, in_words
 from app.slam.loops.factors import Closing, Factor, PositionPrior, loop_factors, odometry_factor, residuals
 from app.slam.loops.messages import Target
 from app.slam.loops.pose_graph import PoseGraph
@@ -309,17 +309,17 @@ class LoopBackend:
         poses = self._optimum(edges)
         return Preview(poses, residuals(self._factors(edges), poses))
 
-    def _entry(self, edit: LoopEdit) -> Entry:
+    def _entry(self, edit: LoopEdit) -> EditEntry:
         """With the loop that it adds. Raises HemislamError if its registration found nothing in common."""
         if not isinstance(edit, Add) or edit.newer >= len(self):
-            return Entry(edit)
+            return EditEntry(edit)
         edge = self._made(edit)
         if edit.register and not edge.evidence.overlap:
             raise HemislamError(
                 f"The surroundings of keyframes {edge.older} and {edge.newer} have nothing in common from there;"
                 " nudge one nearer to where it belongs, or tie them without registration."
             )
-        return Entry(edit, edge)
+        return EditEntry(edit, edge)
 
     def _made(self, edit: Add) -> LoopEdge:
         older, newer = edit.older, edit.newer
@@ -351,7 +351,7 @@ class LoopBackend:
         """(k, 4, 4) T_map_imu by the incremental solver."""
         return self._graph.poses[: len(self)]
 
-    def _edges(self, found: dict[Pair, LoopEdge], extra: Entry | None = None) -> dict[Pair, LoopEdge]:
+    def _edges(self, found: dict[Pair, LoopEdge], extra: EditEntry | None = None) -> dict[Pair, LoopEdge]:
         edges = self._edits.lay_over(found, len(self), extra)
         for pair in self._broken & edges.keys():
             edges[pair] = replace(edges[pair], verdict=Verdict.REJECTED, reason="the solver failed with it")

@@ -28,7 +28,7 @@ from app.slam.types import F64
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class EditEntry:
     """An edit, and the loop that an Add made; None while it waits for its keyframes."""
 
     edit: LoopEdit
@@ -45,10 +45,10 @@ class EditList:
 
     def __init__(self) -> None:
         self.reached = 0
-        self._done: list[Entry] = []
-        self._undone: list[Entry] = []
+        self._done: list[EditEntry] = []
+        self._undone: list[EditEntry] = []
 
-    def __iter__(self) -> Iterator[Entry]:
+    def __iter__(self) -> Iterator[EditEntry]:
         return iter(self._done)
 
     @property
@@ -70,7 +70,7 @@ class EditList:
         """The greatest `since`; in edits of a session with more keyframes it may lie beyond the end."""
         return max((entry.edit.since for entry in [*self._done, *self._undone]), default=0)
 
-    def give(self, entry: Entry) -> None:
+    def give(self, entry: EditEntry) -> None:
         self._done.append(entry)
         self._undone.clear()
 
@@ -83,8 +83,8 @@ class EditList:
         """Replace all edits; loops that were added by those that stay are kept. Returns whether anything changed."""
         known = {entry.edit: entry for entry in [*self._undone, *self._done]}  # whatever their `since`
 
-        def entry_of(edit: LoopEdit) -> Entry:
-            entry = known.get(edit, Entry(edit))
+        def entry_of(edit: LoopEdit) -> EditEntry:
+            entry = known.get(edit, EditEntry(edit))
             return entry if entry.edit.since == edit.since else replace(entry, edit=edit)
 
         before, self._done = self._done, [entry_of(edit) for edit in edits.done]
@@ -104,7 +104,7 @@ class EditList:
         """
         before = self._done
 
-        def resolved(entry: Entry) -> Entry:
+        def resolved(entry: EditEntry) -> EditEntry:
             edit = entry.edit
             if not isinstance(edit, Add) or entry.added is not None or edit.since > self.reached:
                 return entry
@@ -123,7 +123,9 @@ class EditList:
             for entries in (self._done, self._undone)
         )
 
-    def lay_over(self, found: Mapping[Pair, LoopEdge], count: int, extra: Entry | None = None) -> dict[Pair, LoopEdge]:
+    def lay_over(
+        self, found: Mapping[Pair, LoopEdge], count: int, extra: EditEntry | None = None
+    ) -> dict[Pair, LoopEdge]:
         """What was found, as it counts with the edits, and with one more if given.
 
         Args:

@@ -13,7 +13,7 @@ from app.slam.types import I64, Keyframe
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class KeyframeEntry:
     """The frame of a keyframe, its stamp, and the parameters to look for loops with."""
 
     frame: int
@@ -21,7 +21,7 @@ class Entry:
     params: LoopsParams
 
 
-class KeyframeLog(Log[Entry]):
+class KeyframeLog(Log[KeyframeEntry]):
     """All keyframes in order, including those beyond the present frame after going back.
 
     Attributes:
@@ -53,7 +53,7 @@ class KeyframeLog(Log[Entry]):
     def take_stored(self, params: LoopsParams) -> None:
         """Add what the store holds and this log does not: keyframes of an engine whose session this one continues."""
         for index in range(len(self), len(self.store)):
-            self.append(Entry(*self.store.when(index), params))
+            self.append(KeyframeEntry(*self.store.when(index), params))
             self.stored = len(self)
 
 

@@ -16,7 +16,7 @@ from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
 from app.slam.log import Cursor
 from app.slam.loops.files import LoopResults
-from app.slam.loops.keyframe_log import Entry, KeyframeLog
+from app.slam.loops.keyframe_log import KeyframeEntry, KeyframeLog
 from app.slam.loops.messages import (
     Answer,
     Answered,
@@ -127,7 +127,7 @@ class LoopSchedule:
         self._finished, self._params = False, params
         if not self._log.holds(keyframe):
             self._forget(keyframe.index)
-            self._log.append(Entry(keyframe.frame, keyframe.stamp_ns, params))
+            self._log.append(KeyframeEntry(keyframe.frame, keyframe.stamp_ns, params))
         self._ask_next()
 
     def go_to(self, frame: int) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.sensors.live.decoder import Decoder
-from app.sensors.live.frames import Assembler, Frame
+from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.status import Counters
 from app.slam.types import Scan
 from tests.sensors.live import sensor
@@ -14,13 +14,13 @@ from tests.sensors.live import sensor
 TURNS = 6
 
 
-def frames_of(packets: list[bytes], counters: Counters | None = None) -> list[Frame]:
+def frames_of(packets: list[bytes], counters: Counters | None = None) -> list[Revolution]:
     assembler = Assembler(counters)
     found = [frame for packet in packets for frame in assembler.add(packet, 0)]
     return [*found, *assembler.flush()]
 
 
-def scans_of(frames: list[Frame]) -> list[Scan]:
+def scans_of(frames: list[Revolution]) -> list[Scan]:
     decoder = Decoder()
     return [scan for frame in frames if isinstance(scan := decoder.decode(frame), Scan)]
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from app.sensors.live.decoder import Decoder
 from app.sensors.live.difop import NOMINAL, Calibration, Difop, read_angles, read_difop, write_difop
-from app.sensors.live.frames import Assembler, Frame
+from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.msop import PacketWriter, stamp_of, write_packet
 from app.sensors.rsbpearl import BPEARL, BPV4
 from app.slam.errors import HemislamError
@@ -211,7 +211,7 @@ def test_a_real_frame_comes_out_where_another_driver_put_its_points(shared_data:
             blocks[0][1][channel[at]] = (round(truth["range"][at] / 0.0025), int(truth["intensity"][at]))
         packets.append(np.frombuffer(sensor.msop(sensor.START_NS, blocks, v4=True), np.uint8))
         times.append(sensor.START_NS + 10_000 * number)
-    frame = Frame(BPV4, np.array(packets), np.array(times), 0, 12, 0)
+    frame = Revolution(BPV4, np.array(packets), np.array(times), 0, 12, 0)
     scan = Decoder(angles).decode(frame)
     assert isinstance(scan, Scan)
     assert len(scan) > 0.999 * len(truth)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.slam.keyframes import KeyframeStore
-from app.slam.loops.keyframe_log import Entry, KeyframeLog
+from app.slam.loops.keyframe_log import KeyframeEntry, KeyframeLog
 from app.slam.loops.messages import (
     Added,
     AddKeyframe,
@@ -170,13 +170,13 @@ def test_inline_loops_follow_the_log_and_answer_in_order(walked: Walked) -> None
     assert loops.receive() is None
     for keyframe in walked.keyframes[:3]:
         store.append(keyframe)
-        log.append(Entry(keyframe.frame, keyframe.stamp_ns, PARAMS))
+        log.append(KeyframeEntry(keyframe.frame, keyframe.stamp_ns, PARAMS))
         loops.send(Ask(Target(keyframe.index + 1)))
     log.truncate(1)
     store.truncate(1)
     loops.send(Ask(Target(ALL)))
     store.append(walked.keyframes[1])
-    log.append(Entry(walked.keyframes[1].frame, 0, PARAMS))
+    log.append(KeyframeEntry(walked.keyframes[1].frame, 0, PARAMS))
     loops.send(Ask(Target(2)))
     replies = [loops.receive() for _ in range(5)]
     assert [reply.count for reply in replies if isinstance(reply, LoopState)] == [1, 2, 3, 3, 2]
