@@ -1,4 +1,7 @@
-"""Child processes: messages, death, signals, orderly ends, and the fork server."""
+"""Child processes: messages, death, signals, orderly ends, and the fork server.
+
+Tests app/fork_server.py.
+"""
 
 import os
 import signal

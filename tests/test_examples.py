@@ -1,4 +1,7 @@
-"""The examples run as a user would run them, and come to the right results."""
+"""The examples run as a user would run them, and come to the right results.
+
+Tests app/mapping/feed.py.
+"""
 
 import os
 import re

@@ -17,7 +17,7 @@ Value = bool | float | None
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class CheckedFrame:
     """A frame as the breakpoints see it: its result, and its error to the truth (m; nan)."""
 
     result: StepResult
@@ -53,12 +53,12 @@ class Breakpoint:
     name: str
     title: str
     hint: str
-    find: Callable[[Moment, float], list[str]]
+    find: Callable[[CheckedFrame, float], list[str]]
     limit: Limit | None = None
     event: bool = False
 
 
-def _loops(moment: Moment, verdict: Verdict, word: str) -> list[str]:
+def _loops(moment: CheckedFrame, verdict: Verdict, word: str) -> list[str]:
     return [
         f"Loop {word} between keyframes {edge.older} and {edge.newer}: {edge.reason}."
         for edge in moment.result.loops
@@ -66,45 +66,45 @@ def _loops(moment: Moment, verdict: Verdict, word: str) -> list[str]:
     ]
 
 
-def _loop_found(moment: Moment, _: float) -> list[str]:
+def _loop_found(moment: CheckedFrame, _: float) -> list[str]:
     return _loops(moment, Verdict.ACCEPTED, "found")
 
 
-def _loop_rejected(moment: Moment, _: float) -> list[str]:
+def _loop_rejected(moment: CheckedFrame, _: float) -> list[str]:
     return _loops(moment, Verdict.REJECTED, "rejected")
 
 
-def _no_ground(moment: Moment, _: float) -> list[str]:
+def _no_ground(moment: CheckedFrame, _: float) -> list[str]:
     ground = moment.result.ground
     return [] if ground.found else [f"No ground plane: {ground.reason}."]
 
 
-def _degenerate(moment: Moment, _: float) -> list[str]:
+def _degenerate(moment: CheckedFrame, _: float) -> list[str]:
     update = moment.result.registration
     return [f"Degenerate: {update.reason or 'this scan leaves one direction unobserved'}."] if update.degenerate else []
 
 
-def _dropped(moment: Moment, _: float) -> list[str]:
+def _dropped(moment: CheckedFrame, _: float) -> list[str]:
     count = moment.result.dropped
     return [f"{'1 scan was' if count == 1 else f'{count} scans were'} dropped just before this frame."] if count else []
 
 
-def _planarity(moment: Moment, limit: float) -> list[str]:
+def _planarity(moment: CheckedFrame, limit: float) -> list[str]:
     value = moment.result.ground.planarity
     return [f"λ3/λ2 of the seeds is {value:.3f}, over {limit:g}."] if value > limit else []
 
 
-def _residual(moment: Moment, limit: float) -> list[str]:
+def _residual(moment: CheckedFrame, limit: float) -> list[str]:
     value = moment.result.registration.residual_rms
     return [f"The residual is {1e3 * value:.1f} mm, over {1e3 * limit:g} mm."] if value > limit else []
 
 
-def _frame_ms(moment: Moment, limit: float) -> list[str]:
+def _frame_ms(moment: CheckedFrame, limit: float) -> list[str]:
     value = moment.result.timings_ms.get("total", math.nan)
     return [f"The frame took {value:.1f} ms, over {limit:g} ms."] if value > limit else []
 
 
-def _error(moment: Moment, limit: float) -> list[str]:
+def _error(moment: CheckedFrame, limit: float) -> list[str]:
     value = moment.error
     return [f"The error to truth is {100 * value:.1f} cm, over {100 * limit:g} cm."] if value > limit else []
 
@@ -169,7 +169,7 @@ class Breakpoints(Mapping[str, Value]):
         return self._chosen.copy()
 
 
-def reasons(breakpoints: Breakpoints, before: Moment | None, now: Moment) -> tuple[str, ...]:
+def reasons(breakpoints: Breakpoints, before: CheckedFrame | None, now: CheckedFrame) -> tuple[str, ...]:
     """Why to pause at `now`, one sentence each; none: go on.
 
     Args:

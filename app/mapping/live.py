@@ -11,7 +11,8 @@ from pathlib import Path
 from app.mapping.feed import Feed, FeedInfo, Quiet
 from app.mapping.loops import RestartingLoops
 from app.mapping.session import Session
-from app.sensors.live.process import LiveAddress, LiveClient
+from app.sensors.live.address import LiveAddress
+from app.sensors.live.process import LiveClient
 from app.sensors.live.status import LiveState
 from app.slam.engine import Engine
 from app.slam.errors import HemislamError

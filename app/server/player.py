@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.mapping.breakpoints import Breakpoints, Moment, reasons
+from app.mapping.breakpoints import Breakpoints, CheckedFrame, reasons
 from app.mapping.feed import Quiet
 from app.mapping.session import EFFECT, Session
 from app.server.protocol import Progress
@@ -93,7 +93,7 @@ class Player:
         self.breakpoints = Breakpoints()
         self.page_behind = self.relabelling = False
         self._target: SeekTarget | None = None
-        self._moment: Moment | None = None  # the frame that the page shows
+        self._moment: CheckedFrame | None = None  # the frame that the page shows
 
     # --- what is asked for -----------------------------------------------------------------------
     def take(self, session: Session) -> None:
@@ -237,7 +237,7 @@ class Player:
 
     def _passed(self, session: Session, result: StepResult, *, played: bool) -> None:
         """Pause where a breakpoint holds, unless the frame is one on the way to another."""
-        before, self._moment = self._moment, Moment(result)
+        before, self._moment = self._moment, CheckedFrame(result)
         if self.breakpoints["error"] is not None and before is not None and session.frame > 0:
             errors = session.errors()
             before, self._moment = replace(before, error=errors[-2]), replace(self._moment, error=errors[-1])
@@ -251,7 +251,7 @@ class Player:
         if self.page_behind and session is not None:
             self.page_behind = False
             self._page.arrived(session, session.result)
-            self._moment = Moment(session.result) if session.result is not None else None
+            self._moment = CheckedFrame(session.result) if session.result is not None else None
             self.settle_labels(session)
 
     def settle_labels(self, session: Session) -> None:

@@ -9,7 +9,7 @@ from app.mapping.breakpoints import Breakpoints
 from app.slam.params import Params
 
 if TYPE_CHECKING:
-    from app.sensors.live.process import LiveAddress
+    from app.sensors.live.address import LiveAddress
 
 
 POINT_BUDGET = 3_000_000

@@ -1,4 +1,7 @@
-"""`hemislam evaluate` from the outside: the tables, resuming after a kill, and what it refuses."""
+"""`hemislam evaluate` from the outside: the tables, resuming after a kill, and what it refuses.
+
+Tests app/evaluation/job.py, app/evaluation/runner.py, app/evaluation/variants.py.
+"""
 
 import json
 import os

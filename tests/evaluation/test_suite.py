@@ -1,4 +1,7 @@
-"""The twins of the paper's sequences: as long as these, the same every time, and one without a loop."""
+"""The twins of the paper's sequences: as long as these, the same every time, and one without a loop.
+
+Tests app/cli/options.py, app/evaluation/paper.py.
+"""
 
 from pathlib import Path
 

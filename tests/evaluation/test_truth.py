@@ -1,4 +1,7 @@
-"""Truth of every format gives the same poses; truth that cannot be used is refused in one sentence."""
+"""Truth of every format gives the same poses; truth that cannot be used is refused in one sentence.
+
+Tests app/evaluation/truth_match.py.
+"""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""The workbench, `replay` of its session and `run` write the same bytes, also of loops that only the end brings."""
+"""The workbench, `replay` of its session and `run` write the same bytes, also of loops that only the end brings.
+
+Tests app/mapping/opening.py.
+"""
 
 import math
 import time

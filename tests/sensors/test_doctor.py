@@ -1,4 +1,7 @@
-"""The doctor names what is wrong with a recording, and nothing else."""
+"""The doctor names what is wrong with a recording, and nothing else.
+
+Tests app/sensors/clocks.py.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""The same walk reads the same from every container, from any start, and from the recordings of others."""
+"""The same walk reads the same from every container, from any start, and from the recordings of others.
+
+Tests app/slam/provenance.py.
+"""
 
 import hashlib
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""The simulated walk and what its IMU feels."""
+"""The simulated walk and what its IMU feels.
+
+Tests app/sensors/simulator/trajectory.py.
+"""
 
 import numpy as np
 import pytest

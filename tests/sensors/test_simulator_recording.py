@@ -1,4 +1,7 @@
-"""What the simulator writes: layout, stamps, truth, and agreement with recordings that it did not make."""
+"""What the simulator writes: layout, stamps, truth, and agreement with recordings that it did not make.
+
+Tests app/sensors/simulator/simulate.py.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""Contracts with libraries: adapters alone use private names, and tests name what an upgrade has changed."""
+"""Contracts with libraries: adapters alone use private names, and tests name what an upgrade has changed.
+
+Tests app/server/viser_adapter.py.
+"""
 
 import ast
 from collections.abc import Iterator

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import server_fakes as fakes
 
-from app.mapping.breakpoints import Breakpoints, Moment, reasons
+from app.mapping.breakpoints import Breakpoints, CheckedFrame, reasons
 from app.mapping.session import Session
 from app.server.controller import Controller
 from app.server.fold import Fold
@@ -67,7 +67,7 @@ GOOD = frame()
     ],
 )
 def test_a_state_pauses_where_it_begins_and_says_so_with_its_number(chosen: Breakpoints, says: str) -> None:
-    good, bad = Moment(GOOD), Moment(spoilt(GOOD))
+    good, bad = CheckedFrame(GOOD), CheckedFrame(spoilt(GOOD))
     assert reasons(chosen, good, bad) == (says,)
     assert reasons(chosen, bad, bad) == ()
     assert reasons(chosen, bad, good) == ()
@@ -77,36 +77,36 @@ def test_a_state_pauses_where_it_begins_and_says_so_with_its_number(chosen: Brea
 
 def test_an_error_that_is_not_known_is_no_error() -> None:
     chosen = Breakpoints(error=0.5)
-    assert reasons(chosen, Moment(GOOD), Moment(GOOD, math.nan)) == ()
-    assert reasons(chosen, Moment(GOOD, math.nan), Moment(GOOD, 0.512)) == (
+    assert reasons(chosen, CheckedFrame(GOOD), CheckedFrame(GOOD, math.nan)) == ()
+    assert reasons(chosen, CheckedFrame(GOOD, math.nan), CheckedFrame(GOOD, 0.512)) == (
         "The error to truth is 51.2 cm, over 50 cm.",
     )
 
 
 def test_scans_left_out_pause_every_time() -> None:
-    before, now = Moment(frame(dropped=1)), Moment(frame(dropped=2))
+    before, now = CheckedFrame(frame(dropped=1)), CheckedFrame(frame(dropped=2))
     assert reasons(Breakpoints(dropped=True), before, now) == ("2 scans were dropped just before this frame.",)
-    assert reasons(Breakpoints(dropped=True), now, Moment(GOOD)) == ()
+    assert reasons(Breakpoints(dropped=True), now, CheckedFrame(GOOD)) == ()
 
 
 def test_a_loop_pauses_at_the_frame_at_which_it_takes_effect_and_says_why() -> None:
     result = frame(loops=(edge(Verdict.REJECTED, 11), edge(Verdict.ACCEPTED), edge(Verdict.CANDIDATE, 12)))
     found, turned_down = Breakpoints(loop_found=True), Breakpoints(loop_rejected=True)
-    before = Moment(GOOD)
-    assert reasons(found, before, Moment(result)) == (
+    before = CheckedFrame(GOOD)
+    assert reasons(found, before, CheckedFrame(result)) == (
         "Loop found between keyframes 2 and 9: overlap 0.2 is below 0.5.",
     )
-    assert reasons(turned_down, before, Moment(result)) == (
+    assert reasons(turned_down, before, CheckedFrame(result)) == (
         "Loop rejected between keyframes 2 and 11: overlap 0.2 is below 0.5.",
     )
-    assert reasons(found, Moment(result), Moment(GOOD)) == ()
+    assert reasons(found, CheckedFrame(result), CheckedFrame(GOOD)) == ()
 
 
 def test_the_users_own_word_on_a_loop_pauses_nothing() -> None:
     overruled = replace(edge(Verdict.ACCEPTED), edited=True)
     added = replace(edge(Verdict.ACCEPTED), origin=Origin.USER)
     result = frame(loops=(overruled, added))
-    assert reasons(Breakpoints(loop_found=True), Moment(GOOD), Moment(result)) == ()
+    assert reasons(Breakpoints(loop_found=True), CheckedFrame(GOOD), CheckedFrame(result)) == ()
 
 
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])

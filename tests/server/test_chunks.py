@@ -1,4 +1,7 @@
-"""Of a map that outgrows its budget of points, what is far is thinned, and what is thinned away is held nowhere."""
+"""Of a map that outgrows its budget of points, what is far is thinned, and what is thinned away is held nowhere.
+
+Tests app/server/publisher.py.
+"""
 
 from dataclasses import replace
 

@@ -1,4 +1,7 @@
-"""Two settings side by side: B is what A would be with other parameters, goes where A goes, and costs A nothing."""
+"""Two settings side by side: B is what A would be with other parameters, goes where A goes, and costs A nothing.
+
+Tests app/server/protocol.py.
+"""
 
 import os
 import signal

@@ -1,4 +1,7 @@
-"""Engines that die one after the other on live data, at every moment: nothing is missed, and nothing counted twice."""
+"""Engines that die one after the other on live data, at every moment: nothing is missed, and nothing counted twice.
+
+Tests app/sensors/live/address.py, app/sensors/live/receiver.py.
+"""
 
 import random
 import secrets
@@ -15,7 +18,7 @@ from test_rewind import SAMPLE
 from app.mapping.live import open_live_session
 from app.mapping.session import Session
 from app.sensors.live import receiver
-from app.sensors.live.process import LiveAddress
+from app.sensors.live.address import LiveAddress
 from app.sensors.live.receiver import ScanServer
 from app.sensors.live.source import Event
 from app.sensors.live.status import LiveState

@@ -1,4 +1,7 @@
-"""The REST interface over a real socket."""
+"""The REST interface over a real socket.
+
+Tests app/server/api.py.
+"""
 
 import socket
 import time

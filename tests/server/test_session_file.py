@@ -1,4 +1,7 @@
-"""A session is a file: reopened it is where it was, repeated headless it gives the same, killed it loses a moment."""
+"""A session is a file: reopened it is where it was, repeated headless it gives the same, killed it loses a moment.
+
+Tests app/server/controller.py, app/server/loop_commands.py, app/server/player.py.
+"""
 
 import json
 import math

@@ -1,4 +1,7 @@
-"""The public port over real sockets: the page, tokens and origins, https, and how the server ends."""
+"""The public port over real sockets: the page, tokens and origins, https, and how the server ends.
+
+Tests app/server/address.py.
+"""
 
 import asyncio
 import json

@@ -1,4 +1,7 @@
-"""The engine in a process of its own: over real pipes, killed for real."""
+"""The engine in a process of its own: over real pipes, killed for real.
+
+Tests app/server/engine_process.py, app/server/setup.py, app/slam/warmup.py.
+"""
 
 import os
 import signal

@@ -1,4 +1,7 @@
-"""The filter's update: where it ends up, and its algebra against textbook formulas and SciPy's optimiser."""
+"""The filter's update: where it ends up, and its algebra against textbook formulas and SciPy's optimiser.
+
+Tests app/slam/kernels/registration.py.
+"""
 
 from dataclasses import fields, replace
 

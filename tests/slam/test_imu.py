@@ -1,4 +1,7 @@
-"""Propagation against an independent integrator, its covariance against statistics, deskew against the world."""
+"""Propagation against an independent integrator, its covariance against statistics, deskew against the world.
+
+Tests app/slam/kernels/motion.py.
+"""
 
 from dataclasses import replace
 

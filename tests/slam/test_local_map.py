@@ -1,4 +1,7 @@
-"""The local map against brute force, and what bounds its memory."""
+"""The local map against brute force, and what bounds its memory.
+
+Tests app/slam/kernels/map.py, app/slam/sections.py.
+"""
 
 from dataclasses import fields
 

@@ -1,4 +1,7 @@
-"""Trajectory errors against evo, and what must hold whatever the trajectories are."""
+"""Trajectory errors against evo, and what must hold whatever the trajectories are.
+
+Tests app/slam/trajectory.py.
+"""
 
 from pathlib import Path
 

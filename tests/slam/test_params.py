@@ -1,4 +1,7 @@
-"""The parameter tree: every declaration is complete, every value survives YAML, every mistake is named."""
+"""The parameter tree: every declaration is complete, every value survives YAML, every mistake is named.
+
+Tests app/slam/errors.py, app/slam/user_text.py.
+"""
 
 from typing import Any
 

@@ -1,4 +1,7 @@
-"""What a run writes: complete, readable by others, and never over older results by accident."""
+"""What a run writes: complete, readable by others, and never over older results by accident.
+
+Tests app/slam/ply.py, app/slam/run_log.py.
+"""
 
 import csv
 import hashlib

@@ -1,4 +1,7 @@
-"""Voxel-grid downsampling against a dictionary."""
+"""Voxel-grid downsampling against a dictionary.
+
+Tests app/slam/kernels/clouds.py.
+"""
 
 import numpy as np
 import pytest

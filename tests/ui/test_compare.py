@@ -1,4 +1,7 @@
-"""A and B on one page: what differs, in numbers, in plots and in space, and what is asked for."""
+"""A and B on one page: what differs, in numbers, in plots and in space, and what is asked for.
+
+Tests app/ui/compare_maths.py.
+"""
 
 import time
 from collections.abc import Callable, Iterator

@@ -1,4 +1,7 @@
-"""The pure parts of the page: colours, thinning, ceilings and the shapes that explain a scan."""
+"""The pure parts of the page: colours, thinning, ceilings and the shapes that explain a scan.
+
+Tests app/ui/colours.py, app/ui/geometry.py, app/ui/nodes.py, app/ui/sensor.py.
+"""
 
 import numpy as np
 import pytest

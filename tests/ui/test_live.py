@@ -1,4 +1,7 @@
-"""The panel of a live source, and the transport while there is one."""
+"""The panel of a live source, and the transport while there is one.
+
+Tests app/ui/html.py.
+"""
 
 import html
 import re

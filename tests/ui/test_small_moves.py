@@ -1,4 +1,7 @@
-"""Loops move most of a map by almost nothing: the page is sent such moves only when they add up."""
+"""Loops move most of a map by almost nothing: the page is sent such moves only when they add up.
+
+Tests app/ui/widgets.py.
+"""
 
 import numpy as np
 import pytest

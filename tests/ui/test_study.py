@@ -1,4 +1,7 @@
-"""A frame under study: what is coloured how, which point a click means, what is said of it."""
+"""A frame under study: what is coloured how, which point a click means, what is said of it.
+
+Tests app/ui/study_maths.py.
+"""
 
 from dataclasses import replace
 from typing import Any

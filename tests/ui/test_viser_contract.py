@@ -1,4 +1,7 @@
-"""What `app.ui.viser_adapter` assumes of viser's page. When an upgrade breaks it, a sentence says what fails."""
+"""What `app.ui.viser_adapter` assumes of viser's page. When an upgrade breaks it, a sentence says what fails.
+
+Tests app/ui/viser_adapter.py.
+"""
 
 from pathlib import Path
 

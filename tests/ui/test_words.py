@@ -1,4 +1,7 @@
-"""What the panels say, and how they plot."""
+"""What the panels say, and how they plot.
+
+Tests app/ui/files.py, app/ui/readouts.py, app/ui/status.py.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,7 @@
-"""The whole page, drawn at the pace of eyes."""
+"""The whole page, drawn at the pace of eyes.
+
+Tests app/ui/appearance.py.
+"""
 
 from collections import Counter
 from dataclasses import replace

@@ -21,7 +21,7 @@ from app.sensors.live.difop import DIFOP_ID, Difop, read_angles, read_difop
 from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.imu_udp import IMU_MAGIC, ImuOrder, ImuSample
 from app.sensors.live.msop import MSOP_ID
-from app.sensors.live.pcap import Capture, Place
+from app.sensors.live.pcap import Capture, CapturePlace
 from app.sensors.live.status import Counters
 from app.slam.types import I64, Scan
 
@@ -53,7 +53,7 @@ class CaptureStream:
         self._decoder = Decoder(read_angles(sidecar) if sidecar.is_file() else None)
         self._angles = f"from {sidecar.name}" if sidecar.is_file() else ""
         self._devices: list[tuple[int, Difop]] = []
-        self._complete_at: list[tuple[int, Place]] = []
+        self._complete_at: list[tuple[int, CapturePlace]] = []
         self._counters = Counters()
         self._index()
         self.complete = self._capture.complete
@@ -87,15 +87,15 @@ class CaptureStream:
         """Nothing stays open between two readings."""
 
     def _read(
-        self, place: Place | None, running_ns: int, counters: Counters
-    ) -> Iterator[tuple[int, Place, Revolution | ImuSample | Difop]]:
+        self, place: CapturePlace | None, running_ns: int, counters: Counters
+    ) -> Iterator[tuple[int, CapturePlace, Revolution | ImuSample | Difop]]:
         """Log time, place in the file, and what was complete there; from a place on, or all.
 
         Args:
             running_ns: the newest log time before that place. counters: of what was lost.
         """
         assembler, order = Assembler(counters), ImuOrder(counters)
-        at = place or Place(0)
+        at = place or CapturePlace(0)
         for datagram in self._capture.datagrams(place):
             at, running_ns, payload = datagram.place, max(running_ns, datagram.time_ns), datagram.payload
             found: list[Any] = []

@@ -35,7 +35,7 @@ class _Interface:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class CapturePlace:
     """Where a captured frame begins in the file; byte order and interfaces there, by the headers before it."""
 
     position: int
@@ -47,12 +47,12 @@ class Place:
 class Datagram:
     """One UDP datagram. place: of the captured frame that completes it."""
 
-    place: Place
+    place: CapturePlace
     time_ns: int
     payload: bytes
 
 
-Captured = tuple[Place, int, int, bytes]
+Captured = tuple[CapturePlace, int, int, bytes]
 """A captured frame: place in the file, time ns, type of network, bytes."""
 
 
@@ -69,16 +69,16 @@ class Capture:
         self.complete = True
         with path.open("rb") as file:
             start = file.read(24)
-        self._frames, self._start = self._next_frames, Place(0)
+        self._frames, self._start = self._next_frames, CapturePlace(0)
         if start[:4] != NEXT_MAGIC:
             if start[:4] not in CLASSIC_MAGIC or len(start) < 24:
                 raise CaptureError("it does not begin like a capture")
             order = "<" if start[:4] in (CLASSIC_MAGIC[0], CLASSIC_MAGIC[2]) else ">"
             units = 1_000_000_000 if start[:4] in CLASSIC_MAGIC[2:] else 1_000_000
             link = int(struct.unpack_from(order + "I", start, 20)[0]) & 0xFFFF
-            self._frames, self._start = self._classic_frames, Place(24, order, (_Interface(link, units),))
+            self._frames, self._start = self._classic_frames, CapturePlace(24, order, (_Interface(link, units),))
 
-    def datagrams(self, place: Place | None = None) -> Iterator[Datagram]:
+    def datagrams(self, place: CapturePlace | None = None) -> Iterator[Datagram]:
         """UDP datagrams from a frame's place on, or all; up to the end, or where the file makes no sense."""
         waiting: dict[bytes, _Fragments] = {}
         place = place or self._start
@@ -91,7 +91,7 @@ class Capture:
                     if payload is not None:
                         yield Datagram(at, time_ns, payload)
 
-    def _classic_frames(self, file: BinaryIO, place: Place) -> Iterator[Captured]:
+    def _classic_frames(self, file: BinaryIO, place: CapturePlace) -> Iterator[Captured]:
         header = struct.Struct(place.order + "4I")
         (interface,) = place.interfaces
         while True:
@@ -106,10 +106,10 @@ class Capture:
             if len(data) < length:
                 break
             time_ns = seconds * 1_000_000_000 + fraction * 1_000_000_000 // interface.units
-            yield Place(position, place.order, place.interfaces), time_ns, interface.link, data
+            yield CapturePlace(position, place.order, place.interfaces), time_ns, interface.link, data
         self.complete = False
 
-    def _next_frames(self, file: BinaryIO, place: Place) -> Iterator[Captured]:
+    def _next_frames(self, file: BinaryIO, place: CapturePlace) -> Iterator[Captured]:
         order, interfaces = place.order, place.interfaces
         while True:
             position = file.tell()
@@ -134,7 +134,7 @@ class Capture:
                 if number < len(interfaces):
                     interface = interfaces[number]
                     time_ns = (high << 32 | low) * 1_000_000_000 // interface.units + interface.offset_ns
-                    yield Place(position, order, interfaces), time_ns, interface.link, body[20 : 20 + captured]
+                    yield CapturePlace(position, order, interfaces), time_ns, interface.link, body[20 : 20 + captured]
         self.complete = False
 
 

@@ -8,19 +8,19 @@ If the receiving process itself dies, another one takes over at the same address
 of clocks, units and counts. To the engine it looks as if the sensors had been silent.
 """
 
-import contextlib
 import logging
 import secrets
 import tempfile
 import threading
 import time
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from multiprocessing.connection import Client, Connection
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from app.child import Child, ChildDied, Link, RestartLimit
+from app.sensors.live.address import ENDED, TITLE, LiveAddress
 from app.sensors.live.recorder import further
 from app.sensors.live.source import Event, Known
 from app.sensors.live.status import LiveState
@@ -29,34 +29,12 @@ from app.slam.params import Params
 
 log = logging.getLogger(__name__)
 
-TITLE: Final = "The process that receives live data"
 MOST_RESTARTS, WITHIN_S = 4, 60.0
 """If it dies once more within this time (s), it is not started again."""
-ENDED: Final = f"{TITLE} has ended; start hemislam again."
 _START_S, _STOP_S = 30.0, 10.0
 """How long it may take to open the source, and to finish the recording."""
 _RETRY_S = 0.5
 """Between two attempts to start it again."""
-
-
-@dataclass(frozen=True, slots=True)
-class LiveAddress:
-    """Where a `LiveProcess` is polled; passed to the engine's process."""
-
-    path: str
-    key: bytes
-
-    def end(self, reason: str) -> None:
-        """Say that nothing will answer there any more. The first reason counts."""
-        with contextlib.suppress(OSError), Path(f"{self.path}.ended").open("x", encoding="utf-8") as file:
-            file.write(reason)
-
-    def ended(self) -> str:
-        """Why nothing will answer there any more; "" while something may."""
-        try:
-            return Path(f"{self.path}.ended").read_text(encoding="utf-8") or ENDED
-        except OSError:
-            return "" if Path(self.path).parent.is_dir() else ENDED
 
 
 class LiveProcess(AbstractContextManager["LiveProcess"]):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from app.child import Link
-from app.sensors.live.process import LiveAddress
+from app.sensors.live.address import LiveAddress
 from app.sensors.live.source import Event, Known, LiveSource
 from app.sensors.live.urls import open_live
 from app.slam.errors import HemislamError

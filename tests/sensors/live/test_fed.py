@@ -1,4 +1,7 @@
-"""A recording played out over real sockets arrives as the file has it."""
+"""A recording played out over real sockets arrives as the file has it.
+
+Tests app/sensors/live/feed.py, app/sensors/live/urls.py.
+"""
 
 import contextlib
 import math

@@ -1,4 +1,7 @@
-"""`hemislam feed` explains itself, and refuses what cannot be in one sentence."""
+"""`hemislam feed` explains itself, and refuses what cannot be in one sentence.
+
+Tests app/__main__.py, app/cli/feed.py, app/cli/replay.py, app/cli/serve.py.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,8 @@
-"""The client understands any bridge: both protocol names, ROS 1 and 2, connections that end, nonsense."""
+"""The client understands any bridge: both protocol names, ROS 1 and 2, connections that end, nonsense.
+
+Tests app/sensors/live/foxglove_server.py, app/sensors/live/pcap.py, app/sensors/mcap_stream.py, app/sensors/probe.py,
+app/sensors/source.py.
+"""
 
 import contextlib
 import json

@@ -1,4 +1,7 @@
-"""Revolutions come whole out of what a network does to packets, and nothing that comes in stops the rest."""
+"""Revolutions come whole out of what a network does to packets, and nothing that comes in stops the rest.
+
+Tests app/sensors/live/decoder.py, app/sensors/live/status.py.
+"""
 
 import random
 

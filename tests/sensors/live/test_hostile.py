@@ -1,4 +1,7 @@
-"""What no well-behaved sensor does: it costs a count or one sentence, and nothing else."""
+"""What no well-behaved sensor does: it costs a count or one sentence, and nothing else.
+
+Tests app/sensors/ros.py.
+"""
 
 import random
 import socket

@@ -1,4 +1,7 @@
-"""IMU datagrams: in order whatever the network did, and the sender that the documentation gives works."""
+"""IMU datagrams: in order whatever the network did, and the sender that the documentation gives works.
+
+Tests app/sensors/live/udp.py.
+"""
 
 import random
 import re

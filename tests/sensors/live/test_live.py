@@ -1,4 +1,7 @@
-"""A live source survives what sensors, networks and a busy engine do, and says so."""
+"""A live source survives what sensors, networks and a busy engine do, and says so.
+
+Tests app/sensors/live/clock.py, app/sensors/live/intake.py, app/sensors/live/source.py.
+"""
 
 import random
 import socket

@@ -1,4 +1,7 @@
-"""The sensor's packets mean what the vendor's tables say, in every mode the sensor has."""
+"""The sensor's packets mean what the vendor's tables say, in every mode the sensor has.
+
+Tests app/sensors/live/difop.py, app/sensors/live/msop.py.
+"""
 
 from pathlib import Path
 

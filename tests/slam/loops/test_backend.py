@@ -1,4 +1,7 @@
-"""What a walk with drifting odometry comes to: loops found, its history, and what is shown of it."""
+"""What a walk with drifting odometry comes to: loops found, its history, and what is shown of it.
+
+Tests app/slam/loops/files.py, app/slam/loops/search.py.
+"""
 
 import csv
 from dataclasses import replace

@@ -1,3 +1,8 @@
+"""The pose graph meets an independent solver, survives failures and takes factors on one pose.
+
+Tests app/slam/loops/factors.py, app/slam/loops/solvers.py, app/slam/loops/detection.py.
+"""
+
 from dataclasses import replace
 from pathlib import Path
 

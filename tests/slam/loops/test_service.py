@@ -1,4 +1,7 @@
-"""The loop back end as a function of the keyframes it was given and of the question."""
+"""The loop back end as a function of the keyframes it was given and of the question.
+
+Tests app/slam/loops/keyframe_log.py, app/slam/loops/messages.py.
+"""
 
 import numpy as np
 import pytest

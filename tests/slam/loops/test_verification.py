@@ -1,3 +1,8 @@
+"""Submaps are registered to one another, and places that fit twice are noticed.
+
+Tests app/slam/loops/ambiguity.py, app/slam/kernels/patches.py.
+"""
+
 import numpy as np
 import pytest
 

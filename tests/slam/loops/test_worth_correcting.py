@@ -1,4 +1,7 @@
-"""Loops that odometry meets already are not followed, since that would only add their noise."""
+"""Loops that odometry meets already are not followed, since that would only add their noise.
+
+Tests app/slam/loops/verdicts.py.
+"""
 
 from dataclasses import replace
 

@@ -1,4 +1,7 @@
-"""The small drawings for one loop, and which edge an eye means."""
+"""The small drawings for one loop, and which edge an eye means.
+
+Tests app/ui/loops/edges.py, app/ui/loops/panel.py.
+"""
 
 import numpy as np
 import pytest
