@@ -185,7 +185,7 @@ def test_the_loops_process_killed_twice_is_revived_and_leaves_the_same_files(
         assert walk.session.loops is not None
         client = walk.session.loops._client  # only a test has a reason to know it
         assert isinstance(client, RestartingLoops)
-        process = client._worker
+        process = client._process
         assert isinstance(process, LoopProcess)
         os.kill(process.pid, signal.SIGKILL)
 
