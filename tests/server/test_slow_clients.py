@@ -134,6 +134,7 @@ def test_beyond_the_limit_of_connections_requests_are_turned_away(
     with serving(engine, target, tmp_path, None) as site:
         with talking(site, *([b"GET"] * 30)):
             until(lambda: httpx.get(site.url("/healthz")).status_code == 503)
+            assert httpx.get(site.url("/healthz")).status_code == 503, "as long as the connections are there"
         until(lambda: httpx.get(site.url("/healthz")).status_code == 200)
 
 

@@ -137,8 +137,8 @@ class LiveClient:
     While the process is started again, there are no scans.
 
     Attributes:
-        place: number of the scan that was given last; the receiving process counts, whoever polls. Set it to that of
-            an engine that died, and `poll` goes on behind it; 0 is before the first.
+        place: number of the scan that was given last, as the receiving process counts them; 0 before the first.
+            Set it to that of an engine that died, and `poll` goes on behind it.
 
     Raises:
         HemislamError: the process has ended for good.
