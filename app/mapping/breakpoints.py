@@ -1,7 +1,6 @@
-"""Conditions at which playing pauses, and the sentence that says which one held.
+"""Conditions at which playing pauses, and sentences that say which ones held.
 
-`BREAKPOINTS` declares them: a new one is one entry and one function. The page, REST and session files read
-the table. Pure: two frames in, sentences out.
+`BREAKPOINTS` declares them: a new one is one entry and one function. The page, REST and session files read the table.
 """
 
 import math
@@ -24,14 +23,13 @@ class CheckedFrame:
     error: float = math.nan
 
 
+Find = Callable[[CheckedFrame, float], list[str]]
+"""Why a condition with this limit holds at a frame, in sentences; none if it does not."""
+
+
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A number that must be exceeded.
-
-    Attributes:
-        unit, default, step: as on the page, which shows `scale` times the breakpoint's own number.
-        base_unit: of that number.
-    """
+    """A number that must be exceeded, in `base_unit`. The page shows it times `scale`, in `unit`."""
 
     unit: str
     default: float
@@ -45,33 +43,27 @@ class Breakpoint:
     """A condition.
 
     Attributes:
-        title, hint: for the page. find: why it holds at a frame, in sentences; none if it does not.
-        limit: of what must be exceeded; None: it is a switch.
+        title, hint: for the page. limit: None for a switch.
         event: counts at every frame. Other conditions count where they begin, so that Play goes on from there.
     """
 
     name: str
     title: str
     hint: str
-    find: Callable[[CheckedFrame, float], list[str]]
+    find: Find
     limit: Limit | None = None
     event: bool = False
 
 
-def _loops(moment: CheckedFrame, verdict: Verdict, word: str) -> list[str]:
-    return [
-        f"Loop {word} between keyframes {edge.older} and {edge.newer}: {edge.reason}."
-        for edge in moment.result.loops
-        if edge.verdict is verdict and not edge.edited and edge.origin is not Origin.USER  # the user knows of those
-    ]
+def _loops(verdict: Verdict, word: str) -> Find:
+    def find(moment: CheckedFrame, _: float) -> list[str]:
+        return [
+            f"Loop {word} between keyframes {edge.older} and {edge.newer}: {edge.reason}."
+            for edge in moment.result.loops
+            if edge.verdict is verdict and not edge.edited and edge.origin is not Origin.USER  # the user knows of those
+        ]
 
-
-def _loop_found(moment: CheckedFrame, _: float) -> list[str]:
-    return _loops(moment, Verdict.ACCEPTED, "found")
-
-
-def _loop_rejected(moment: CheckedFrame, _: float) -> list[str]:
-    return _loops(moment, Verdict.REJECTED, "rejected")
+    return find
 
 
 def _no_ground(moment: CheckedFrame, _: float) -> list[str]:
@@ -89,43 +81,44 @@ def _dropped(moment: CheckedFrame, _: float) -> list[str]:
     return [f"{'1 scan was' if count == 1 else f'{count} scans were'} dropped just before this frame."] if count else []
 
 
-def _planarity(moment: CheckedFrame, limit: float) -> list[str]:
-    value = moment.result.ground.planarity
-    return [f"λ3/λ2 of the seeds is {value:.3f}, over {limit:g}."] if value > limit else []
+def _over(value: Callable[[CheckedFrame], float], sentence: str, scale: float = 1.0) -> Find:
+    """A number of the frame exceeds the limit. sentence: with places for both, times `scale`."""
 
+    def find(moment: CheckedFrame, limit: float) -> list[str]:
+        now = value(moment)
+        return [sentence.format(scale * now, scale * limit)] if now > limit else []
 
-def _residual(moment: CheckedFrame, limit: float) -> list[str]:
-    value = moment.result.registration.residual_rms
-    return [f"The residual is {1e3 * value:.1f} mm, over {1e3 * limit:g} mm."] if value > limit else []
-
-
-def _frame_ms(moment: CheckedFrame, limit: float) -> list[str]:
-    value = moment.result.timings_ms.get("total", math.nan)
-    return [f"The frame took {value:.1f} ms, over {limit:g} ms."] if value > limit else []
-
-
-def _error(moment: CheckedFrame, limit: float) -> list[str]:
-    value = moment.error
-    return [f"The error to truth is {100 * value:.1f} cm, over {100 * limit:g} cm."] if value > limit else []
+    return find
 
 
 BREAKPOINTS: Final = (
-    Breakpoint("loop_found", "loop found", "A loop was accepted.", _loop_found, event=True),
-    Breakpoint("loop_rejected", "loop rejected", "A loop candidate was rejected.", _loop_rejected, event=True),
+    Breakpoint("loop_found", "loop found", "A loop was accepted.", _loops(Verdict.ACCEPTED, "found"), event=True),
+    Breakpoint(
+        "loop_rejected", "loop rejected", "A loop candidate was rejected.", _loops(Verdict.REJECTED, "rejected"),
+        event=True,
+    ),
     Breakpoint("no_ground", "no ground", "The seeds gave no plane; the notice says why.", _no_ground),
     Breakpoint("degenerate", "degenerate", "The scan does not constrain one direction.", _degenerate),
     Breakpoint("dropped", "scan dropped", "A scan was not processed.", _dropped, event=True),
-    Breakpoint("planarity", "λ3/λ2 over", "The seeds are less flat than this.", _planarity, Limit("", 0.3, 0.01)),
     Breakpoint(
-        "residual", "residual over", "RMS distance of the points to the map's planes.", _residual,
+        "planarity", "λ3/λ2 over", "The seeds are less flat than this.",
+        _over(lambda one: one.result.ground.planarity, "λ3/λ2 of the seeds is {:.3f}, over {:g}."),
+        Limit("", 0.3, 0.01),
+    ),
+    Breakpoint(
+        "residual", "residual over", "RMS distance of the points to the map's planes.",
+        _over(lambda one: one.result.registration.residual_rms, "The residual is {:.1f} mm, over {:g} mm.", 1e3),
         Limit("mm", 50.0, 1.0, 1000.0, "m"),
     ),
     Breakpoint(
-        "frame_ms", "frame over", "Time that the engine took for the frame.", _frame_ms,
+        "frame_ms", "frame over", "Time that the engine took for the frame.",
+        _over(lambda one: one.result.timings_ms.get("total", math.nan), "The frame took {:.1f} ms, over {:g} ms."),
         Limit("ms", 100.0, 1.0, base_unit="ms"),
     ),
     Breakpoint(
-        "error", "error over", "Distance to the truth, where there is one.", _error, Limit("cm", 50.0, 1.0, 100.0, "m")
+        "error", "error over", "Distance to the truth, where there is one.",
+        _over(lambda one: one.error, "The error to truth is {:.1f} cm, over {:g} cm.", 100.0),
+        Limit("cm", 50.0, 1.0, 100.0, "m"),
     ),
 )  # fmt: skip
 _BY_NAME: Final = {one.name: one for one in BREAKPOINTS}

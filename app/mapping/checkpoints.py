@@ -6,8 +6,10 @@ Which ones are kept follows from frame numbers and sizes alone, never from the c
 import logging
 import pickle
 import sqlite3
+from dataclasses import dataclass
 from typing import Any
 
+from app.slam.engine import EngineState
 from app.slam.errors import HemislamError
 
 log = logging.getLogger(__name__)
@@ -22,6 +24,15 @@ DENSE = 16_000
 DISK_SHARE = 4
 """Disk space that checkpoints may take, in multiples of the memory; beyond it they become sparser."""
 START = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A session after a frame, without the frames themselves. place: in its feed."""
+
+    frame: int
+    engine: EngineState
+    place: Any
 
 
 class Checkpoints:

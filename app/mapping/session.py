@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from app.mapping import truth as truths
-from app.mapping.checkpoints import NEAR, Checkpoints
+from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelEdit, LabelledKeyframes
 from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
 from app.sensors.findings import Finding
-from app.slam import engine
 from app.slam.engine import Engine
 from app.slam.errors import HemislamError
 from app.slam.frames import Frame
@@ -35,20 +34,11 @@ EFFECT = {leaf.path: leaf.effect for leaf in leaves()}
 _NO_LOOPS = MapFrame()
 
 
-@dataclass(frozen=True, slots=True)
-class Checkpoint:
-    """A session after a frame. The frames themselves are in the session's log."""
-
-    frame: int
-    engine: engine.EngineState
-    place: Any
-
-
 class Session:
     """One pass through a feed, frame by frame. `serve`, `run`, `replay` and `evaluate` all drive this.
 
-    A session that went back knows how it went on before, up to frame `known`, until it goes on
-    differently. A session that repeats a file knows it up to frame `planned`.
+    After going back, the session knows the frames up to `known` until it goes on differently. A session that repeats a
+    file knows its frames up to `planned`.
 
     Args:
         loops: makes the client that looks for loops, `InlineLoops` for example; None: odometry alone.
@@ -56,15 +46,13 @@ class Session:
         checkpoints: to go back to; None: the session only goes on.
 
     Attributes:
-        frame: index of the newest frame, -1 before the first. result: what the engine made of it; None
-            before the first, and right after going back.
-        frames: all that are known, also those after `frame` that the session went back over.
-        planned: the last frame that a session file tells of, -1 if there is none.
+        frame: index of the newest frame, -1 before the first. result: of it; None before the first frame and right
+            after going back.
+        frames: all that are known, also those after `frame`. planned: the last frame of a session file, or -1.
         heading: frames up to this one are repeated as they were, see `go_to`.
-        history: from which frame on which parameters were in force, ascending.
         params: for frames not yet processed; set them with `choose`.
-        ended: whether the feed has no more to give.
-        label_edits: of the keyframes' points, in the order in which they were made.
+        history: parameters by the frame from which they apply, ascending.
+        ended: the feed has no more to give. label_edits: of the keyframes' points, oldest first.
 
     Raises:
         HemislamError: the truth cannot be read.
@@ -79,14 +67,11 @@ class Session:
         truth: Path | None = None,
         checkpoints: Checkpoints | None = None,
     ) -> None:
-        self.truth = read_tum(truth) if truth else None
-        self.truth_path = truth
-        self.feed = feed
-        self.engine = engine
+        self.truth, self.truth_path = read_tum(truth) if truth else None, truth
+        self.feed, self.engine, self.params = feed, engine, engine.params
         self.loops = LoopSchedule(loops, engine.keyframes, engine.params.loops) if loops else None
         if self.loops and not feed.repeatable:
             self.loops.never_go_back()
-        self.params = engine.params
         self.frame = self.planned = self.heading = -1
         self.result: StepResult | None = None
         self.history: tuple[tuple[int, Params], ...] = ()
@@ -122,8 +107,8 @@ class Session:
     def advance(self) -> StepResult | DroppedScan | Quiet | None:
         """Process the next frame. Returns its result, or what `peek` gives if that is no measurement.
 
-        On the way to a frame (`go_to`) the parameters are those of then, else the present ones. A scan on
-        which the engine fails is used up; one on which it failed before is a `DroppedScan`.
+        Frames that are repeated (`go_to`) use the parameters they had. A scan on which the engine fails is left out;
+        when it is repeated, a `DroppedScan` is returned.
 
         Raises:
             HemislamError: the feed cannot be read any further. Exception: the engine failed.
@@ -192,7 +177,7 @@ class Session:
 
     # --- parameters and edits --------------------------------------------------------------------
     def choose(self, params: Params) -> None:
-        """Use these for all frames not yet processed, but for those that act on restart."""
+        """Use these for all frames not yet processed, except those that take effect on restart."""
         waiting = [path for path in self.params.changed(params) if EFFECT[path] == "restart"]
         usable = params.with_values({path: self.params.value(path) for path in waiting})
         if usable != self.params:
@@ -204,27 +189,18 @@ class Session:
         return next((params for first, params in reversed(self.history) if first <= frame), None)
 
     def edit_loops(self, edits: tuple[LoopEdit, ...], undone: tuple[LoopEdit, ...] = ()) -> None:
-        """Put these edits over the loops that are found, now and later; the undone ones can be redone.
-
-        Raises:
-            HemislamError: loops are not looked for.
-        """
+        """Replace all loop edits; the undone ones can be redone. Raises HemislamError: the loop search is off."""
         if self.loops is None:
             raise HemislamError("Loops are not looked for, so there are none to edit; set loops.enabled.")
         self.loops.command(lambda _: Edits(edits, undone))
 
     def resume(self, saved: SavedSession) -> None:
-        """Plan to repeat a session of this recording: `go_to` its frame repeats it as it went.
-
-        Raises:
-            HemislamError: it edits loops, and none are looked for.
-        """
+        """Plan to repeat a session of this recording: `go_to` its frame does so. Raises as `edit_loops`."""
         state = saved.state
         self.choose(state.params)
         if state.edits or state.undone:
             self.edit_loops(state.edits, state.undone)
-        self.history = state.history
-        self.planned = saved.frame
+        self.history, self.planned = state.history, saved.frame
 
     @property
     def edits(self) -> tuple[tuple[LoopEdit, ...], tuple[LoopEdit, ...]]:
@@ -244,10 +220,10 @@ class Session:
 
     # --- going back ------------------------------------------------------------------------------
     def go_to(self, frame: int) -> None:
-        """Head for a frame that is known or planned: `advance` repeats all up to it as it was.
+        """Head for a frame that is known or planned: `advance` repeats all frames up to it.
 
-        If it lies behind, or a later checkpoint is nearer, the session is at that checkpoint now.
-        Saves under way are waited for: they may read keyframes that are about to be replaced.
+        The session goes to the nearest checkpoint if that saves frames. Saves under way are finished first, since they
+        read keyframes that are about to be replaced.
 
         Raises:
             HemislamError: the feed cannot go back, or a checkpoint cannot be read; nothing has changed.
@@ -274,11 +250,7 @@ class Session:
     def checkpoint(self) -> Checkpoint:
         """The present state. Call it between two frames, with nothing peeked at."""
         assert self._waiting is None
-        return Checkpoint(
-            frame=self.frame,
-            engine=self.engine.checkpoint(),
-            place=self.feed.place(),
-        )
+        return Checkpoint(self.frame, self.engine.checkpoint(), self.feed.place())
 
     def return_to(self, checkpoint: Checkpoint) -> None:
         """Be where a checkpoint of this session was taken."""
@@ -317,24 +289,21 @@ class Session:
         return (*info.findings, *([Finding("truth", "needs you", apart)] if apart else []))
 
     def compare_with(self, path: Path | None) -> None:
-        """Compare with another trajectory, or none, from now on.
+        """Compare with another trajectory, or none.
 
         Raises:
-            HemislamError: the feed has no end yet, or the trajectory cannot be read or shares no time with it;
-                nothing has changed.
+            HemislamError: the session is live, or the trajectory cannot be read or shares no time with it.
         """
         info = self.feed.info
         if info.duration_s is None:
-            raise HemislamError(
-                "A live session cannot be compared with a trajectory; record it, and open the recording."
-            )
+            raise HemislamError("A live session cannot be compared with a trajectory; record it, then open the file.")
         truth = read_tum(path) if path else None
         if truth and (apart := time_apart(str(path), truth.stamps_ns, info.start_ns, info.duration_s)):
             raise HemislamError(apart)
         self.truth, self.truth_path = truth, path
 
     def errors(self) -> F64:
-        """(frame + 1,) m, distances of the frames so far to the truth, which is aligned to them; nan without truth."""
+        """(frame + 1,) m, distances to the truth, which is aligned to the frames so far; nan without truth."""
         if self.truth is None:
             return np.full(self.frame + 1, np.nan)
         return truths.errors(self.truth, self.map_frame.trajectory(self.log.odometry))
@@ -348,16 +317,14 @@ class Session:
         replace: bool = True,
         stopped: str = "",
     ) -> "Future[dict[str, Any]]":
-        """Write the results of the frames so far, in a thread of its own.
-
-        All loops that are known of count, whether in effect yet or not.
+        """Write the results of the frames so far in a thread of its own, with all loops, in effect or not.
 
         Args:
             session: to be written beside them. trajectory_only: nothing but trajectory.tum.
             replace: overwrite older results. stopped: why the session ended early, if it did.
 
         Returns:
-            What report.json holds, or HemislamError if the folder cannot be written to.
+            The content of report.json, or HemislamError if the folder cannot be written to.
         """
         info = self.feed.info
         made_from = RunInfo(info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped)

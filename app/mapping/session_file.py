@@ -1,8 +1,7 @@
-"""A session as a file: what was opened, and everything that its present state follows from.
+"""Session files: what was opened, and everything that the present state follows from.
 
-Lines of JSON that are only appended, so a file that was cut anywhere holds the session up to its last
-whole line. The engine is deterministic: a session is the recording, the parameters by the frame from
-which they were in force, the edits of loops, and the frame that it is at.
+Lines of JSON are only appended, so a file that was cut anywhere holds the session up to its last whole line. The engine
+is deterministic: the recording, the parameters by the frame from which they apply, the loop edits and the frame suffice.
 
     {"hemislam": "0.3.0", "format": 2, "recording": "/data/walk.mcap", ...}    what was opened
     {"frame": 120, "did": "SetParams", "values": {"ground.alpha": 30}}         what the user did, for people
@@ -17,12 +16,14 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any
 
+import msgspec
 import yaml
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator, TypeAdapter
 
 from app import __version__
 from app.mapping.breakpoints import Breakpoints
@@ -61,29 +62,51 @@ class Opened:
     nbytes: int = 0
 
 
+_Params = Annotated[Params, PlainValidator(Params().with_values), PlainSerializer(Params().changed)]
+_Edits = Annotated[
+    tuple[LoopEdit, ...],
+    PlainValidator(lambda entries: edit_files.read(yaml.safe_dump(entries))),
+    PlainSerializer(lambda edits: yaml.safe_load(edit_files.write(edits))),
+]
+_Path = Annotated[Path, PlainSerializer(lambda path: str(path.resolve()))]
+_Note = Annotated[
+    Note, PlainValidator(lambda entry: Note(*entry)), PlainSerializer(lambda note: (note.frame, note.text))
+]
+_Breakpoints = Annotated[
+    Breakpoints, PlainValidator(lambda chosen: Breakpoints(**chosen)), PlainSerializer(lambda points: points.chosen)
+]
+_Speed = Annotated[
+    float,
+    BeforeValidator(lambda speed: math.inf if speed == "max" else speed),
+    PlainSerializer(lambda speed: "max" if math.isinf(speed) else speed),
+]
+
+
 @dataclass(frozen=True, slots=True)
 class State:
     """Attributes:
-    params: as chosen now. history: from which frame on which were in force, ascending.
+    params: as chosen now. history: parameters by the frame from which they apply, ascending.
     edits: of loops, in force. undone: those that can be redone, the next one last.
-    truth: what the trajectory is compared with. notes: in the order in which they were made.
-    breakpoints: where playing pauses. speed: to play at.
+    truth: trajectory to compare with. notes: in the order in which they were made. speed: to play at.
     """
 
-    params: Params
-    history: tuple[tuple[int, Params], ...] = ()
-    edits: tuple[LoopEdit, ...] = ()
-    undone: tuple[LoopEdit, ...] = ()
-    truth: Path | None = None
-    notes: tuple[Note, ...] = ()
-    breakpoints: Breakpoints = field(default_factory=Breakpoints)
-    speed: float = 1.0
+    params: _Params
+    history: tuple[tuple[int, _Params], ...] = ()
+    edits: _Edits = ()
+    undone: _Edits = ()
+    truth: _Path | None = None
+    notes: tuple[_Note, ...] = ()
+    breakpoints: _Breakpoints = field(default_factory=Breakpoints)
+    speed: _Speed = 1.0
+
+
+_OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)
 
 
 @dataclass(frozen=True, slots=True)
 class SavedSession:
-    """What a session file holds. frame: that it was at, -1 before the first. ended: whether the recording had ended,
-    so that loops of the last keyframes were looked for, too.
+    """What a session file holds. frame: the newest, -1 before the first. ended: the recording had ended, so that loops
+    were searched at the last keyframes too.
     """
 
     opened: Opened
@@ -133,9 +156,9 @@ class SessionWriter:
             self._failed(error)
         self._line(_head(opened))
 
-    def did(self, frame: int, command: Any) -> None:
-        """Write what the user did: a command, which is a dataclass."""
-        values = {name: _plain(value) for name, value in asdict(command).items()}
+    def did(self, frame: int, command: msgspec.Struct) -> None:
+        """Write what the user did."""
+        values = msgspec.to_builtins(command, enc_hook=_plain)
         self._line({"frame": frame, "did": type(command).__name__, **values})
 
     def write(self, frame: int, state: State, *, ended: bool = False, settled: bool = False) -> None:
@@ -145,9 +168,9 @@ class SessionWriter:
         """
         now, at = self._clock(), (frame, ended)
         if state != self._state:
-            self._line(_place(frame, ended) | {"state": _state_tree(state)})
+            self._line(_entry(frame, ended, state))
         elif at != self._at and (settled or ended or now - self._written_at >= EVERY_S):
-            self._line(_place(frame, ended))
+            self._line(_entry(frame, ended))
         else:
             return
         self._state, self._at, self._written_at = state, at, now
@@ -185,8 +208,8 @@ def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) ->
 
 def write_session(path: Path, session: SavedSession) -> None:
     """Write a session file as a whole; its folder need not exist yet. Raises HemislamError: that is not possible."""
-    state = _place(session.frame, session.ended) | {"state": _state_tree(session.state)}
-    lines = [json.dumps(entry, ensure_ascii=False) + "\n" for entry in (_head(session.opened), state)]
+    entries = (_head(session.opened), _entry(session.frame, session.ended, session.state))
+    lines = [json.dumps(entry, ensure_ascii=False) + "\n" for entry in entries]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("".join(lines), encoding="utf-8")
@@ -218,9 +241,9 @@ def read_session(path: Path) -> SavedSession:
             f"The session {path} was written by hemislam {head['hemislam']}; open it with that version."
         )
     try:
-        opened = _opened(head)
+        opened = _OPENED.validate_python(head)
         states = [entry for entry in entries if "state" in entry]
-        state = _state(states[-1]["state"]) if states else State(Params())
+        state = _STATE.validate_python(states[-1]["state"]) if states else State(Params())
         places = [entry for entry in entries if "frame" in entry and "did" not in entry]
         frame, ended = (int(places[-1]["frame"]), bool(places[-1].get("ended"))) if places else (-1, False)
     except (KeyError, TypeError, ValueError) as error:
@@ -249,57 +272,17 @@ def size_of(recording: Path) -> int:
 
 
 def _head(opened: Opened) -> dict[str, Any]:
-    return {"hemislam": __version__, "format": FORMAT} | {k: _plain(v) for k, v in asdict(opened).items()}
+    return {"hemislam": __version__, "format": FORMAT, **_OPENED.dump_python(opened, mode="json")}
 
 
-def _place(frame: int, ended: bool) -> dict[str, Any]:
-    return {"frame": frame, "ended": True} if ended else {"frame": frame}
-
-
-def _opened(tree: Mapping[str, Any]) -> Opened:
-    duration_s = tree["duration_s"]
-    return Opened(
-        Path(tree["recording"]),
-        float(tree["start_s"]),
-        None if duration_s is None else float(duration_s),
-        int(tree["nbytes"]),
-    )
-
-
-def _state_tree(state: State) -> dict[str, Any]:
-    return {
-        "params": Params().changed(state.params),
-        "history": [[frame, Params().changed(params)] for frame, params in state.history],
-        "edits": yaml.safe_load(edit_files.write(state.edits)),
-        "undone": yaml.safe_load(edit_files.write(state.undone)),
-        "truth": _plain(state.truth),
-        "notes": [[note.frame, note.text] for note in state.notes],
-        "breakpoints": state.breakpoints.chosen,
-        "speed": "max" if math.isinf(state.speed) else state.speed,
-    }
-
-
-def _state(tree: Mapping[str, Any]) -> State:
-    return State(
-        params=Params().with_values(tree["params"]),
-        history=tuple((int(frame), Params().with_values(values)) for frame, values in tree["history"]),
-        edits=edit_files.read(yaml.safe_dump(tree["edits"])),
-        undone=edit_files.read(yaml.safe_dump(tree["undone"])),
-        truth=Path(tree["truth"]) if tree["truth"] else None,
-        notes=tuple(Note(int(frame), str(text)) for frame, text in tree["notes"]),
-        breakpoints=Breakpoints(**tree["breakpoints"]),
-        speed=math.inf if tree["speed"] == "max" else float(tree["speed"]),
-    )
+def _entry(frame: int, ended: bool, state: State | None = None) -> dict[str, Any]:
+    """Where the session is, and its state if that has changed."""
+    entry: dict[str, Any] = {"frame": frame} | ({"ended": True} if ended else {})
+    return entry if state is None else entry | {"state": _STATE.dump_python(state)}
 
 
 def _plain(value: Any) -> Any:
-    """As JSON can hold it."""
-    if isinstance(value, Path):
-        return str(value.resolve())
+    """What msgspec does not know, as JSON can hold it."""
     if isinstance(value, Mapping):
-        return {name: _plain(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if is_dataclass(value) and not isinstance(value, type):
-        return _plain(asdict(value))
-    return value if isinstance(value, str | int | float | bool | None) else str(value)
+        return dict(value)
+    return str(value.resolve() if isinstance(value, Path) else value)

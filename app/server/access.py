@@ -17,12 +17,12 @@ import ipaddress
 import logging
 import secrets
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
 from typing import Final
-from urllib.parse import parse_qsl, quote, urlencode, urlsplit
+from urllib.parse import quote, urlencode, urlsplit
 
 from fastapi import HTTPException
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.responses import PlainTextResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -114,14 +114,14 @@ class Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
-        elif refusal := self._refusal(scope, Headers(scope=scope)):
+        elif refusal := self._refusal(HTTPConnection(scope)):
             status, reason = refusal
             client, _ = scope.get("client") or ("?", 0)
             path = quote(scope["path"])  # quoted, it cannot forge a line of the log
             log.warning("Refused %s from %s: %s", path, client, reason, extra={"status": status})
             await _refuse(scope, receive, send, status, reason)
-        elif token := self._token_in_link(scope):
-            await self._set_cookie(scope, token)(scope, receive, _with_headers(send))
+        elif response := self._cookie_response(HTTPConnection(scope)):
+            await response(scope, receive, _with_headers(send))
         elif scope["type"] == "http":
             await self._pass_on(scope, receive, _with_headers(send))
         else:
@@ -155,25 +155,31 @@ class Guard:
         finally:
             self._held -= received
 
-    def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
+    def _refusal(self, request: HTTPConnection) -> tuple[int, str] | None:
         """Status and reason if the request must not go on. Marks view-only requests in their scope."""
-        host = headers.get("host", "")
-        if any(_host_of(origin) != host.lower() for origin in headers.getlist("origin")):
+        host = request.headers.get("host", "")
+        if any(_host_of(origin) != host.lower() for origin in request.headers.getlist("origin")):
             return 403, "This page belongs to another site and may not talk to hemislam."
-        if refusal := self._refusal_by_token(scope, headers, host):
+        if refusal := self._refusal_by_token(request, host):
             return refusal
-        length = headers.get("content-length", "0")
+        length = request.headers.get("content-length", "0")
         if not length.isdecimal():
             return 400, "The length of the request is not a number."
         if int(length) > MOST_BYTES:
             return 413, _TOO_LARGE
         return None
 
-    def _refusal_by_token(self, scope: Scope, headers: Headers, host: str) -> tuple[int, str] | None:
+    def _refusal_by_token(self, request: HTTPConnection, host: str) -> tuple[int, str] | None:
+        scope = request.scope
         if self._access.token is None:
             name = host[: host.rindex("]") + 1] if "]" in host else host.partition(":")[0]
             return None if is_loopback(name) else (403, "Open hemislam as http://127.0.0.1 or http://localhost.")
-        given = self._given_tokens(scope, headers)
+        given = [
+            request.headers.get("authorization", "").removeprefix("Bearer "),
+            request.cookies.get(self._access.cookie, ""),
+        ]
+        if scope["type"] == "http":
+            given += request.query_params.getlist("token")
         if scope["path"] in OPEN_PATHS or any(_same(one, self._access.token) for one in given):
             return None
         if not any(_same(one, self._access.viewer_token) for one in given):
@@ -183,33 +189,18 @@ class Guard:
             return 403, "This link is view only; the other link that hemislam printed lets you control it."
         return None
 
-    def _given_tokens(self, scope: Scope, headers: Headers) -> list[str]:
-        given = [headers.get("authorization", "").removeprefix("Bearer ")]
-        if scope["type"] == "http":
-            given += [value for name, value in _query(scope) if name == "token"]
-        try:
-            cookies = SimpleCookie(headers.get("cookie", ""))
-        except CookieError:
-            return given
-        return given + [cookie.value for name, cookie in cookies.items() if name == self._access.cookie]
-
-    def _token_in_link(self, scope: Scope) -> str | None:
-        """A valid token in the address. It moves into a cookie and out of sight."""
-        if self._access.token is None or scope["type"] != "http" or scope["method"] != "GET":
+    def _cookie_response(self, request: HTTPConnection) -> RedirectResponse | None:
+        """Move a valid token in the address into a cookie; None if there is no such token."""
+        if self._access.token is None or request.scope["type"] != "http" or request.scope["method"] != "GET":
             return None
-        given = (value for name, value in _query(scope) if name == "token")
-        return next(filter(self._access.is_token, given), None)
-
-    def _set_cookie(self, scope: Scope, token: str) -> RedirectResponse:
-        query = urlencode([(name, value) for name, value in _query(scope) if name != "token"])
-        path = "/" + scope["path"].lstrip("/\\")  # "//elsewhere" would lead to another host
+        token = next(filter(self._access.is_token, request.query_params.getlist("token")), None)
+        if token is None:
+            return None
+        query = urlencode([(name, value) for name, value in request.query_params.multi_items() if name != "token"])
+        path = "/" + request.scope["path"].lstrip("/\\")  # "//elsewhere" would lead to another host
         response = RedirectResponse(f"{path}?{query}" if query else path, status_code=303)
         response.set_cookie(self._access.cookie, token, httponly=True, samesite="lax", secure=self._access.secure)
         return response
-
-
-def _query(scope: Scope) -> list[tuple[str, str]]:
-    return parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
 
 
 def _host_of(origin: str) -> str | None:

@@ -16,6 +16,8 @@ from app.server.protocol import Chunk
 from app.slam import lie
 from app.slam.types import F32, F64, I64, Keyframe
 
+VOXEL_M: Final = 0.05
+"""Edge of the voxels of level 0."""
 FINEST_VOXEL_M: Final = 0.08
 COARSEST_LEVEL: Final = 8
 """At 0.08 m · 2^7 = 10 m a keyframe has only a handful of points left."""
@@ -28,7 +30,7 @@ _SLACK: Final = 0.97
 """A map over budget is thinned to this share of it, so that not every new keyframe thins it again."""
 
 
-def thinned(keyframe: Keyframe, voxel_size: float) -> Chunk:
+def thinned(keyframe: Keyframe, voxel_size: float = VOXEL_M) -> Chunk:
     """A keyframe's cloud with one of its points per voxel of this edge (m), in random order."""
     cloud = keyframe.cloud
     chosen = one_per_voxel(cloud.points, voxel_size, seed=keyframe.index)
@@ -69,8 +71,8 @@ def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: in
 def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
     """The same with at most `MOST_SHOWN` that have points, spread evenly along the trajectory.
 
-    The keyframe whose two neighbours are closest to each other, along the trajectory, gives its points to the later
-    one. So a seek back never shows points that were not measured yet.
+    The keyframe whose neighbours are closest to each other gives its points to the later one, so that a seek back never
+    shows points that were not measured yet.
     """
     shown = [index for index, chunk in enumerate(chunks) if chunk.level < EMPTY_LEVEL]
     if len(shown) <= MOST_SHOWN:
@@ -122,9 +124,7 @@ def voxel_of_level(level: int) -> float:
 
 
 def next_to_thin(levels: Sequence[int], positions: F64, sensor: F64) -> int | None:
-    """The keyframe to thin next; None if all are at the coarsest level.
-
-    It is the one farthest from the sensor among those at the lowest level; of equally far ones, the oldest.
+    """The keyframe at the lowest level that is farthest from the sensor; None if all are at the coarsest level.
 
     Args:
         levels: of each keyframe. positions: (k, 3) m. sensor: (3,) m, in the same frame.
@@ -145,7 +145,4 @@ def _first_per_voxel(points: F32, voxel_size: float) -> I64:
     cells -= cells.min(axis=0)
     extent = cells.max(axis=0) + 1
     keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-    order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
-    first = np.concatenate(([True], ordered[1:] != ordered[:-1]))
-    return np.asarray(order[first])
+    return np.unique(keys, return_index=True)[1]

@@ -24,7 +24,7 @@ from app.server import protocol
 from app.server.loop_commands import LoopCommands
 from app.server.player import Player
 from app.server.protocol import Command
-from app.server.publisher import Publisher
+from app.server.publisher import Publisher, opened_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 
@@ -140,7 +140,7 @@ class Controller:
             case protocol.CompareWith(trajectory):
                 session = self._need_session()
                 session.compare_with(trajectory)
-                self._page.put(recording=protocol.OpenedRecording.of(session), urgent=True)
+                self._page.put(recording=opened_recording(session), urgent=True)
             case protocol.Restart():
                 self._open_soon(self._need_session().feed.info.path, self._reopen)
             case protocol.Save(folder, trajectory_only):
@@ -148,7 +148,7 @@ class Controller:
                 saved = None if trajectory_only else session.saved(self._state(session))
                 save = session.save(folder, session=saved, trajectory_only=trajectory_only)
                 self._saves.append((folder, save))
-            case _:
+            case protocol.LoopCommand():
                 loops = self._need_session().loops
                 if loops is None:
                     raise HemislamError("Loops are not looked for; set loops.enabled and restart.")
@@ -227,7 +227,7 @@ class Controller:
                 self._player.fail("Nothing more comes live", error)
                 self._page.show(finished=True)
                 return None
-            self._page.put(live=state, recording=protocol.OpenedRecording.of(session))
+            self._page.put(live=state, recording=opened_recording(session))
         return SOURCE_PERIOD_S
 
     def _look_at_loops(self, session: Session) -> float | None:

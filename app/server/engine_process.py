@@ -67,15 +67,15 @@ class Updates:
 
 def main(owner: Link, setup: Setup) -> None:
     """Compile, open the recording, and work until the owner asks to end or is gone."""
-    opened_before: list[Path] = []
+    revive = setup.revive
 
     def opener(
         path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /
     ) -> Session:
+        nonlocal revive
         if path == LIVE and setup.live is not None and setup.live_folder is not None:
-            revive = setup.revive and not opened_before
-            opened_before.append(path)
-            return open_live_session(setup.live, LIVE, params, setup.live_folder, take_over=revive)
+            take_over, revive = revive, False
+            return open_live_session(setup.live, LIVE, params, setup.live_folder, take_over=take_over)
         part = part or ((setup.start_s, setup.duration_s) if path == setup.recording else (0.0, None))
         return open_session(path, params, *part, truth=truth, checkpoint_bytes=setup.checkpoint_bytes)
 
@@ -89,22 +89,10 @@ def run_loop(
     prepare: Callable[[Callable[[str, float], None]], None] | None = None,
 ) -> None:
     """As `main`, with the function that opens a recording and one that prepares it, reporting (name, fraction)."""
-    page = Publisher(
-        setup.params,
-        chunk_voxel=setup.chunk_voxel,
-        session=setup.session,
-        notices=setup.notices,
-        frames=setup.frames,
-        chunks=setup.chunks,
-    )
+    seen = {name: getattr(setup, name) for name in ("session", "notices", "frames", "chunks")}
+    page = Publisher(setup.params, **seen)
     updates = Updates(owner, page)
-    controller = Controller(
-        page,
-        setup.params,
-        opener,
-        resolve=setup.resolve,
-        session_folder=setup.session_folder,
-    )
+    controller = Controller(page, setup.params, opener, resolve=setup.resolve, session_folder=setup.session_folder)
     controller.handle(SetSpeed(setup.speed))
     controller.handle(SetBreakpoints(setup.breakpoints))
     if prepare is not None:
@@ -120,13 +108,9 @@ def run_loop(
     wait: float | None = 0.0
     try:
         while True:
-            for command in updates.commands(_sooner(wait, updates.publish())):
+            waits = [seconds for seconds in (wait, updates.publish()) if seconds is not None]
+            for command in updates.commands(min(waits, default=None)):
                 controller.handle(command)
             wait = controller.work()
     except LinkClosed:
         controller.close()
-
-
-def _sooner(a: float | None, b: float | None) -> float | None:
-    """The shorter of two waits; None means no limit."""
-    return min((wait for wait in (a, b) if wait is not None), default=None)

@@ -36,9 +36,7 @@ _NOT_KEPT = "This session is not kept in a file, so it cannot be forked; serve k
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """Attributes:
-    name: for people. folder: of its own, gone when it is discarded; None for the first session.
-    """
+    """One of the two. folder: of a fork, deleted when it is discarded."""
 
     engine: RunningEngine
     name: str
@@ -46,7 +44,7 @@ class Side:
 
 
 def forked(a: Snapshot, values: Mapping[str, Any]) -> SavedSession:
-    """The session that goes on from where `a` stands with some parameters changed.
+    """The session that goes on from the frame of `a` with some parameters changed.
 
     Raises:
         HemislamError: there is no frame yet, the session is not kept in a file, or a value is not possible.
@@ -142,7 +140,7 @@ class Workspace:
             b.engine.send(command)
 
     def fork(self, name: str, values: Mapping[str, Any] | None = None) -> None:
-        """Start B where A is, with these parameters by dotted name in place of A's, from the next frame on.
+        """Start B at A's frame, with these parameters by dotted name in place of A's, from the next frame on.
 
         Raises:
             HemislamError: there is a fork already, A cannot be forked, or its file cannot be written.
@@ -157,11 +155,7 @@ class Workspace:
             a.engine.send(AddNote(f"Forked as {self.names[1]}{f' with {changed}' if changed else ''}."))
 
     def open(self, path: Path) -> None:
-        """Start B on a session file, a kept fork or any other of A's recording; it comes to where A is.
-
-        Raises:
-            HemislamError: there is a fork already, or the file is none of A's recording.
-        """
+        """Start B on a session file of A's recording. Raises HemislamError: it is of another one, or B exists."""
         with self._lock:
             a, folder = self._place(path.stem)
             session, session_file = read_session(path), a.engine.snapshot.session_file
@@ -209,10 +203,7 @@ class Workspace:
             self.send(AddNote(f"Discarded {b.name}."))
 
     def keep(self, name: str = "") -> Path:
-        """End B and keep its session as a file, which can be opened again.
-
-        Returns:
-            The file, beside the other session files; no older one is replaced.
+        """End B and keep its session in a new file beside the others, which is returned.
 
         Raises:
             HemislamError: there is no fork, or the file cannot be written; B's own files stay then.

@@ -1,12 +1,14 @@
-"""What crosses the border of the engine's process: commands one way, snapshots the other.
+"""What passes between the engine's process and its users: commands one way, snapshots the other.
 
-Both are plain frozen values. A command is data, so that it can be written to a session file. A snapshot is
-cumulative: a reader that misses ten of them loses nothing.
+Both are frozen values. Session files record commands. A snapshot is cumulative: a reader that misses ten of them loses
+nothing.
 """
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
+
+import msgspec
 
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import Note
@@ -18,9 +20,6 @@ from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import F32, F64, I64, U8, U16, StepResult
 
-if TYPE_CHECKING:
-    from app.mapping.session import Session
-
 LIVE = Path("live")
 """Stands for the live source wherever a recording is named."""
 ACKNOWLEDGED = "acknowledged"
@@ -28,165 +27,130 @@ ACKNOWLEDGED = "acknowledged"
 
 
 # --- commands ------------------------------------------------------------------------------------
-@dataclass(frozen=True, slots=True)
-class Play:
+class Command(msgspec.Struct, frozen=True):
+    """Something the user asks of the engine."""
+
+
+class Play(Command, frozen=True):
     """Go on at the chosen speed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pause:
-    """Stop after the frame that is being worked on."""
+class Pause(Command, frozen=True):
+    """Stop after the present frame."""
 
 
-@dataclass(frozen=True, slots=True)
-class StepFrame:
+class StepFrame(Command, frozen=True):
     """Pause and go this many frames on; back, if negative."""
 
     frames: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class SetSpeed:
-    """Replay speed as a multiple of real time; inf is as fast as it can."""
+class SetSpeed(Command, frozen=True):
+    """Replay speed as a multiple of real time; inf: as fast as possible."""
 
     factor: float
 
 
-@dataclass(frozen=True, slots=True)
-class Seek:
-    """Go to a frame, back or on. One that was processed before is shown as it was, but for ground labels.
+class Seek(Command, frozen=True):
+    """Go to a frame, back or on. One that was processed before is shown as it was, except for its ground labels.
 
-    Going on from there, the frames that follow are processed anew, with the present parameters.
+    The frames after it are processed again, with the present parameters.
     """
 
     frame: int
 
 
-@dataclass(frozen=True, slots=True)
-class SetBreakpoints:
+class SetBreakpoints(Command, frozen=True):
     """Pause at frames where one of these holds, from now on."""
 
     breakpoints: Breakpoints
 
 
-@dataclass(frozen=True, slots=True)
-class AddNote:
-    """Keep a remark on the present frame in the session."""
+class AddNote(Command, frozen=True):
+    """Keep a note on the present frame in the session."""
 
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class SetParams:
+class SetParams(Command, frozen=True):
     """Change parameters by dotted name, for example {"ground.alpha": 30}."""
 
     values: dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class LoadParams:
+class LoadParams(Command, frozen=True):
     """Replace all parameters by those of a YAML text."""
 
     yaml: str
 
 
-@dataclass(frozen=True, slots=True)
-class OpenRecording:
-    """Leave the present recording and open another one from its first frame."""
+class OpenRecording(Command, frozen=True):
+    """Leave the present recording and open another one at its first frame."""
 
     path: Path
     truth: Path | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class CompareWith:
-    """Hold the walk, also what there is of it already, against another trajectory (TUM): the truth, or what another
-    program or another run made of the same recording. None: against nothing.
+class CompareWith(Command, frozen=True):
+    """Compare the whole trajectory with another one (TUM): the truth, or what another program or run made of the same
+    recording. None: with nothing.
     """
 
     path: Path | None
 
 
-@dataclass(frozen=True, slots=True)
-class Restart:
+class Restart(Command, frozen=True):
     """Start the present recording again with the present parameters."""
 
 
-@dataclass(frozen=True, slots=True)
-class Save:
-    """Write trajectory.tum, timings.csv, map.ply and report.json of what was processed so far.
-
-    `trajectory_only` leaves out all but the first, which takes no time. Older results in the folder
-    are replaced once the new ones are complete; `Snapshot.saved` tells when.
-    """
+class Save(Command, frozen=True):
+    """Write the results of the frames so far, replacing older ones in the folder; `Snapshot.saved` tells when."""
 
     folder: Path
     trajectory_only: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class EditLoop:
-    """The user's word on a loop: accept, reject, add or weigh it."""
+class LoopCommand(Command, frozen=True):
+    """A command about loops."""
+
+
+class EditLoop(LoopCommand, frozen=True):
+    """Accept, reject, add or weigh a loop."""
 
     command: loops.LoopEdit
 
 
-@dataclass(frozen=True, slots=True)
-class UndoLoop:
+class UndoLoop(LoopCommand, frozen=True):
     """Take the last `EditLoop` back."""
 
 
-@dataclass(frozen=True, slots=True)
-class RedoLoop:
-    """Do again what was undone last."""
+class RedoLoop(LoopCommand, frozen=True):
+    """Repeat the edit that was undone last."""
 
 
-@dataclass(frozen=True, slots=True)
-class TryLoop:
-    """Show in `LoopsView.tried` what the graph would become by a command, without doing it; None: no more."""
+class TryLoop(LoopCommand, frozen=True):
+    """Show in `LoopsView.tried` what an edit would make of the graph, without applying it; None: show nothing."""
 
     command: loops.LoopEdit | None
 
 
-@dataclass(frozen=True, slots=True)
-class InspectLoop:
-    """Show in `LoopsView.inspected` all there is on a candidate; None: no more."""
+class InspectLoop(LoopCommand, frozen=True):
+    """Show in `LoopsView.inspected` all that is known of a candidate; None: show nothing."""
 
     pair: loops.Pair | None
-
-
-LoopCommand = EditLoop | UndoLoop | RedoLoop | TryLoop | InspectLoop
-Command = (
-    Play
-    | Pause
-    | StepFrame
-    | SetSpeed
-    | Seek
-    | SetBreakpoints
-    | AddNote
-    | SetParams
-    | LoadParams
-    | OpenRecording
-    | CompareWith
-    | Restart
-    | Save
-    | LoopCommand
-)
 
 
 # --- snapshots -----------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """One keyframe's points, thinned for display, in the LiDAR frame of that keyframe.
+    """One keyframe's points, thinned for display (`app.server.chunks`). Sent once; its pose may change.
 
-    Sent once; a reader thins it further (`app.server.chunks`) when the whole map has too many points.
-    T_imu_lidar is fixed per chunk; the keyframe's pose is in `Snapshot.keyframe_poses`.
-    Points are in random order: the first k are a fair sample, for a page that must show fewer.
+    Points are in random order, so the first k are a fair sample.
 
     Attributes:
-        index: of the keyframe. frame: that it was. stamp_ns: its time.
-        points: (n, 3) float32 m. labels: (n,) uint8. intensity: (n,) float32. ring: (n,) uint16.
-        T_imu_lidar: (4, 4). level: how often it was thinned. joined: how many keyframes' points it took over.
+        index, frame, stamp_ns: of the keyframe. T_imu_lidar: (4, 4).
+        points: (n, 3) float32 m, LiDAR frame. labels: (n,) uint8. intensity: (n,) float32. ring: (n,) uint16.
+        level: how often it was thinned. joined: how many keyframes' points it took over.
     """
 
     index: int
@@ -203,7 +167,7 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class OpenedRecording:
-    """What the page knows of the recording that is open."""
+    """The open recording."""
 
     path: Path
     start_ns: int
@@ -212,25 +176,8 @@ class OpenedRecording:
     findings: tuple[Finding, ...]
     truth_stamps_ns: I64 | None = None
     truth_positions: F64 | None = None
-    """(m, 3) truth positions of the IMU, in the truth's own frame, if truth was given."""
+    """(m, 3) positions of the IMU, in the truth's own frame."""
     truth: Path | None = None
-
-    @classmethod
-    def of(cls, session: "Session") -> "OpenedRecording":
-        """What a session works on. A source without an end is as long as what was processed of it."""
-        info, truth = session.feed.info, session.truth
-        newest = session.frames[session.frame] if session.frame >= 0 else None
-        so_far_s = (newest.stamp_ns - info.start_ns) * 1e-9 if newest is not None else 0.0
-        return cls(
-            path=info.path,
-            start_ns=info.start_ns,
-            duration_s=so_far_s if info.duration_s is None else info.duration_s,
-            frames=session.frame + 1 if info.frames is None else info.frames,
-            findings=session.findings,
-            truth_stamps_ns=truth.stamps_ns if truth else None,
-            truth_positions=truth.positions if truth else None,
-            truth=session.truth_path,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +194,7 @@ class Transport:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Long work under way in the engine's process. fraction is 0-1; nan while unknown."""
+    """Long work under way. fraction: 0-1, nan while unknown."""
 
     title: str
     fraction: float
@@ -255,7 +202,7 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Saved:
-    """A `Save` that has ended; `error` says why it failed, "" if it did not."""
+    """A `Save` that has ended. error: why it failed; "" if it did not."""
 
     folder: Path
     error: str = ""
@@ -263,7 +210,7 @@ class Saved:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """Something to tell the user once. `number` increases by one with every notice."""
+    """A message to the user. number: increases by one with every notice."""
 
     number: int
     level: Literal["info", "warning", "error"]
@@ -272,12 +219,12 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class LoopsView:
-    """Loops as they count at the newest frame.
+    """Loops at the newest frame.
 
     Attributes:
         edges: all candidates, by keyframes. residuals: of every factor of the graph, odometry first.
-        undo, redo: commands that can be taken back (the last one next) or done again (likewise).
-        inspected: what `InspectLoop` asked for. tried: what `TryLoop` asked for.
+        undo, redo: edits that can be undone or redone, the next one last.
+        inspected: answer to `InspectLoop`. tried: answer to `TryLoop`.
     """
 
     edges: tuple[loops.LoopEdge, ...] = ()
@@ -289,8 +236,8 @@ class LoopsView:
 
 
 SERIES = ("stamp_s", "distance", "error_m", *READOUTS)
-"""Names of the arrays of numbers by frame. `stamp_s` counts from the start of the recording. `distance` is the length
-of the trajectory up to the frame (m). `error_m` is the distance to the truth (m), aligned to all frames shown."""
+"""Numbers by frame. stamp_s: since the start of the recording. distance: length of the trajectory so far (m).
+error_m: to the truth (m), aligned to all frames shown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,27 +245,16 @@ class Snapshot:
     """All that the page draws, as one immutable value.
 
     Attributes:
-        session: grows when a recording is opened or restarted: the scene starts empty.
-        revision: grows with every snapshot.
-        params: as chosen; the engine uses them from its next frame on, but for
-        pending_restart: names of parameters that were changed and act on restart only.
-        result: newest frame, already relabelled with the present ground parameters. Its `keyframe`
-            is left out, since that is sent as a chunk.
-        chunks: within a session appended, thinned, and taken away at the end when going back.
-        keyframe_poses: (k, 4, 4) T_map_imu of each keyframe.
-        trajectory: (n, 3) positions of the IMU in the map, every processed frame.
-        corrections: by which loops lay odometry in the map.
-        loops: candidates, their verdicts and what was asked about them.
+        session: increases when a recording is opened or restarted. revision: increases with every snapshot.
+        params: as chosen. pending_restart: names of those that take effect on restart only.
+        result: of the newest frame, with the present ground parameters and without its `keyframe`.
+        chunks: of all keyframes up to the frame. keyframe_poses: (k, 4, 4) T_map_imu.
+        trajectory: (n, 3) m, positions of the IMU in the map. corrections: of odometry, by loops.
         series: (n,) arrays by SERIES name.
-        T_map_truth: (4, 4) that lays the truth's positions over the map, None until the walk
-            determines it.
-        breakpoints: where playing pauses.
-        notes: of this session, in the order in which they were made.
-        progress: what takes long just now, or None. notices: the newest 50.
-        saved: the newest 10 `Save`s that ended.
-        engine_alive: False when the engine's process has died.
-        live: how the live source is doing; None for a recording.
-        session_file: file in which this session is kept; opening it goes on from there.
+        T_map_truth: (4, 4), aligns the truth with the trajectory; None until the trajectory determines it.
+        notes: in the order in which they were made. notices: the newest 50. saved: the newest 10.
+        live: state of the live source; None for a recording.
+        session_file: keeps this session; opening it continues the session.
     """
 
     session: int = 0
@@ -347,15 +283,13 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Delta:
-    """Changes since the delta before.
+    """Changes since the last delta.
 
     Attributes:
         replaced: new values of fields of `Snapshot`; `loops` without its edges. With `session`, another session
             begins: the reader drops its edges.
-        edges: what has changed of the loops' edges.
-        keep: the reader keeps so many of its frames and appends `frames`.
-        chunks: of the next keyframes whose cloud the reader does not have.
-        notices: new since then.
+        edges: changed ones. keep: how many of its frames the reader keeps before it appends `frames`.
+        chunks: of the next keyframes. notices: new ones.
     """
 
     replaced: dict[str, Any]

@@ -28,11 +28,27 @@ REPEAT_AFTER_S = 10.0
 SAVED_KEPT = 10
 
 
+def opened_recording(session: Session) -> OpenedRecording:
+    """Describe a session's source. One without an end is as long as the part that was processed."""
+    info, truth = session.feed.info, session.truth
+    newest = session.frames[session.frame] if session.frame >= 0 else None
+    so_far_s = (newest.stamp_ns - info.start_ns) * 1e-9 if newest is not None else 0.0
+    return OpenedRecording(
+        path=info.path,
+        start_ns=info.start_ns,
+        duration_s=so_far_s if info.duration_s is None else info.duration_s,
+        frames=session.frame + 1 if info.frames is None else info.frames,
+        findings=session.findings,
+        truth_stamps_ns=truth.stamps_ns if truth else None,
+        truth_positions=truth.positions if truth else None,
+        truth=session.truth_path,
+    )
+
+
 class Publisher:
     """Turns a session's events into deltas.
 
     Args:
-        chunk_voxel: edge of the voxels (m) in which clouds are thinned.
         session, notices, frames, chunks: how many the reader already has from an earlier process.
 
     Attributes:
@@ -44,7 +60,6 @@ class Publisher:
         self,
         params: Params,
         *,
-        chunk_voxel: float = 0.05,
         session: int = 0,
         notices: int = 0,
         frames: int = 0,
@@ -53,7 +68,7 @@ class Publisher:
         self.transport = Transport()
         self.result: StepResult | None = None
         self.urgent = True
-        self._session, self._notices_given, self._chunk_voxel = session, notices, chunk_voxel
+        self._session, self._notices_given = session, notices
         self._replaced: dict[str, Any] = {"params": params}
         self._corrections = MapFrame()
         self._noticed: dict[str, int] = {}
@@ -121,7 +136,7 @@ class Publisher:
         self._keyframes[kept:] = [keep + index for index, frame in enumerate(frames) if frame.keyframe]
         self._chunks = first = min(self._chunks, kept)
         self._chunks = max(first, min(self._chunks_ready, first + CHUNKS_AT_ONCE))
-        chunks = tuple(thinned(self._clouds[index], self._chunk_voxel) for index in range(first, self._chunks))
+        chunks = tuple(thinned(self._clouds[index]) for index in range(first, self._chunks))
         delta = Delta(self._replaced, edges, keep, frames, chunks, tuple(self._notices))
         self._replaced, self._notices, self.urgent = {}, [], False
         return delta
@@ -131,7 +146,7 @@ class Publisher:
         """Show another session, from its first frame on, or from where an earlier process left it."""
         self.begin(session.frames, session.engine.keyframes)
         self.result, self._corrections, self._noticed = None, MapFrame(), {}
-        self.put(recording=OpenedRecording.of(session))
+        self.put(recording=opened_recording(session))
         self.show(frame=session.frame, stamp_ns=0, finished=False, frames_per_second=0.0, dropped=session.dropped)
         if session.frame < 0:
             for finding in session.findings:

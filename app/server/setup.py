@@ -24,8 +24,7 @@ class Setup:
         start_s, duration_s: the part of that recording to process.
         resolve: parameters for recordings opened later; None keeps the present ones.
         play: begin at once. speed: to play at. breakpoints: where to pause.
-        chunk_voxel: m, see `Controller`. point_budget: most points of the map that are held for pages;
-            see `app.server.chunks`.
+        point_budget: most points of the map that are held for pages, see `app.server.chunks`.
         checkpoint_bytes: see `app.mapping.checkpoints`.
         live_folder: where a live run keeps what a process that takes over needs. revive: it is that process.
         live: where to take scans from while `recording` is `app.server.protocol.LIVE`.
@@ -42,7 +41,6 @@ class Setup:
     play: bool = False
     speed: float = 1.0
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
-    chunk_voxel: float = 0.05
     point_budget: int = POINT_BUDGET
     checkpoint_bytes: int = 1 << 30
     live: "LiveAddress | None" = None

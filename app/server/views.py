@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from app.mapping.session_file import Note
 from app.sensors.findings import Finding
-from app.sensors.live.status import Counters
+from app.sensors.live.status import LiveState
 from app.server.protocol import LoopsView, Notice, Snapshot
 from app.slam.loops import edit_files
 from app.slam.types import StepResult
@@ -72,23 +72,6 @@ class ProgressView(RestModel):
     fraction: float | None
 
 
-class LiveView(RestModel):
-    """How the live source is doing."""
-
-    lidar_hz: float
-    imu_hz: float
-    lidar_age_s: float | None = Field(description="Since the last arrival.")
-    imu_age_s: float | None
-    backlog: int = Field(description="Scans that wait for the engine.")
-    clock: str = Field(description='Whose time is used: "sensor", "host", or "" while that is not settled.')
-    imu_lag_s: float | None = Field(
-        validation_alias="offset_s", description="By how much the IMU's stamps lag behind the LiDAR's."
-    )
-    sensor: str
-    recorded: int | None = Field(description="Bytes written; null if nothing is recorded.")
-    counters: Counters
-
-
 class LoopView(RestModel):
     """A loop candidate, by keyframes."""
 
@@ -122,7 +105,7 @@ class StateView(RestModel):
     progress: ProgressView | None
     pending_restart: list[str]
     notices: list[Notice]
-    live: LiveView | None
+    live: LiveState | None
     session_file: Path | None = Field(description="The session file; opening it continues the session.")
     notes: list[Note]
 

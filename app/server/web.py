@@ -10,7 +10,7 @@ import ssl
 import threading
 import webbrowser
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
@@ -30,7 +30,6 @@ from app.server.api import make_router
 from app.server.bridge import bridge
 from app.server.folders import Folders
 from app.server.fork import Workspace
-from app.server.logs import log_notices
 from app.server.setup import Setup
 from app.server.viser_adapter import Viser, page_html, start_viser, viewer_html
 from app.server.worker import EngineProcess, RunningEngine
@@ -163,9 +162,25 @@ def run_server(
         threading.Thread(target=show_compilation, args=(engine,), name="progress", daemon=True).start()
         if open_browser and has_display():
             webbrowser.open(address)  # the listener holds the request until the server is up
-        with _signals_end(server):
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with contextlib.suppress(KeyboardInterrupt):  # uvicorn ends in order, then raises the signal again
             server.run(sockets=[listener])
         log.info("Ending")
+
+
+def log_notices(engine: RunningEngine) -> None:
+    """Log the notices that the engine publishes, without end. For a thread of its own."""
+    if not log.isEnabledFor(logging.INFO):
+        return  # people read them on the page
+    logged: set[int] = set()
+    snapshot = engine.snapshot
+    while True:
+        for notice in snapshot.notices:
+            if notice.number not in logged:
+                logged.add(notice.number)
+                extra = {"notice": notice.number, "frame": snapshot.transport.frame}
+                log.log(getattr(logging, notice.level.upper()), notice.text, extra=extra)
+        snapshot = engine.wait(snapshot.revision, 1.0)
 
 
 def show_compilation(engine: EngineProcess) -> None:
@@ -216,18 +231,3 @@ def make_server(app: FastAPI, tls: Tls | None = None) -> uvicorn.Server:
             server_header=False,
         )
     )
-
-
-@contextlib.contextmanager
-def _signals_end(server: uvicorn.Server) -> Iterator[None]:
-    """SIGINT and SIGTERM end the server. uvicorn sees to that while it runs, but raises the signal again afterwards."""
-
-    def end(number: int, frame: object) -> None:
-        server.should_exit = True
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -83,7 +83,7 @@ def _tiles(state: LiveState) -> Iterator[Tile]:
     yield Tile("scans dropped", f"{counted.dropped:,}", "", "the oldest first; never IMU", colour, "half")
     colour = WARN if state.backlog > BUSY_BACKLOG else ""
     yield Tile("waiting", f"{state.backlog:,}", "scans", "for the engine", colour, "half")
-    offset = state.offset_s
+    offset = state.imu_lag_s
     far = offset is not None and abs(offset) > OFFSET_S and state.clock != "host"
     shown = "–" if offset is None else f"{1e3 * offset:+,.1f}"
     yield Tile("IMU behind LiDAR", shown, "ms", "by arrival", WARN if far else "", "half")

@@ -17,7 +17,7 @@ WELL = LiveState(
     lidar_age_s=0.03,
     imu_age_s=0.004,
     clock="sensor",
-    offset_s=0.0021,
+    imu_lag_s=0.0021,
     sensor="RS-Bpearl 68656d690001: 600 rpm, strongest return",
     recorded=12_345_678,
 )

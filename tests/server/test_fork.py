@@ -23,7 +23,6 @@ from app.server.protocol import (
     SERIES,
     AddNote,
     Command,
-    OpenedRecording,
     OpenRecording,
     Pause,
     Play,
@@ -35,6 +34,7 @@ from app.server.protocol import (
     StepFrame,
     Transport,
 )
+from app.server.publisher import opened_recording
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
@@ -83,7 +83,7 @@ class Recorder:
 # --- what B is told ------------------------------------------------------------------------------
 def at(frame: int, *, frames: int = 100, name: str = "walk") -> Snapshot:
     session = fakes.open_fake(Path(f"walk-{frames}.mcap"), None, Params())
-    opened = replace(OpenedRecording.of(session), path=Path(f"{name}.mcap"))
+    opened = replace(opened_recording(session), path=Path(f"{name}.mcap"))
     return Snapshot(
         recording=opened,
         transport=Transport(frame=frame),

@@ -24,7 +24,7 @@ WELL = LiveState(
     lidar_age_s=0.03,
     imu_age_s=0.004,
     clock="sensor",
-    offset_s=0.0021,
+    imu_lag_s=0.0021,
     sensor="RS-Bpearl 10 Hz",
     recorded=12_345_678,
 )
@@ -76,9 +76,9 @@ def test_only_trouble_is_coloured_as_trouble() -> None:
         replace(WELL, lidar_age_s=3.0),
     ):
         assert BAD in live_html(worse)
-    for warned in (replace(WELL, offset_s=0.3), replace(WELL, counters=Counters(packets=10, truncated=1))):
+    for warned in (replace(WELL, imu_lag_s=0.3), replace(WELL, counters=Counters(packets=10, truncated=1))):
         assert WARN in live_html(warned)
-    assert WARN not in live_html(replace(WELL, offset_s=0.3, clock="host")), "then it does no harm"
+    assert WARN not in live_html(replace(WELL, imu_lag_s=0.3, clock="host")), "then it does no harm"
 
 
 def test_a_sensor_s_words_are_no_html() -> None:

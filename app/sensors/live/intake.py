@@ -162,7 +162,7 @@ class Intake:
                 imu_age_s=ages["IMU"],
                 backlog=len(self._scans),
                 clock="" if self._held is not None else self._clock,
-                offset_s=self._offset.seconds(),
+                imu_lag_s=self._offset.seconds(),
                 sensor=self.sensor,
             )
 

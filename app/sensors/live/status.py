@@ -72,7 +72,7 @@ class LiveState:
     Attributes:
         lidar_hz, imu_hz: over the last seconds. lidar_age_s, imu_age_s: since the last arrival, None before the first.
         backlog: scans that wait for the engine. clock: which clock stamps the measurements, "" while not settled.
-        offset_s: how far the IMU's stamps lag behind the LiDAR's, estimated from arrival times; None if unknown.
+        imu_lag_s: how far the IMU's stamps lag behind the LiDAR's, estimated from arrival times; None if unknown.
         sensor: what the LiDAR reports about itself. recorded: bytes written, None if not recording.
     """
 
@@ -83,7 +83,7 @@ class LiveState:
     imu_age_s: float | None = None
     backlog: int = 0
     clock: str = ""
-    offset_s: float | None = None
+    imu_lag_s: float | None = None
     sensor: str = ""
     recorded: int | None = None
 

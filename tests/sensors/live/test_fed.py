@@ -87,7 +87,7 @@ def test_as_packets_the_same_but_for_the_packets_steps(
     counters = state.counters
     assert (counters.lost, counters.late, counters.dropped, counters.imu_lost) == (0, 0, 0, 0)
     assert state.lidar_hz == pytest.approx(10.0, rel=0.3) and state.imu_hz == pytest.approx(200.0, rel=0.3)
-    assert state.offset_s == pytest.approx(0.0, abs=0.1) and state.clock == "sensor"
+    assert state.imu_lag_s == pytest.approx(0.0, abs=0.1) and state.clock == "sensor"
     with open_recording(record, params) as recording:
         recorded = [m for m in recording.measurements() if isinstance(m, Measurement)]
     assert len(recorded) >= len(ports.measurements(events))
