@@ -1,7 +1,7 @@
 """Session files: what was opened, and everything that the present state follows from.
 
 Lines of JSON are only appended, so a file that was cut anywhere holds the session up to its last whole line. The engine
-is deterministic: the recording, the parameters by the frame from which they apply, the loop edits and the frame suffice.
+is deterministic: the recording, the parameters by frame, the loop edits and the newest frame are all that is needed.
 
     {"hemislam": "0.3.0", "format": 2, "recording": "/data/walk.mcap", ...}    what was opened
     {"frame": 120, "did": "SetParams", "values": {"ground.alpha": 30}}         what the user did, for people
