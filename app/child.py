@@ -1,11 +1,8 @@
 """One way to run a function in a process of its own.
 
-The owner makes a `Child`; the function there gets a `Link` to its owner. Both ends send messages without waiting
-and receive them with a timeout.
-
-Signals: a child ignores SIGINT and SIGTERM, even while it starts. Terminals and service managers send them to all
-processes of a group; only the first process of the program acts on them, and ends its children in order. A child
-whose owner dies ends by itself.
+The owner makes a `Child`; the function there gets a `Link` to its owner. Both send without waiting and receive with a
+timeout. Children ignore SIGINT and SIGTERM, which terminals send to all processes of a group: the first process of the
+program ends its children in order. A child whose owner dies ends by itself.
 """
 
 import atexit
@@ -64,7 +61,7 @@ class ChildDied(HemislamError):
 
 
 class RestartLimit:
-    """How often a child may be started again after it died: `most` times within any `within_s` seconds."""
+    """A child that dies may be started again `most` times within any `within_s` seconds."""
 
     def __init__(self, most: int, within_s: float = math.inf) -> None:
         self.most = most
@@ -107,11 +104,11 @@ class Link:
         return pickle.loads(packed)
 
     def close(self) -> None:
-        """Have the other end's `receive` raise `LinkClosed` once it has received everything sent before."""
+        """Have the other end's `receive` raise `LinkClosed` after the last message."""
         self._unsent.put(_END)
 
     def flush(self) -> None:
-        """Wait until the other end has received everything sent before `close`, or is gone."""
+        """After `close`, wait until the other end has received everything, or is gone."""
         self._writer.join()
 
     def _write(self) -> None:
@@ -131,12 +128,10 @@ class Child(Link):
     """The owner's end of a link to a function that runs in a process of its own. It ends with its owner at the latest.
 
     Args:
-        main: called there with a `Link` to this process and `args`; all must be picklable. It ends by returning,
-            or by `LinkClosed`.
-        name: for `ps` ("hemislam-NAME", 15 characters) and the log. title: what it is called in messages.
-        fork: start as a fork of a process that has imported the engine already, where the system can: this
-            takes 20 ms. Otherwise a new interpreter starts.
-        environment: additional variables of a new interpreter.
+        main: called there with a `Link` and `args`, all picklable. It ends by returning, or by `LinkClosed`.
+        name: for `ps` ("hemislam-NAME", 15 characters) and the log. title: for messages.
+        fork: fork a process that has imported the engine, where possible, which takes 20 ms; else a new interpreter
+            starts, with `environment` added to its variables.
         grace_s: how long it may go on working when its owner dies or asks it to end.
     """
 
@@ -229,10 +224,9 @@ def _end_with_owner(grace_s: float) -> None:
 
 
 def fork_context() -> ForkServerContext | SpawnContext:
-    """The context of `multiprocessing` that forks the process that has imported already, where the system can.
+    """The context of `multiprocessing` that forks a process that has imported the engine, where possible.
 
-    The first call starts that process and returns at once; it has the environment of then. It runs a single thread,
-    since a fork of a pool of threads hangs.
+    The first call starts that process and returns at once. It has a single thread, since forks of thread pools hang.
     """
     if sys.platform != "linux":  # macOS cannot fork a process that has used its frameworks
         return multiprocessing.get_context("spawn")
@@ -259,7 +253,7 @@ def _signals_blocked() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _main_hidden() -> Iterator[None]:
-    """A process started meanwhile does not run the owner's script again, which so needs no `if __name__ == ...`."""
+    """A process started meanwhile does not run the owner's script, which so needs no `if __name__ == "__main__"`."""
     script = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:

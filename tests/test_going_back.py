@@ -22,8 +22,6 @@ STORES = {
 """Containers with `truncate`, which others call."""
 LOOP_BACK_END = {f"slam/loops/{name}.py" for name in ("backend", "detection", "edits", "submap", "types")}
 """What is derived from keyframes and edits. It is brought to another number of keyframes by `backend.py` alone."""
-OTHER = {"sensors/live/receiver.py"}
-"""`_forget` releases scans that are not asked for again."""
 
 
 def test_only_a_few_files_know_how_to_go_back() -> None:
@@ -32,8 +30,8 @@ def test_only_a_few_files_know_how_to_go_back() -> None:
         names = [node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
         if going_back := [name for name in names if GOES_BACK.fullmatch(name)]:
             found[path.relative_to(APP).as_posix()] = going_back
-    allowed = KNOW | ONE_VALUE.keys() | STORES.keys() | LOOP_BACK_END | OTHER
+    allowed = KNOW | ONE_VALUE.keys() | STORES.keys() | LOOP_BACK_END
     assert not {path: names for path, names in found.items() if path not in allowed}, (
         "follow a cursor instead (app/slam/log.py)"
     )
-    assert found.keys() >= KNOW, "the list of files is out of date"
+    assert found.keys() == allowed, "the list of files is out of date"

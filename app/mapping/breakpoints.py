@@ -4,15 +4,14 @@
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
-from app.slam.errors import HemislamError
+from pydantic import ConfigDict, Field, create_model
+
 from app.slam.loops.types import Origin, Verdict
 from app.slam.types import StepResult
-
-Value = bool | float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,42 +123,29 @@ BREAKPOINTS: Final = (
 _BY_NAME: Final = {one.name: one for one in BREAKPOINTS}
 
 
-class Breakpoints(Mapping[str, Value]):
-    """Where to pause, by name: True or False for a switch, a number or None for a limit. A value.
+def _field(one: Breakpoint) -> Any:
+    if one.limit is None:
+        return bool, Field(False, description=one.hint)
+    unit = f" Unit: {one.limit.base_unit}." if one.limit.base_unit else ""
+    return float | None, Field(None, ge=0, allow_inf_nan=False, description=one.hint + unit)
 
-    Raises:
-        HemislamError: there is no such breakpoint, or a limit is negative or not a number.
-    """
 
-    __slots__ = ("_chosen",)
+_Fields: Any = create_model("_Fields", **{one.name: _field(one) for one in BREAKPOINTS})
 
-    def __init__(self, **chosen: Value) -> None:
-        for name, value in chosen.items():
-            if name not in _BY_NAME:
-                raise HemislamError(f"There is no breakpoint `{name}`; there are {', '.join(_BY_NAME)}.")
-            if _BY_NAME[name].limit is not None and value is not None and not 0.0 <= value < math.inf:
-                raise HemislamError(f"The breakpoint `{name}` cannot be {value}; give a number from 0 on.")
-        self._chosen = {
-            name: float(value) for name, value in chosen.items() if value is not None and value is not False
-        }
 
-    def __getitem__(self, name: str) -> Value:
-        value = self._chosen.get(name)
-        return value if _BY_NAME[name].limit is not None else value is not None
+class Breakpoints(_Fields):  # type: ignore[misc]  # its fields are those of the table
+    """Where playing pauses. A limit pauses when it is exceeded; without a value, or with null, it is off."""
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(_BY_NAME)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
-    def __len__(self) -> int:
-        return len(_BY_NAME)
-
-    def __repr__(self) -> str:
-        return f"Breakpoints({', '.join(f'{name}={value}' for name, value in self._chosen.items())})"
+    def __getitem__(self, name: str) -> bool | float | None:
+        value: bool | float | None = getattr(self, name)
+        return value
 
     @property
     def chosen(self) -> dict[str, float]:
         """Those that are set; a switch has the number 1."""
-        return self._chosen.copy()
+        return {name: float(value) for name, value in self if value is not None and value is not False}
 
 
 def reasons(breakpoints: Breakpoints, before: CheckedFrame | None, now: CheckedFrame) -> tuple[str, ...]:

@@ -16,13 +16,13 @@ log = logging.getLogger(__name__)
 
 DEFAULT_BYTES = 1 << 30
 EVERY = 10
-"""Frames between two checkpoints while a session goes on. One takes a tenth to a half of a frame's time."""
+"""Frames between two checkpoints. One takes a tenth to a half of a frame's time."""
 NEAR = 24
-"""Each of so many frames before a sought one gets a checkpoint, so that stepping back is immediate."""
+"""So many frames before the target of a seek get a checkpoint each, so that stepping back is immediate."""
 DENSE = 16_000
 """Up to this distance from the present, checkpoints stay `EVERY` frames apart; at twice the distance, twice as far."""
 DISK_SHARE = 4
-"""Disk space that checkpoints may take, in multiples of the memory; beyond it they become sparser."""
+"""Disk space for checkpoints, in multiples of the memory; beyond it they become sparser."""
 START = -1
 
 
@@ -62,11 +62,11 @@ class Checkpoints:
         return sum(self._sizes.values())
 
     def wanted(self, frame: int, *, near: bool = False) -> bool:
-        """Whether to take one now, after this frame. near: the frame is just before a sought one."""
+        """Whether to take one after this frame. near: the frame is just before the target of a seek."""
         return frame not in self._sizes and (near or frame == START or frame % EVERY == 0)
 
     def add(self, frame: int, state: object) -> None:
-        """Keep a state. Others may be dropped; if the disk does not take it, this one is."""
+        """Keep a state. Others may be dropped; if the disk is full, this one is."""
         value = pickle.dumps(state, protocol=5)
         try:
             self._states.execute("REPLACE INTO states VALUES (?, ?)", (frame, value))

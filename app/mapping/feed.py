@@ -23,11 +23,10 @@ class FeedInfo:
     """What is known of a source beside its measurements.
 
     Attributes:
-        path: of the recording, or a name for a live source.
-        start_ns: time of the first point; 0 while it is unknown.
-        duration_s: of the whole recording. frames: scans expected in the part that is processed.
-            Both are None if the source has no end yet.
-        start_s, part_s: the part that is processed: where it begins, and how long it is (None: to the end).
+        path: of the recording, or a name for a live source. start_ns: time of the first point; 0: unknown.
+        duration_s: of the whole recording. frames: scans expected in the part that is processed. Both are None if the
+            source has no end yet.
+        start_s, part_s: start and length of the part that is processed (None: to the end).
         findings: what is unusual about the source.
     """
 
@@ -44,8 +43,8 @@ class Feed(Protocol):
     """A source of measurements in order of time. Subclass it: only `info` and `next` are required.
 
     Attributes:
-        repeatable: whether the same measurements can be had again, by `go_to` or from another feed of
-            the same source: only then can a session go back, and be repeated from its file.
+        repeatable: whether `go_to`, or another feed of the same source, gives the same measurements again: only then
+            can a session go back or be repeated from its file.
     """
 
     repeatable: bool = False

@@ -8,7 +8,7 @@ from typing import Final
 
 from app.child import Child, ChildDied, Link, RestartLimit
 from app.slam.loops.keyframe_log import Follower, KeyframeLog
-from app.slam.loops.messages import Added, Answer, Ask, Failure, LoopState, Reply, Request
+from app.slam.loops.messages import Added, Answer, Ask, Failure, LoopState, Reply
 from app.slam.loops.types import LoopChange, LoopEdge, changed_by, difference
 
 NICENESS: Final = 10
@@ -22,22 +22,13 @@ MOST_PENDING: Final = 4
 """Requests that a new worker is sent at a time, so that keyframes do not pile up in memory."""
 
 
-class LoopProcess:
+class LoopProcess(Child):
     """A process that answers requests one by one, in order. Used by one thread."""
 
     def __init__(self) -> None:
-        self._child = Child(
-            main, name="loops", title="The process that looks for loops", environment=_ONE_THREAD, grace_s=0.0
-        )
+        title = "The process that looks for loops"
+        super().__init__(main, name="loops", title=title, environment=_ONE_THREAD, grace_s=0.0)
         self._edges: tuple[LoopEdge, ...] = ()
-
-    @property
-    def pid(self) -> int:
-        return self._child.pid
-
-    def send(self, request: Request) -> None:
-        """Send a request, whose arrays must not change any more. Never waits, not even if the process is dead."""
-        self._child.send(request)
 
     def receive(self, timeout: float | None = None) -> Reply | None:
         """The reply to the oldest request that has none yet; None if there is none within the time (s).
@@ -45,7 +36,7 @@ class LoopProcess:
         Raises:
             ChildDied: it will never come.
         """
-        message: tuple[Reply, LoopChange | None] | None = self._child.receive(timeout)
+        message: tuple[Reply, LoopChange | None] | None = super().receive(timeout)
         if message is None:
             return None
         reply, change = message
@@ -55,17 +46,9 @@ class LoopProcess:
             self._edges = changed_by(change, self._edges)
         return replace(reply, edges=self._edges)
 
-    def close(self) -> None:
-        """End the process; unanswered requests are dropped."""
-        self._child.close()
-
 
 class RestartingLoops:
-    """A `LoopClient` whose process is replaced when it dies.
-
-    Args:
-        log: the keyframes that it follows. make: starts a process.
-    """
+    """A `LoopClient` whose process is replaced when it dies. make: starts a process."""
 
     def __init__(self, log: KeyframeLog, make: Callable[[], LoopProcess] = LoopProcess) -> None:
         self._make, self._log = make, log

@@ -72,9 +72,6 @@ _Path = Annotated[Path, PlainSerializer(lambda path: str(path.resolve()))]
 _Note = Annotated[
     Note, PlainValidator(lambda entry: Note(*entry)), PlainSerializer(lambda note: (note.frame, note.text))
 ]
-_Breakpoints = Annotated[
-    Breakpoints, PlainValidator(lambda chosen: Breakpoints(**chosen)), PlainSerializer(lambda points: points.chosen)
-]
 _Speed = Annotated[
     float,
     BeforeValidator(lambda speed: math.inf if speed == "max" else speed),
@@ -96,7 +93,7 @@ class State:
     undone: _Edits = ()
     truth: _Path | None = None
     notes: tuple[_Note, ...] = ()
-    breakpoints: _Breakpoints = field(default_factory=Breakpoints)
+    breakpoints: Breakpoints = field(default_factory=Breakpoints)
     speed: _Speed = 1.0
 
 
@@ -283,6 +280,6 @@ def _entry(frame: int, ended: bool, state: State | None = None) -> dict[str, Any
 
 def _plain(value: Any) -> Any:
     """What msgspec does not know, as JSON can hold it."""
-    if isinstance(value, Mapping):
-        return dict(value)
+    if isinstance(value, Breakpoints):
+        return value.chosen
     return str(value.resolve() if isinstance(value, Path) else value)

@@ -21,27 +21,11 @@ from fastapi import Path as PathParam
 from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
-from app.mapping.breakpoints import BREAKPOINTS, Breakpoint, Breakpoints
+from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import SUFFIX
+from app.server import protocol
 from app.server.folders import Folders
-from app.server.protocol import (
-    AddNote,
-    Command,
-    CompareWith,
-    EditLoop,
-    OpenRecording,
-    Pause,
-    Play,
-    RedoLoop,
-    Restart,
-    Save,
-    Seek,
-    SetBreakpoints,
-    SetParams,
-    SetSpeed,
-    StepFrame,
-    UndoLoop,
-)
+from app.server.protocol import Command
 from app.server.views import LoopsState, Speed, StateView, loops_state, state_view
 from app.server.worker import RunningEngine
 from app.slam.loops.types import Accept, Add, LoopEdit, Reject, SetWeight, Solve
@@ -68,7 +52,7 @@ class Action:
 
 
 def _edit(kind: Callable[..., LoopEdit]) -> Callable[..., Command]:
-    return lambda **fields: EditLoop(kind(**fields))
+    return lambda **fields: protocol.EditLoop(kind(**fields))
 
 
 Replay = Annotated[Speed, AfterValidator(lambda speed: math.inf if speed == "max" else speed)]
@@ -79,12 +63,12 @@ Registered = Annotated[bool, Field(description="Register the two submaps; false 
 PAIR = {"older": (Index, ...), "newer": (Index, ...)}
 
 TRANSPORT = {
-    "play": Action(Play),
-    "pause": Action(Pause),
-    "restart": Action(Restart),
-    "step": Action(StepFrame, {"frames": (Count, 1)}),
-    "seek": Action(Seek, {"frame": (Index, ...)}),
-    "speed": Action(SetSpeed, {"factor": (Replay, ...)}),
+    "play": Action(protocol.Play),
+    "pause": Action(protocol.Pause),
+    "restart": Action(protocol.Restart),
+    "step": Action(protocol.StepFrame, {"frames": (Count, 1)}),
+    "seek": Action(protocol.Seek, {"frame": (Index, ...)}),
+    "speed": Action(protocol.SetSpeed, {"factor": (Replay, ...)}),
 }
 LOOPS = {
     "accept": Action(_edit(Accept), PAIR),
@@ -92,8 +76,8 @@ LOOPS = {
     "weigh": Action(_edit(SetWeight), PAIR | {"weight": (Weight, 1.0)}),
     "add": Action(_edit(Add), PAIR | {"register": (Registered, True)}),
     "solve": Action(_edit(Solve)),
-    "undo": Action(UndoLoop),
-    "redo": Action(RedoLoop),
+    "undo": Action(protocol.UndoLoop),
+    "redo": Action(protocol.RedoLoop),
 }
 
 
@@ -127,23 +111,6 @@ def _add_actions(
 
 
 # --- other bodies --------------------------------------------------------------------------------
-def _breakpoint_field(one: Breakpoint) -> tuple[Any, Any]:
-    if one.limit is None:
-        return bool, Field(False, description=one.hint)
-    unit = f" Unit: {one.limit.base_unit}." if one.limit.base_unit else ""
-    return float | None, Field(None, ge=0, description=one.hint + unit)
-
-
-_FIELDS: dict[str, Any] = {one.name: _breakpoint_field(one) for one in BREAKPOINTS}
-_Breakpoints: Any = create_model("_Breakpoints", **_FIELDS)
-
-
-class BreakpointsBody(_Breakpoints):  # type: ignore[misc]  # its fields are those of the table
-    """Where playing pauses. A limit pauses when it is exceeded; without a value, or with null, it is off."""
-
-    model_config = ConfigDict(extra="forbid")
-
-
 class NoteBody(BaseModel):
     text: str = Field(min_length=1, max_length=1000)
 
@@ -187,12 +154,9 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
     @router.patch("/params")
     def change(tree: dict[str, dict[str, Any]]) -> Params:
         """Change some, for example {"ground": {"alpha": 30}}. If one of them cannot be used, none is changed."""
-        before = engine.snapshot.params
-        after = before.merged(tree)
-        _send(
-            engine,
-            SetParams({f"{section}.{name}": value for section, part in tree.items() for name, value in part.items()}),
-        )
+        after = engine.snapshot.params.merged(tree)
+        values = {f"{section}.{name}": value for section, part in tree.items() for name, value in part.items()}
+        _send(engine, protocol.SetParams(values))
         return after
 
     _add_actions(
@@ -204,14 +168,14 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
     )
 
     @router.get("/breakpoints")
-    def breakpoints() -> BreakpointsBody:
+    def breakpoints() -> Breakpoints:
         """Where playing pauses."""
-        return BreakpointsBody(**engine.snapshot.breakpoints)
+        return engine.snapshot.breakpoints
 
     @router.put("/breakpoints")
-    def set_breakpoints(body: BreakpointsBody) -> BreakpointsBody:
+    def set_breakpoints(body: Breakpoints) -> Breakpoints:
         """Replace the breakpoints. The notices in the state say why playing paused."""
-        _send(engine, SetBreakpoints(Breakpoints(**body.model_dump())))
+        _send(engine, protocol.SetBreakpoints(body))
         return body
 
     @router.get("/loops")
@@ -230,7 +194,7 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
     @router.post("/notes", status_code=202)
     def add_note(body: NoteBody) -> None:
         """Add a note on the current frame to the session; the state lists them."""
-        _send(engine, AddNote(body.text))
+        _send(engine, protocol.AddNote(body.text))
 
     @router.get("/recordings")
     def recordings() -> list[str]:
@@ -241,12 +205,12 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
     def open_recording(body: OpenBody) -> None:
         """Open one. The notices in the state say whether that worked."""
         path = folders.openable(body.path)
-        _send(engine, OpenRecording(path, folders.inside(body.truth) if body.truth else truth_beside(path)))
+        _send(engine, protocol.OpenRecording(path, folders.inside(body.truth) if body.truth else truth_beside(path)))
 
     @router.post("/truth", status_code=202)
     def compare_with(body: CompareBody) -> None:
         """Compare the trajectory, from its start, with another one."""
-        _send(engine, CompareWith(folders.inside(body.path) if body.path else None))
+        _send(engine, protocol.CompareWith(folders.inside(body.path) if body.path else None))
 
     @router.get("/export/{name}", response_class=FileResponse)
     def export(name: ExportName, background: BackgroundTasks) -> FileResponse:
@@ -262,7 +226,7 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
 
 
 def _send(engine: RunningEngine, command: Command) -> None:
-    if not engine.snapshot.engine_alive and not isinstance(command, Restart | OpenRecording):
+    if not engine.snapshot.engine_alive and not isinstance(command, protocol.Restart | protocol.OpenRecording):
         raise HTTPException(503, "The engine's process has ended; the action `restart` starts it again.")
     engine.send(command)
 
@@ -285,7 +249,7 @@ def _save(engine: RunningEngine, folder: Path, *, trajectory_only: bool) -> None
     snapshot = engine.snapshot
     if snapshot.transport.frame < 0:
         raise HTTPException(409, "No frame has been processed yet; open a recording and play it first.")
-    _send(engine, Save(folder, trajectory_only))
+    _send(engine, protocol.Save(folder, trajectory_only))
     deadline = time.monotonic() + EXPORT_TIMEOUT_S
     while time.monotonic() < deadline:
         for saved in snapshot.saved:

@@ -42,9 +42,7 @@ class Gate:
         self._uploads: dict[str, int] = {}
 
     def let(self, raw: bytes) -> bytes | None:
-        """The message to pass on, or None to leave it out.
-
-        The message is encoded again, so that viser reads exactly what was checked here.
+        """The message to pass on, encoded again so that viser reads exactly what was checked; None: leave it out.
 
         Raises:
             Refused: it is not a message, or it belongs to an upload that is too large.
@@ -87,8 +85,7 @@ class Gate:
 async def bridge(browser: WebSocket, target: Viser, *, viewer: bool = False) -> None:
     """Pass messages between a browser and viser until either of them leaves.
 
-    Each direction reads a message only after the previous one was delivered. A slow browser therefore slows
-    viser down, which then sends it fewer and newer updates.
+    A message is read after the previous one was delivered, so viser sends a slow browser fewer and newer updates.
     """
     pipe = socket.socket(proto=socket.IPPROTO_TCP)  # asyncio turns Nagle's algorithm off only if the protocol is named
     pipe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)

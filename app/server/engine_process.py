@@ -69,9 +69,7 @@ def main(owner: Link, setup: Setup) -> None:
     """Compile, open the recording, and work until the owner asks to end or is gone."""
     revive = setup.revive
 
-    def opener(
-        path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None = None, /
-    ) -> Session:
+    def opener(path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None) -> Session:
         nonlocal revive
         if path == LIVE and setup.live is not None and setup.live_folder is not None:
             take_over, revive = revive, False

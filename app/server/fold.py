@@ -1,7 +1,6 @@
-"""Puts deltas together to snapshots, in the reader's process.
+"""Makes snapshots of deltas, in the reader's process.
 
-What follows from other values is not sent but computed here: where frames and keyframes lie in the map, by the
-odometry and the newest corrections; the distance travelled; and the error to the truth.
+Computed here, not sent: positions of frames and keyframes in the map, the distance travelled, the error to the truth.
 """
 
 from collections.abc import Iterable
@@ -25,13 +24,9 @@ NOTICES_KEPT = 50
 
 
 class Fold:
-    """Applies deltas, in their order, to a snapshot. One thread writes; any thread may read `snapshot`.
+    """Applies deltas to a snapshot. One thread writes; any thread may read `snapshot`, whose arrays never change.
 
-    It knows all frames, keyframes and chunks, also those after the frame shown. Arrays that were handed out stay as
-    they are.
-
-    Args:
-        point_budget: most points that all chunks together may have.
+    It keeps the frames, keyframes and chunks after the frame shown, too. point_budget: most points of all chunks.
     """
 
     def __init__(self, snapshot: Snapshot | None = None, point_budget: int = POINT_BUDGET) -> None:

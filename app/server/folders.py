@@ -15,12 +15,11 @@ TRAJECTORIES = (".tum",)
 
 @dataclass(frozen=True, slots=True)
 class FolderEntry:
-    """A line of the file browser: a file to choose, or a folder to look into."""
+    """A line of the file browser: a file to choose, with its size in bytes, or a folder to look into."""
 
     path: Path
     is_choice: bool
     size: int = 0
-    """Bytes of what can be chosen."""
 
 
 class Folders:
@@ -40,8 +39,7 @@ class Folders:
         """The real path behind `path`, relative to the first folder if it is not absolute.
 
         Raises:
-            HemislamError: it does not exist or lies outside. Both have the same message, which therefore says nothing
-                about files outside.
+            HemislamError: it does not exist or lies outside; the message does not say which.
         """
         try:
             real = (self.roots[0] / path if self.roots else Path(path)).resolve(strict=True)

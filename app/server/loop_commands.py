@@ -2,23 +2,16 @@
 
 from dataclasses import replace
 
+from app.mapping.session import Session
 from app.server.protocol import EditLoop, InspectLoop, LoopCommand, LoopsView, RedoLoop, TryLoop, UndoLoop
 from app.server.publisher import Publisher
-from app.slam.loops.messages import (
-    Answered,
-    ApplyEdit,
-    AskResiduals,
-    Failure,
-    Inspect,
-    LoopState,
-    TryOut,
-)
+from app.slam.loops.messages import Answered, ApplyEdit, AskResiduals, Failure, Inspect, LoopState, TryOut
 from app.slam.loops.schedule import LoopSchedule
 from app.slam.loops.types import Edits, LoopDetail, Preview
 
 
 class LoopCommands:
-    """Passes commands on to the loops of the open session, and shows what comes of them."""
+    """Passes commands on to the loops of the open session, and shows the results."""
 
     def __init__(self, page: Publisher) -> None:
         self._page = page
@@ -53,8 +46,11 @@ class LoopCommands:
             loops.command(AskResiduals())  # for a trial, too: to compare with
         self._show(view)
 
-    def update(self, loops: LoopSchedule, *, show: bool = True) -> bool:
-        """Take in answers and, if `show`, the state that came into effect. Returns whether the map has moved."""
+    def update(self, session: Session, *, show: bool = True) -> bool:
+        """Take in answers and, if `show`, show the state in effect. Returns whether answers are still to come."""
+        loops = session.loops
+        if loops is None:
+            return False
         loops.poll()
         view = self._view
         for answer in loops.take_answers():
@@ -76,8 +72,9 @@ class LoopCommands:
                 view = replace(view, edges=state.edges)
             if (view.undo, view.redo) != (state.undo, state.redo):
                 view = replace(view, undo=state.undo, redo=state.redo)
+            self._page.map_moved(session)
         self._show(view)
-        return moved
+        return not loops.idle
 
     def _show(self, view: LoopsView) -> None:
         if view is not self._view:

@@ -1,4 +1,4 @@
-"""The way of the open session through its frames: playing at a pace, stepping and seeking, both ways."""
+"""Moves the open session through its frames: playing at a pace, stepping and seeking, both ways."""
 
 import logging
 import time
@@ -11,12 +11,13 @@ from app.mapping.breakpoints import Breakpoints, CheckedFrame, reasons
 from app.mapping.feed import Quiet
 from app.mapping.session import EFFECT, Session
 from app.server.protocol import Progress
-from app.server.publisher import Publisher
+from app.server.publisher import Publisher, opened_recording
 from app.slam.errors import HemislamError
 from app.slam.types import DroppedScan, StepResult
 
 log = logging.getLogger(__name__)
 
+SOURCE_PERIOD_S = 0.5
 SLOWEST = 0.1
 LONGEST_LAG_S = 0.5
 """Playing that is later than this does not catch up; it goes on from where it is."""
@@ -28,7 +29,7 @@ _WARNINGS = ("disconnected", "silent", "jump", "recording", "units", "restarted"
 
 
 class Pacer:
-    """When the next frame is due: maps stamps of the recording to the clock at a chosen speed."""
+    """Says when the next frame is due, at a chosen speed."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -61,11 +62,7 @@ class Pacer:
 
 @dataclass(frozen=True, slots=True)
 class SeekTarget:
-    """A frame that was asked for.
-
-    Attributes:
-        stepping: asked for by steps, to which further steps are added. origin: where the way began, for progress.
-    """
+    """A frame to go to. origin: where the seek began. stepping: by steps, to which further ones are added."""
 
     frame: int
     origin: int
@@ -73,22 +70,21 @@ class SeekTarget:
 
 
 class Player:
-    """Takes a session from frame to frame and has the page show where it is.
-
-    `work` does what was asked for, a short piece per call.
+    """Takes a session from frame to frame and has the page show it. `work` does a short piece per call.
 
     Args:
         clock: monotonic seconds.
 
     Attributes:
         session: the open one, or None. breakpoints: where playing pauses.
-        page_behind: whether the page does not show the frame that the session is at.
-        relabelling: whether the ground of the frame shown is to be segmented again, with the present parameters.
+        page_behind: the page does not show the session's frame yet.
+        relabelling: the ground of the frame shown has to be segmented again, with the present parameters.
     """
 
     def __init__(self, page: Publisher, clock: Callable[[], float] = time.monotonic) -> None:
         self._page = page
         self._pacer = Pacer(clock)
+        self._clock, self._looked_at_source = clock, -1e9
         self.session: Session | None = None
         self.breakpoints = Breakpoints()
         self.page_behind = self.relabelling = False
@@ -97,7 +93,7 @@ class Player:
 
     # --- what is asked for -----------------------------------------------------------------------
     def take(self, session: Session) -> None:
-        """Begin with another session, at its first frame, or at the one that it is at."""
+        """Begin with another session, at its frame, or at its first one."""
         self.session = session
         self.relabelling = self.page_behind = False
         self._moment = None
@@ -110,7 +106,7 @@ class Player:
         self._page.show(playing=True)
 
     def halt(self) -> None:
-        """Stay at the present frame, also if one was being sought."""
+        """Stay at the present frame; end a seek."""
         if self._target is not None:
             self._target = None
             self._page.put(progress=None)
@@ -128,7 +124,7 @@ class Player:
         self._page.show(speed=factor)
 
     def step(self, session: Session, frames: int) -> None:
-        """Steps asked for while the last one is not done yet add up. Raises HemislamError: back on a live source."""
+        """Go this many frames on, or back; steps not done yet add up. Raises HemislamError: back on a live source."""
         if frames < 0 and not session.feed.repeatable:
             raise HemislamError(ONLY_ON)
         if self._target is not None and self._target.stepping:
@@ -141,22 +137,18 @@ class Player:
         self._aim(session, frame, frame if frame < max(session.heading, session.frame) else None, stepping=True)
 
     def seek(self, session: Session, frame: int) -> None:
-        """Go to a frame, or to the end if there are fewer, as fast as possible, then go on as before.
-
-        Raises:
-            HemislamError: the source is live.
-        """
+        """Go to a frame, or to the end, as fast as possible, then go on as before. Raises HemislamError: it is live."""
         if not session.feed.repeatable:
             raise HemislamError(ONLY_ON)
         frame = max(0, frame)
         self._aim(session, frame, frame)
 
     def resume(self, session: Session, frame: int, *, to_end: bool) -> None:
-        """Go to the frame that a session file was at. to_end: on to the end of the recording from there."""
+        """Go to the frame of a session file. to_end: and on to the end of the recording."""
         self._aim(session, max(frame, 0) + to_end, frame)
 
     def _aim(self, session: Session, frame: int, as_it_was: int | None, *, stepping: bool = False) -> None:
-        """Aim at a frame. as_it_was: frames up to this one are repeated, later ones processed anew; None: all anew."""
+        """Aim at a frame. as_it_was: the last frame to be repeated; later ones are processed anew. None: all are."""
         if as_it_was is not None:
             try:
                 session.go_to(as_it_was)
@@ -172,7 +164,7 @@ class Player:
 
     # --- work ------------------------------------------------------------------------------------
     def work(self) -> float | None:
-        """Do the next piece of due work; returns as `Controller.work`."""
+        """Do the next piece of work; returns as `Controller.work`."""
         session, target = self.session, self._target
         if session is None:
             return None
@@ -183,8 +175,24 @@ class Player:
             return None
         return self._advance(session, target)
 
+    def look_at_source(self, session: Session) -> float | None:
+        """Show the state of a live source now and then. Returns seconds until the next look."""
+        if self._page.transport.finished or session.feed.info.duration_s is not None:
+            return None
+        now = self._clock()
+        if now - self._looked_at_source >= SOURCE_PERIOD_S:
+            self._looked_at_source = now
+            try:
+                state = session.feed.live_state()
+            except HemislamError as error:
+                self.fail("Nothing more comes live", error)
+                self._page.show(finished=True)
+                return None
+            self._page.put(live=state, recording=opened_recording(session))
+        return SOURCE_PERIOD_S
+
     def fail(self, what: str, error: Exception) -> None:
-        """Report an error, pause, and go on living."""
+        """Report an error and pause."""
         if isinstance(error, HemislamError):
             reason = str(error)
         else:
@@ -224,7 +232,7 @@ class Player:
         except Exception as error:
             self.fail(f"The frame after frame {session.frame} could not be processed and is left out", error)
             return None
-        if not isinstance(result, StepResult):  # it failed then, too
+        if not isinstance(result, StepResult):  # it failed the first time too
             return 0.0
         if revisited:
             self.page_behind = True
@@ -236,7 +244,7 @@ class Player:
         return 0.0
 
     def _passed(self, session: Session, result: StepResult, *, played: bool) -> None:
-        """Pause where a breakpoint holds, unless the frame is one on the way to another."""
+        """Pause where a breakpoint holds, unless the frame is only passed by a seek."""
         before, self._moment = self._moment, CheckedFrame(result)
         if self.breakpoints["error"] is not None and before is not None and session.frame > 0:
             errors = session.errors()
@@ -255,13 +263,13 @@ class Player:
             self.settle_labels(session)
 
     def settle_labels(self, session: Session) -> None:
-        """Have the frame shown with the present ground parameters, if it was processed with others."""
+        """Relabel the frame if it was processed with other ground parameters."""
         then = session.params_of(session.frame)
         changed = then.changed(session.params) if then is not None else {}
         self.relabelling = any(EFFECT[path] == "now" for path in changed)
 
     def _arrive(self, session: Session) -> None:
-        """Show the frame once nothing is revisited any more; end the way at its target, or show how far it is."""
+        """Show the frame unless it is revisited; end a seek at its target, or show its progress."""
         if not session.revisits:
             self._catch_up()
         target, frame = self._target, session.frame

@@ -92,9 +92,7 @@ class OpenRecording(Command, frozen=True):
 
 
 class CompareWith(Command, frozen=True):
-    """Compare the whole trajectory with another one (TUM): the truth, or what another program or run made of the same
-    recording. None: with nothing.
-    """
+    """Compare the trajectory with another one (TUM): the truth, or that of another run or program. None: with none."""
 
     path: Path | None
 

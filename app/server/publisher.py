@@ -1,8 +1,7 @@
-"""What the page is told while frames are processed: collected in the engine's process, and sent as deltas.
+"""Collects what changes for the page, in the engine's process, and makes deltas of it.
 
-Fields of the snapshot that are replaced as a whole are sent in their newest value only. Frames are followed by a
-cursor, and the clouds of keyframes are read from disk when they are sent. So a slow reader never holds up the
-engine, misses nothing, and nothing piles up for it.
+Of most fields only the newest value is sent. Frames are followed by a cursor, and clouds are read from disk when sent.
+So a slow reader never delays the engine, misses nothing, and nothing piles up for it.
 """
 
 import re
@@ -24,7 +23,7 @@ from app.slam.types import StepResult
 CHUNKS_AT_ONCE = 20
 """Most clouds in one delta, so that a reader far behind sees the map grow."""
 REPEAT_AFTER_S = 10.0
-"""The same kind of notice is shown again only after so much of the recording's time."""
+"""Recording time after which the same kind of notice is shown again."""
 SAVED_KEPT = 10
 
 
@@ -82,9 +81,8 @@ class Publisher:
         self._keyframes: list[int] = []  # their frames
         self._chunks = chunks
 
-    # --- what is sent ----------------------------------------------------------------------------
     def put(self, *, urgent: bool = False, **values: Any) -> None:
-        """Set fields of the snapshot. Only the newest value of each is sent."""
+        """Set fields of the snapshot."""
         self._replaced |= values
         self.urgent |= urgent
 
@@ -102,7 +100,7 @@ class Publisher:
             self.notice("warning", text)
 
     def begin(self, frames: Log[Frame], keyframes: Keyframes) -> None:
-        """Follow another session, or, if it has frames already, the one that an earlier process began."""
+        """Follow another session. If it has frames, an earlier process began it."""
         self._frames, self._clouds, self._edges = frames, keyframes, ()
         self._keyframes = [index for index, frame in enumerate(frames) if frame.keyframe]
         if len(frames):
@@ -121,7 +119,7 @@ class Publisher:
 
     @property
     def _chunks_ready(self) -> int:
-        """Keyframes whose cloud can be read. After a seek back, later ones can be read again once they are passed."""
+        """Keyframes whose cloud can be read: after a seek back, only those up to the session's frame."""
         return min(len(self._keyframes), len(self._clouds))
 
     def take(self) -> Delta:
@@ -166,14 +164,10 @@ class Publisher:
             self.notice_once(notice, result.stamp_ns)
 
     def arrived(self, session: Session, result: StepResult | None) -> None:
-        """Show the known frame that the session went to."""
+        """Show a known frame, to which the session went."""
         self._show_frame(session, result)
-        self.show(
-            frame=session.frame,
-            stamp_ns=result.stamp_ns if result else 0,
-            finished=session.ended,
-            dropped=session.dropped,
-        )
+        stamp_ns = result.stamp_ns if result else 0
+        self.show(frame=session.frame, stamp_ns=stamp_ns, finished=session.ended, dropped=session.dropped)
 
     def _show_frame(self, session: Session, result: StepResult | None) -> None:
         self.result = result and replace(result, keyframe=None)
@@ -181,13 +175,13 @@ class Publisher:
         self.map_moved(session)
 
     def map_moved(self, session: Session) -> None:
-        """Loops may have moved keyframes."""
+        """Show the corrections by loops, if they have changed."""
         if session.map_frame is not self._corrections:
             self._corrections = session.map_frame
             self.put(corrections=self._corrections)
 
     def relabelled(self, result: StepResult) -> None:
-        """The newest frame got other labels."""
+        """Show other labels of the frame."""
         self.result = result
         self.put(result=result, urgent=True)
 

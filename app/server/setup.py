@@ -11,7 +11,6 @@ from app.slam.params import Params
 if TYPE_CHECKING:
     from app.sensors.live.address import LiveAddress
 
-
 POINT_BUDGET = 3_000_000
 
 
@@ -20,16 +19,12 @@ class Setup:
     """What an engine's process starts with. Must be picklable.
 
     Attributes:
-        recording: to open, or None to wait for OpenRecording. truth: its truth, if not beside it.
-        start_s, duration_s: the part of that recording to process.
-        resolve: parameters for recordings opened later; None keeps the present ones.
-        play: begin at once. speed: to play at. breakpoints: where to pause.
-        point_budget: most points of the map that are held for pages, see `app.server.chunks`.
-        checkpoint_bytes: see `app.mapping.checkpoints`.
-        live_folder: where a live run keeps what a process that takes over needs. revive: it is that process.
-        live: where to take scans from while `recording` is `app.server.protocol.LIVE`.
-        session_folder: folder for session files, see `Controller`.
-        session, notices, frames, chunks: how many there were before, for a process that takes over from another.
+        recording: to open; None: wait for OpenRecording. start_s, duration_s: the part to process.
+        resolve, session_folder: see `Controller`. play: begin at once.
+        point_budget: most points of the map that are held for pages. checkpoint_bytes: memory for checkpoints.
+        live: source of scans if `recording` is `app.server.protocol.LIVE`. live_folder: keeps what a process that takes
+            over needs. revive: this process takes over.
+        session, notices, frames, chunks: how many there were before, if this process takes over.
     """
 
     recording: Path | None = None

@@ -128,11 +128,9 @@ def run_server(
     """Serve the workbench until Ctrl-C or SIGTERM, then end the engine's process and everything else.
 
     Args:
-        setup: what the engine starts with. folders: what the page may open.
-        build_page: makes the page.
-        host, port: to bind to; on an address that others can reach, the printed link has a token. Port 0: a free one.
-        open_browser: open the page, if there is a display.
-        start_engine: replaced only in tests.
+        setup: of the engine. folders: that the page may open. build_page: makes the page.
+        host, port: to bind to; port 0: a free one. On an address that others can reach, the printed link has a token.
+        open_browser: open the page, if there is a display. start_engine: replaced only in tests.
         tls: certificate and key for https.
 
     Raises:
@@ -184,7 +182,7 @@ def log_notices(engine: RunningEngine) -> None:
 
 
 def show_compilation(engine: EngineProcess) -> None:
-    """A progress bar in the terminal while the engine compiles, which takes a minute at the first start."""
+    """Show a progress bar in the terminal while the engine compiles, a minute at the first start."""
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{desc}: {percentage:3.0f}% |{bar}|") as bar:
         snapshot = engine.snapshot
         while snapshot.engine_alive and (snapshot.revision == 0 or snapshot.progress is not None):

@@ -1,7 +1,6 @@
 """The engine in a process of its own, started and watched from here.
 
-Commands go down; deltas come up, one at a time: the next is sent when the one before was acknowledged. So a slow
-reader gets few large deltas instead of many small ones.
+The process sends the next delta when the last one was acknowledged. So a slow reader gets few large deltas.
 """
 
 import math
@@ -57,7 +56,6 @@ class EngineProcess:
 
     @property
     def snapshot(self) -> Snapshot:
-        """The newest one."""
         return self._fold.snapshot
 
     @property
@@ -79,10 +77,7 @@ class EngineProcess:
             child.send(command)
 
     def restart(self, command: Restart | OpenRecording | None = None) -> None:
-        """Start a new process in place of this one, with the newest parameters, at the first frame.
-
-        It opens the recording that was open, or the one that the command names.
-        """
+        """Start a new process with the newest parameters, at the first frame of the command's or the open recording."""
         self.close(timeout=0)
         last, setup = self.snapshot, self._next_setup(play=False)
         if isinstance(command, OpenRecording):
@@ -106,7 +101,7 @@ class EngineProcess:
         threading.Thread(target=self._follow, args=(child,), name="engine updates", daemon=True).start()
 
     def _follow(self, child: Child) -> None:
-        """Fold what the process sends, until it ends."""
+        """Apply what the process sends, until it ends."""
         try:
             while True:
                 delta = child.receive()
@@ -121,22 +116,18 @@ class EngineProcess:
                 self._died(death)
 
     def _died(self, death: ChildDied) -> None:
-        """Say so, and start the process again if there is something that it can go on with."""
+        """Report it, and start the process again if its session was kept."""
         last = self.snapshot
         place = last.session_file or (LIVE if last.live is not None else None)
         restarts = place is not None and self._restarts.allows()
-        then = (
-            "It is started again and returns to where it was."
-            if restarts
-            else "Restart it to begin again at the first frame."
-        )
-        notices = (Notice(_number(last) + 1, "error", f"{death} {then}"),)
+        again, ended = "It is started again and returns to where it was.", "Restart it to begin at the first frame."
+        notices = (Notice(_number(last) + 1, "error", f"{death} {again if restarts else ended}"),)
         if not restarts:
             transport = replace(last.transport, playing=False, frames_per_second=0.0)
             self._edit(engine_alive=False, progress=None, transport=transport, notices=notices)
             return
         self._edit(notices=notices, progress=Progress("Starting the engine again", math.nan))
-        on_the_way = last.progress is not None or last.transport.frame < 0  # to where the one before was
+        on_the_way = last.progress is not None or last.transport.frame < 0  # to the frame of the process before
         setup = self._next_setup(play=self._started_with.play if on_the_way else last.transport.playing)
         frames = 0 if last.trajectory is None else len(last.trajectory)
         self._start(replace(setup, recording=place, revive=True, frames=frames, chunks=len(last.chunks)))

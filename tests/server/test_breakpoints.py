@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import server_fakes as fakes
+from pydantic import ValidationError
 
 from app.mapping.breakpoints import Breakpoints, CheckedFrame, reasons
 from app.mapping.session import Session
@@ -20,7 +21,6 @@ from app.server.protocol import Pause, Play, Restart, Seek, SetBreakpoints, SetS
 from app.server.publisher import Publisher
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
-from app.slam.errors import HemislamError
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.params import Params
 from app.slam.types import ImuSamples, Scan, StepResult
@@ -111,7 +111,7 @@ def test_the_users_own_word_on_a_loop_pauses_nothing() -> None:
 
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
 def test_a_limit_that_is_no_limit_is_refused_by_name(value: float) -> None:
-    with pytest.raises(HemislamError, match="residual"):
+    with pytest.raises(ValidationError, match="residual"):
         Breakpoints(residual=value)
 
 

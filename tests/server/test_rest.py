@@ -13,7 +13,6 @@ import server_fakes as fakes
 from server_site import TIMEOUT_S, Site, eventually
 
 from app.mapping.breakpoints import Breakpoints
-from app.server.api import BreakpointsBody
 
 
 def test_transport_by_rest(site: Site) -> None:
@@ -103,7 +102,7 @@ def notices(site: Site) -> list[str]:
 def test_breakpoints_by_rest_reach_the_engine_together(site: Site) -> None:
     for body in ({"no_ground": True, "residual": 0.5}, {"frame_ms": 80}, {}):
         answer = httpx.put(site.url("/api/breakpoints"), json=body)
-        assert answer.status_code == 200 and answer.json() == BreakpointsBody(**body).model_dump()
+        assert answer.status_code == 200 and answer.json() == Breakpoints(**body).model_dump()
         deadline = time.monotonic() + TIMEOUT_S
         while site.engine.snapshot.breakpoints != Breakpoints(**body):
             assert time.monotonic() < deadline
@@ -119,8 +118,8 @@ def test_an_invalid_breakpoint_is_refused(site: Site, body: dict[str, object]) -
 
 def test_breakpoints_are_described(site: Site) -> None:
     schemas = httpx.get(site.url("/api/openapi.json")).json()["components"]["schemas"]
-    described = schemas["BreakpointsBody"]["properties"]
-    assert set(described) == set(Breakpoints())
+    described = schemas["Breakpoints"]["properties"]
+    assert set(described) == set(Breakpoints.model_fields)
     assert all(entry["description"] for entry in described.values())
 
 

@@ -284,7 +284,7 @@ def walk_on(bench: Bench, end: int) -> None:
 def test_restored_and_continued_equals_never_stopped(
     sample_params: Params, never_stopped: Snapshot, kilobytes: int
 ) -> None:
-    def opener(path: Path, truth: Path | None, params: Params, /) -> Session:
+    def opener(path: Path, truth: Path | None, params: Params, part: object = None, /) -> Session:
         return open_sample(path, truth, params, kilobytes=kilobytes)
 
     bench = Bench(sample_params, opener, SAMPLE)

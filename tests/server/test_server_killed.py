@@ -88,7 +88,7 @@ class Server:
 def never_killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, dict[str, bytes]]:
     """The last frame, and what a session that nobody kills ends with."""
 
-    def opener(path: Path, truth: Path | None, params: Params, /) -> Session:
+    def opener(path: Path, truth: Path | None, params: Params, part: object = None, /) -> Session:
         return open_session(path, params, 0.0, LENGTH_S, truth=truth, checkpoint_bytes=DEFAULT_BYTES)
 
     bench, folder = (
