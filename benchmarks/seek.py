@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from app.mapping.checkpoints import Checkpoints
-from app.mapping.feed import open_file
+from app.mapping.feed import FileFeed
 from app.mapping.loops import RestartingLoops
 from app.mapping.session import Session
 from app.sensors.presets import resolve_params
@@ -101,7 +101,7 @@ def cost(path: Path, budget: int, frames: int | None = None) -> list[Line]:
     compile_kernels()
     steps, held = 0.0, [0.0]
     checkpoints = _Timed(budget)
-    session = Session(open_file(path, params), Engine(params), loops=RestartingLoops, checkpoints=checkpoints)
+    session = Session(FileFeed(path, params), Engine(params), loops=RestartingLoops, checkpoints=checkpoints)
     if session.loops:
         session.loops.wait_ready()
     checkpoints.seconds = 0.0

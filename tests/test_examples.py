@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.mapping.feed import open_file
+from app.mapping.feed import FileFeed
 from app.slam.params import Params
 from app.slam.types import Measurement
 
@@ -49,7 +49,7 @@ def test_a_recording_is_read_frame_by_frame() -> None:
 
 def test_a_feed_of_ones_own_makes_a_map(tmp_path: Path) -> None:
     """Three seconds of the sample at rest, written as plain text."""
-    feed = open_file(SAMPLE, Params(), 0.0, 3.0)
+    feed = FileFeed(SAMPLE, Params(), 0.0, 3.0)
     entries = [entry for entry in iter(feed.next, None) if isinstance(entry, Measurement)]
     feed.close()
     clouds = [

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState, Status
-from app.sensors.recording import Measurements, Place, Recording, open_recording
+from app.sensors.recording import Measurements, Place, open_recording
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
@@ -78,12 +78,12 @@ class Feed(Protocol):
 
 
 class FileFeed(Feed):
-    """A recording, or a part of it."""
+    """A recording, or a part of it. Raises HemislamError: it cannot be used."""
 
     repeatable = True
 
-    def __init__(self, recording: Recording, start_s: float = 0.0, duration_s: float | None = None) -> None:
-        self._recording = recording
+    def __init__(self, path: Path, params: Params, start_s: float = 0.0, duration_s: float | None = None) -> None:
+        self._recording = recording = open_recording(path, params)
         rest = max(0.0, recording.duration_s - start_s)
         share = (rest if duration_s is None else min(rest, duration_s)) / max(recording.duration_s, 1e-9)
         self._info = FeedInfo(
@@ -115,8 +115,3 @@ class FileFeed(Feed):
 
     def _read(self, after: Place | None) -> Measurements:
         return self._recording.measurements(self._info.start_s, self._info.part_s, after=after)
-
-
-def open_file(path: Path, params: Params, start_s: float = 0.0, duration_s: float | None = None) -> FileFeed:
-    """Open a recording, or a part of it. Raises HemislamError: it cannot be used."""
-    return FileFeed(open_recording(path, params), start_s, duration_s)

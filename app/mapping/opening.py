@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from app.mapping.checkpoints import Checkpoints
-from app.mapping.feed import open_file
+from app.mapping.feed import FileFeed
 from app.mapping.loops import RestartingLoops
 from app.mapping.session import Session
 from app.slam.engine import Engine
@@ -33,7 +33,7 @@ def open_session(
     Raises:
         HemislamError: the recording or the truth cannot be used.
     """
-    feed = open_file(path, params, start_s, duration_s)
+    feed = FileFeed(path, params, start_s, duration_s)
     try:
         return Session(
             feed,

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from app.mapping import truth as truths
 from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelEdit, LabelledKeyframes
 from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
+from app.mapping.truth import compared
 from app.sensors.findings import Finding
 from app.slam.engine import Engine
 from app.slam.errors import HemislamError
@@ -306,7 +306,8 @@ class Session:
         """(frame + 1,) m, distances to the truth, which is aligned to the frames so far; nan without truth."""
         if self.truth is None:
             return np.full(self.frame + 1, np.nan)
-        return truths.errors(self.truth, self.map_frame.trajectory(self.log.odometry))
+        ours = self.map_frame.trajectory(self.log.odometry)
+        return compared(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns, ours.positions)[1]
 
     def save(
         self,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from app.mapping import truth
+from app.mapping.truth import compared
 from app.server.chunks import within_budget
 from app.server.protocol import Chunk, Delta, Notice, OpenedRecording, Snapshot
 from app.server.setup import POINT_BUDGET
@@ -107,9 +107,9 @@ class Fold:
         steps = np.linalg.norm(np.diff(positions, axis=0, prepend=positions[:1]), axis=1)
         T_map_truth, error = None, np.full(shown, np.nan)
         if recording is not None and recording.truth_stamps_ns is not None and recording.truth_positions is not None:
-            there = truth.interpolated(recording.truth_stamps_ns, recording.truth_positions, frames["stamp_ns"])
-            T_map_truth = truth.align(there, positions)
-            error = truth.distances(T_map_truth, there, positions)
+            T_map_truth, error = compared(
+                recording.truth_stamps_ns, recording.truth_positions, frames["stamp_ns"], positions
+            )
         series = {
             "stamp_s": (frames["stamp_ns"] - start_ns) * 1e-9,
             "distance": np.cumsum(steps),

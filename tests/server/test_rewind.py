@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from test_fold import content
 
 from app.mapping.checkpoints import DEFAULT_BYTES, START
-from app.mapping.feed import open_file
+from app.mapping.feed import FileFeed
 from app.mapping.labels import LabelEdit
 from app.mapping.opening import open_session
 from app.mapping.session import Session
@@ -313,7 +313,7 @@ def test_after_going_back_there_is_nothing_of_what_came_later(sample_params: Par
 
 
 def test_reading_is_taken_up_between_any_two_measurements_as_if_it_had_gone_on(sample_params: Params) -> None:
-    feed, read, places = open_file(SAMPLE, sample_params, 1.0, 3.0), [], []
+    feed, read, places = FileFeed(SAMPLE, sample_params, 1.0, 3.0), [], []
     while (entry := feed.next()) is not None:
         read.append(entry)
         places.append(feed.place())
