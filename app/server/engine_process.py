@@ -20,49 +20,41 @@ FRAME_PERIOD_S = 0.04
 
 
 class Updates:
-    """Publishes deltas to the owner, one at a time, and takes its commands. The engine never waits for the owner.
-
-    All methods raise `LinkClosed` when the owner is gone or asks the engine to end.
-    """
+    """Publishes deltas to the owner, one at a time, and takes its commands. The engine never waits for the owner."""
 
     def __init__(self, owner: Link, page: Publisher) -> None:
         self._owner, self._page = owner, page
-        self._inbox: list[Command] = []
-        self._acknowledged = True
-        self._published = 0.0
+        self._acknowledged, self._published = True, 0.0
 
-    def publish(self) -> float | None:
-        """Send what changed, if the owner is ready and it is time.
+    def exchange(self, wait: float | None) -> list[Command]:
+        """Send what changed, if the owner is ready and it is time. Returns the commands that have come.
 
-        Returns:
-            Seconds until there is something to publish; None if there is nothing or the owner is not ready, in which
-            case its acknowledgement wakes `commands`.
+        Args:
+            wait: for commands, if none has come (s); None: without limit. Shorter if there is something to send.
+
+        Raises:
+            LinkClosed: the owner is gone, or asks the engine to end.
         """
-        self._receive(0.0)
-        if not self._acknowledged or not self._page.filled:
-            return None
-        wait = 0.0 if self._page.urgent else self._published + FRAME_PERIOD_S - time.monotonic()
-        if wait > 0:
-            return wait
-        self._published = time.monotonic()
-        self._acknowledged = False
-        self._owner.send(self._page.take())
-        return None
+        commands = self._receive(0.0)
+        if self._acknowledged and self._page.filled:
+            due = 0.0 if self._page.urgent else self._published + FRAME_PERIOD_S - time.monotonic()
+            if due > 0:
+                wait = due if wait is None else min(wait, due)
+            else:
+                self._published, self._acknowledged = time.monotonic(), False
+                self._owner.send(self._page.take())
+        return commands or self._receive(wait)
 
-    def commands(self, wait: float | None) -> list[Command]:
-        """Commands that have come; if nothing has, waits up to so many seconds (None: without a limit)."""
-        self._receive(0.0 if self._inbox else wait)
-        commands, self._inbox = self._inbox, []
-        return commands
-
-    def _receive(self, wait: float | None) -> None:
-        """Take in all messages that have come; if none has, wait for one."""
+    def _receive(self, wait: float | None) -> list[Command]:
+        """All commands that have come; if no message has, wait for one."""
+        commands = []
         while (message := self._owner.receive(wait)) is not None:
             if message == ACKNOWLEDGED:
                 self._acknowledged = True
             else:
-                self._inbox.append(message)
+                commands.append(message)
             wait = 0.0
+        return commands
 
 
 def main(owner: Link, setup: Setup) -> None:
@@ -93,22 +85,22 @@ def run_loop(
     controller = Controller(page, setup.params, opener, resolve=setup.resolve, session_folder=setup.session_folder)
     controller.handle(SetSpeed(setup.speed))
     controller.handle(SetBreakpoints(setup.breakpoints))
+    early: list[Command] = []
     if prepare is not None:
 
         def progress(name: str, fraction: float) -> None:
             page.put(progress=Progress(f"Compiling {name}", fraction))
-            updates.publish()
+            early.extend(updates.exchange(0.0))
 
         prepare(progress)
         page.put(progress=None)
     if setup.recording is not None:
         controller.open(setup.recording, setup.truth, play=setup.play)
-    wait: float | None = 0.0
     try:
+        commands = early + updates.exchange(0.0)
         while True:
-            waits = [seconds for seconds in (wait, updates.publish()) if seconds is not None]
-            for command in updates.commands(min(waits, default=None)):
+            for command in commands:
                 controller.handle(command)
-            wait = controller.work()
+            commands = updates.exchange(controller.work())
     except LinkClosed:
         controller.close()
