@@ -1,5 +1,6 @@
 """Where numba keeps compiled kernels when it can write neither beside their source nor in the user's cache folder."""
 
+import contextlib
 import os
 import stat
 import tempfile
@@ -33,13 +34,11 @@ def _can_make(folder: Path) -> bool:
 
 def _private_folder() -> Path:
     """A folder that only this user can write to, since numba runs what it finds there. The same one at each start."""
-    user = os.getuid() if hasattr(os, "getuid") else "user"
+    user = os.getuid() if hasattr(os, "getuid") else 0  # as `st_uid` is on Windows
     folder = Path(tempfile.gettempdir()) / f"hemislam-kernels-{user}"
-    try:
+    with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
-    except FileExistsError:
-        found = folder.lstat()
-        foreign = hasattr(os, "getuid") and found.st_uid != os.getuid()
-        if foreign or not stat.S_ISDIR(found.st_mode) or stat.S_IMODE(found.st_mode) & 0o077:
-            return Path(tempfile.mkdtemp(prefix="hemislam-kernels-"))
-    return folder
+    found = folder.lstat()
+    if found.st_uid == user and stat.S_ISDIR(found.st_mode) and (os.name == "nt" or not found.st_mode & 0o077):
+        return folder
+    return Path(tempfile.mkdtemp(prefix="hemislam-kernels-"))

@@ -30,10 +30,10 @@ _SLACK: Final = 0.97
 """A map over budget is thinned to this share of it, so that not every new keyframe thins it again."""
 
 
-def thinned(keyframe: Keyframe, voxel_size: float = VOXEL_M) -> Chunk:
-    """A keyframe's cloud with one of its points per voxel of this edge (m), in random order."""
+def thinned(keyframe: Keyframe) -> Chunk:
+    """A keyframe's cloud with one of its points per voxel, in random order."""
     cloud = keyframe.cloud
-    chosen = one_per_voxel(cloud.points, voxel_size, seed=keyframe.index)
+    chosen = one_per_voxel(cloud.points, VOXEL_M, seed=keyframe.index)
     return Chunk(
         index=keyframe.index,
         frame=keyframe.frame,
