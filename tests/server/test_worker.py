@@ -15,7 +15,21 @@ import numpy as np
 import pytest
 import server_fakes as fakes
 
-from app.server.protocol import OpenRecording, Pause, Play, Restart, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.child import LinkClosed
+from app.server.engine_process import run_loop
+from app.server.protocol import (
+    ACKNOWLEDGED,
+    Delta,
+    OpenRecording,
+    Pause,
+    Play,
+    Restart,
+    Seek,
+    SetParams,
+    SetSpeed,
+    Snapshot,
+    StepFrame,
+)
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 
@@ -174,3 +188,31 @@ def test_ctrl_c_ends_both_without_a_traceback(parent: tuple[subprocess.Popen[str
     out, err = process.communicate(timeout=PATIENCE_S)
     assert out == "closed True\n" and err == "" and process.returncode == 0
     assert gone(engine_pid)
+
+
+def test_the_page_is_told_that_a_recording_is_being_opened_before_it_is_open() -> None:
+    class Owner:
+        """Acknowledges each delta, opens a recording once nothing else is due, and leaves when that is done."""
+
+        def __init__(self) -> None:
+            self.deltas: list[Delta] = []
+            self._messages: list[object] = []
+            self._orders: list[object] = [OpenRecording(Path("walk-30.mcap"))]
+
+        def send(self, delta: Delta) -> None:
+            self.deltas.append(delta)
+            self._messages.append(ACKNOWLEDGED)
+
+        def receive(self, wait: float | None) -> object:
+            if self._messages:
+                return self._messages.pop(0)
+            if wait is None and not self._orders:
+                raise LinkClosed
+            return self._orders.pop() if wait is None else None
+
+    owner = Owner()
+    run_loop(owner, Setup(), fakes.open_fake)  # type: ignore[arg-type]
+    told = [delta.replaced["progress"] for delta in owner.deltas if delta.replaced.get("progress")]
+    assert [progress.title for progress in told] == ["Opening walk-30.mcap"]
+    opened = next(index for index, delta in enumerate(owner.deltas) if delta.replaced.get("recording"))
+    assert owner.deltas[opened - 1].replaced["progress"] is told[0]
