@@ -27,6 +27,10 @@ ARGS = (
 SLOW_MS = 120_000
 """Software rendering on a busy machine; what is expected comes as soon as it comes."""
 expect.set_options(timeout=SLOW_MS)
+OF_OTHERS = ("THREE.Clock: ", "GL Driver Message", "Canvas2D: Multiple readback")
+"""How warnings begin that viser, the software renderer and the tests themselves cause."""
+complaints: list[str] = []
+"""Errors and warnings on the browser's consoles, and uncaught exceptions, since the last test."""
 
 
 @dataclass
@@ -86,6 +90,23 @@ def chromium() -> Iterator[Browser]:
         browser.close()
 
 
+def new_page(chromium: Browser, width: int, height: int) -> Page:
+    """A page on which an error or a warning of our own fails the test."""
+    page = chromium.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(SLOW_MS)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+    return page
+
+
+@pytest.fixture(autouse=True)
+def _no_complaints() -> Iterator[None]:
+    yield
+    told = [text for text in complaints if not text.startswith(OF_OTHERS)]
+    complaints.clear()
+    assert not told
+
+
 @contextmanager
 def opened(
     chromium: Browser, engine: Any, folder: Path, width: int, height: int, camera: tuple[Any, Any] | None = None
@@ -100,8 +121,7 @@ def opened(
     if camera is not None:
         server.initial_camera.position, server.initial_camera.look_at = camera
     workbench.start()
-    page = chromium.new_page(viewport={"width": width, "height": height})
-    page.set_default_timeout(SLOW_MS)
+    page = new_page(chromium, width, height)
     url = f"http://127.0.0.1:{server.get_port()}/"
     page.goto(url)
     expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()

@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from app.server.protocol import CompareWith, OpenRecording, Pause, Play, Seek, SetParams, StepFrame
-from tests.browser.conftest import Bench
+from tests.browser.conftest import Bench, new_page
 
 
 @pytest.fixture(autouse=True)
@@ -171,7 +171,7 @@ def test_a_reload_finds_everything_again(bench: Bench) -> None:
 
 
 def test_two_browsers_see_one_session(bench: Bench, chromium: Browser) -> None:
-    other = chromium.new_page(viewport={"width": 1000, "height": 620})
+    other = new_page(chromium, 1000, 620)
     try:
         other.goto(bench.url)
         theirs = other.locator("[role=slider]").nth(ALPHA)
@@ -188,20 +188,16 @@ def test_two_browsers_see_one_session(bench: Bench, chromium: Browser) -> None:
         other.close()
 
 
-def test_the_page_has_no_errors_and_reaches_out_to_nobody(bench: Bench, chromium: Browser) -> None:
-    page = chromium.new_page(viewport={"width": 1000, "height": 620})
+def test_the_page_reaches_out_to_nobody(bench: Bench, chromium: Browser) -> None:
+    page = new_page(chromium, 1000, 620)
     try:
-        errors: list[str] = []
         hosts: set[str] = set()
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("request", lambda request: hosts.add(request.url.split("/")[2]) if "://" in request.url else None)
         page.goto(bench.url)
         expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
         bench.engine.send(Seek(12))
         expect(page.get_by_text("frame 12 of 400")).to_be_visible()
         page.wait_for_timeout(500)
-        assert errors == []
         assert hosts <= {Path(bench.url).name, bench.url.split("/")[2]}
     finally:
         page.close()

@@ -88,6 +88,17 @@ def test_along_the_scene_it_is_as_wide_as_that_and_works_the_same_also_after_a_r
     bench.eventually(lambda: abs(x() - panel["x"]) < 2)
 
 
+def test_a_copy_of_the_strips_that_the_page_drops_while_it_loads_leaves_the_strips_alone(bench: Bench) -> None:
+    dropped = (
+        "() => new Promise((done) => { const box = document.createElement('div');"
+        "box.innerHTML = document.querySelector('canvas[aria-label=timeline]').closest('[data-hs-to]').outerHTML;"
+        "const image = box.querySelector('img'); box.firstChild.remove();"
+        "image.addEventListener('load', () => setTimeout(done, 1000)); })"
+    )
+    bench.page.evaluate(dropped)
+    expect(timeline(bench)).to_have_count(1)
+
+
 def test_a_breakpoint_is_switched_on(bench: Bench) -> None:
     bench.page.get_by_text("Pause when").click()
     bench.page.get_by_role("checkbox", name="no ground").click()

@@ -1,4 +1,5 @@
 // Draws the strips on a canvas, reads the pointer, and asks the server to seek (see viser_adapter.js).
+if (!this.isConnected) return; // a copy that the page has dropped already
 const shell = this.parentElement, mover = shell.closest('[data-hs-to]'), home = mover.parentElement;
 const canvas = shell.querySelector('canvas'), button = shell.querySelector('button');
 const pen = canvas.getContext('2d');
