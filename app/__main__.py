@@ -135,6 +135,11 @@ def simulate(
         float,
         typer.Option("--range-step", metavar="METRES", help="Step of distances; 0.0025 for a newer unit, 0: none."),
     ] = 0.005,
+    imperfect: options.Imperfect = False,
+    errors: Annotated[
+        list[str] | None,
+        typer.Option("--error", metavar="NAME=SIZE", help="Size of one imperfection; 0: none. Repeatable."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
 ) -> None:
     """Simulate a recording in a modelled scene.
@@ -148,11 +153,14 @@ def simulate(
       hemislam simulate corridor --out corridor.mcap
       hemislam simulate outdoor --out outdoor.mcap --duration 120 --seed 7
       hemislam simulate room --out small.mcap --duration 20 --every-block 6
+      hemislam simulate outdoor --out real.mcap --imperfect --error companions=0
       hemislam simulate --suite paper --out suite/
     """
     from app.cli.suite import make_suite
     from app.sensors.simulator import SCENES, simulate
+    from app.sensors.simulator.imperfections import IMPERFECT, NONE
 
+    imperfections = (IMPERFECT if imperfect else NONE).with_sizes(errors or [])
     if (scene is not None) if suite is not None else short:
         raise HemislamError("SCENE takes --duration, --suite takes --short; give either SCENE or --suite.")
     if suite is not None:
@@ -161,7 +169,7 @@ def simulate(
         if given := [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]:
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
             raise HemislamError(f"--suite does not take {names}; leave them out, or name a SCENE.")
-        make_suite(suite, out, [seed], short=short, every_block=every_block)
+        make_suite(suite, out, [seed], short=short, every_block=every_block, imperfections=imperfections)
         return
     if scene is None:
         raise HemislamError(f"Name a SCENE, one of {', '.join(SCENES)}, or use --suite paper.")
@@ -177,6 +185,7 @@ def simulate(
             every_block=every_block or 1,
             range_step=range_step,
             coordinate_step=coordinate_step,
+            imperfections=imperfections,
             progress=show,
         )
     typer.echo(

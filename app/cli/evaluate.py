@@ -6,7 +6,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic, Preset, Start, make_folder, resolve
+from app.cli.options import (
+    Assignments,
+    Config,
+    Duration,
+    Imperfect,
+    ImuTopic,
+    LidarTopic,
+    Preset,
+    Start,
+    make_folder,
+    resolve,
+)
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
@@ -51,6 +62,7 @@ def evaluate(
     ] = None,
     short: Annotated[bool, typer.Option("--short", help="Only the first 60 s of each sequence of the suite.")] = False,
     seeds: Annotated[list[int] | None, typer.Option("--seed", min=0, help="Seed of the suite. Repeatable.")] = None,
+    imperfect: Imperfect = False,
     jobs: Annotated[
         int | None, typer.Option("--jobs", min=1, metavar="N", help="Parallel runs. Default: one per core.")
     ] = None,
@@ -88,14 +100,19 @@ def evaluate(
     from app.evaluation.evaluate import evaluate as run_evaluation
     from app.evaluation.truth import read_truth
     from app.evaluation.variants import choose_variants, parse_variant
+    from app.sensors.simulator.imperfections import IMPERFECT, NONE
 
-    if suite is None and (short or seeds):
-        raise HemislamError("--short and --seed belong to --suite; with a RECORDING, --duration shortens it.")
+    if suite is None and (short or seeds or imperfect):
+        raise HemislamError(
+            "--short, --seed and --imperfect belong to --suite; with a RECORDING, --duration shortens it."
+        )
     chosen = choose_variants([parse_variant(text) for text in variants or []], ablation=ablation)
     paths = list(recordings or [])
     make_folder(out)
     if suite is not None:
-        paths += make_suite(suite, out / "recordings", seeds or [0], short=short)
+        paths += make_suite(
+            suite, out / "recordings", seeds or [0], short=short, imperfections=IMPERFECT if imperfect else NONE
+        )
     if not paths:
         raise HemislamError("Nothing to evaluate; name a RECORDING or use --suite paper.")
     names = _names(paths)

@@ -34,6 +34,9 @@ Start = Annotated[float, typer.Option("--start", min=0, metavar="SECONDS", help=
 Duration = Annotated[
     float | None, typer.Option("--duration", min=0, metavar="SECONDS", help="Process only so much of the recording.")
 ]
+Imperfect = Annotated[
+    bool, typer.Option("--imperfect", help="With the errors of a real scanner and hand, and with people beside.")
+]
 Truth = Annotated[
     Path | None,
     typer.Option(

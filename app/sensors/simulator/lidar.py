@@ -1,6 +1,7 @@
 """The simulated RS-Bpearl: each of its firings has its own time, azimuth, origin and pose."""
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from app.sensors.rsbpearl import (
 from app.sensors.simulator.raycast import Raycaster
 from app.sensors.simulator.trajectory import SmoothTrajectory, seconds
 from app.slam.types import F32, F64, I64, U16, Scan
+
+if TYPE_CHECKING:
+    from app.sensors.simulator.imperfections import Unit
 
 P_IMU_LIDAR: F64 = np.array([0.0175, 0.0276, -0.1083])
 """m, the LiDAR's place on H2LID's IMU; their axes agree."""
@@ -65,6 +69,7 @@ class Lidar:
     """Attributes:
     range_noise: m, spread of a distance before it is rounded to `range_step` (m, 0 = not rounded).
     coordinate_step: m, rounding of x, y, z (0 = none). lossless: whether every beam that hits returns.
+    unit: the errors of one scanner; None: it has none.
     """
 
     pattern: Pattern = field(default_factory=firing_pattern)
@@ -72,6 +77,7 @@ class Lidar:
     range_step: float = BPEARL.range_step
     coordinate_step: float = 0.0
     lossless: bool = False
+    unit: "Unit | None" = None
 
     def turn(
         self, scene: Raycaster, trajectory: SmoothTrajectory, start_s: float, epoch_ns: int, rng: np.random.Generator
@@ -83,10 +89,15 @@ class Lidar:
         pattern = self.pattern
         start_ns = round(start_s * 1e9)
         origins, directions = self._rays(trajectory, start_ns)
-        hits = scene.cast(origins, directions, seconds(start_ns + pattern.offsets_ns))
+        times = seconds(start_ns + pattern.offsets_ns)
+        hits = scene.cast(origins, directions, times)
 
         n = len(directions)
-        distance = hits.distance + self.range_noise * rng.normal(size=n)
+        exact, noise = hits.distance, self.range_noise
+        if self.unit is not None:
+            self.unit.see_through(hits, scene, origins, directions, times, rng)
+            exact, noise = self.unit.ranges(hits, rng), self.unit.sizes.range_noise or noise
+        distance = exact + noise * rng.normal(size=n)
         if self.range_step > 0:
             distance = np.rint(distance / self.range_step) * self.range_step
         seen = (distance >= MIN_RANGE_M) & (distance <= MAX_RANGE_M)
@@ -117,7 +128,7 @@ class Lidar:
         Poses are computed at both ends of each block and interpolated between: within 55 us a hand's motion deviates
         from a straight line by nanometres.
         """
-        pattern = self.pattern
+        pattern = self.pattern if self.unit is None else self.unit.fired(self.pattern)
         begin = start_ns + pattern.blocks_ns
         p0, R0 = trajectory.poses(seconds(begin))
         p1, R1 = trajectory.poses(seconds(begin + pattern.block_ns))

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from app.sensors.ros import RecordingWriter
 from app.sensors.rsbpearl import BPEARL, ROTATION_RATES_HZ
+from app.sensors.simulator.imperfections import NONE, Imperfections, Unit, companions, livelier
 from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
 from app.sensors.simulator.raycast import Raycaster, SimulatedScene
 from app.sensors.simulator.scenes import build_scene
@@ -35,7 +36,7 @@ TRANSPORT_NS = 4_000_000
 _FIRST_TURN_S = 0.05
 _IMU_PERIOD_NS = 1_000_000_000 // IMU_RATE_HZ
 
-_TRAJECTORY, _IMU, _LIDAR = 1, 2, 3
+_TRAJECTORY, _IMU, _LIDAR, _UNIT, _PEOPLE = 1, 2, 3, 4, 5
 """Streams of random numbers that do not disturb one another (0 is the scene's)."""
 
 
@@ -67,6 +68,7 @@ def simulate(
     range_step: float = BPEARL.range_step,
     coordinate_step: float = 0.0,
     walker: Walker | None = None,
+    imperfections: Imperfections = NONE,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulationSummary:
     """Simulate a person who carries an RS-Bpearl and an IMU, and write it as a ROS 2 recording.
@@ -86,6 +88,7 @@ def simulate(
         coordinate_step: m, rounding of x, y, z; 0 = none. A power of two near the noise, such as
             0.00390625, makes the file a third smaller.
         walker: how the person walks; None = the defaults.
+        imperfections: errors of a real scanner and hand, and people beside the operator.
         progress: called with (scans done, scans in all).
 
     Raises:
@@ -99,12 +102,17 @@ def simulate(
     _check_range("range_step", range_step, 0.0, 0.1, "m")
     _check_range("coordinate_step", coordinate_step, 0.0, 0.1, "m")
     place = build_scene(scene, seed)
-    trajectory = trajectory_through(place, duration_s, seed, walker or Walker())
-    caster = Raycaster(place.mesh, place.movers)
+    walker = livelier(walker or Walker(), imperfections.hand)
+    trajectory = trajectory_through(place, duration_s, seed, walker)
+    company = companions(imperfections.companions, trajectory, place.height, _random(seed, _PEOPLE))
+    caster = Raycaster(place.mesh, (*place.movers, *company))
+    unit = None if imperfections == NONE else Unit(imperfections, _random(seed, _UNIT))
     pattern = firing_pattern(BPEARL, rate_hz, every_block)
-    lidar = Lidar(pattern, range_step=range_step, coordinate_step=coordinate_step)
+    lidar = Lidar(pattern, range_step=range_step, coordinate_step=coordinate_step, unit=unit)
     imu_stamps = START_NS + np.arange(round(duration_s * IMU_RATE_HZ) + 1, dtype=np.int64) * _IMU_PERIOD_NS
     imu = measured(trajectory, imu_stamps, START_NS, ImuNoise(), _random(seed, _IMU))
+    if unit is not None:
+        imu = unit.felt(imu, START_NS, _random(seed, _UNIT, _IMU))
 
     total = int((duration_s - _FIRST_TURN_S) * rate_hz + 1e-6)
     points = written = 0

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from app.sensors.simulator.imperfections import NONE, Imperfections
 from app.sensors.simulator.scenes import build_scene
 from app.sensors.simulator.simulate import simulate, trajectory_through
 from app.sensors.simulator.trajectory import Walker
@@ -67,6 +68,7 @@ def make_twin(
     seed: int = 0,
     short: bool = False,
     every_block: int | None = None,
+    imperfections: Imperfections = NONE,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Made:
     """Simulate one sequence into `folder`, unless it is there already.
@@ -80,11 +82,12 @@ def make_twin(
         HemislamError: as `simulate`.
     """
     name = twin.scene + (f"-seed{seed}" if seed else "") + ("-short" if short else "")
+    name += "" if imperfections == NONE else "-imperfect"
     out, note = folder / f"{name}.mcap", folder / f"{name}.suite.json"
     every_block = every_block or (SHORT_EVERY_BLOCK if short else 1)
     duration_s = min(SHORT_S, twin.duration_s) if short else twin.duration_s
     wanted = {"twin": asdict(twin), "seed": seed, "duration_s": duration_s, "every_block": every_block}
-    wanted["simulator"] = _digest()
+    wanted |= {"simulator": _digest(), "imperfections": asdict(imperfections)}
     there = _noted(note) if out.is_file() else {}
     if there.get("made") == wanted:
         return Made(out, False, there["distance_m"])
@@ -96,6 +99,7 @@ def make_twin(
         rate_hz=RATE_HZ,
         every_block=every_block,
         walker=Walker(speed=fitting_speed(twin, seed)),
+        imperfections=imperfections,
         progress=progress,
     )
     note.write_text(json.dumps({"made": wanted, "distance_m": made.distance_m}, indent=2) + "\n", encoding="utf-8")
