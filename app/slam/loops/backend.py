@@ -15,7 +15,7 @@ from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops.detection import Detector, Head
 from app.slam.loops.drift import Drift
-from app.slam.loops.edits import EditEntry, EditList, check, in_words
+from app.slam.loops.edits import check, in_words, lay_over
 from app.slam.loops.factors import Closing, Factor, PositionPrior, loop_factors, odometry_factor, residuals
 from app.slam.loops.messages import Target
 from app.slam.loops.pose_graph import PoseGraph
@@ -32,6 +32,7 @@ from app.slam.loops.types import (
     Preview,
     Solve,
     Verdict,
+    loses,
     rows,
 )
 from app.slam.loops.verdicts import by_hand, worth_correcting
@@ -62,7 +63,9 @@ class LoopBackend:
     def __init__(self) -> None:
         self._history: list[_Record] = []
         self._ends: dict[int, Found] = {}  # found in addition where the session ended, by the number of keyframes
-        self._edits = EditList()
+        self._edits = Edits()
+        self._made: dict[Add, LoopEdge] = {}  # the loops by hand among them
+        self._reached = 0  # keyframes that the session ever had, one more after its end; later edits do not act yet
         self._start = LoopsParams()  # for what acts on restart
         self._detector = Detector(self._start)
         self._graph = PoseGraph(np.eye(4))
@@ -125,10 +128,11 @@ class LoopBackend:
             self._ends[count] = self._look(self._detector.described, count)
         self._finished = True
         self._stand(count)
-        self._reach(max(self.known + 1, self._edits.latest) if count == self.known else 0)
-        for entry in self._edits:
-            if entry.edit.pair and entry.edit.pair not in self.by_pair:
-                self._say(f"{in_words(entry.edit)} has no effect: there is no such loop; loops.csv lists all.")
+        sinces = [edit.since for edit in (*self._edits.done, *self._edits.undone)]  # may lie beyond the end
+        self._reach(max(self.known + 1, *sinces) if count == self.known else 0)
+        for edit in self._edits.done:
+            if edit.pair and edit.pair not in self.by_pair:
+                self._say(f"{in_words(edit)} has no effect: there is no such loop; loops.csv lists all.")
 
     def go_to(self, count: int) -> None:
         """Go to the state after `count` keyframes of the history. Raises HemislamError if it has fewer."""
@@ -149,7 +153,9 @@ class LoopBackend:
         del self._history[count:]
         self._ends = {end: found for end, found in self._ends.items() if end <= count}
         self._detector.forget()
-        self._edits.cut(count, self._start.submap_keyframes)
+        half = self._start.submap_keyframes
+        self._edits, self._reached = self._edits.cut(count, half), count
+        self._made = {edit: edge for edit, edge in self._made.items() if not loses(edit, count, half)}
         self._stand(count)
 
     def stand(self, target: Target) -> None:
@@ -163,7 +169,8 @@ class LoopBackend:
 
     def _reach(self, reached: int) -> None:
         """The session has come this far: edits that were made here act from now on."""
-        if self._edits.reach(reached):
+        before, self._reached = self._reached, max(self._reached, reached)
+        if any(before < edit.since <= reached for edit in self._edits.done):
             self._solve()
         self._resolve()
 
@@ -205,13 +212,13 @@ class LoopBackend:
         params = self._history[len(self) - 1].params
         if not params.enabled:
             return Found()
-        return search(self._detector, range(first, max(end, 0)), self._found, self._edges, self._solved, params)
+        return search(self._detector, range(first, max(end, 0)), self._found, self._counting, self._solved, params)
 
     # --- results --------------------------------------------------------------------------------
     @property
     def poses(self) -> F64:
         """(k, 4, 4) T_map_imu of all keyframes."""
-        if self._edits.solving:
+        if self._solving:
             try:
                 return self._optimum(self.edges)
             except HemislamError as error:
@@ -223,7 +230,7 @@ class LoopBackend:
         """(k, 4, 4) T_map_odom at each keyframe; identity while odometry agrees with the loops."""
         odometry = self._detector.poses
         measured = any(record.priors for record in self._history[: len(self)])
-        if measured or self._edits.solving or worth_correcting(self.edges, odometry):
+        if measured or self._solving or worth_correcting(self.edges, odometry):
             return np.asarray(self.poses @ lie.inverse(odometry))
         return np.tile(np.eye(4), (len(self), 1, 1))
 
@@ -236,7 +243,7 @@ class LoopBackend:
     def by_pair(self) -> Mapping[Pair, LoopEdge]:
         """The same, by pair. It is not changed later."""
         if self._by_pair is None:
-            self._by_pair = self._edges(self._found)
+            self._by_pair = self._counting(self._found)
         return self._by_pair
 
     def take_notices(self) -> tuple[str, ...]:
@@ -265,12 +272,17 @@ class LoopBackend:
     @property
     def edits(self) -> Edits:
         """The user's edits, in force and undone."""
-        return self._edits.edits
+        return self._edits
 
     @property
-    def acting(self) -> int:
-        """How many of those in force act already."""
-        return self._edits.acting
+    def acting(self) -> tuple[LoopEdit, ...]:
+        """Those in force that act already."""
+        return tuple(edit for edit in self._edits.done if edit.since <= self._reached)
+
+    @property
+    def _solving(self) -> bool:
+        """Whether poses are those of all factors solved at once."""
+        return any(isinstance(edit, Solve) for edit in self.acting)
 
     def apply(self, edit: LoopEdit) -> None:
         """Add an edit. Those undone before can no longer be redone. Raises HemislamError if it makes no sense."""
@@ -281,7 +293,8 @@ class LoopBackend:
                 edit = replace(edit, guess=rows(self._present(edit.older, edit.newer)))
         else:
             there = edit.pair is None or edit.pair in self.by_pair
-        self._edits.give(self._entry(replace(edit, since=self._edits.reached if there else 0)))
+        self._made |= self._made_by(edit)
+        self._edits = Edits((*self._edits.done, replace(edit, since=self._reached if there else 0)))
         self._solve()
         if not there:
             self._notices.append(f"{in_words(edit)} waits until there is such a loop.")
@@ -290,7 +303,9 @@ class LoopBackend:
         """Replace all edits. Raises HemislamError if one makes no sense, and then nothing has changed."""
         for edit in (*edits.done, *edits.undone):
             check(edit)
-        if self._edits.load(edits):
+        known, before, self._edits = {*edits.done, *edits.undone}, self._edits.done, edits
+        self._made = {edit: edge for edit, edge in self._made.items() if edit in known}
+        if [(edit, edit.since) for edit in before] != [(edit, edit.since) for edit in edits.done]:
             self._solve()
             self._resolve()
 
@@ -305,23 +320,24 @@ class LoopBackend:
             self._check_there(edit.older, edit.newer)
             if not isinstance(edit, Add) and edit.pair not in self.by_pair:
                 raise HemislamError(f"There is no loop candidate of keyframes {edit.older} and {edit.newer}.")
-        edges = tuple(self._edges(self._found, self._entry(replace(edit, since=0))).values())
+        edits, made = (*self.acting, edit), self._made | self._made_by(edit)
+        edges = tuple(self._in_graph(lay_over(self._found, edits, made, len(self))).values())
         poses = self._optimum(edges)
         return Preview(poses, residuals(self._factors(edges), poses))
 
-    def _entry(self, edit: LoopEdit) -> EditEntry:
-        """With the loop that it adds. Raises HemislamError if its registration found nothing in common."""
+    def _made_by(self, edit: LoopEdit) -> dict[Add, LoopEdge]:
+        """The loop that an edit adds, if any. Raises HemislamError if its registration found nothing in common."""
         if not isinstance(edit, Add) or edit.newer >= len(self):
-            return EditEntry(edit)
-        edge = self._made(edit)
+            return {}
+        edge = self._make(edit)
         if edit.register and not edge.evidence.overlap:
             raise HemislamError(
                 f"The surroundings of keyframes {edge.older} and {edge.newer} have nothing in common from there;"
                 " nudge one nearer to where it belongs, or tie them without registration."
             )
-        return EditEntry(edit, edge)
+        return {edit: edge}
 
-    def _made(self, edit: Add) -> LoopEdge:
+    def _make(self, edit: Add) -> LoopEdge:
         older, newer = edit.older, edit.newer
         guess = self._present(older, newer) if edit.guess is None else np.array(edit.guess, dtype=np.float64)
         return by_hand(older, newer, self._detector, guess, register=edit.register)
@@ -332,10 +348,13 @@ class LoopBackend:
         return np.asarray(lie.inverse(poses[older]) @ poses[newer])
 
     def _resolve(self) -> None:
-        """Make the loops by hand whose keyframes now exist."""
+        """Make the loops by hand whose keyframes now exist; those given from the start wait for their surroundings."""
         count = len(self)
         complete = count if self._finished else count - self._start.submap_keyframes
-        if self._edits.resolve(count, complete, self._made):
+        waiting = [edit for edit in self.acting if isinstance(edit, Add) and edit not in self._made]
+        made = {edit: self._make(edit) for edit in waiting if edit.newer < (count if edit.since else complete)}
+        if made:
+            self._made |= made
             self._solve()
 
     def _check_there(self, older: int, newer: int) -> None:
@@ -351,8 +370,12 @@ class LoopBackend:
         """(k, 4, 4) T_map_imu by the incremental solver."""
         return self._graph.poses[: len(self)]
 
-    def _edges(self, found: dict[Pair, LoopEdge], extra: EditEntry | None = None) -> dict[Pair, LoopEdge]:
-        edges = self._edits.lay_over(found, len(self), extra)
+    def _counting(self, found: Mapping[Pair, LoopEdge]) -> dict[Pair, LoopEdge]:
+        """What was found, as it counts with the edits."""
+        return self._in_graph(lay_over(found, self.acting, self._made, len(self)))
+
+    def _in_graph(self, edges: dict[Pair, LoopEdge]) -> dict[Pair, LoopEdge]:
+        """The same, without those that the solver failed with."""
         for pair in self._broken & edges.keys():
             edges[pair] = replace(edges[pair], verdict=Verdict.REJECTED, reason="the solver failed with it")
         return edges
@@ -360,7 +383,7 @@ class LoopBackend:
     def _solve(self) -> None:
         """Solve the graph again, in the order in which keyframes and loops came."""
         self._by_pair, self._broken = None, frozenset()
-        edges = self._edges(self._found)
+        edges = self._counting(self._found)
         arrivals: dict[int, list[LoopEdge]] = {}
         for edge in edges.values():
             arrivals.setdefault(edge.decided_at, []).append(edge)

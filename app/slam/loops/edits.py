@@ -4,145 +4,33 @@ An edit names a pair of keyframes, whether that pair was found already or not. A
 for it, so a list of edits can be given before the session begins.
 """
 
-import operator
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from app.slam.errors import HemislamError
-from app.slam.loops.types import (
-    Accept,
-    Add,
-    Edits,
-    LoopEdge,
-    LoopEdit,
-    Origin,
-    Pair,
-    SetWeight,
-    Solve,
-    Verdict,
-    loses,
-)
+from app.slam.loops.types import Accept, Add, LoopEdge, LoopEdit, Origin, Pair, SetWeight, Solve, Verdict
 from app.slam.types import F64
 
 
-@dataclass(frozen=True, slots=True)
-class EditEntry:
-    """An edit, and the loop that an Add made; None while it waits for its keyframes."""
+def lay_over(
+    found: Mapping[Pair, LoopEdge], edits: Iterable[LoopEdit], made: Mapping[Add, LoopEdge], count: int
+) -> dict[Pair, LoopEdge]:
+    """What was found, as it counts with the edits.
 
-    edit: LoopEdit
-    added: LoopEdge | None = None
-
-
-class EditList:
-    """The edits in force and those undone, with the loops that they added.
-
-    Attributes:
-        reached: how many keyframes the session ever had, one more after its end. An edit acts if its `since` is not
-            greater.
+    Args:
+        made: the loops by hand; an Add without one waits for its keyframes. count: number of keyframes; loops by hand
+            beyond them do not count.
     """
-
-    def __init__(self) -> None:
-        self.reached = 0
-        self._done: list[EditEntry] = []
-        self._undone: list[EditEntry] = []
-
-    def __iter__(self) -> Iterator[EditEntry]:
-        return iter(self._done)
-
-    @property
-    def edits(self) -> Edits:
-        return Edits(tuple(entry.edit for entry in self._done), tuple(entry.edit for entry in self._undone))
-
-    @property
-    def acting(self) -> int:
-        """How many edits in force act already."""
-        return sum(entry.edit.since <= self.reached for entry in self._done)
-
-    @property
-    def solving(self) -> bool:
-        """Whether poses are those of all factors solved at once."""
-        return any(isinstance(entry.edit, Solve) and entry.edit.since <= self.reached for entry in self._done)
-
-    @property
-    def latest(self) -> int:
-        """The greatest `since`; in edits of a session with more keyframes it may lie beyond the end."""
-        return max((entry.edit.since for entry in [*self._done, *self._undone]), default=0)
-
-    def give(self, entry: EditEntry) -> None:
-        self._done.append(entry)
-        self._undone.clear()
-
-    def reach(self, reached: int) -> bool:
-        """The session has come this far. Returns whether edits act from now on that did not before."""
-        before, self.reached = self.reached, max(self.reached, reached)
-        return any(before < entry.edit.since <= reached for entry in self._done)
-
-    def load(self, edits: Edits) -> bool:
-        """Replace all edits; loops that were added by those that stay are kept. Returns whether anything changed."""
-        known = {entry.edit: entry for entry in [*self._undone, *self._done]}  # whatever their `since`
-
-        def entry_of(edit: LoopEdit) -> EditEntry:
-            entry = known.get(edit, EditEntry(edit))
-            return entry if entry.edit.since == edit.since else replace(entry, edit=edit)
-
-        before, self._done = self._done, [entry_of(edit) for edit in edits.done]
-        self._undone = [entry_of(edit) for edit in edits.undone]
-        same = len(before) == len(self._done) and all(map(operator.is_, before, self._done))
-        return not same
-
-    def resolve(self, count: int, complete: int, make: Callable[[Add], LoopEdge]) -> bool:
-        """Make the loops by hand that wait for their keyframes, where these are there.
-
-        Args:
-            count: keyframes there are. complete: how many of them have complete surroundings; edits
-                given from the start wait for those, others were given without.
-
-        Returns:
-            Whether there were any.
-        """
-        before = self._done
-
-        def resolved(entry: EditEntry) -> EditEntry:
-            edit = entry.edit
-            if not isinstance(edit, Add) or entry.added is not None or edit.since > self.reached:
-                return entry
-            there = edit.newer < (count if edit.since else complete)
-            return replace(entry, added=make(edit)) if there else entry
-
-        self._done = [resolved(entry) for entry in before]
-        return any(new is not old for new, old in zip(self._done, before, strict=True))
-
-    def cut(self, count: int, half: int) -> None:
-        """All keyframes but the first `count` were forgotten; see `Edits.cut`."""
-        self.load(self.edits.cut(count, half))
-        self.reached = count
-        self._done, self._undone = (
-            [replace(entry, added=None) if loses(entry.edit, count, half) else entry for entry in entries]
-            for entries in (self._done, self._undone)
-        )
-
-    def lay_over(
-        self, found: Mapping[Pair, LoopEdge], count: int, extra: EditEntry | None = None
-    ) -> dict[Pair, LoopEdge]:
-        """What was found, as it counts with the edits, and with one more if given.
-
-        Args:
-            count: number of keyframes; loops by hand beyond them do not count.
-        """
-        entries = [*self._done, *([extra] if extra else [])]
-        edges = dict(found)
-        for entry in entries:
-            pair = entry.edit.pair
-            if pair is None or entry.edit.since > self.reached:
-                continue
-            if entry.added is not None:
-                if entry.added.newer < count:
-                    edges[pair] = entry.added
-            elif pair in edges:
-                edges[pair] = _edited(edges[pair], entry.edit)
-        return {pair: _standing(edges[pair], edges) for pair in sorted(edges)}
+    edges = dict(found)
+    for edit in edits:
+        if isinstance(edit, Add) and edit in made:
+            if edit.newer < count:
+                edges[edit.pair] = made[edit]
+        elif edit.pair is not None and edit.pair in edges:
+            edges[edit.pair] = _edited(edges[edit.pair], edit)
+    return {pair: _standing(edges[pair], edges) for pair in sorted(edges)}
 
 
 def check(edit: LoopEdit) -> None:

@@ -75,7 +75,7 @@ class LoopService:
             edges=backend.edges,
             undo=backend.edits.done,
             redo=backend.edits.undone,
-            acting=backend.acting,
+            acting=len(backend.acting),
             notices=backend.take_notices(),
         )
 
