@@ -129,7 +129,7 @@ class LoopBackend:
         self._finished = True
         self._stand(count)
         sinces = [edit.since for edit in (*self._edits.done, *self._edits.undone)]  # may lie beyond the end
-        self._reach(max(self.known + 1, *sinces) if count == self.known else 0)
+        self._reach(max([self.known + 1, *sinces]) if count == self.known else 0)
         for edit in self._edits.done:
             if edit.pair and edit.pair not in self.by_pair:
                 self._say(f"{in_words(edit)} has no effect: there is no such loop; loops.csv lists all.")
