@@ -17,6 +17,7 @@ from app.sensors.recording import ImuEntry, Recording, ScanEntry, open_recording
 from app.sensors.sequencer import Counts, Sequencer
 from app.slam.errors import HemislamError
 from app.slam.params import Params
+from app.slam.sections import ImuParams
 from app.slam.types import I64, DroppedScan, Scan
 
 DAMAGE = "file"
@@ -35,7 +36,7 @@ def examine(
         HemislamError: the recording cannot be opened. Damage further on is a finding.
     """
     with open_recording(path, params) as recording:
-        census = _Census(Sequencer(params.imu.max_gap))
+        census = _Census(Sequencer(params.imu))
         damage = []
         try:
             for number, entry in enumerate(recording.entries()):
@@ -58,6 +59,7 @@ def examine(
             clock_finding(scans, imu, params.recording.imu_time_offset),
             _imu_gaps(counts, params.imu.max_gap),
             _imu_time(counts),
+            _imu_values(counts, len(imu), params.imu),
             *_scan_time(scans),
             _pairing(counts.paired, census.reasons),
             _returns(census, len(scans)),
@@ -142,6 +144,15 @@ def _imu_time(counts: Counts) -> Finding:
     )
     text = f"{wrong}; those samples are left out" if wrong else "the stamps only ever rise"
     return Finding("IMU time", "corrected" if wrong else "fine", text)
+
+
+def _imu_values(counts: Counts, samples: int, limits: ImuParams) -> Finding:
+    bounds = f"{limits.max_acceleration:g} m/s² or {limits.max_rate:g} rad/s"
+    wrong = _listed((counts.imu_out_of_range, f"beyond {bounds}"), (counts.imu_spikes, "single spikes"))
+    if not wrong:
+        return Finding("IMU values", "fine", f"none beyond {bounds}, no spikes")
+    verdict: Verdict = "corrected" if counts.imu_out_of_range + counts.imu_spikes < 0.01 * samples else "needs you"
+    return Finding("IMU values", verdict, f"of {samples} samples {wrong}; those are left out")
 
 
 def _scan_time(scans: I64) -> list[Finding]:

@@ -187,7 +187,7 @@ class Measurements(Iterator[Measurement | DroppedScan]):
         self._recording = recording
         self._part = (start_s, duration_s)
         self._message = after.message if after else None
-        self._sequencer = after.sequencer.copy() if after else Sequencer(recording.params.imu.max_gap)
+        self._sequencer = after.sequencer.copy() if after else Sequencer(recording.params.imu)
         self._reasons = after.reasons.copy() if after else Counter[str]()
         self._ended = after is not None and after.ended
         self._entries = self._read()

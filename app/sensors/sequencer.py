@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from app.sensors.ros import Vector
+from app.slam.sections import ImuParams
 from app.slam.types import DroppedScan, ImuSamples, Measurement, Samples, Scan
 
 OUTAGE_NS = 1_000_000_000
@@ -26,6 +27,12 @@ MAX_WAITING = 64
 MAX_HELD = 10_000
 """Samples of another sensor that may wait for a scan; the oldest go first."""
 
+GYRO, ACCEL = slice(0, 3), slice(3, 6)
+SPIKE_FLOOR = ((GYRO, 0.5), (ACCEL, 3.0))
+"""rad/s, m/s^2: what differs less from its neighbours is never a spike."""
+SPIKE_TO_NEIGHBOURS, SPIKE_TO_USUAL = 4.0, 10.0
+"""A spike is off the way between its neighbours by this many times their difference, and what is usual."""
+
 
 @dataclass(slots=True)
 class Counts:
@@ -34,6 +41,8 @@ class Counts:
     imu_duplicates: int = 0
     imu_back_steps: int = 0
     imu_invalid: int = 0
+    imu_out_of_range: int = 0
+    imu_spikes: int = 0
     imu_gaps: int = 0
     longest_imu_gap_s: float = 0.0
     paired: int = 0
@@ -41,15 +50,15 @@ class Counts:
 
 @dataclass(slots=True)
 class Sequencer:
-    """The one place that guarantees IMU coverage of a scan.
+    """The one place that guarantees IMU coverage of a scan, by samples that an IMU can have measured.
 
     Attributes:
-        max_gap_s: a longer interval between IMU samples is a gap: reported, and a scan that lies
-            mostly inside it is dropped.
+        limits: `max_gap`: a longer interval between IMU samples is a gap: reported, and a scan that lies mostly
+            inside it is dropped. `max_rate`, `max_acceleration`: samples beyond are refused.
         counts: what was met so far.
     """
 
-    max_gap_s: float
+    limits: ImuParams
     counts: Counts = field(default_factory=Counts)
     _stamps: list[int] = field(default_factory=list)
     _values: list[tuple[float, ...]] = field(default_factory=list)
@@ -62,6 +71,9 @@ class Sequencer:
     _behind: bool = False
     _suspect: tuple[int, tuple[float, ...]] | None = None
     """A sample stamped far ahead of the one before: a wrong stamp, unless the next one goes on from there."""
+    _usual: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    """How far samples usually are from the way between their neighbours: rad/s, m/s^2."""
+    _begun: bool = False
 
     def copy(self) -> "Sequencer":
         """An independent copy in the same state. Scans and samples are shared: they never change."""
@@ -70,13 +82,15 @@ class Sequencer:
     def tail(self) -> "Sequencer":
         """A sequencer that takes over after this one's last scan, and notices what is missing in between."""
         return Sequencer(
-            self.max_gap_s,
+            self.limits,
             replace(self.counts),
             _stamps=self._stamps[-1:],
             _values=self._values[-1:],
             _last_stamp_ns=self._last_stamp_ns,
             _last_end_ns=self._last_end_ns,
             _intervals_ns=self._intervals_ns.copy(),
+            _usual=self._usual.copy(),
+            _begun=self._begun,
         )
 
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector) -> None:
@@ -84,6 +98,9 @@ class Sequencer:
         values = (*gyro, *accel)
         if not all(map(math.isfinite, values)):
             self._count("imu_invalid", "an IMU sample is NaN or infinite and was left out")
+            return
+        if max(map(abs, gyro)) > self.limits.max_rate or max(map(abs, accel)) > self.limits.max_acceleration:
+            self._count("imu_out_of_range", "an IMU sample is beyond what an IMU can measure and was left out")
             return
         newest = self._stamps[-1] if self._stamps else None
         if newest is not None and stamp_ns > newest + OUTAGE_NS and not self._confirms(stamp_ns):
@@ -112,11 +129,31 @@ class Sequencer:
 
     def _append(self, stamp_ns: int, values: tuple[float, ...]) -> None:
         gap_s = (stamp_ns - self._stamps[-1]) / 1e9 if self._stamps else 0.0
-        if gap_s > self.max_gap_s:
+        if gap_s > self.limits.max_gap:
             self.counts.imu_gaps += 1
             self.counts.longest_imu_gap_s = max(self.counts.longest_imu_gap_s, gap_s)
         self._stamps.append(stamp_ns)
         self._values.append(values)
+        if len(self._values) > 2:
+            self._check(-3, -2, -1)
+            if not self._begun and len(self._values) > 2:  # the very first has neighbours on one side only
+                self._begun = True
+                self._check(-2, -3, -1)
+
+    def _check(self, before: int, this: int, after: int) -> None:
+        """Take out this sample if it differs from its neighbours as no motion does: for a single sample."""
+        values, spike = self._values, False
+        for n, (part, floor) in enumerate(SPIKE_FLOOR):
+            first, second, third = values[before][part], values[this][part], values[after][part]
+            off, apart = math.dist(first, second) + math.dist(second, third), math.dist(first, third)
+            off = (off - apart) / 2  # 0 on the way from one neighbour to the other, however fast
+            if off > max(floor, SPIKE_TO_NEIGHBOURS * apart, SPIKE_TO_USUAL * self._usual[n]):
+                spike = True
+            else:
+                self._usual[n] += 0.02 * (off - self._usual[n])
+        if spike:
+            del self._stamps[this], self._values[this]
+            self._count("imu_spikes", "an IMU sample is far from those before and after it and was left out")
 
     def add(self, samples: Samples) -> None:
         """Samples of any other sensor. Each goes out once, with the first measurement that ends at or after it.
@@ -136,7 +173,7 @@ class Sequencer:
         while self._waiting:
             scan = self._waiting[0]
             end_ns = scan.end_ns if isinstance(scan, Scan) else scan.stamp_ns
-            covered = bool(self._stamps) and self._stamps[-1] >= end_ns
+            covered = len(self._stamps) > 1 and self._stamps[-2] >= end_ns  # the newest may be a spike
             if not covered and len(self._waiting) <= MAX_WAITING:
                 return
             yield self._take(self._waiting.pop(0))
@@ -158,7 +195,7 @@ class Sequencer:
         self._note_missing_scans(scan)
         imu = self._samples(first, last + 1)
         gaps = np.diff(imu.stamps_ns) / 1e9
-        self._notices += [f"no IMU sample for {gap:.3f} s" for gap in gaps[gaps > self.max_gap_s]]
+        self._notices += [f"no IMU sample for {gap:.3f} s" for gap in gaps[gaps > self.limits.max_gap]]
         measurement = Measurement(scan, imu, tuple(self._notices), self._take_streams(end_ns))
         self._notices.clear()
         self._last_stamp_ns, self._last_end_ns = scan.stamp_ns, end_ns
@@ -194,7 +231,7 @@ class Sequencer:
         last = bisect.bisect_left(self._stamps, end_ns)
         for before, after in zip(self._stamps[first:last], self._stamps[first + 1 : last + 1], strict=True):
             inside = min(after, end_ns) - max(before, begin_ns)
-            if after - before > self.max_gap_s * 1e9 and inside > 0.5 * (end_ns - begin_ns):
+            if after - before > self.limits.max_gap * 1e9 and inside > 0.5 * (end_ns - begin_ns):
                 return "it lies in a gap of the IMU"
         return ""
 

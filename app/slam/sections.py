@@ -146,6 +146,12 @@ class ImuParams(Section):
     gyro_bias_walk: float = _next_frame(2.5e-5, "Random walk of the gyroscope's bias.", (0, 1, 1e-5), "rad/s²/√Hz")
     accel_bias_walk: float = _next_frame(1.0e-4, "Random walk of the accelerometer's bias.", (0, 1, 1e-4), "m/s³/√Hz")
     gravity: float = _on_restart(9.81, "Local gravity.", (9.7, 9.9, 0.001), "m/s²")
+    max_rate: float = _next_frame(
+        35.0, "Samples that turn faster about an axis are refused: no gyroscope reads that far.", (5, 1000, 1), "rad/s"
+    )
+    max_acceleration: float = _next_frame(
+        490.0, "Samples beyond this on an axis are refused: 50 g, more than IMUs measure.", (20, 5000, 10), "m/s²"
+    )
     start_duration: float = _on_restart(
         1.0, "Time at rest that the start waits for, to measure biases and gravity.", (0.1, 10, 0.1), "s"
     )

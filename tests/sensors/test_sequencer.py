@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.sensors.sequencer import MAX_HELD, MAX_WAITING, Sequencer
+from app.slam.sections import ImuParams
 from app.slam.types import F64, I64, DroppedScan, Measurement, Samples, Scan
 
 MS = 1_000_000
@@ -29,7 +30,7 @@ def feed(
     """Everything in the order of time, and what came out. A sample's gyro carries its own time."""
     arrivals: list[tuple[int, int, int | Scan | DroppedScan]] = [(at, n, at) for n, at in enumerate(imu_ms)]
     arrivals += [(s.stamp_ns // MS + 100, n, s) for n, s in enumerate(scans)]
-    sequencer = Sequencer(max_gap_s=0.1)
+    sequencer = Sequencer(ImuParams())
     out: list[Measurement | DroppedScan] = []
     for _, _, arrived in sorted(arrivals, key=lambda entry: entry[:2]):
         push(sequencer, arrived)
@@ -39,14 +40,14 @@ def feed(
 
 def push(sequencer: Sequencer, arrived: int | Scan | DroppedScan) -> None:
     if isinstance(arrived, int):
-        sequencer.add_imu(arrived * MS, (float(arrived), 0.0, 0.0), (0.0, 0.0, 9.81))
+        sequencer.add_imu(arrived * MS, (arrived / 1e6, 0.0, 0.0), (0.0, 0.0, 9.81))
     else:
         sequencer.add_scan(arrived)
 
 
 def stamps(entry: Measurement | DroppedScan) -> list[int]:
     assert isinstance(entry, Measurement)
-    np.testing.assert_array_equal(entry.imu.gyro[:, 0] * MS, entry.imu.stamps_ns)
+    np.testing.assert_array_equal(entry.imu.gyro[:, 0], entry.imu.stamps_ns // MS / 1e6)
     return (entry.imu.stamps_ns // MS).tolist()
 
 
@@ -79,7 +80,7 @@ def test_the_pairs_do_not_depend_on_delays_of_arrival(delays: list[int], imu_del
     expected, _ = feed(imu, scans)
     arrivals: list[tuple[int, int, int | Scan]] = [(at + imu_delay, n, at) for n, at in enumerate(imu)]
     arrivals += [(100 * n + 100 + delay, n, s) for n, (delay, s) in enumerate(zip(delays, scans, strict=True))]
-    sequencer, out = Sequencer(max_gap_s=0.1), []
+    sequencer, out = Sequencer(ImuParams()), []
     for _, _, arrived in sorted(arrivals, key=lambda entry: entry[:2]):
         push(sequencer, arrived)
         out += sequencer.ready()
@@ -130,7 +131,7 @@ def test_scans_after_the_imu_stopped_are_dropped_with_the_reason() -> None:
 
 
 def test_a_silent_imu_does_not_fill_the_memory() -> None:
-    sequencer = Sequencer(max_gap_s=0.1)
+    sequencer = Sequencer(ImuParams())
     for at in samples(0, 110):
         push(sequencer, at)
     out: list[Measurement | DroppedScan] = []
@@ -160,7 +161,7 @@ def test_a_scan_partly_in_a_gap_is_used_and_reported() -> None:
 
 
 def test_repeated_and_reversed_samples_are_left_out_and_reported_once() -> None:
-    sequencer = Sequencer(max_gap_s=0.1)
+    sequencer = Sequencer(ImuParams())
     order = [*samples(0, 50), 50, 20, 30, 40, *samples(60, 210)]
     for at in order:
         push(sequencer, at)
@@ -174,7 +175,7 @@ def test_repeated_and_reversed_samples_are_left_out_and_reported_once() -> None:
 
 
 def test_one_sample_stamped_far_ahead_does_not_silence_the_rest() -> None:
-    sequencer = Sequencer(max_gap_s=0.1)
+    sequencer = Sequencer(ImuParams())
     for at in [*samples(0, 50), 9_000_000, *samples(60, 210)]:
         push(sequencer, at)
     sequencer.add_scan(scan(0))
@@ -192,7 +193,7 @@ def test_the_imu_goes_on_after_an_outage_of_many_seconds() -> None:
 
 
 def test_nan_samples_are_left_out_and_reported() -> None:
-    sequencer = Sequencer(max_gap_s=0.1)
+    sequencer = Sequencer(ImuParams())
     for at in samples(0, 110):
         push(sequencer, at)
         sequencer.add_imu(at * MS + MS, (float("nan"), 0, 0), (0, 0, 9.81))
@@ -203,7 +204,7 @@ def test_nan_samples_are_left_out_and_reported() -> None:
 
 
 def test_repeated_and_reversed_scans_are_dropped_and_the_next_is_used() -> None:
-    sequencer = Sequencer(max_gap_s=0.1)
+    sequencer = Sequencer(ImuParams())
     for at in samples(0, 500):
         push(sequencer, at)
     out: list[Measurement | DroppedScan] = []
@@ -253,8 +254,8 @@ def fix_times(entry: Measurement | DroppedScan) -> list[int]:
 
 
 def test_samples_of_another_sensor_come_once_with_the_scan_that_they_fall_into() -> None:
-    sequencer, out = Sequencer(max_gap_s=0.1), []
-    for at in samples(0, 410):
+    sequencer, out = Sequencer(ImuParams()), []
+    for at in samples(0, 500):
         push(sequencer, at)
         if at % 50 == 0:
             sequencer.add(fix(at))
@@ -265,7 +266,7 @@ def test_samples_of_another_sensor_come_once_with_the_scan_that_they_fall_into()
 
 
 def test_a_late_sample_of_another_sensor_comes_with_the_next_scan_and_covers_nothing() -> None:
-    sequencer = Sequencer(max_gap_s=0.1)
+    sequencer = Sequencer(ImuParams())
     for at in samples(0, 310):
         push(sequencer, at)
     sequencer.add_scan(scan(0))
@@ -282,10 +283,72 @@ def test_a_late_sample_of_another_sensor_comes_with_the_next_scan_and_covers_not
 
 
 def test_a_sensor_without_scans_does_not_fill_the_memory() -> None:
-    sequencer = Sequencer(max_gap_s=0.1)
+    sequencer = Sequencer(ImuParams())
     many = np.arange(2 * MAX_HELD) * MS
     sequencer.add(GnssFixes(many, np.zeros((2 * MAX_HELD, 3)), np.zeros(2 * MAX_HELD, np.int64)))
     for at in samples(0, 110):
         push(sequencer, at)
     sequencer.add_scan(scan(0))
     assert fix_times(next(sequencer.ready())) == []  # the oldest were given up
+
+
+# --- values that no IMU measures ---------------------------------------------------------------------
+def swaying(seed: int, count: int = 200) -> F64:
+    """(count, 6) rad/s and m/s^2 at 100 Hz of someone walking fast, with noise and steps of the foot."""
+    rng = np.random.default_rng(seed)
+    at = np.arange(count)[:, None] / 100
+    swing = np.sin(2 * np.pi * rng.uniform(0.5, 4.0, 6) * at + rng.uniform(0, 6, 6)) * [2, 2, 2, 6, 6, 6]
+    return np.asarray(swing + rng.normal(size=(count, 6)) * [0.02, 0.02, 0.02, 0.3, 0.3, 0.3])
+
+
+def given_on(values: F64) -> tuple[list[int], Sequencer]:
+    """The samples, by number, that a scan over all of them is given."""
+    sequencer = Sequencer(ImuParams())
+    for n, row in enumerate(values.tolist()):
+        sequencer.add_imu(n * 10 * MS, tuple(row[:3]), tuple(row[3:]))
+    sequencer.add_scan(scan(10, 10 * len(values) - 40))
+    (only,) = sequencer.ready()
+    assert isinstance(only, Measurement)
+    return (only.imu.stamps_ns // (10 * MS)).tolist(), sequencer
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=30, deadline=None)
+def test_no_sample_of_a_vigorous_walk_is_refused(seed: int) -> None:
+    kept, sequencer = given_on(swaying(seed))
+    assert kept == list(range(198)) and sequencer.counts.imu_spikes == 0
+
+
+@given(
+    st.integers(0, 1000),
+    st.integers(0, 197),
+    st.integers(0, 5),
+    st.floats(25.0, 1e300) | st.sampled_from([float("nan"), float("inf")]),
+    st.sampled_from([-1, 1]),
+)
+@settings(max_examples=100, deadline=None)
+def test_one_bad_sample_is_left_out_wherever_it_is_and_no_other(
+    seed: int, place: int, axis: int, size: float, sign: int
+) -> None:
+    values = swaying(seed)
+    values[place, axis] = sign * size
+    kept, sequencer = given_on(values)
+    counts = sequencer.counts
+    assert counts.imu_invalid + counts.imu_out_of_range + counts.imu_spikes >= 1
+    assert set(range(198)) - set(kept) <= {place, 0}  # the first may go with its only neighbour
+    assert place not in kept
+
+
+def test_a_shock_that_lasts_is_no_spike() -> None:
+    values = swaying(1)
+    values[100:104, 3] += [20.0, 60.0, 60.0, 20.0]
+    assert given_on(values)[0] == list(range(198))
+
+
+def test_a_refused_sample_is_told_with_the_measurement() -> None:
+    sequencer = Sequencer(ImuParams(max_acceleration=20.0))
+    for at in samples(0, 200):
+        sequencer.add_imu(at * MS, (0.0, 0.0, 0.0), (0.0, 0.0, 25.0 if at == 50 else 9.81))
+    sequencer.add_scan(scan(0))
+    (only,) = sequencer.ready()
+    assert isinstance(only, Measurement) and "beyond what an IMU can measure" in only.notices[0]

@@ -55,7 +55,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         self._intake = intake
         self._recorder = recorder
         self._recorded_before = (before and before.state.recorded) or 0
-        self._sequencer = (before and before.pairing) or Sequencer(params.imu.max_gap)
+        self._sequencer = (before and before.pairing) or Sequencer(params.imu)
         self._stop = threading.Event()
         self._events: deque[Event] = deque()
         self._pairing = False
