@@ -7,7 +7,7 @@ import numpy as np
 
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, Probe, stamped
 from app.sensors.findings import Finding
-from app.sensors.layout import ImuProbe
+from app.sensors.imu_units import ImuProbe
 from app.sensors.ros import IMU, stamp_ns
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
@@ -15,7 +15,7 @@ from app.slam.errors import HemislamError
 _CONTENT = {"lidar": "point clouds", "imu": "IMU samples"}
 
 PROBED_CLOUDS = 10
-PROBED_IMU_NS = 2_000_000_000
+PROBED_IMU_NS = 20_000_000_000
 
 
 def usable_types(sensor: Literal["lidar", "imu"]) -> tuple[str, ...]:

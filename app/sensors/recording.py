@@ -11,7 +11,8 @@ import numpy as np
 from app.sensors.clocks import clock_finding
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
 from app.sensors.findings import Finding
-from app.sensors.layout import gravity_findings, settle_cloud, settle_imu
+from app.sensors.imu_units import gravity_findings, settle_imu
+from app.sensors.layout import settle_cloud
 from app.sensors.pointcloud import decode, read_scan
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu
 from app.sensors.ros import Vector, stamp_ns
@@ -69,7 +70,7 @@ class Recording:
         probes, probe_findings = probe_clouds(source, lidar)
         self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic, CLOUD_TYPES[lidar.type])
         imu, self._imu_stamped, imu_probe_findings = probe_imu(source, self.imu_topic, chosen.imu_time_offset)
-        self._accel_scale, imu_findings = settle_imu(imu, chosen)
+        self._imu_units, imu_findings = settle_imu(imu, chosen)
         probes, scans = self._decode_probes(probes, cloud_findings)
         self.start_ns = scans[0].stamp_ns
         self._log_after_stamp_ns = probes[0].log_ns - self.start_ns
@@ -86,7 +87,7 @@ class Recording:
             *imu_probe_findings,
             *imu_findings,
             self._clocks,
-            *gravity_findings(imu, self._accel_scale, params),
+            *gravity_findings(imu, self._imu_units, params),
         )
 
     def measurements(
@@ -127,9 +128,9 @@ class Recording:
 
     def _imu_entry(self, message: Any, log_ns: int) -> ImuEntry:
         stamp = stamp_ns(message.header.stamp) if self._imu_stamped else log_ns
-        w, a, k = message.angular_velocity, message.linear_acceleration, self._accel_scale
+        w, a = message.angular_velocity, message.linear_acceleration
         offset = round(self.params.recording.imu_time_offset * 1e9)
-        return ImuEntry(log_ns, stamp + offset, (w.x, w.y, w.z), (k * a.x, k * a.y, k * a.z))
+        return ImuEntry(log_ns, stamp + offset, *self._imu_units.apply((w.x, w.y, w.z), (a.x, a.y, a.z)))
 
     def _decode_probes(self, probes: list[Probe], findings: list[Finding]) -> tuple[list[Probe], list[Scan]]:
         """The probes that make scans, and the scans. Raises HemislamError if none does (a wrong time unit, say)."""

@@ -195,7 +195,11 @@ def walk(
         entries.append((lidar_topic, made.begin_ns + PERIOD_NS + delay_ns, message(made, layout, ros)))
     stop = turns * PERIOD_NS + 50_000_000 if imu_stop_ns is None else imu_stop_ns
     stamps = range(START_NS + imu_start_ns, START_NS + stop, imu_period_ns)
-    entries.extend((imu_topic, stamp + 500_000, imu(stamp, ros=ros)) for stamp in stamps)
+    noise = np.random.default_rng(0).normal(size=(len(stamps), 6)) * 1e-3
+    entries.extend(
+        (imu_topic, stamp + 500_000, imu(stamp, (ax, ay, 9.81 + az), (wx, wy, wz), ros=ros))
+        for stamp, (wx, wy, wz, ax, ay, az) in zip(stamps, noise.tolist(), strict=True)
+    )
     return sorted(entries, key=lambda entry: entry[1])
 
 

@@ -5,10 +5,9 @@ import pytest
 
 from app.sensors.cloud_types import Probe, read_point_cloud_2
 from app.sensors.findings import Finding
-from app.sensors.layout import ImuProbe, gravity_findings, settle_cloud, settle_imu
+from app.sensors.layout import settle_cloud
 from app.sensors.pointcloud import CloudLayout, decode
 from app.slam.errors import HemislamError
-from app.slam.params import Params
 from app.slam.sections import RecordingParams
 from tests.sensors import rig
 
@@ -234,45 +233,3 @@ def test_lines_are_separated_although_the_beams_start_above_the_origin() -> None
     settled, _ = settle(probes)
     decoded = decode(probes[0].cloud, settled).ring
     assert (decoded == ring).mean() > 0.98
-
-
-# --- the IMU -----------------------------------------------------------------------------------------
-def imu_probe(accel: tuple[float, ...], gyro: tuple[float, ...] = (0, 0, 0), wobble: float = 0.0) -> ImuProbe:
-    stamps = rig.START_NS + 5_000_000 * np.arange(200)
-    noise = np.random.default_rng(0).normal(size=(200, 3)) * wobble
-    return ImuProbe(stamps, stamps, np.array(gyro) + noise, np.array(accel) + 5 * noise)
-
-
-@pytest.mark.parametrize(
-    ("norm", "chosen", "scale", "verdict"),
-    [
-        (1.0, "auto", 9.80665, "corrected"),
-        (9.79, "auto", 1.0, "fine"),
-        (9.79, "m/s2", 1.0, "fine"),
-        (9.79, "g", 9.80665, "needs you"),
-        (5.0, "auto", 1.0, "needs you"),
-    ],
-)
-def test_the_unit_of_acceleration_is_known_by_gravity(norm: float, chosen: str, scale: float, verdict: str) -> None:
-    got, findings = settle_imu(imu_probe((0.6 * norm, 0.0, -0.8 * norm)), RecordingParams(acceleration_unit=chosen))
-    assert got == scale
-    assert findings[0].verdict == verdict
-
-
-def test_a_gyroscope_in_degrees_is_suspected() -> None:
-    _, findings = settle_imu(imu_probe((0, 0, 9.81), gyro=(0, 25.0, 0)), RecordingParams())
-    assert findings[-1].verdict == "needs you" and "rad/s" in findings[-1].text
-
-
-def test_down_is_reported_in_the_lidar_frame_through_the_mount() -> None:
-    """IMU upright, LiDAR pitched by +90 deg: its x axis then points down."""
-    params = Params().merged({"sensor": {"rotation": [0, 90, 0], "translation": [0, 0, 0.1]}})
-    gravity, mount = gravity_findings(imu_probe((0, 0, 9.81)), 1.0, params)
-    assert "0 deg from the LiDAR's +x axis" in gravity.text
-    assert (gravity.verdict, mount.verdict) == ("fine", "fine")
-
-
-def test_a_mount_that_was_never_given_and_a_moving_start_are_named() -> None:
-    gravity, mount = gravity_findings(imu_probe((9.81, 0, 0), wobble=0.2), 1.0, Params())
-    assert "moves" in gravity.text and gravity.verdict == "corrected"
-    assert mount.verdict == "needs you" and "sensor.translation" in mount.option

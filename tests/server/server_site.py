@@ -22,7 +22,7 @@ from app.server.web import Tls, make_app, make_server
 from app.server.worker import EngineProcess
 
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 
 VIEWER = {"Authorization": "Bearer for-viewers"}
 OWNER = {"Authorization": "Bearer for-owners"}

@@ -39,6 +39,8 @@ def any_value(leaf: Leaf) -> st.SearchStrategy[Any]:
         return st.sampled_from(leaf.choices)
     if isinstance(leaf.default, bool):
         return st.booleans()
+    if leaf.path.endswith("_axes"):
+        return st.sampled_from(["xyz", "-yxz", "z-x-y"])
     if isinstance(leaf.default, str):
         return st.sampled_from(["", "auto", "/a topic: #1", "yes", "12", "1e3", "~", "'"])
     assert leaf.minimum is not None and leaf.maximum is not None

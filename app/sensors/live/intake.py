@@ -15,11 +15,12 @@ from typing import Literal
 import numpy as np
 
 from app.sensors.clocks import TOLERANCE_S
-from app.sensors.layout import ImuProbe, settle_imu
+from app.sensors.imu_units import AS_RECORDED, ImuProbe, ImuUnits, settle_imu
 from app.sensors.live.clock import JUMP_NS, ClockMap, OffsetEstimate
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Counters, Kind, LiveState, Status
 from app.sensors.ros import Vector
+from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan
 
@@ -59,12 +60,12 @@ class Settled:
     """What was learnt in the first second, and the state of the clocks, for another intake to continue with.
 
     Attributes:
-        clock: which clock stamps the data. maps: by sensor. accel_scale: factor to m/s^2.
+        clock: which clock stamps the data. maps: by sensor. units: of the IMU.
     """
 
     clock: Clock
     maps: dict[str, ClockMap]
-    accel_scale: float
+    units: ImuUnits
 
 
 class Intake:
@@ -99,14 +100,14 @@ class Intake:
         self._rest: deque[LiveImu | DroppedScan | Status] = deque()
         self._held: deque[LiveScan | LiveImu] | None = deque()
         self._suspect: LiveImu | None = None
-        self._still_reported = False
+        self._still_reported = self._unusable_reported = False
         self._maps = {"LiDAR": ClockMap(), "IMU": ClockMap()}
         self._offset = OffsetEstimate()
         self._arrivals: dict[str, deque[int]] = {"LiDAR": deque(maxlen=50), "IMU": deque(maxlen=1000)}
-        self._accel_scale = 1.0
+        self._units = AS_RECORDED
         if settled is not None:
             self._held = None
-            self._clock, self._maps, self._accel_scale = settled.clock, settled.maps, settled.accel_scale
+            self._clock, self._maps, self._units = settled.clock, settled.maps, settled.units
 
     # --- the receiving threads -------------------------------------------------------------------
 
@@ -148,7 +149,7 @@ class Intake:
         with self._changed:
             if self._held is not None:
                 return None
-            return Settled(self._clock, deepcopy(self._maps), self._accel_scale)
+            return Settled(self._clock, deepcopy(self._maps), self._units)
 
     def state(self) -> LiveState:
         now = time.time_ns()
@@ -203,11 +204,17 @@ class Intake:
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         accel = np.array([sample.accel for sample in samples], np.float64)
         gyro = np.array([sample.gyro for sample in samples], np.float64)
-        finite = np.isfinite(accel).all(axis=1)
+        finite = np.isfinite(accel).all(axis=1) & np.isfinite(gyro).all(axis=1)
         if not finite.any():
             return False
         probe = ImuProbe(stamps[finite], stamps[finite], gyro[finite], accel[finite])
-        self._accel_scale, findings = settle_imu(probe, self._params.recording)
+        try:
+            self._units, findings = settle_imu(probe, self._params.recording)
+        except HemislamError as error:
+            if not self._unusable_reported:
+                self._unusable_reported = True
+                self._tell("units", "IMU", str(error))
+            return False
         for finding in findings:
             if finding.verdict != "fine":
                 self._tell("units", "IMU", f"{finding.subject}: {finding.text} {finding.option}".rstrip())
@@ -245,12 +252,10 @@ class Intake:
 
     def _release_imu(self, entry: LiveImu) -> None:
         stamp = self._mapped("IMU", entry.stamp_ns, entry.arrival_ns)
-        x, y, z = entry.accel
-        k = self._accel_scale
-        accel = (k * x, k * y, k * z)
+        gyro, accel = self._units.apply(entry.gyro, entry.accel)
         if self._recorder is not None:
-            self._recorder.add_imu(stamp, entry.gyro, accel, entry.arrival_ns)
-        self._rest.append(LiveImu(stamp, entry.gyro, accel, entry.arrival_ns))
+            self._recorder.add_imu(stamp, gyro, accel, entry.arrival_ns)
+        self._rest.append(LiveImu(stamp, gyro, accel, entry.arrival_ns))
 
     def _release_scan(self, entry: LiveScan) -> None:
         scan = entry.scan

@@ -1,0 +1,265 @@
+"""The units and axes of an IMU, settled from its first samples, and what is wrong with them.
+
+Gravity gives the accelerometer's unit. While the device sways, the direction of gravity turns in the IMU frame as the
+gyroscope says, if its unit is rad/s and both sensors have the same axes: this tests both.
+"""
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from app.sensors.findings import Finding
+from app.sensors.ros import Vector
+from app.slam import lie
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.sections import RecordingParams
+from app.slam.types import F64, I64
+
+STANDARD_GRAVITY = 9.80665
+ACCELERATION_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000}
+GYROSCOPE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
+
+WINDOW_S, STRIDE_S, SPAN_S, STEPS = 0.5, 0.25, 1.0, 50
+"""Accelerations are averaged over a window, about a step of walking, and compared with those one span later."""
+CLEARLY, LEAST_ERROR = 0.5, 0.3
+"""Another unit or other axes are proposed if they leave less than this share of the error, which is at least so many
+m/s^2."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImuProbe:
+    """The first IMU samples: log times and stamps (k,) int64 ns, gyro and accel (k, 3) as recorded."""
+
+    log_ns: I64
+    stamps_ns: I64
+    gyro: F64
+    accel: F64
+
+
+Axes = tuple[tuple[int, float], ...]
+"""For x, y and z of the IMU frame: which recorded axis it is, and the factor to SI units, with its sign."""
+
+
+ALL_AXES: tuple[Axes, ...] = tuple(
+    tuple(zip(order, signs, strict=True))
+    for order in permutations(range(3))
+    for signs in product((1.0, -1.0), repeat=3)
+)
+"""All 48 orders and signs."""
+AS_IS = ALL_AXES[0]
+
+
+@dataclass(frozen=True, slots=True)
+class ImuUnits:
+    """Makes rad/s and m/s^2 in the IMU frame of what is recorded."""
+
+    gyro: Axes
+    accel: Axes
+
+    def apply(self, gyro: Vector, accel: Vector) -> tuple[Vector, Vector]:
+        return _converted(gyro, self.gyro), _converted(accel, self.accel)
+
+
+def _converted(values: Vector, axes: Axes) -> Vector:
+    (i, a), (j, b), (k, c) = axes
+    return a * values[i], b * values[j], c * values[k]
+
+
+AS_RECORDED = ImuUnits(AS_IS, AS_IS)
+
+
+def settle_imu(probe: ImuProbe, chosen: RecordingParams) -> tuple[ImuUnits, list[Finding]]:
+    """Units and axes as chosen, or where that is `auto` by the first samples; and findings.
+
+    Raises:
+        HemislamError: the accelerometer reads nothing at all.
+    """
+    gyro_axes, accel_axes = named_axes(chosen.gyroscope_axes), named_axes(chosen.accelerometer_axes)
+    norm = float(np.median(np.linalg.norm(probe.accel, axis=1)))
+    if norm == 0.0:
+        raise HemislamError(
+            "The accelerometer reads 0 on all axes, which none does on Earth; check the IMU's driver, or choose "
+            "another topic by --imu-topic."
+        )
+    accel_unit, findings = _acceleration_unit(norm, chosen.acceleration_unit)
+    accel = _reordered(probe.accel, accel_axes) * accel_unit
+    gyro = _reordered(probe.gyro, gyro_axes)
+    sway = Sway.of(probe.stamps_ns, gyro, accel)
+    gyro_unit, more = _gyroscope_unit(gyro, sway, chosen.gyroscope_unit)
+    findings += [*more, *_stuck(probe)]
+    if sway is not None and not any(finding.verdict == "needs you" for finding in findings):
+        findings += _axes_finding(sway, gyro_unit, chosen)
+    units = ImuUnits(
+        tuple((i, sign * gyro_unit) for i, sign in gyro_axes), tuple((i, sign * accel_unit) for i, sign in accel_axes)
+    )
+    return units, findings
+
+
+def named_axes(name: str) -> Axes:
+    """`xyz`, `-yxz`: which recorded axes are x, y and z."""
+    signs = [
+        -1.0 if before == "-" else 1.0 for before, letter in zip(" " + name, name, strict=False) if letter in "xyz"
+    ]
+    return tuple(zip(map("xyz".index, (letter for letter in name if letter in "xyz")), signs, strict=True))
+
+
+def axes_name(axes: Axes) -> str:
+    return "".join(("-" if sign < 0 else "") + "xyz"[i] for i, sign in axes)
+
+
+def _reordered(values: F64, axes: Axes) -> F64:
+    return np.stack([sign * values[:, i] for i, sign in axes], axis=1)
+
+
+def _acceleration_unit(norm: float, chosen: str) -> tuple[float, list[Finding]]:
+    """The factor to m/s^2, by the norm of the first samples, which is gravity."""
+    text, option = f"the acceleration's norm is {norm:.4g} at the start", "--set recording.acceleration_unit="
+    fitting = next((unit for unit, scale in ACCELERATION_UNITS.items() if 8.0 < norm * scale < 12.0), None)
+    if chosen != "auto":
+        text, scale = f"{chosen}, as you set it; {text}", ACCELERATION_UNITS[chosen]
+        if fitting == chosen:
+            return scale, [Finding("IMU units", "fine", text)]
+        return scale, [Finding("IMU units", "needs you", f"{text}, which is not gravity in it", f"{option}auto")]
+    if fitting == "m/s2":
+        return 1.0, [Finding("IMU units", "fine", f"m/s²: {text}", f"{option}m/s2")]
+    if fitting is not None:
+        text = f"{fitting}: {text}; scaled to m/s²"
+        return ACCELERATION_UNITS[fitting], [Finding("IMU units", "corrected", text, option + fitting)]
+    nearest = min(ACCELERATION_UNITS, key=lambda unit: abs(np.log(norm * ACCELERATION_UNITS[unit] / STANDARD_GRAVITY)))
+    text = f"{text}, gravity in none of {', '.join(ACCELERATION_UNITS)}; taken as {nearest}: check the IMU's driver"
+    return ACCELERATION_UNITS[nearest], [Finding("IMU units", "needs you", text)]
+
+
+def _gyroscope_unit(gyro: F64, sway: "Sway | None", chosen: str) -> tuple[float, list[Finding]]:
+    """The factor to rad/s, by how gravity turns, or by what a hand can do."""
+    option = "--set recording.gyroscope_unit="
+    if chosen != "auto":
+        return GYROSCOPE_UNITS[chosen], []
+    turning = float(np.percentile(np.linalg.norm(gyro, axis=1), 90))
+    if sway is None:
+        if turning > 10.0:
+            text = f"the gyroscope reads {turning:.0f} at the start, too fast for a hand in rad/s: it may be in deg/s"
+            return 1.0, [Finding("IMU units", "needs you", text, f"{option}deg/s")]
+        return 1.0, []
+    errors = {unit: sway.error(scale) for unit, scale in GYROSCOPE_UNITS.items()}
+    if turning > 3.0 and errors["deg/s"] < CLEARLY * errors["rad/s"]:
+        text = "the gyroscope is in deg/s, by how gravity turns in the IMU's axes; scaled to rad/s"
+        return GYROSCOPE_UNITS["deg/s"], [Finding("IMU units", "corrected", text, f"{option}deg/s")]
+    return 1.0, []
+
+
+def _axes_finding(sway: "Sway", gyro_unit: float, chosen: RecordingParams) -> list[Finding]:
+    """Whether another order or sign of the axes makes gyroscope and accelerometer agree far better."""
+    errors = {axes: sway.error(gyro_unit, axes) for axes in ALL_AXES}
+    best = min(errors, key=lambda axes: errors[axes])
+    if errors[best] > CLEARLY * errors[AS_IS] or errors[AS_IS] < LEAST_ERROR:
+        return []
+    # Turning all axes of one sensor or back those of the other is the same, and so is gravity upside down. A mirrored
+    # gyroscope is another matter: nothing that is done to the accelerometer mends it.
+    name, given, change = "gyroscope", chosen.gyroscope_axes, _matrix(best)
+    if np.linalg.det(change) > 0:
+        back = change.T
+        change = max((back, -back), key=np.sum)
+        name, given = "accelerometer", chosen.accelerometer_axes
+    total = change @ _matrix(named_axes(given))
+    axes = tuple((int(np.flatnonzero(row)[0]), float(row.sum())) for row in total)
+    text = f"gravity does not turn as the gyroscope says; it does with the {name}'s axes taken as {axes_name(axes)}"
+    return [Finding("IMU axes", "needs you", text, f"--set recording.{name}_axes={axes_name(axes)}")]
+
+
+def _stuck(probe: ImuProbe) -> list[Finding]:
+    """An axis that reads the same number in every sample measures nothing."""
+    if len(probe.gyro) < 100:
+        return []
+    names = [
+        f"{sensor} {'xyz'[axis]} ({values[0, axis]:g})"
+        for sensor, values in (("gyroscope", probe.gyro), ("accelerometer", probe.accel))
+        for axis in range(3)
+        if np.ptp(values[:, axis]) == 0.0
+    ]
+    if not names:
+        return []
+    text = f"{', '.join(names)}: the same number in all of the first {len(probe.gyro)} samples; check the IMU's driver"
+    return [Finding("IMU values", "needs you", text, "--imu-topic if there is another IMU")]
+
+
+@dataclass(frozen=True, slots=True)
+class Sway:
+    """Where the device swayed: mean accelerations (n, 3) m/s^2 at the begin and end of spans, and each span's
+    rotation vectors (n, m, 3), rad in the gyroscope's recorded unit, of its m samples in turn."""
+
+    begin: F64
+    end: F64
+    steps: F64
+
+    @classmethod
+    def of(cls, stamps_ns: I64, gyro: F64, accel: F64) -> "Sway | None":
+        """None if the samples are too few."""
+        times = (stamps_ns - stamps_ns[0]) / 1e9
+        if len(times) < 100 or not (np.diff(times) > 0).all() or times[-1] < SPAN_S + WINDOW_S + STRIDE_S:
+            return None
+        starts = np.arange(0.0, times[-1] - SPAN_S - WINDOW_S, STRIDE_S)
+        means = _window_means(times, accel, np.r_[starts, starts + SPAN_S])
+        begin, end = np.split(means, 2)
+        middle = starts[:, None] + WINDOW_S / 2 + np.linspace(0.0, SPAN_S, STEPS + 1)[None, :]
+        step = SPAN_S / STEPS
+        rates = np.stack([np.interp(middle[:, :-1] + step / 2, times, gyro[:, axis]) for axis in range(3)], axis=-1)
+        return cls(begin, end, rates * step)
+
+    def turned(self, gyro_unit: float, axes: Axes = AS_IS) -> F64:
+        """(n, 3) m/s^2: gravity at the begin of each span, turned to its end as the gyroscope says."""
+        unit = _matrix(axes) * gyro_unit
+        gravity = self.begin[:, None, :]
+        for n in range(self.steps.shape[1]):
+            gravity = gravity @ Rotation.from_rotvec(self.steps[:, n] @ unit.T).as_matrix()
+        return np.asarray(gravity[:, 0])
+
+    def error(self, gyro_unit: float, gyro: Axes = AS_IS) -> float:
+        """m/s^2, RMS: how far gravity at the end of a span is from where the gyroscope turns it."""
+        return float(np.sqrt(np.mean(np.sum((self.end - self.turned(gyro_unit, gyro)) ** 2, axis=1))))
+
+
+def _matrix(axes: Axes) -> F64:
+    matrix = np.zeros((3, 3))
+    for row, (column, sign) in enumerate(axes):
+        matrix[row, column] = sign
+    return matrix
+
+
+def _window_means(times: F64, values: F64, starts: F64) -> F64:
+    first, last = np.searchsorted(times, starts), np.searchsorted(times, starts + WINDOW_S)
+    sums = np.vstack([np.zeros(3), np.cumsum(values, axis=0)])
+    return np.asarray((sums[last] - sums[first]) / np.maximum(last - first, 1)[:, None])
+
+
+def gravity_findings(probe: ImuProbe, units: ImuUnits, params: Params) -> list[Finding]:
+    """The direction of down in the LiDAR frame, by the IMU's first samples, and whether the mount was given."""
+    first = probe.stamps_ns - probe.stamps_ns[0] <= params.imu.start_duration * 1e9
+    accel, gyro = _reordered(probe.accel[first], units.accel), _reordered(probe.gyro[first], units.gyro)
+    specific = accel.mean(axis=0)
+    norm = float(np.linalg.norm(specific))
+    findings = []
+    if norm > 1.0:
+        down = -(lie.from_rpy_degrees(params.sensor.rotation).T @ specific) / norm
+        axis = int(np.argmax(np.abs(down)))
+        name = f"{'+' if down[axis] > 0 else '−'}{'xyz'[axis]}"
+        off = np.degrees(np.arccos(min(abs(float(down[axis])), 1.0)))
+        values = ", ".join(f"{value:+.2f}" for value in down)
+        text = f"down is {off:.0f} deg from the LiDAR's {name} axis ({values})"
+        moving = float(np.linalg.norm(gyro.std(axis=0))) > 0.05 or float(np.linalg.norm(accel.std(axis=0))) > 0.5
+        if moving:
+            text += f"; the device moves during the first {params.imu.start_duration:g} s, so this is rough"
+        findings.append(Finding("gravity", "corrected" if moving else "fine", text))
+    if any(params.sensor.translation + params.sensor.rotation):
+        x, y, z = params.sensor.translation
+        roll, pitch, yaw = params.sensor.rotation
+        text = f"LiDAR in the IMU frame at {x:g}, {y:g}, {z:g} m, turned by {roll:g}, {pitch:g}, {yaw:g} deg"
+        findings.append(Finding("mount", "fine", text))
+    else:
+        text = "no pose of the LiDAR on the IMU is given; taken as the same axes and origin"
+        option = "--set 'sensor.translation=[x, y, z]' --set 'sensor.rotation=[roll, pitch, yaw]'"
+        findings.append(Finding("mount", "needs you", text, option))
+    return findings
