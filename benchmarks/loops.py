@@ -11,7 +11,7 @@ from tqdm import tqdm
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.slam.engine import Engine
-from app.slam.loops.factors import Factor, between, residuals
+from app.slam.loops.factors import Factor, residuals
 from app.slam.loops.messages import AddKeyframe, ApplyEdit, Ask, LoopState, Target
 from app.slam.loops.pose_graph import PoseGraph
 from app.slam.loops.service import LoopService, warm_up
@@ -63,7 +63,7 @@ def read_g2o(path: Path) -> tuple[F64, list[Factor], list[Factor], F64]:
         if i > j:
             adjoint = T.AdjointMap()
             i, j, T, covariance = j, i, T.inverse(), adjoint @ covariance @ adjoint.T
-        ours = between(i, j, T.matrix(), covariance)
+        ours = Factor(i, j, T.matrix(), covariance)
         if j == i + 1 and j not in odometry:
             odometry[j] = ours
         else:

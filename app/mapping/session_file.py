@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import IO, Annotated, Any
 
 import msgspec
-import yaml
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, TypeAdapter
 
 from app import __version__
 from app.mapping.breakpoints import Breakpoints
 from app.slam.errors import HemislamError
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import edit_files
 from app.slam.loops.types import LoopEdit
 from app.slam.params import Params
@@ -65,8 +65,8 @@ class Opened:
 _Params = Annotated[Params, PlainValidator(Params().with_values), PlainSerializer(Params().changed)]
 _Edits = Annotated[
     tuple[LoopEdit, ...],
-    PlainValidator(lambda entries: edit_files.read(yaml.safe_dump(entries))),
-    PlainSerializer(lambda edits: yaml.safe_load(edit_files.write(edits))),
+    PlainValidator(edit_files.edits_of),
+    PlainSerializer(edit_files.entries_of),
 ]
 _Path = Annotated[Path, PlainSerializer(lambda path: str(path.resolve()))]
 _Note = Annotated[
@@ -282,4 +282,6 @@ def _plain(value: Any) -> Any:
     """What msgspec does not know, as JSON can hold it."""
     if isinstance(value, Breakpoints):
         return value.chosen
+    if isinstance(value, KeyframeId):
+        return str(value) if value.session else value.index
     return str(value.resolve() if isinstance(value, Path) else value)

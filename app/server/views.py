@@ -7,7 +7,6 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
@@ -113,8 +112,8 @@ class StateView(RestModel):
 def loops_state(view: LoopsView) -> LoopsState:
     return LoopsState(
         loops=[LoopView.model_validate(edge) for edge in view.edges],
-        edits=yaml.safe_load(edit_files.write(view.undo)),
-        undone=yaml.safe_load(edit_files.write(view.redo)),
+        edits=edit_files.entries_of(view.undo),
+        undone=edit_files.entries_of(view.redo),
     )
 
 

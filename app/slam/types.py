@@ -229,14 +229,6 @@ class Registration:
     matches: Matches | None = None
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class KeyframeId:
-    """Names a keyframe among those of several sessions."""
-
-    session: int
-    index: int
-
-
 @dataclass(frozen=True, slots=True)
 class Keyframe:
     """A cloud that stays in its own frame; only its pose moves when loops are closed.

@@ -13,6 +13,7 @@ import numpy as np
 
 from app.slam import lie
 from app.slam.errors import HemislamError
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.detection import Detector, Head
 from app.slam.loops.drift import Drift
 from app.slam.loops.edits import check, in_words, lay_over
@@ -255,7 +256,7 @@ class LoopBackend:
         """The residual of every factor of the graph, odometry first."""
         return residuals(self._factors(self.edges), self.poses)
 
-    def detail(self, older: int, newer: int) -> LoopDetail:
+    def detail(self, older: KeyframeId, newer: KeyframeId) -> LoopDetail:
         """What the inspector shows of two keyframes. Raises HemislamError if one does not exist."""
         self._check_there(older, newer)
         edge = self.by_pair.get((older, newer))
@@ -422,11 +423,11 @@ class LoopBackend:
         self._broken |= loops
         for factor in failed:
             if isinstance(factor, PositionPrior):
-                self._say(f"The solver failed with the position of keyframe {factor.keyframe.index}; it is left out.")
+                self._say(f"The solver failed with the position of keyframe {factor.keyframe}; it is left out.")
             elif factor.robust:
                 self._say(f"The solver failed with the loop {'{}-{}'.format(*factor.name)}; the graph goes on without.")
             else:
-                self._say(f"The solver failed with the step to keyframe {factor.second.index}; it now says little.")
+                self._say(f"The solver failed with the step to keyframe {factor.second}; it now says little.")
         return bool(loops)
 
     def _say(self, notice: str) -> None:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from app.slam import lie
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import scan_context, verification
 from app.slam.loops.drift import Expectation
 from app.slam.loops.scan_context import ScanContext
@@ -39,8 +40,8 @@ class Sighting:
             that shift: heading of the newer's level frame in the older's.
     """
 
-    older: int
-    newer: int
+    older: KeyframeId
+    newer: KeyframeId
     distance: float
     yaw: float
 
@@ -228,7 +229,9 @@ class Detector:
         away = np.abs(_wrapped(scan_context.YAWS - yaw))
         allowed = away <= params.max_mahalanobis * sigma + scan_context.SECTOR
         shift = int(np.argmin(np.where(allowed, distances, np.inf)))
-        return Sighting(older, newer, float(distances[shift]), float(scan_context.YAWS[shift]))
+        return Sighting(
+            KeyframeId(0, older), KeyframeId(0, newer), float(distances[shift]), float(scan_context.YAWS[shift])
+        )
 
     def _last(self, index: int) -> int:
         """The last keyframe of a submap."""

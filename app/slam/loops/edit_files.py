@@ -9,48 +9,60 @@
       guess: [[1.0, 0.0, 0.0, 0.2], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
     - solve: at once
 
-A loop is named by its older and its newer keyframe. `guess` is T_older_newer of the IMU frames; without it, the graph's
+A loop is named by its older and its newer keyframe: an index, or `session/index` in another session than the first.
+`guess` is T_older_newer of the IMU frames; without it, the graph's
 present one is used. `register` is true by default. `solve: at once` takes the poses from all factors at once
 (Levenberg-Marquardt) instead of one after the other. Any entry may have `since`: the number of keyframes from which
 on it acts; by default it acts from the start.
 """
 
-from collections.abc import Iterable
-from dataclasses import fields
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import MISSING, fields
 from typing import Any, Final
 
 import numpy as np
 import yaml
 
 from app.slam.errors import HemislamError
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.edits import check
 from app.slam.loops.types import Accept, Add, LoopEdit, Pair, Reject, SetWeight, Solve, rows
 from app.slam.user_text import read_yaml
 
-_VERBS: Final[dict[str, type[LoopEdit]]] = {
+_VERBS: Final[dict[str, Any]] = {
     "accept": Accept, "reject": Reject, "weigh": SetWeight, "add": Add, "solve": Solve
 }  # fmt: skip
 _AT_ONCE: Final = "at once"
+_EXAMPLE: Final = "write entries such as `- accept: [12, 340]`"
 _HEAD: Final = "# Edits of loops, in their order: hemislam run RECORDING --loops THIS_FILE\n"
 
 
 def write(edits: Iterable[LoopEdit]) -> str:
     """YAML text of edits; `read` gives the same ones back, to the last digit."""
-    entries = [_entry(edit) for edit in edits]
-    return _HEAD + yaml.safe_dump(entries, sort_keys=False, default_flow_style=None, width=1000)
+    return _HEAD + yaml.safe_dump(entries_of(edits), sort_keys=False, default_flow_style=None, width=1000)
 
 
 def read(text: str, source: str = "the list of edits") -> tuple[LoopEdit, ...]:
-    """The edits of a YAML text.
+    """The edits of a YAML text. Raises HemislamError, naming `source`: as `edits_of`, or it is not YAML."""
+    return edits_of(read_yaml(text, source, _EXAMPLE), source)
+
+
+def entries_of(edits: Iterable[LoopEdit]) -> list[dict[str, Any]]:
+    """Edits as YAML and JSON can hold them."""
+    return [_entry(edit) for edit in edits]
+
+
+def edits_of(entries: object, source: str = "the list of edits") -> tuple[LoopEdit, ...]:
+    """The edits that `entries_of` made these entries of; none of None.
 
     Raises:
         HemislamError: naming `source` and the entry that cannot be used, counted from 1.
     """
-    entries = read_yaml(text, source, "write entries such as `- accept: [12, 340]`")
     if entries is None:
         return ()
     if not isinstance(entries, list):
-        raise HemislamError(f"{source} must be a list; write entries such as `- accept: [12, 340]`.")
+        raise HemislamError(f"{source} must be a list; {_EXAMPLE}.")
     edits = []
     for number, entry in enumerate(entries, 1):
         try:
@@ -62,14 +74,11 @@ def read(text: str, source: str = "the list of edits") -> tuple[LoopEdit, ...]:
 
 def _entry(edit: LoopEdit) -> dict[str, Any]:
     verb = next(verb for verb, kind in _VERBS.items() if isinstance(edit, kind))
-    entry: dict[str, Any] = {verb: _AT_ONCE if isinstance(edit, Solve) else [edit.older, edit.newer]}
-    if isinstance(edit, SetWeight):
-        entry["weight"] = float(edit.weight)
-    if isinstance(edit, Add):
-        entry["register"] = edit.register
-        if edit.guess is not None:
-            entry["guess"] = [list(row) for row in edit.guess]
-    return {**entry, "since": edit.since} if edit.since else entry
+    pair = [int(one) if one < KeyframeId(1, 0) else str(one) for one in edit.pair or ()]
+    entry = {verb: pair or _AT_ONCE} | {name: getattr(edit, name) for name in _fields(type(edit))}
+    if guess := entry.pop("guess", None):
+        entry["guess"] = [list(row) for row in guess]
+    return entry if entry.pop("since") == 0 else entry | {"since": edit.since}
 
 
 def _edit(entry: object) -> LoopEdit:
@@ -80,43 +89,34 @@ def _edit(entry: object) -> LoopEdit:
             f" {_AT_ONCE}`."
         )
     (verb,) = verbs
-    kind = _VERBS[verb]
-    known = [field.name for field in fields(kind) if field.name not in ("older", "newer", "since")]
-    unknown = sorted(str(name) for name in entry.keys() - {verb, "since", *known})
-    if unknown:
-        raise HemislamError(f"{verb} has no {unknown[0]}; it takes {' and '.join(known) or 'nothing else'}.")
-    since = _since(entry.get("since", 0))
-    if kind is Solve:
-        if entry[verb] != _AT_ONCE:
-            raise HemislamError(f"solve is {entry[verb]!r}; it can only be `{_AT_ONCE}`.")
-        return Solve(since=since)
-    older, newer = _pair(verb, entry[verb])
-    edit: LoopEdit
-    if kind is SetWeight:
-        edit = SetWeight(older, newer, _weight(entry.get("weight")), since=since)
-    elif kind is Add:
-        register = entry.get("register", True)
-        if not isinstance(register, bool):
-            raise HemislamError(f"register is {register!r}; it must be true or false.")
-        edit = Add(older, newer, _guess(entry.get("guess")), register, since=since)
-    else:
-        edit = (Accept if kind is Accept else Reject)(older, newer, since=since)
+    defaults = _fields(_VERBS[verb])
+    if unknown := sorted(str(name) for name in entry.keys() - {verb, *defaults}):
+        known = " and ".join(name for name in defaults if name != "since") or "nothing else"
+        raise HemislamError(f"{verb} has no {unknown[0]}; it takes {known}.")
+    values = {name: _READ[name](entry.get(name, default)) for name, default in defaults.items()}
+    if verb == "solve" and entry[verb] != _AT_ONCE:
+        raise HemislamError(f"solve is {entry[verb]!r}; it can only be `{_AT_ONCE}`.")
+    edit: LoopEdit = _VERBS[verb](*(() if verb == "solve" else _pair(verb, entry[verb])), **values)
     check(edit)
     return edit
 
 
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+def _fields(kind: type[LoopEdit]) -> dict[str, Any]:
+    """What an entry may hold beside its verb, with the values that it has without."""
+    own = [field for field in fields(kind) if field.name not in ("older", "newer", "since")]
+    return {field.name: None if field.default is MISSING else field.default for field in own} | {"since": 0}
 
 
 def _pair(verb: str, value: object) -> Pair:
-    if not isinstance(value, list) or len(value) != 2 or not all(map(_is_count, value)) or value[0] >= value[1]:
+    names = [re.fullmatch(r"(?:(\d{1,6})/)?(\d{1,12})", str(one)) for one in value] if isinstance(value, list) else []
+    pair = [KeyframeId(int(name[1] or 0), int(name[2])) for name in names if name]
+    if len(names) != 2 or len(pair) != 2 or pair[0] >= pair[1]:
         raise HemislamError(f"{verb} is {value!r}; it takes two keyframes, the older one first: [12, 340].")
-    return value[0], value[1]
+    return pair[0], pair[1]
 
 
 def _since(value: Any) -> int:
-    if not _is_count(value):
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise HemislamError(f"since is {value!r}; it must be a number of keyframes.")
     return int(value)
 
@@ -127,6 +127,12 @@ def _weight(value: object) -> float:
     return float(value)
 
 
+def _register(value: object) -> bool:
+    if not isinstance(value, bool):
+        raise HemislamError(f"register is {value!r}; it must be true or false.")
+    return value
+
+
 def _guess(value: object) -> tuple[tuple[float, ...], ...] | None:
     if value is None:
         return None
@@ -135,3 +141,8 @@ def _guess(value: object) -> tuple[tuple[float, ...], ...] | None:
     except (TypeError, ValueError):
         T = np.empty(0)
     return rows(T) if T.ndim == 2 else ()  # what is no matrix is refused by `check`
+
+
+_READ: Final[dict[str, Callable[[Any], Any]]] = {
+    "since": _since, "weight": _weight, "register": _register, "guess": _guess
+}  # fmt: skip

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.slam import lie
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.detection import Head
 from app.slam.loops.drift import Drift
 from app.slam.loops.support import laid
 from app.slam.loops.types import FactorResidual, LoopEdge, Pair
-from app.slam.types import F64, KeyframeId
+from app.slam.types import F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,12 +28,12 @@ class Factor:
     T_first_second: F64
     covariance: F64
     robust: bool = False
-    loop: tuple[int, int] | None = None
+    loop: Pair | None = None
 
     @property
-    def name(self) -> tuple[int, int]:
+    def name(self) -> Pair:
         """The keyframes of the loop or of the step."""
-        return self.loop or (self.first.index, self.second.index)
+        return self.loop or (self.first, self.second)
 
     @property
     def keyframes(self) -> tuple[KeyframeId, ...]:
@@ -58,21 +59,6 @@ Step = Factor | tuple[Closing, ...]
 """One change of a graph: odometry to the next pose, or what ties poses that it has."""
 
 
-def between(
-    first: int,
-    second: int,
-    T_first_second: F64,
-    covariance: F64,
-    robust: bool = False,
-    loop: tuple[int, int] | None = None,
-    *,
-    session: int = 0,
-) -> Factor:
-    """A factor between two keyframes of one session."""
-    ends = KeyframeId(session, first), KeyframeId(session, second)
-    return Factor(*ends, T_first_second, covariance, robust, loop)
-
-
 STILL_M, STILL_RAD = 0.001, np.radians(0.02)
 """Standard deviations of a step, however short."""
 EVEN_M = 1.0
@@ -93,7 +79,7 @@ def odometry_factor(second: int, before: Head, after: Head, drift: Drift) -> Fac
     even = walked * EVEN_M
     noise = np.array([STILL_RAD**2 + drift.rotation**2 * even] * 3 + [STILL_M**2 + drift.translation**2 * even] * 3)
     covariance = first + _own_axes(after) + np.diag(noise)
-    return between(second - 1, second, T, (covariance + covariance.T) / 2)
+    return Factor(KeyframeId(0, second - 1), KeyframeId(0, second), T, (covariance + covariance.T) / 2)
 
 
 def _own_axes(head: Head) -> F64:
@@ -120,7 +106,7 @@ def loop_factors(
             T, covariance = edge.T_older_newer, edge.covariance
             if first is not edge:
                 T, covariance = laid(edge, first, T_odom_imu)
-            factors.append(between(first.older, first.newer, T, covariance / edge.weight, True, edge.pair))
+            factors.append(Factor(first.older, first.newer, T, covariance / edge.weight, True, edge.pair))
     return factors
 
 
@@ -129,7 +115,7 @@ def residuals(graph: Iterable[Closing], poses: F64) -> tuple[FactorResidual, ...
     factors = [factor for factor in graph if isinstance(factor, Factor)]
     if not factors:
         return ()
-    first, second = np.array([(f.first.index, f.second.index) for f in factors]).T
+    first, second = np.array([f.keyframes for f in factors]).T
     measured = np.array([f.T_first_second for f in factors])
     errors = lie.log_se3(lie.inverse(measured) @ lie.inverse(poses[first]) @ poses[second])
     whitened = np.linalg.solve(np.array([f.covariance for f in factors]), errors[..., None])[..., 0]

@@ -8,6 +8,7 @@ request has one reply, in order. What cannot be done is answered by a `Failure`,
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.types import Edits, FactorResidual, LoopDetail, LoopEdge, LoopEdit, Preview
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe
@@ -66,8 +67,8 @@ class TryOut:
 class Inspect:
     """All there is about two keyframes, a candidate or not. The answer is a `LoopDetail`."""
 
-    older: int
-    newer: int
+    older: KeyframeId
+    newer: KeyframeId
 
 
 @dataclass(frozen=True, slots=True)

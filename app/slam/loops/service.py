@@ -5,9 +5,10 @@ from collections import deque
 import numpy as np
 
 from app.slam.errors import HemislamError
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import scan_context, verification
 from app.slam.loops.backend import LoopBackend
-from app.slam.loops.factors import between
+from app.slam.loops.factors import Factor
 from app.slam.loops.keyframe_log import Follower, KeyframeLog
 from app.slam.loops.messages import (
     Added,
@@ -123,6 +124,6 @@ def warm_up() -> None:
     verification.slide(place, place, fit)
     context = scan_context.describe(thin)
     scan_context.shift_distances(context, context)
-    graph = PoseGraph(np.eye(4))
-    graph.extend(between(0, 1, np.eye(4), np.eye(6)))
-    graph.close([between(0, 1, np.eye(4), np.eye(6), robust=True)])
+    graph, ends = PoseGraph(np.eye(4)), (KeyframeId(0, 0), KeyframeId(0, 1))
+    graph.extend(Factor(*ends, np.eye(4), np.eye(6)))
+    graph.close([Factor(*ends, np.eye(4), np.eye(6), robust=True)])

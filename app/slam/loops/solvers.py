@@ -1,6 +1,7 @@
 """The solvers of the pose graph. The only place where gtsam is used.
 
-A pose is T_map_imu of a keyframe; its error is a right perturbation, rotation then translation.
+A pose is T_map_imu of a keyframe, whose `KeyframeId` is its key; its error is a right perturbation, rotation then
+translation.
 """
 
 import tempfile
@@ -14,18 +15,17 @@ import gtsam
 import numpy as np
 
 from app.slam import lie
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.chain import Chain
-from app.slam.loops.factors import Closing, Factor, PositionPrior, Step, between
-from app.slam.loops.types import LOOP_HUBER
+from app.slam.loops.factors import Closing, Factor, PositionPrior, Step
+from app.slam.loops.types import LOOP_HUBER, Pair
 from app.slam.rows import Rows
-from app.slam.types import F64, KeyframeId
+from app.slam.types import F64
 
 RELINEARISE = 0.05
 """Change of a pose (rad, m) from which its factors are linearised again."""
 MOST_UPDATES = 5
 """After a loop the update is repeated while the newest pose moves more than that, at most this often."""
-SESSION_BITS = 40
-"""The lower bits of a key of gtsam hold the index of the keyframe, those above its session."""
 _HELD = 1e-6
 """Standard deviation (rad, m) with which the first pose is held."""
 
@@ -81,8 +81,8 @@ class Incremental:
         self._isam.update(*_start(first))
         self._factors = 1  # ever given to the solver
         self._chain = Chain(first)
-        self._tied = [0]
-        self._odometry: dict[tuple[int, int], int] = {}  # number of the factor between two of these
+        self._tied = [KeyframeId(0, 0)]
+        self._odometry: dict[Pair, int] = {}  # number of the factor between two of these
         self._loops: dict[tuple[KeyframeId, ...], _Mean] = {}
         self._poses: Rows[np.float64] | None = Rows((4, 4), np.float64, [first])  # None: loops have moved them since
         self._ahead: list[F64] = []  # the poses after those
@@ -97,7 +97,7 @@ class Incremental:
             self.count += 1
             (self._ahead if self._poses is None else self._poses).append(self.newest)
             return
-        if not all(0 <= keyframe.index < self.count for factor in step for keyframe in factor.keyframes):
+        if not all(0 <= keyframe < self.count for factor in step for keyframe in factor.keyframes):
             raise IndexError("a factor ties a pose that does not exist")
         self._poses, self._ahead = None, []
         T_last, odometry = self._tie(step), self._chain.poses
@@ -116,9 +116,9 @@ class Incremental:
     def _tie(self, factors: Sequence[Closing]) -> F64:
         """Solve with more factors. Returns the last pose (4, 4) that one ties."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        new = sorted({keyframe.index for factor in factors for keyframe in factor.keyframes}.difference(self._tied))
+        new = sorted({keyframe for factor in factors for keyframe in factor.keyframes}.difference(self._tied))
         expected = {key: self._expected(key) for key in new}
-        removed, added = [], dict[tuple[int, int], None]()
+        removed, added = [], dict[Pair, None]()
         for key, pose in expected.items():
             values.insert(key, gtsam.Pose3(pose))
             at = bisect_left(self._tied, key)
@@ -133,7 +133,7 @@ class Incremental:
                     removed.append(self._odometry.pop((before, end)))
         for first, second in added:
             self._odometry[first, second] = self._factors + graph.size()
-            graph.add(_gtsam(between(first, second, *self._chain.between(first, second))))
+            graph.add(_gtsam(Factor(first, second, *self._chain.between(first, second))))
         means: dict[_Mean, None] = {}  # in the order of their first loops
         for factor in factors:
             if isinstance(factor, PositionPrior):
@@ -200,7 +200,7 @@ class Windowed:
         closing: tuple[Closing, ...] = ()
         if isinstance(step, Factor):
             self.newest = self.newest @ step.T_first_second
-            values.insert(_key(step.second), gtsam.Pose3(self.newest))
+            values.insert(step.second, gtsam.Pose3(self.newest))
             graph.add(_gtsam(step))
             stamps[self.count] = float(self.count)
             if self.count - len(self._left) == self._size:
@@ -209,12 +209,12 @@ class Windowed:
         else:
             closing = step
         for factor in closing:
-            first, last = factor.keyframes[0].index, factor.keyframes[-1]
+            first, last = factor.keyframes[0], factor.keyframes[-1]
             if first >= len(self._left):
                 graph.add(_gtsam(factor))
-            elif isinstance(factor, Factor) and last.index >= len(self._left):  # the older pose stays where it was left
+            elif isinstance(factor, Factor) and last >= len(self._left):  # the older pose stays where it was left
                 where = gtsam.Pose3(self._left[first] @ factor.T_first_second)
-                graph.add(gtsam.PriorFactorPose3(_key(last), where, _noise(factor)))
+                graph.add(gtsam.PriorFactorPose3(last, where, _noise(factor)))
         self._smoother.update(graph, values, stamps)
         if closing:
             self.newest = _settled(self._smoother, self.count - 1, self.newest)
@@ -267,14 +267,9 @@ def _gtsam(factor: Closing, times: int = 1) -> gtsam.NonlinearFactor:
     """The factor as gtsam has it."""
     if isinstance(factor, PositionPrior):
         noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
-        return gtsam.GPSFactor(_key(factor.keyframe), factor.p_map_imu, noise)
+        return gtsam.GPSFactor(factor.keyframe, factor.p_map_imu, noise)
     T = gtsam.Pose3(factor.T_first_second)
-    return gtsam.BetweenFactorPose3(_key(factor.first), _key(factor.second), T, _noise(factor, times))
-
-
-def _key(keyframe: KeyframeId) -> int:
-    """gtsam's key of a pose; the index itself in session 0."""
-    return (keyframe.session << SESSION_BITS) | keyframe.index
+    return gtsam.BetweenFactorPose3(factor.first, factor.second, T, _noise(factor, times))
 
 
 def _matrices(values: Any) -> F64:

@@ -13,11 +13,12 @@ import numpy as np
 
 from app.slam.arrays import F32, F64
 from app.slam.errors import HemislamError
+from app.slam.keyframe_id import KeyframeId
 
 LOOP_HUBER = 1.345
 """Whitened error from which a loop pulls with constant force (95 % efficient for a Gaussian)."""
 
-Pair = tuple[int, int]
+Pair = tuple[KeyframeId, KeyframeId]
 """(older, newer) keyframe."""
 
 
@@ -93,8 +94,8 @@ class LoopEdge:
             between that loop's keyframes and ties no poses of its own.
     """
 
-    older: int
-    newer: int
+    older: KeyframeId
+    newer: KeyframeId
     decided_at: int
     T_older_newer: F64
     covariance: F64
@@ -170,8 +171,8 @@ class _Edit:
 
 @dataclass(frozen=True, slots=True)
 class _PairEdit(_Edit):
-    older: int
-    newer: int
+    older: KeyframeId
+    newer: KeyframeId
 
     @property
     def pair(self) -> Pair:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from app.slam import lie
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.ambiguity import nearest_alternative
 from app.slam.loops.detection import Detector, Sighting
 from app.slam.loops.drift import Expectation
@@ -62,7 +63,9 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
     return edge(T, covariance(detector, newer, fit), evidence, reason)
 
 
-def by_hand(older: int, newer: int, detector: Detector, T_older_newer: F64, *, register: bool) -> LoopEdge:
+def by_hand(
+    older: KeyframeId, newer: KeyframeId, detector: Detector, T_older_newer: F64, *, register: bool
+) -> LoopEdge:
     """A loop that the user proposes, registered from the given (4, 4) or taken as it is."""
     guess = detector.T_level_imu(older) @ T_older_newer @ lie.inverse(detector.T_level_imu(newer))
     fit = detector.register(older, newer, guess) if register else detector.assess(older, newer, guess)

@@ -9,6 +9,7 @@ import viser
 
 from app.server.protocol import Chunk, Snapshot
 from app.slam import lie
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.types import Add, Pair, rows
 from app.slam.types import F32, F64
 from app.ui.chunks import shown_points
@@ -119,7 +120,7 @@ class AddLoopPanel:
 
     @property
     def pair(self) -> Pair:
-        return int(self._older.value), int(self._newer.value)
+        return KeyframeId(0, int(self._older.value)), KeyframeId(0, int(self._newer.value))
 
     def suggest_pair(self, pair: Pair) -> None:
         show(self._older, pair[0])
@@ -147,7 +148,7 @@ class AddLoopPanel:
             return
         picked.append(index)
         if len(picked) == 2:
-            self.suggest_pair((min(picked), max(picked)))
+            self.suggest_pair((KeyframeId(0, min(picked)), KeyframeId(0, max(picked))))
             self._picked = None
 
     def draw_scene(self, snapshot: Snapshot, view: View) -> None:

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from app.slam.errors import HemislamError
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.factors import PositionPrior
 from app.slam.loops.files import loops_csv
 from app.slam.loops.types import Add, Edits, Origin, Solve, Verdict, rows
 from app.slam.metrics import umeyama
 from app.slam.sections import LoopsParams
-from app.slam.types import F64, KeyframeId
+from app.slam.types import F64
 from tests.slam.loops.conftest import PARAMS, Walked, accepted, same
 from tests.slam.loops.walks import drive, error, revisits, take
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from app.slam.errors import HemislamError
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.edit_files import read, write
 from app.slam.loops.types import Accept, Add, LoopEdit, Reject, SetWeight, Solve, rows
 
@@ -25,7 +26,7 @@ def _edits(draw: st.DrawFn) -> LoopEdit:
     return draw(
         st.sampled_from(
             (
-                Accept(older, newer, since=since),
+                Accept(KeyframeId(draw(st.integers(0, 3)), older), KeyframeId(3, newer), since=since),
                 Reject(older, newer, since=since),
                 SetWeight(older, newer, weight, since=since),
                 Add(older, newer, None, register, since=since),
@@ -46,9 +47,10 @@ def test_what_is_written_is_read_again_to_the_last_digit(edits: list[LoopEdit]) 
 
 def test_a_list_written_by_hand_is_understood() -> None:
     text = (
-        "- accept: [12, 340]\n- reject: [3, 40]\n- {weigh: [12, 340], weight: 2}\n- add: [5, 300]\n- solve: at once\n"
+        "- accept: [12, 340]\n- reject: [3, 1/40]\n- {weigh: [12, 340], weight: 2}\n- add: [5, 300]\n- solve: at once\n"
     )
-    assert read(text) == (Accept(12, 340), Reject(3, 40), SetWeight(12, 340, 2.0), Add(5, 300), Solve())
+    other = KeyframeId(1, 40)
+    assert read(text) == (Accept(12, 340), Reject(3, other), SetWeight(12, 340, 2.0), Add(5, 300), Solve())
 
 
 def test_an_empty_file_has_no_edits() -> None:
@@ -62,6 +64,8 @@ def test_an_empty_file_has_no_edits() -> None:
         ("{accept: [1, 2], reject: [1, 2]}", "accept, reject, weigh or add"),
         ("accept: [2, 1]", "older one first"),
         ("accept: [-1, 1]", "older one first"),
+        ("accept: [1/3, 3]", "older one first"),
+        ("accept: [x/1, 3]", "two keyframes"),
         ("accept: [1, 2, 3]", "two keyframes"),
         ("accept: [1.5, 2]", "two keyframes"),
         ("{accept: [1, 2], weight: 3}", "accept has no weight"),

@@ -13,11 +13,12 @@ from scipy.optimize import least_squares
 
 from app.slam import lie
 from app.slam.kernels import manifold
-from app.slam.loops.factors import Factor, PositionPrior, Step, between, residuals
+from app.slam.keyframe_id import KeyframeId
+from app.slam.loops.factors import Factor, PositionPrior, Step, residuals
 from app.slam.loops.pose_graph import PoseGraph
-from app.slam.loops.solvers import _key, g2o_text, optimise
+from app.slam.loops.solvers import g2o_text, optimise
 from app.slam.loops.types import LOOP_HUBER
-from app.slam.types import F64, KeyframeId
+from app.slam.types import F64
 
 
 def random_pose(rng: np.random.Generator, spread: float) -> F64:
@@ -40,8 +41,8 @@ def chain(count: int, seed: int = 0, noise: float = 0.02) -> tuple[list[Factor],
     def measured(i: int, j: int) -> F64:
         return lie.inverse(truth[i]) @ truth[j] @ random_pose(rng, noise)
 
-    odometry = [between(k - 1, k, measured(k - 1, k), covariance(rng, 0.05)) for k in range(1, count)]
-    loops = [between(i, j, measured(i, j), covariance(rng, 0.02)) for i, j in ((0, count - 1), (1, count // 2))]
+    odometry = [Factor(k - 1, k, measured(k - 1, k), covariance(rng, 0.05)) for k in range(1, count)]
+    loops = [Factor(i, j, measured(i, j), covariance(rng, 0.02)) for i, j in ((0, count - 1), (1, count // 2))]
     return odometry, loops
 
 
@@ -58,7 +59,7 @@ def errors(x: F64, factors: list[Factor]) -> F64:
     poses = [np.eye(4)] + [lie.transform(lie.exp(v[:3]), v[3:]) for v in x.reshape(-1, 6)]
     out = []
     for factor in factors:
-        E = lie.inverse(factor.T_first_second) @ lie.inverse(poses[factor.first.index]) @ poses[factor.second.index]
+        E = lie.inverse(factor.T_first_second) @ lie.inverse(poses[factor.first]) @ poses[factor.second]
         w = lie.log(E[:3, :3])
         # left Jacobian of SO(3): J(w) = Jr(-w)
         v = manifold.right_jacobian_inverse(-w) @ E[:3, 3]
@@ -103,12 +104,12 @@ def test_loops_between_the_same_two_poses_are_one_factor_that_says_what_they_say
 
 def test_against_odometry_they_pull_as_far_as_each_would_by_itself() -> None:
     step = lie.transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
-    odometry = [between(k, k + 1, step, np.eye(6) * 0.05**2) for k in range(5)]
+    odometry = [Factor(k, k + 1, step, np.eye(6) * 0.05**2) for k in range(5)]
     aside = lie.transform(np.eye(3), np.array([5.0, 3.0, 0.0]))
     graph = graph_of(odometry, [])
     for _ in range(4):
-        graph.close([between(0, 5, aside, np.eye(6) * 0.1**2, robust=True)])
-    loops = [between(0, 5, aside, np.eye(6) * 0.1**2, robust=True)] * 4
+        graph.close([Factor(0, 5, aside, np.eye(6) * 0.1**2, robust=True)])
+    loops = [Factor(0, 5, aside, np.eye(6) * 0.1**2, robust=True)] * 4
     apart = optimise(np.eye(4), odometry + loops, graph.poses)
     assert 0.2 < apart[5, 1, 3] < 2.8, "neither has its way"
     assert graph.poses[5, 1, 3] == pytest.approx(apart[5, 1, 3], rel=0.1)
@@ -136,13 +137,13 @@ def test_doing_it_again_gives_the_same_poses_to_the_last_bit() -> None:
     np.testing.assert_array_equal(graph.poses, again.poses)
     again.poses  # noqa: B018 - looking must not change what comes
     for g in (graph, again):
-        g.close([between(5, 30, np.eye(4), np.eye(6) * 0.1, robust=True)])
+        g.close([Factor(5, 30, np.eye(4), np.eye(6) * 0.1, robust=True)])
     np.testing.assert_array_equal(graph.poses, again.poses)
 
 
 def test_odometry_alone_moves_no_pose_that_is_there() -> None:
     odometry, loops = chain(40)
-    graph = graph_of(odometry[:20], [between(0, 15, odometry[0].T_first_second, np.eye(6) * 0.1)])
+    graph = graph_of(odometry[:20], [Factor(0, 15, odometry[0].T_first_second, np.eye(6) * 0.1)])
     before = graph.poses
     for factor in odometry[20:]:
         graph.extend(factor)
@@ -158,7 +159,7 @@ def test_odometry_alone_moves_no_pose_that_is_there() -> None:
 
 def straight(count: int, sigma: float) -> list[Factor]:
     step = lie.transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
-    return [between(k - 1, k, step, np.eye(6) * sigma**2) for k in range(1, count)]
+    return [Factor(k - 1, k, step, np.eye(6) * sigma**2) for k in range(1, count)]
 
 
 def along(x: float) -> F64:
@@ -167,7 +168,7 @@ def along(x: float) -> F64:
 
 def test_a_robust_loop_pulls_with_bounded_force() -> None:
     def last(x: float, robust: bool = True) -> float:
-        graph = graph_of(straight(11, 0.1), [between(0, 10, along(x), np.eye(6) * 0.05**2, robust=robust)])
+        graph = graph_of(straight(11, 0.1), [Factor(0, 10, along(x), np.eye(6) * 0.05**2, robust=robust)])
         return float(graph.poses[10, 0, 3])
 
     # the chain is a spring of variance 10 x 0.1^2, the loop one of 0.05^2; far off, a constant force LOOP_HUBER / sigma
@@ -181,12 +182,12 @@ def test_a_robust_loop_pulls_with_bounded_force() -> None:
 def test_a_loop_that_breaks_the_solver_is_left_out_and_the_rest_goes_on(broken: str, window: int) -> None:
     odometry, loops = chain(20)
     bad = {
-        "covariance": between(14, 18, np.eye(4), np.full((6, 6), np.nan), robust=True),
-        "measurement": between(14, 18, np.full((4, 4), np.nan), np.eye(6), robust=True),
-        "key": between(14, 99, np.eye(4), np.eye(6), robust=True),
+        "covariance": Factor(14, 18, np.eye(4), np.full((6, 6), np.nan), robust=True),
+        "measurement": Factor(14, 18, np.full((4, 4), np.nan), np.eye(6), robust=True),
+        "key": Factor(14, 99, np.eye(4), np.eye(6), robust=True),
     }[broken]
     graph, clean = graph_of(odometry[:18], loops, window), graph_of(odometry[:18], loops, window)
-    good = between(13, 18, lie.inverse(clean.poses[13]) @ clean.poses[18], np.eye(6) * 0.01, robust=True)
+    good = Factor(13, 18, lie.inverse(clean.poses[13]) @ clean.poses[18], np.eye(6) * 0.01, robust=True)
     assert graph.close([good, bad]) == (bad,)
     assert clean.close([good]) == ()
     for factor in odometry[18:]:
@@ -197,7 +198,7 @@ def test_a_loop_that_breaks_the_solver_is_left_out_and_the_rest_goes_on(broken: 
 def test_a_step_that_breaks_the_solver_leaves_a_pose_all_the_same() -> None:
     odometry, _ = chain(10)
     graph = graph_of(odometry[:5], [])
-    bad = between(5, 6, odometry[5].T_first_second, np.zeros((6, 6)) * np.nan)
+    bad = Factor(5, 6, odometry[5].T_first_second, np.zeros((6, 6)) * np.nan)
     assert graph.extend(bad) == (bad,)
     assert graph.extend(odometry[6]) == ()
     assert len(graph) == len(graph.poses) == 8
@@ -209,7 +210,7 @@ def test_a_window_leaves_old_poses_where_they_are_and_solves_for_the_new_ones() 
     graph = graph_of(odometry, [], window=10)
     before = graph.poses
     off = lie.inverse(before[2]) @ before[29] @ along(0.5)
-    graph.close([between(2, 29, off, np.eye(6) * 0.01**2, robust=True)])
+    graph.close([Factor(2, 29, off, np.eye(6) * 0.01**2, robust=True)])
     moved = np.linalg.norm((graph.poses - before)[:, :3, 3], axis=1)
     assert (moved[:20] == 0).all()
     assert moved[29] > 0.1
@@ -228,7 +229,7 @@ def test_leaving_out_poses_that_no_loop_ties_changes_next_to_nothing(count: int)
     graph = graph_of(odometry, loops)
     for first in (count // 4, count // 3):  # splits a stretch, and ends at one that is tied from then on
         T = lie.inverse(graph.poses[first]) @ graph.poses[-2] @ random_pose(np.random.default_rng(first), 0.003)
-        graph.close([between(first, count - 2, T, np.eye(6) * 0.01**2)])
+        graph.close([Factor(first, count - 2, T, np.eye(6) * 0.01**2)])
     factors = odometry + [loop for step in graph.steps if isinstance(step, tuple) for loop in step]
 
     def cost(poses: F64) -> float:
@@ -244,7 +245,7 @@ def test_the_g2o_file_holds_the_poses_and_factors(tmp_path: Path) -> None:
     odometry, loops = chain(8)
     poses = graph_of(odometry, loops).poses
     (tmp_path / "graph.g2o").write_text(
-        g2o_text(poses, [*odometry, between(0, 5, along(3.0), np.eye(6) * 0.04, robust=True)])
+        g2o_text(poses, [*odometry, Factor(0, 5, along(3.0), np.eye(6) * 0.04, robust=True)])
     )
     graph, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
     assert (values.size(), graph.size()) == (8, 8)
@@ -268,7 +269,7 @@ def test_the_parking_garage_fed_pose_by_pose_ends_at_the_batch_optimum(shared_da
         if i > j:
             adjoint = T.AdjointMap()
             i, j, T, noise = j, i, T.inverse(), adjoint @ noise @ adjoint.T
-        ours = between(i, j, T.matrix(), noise)
+        ours = Factor(i, j, T.matrix(), noise)
         if j == i + 1 and j not in odometry:
             odometry[j] = ours
         else:
@@ -276,7 +277,7 @@ def test_the_parking_garage_fed_pose_by_pose_ends_at_the_batch_optimum(shared_da
     first = values.atPose3(0).matrix()
     graph = PoseGraph(first)
     for j in range(1, count):
-        assert graph.extend(odometry[j]) == graph.close([loop for loop in loops if loop.second.index == j]) == ()
+        assert graph.extend(odometry[j]) == graph.close([loop for loop in loops if loop.second == j]) == ()
     factors = [*odometry.values(), *loops]
     batch = optimise(first, factors, [values.atPose3(k).matrix() for k in range(count)])
 
@@ -304,7 +305,7 @@ def test_positions_of_single_poses_move_the_trajectory_as_an_independent_solver_
 
     def whitened(x: F64) -> F64:
         positions = np.concatenate([np.zeros(3), x.reshape(-1, 6)[:, 3:].ravel()]).reshape(-1, 3)
-        off = [(positions[p.keyframe.index] - p.p_map_imu) / np.sqrt(np.diag(p.covariance)) for p in priors]
+        off = [(positions[p.keyframe] - p.p_map_imu) / np.sqrt(np.diag(p.covariance)) for p in priors]
         return np.concatenate([errors(x, longer), *off])
 
     start = np.concatenate([np.concatenate([lie.log(T[:3, :3]), T[:3, 3]]) for T in alone[1:]])
@@ -329,12 +330,6 @@ def test_a_position_that_breaks_the_solver_or_has_no_pose_is_left_out(window: in
     assert set(map(id, graph.close([good, bad, missing]))) >= {id(bad)}
     assert np.isfinite(graph.poses).all()
     assert np.linalg.norm(graph.poses[18, :3, 3] - before[18, :3, 3]) > 0.01
-
-
-def test_keyframes_of_different_sessions_have_different_keys() -> None:
-    ids = [KeyframeId(session, index) for session in range(3) for index in (0, 1, 100_000)]
-    assert len({_key(keyframe) for keyframe in ids}) == len(ids)
-    assert [_key(KeyframeId(0, index)) for index in (0, 1, 7)] == [0, 1, 7]
 
 
 def test_steps_say_what_was_done() -> None:

@@ -9,7 +9,7 @@ import pytest
 from app.slam import lie
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.edits import lay_over
-from app.slam.loops.factors import between, loop_factors
+from app.slam.loops.factors import Factor, loop_factors
 from app.slam.loops.solvers import optimise
 from app.slam.loops.support import laid, placed
 from app.slam.loops.types import Add, Evidence, LoopEdge, Origin, Reject, SetWeight, Verdict
@@ -131,7 +131,7 @@ def test_repeated_loops_hold_two_ways_together_nearly_as_well_as_each_by_itself(
         steps, odometry = [], [POSES[0]]
         for k, (before, after) in enumerate(pairwise(POSES)):
             T = lie.inverse(before) @ after @ lie.exp_se3(rng.normal(0.0, sigmas))
-            steps.append(between(k, k + 1, T, np.diag(sigmas**2)))
+            steps.append(Factor(k, k + 1, T, np.diag(sigmas**2)))
             odometry.append(odometry[-1] @ T)
         each_errs = rng.normal(0.0, 0.02 * np.sqrt(2 * HALF + 1), (TURN + 2 * HALF, 3))
         errs = {older: each_errs[older : older + 2 * HALF + 1].mean(axis=0) for older in range(50, 0, -HALF // 2 - 1)}
@@ -214,5 +214,5 @@ def test_with_a_window_each_loop_is_between_its_own_keyframes() -> None:
     edges = {edge.pair: edge for edge in (loop(40), replace(loop(34), repeats=loop(40).pair))}
     for window, pairs in ((0, [loop(40).pair] * 2), (50, [*edges])):
         factors = loop_factors(edges.values(), edges, POSES, window=window)
-        assert [(factor.first.index, factor.second.index) for factor in factors] == pairs
+        assert [factor.keyframes for factor in factors] == pairs
         assert [factor.name for factor in factors] == [*edges]
