@@ -91,7 +91,7 @@ class LiveSession(Session):
         """Write what another process needs to go on from here. What is written must not grow with the session."""
         if self.frame < 0 or self.frame % EVERY:
             return
-        kept = (self.checkpoint(), self.params, self.history, self.edits)
+        kept = (self.checkpoint(), self.params, self.history, self.edits, self.keyframes.edits)
         try:
             with self._file:
                 self._file.execute("BEGIN")
@@ -108,7 +108,7 @@ class LiveSession(Session):
         """Go on where a process that died was. False if it left nothing to go on from."""
         try:
             ((pickled,),) = self._file.execute("SELECT pickled FROM kept")
-            checkpoint, params, history, edits = pickle.loads(pickled)
+            checkpoint, params, history, edits, labels = pickle.loads(pickled)
             frames = [pickle.loads(row) for (row,) in self._file.execute("SELECT pickled FROM frames ORDER BY rowid")]
         except (sqlite3.Error, ValueError, pickle.UnpicklingError):
             return False
@@ -118,7 +118,7 @@ class LiveSession(Session):
         self._written = len(frames)
         self.return_to(checkpoint)
         self.choose(params)
-        self.history = history
+        self.history, self.keyframes.edits = history, labels
         if any(edits):
             self.edit_loops(*edits)
         return True

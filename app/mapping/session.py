@@ -11,7 +11,7 @@ import numpy as np
 
 from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
 from app.mapping.feed import Feed, Quiet
-from app.mapping.labels import LabelEdit, LabelledKeyframes
+from app.mapping.labels import LabelledKeyframes
 from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
 from app.mapping.truth import compared
 from app.sensors.findings import Finding
@@ -52,7 +52,7 @@ class Session:
         heading: frames up to this one are repeated as they were, see `go_to`.
         params: for frames not yet processed; set them with `choose`.
         history: parameters by the frame from which they apply, ascending.
-        ended: the feed has no more to give. label_edits: of the keyframes' points, oldest first.
+        ended: the feed has no more to give. keyframes: with the labels that the user gave them.
 
     Raises:
         HemislamError: the truth cannot be read.
@@ -77,7 +77,7 @@ class Session:
         self.history: tuple[tuple[int, Params], ...] = ()
         self.ended = False
         self.frames: Log[Frame] = Log()
-        self.label_edits: tuple[LabelEdit, ...] = ()
+        self.keyframes = LabelledKeyframes(engine.keyframes)
         self.checkpoints = checkpoints
         self._waiting: Measurement | None = None
         self._dropped: tuple[str, ...] = ()  # why scans since the newest frame were
@@ -200,7 +200,7 @@ class Session:
         self.choose(state.params)
         if state.edits or state.undone:
             self.edit_loops(state.edits, state.undone)
-        self.history, self.planned = state.history, saved.frame
+        self.history, self.planned, self.keyframes.edits = state.history, saved.frame, state.labels
 
     @property
     def edits(self) -> tuple[tuple[LoopEdit, ...], tuple[LoopEdit, ...]]:
@@ -265,8 +265,8 @@ class Session:
     def _forget_after(self, frame: int) -> None:
         """What comes after a frame will be different."""
         self.frames.truncate(frame + 1)
-        keyframes = sum(one.keyframe for one in self.frames)
-        self.label_edits = tuple(edit for edit in self.label_edits if edit.keyframe < keyframes)
+        count = sum(one.keyframe for one in self.frames)
+        self.keyframes.edits = tuple(edit for edit in self.keyframes.edits if edit.keyframe < count)
         self.planned, self.heading = min(self.planned, frame), min(self.heading, frame)
         self.history = tuple(entry for entry in self.history if entry[0] <= frame)
         if self.loops:
@@ -329,8 +329,7 @@ class Session:
         """
         info = self.feed.info
         made_from = RunInfo(info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped)
-        keyframes = LabelledKeyframes(self.engine.keyframes, self.label_edits)
-        results = Results(self.log, keyframes, made_from, self.loops.results() if self.loops else None)
+        results = Results(self.log, self.keyframes.now(), made_from, self.loops.results() if self.loops else None)
 
         def write() -> dict[str, Any]:
             report = save_results(folder, results, EXPORTS[:1] if trajectory_only else EXPORTS, replace=replace)

@@ -15,6 +15,8 @@ import json
 import logging
 import math
 import time
+import zlib
+from base64 import b64decode, b64encode
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -26,6 +28,7 @@ from pydantic import BeforeValidator, PlainSerializer, PlainValidator, TypeAdapt
 
 from app import __version__
 from app.mapping.breakpoints import Breakpoints
+from app.mapping.labels import LabelEdit
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import edit_files
@@ -68,6 +71,13 @@ _Edits = Annotated[
     PlainValidator(edit_files.edits_of),
     PlainSerializer(edit_files.entries_of),
 ]
+_LabelEdit = Annotated[
+    LabelEdit,
+    PlainValidator(lambda entry: LabelEdit(KeyframeId(*entry[:2]), zlib.decompress(b64decode(entry[2])))),
+    PlainSerializer(
+        lambda edit: (edit.keyframe.session, edit.keyframe.index, b64encode(zlib.compress(edit.labels)).decode())
+    ),
+]
 _Path = Annotated[Path, PlainSerializer(lambda path: str(path.resolve()))]
 _Note = Annotated[
     Note, PlainValidator(lambda entry: Note(*entry)), PlainSerializer(lambda note: (note.frame, note.text))
@@ -83,7 +93,7 @@ _Speed = Annotated[
 class State:
     """Attributes:
     params: as chosen now. history: parameters by the frame from which they apply, ascending.
-    edits: of loops, in force. undone: those that can be redone, the next one last.
+    edits: of loops, in force. undone: those that can be redone, the next one last. labels: edits of labels.
     truth: trajectory to compare with. notes: in the order in which they were made. speed: to play at.
     """
 
@@ -95,6 +105,7 @@ class State:
     notes: tuple[_Note, ...] = ()
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     speed: _Speed = 1.0
+    labels: tuple[_LabelEdit, ...] = ()
 
 
 _OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)
@@ -243,7 +254,7 @@ def read_session(path: Path) -> SavedSession:
         state = _STATE.validate_python(states[-1]["state"]) if states else State(Params())
         places = [entry for entry in entries if "frame" in entry and "did" not in entry]
         frame, ended = (int(places[-1]["frame"]), bool(places[-1].get("ended"))) if places else (-1, False)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, zlib.error) as error:
         raise HemislamError(f"The session {path} is damaged ({error!r}); an older copy may be whole.") from None
     if not states:
         raise HemislamError(f"The session {path} ends before its first frame; open its recording {opened.recording}.")

@@ -1,6 +1,6 @@
 """The REST interface for scripts: state, parameters, transport, breakpoints, loops, notes, recordings, exports.
 
-A new action is one entry in `TRANSPORT` or `LOOPS`.
+A new action is one entry in `TRANSPORT`, `LABELS` or `LOOPS`.
 """
 
 import functools
@@ -32,6 +32,7 @@ from app.slam.loops.types import Accept, Add, LoopEdit, Reject, SetWeight, Solve
 from app.slam.params import Params
 from app.slam.results import EXPORTS
 from app.slam.trajectory import truth_beside
+from app.slam.types import NON_GROUND, SEED
 
 EXPORT_TIMEOUT_S = 600.0
 MOST_EXPORTS = 4
@@ -60,6 +61,11 @@ Index = Annotated[int, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 Weight = Annotated[float, Field(gt=0, description="Divides the loop's covariance.")]
 Registered = Annotated[bool, Field(description="Register the two submaps; false ties them where the graph has them.")]
+Label = Annotated[int, Field(ge=NON_GROUND, le=SEED)]
+Labels = Annotated[
+    Label | tuple[Label, ...],
+    Field(description="For all points of the keyframe, or one for each: 0 not ground, 1 ground, 2 a seed of it."),
+]
 PAIR = {"older": (Index, ...), "newer": (Index, ...)}
 
 TRANSPORT = {
@@ -69,6 +75,10 @@ TRANSPORT = {
     "step": Action(protocol.StepFrame, {"frames": (Count, 1)}),
     "seek": Action(protocol.Seek, {"frame": (Index, ...)}),
     "speed": Action(protocol.SetSpeed, {"factor": (Replay, ...)}),
+}
+LABELS = {
+    "set": Action(protocol.EditLabels, {"keyframe": (Index, ...), "labels": (Labels, ...)}),
+    "undo": Action(protocol.UndoLabels),
 }
 LOOPS = {
     "accept": Action(_edit(Accept), PAIR),
@@ -190,6 +200,8 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
         LOOPS,
         "Accept, reject, weigh or add a loop; solve all factors at once (Levenberg-Marquardt); undo or redo an edit.",
     )
+
+    _add_actions(router, "/labels", engine, LABELS, "Change the labels of a keyframe's points; undo the last change.")
 
     @router.post("/notes", status_code=202)
     def add_note(body: NoteBody) -> None:

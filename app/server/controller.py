@@ -30,7 +30,8 @@ MOST_NOTES = 1000
 
 _AT_ONCE = protocol.OpenRecording | protocol.Restart | protocol.SetSpeed | protocol.SetBreakpoints
 """Commands that do not wait for the session that is being opened."""
-_FOR_THE_FRAME = protocol.LoopCommand | protocol.AddNote | protocol.CompareWith | protocol.Save
+_OF_LABELS = protocol.EditLabels | protocol.UndoLabels
+_FOR_THE_FRAME = protocol.LoopCommand | _OF_LABELS | protocol.AddNote | protocol.CompareWith | protocol.Save
 """Commands that wait until a reopened session is at its frame."""
 
 
@@ -125,6 +126,11 @@ class Controller:
                 session = self._need_session()
                 saved = None if trajectory_only else session.saved(self._state(session))
                 self._saves.append((folder, session.save(folder, session=saved, trajectory_only=trajectory_only)))
+            case protocol.EditLabels(keyframe, labels):
+                self._need_session().keyframes.edit(keyframe, labels)
+                self._page.show_again(keyframe)
+            case protocol.UndoLabels():
+                self._page.show_again(self._need_session().keyframes.undo())
             case protocol.LoopCommand():
                 loops = self._need_session().loops
                 if loops is None:
@@ -202,6 +208,7 @@ class Controller:
             notes=self._notes,
             breakpoints=self._player.breakpoints,
             speed=self._page.transport.speed,
+            labels=session.keyframes.edits,
         )
 
     # --- opening ---------------------------------------------------------------------------------

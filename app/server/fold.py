@@ -94,8 +94,8 @@ class Fold:
 
     def _take_chunks(self, delta: Delta, now: Snapshot) -> None:
         held = self._chunks[: int(np.searchsorted(self._keyframes, delta.keep))]
-        held = (*held, *read_only(delta.chunks))
         if delta.chunks:
+            held = tuple({chunk.index: chunk for chunk in (*held, *read_only(delta.chunks))}.values())
             sensor = self._poses[len(held) - 1] if now.result is None else now.result.T_map_imu
             held = within_budget(held, self._poses, sensor[:3, 3], self._point_budget)
         self._chunks = held

@@ -108,6 +108,17 @@ class Save(Command, frozen=True):
     trajectory_only: bool = False
 
 
+class EditLabels(Command, frozen=True):
+    """Give the points of a keyframe other labels (as in `Cloud`): one each, in their order, or all the same."""
+
+    keyframe: int
+    labels: tuple[int, ...] | int
+
+
+class UndoLabels(Command, frozen=True):
+    """Take the last `EditLabels` back."""
+
+
 class LoopCommand(Command, frozen=True):
     """A command about loops."""
 
@@ -287,7 +298,7 @@ class Delta:
         replaced: new values of fields of `Snapshot`; `loops` without its edges. With `session`, another session
             begins: the reader drops its edges.
         edges: changed ones. keep: how many of its frames the reader keeps before it appends `frames`.
-        chunks: of the next keyframes. notices: new ones.
+        chunks: of the next keyframes, and of earlier ones that have other labels now. notices: new ones.
     """
 
     replaced: dict[str, Any]

@@ -80,6 +80,7 @@ class Publisher:
         self._cursor = Cursor(0, frames)
         self._keyframes: list[int] = []  # their frames
         self._chunks = chunks
+        self._again: set[int] = set()  # chunks to send again
 
     def put(self, *, urgent: bool = False, **values: Any) -> None:
         """Set fields of the snapshot."""
@@ -114,7 +115,7 @@ class Publisher:
     @property
     def filled(self) -> bool:
         """Whether there is anything to take."""
-        behind = self._frames.cursor != self._cursor or self._chunks < self._chunks_ready
+        behind = self._again or self._frames.cursor != self._cursor or self._chunks < self._chunks_ready
         return bool(self._replaced or self._notices or behind)
 
     @property
@@ -134,15 +135,16 @@ class Publisher:
         self._keyframes[kept:] = [keep + index for index, frame in enumerate(frames) if frame.keyframe]
         self._chunks = first = min(self._chunks, kept)
         self._chunks = max(first, min(self._chunks_ready, first + CHUNKS_AT_ONCE))
-        chunks = tuple(thinned(self._clouds[index]) for index in range(first, self._chunks))
+        again = sorted(index for index in self._again if index < first)
+        chunks = tuple(thinned(self._clouds[index]) for index in (*again, *range(first, self._chunks)))
         delta = Delta(self._replaced, edges, keep, frames, chunks, tuple(self._notices))
-        self._replaced, self._notices, self.urgent = {}, [], False
+        self._replaced, self._notices, self._again, self.urgent = {}, [], set(), False
         return delta
 
     # --- events ----------------------------------------------------------------------------------
     def opened(self, session: Session) -> None:
         """Show another session, from its first frame on, or from where an earlier process left it."""
-        self.begin(session.frames, session.engine.keyframes)
+        self.begin(session.frames, session.keyframes)
         self.result, self._corrections, self._noticed = None, MapFrame(), {}
         self.put(recording=opened_recording(session))
         self.show(frame=session.frame, stamp_ns=0, finished=False, frames_per_second=0.0, dropped=session.dropped)
@@ -184,6 +186,11 @@ class Publisher:
         """Show other labels of the frame."""
         self.result = result
         self.put(result=result, urgent=True)
+
+    def show_again(self, keyframe: int) -> None:
+        """A keyframe has other labels now."""
+        self._again.add(keyframe)
+        self.urgent = True
 
     def saved(self, saved: Saved) -> None:
         self._saved = (*self._saved, saved)[-SAVED_KEPT:]

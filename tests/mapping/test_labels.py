@@ -36,23 +36,25 @@ ALL_GROUND = np.full(POINTS, GROUND, np.uint8)
 @given(st.lists(st.one_of(st.none(), st.tuples(st.integers(0, 2), st.integers(0, 2))), max_size=12))
 def test_the_newest_edit_counts_and_undo_brings_the_one_before_back(steps: list[tuple[int, int] | None]) -> None:
     """A step is an edit (keyframe, label) or an undo (None)."""
-    label_edits: tuple[LabelEdit, ...] = ()
+    seen = LabelledKeyframes(KEYFRAMES)
     edits: list[tuple[int, int]] = []
     for step in steps:
-        if step is None:
-            label_edits, edits = label_edits[:-1], edits[:-1]
+        if step is not None:
+            seen.edit(*step)
+            edits.append(step)
+        elif edits:
+            assert seen.undo() == edits.pop()[0]
         else:
-            edit = LabelEdit.of(KEYFRAMES[step[0]], np.full(POINTS, step[1], np.uint8))
-            label_edits, edits = (*label_edits, edit), [*edits, step]
+            with pytest.raises(HemislamError, match="no edit of labels"):
+                seen.undo()
     expected = dict.fromkeys(range(3), NON_GROUND) | dict(edits)
-    seen = LabelledKeyframes(KEYFRAMES, label_edits)
     assert {index: int(seen[index].cloud.labels[0]) for index in range(len(seen))} == expected
     assert all((one.cloud.labels == NON_GROUND).all() for one in KEYFRAMES)
 
 
 def test_an_export_under_way_does_not_see_later_keyframes() -> None:
     keyframes = KEYFRAMES[:2]
-    seen = LabelledKeyframes(keyframes, [LabelEdit.of(KEYFRAMES[1], ALL_GROUND)])
+    seen = LabelledKeyframes(keyframes, (LabelEdit.of(KEYFRAMES[1], ALL_GROUND),)).now()
     keyframes.append(KEYFRAMES[2])
     assert len(seen) == 2 and (seen[0].cloud.labels == NON_GROUND).all()
     with pytest.raises(IndexError):
@@ -61,19 +63,21 @@ def test_an_export_under_way_does_not_see_later_keyframes() -> None:
 
 def test_labels_for_another_number_of_points_are_refused() -> None:
     with pytest.raises(HemislamError, match="Keyframe 0 has 4 points; 3 labels do not fit"):
-        LabelEdit.of(KEYFRAMES[0], ALL_GROUND[:3])
+        LabelledKeyframes(KEYFRAMES).edit(0, ALL_GROUND[:3])
+    with pytest.raises(HemislamError, match="no keyframe 3 to label; there are 3"):
+        LabelledKeyframes(KEYFRAMES).edit(3, GROUND)
 
 
 def test_labels_are_kept_as_they_were_given() -> None:
     labels = ALL_GROUND.copy()
     edit = LabelEdit.of(KEYFRAMES[0], labels)
     labels[:] = NON_GROUND
-    assert (edit.labels == GROUND).all() and not edit.labels.flags.writeable
+    assert edit.labels == bytes([GROUND] * POINTS)
 
 
 def test_the_map_is_written_with_edited_labels(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
-    write_map(path, LabelledKeyframes(KEYFRAMES, [LabelEdit.of(KEYFRAMES[1], ALL_GROUND)]), MapFrame())
+    write_map(path, LabelledKeyframes(KEYFRAMES, (LabelEdit.of(KEYFRAMES[1], ALL_GROUND),)), MapFrame())
     edited = path.read_bytes()
     relabelled = [replace(one, cloud=replace(one.cloud, labels=ALL_GROUND)) for one in KEYFRAMES[1:2]]
     write_map(path, [KEYFRAMES[0], *relabelled, KEYFRAMES[2]], MapFrame())

@@ -69,6 +69,26 @@ def test_exports_by_rest(site: Site) -> None:
     assert without_loops.status_code == 404 and "loop search is off" in without_loops.json()["detail"]
 
 
+def test_labels_by_rest(site: Site) -> None:
+    httpx.post(site.url("/api/transport"), json={"action": "seek", "frame": 20})
+    eventually(site, frame=20)
+
+    def ground() -> int:
+        cloud = httpx.get(site.url("/api/export/map.ply"), timeout=TIMEOUT_S).content
+        return sum(cloud.partition(b"end_header\n")[2][16::17])
+
+    def post(**body: object) -> int:
+        return httpx.post(site.url("/api/labels"), json=body).status_code
+
+    found = ground()
+    assert post(action="set", keyframe=0, labels=1) == 202
+    assert post(action="set", keyframe=1, labels=[1] * fakes.POINTS) == 202
+    assert ground() > found
+    assert post(action="undo") == post(action="undo") == 202
+    assert ground() == found
+    assert post(action="set", keyframe=0, labels=7) == post(action="set", labels=1) == 422
+
+
 @pytest.mark.parametrize("path", ["/etc/passwd", "../../../../etc/passwd", "missing.mcap"])
 def test_recordings_outside_the_folders_are_not_opened(site: Site, path: str) -> None:
     answer = httpx.post(site.url("/api/recordings"), json={"path": path})

@@ -14,13 +14,12 @@ from test_fold import content
 
 from app.mapping.checkpoints import DEFAULT_BYTES, START
 from app.mapping.feed import FileFeed
-from app.mapping.labels import LabelEdit
 from app.mapping.opening import open_session
 from app.mapping.session import Session
 from app.sensors.presets import resolve_params
 from app.server.controller import Controller
 from app.server.fold import Fold
-from app.server.protocol import SERIES, Command, Pause, Play, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.protocol import SERIES, Command, EditLabels, Pause, Play, Seek, SetParams, SetSpeed, Snapshot, StepFrame
 from app.server.publisher import Publisher
 from app.slam.params import Params
 from app.slam.types import DroppedScan
@@ -211,12 +210,11 @@ def test_playing_on_after_going_back_overwrites_the_future() -> None:
 def test_label_edits_of_keyframes_that_become_different_ones_are_dropped() -> None:
     bench = Bench(Params(), fakes.open_fake, Path("walk-60.mcap"))
     bench.do(Seek(50))
-    keyframes = bench.session.engine.keyframes
-    bench.session.label_edits = tuple(LabelEdit.of(one, one.cloud.labels) for one in keyframes)
+    bench.do(*(EditLabels(index, 0) for index in range(11)))
     bench.do(Seek(20))
-    assert len(bench.session.label_edits) == 11, "the later keyframes are still known"
+    assert len(bench.session.keyframes.edits) == 11, "the later keyframes are still known"
     bench.do(SetParams({"ground.sigma": 0.2}))
-    assert [edit.keyframe for edit in bench.session.label_edits] == [0, 1, 2, 3, 4]
+    assert [edit.keyframe for edit in bench.session.keyframes.edits] == [0, 1, 2, 3, 4]
 
 
 def test_a_longer_way_shows_progress() -> None:

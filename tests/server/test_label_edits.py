@@ -1,0 +1,50 @@
+"""Labels that the user changes: on the page, in the session's state, and undone.
+
+Tests app/server/controller.py and app/server/publisher.py.
+"""
+
+import numpy as np
+from pydantic import TypeAdapter
+from session_bench import Bench, last_notice
+
+from app.mapping.session_file import State
+from app.server.protocol import EditLabels, Seek, SetParams, UndoLabels
+from app.slam.types import GROUND, NON_GROUND
+
+
+def test_changed_labels_are_shown_and_taken_back() -> None:
+    bench = Bench()
+    before = bench.do(Seek(20)).chunks
+    frames = len(bench.fold.snapshot.series["speed"])
+    after = bench.do(EditLabels(1, GROUND), EditLabels(3, NON_GROUND)).chunks
+    assert (after[1].labels == GROUND).all() and (after[3].labels == NON_GROUND).all()
+    assert [one is other for one, other in zip(before, after, strict=True)] == [True, False, True, False, True]
+    assert np.array_equal(after[1].points, before[1].points) and len(bench.see().series["speed"]) == frames
+    undone = bench.do(UndoLabels(), UndoLabels(), UndoLabels())
+    assert all(np.array_equal(one.labels, other.labels) for one, other in zip(before, undone.chunks, strict=True))
+    assert "no edit of labels to undo" in last_notice(undone)
+
+
+def test_labels_that_do_not_fit_are_refused() -> None:
+    bench = Bench()
+    bench.do(Seek(20))
+    assert "2 labels do not fit" in last_notice(bench.do(EditLabels(1, (GROUND, GROUND))))
+    assert "no keyframe 500" in last_notice(bench.do(EditLabels(500, GROUND)))
+    assert not bench.sessions[-1].keyframes.edits
+
+
+def test_a_keyframe_that_is_made_anew_has_its_own_labels() -> None:
+    bench = Bench()
+    bench.do(Seek(40))
+    bench.do(EditLabels(6, GROUND), Seek(10), SetParams({"ground.sigma": 0.2}))
+    assert not (bench.do(Seek(40)).chunks[6].labels == GROUND).all()
+
+
+def test_a_state_with_label_edits_is_written_and_read() -> None:
+    bench = Bench()
+    bench.do(Seek(20))
+    bench.do(EditLabels(1, GROUND), EditLabels(2, NON_GROUND))
+    session, adapter = bench.sessions[-1], TypeAdapter(State)
+    state = State(session.params, labels=session.keyframes.edits)
+    assert adapter.validate_json(adapter.dump_json(state)) == state
+    assert len(state.labels) == 2
