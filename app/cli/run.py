@@ -120,6 +120,11 @@ def save(session: "Session", folder: Path, stop: BaseException | None, *, replac
     if session.loops:
         for notice in (*session.loops.take_notices(), *session.loops.take_alarms()):
             typer.echo(notice)
+    if not report["map"]["points"] and report["map"]["keyframes"]:
+        raise HemislamError(
+            f"The map has no points: no return lies between sensor.min_range and sensor.max_range; run `hemislam info` "
+            f"on the recording. What there is was saved in {folder}."
+        )
     if isinstance(stop, HemislamError):
         raise HemislamError(f"{stop} The frames before that were processed and saved in {folder}.")
     if stop is not None:

@@ -17,6 +17,11 @@ from app.slam.types import F32, U8
 
 Column = npt.NDArray[Any]
 
+FARTHEST_M = 10_000.0
+"""On one axis; no LiDAR sees farther."""
+LATEST = 1e19
+"""Of a point's time in any unit: years in ns. Beyond it integers overflow."""
+
 
 class CloudError(ValueError):
     """One point-cloud message cannot be read; the text says why, fit for `DroppedScan.reason`."""
@@ -29,6 +34,7 @@ class CloudMessage:
     Attributes:
         stamp_ns: header stamp. height, width: as in the message; firing order is row-major.
         fields: name -> (offset in bytes, numpy dtype with byte order). data: (bytes,) uint8.
+        swapped: whether its byte order is not the one that the message states.
     """
 
     stamp_ns: int
@@ -38,6 +44,7 @@ class CloudMessage:
     row_step: int
     fields: dict[str, tuple[int, np.dtype[Any]]]
     data: U8
+    swapped: bool = False
 
     def __len__(self) -> int:
         return self.height * self.width
@@ -115,7 +122,26 @@ def read_point_cloud_2(message: Any) -> CloudMessage:
     for name, (offset, dtype) in fields.items():
         if offset + dtype.itemsize > point_step and needed:
             raise CloudError(f"field `{name}` ends after the point_step of {point_step} bytes")
-    return CloudMessage(stamp_ns(message.header.stamp), height, width, point_step, row_step, fields, data)
+    return _in_true_byte_order(
+        CloudMessage(stamp_ns(message.header.stamp), height, width, point_step, row_step, fields, data)
+    )
+
+
+def _in_true_byte_order(cloud: CloudMessage) -> CloudMessage:
+    """The same, in the other byte order if coordinates are lengths in that one only: some drivers state it wrongly."""
+    if not {"x", "y", "z"} <= cloud.fields.keys() or _share_of_lengths(cloud) > 0.5:
+        return cloud
+    fields = {name: (offset, dtype.newbyteorder()) for name, (offset, dtype) in cloud.fields.items()}
+    other = replace(cloud, fields=fields, swapped=True)
+    return other if _share_of_lengths(other) > 0.9 else cloud
+
+
+def _share_of_lengths(cloud: CloudMessage) -> float:
+    """Share of some numbers among the coordinates that are lengths in m; 1 if there are none."""
+    xyz = np.stack([cloud.column(name)[:: max(len(cloud) // 300, 1)] for name in "xyz"]).astype(np.float64)
+    size = np.abs(xyz[xyz == xyz])
+    size = size[size > 0]
+    return float(np.mean((size > 1e-6) & (size < FARTHEST_M))) if len(size) else 1.0
 
 
 POINT_CLOUD_2 = CloudType(
@@ -137,15 +163,17 @@ class Probe:
     Attributes:
         log_ns: when it was logged. cloud: its content.
         stamped: False if its header carries no time, and `cloud.stamp_ns` is the log time.
+        time: name of the field with the points' times, once it is known; points without a time are then not valid.
     """
 
     log_ns: int
     cloud: CloudMessage
     stamped: bool = True
+    time: str | None = None
 
     @cached_property
-    def _valid(self) -> tuple[F32, npt.NDArray[np.intp]]:
-        return valid_points(self.cloud.xyz())
+    def _valid(self) -> tuple[F32, npt.NDArray[np.intp], int]:
+        return valid_points(self.cloud.xyz(), None if self.time is None else self.cloud.column(self.time))
 
     @property
     def points(self) -> F32:
@@ -169,12 +197,15 @@ def stamped(probes: list[Probe]) -> list[Probe]:
     return [Probe(probe.log_ns, replace(probe.cloud, stamp_ns=probe.log_ns), stamped=False) for probe in probes]
 
 
-def valid_points(xyz: F32, time: Column | None = None) -> tuple[F32, npt.NDArray[np.intp]]:
-    """Points with a return (finite, not all zero, with a finite time), and their indices."""
+def valid_points(xyz: F32, time: Column | None = None) -> tuple[F32, npt.NDArray[np.intp], int]:
+    """Points that can be a return (nearer than `FARTHEST_M`, with a time), their indices, and how many others are none.
+
+    Points that are NaN or all zero are not counted: drivers put them where nothing came back.
+    """
     x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
-    # An overflow is not finite either, so one sum tests all three.
-    valid = np.isfinite(x + y + z) & ((x != 0) | (y != 0) | (z != 0))
+    farthest = np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(z))  # NaN if any of them is
+    valid = (farthest < FARTHEST_M) & (farthest > 0)
     if time is not None and time.dtype.kind == "f":
-        valid &= np.isfinite(time)
+        valid &= np.abs(time) < LATEST
     index = np.flatnonzero(valid)
-    return xyz.take(index, axis=0), index
+    return xyz.take(index, axis=0), index, int(np.count_nonzero(farthest > 0)) - len(index)

@@ -73,7 +73,7 @@ class _Census:
     Attributes:
         scan_times: log time, begin and end of each scan, ns. imu_times: log time and stamp of each sample.
         places: points that the messages have room for. nan, returns: how many of them are.
-        reasons: why scans are left out.
+        refused: points that cannot be returns. reasons: why scans are left out.
     """
 
     sequencer: Sequencer
@@ -81,6 +81,7 @@ class _Census:
     imu_times: list[tuple[int, int]] = field(default_factory=list)
     places: int = 0
     nan: int = 0
+    refused: int = 0
     returns: int = 0
     reasons: Counter[str] = field(default_factory=Counter)
 
@@ -95,6 +96,7 @@ class _Census:
             if isinstance(entry.scan, Scan):
                 self.scan_times.append((entry.log_ns, entry.scan.stamp_ns, entry.scan.end_ns))
                 self.returns += len(entry.scan)
+                self.refused += entry.scan.refused
             self.sequencer.add_scan(entry.scan)
         self.take(last=False)
 
@@ -183,7 +185,10 @@ def _returns(census: _Census, scans: int) -> Finding:
     nan, returns = census.nan / census.places, census.returns / census.places
     each = census.returns // max(scans, 1)
     text = f"{each} a scan; of the places in the clouds {nan:.1%} are NaN, {returns:.1%} are returns"
-    return Finding("returns", "fine" if returns > 0.05 else "needs you", text)
+    if census.refused:
+        text += f"; {census.refused / census.places:.1%} are beyond 10 km or without a time and are left out"
+    usual: Verdict = "corrected" if census.refused else "fine"
+    return Finding("returns", usual if returns > 0.05 and census.refused < 0.3 * census.places else "needs you", text)
 
 
 def _listed(*counted: tuple[int, str]) -> str:

@@ -37,6 +37,7 @@ def settle_cloud(
             f"{', '.join(fields)}: choose one by --set recording.time_field=NAME, or `none`."
         )
     timing, time_findings = settle_timing(probes, kind, chosen)
+    probes = [probe for cloud in probes if len((probe := replace(cloud, time=timing.field)).points)]
     rings, ring_finding = settle_rings(probes, kind, names)
     clouds = [(probe.points, rings.of(probe.cloud, probe.points, probe.index)) for probe in probes]
     spin = None
@@ -55,7 +56,11 @@ def settle_cloud(
         kind=kind,
         stamped=probes[0].stamped,
     )
-    return layout, [_fields_finding(probes[0].cloud), *time_findings, ring_finding]
+    findings = [_fields_finding(probes[0].cloud), *time_findings, ring_finding]
+    if any(probe.cloud.swapped for probe in probes):
+        text = "the clouds state a wrong byte order (is_bigendian); they are read in the other one"
+        findings.append(Finding("fields", "corrected", text))
+    return layout, findings
 
 
 def _rotation_finding(cloud: tuple[F32, U16], time: npt.NDArray[Any], timing: Timing) -> Finding:

@@ -50,14 +50,14 @@ def read_scan(message: Any, log_ns: int, layout: CloudLayout) -> tuple[CloudMess
 
 
 def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
-    """One message as a `Scan`: points without a return (NaN, infinite or all zero) removed.
+    """One message as a `Scan`: points without a return (NaN, infinite, beyond 10 km or all zero) removed.
 
     Raises:
         CloudError: no valid point is left, a field is missing, or the times make no scan.
     """
     timing = layout.timing
     time = cloud.column(timing.field) if timing.field is not None else None
-    points, index = valid_points(cloud.xyz(), time)
+    points, index, refused = valid_points(cloud.xyz(), time)
     if not len(points):
         raise CloudError(_nothing_left(cloud))
 
@@ -79,6 +79,8 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
             begin_ns = cloud.stamp_ns
         case "last":
             begin_ns = cloud.stamp_ns - (latest - earliest)
+    if abs(begin_ns) > np.iinfo(np.int64).max // 2:
+        raise CloudError("its time is in no calendar")
     offsets_ns = (times_ns - earliest).astype(np.int32)
     intensity = (
         cloud.column(layout.intensity_field).take(index).astype(np.float32)
@@ -89,7 +91,7 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
     for array in (points, offsets_ns, intensity, ring, ground):
         if array is not None:
             array.setflags(write=False)
-    return Scan(begin_ns, points, offsets_ns, intensity, ring, ground)
+    return Scan(begin_ns, points, offsets_ns, intensity, ring, ground, refused)
 
 
 def _nothing_left(cloud: CloudMessage) -> str:

@@ -95,8 +95,8 @@ def cloud_message(scan: Scan, *, exact: bool = False) -> Any:
 
 def empty_cloud(stamp_ns: int) -> Any:
     """A PointCloud2 without a point, for a revolution that saw nothing."""
-    nothing = np.empty(0)
-    scan = Scan(stamp_ns, np.empty((0, 3), np.float32), *(nothing.astype(kind) for kind in ("i4", "f4", "u2")))
+    points, times = np.empty((0, 3), np.float32), np.empty(0, np.int32)
+    scan = Scan(stamp_ns, points, times, np.empty(0, np.float32), np.empty(0, np.uint16))
     return cloud_message(scan, exact=True)
 
 

@@ -193,6 +193,8 @@ class Sequencer:
         first = max(bisect.bisect_right(self._stamps, begin_ns) - 1, 0)
         last = bisect.bisect_left(self._stamps, end_ns)
         self._note_missing_scans(scan)
+        if scan.refused:
+            self._notices.append("points beyond 10 km or without a time were left out")
         imu = self._samples(first, last + 1)
         gaps = np.diff(imu.stamps_ns) / 1e9
         self._notices += [f"no IMU sample for {gap:.3f} s" for gap in gaps[gaps > self.limits.max_gap]]

@@ -5,7 +5,7 @@ against what must hold: a scan lasts about as long as the interval to the next o
 message was logged.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,9 @@ from app.slam.sections import RecordingParams
 from app.slam.types import I64
 
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+
+MOST_NS = 2**61
+"""Later times, 73 years after others, are cut to this, so that integers hold them."""
 
 Anchor = Literal["absolute", "header", "first", "last"]
 End = Literal["first", "last"]
@@ -46,9 +49,13 @@ def settle_timing(clouds: list[Probe], kind: CloudType, chosen: RecordingParams)
     period_ns, period_known = scan_period_ns(clouds, chosen.rotation_rate)
     rejected: list[str] = []
     for name in _candidates(clouds[0], kind, chosen.time_field):
-        unit_ns, problem, finding = _settle_unit(name, clouds, kind, chosen, period_ns)
+        timed = [probe for cloud in clouds if len((probe := replace(cloud, time=name)).points)]
+        if not timed:
+            rejected.append(f"`{name}` is not a finite number at any point")
+            continue
+        unit_ns, problem, finding = _settle_unit(name, timed, kind, chosen, period_ns)
         if not problem or chosen.time_field == name:
-            timing, findings = _settle_reference(name, unit_ns, clouds, chosen, period_ns)
+            timing, findings = _settle_reference(name, unit_ns, timed, chosen, period_ns)
             return timing, [finding, *findings]
         rejected.append(problem)
     return _without_field(clouds, chosen, period_ns, period_known, rejected)
@@ -246,6 +253,8 @@ def exact_ns(time: npt.NDArray[Any], unit_ns: int) -> tuple[int, I64]:
     if time.dtype.kind == "f":
         values = time.astype(np.float64)
         whole = float(np.floor(values.min()))
-        return int(whole) * unit_ns, np.rint((values - whole) * unit_ns).astype(np.int64)
+        after = np.minimum((values - whole) * unit_ns, MOST_NS)
+        return int(whole) * unit_ns, np.rint(after).astype(np.int64)
     least = time.min()
-    return int(least) * unit_ns, (time - least).astype(np.int64) * unit_ns
+    after = np.minimum((time - least).astype(np.uint64), MOST_NS // unit_ns)
+    return int(least) * unit_ns, after.astype(np.int64) * unit_ns

@@ -1,5 +1,6 @@
 """The engine: one frame in, one result out. Synchronous and deterministic."""
 
+import contextlib
 import time
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
 from app.slam.local_map import LocalMap, MapState
 from app.slam.params import Params
-from app.slam.types import F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
+from app.slam.types import F32, F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
 from app.slam.voxel import VoxelGrid, spread
 
 
@@ -91,7 +92,7 @@ class Engine:
         posterior, registration = predicted, _NOT_REGISTERED
         if self._map.voxels:
             chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
-            posterior, registration = iekf.update(predicted, chosen, self._map, p.filter)
+            posterior, registration = self._update(predicted, chosen)
         status = _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 
@@ -154,6 +155,14 @@ class Engine:
     def close(self) -> None:
         """Give the disk space of the keyframes back."""
         self.keyframes.close()
+
+    def _update(self, predicted: Belief, points: F32) -> tuple[Belief, Registration]:
+        """As `iekf.update`; if the numbers break down, the prediction stands and the frame is lost."""
+        with contextlib.suppress(np.linalg.LinAlgError):
+            posterior, registration = iekf.update(predicted, points, self._map, self.params.filter)
+            if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():
+                return posterior, registration
+        return predicted, replace(_NOT_REGISTERED, used=len(points), reason="the update gave no finite pose")
 
     def _insert(self, belief: Belief, points: np.ndarray) -> None:
         T = (belief.state.T_odom_imu @ belief.state.T_imu_lidar).astype(np.float32)

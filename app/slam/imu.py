@@ -68,6 +68,11 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -
         times, gyro, accel, spacing > params.max_gap, spacing > LONG_GAP, MAX_KNOT_STEP, R, p, v,
         state.b_gyro, state.b_accel, state.g_odom, basis, P, noise, knot_t, knot_T,
     )  # fmt: skip
+    if not (np.isfinite(p).all() and np.isfinite(v).all() and np.isfinite(R).all() and np.isfinite(P).all()):
+        here = state.T_odom_imu[None, :3]  # the samples made no sense: stay, and let the scan tell
+        return Belief(replace(state, stamp_ns=end_ns), belief.covariance), Path(
+            np.array([-1.0, 0.0]), np.r_[here, here]
+        )
     R = 1.5 * R - 0.5 * R @ R.T @ R  # back onto SO(3) after many products: one Newton step of the polar form
     P = 0.5 * (P + P.T)
     moved = replace(state, stamp_ns=end_ns, R_odom_imu=R, p_odom_imu=p, v_odom_imu=v)

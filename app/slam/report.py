@@ -7,12 +7,16 @@ from typing import Any
 import numpy as np
 
 from app import __version__
+from app.slam.doubts import doubts
 from app.slam.errors import HemislamError
 from app.slam.metrics import compare
 from app.slam.provenance import describe_machine, hash_input, peak_memory_mb
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64, TIMINGS, FrameStatus
+
+MOST_NOTED = 5
+"""Different notices that the summary lists; report.json has them all."""
 
 
 def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo) -> dict[str, Any]:
@@ -21,6 +25,7 @@ def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo) -> dict[str,
     return {
         "hemislam": __version__,
         "stopped_early": info.stopped or None,
+        "doubts": list(doubts(log)),
         "recording": {
             "path": str(info.recording),
             "sha256": hash_input(info.recording),
@@ -82,7 +87,8 @@ def finite(value: Any) -> Any:
 
 
 def summarise(report: dict[str, Any], folder: Path) -> str:
-    """The report in a few lines."""
+    """The report in a few lines; what speaks against the result comes first and last."""
+    warning = [("WARNING", f"this cannot be right: {' '.join(report['doubts'])}")] if report["doubts"] else []
     frames, ground, loops, accuracy = (report[name] for name in ("frames", "ground", "loops", "accuracy"))
     total, points = report["timings_ms"]["total"], report["map"]
     counts = f"{frames['processed']} processed, {frames['dropped']} dropped, {frames['lost']} lost"
@@ -114,5 +120,6 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
             lines.append(("", f"no rotation error: {accuracy['ate_deg_withheld']}"))
         if (before := report.get("accuracy_odometry")) and "ate_m" in before:
             lines.append(("", f"without loops ATE {before['ate_m']['rmse']:.4f} m"))
+    lines += [("noted", f"{count} x {notice}") for notice, count in [*report["notices"].items()][:MOST_NOTED]]
     lines += [("memory", f"{report['peak_memory_mb']:.0f} MB at most"), ("saved in", str(folder))]
-    return "\n".join(f"{name:<10} {text}" for name, text in lines)
+    return "\n".join(f"{name:<10} {text}" for name, text in (*warning, *lines, *warning))

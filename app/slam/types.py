@@ -38,6 +38,7 @@ class Scan:
         intensity: (n,) float32, the sensor's own scale (0-255 for RoboSense).
         ring: (n,) uint16, rank of the scan line's elevation; 0 = lowest = outermost cone.
         truth_ground: (n,) uint8, 1 where the recording labels a point as ground; None without labels.
+        refused: how many more points there were that cannot be returns: too far, or without a time.
     """
 
     stamp_ns: int
@@ -46,6 +47,7 @@ class Scan:
     intensity: F32
     ring: U16
     truth_ground: U8 | None = None
+    refused: int = 0
 
     @property
     def end_ns(self) -> int:

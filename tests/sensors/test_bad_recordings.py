@@ -1,11 +1,13 @@
 """What cannot be used is refused in one sentence that says what, where and what to do."""
 
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from app.sensors.doctor import examine
 from app.sensors.recording import open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -215,3 +217,74 @@ def test_a_time_unit_that_makes_no_scans_names_the_option_that_does(tmp_path: Pa
     path = rig.write(tmp_path / "walk", rig.walk(turns=3, layout=layout, columns=12))
     sentence = refusal(path, Params().with_values({"recording.time_unit": "s"}))
     assert "--set recording.time_unit=auto" in sentence
+
+
+# --- points that cannot be returns -------------------------------------------------------------------
+ABSOLUTE = rig.Layout([*[(axis, "f4", axis) for axis in "xyz"], ("timestamp", "f8", "time")])
+
+
+def spoilt(field: str, value: float, share: float, layout: rig.Layout | None = None) -> list[rig.Entry]:
+    """A walk in which a share of the points have this value in a field."""
+    entries = []
+    for topic, log, sent in rig.walk(turns=4, columns=12, layout=layout or ABSOLUTE):
+        if topic == "/points":
+            data = sent.data.copy()
+            named = {column.name: column for column in sent.fields}[field]
+            kind = np.dtype("f8" if named.datatype == 8 else "f4")
+            column = np.ndarray((sent.width,), kind, data.data, named.offset, (sent.point_step,))
+            column[: round(share * sent.width)] = value
+            sent = replace(sent, data=data)
+        entries.append((topic, log, sent))
+    return entries
+
+
+@pytest.mark.parametrize("share", [0.1, 0.6])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("timestamp", np.nan), ("timestamp", np.inf), ("timestamp", 1e300), ("x", np.inf), ("y", 1e30), ("z", -3e4)],
+)
+def test_points_that_cannot_be_returns_are_left_out_and_told(
+    tmp_path: Path, field: str, value: float, share: float
+) -> None:
+    path = rig.write(tmp_path / "walk", spoilt(field, value, share))
+    with open_recording(path, Params()) as recording:
+        read = list(recording.measurements())
+    assert len(read) == 4
+    for entry in read:
+        assert isinstance(entry, Measurement)
+        assert entry.scan.refused == round(share * 96) == 96 - len(entry.scan)
+        assert np.abs(entry.scan.points).max() < 100 and entry.scan.end_ns - entry.scan.stamp_ns < 1e8
+        assert "points beyond 10 km or without a time were left out" in entry.notices
+    (returns,) = (finding for finding in examine(path, Params()) if finding.subject == "returns")
+    assert "beyond 10 km or without a time" in returns.text
+    assert returns.verdict == ("corrected" if share < 0.3 else "needs you")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
+def test_a_time_field_without_a_time_gives_way_to_the_azimuth(tmp_path: Path, value: float) -> None:
+    path = rig.write(tmp_path / "walk", spoilt("timestamp", value, 1.0))
+    with open_recording(path, Params()) as recording:
+        assert any("derived from the azimuth" in finding.text for finding in recording.findings)
+        assert all(isinstance(entry, Measurement) for entry in recording.measurements())
+
+
+@pytest.mark.parametrize("big_endian", [False, True])
+def test_a_byte_order_that_is_stated_wrongly_is_corrected(tmp_path: Path, big_endian: bool) -> None:
+    layout = rig.Layout(big_endian=big_endian)
+    entries = [
+        (topic, log, replace(sent, is_bigendian=not big_endian) if topic == "/points" else sent)
+        for topic, log, sent in rig.walk(turns=3, columns=12, layout=layout)
+    ]
+    with open_recording(rig.write(tmp_path / "walk", entries), Params()) as recording:
+        assert any("is_bigendian" in finding.text for finding in recording.findings)
+        (first, *_) = recording.measurements()
+    assert isinstance(first, Measurement)
+    np.testing.assert_array_equal(first.scan.points, rig.turn(0, columns=12).points)
+
+
+def test_an_imu_that_reads_nothing_is_refused(tmp_path: Path) -> None:
+    entries = [
+        (topic, log, rig.imu(log, accel=(0.0, 0.0, 0.0)) if topic == "/imu" else sent)
+        for topic, log, sent in rig.walk(turns=3, columns=4)
+    ]
+    assert "reads 0 on all axes" in refusal(rig.write(tmp_path / "walk", entries))

@@ -1,0 +1,59 @@
+"""What shows that a run cannot be right, whatever its parameters: no person moves like that."""
+
+import numpy as np
+
+from app.slam.run_log import RunLog
+from app.slam.types import F64, FrameStatus
+
+FASTEST = 10.0
+"""m/s between two frames; a sprint."""
+HARDEST = 60.0
+"""m/s^2 between three frames, lasting a tenth of a second: over 5 g, a fall onto the floor."""
+LEAP, LEAP_TIMES = 0.5, 4.0
+"""m; a leap is a step between two frames longer than this, and so many times the usual one around it."""
+MOST_LOST, MOST_DROPPED = 0.1, 0.5
+"""Shares of the frames that may be lost, and of the scans that may be dropped."""
+
+
+def doubts(log: RunLog) -> tuple[str, ...]:
+    """Why the trajectory cannot be right, a sentence each, with where it begins; empty if nothing speaks against it."""
+    found = []
+    positions, times = log.odometry.positions, np.asarray((log.stamps_ns - log.stamps_ns[:1]) * 1e-9)
+    finite = np.asarray(np.isfinite(positions).all(axis=1))
+    if not finite.all():
+        found.append(f"{np.count_nonzero(~finite)} poses are not finite{_since(times, ~finite)}.")
+    elif len(positions) > 2:
+        found += _of_motion(positions, times)
+    lost, total = log.statuses[FrameStatus.LOST], len(log)
+    if lost > MOST_LOST * total:
+        is_lost = np.array([frame.status is FrameStatus.LOST for frame in log.frames])
+        found.append(f"Tracking was lost in {lost} of {total} frames{_since(times, is_lost)}.")
+    dropped = log.dropped.total()
+    if dropped > MOST_DROPPED * (total + dropped):
+        reason, _ = log.dropped.most_common(1)[0]
+        found.append(f"{dropped} of {total + dropped} scans were dropped, mostly because {reason}.")
+    return tuple(found)
+
+
+def _of_motion(positions: F64, times: F64) -> list[str]:
+    found = []
+    steps, intervals = np.diff(positions, axis=0), np.maximum(np.diff(times), 1e-3)
+    lengths = np.linalg.norm(steps, axis=1)
+    speeds = lengths / intervals
+    if (fast := speeds > FASTEST).any():
+        found.append(f"It moves at up to {speeds.max():.3g} m/s{_since(times[1:], fast)}.")
+    velocities = steps / intervals[:, None]
+    spans = np.maximum((intervals[1:] + intervals[:-1]) / 2, 0.1)
+    hard = np.linalg.norm(np.diff(velocities, axis=0), axis=1) / spans
+    before, after = np.r_[lengths[:1], lengths[:-1]], np.r_[lengths[1:], lengths[-1:]]
+    leaps = (lengths > LEAP) & (lengths > LEAP_TIMES * np.maximum(before, after)) & (intervals < 0.5)
+    if leaps.any():
+        found.append(f"It leaps by up to {lengths[leaps].max():.1f} m between two frames{_since(times[1:], leaps)}.")
+    if not found and (too_hard := hard > HARDEST).any():
+        found.append(f"It is accelerated by up to {hard.max():.0f} m/s²{_since(times[2:], too_hard)}.")
+    return found
+
+
+def _since(times: F64, where: np.ndarray) -> str:
+    """`, first at 12.3 s`, from the first frame on."""
+    return f", first at {times[np.argmax(where)]:.1f} s"

@@ -1,0 +1,61 @@
+"""A run that cannot be right says so; one that can be says nothing."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from app.slam.doubts import doubts
+from app.slam.frames import READOUTS, Frame
+from app.slam.run_log import RunLog
+from app.slam.types import F64, FrameStatus
+
+WALK = np.column_stack([0.12 * np.arange(200), 0.1 * np.sin(np.arange(200)), np.zeros(200)])
+"""(200, 3) m at 10 Hz: a walk at 1.2 m/s that sways."""
+
+
+def log(positions: F64, statuses: Sequence[FrameStatus] = (), dropped: int = 0) -> RunLog:
+    nothing = np.full(len(READOUTS), np.nan)
+    frames = [Frame(n * 100_000_000, False, p, np.array([0.0, 0, 0, 1]), nothing) for n, p in enumerate(positions)]
+    for n, status in enumerate(statuses):
+        object.__setattr__(frames[n], "status", status)
+    return RunLog(frames, ("it was dark",) * dropped)
+
+
+def test_a_walk_a_rest_and_nothing_at_all_raise_no_doubt() -> None:
+    for positions in (WALK, 0 * WALK, WALK[:2], WALK[:0], np.repeat(WALK, 3, axis=0) * 2):
+        assert doubts(log(positions)) == ()
+
+
+def test_one_leap_is_told_with_its_size_and_time() -> None:
+    moved = WALK.copy()
+    moved[120:] += [0.0, 0.7, 0.0]
+    (doubt,) = doubts(log(moved))
+    assert "leaps by up to 0.8 m" in doubt and "first at 12.0 s" in doubt
+
+
+def test_no_person_moves_at_a_hundred_metres_a_second() -> None:
+    (doubt,) = doubts(log(WALK * [100, 1, 1]))
+    assert "120 m/s, first at 0.1 s" in doubt
+
+
+def test_a_zigzag_that_no_hand_makes_is_told() -> None:
+    (doubt,) = doubts(log(np.where(np.arange(200) % 2, 1.0, 0.0)[:, None] * [0.6, 0, 0]))
+    assert "accelerated by up to 120 m/s²" in doubt
+
+
+@pytest.mark.parametrize(("lost", "told"), [(10, False), (100, True)])
+def test_a_walk_that_is_mostly_lost_is_told(lost: int, told: bool) -> None:
+    found = doubts(log(WALK, [FrameStatus.LOST] * lost))
+    assert found == ((f"Tracking was lost in {lost} of 200 frames, first at 0.0 s.",) if told else ())
+
+
+def test_a_walk_of_which_most_scans_were_dropped_is_told() -> None:
+    (doubt,) = doubts(log(WALK, dropped=300))
+    assert doubt == "300 of 500 scans were dropped, mostly because it was dark."
+
+
+def test_poses_that_are_not_finite_are_told() -> None:
+    broken = WALK.copy()
+    broken[50, 2] = np.nan
+    assert doubts(log(broken)) == ("1 poses are not finite, first at 5.0 s.",)
