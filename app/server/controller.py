@@ -18,6 +18,7 @@ from app.server.player import Player
 from app.server.protocol import Command
 from app.server.publisher import Publisher, opened_recording
 from app.slam.errors import HemislamError
+from app.slam.loops.types import Edits
 from app.slam.params import Params
 
 log = logging.getLogger(__name__)
@@ -94,8 +95,9 @@ class Controller:
     def _handle(self, command: Command) -> None:
         match command:
             case protocol.Play():
-                if self._need_session().ended:
-                    self._handle(protocol.Restart())
+                session = self._need_session()
+                if session.ended:
+                    self._handle(protocol.Seek(0) if session.feed.repeatable else protocol.Restart())
                 self._player.play()
             case protocol.Pause():
                 self._player.halt()
@@ -246,8 +248,14 @@ class Controller:
         self._take(session)
 
     def _reopen(self) -> None:
-        session, info = self._need_session(), self._need_session().feed.info
-        self._take(self._open_session(info.path, session.truth_path, self._params, (info.start_s, info.part_s)))
+        """Begin again with the present parameters. Notes and loop edits stay."""
+        before, notes = self._need_session(), self._notes
+        info, edits = before.feed.info, Edits(*before.edits).cut(0, 0)
+        session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
+        self._take(session)
+        self._show_notes(notes)
+        if session.loops is not None and edits != Edits():
+            session.edit_loops(edits.done, edits.undone)
 
     def _resume(self, path: Path) -> None:
         """Open the recording of a session file, and repeat the session up to its frame."""

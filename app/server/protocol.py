@@ -32,7 +32,7 @@ class Command(msgspec.Struct, frozen=True):
 
 
 class Play(Command, frozen=True):
-    """Go on at the chosen speed."""
+    """Go on at the chosen speed; at the end of a recording, from its first frame, as by `Seek`."""
 
 
 class Pause(Command, frozen=True):
@@ -98,7 +98,7 @@ class CompareWith(Command, frozen=True):
 
 
 class Restart(Command, frozen=True):
-    """Start the present recording again with the present parameters."""
+    """Start the present recording again with the present parameters, the loop edits and the notes."""
 
 
 class Save(Command, frozen=True):

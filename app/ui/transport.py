@@ -12,7 +12,6 @@ from app.server.protocol import (
     Command,
     Pause,
     Play,
-    Restart,
     Seek,
     SetBreakpoints,
     SetSpeed,
@@ -34,8 +33,8 @@ SPEEDS: Final = {
 }
 _SWITCHES: Final = tuple(one for one in BREAKPOINTS if one.limit is None)
 _LIMITS: Final = tuple((one, one.limit) for one in BREAKPOINTS if one.limit is not None)
-_BACK, _STEP, _RESTART = "◂ back", "step ▸", "from start ↺"
-_FRAME_COMMANDS: Final[dict[str, Command]] = {_BACK: StepFrame(-1), _STEP: StepFrame(), _RESTART: Restart()}
+_BACK, _STEP, _START = "◂ back", "step ▸", "to start"
+_FRAME_COMMANDS: Final[dict[str, Command]] = {_BACK: StepFrame(-1), _STEP: StepFrame(), _START: Seek(0)}
 _DRAG_REST_S: Final = 0.2
 """The slider seeks after resting this long: frames on the way may have to be processed."""
 _SEEK_HOLD_S: Final = 1.0
@@ -53,7 +52,9 @@ class TransportPanel:
         self._edit: Edit | None = None  # of the slider
         self._follows = Changes(page.now, PANEL_PERIOD_S)
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY_FILLED, hint="space")
-        self._frames = gui.add_button_group("frame", (_BACK, _STEP, _RESTART), hint="← and → step one frame.")
+        self._frames = gui.add_button_group(
+            "frame", (_BACK, _STEP, _START), hint="Keys: ← and →. Going back loses nothing."
+        )
         self._slider = gui.add_slider("time (frame)", 0, 1, 1, 0, hint="Drag to go to a frame, back or forward.")
         self._where = gui.add_html("")
         self._speed = gui.add_dropdown(
@@ -68,11 +69,7 @@ class TransportPanel:
         gui.add_command("Step one frame back", hotkey="arrowleft").on_trigger(lambda _: send(StepFrame(-1)))
 
     def toggle(self) -> None:
-        """Play or pause; at the end, play from the beginning."""
-        transport = self._snapshot().transport
-        if transport.finished and not transport.playing:
-            self._send(Restart())
-        self._send(Pause() if transport.playing else Play())
+        self._send(Pause() if self._snapshot().transport.playing else Play())
 
     def draw(self, snapshot: Snapshot) -> None:
         transport, now, edit = snapshot.transport, self._now(), self._edit

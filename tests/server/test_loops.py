@@ -16,11 +16,13 @@ from app.__main__ import cli
 from app.mapping.loops import LoopProcess, RestartingLoops
 from app.sensors.presets import resolve_params
 from app.server.protocol import (
+    AddNote,
     EditLoop,
     InspectLoop,
     Pause,
     Play,
     RedoLoop,
+    Restart,
     Save,
     Seek,
     SetSpeed,
@@ -95,6 +97,21 @@ def test_back_and_on_again_gives_the_same_files(walk: Walk, files: dict[str, byt
         assert all(edge.decided_at < len(snapshot.chunks) for edge in snapshot.loops.edges)
     walk.end()
     assert walk.saved(tmp_path) == files
+
+
+def test_playing_again_from_the_end_or_restarting_keeps_the_edits(
+    walk: Walk, files: dict[str, bytes], tmp_path: Path
+) -> None:
+    last = accepted(walk.end())[-1].pair
+    walk.do(EditLoop(Reject(*last)), AddNote("a door"))
+    edited = walk.saved(tmp_path / "edited")
+    assert walk.do(Play()).transport.finished
+    assert walk.saved(tmp_path / "played") == edited
+    restarted = walk.do(Restart(), Play())
+    assert restarted.transport.finished and restarted.notes[-1].text == "a door"
+    assert restarted.loops.undo == (Reject(*last),) and last not in [edge.pair for edge in accepted(restarted)]
+    walk.do(UndoLoop())
+    assert walk.saved(tmp_path / "undone") == files
 
 
 def test_before_a_loop_is_found_the_map_is_where_odometry_has_it(walk: Walk) -> None:

@@ -10,6 +10,7 @@ from session_bench import Bench, last_notice
 
 from app.mapping.session import Session
 from app.server.protocol import (
+    AddNote,
     Command,
     CompareWith,
     LoadParams,
@@ -118,13 +119,22 @@ def test_a_seek_beyond_the_end_goes_to_the_last_frame() -> None:
     assert Bench().do(Seek(10_000)).transport.frame == 59
 
 
-def test_playing_a_finished_recording_starts_it_again() -> None:
+def test_playing_a_finished_recording_goes_back_to_its_start_and_loses_nothing() -> None:
     bench = Bench()
-    bench.do(Seek(59), Play())
-    assert bench.see().transport.finished
+    bench.do(Seek(30), AddNote("here"), Seek(59), Play())
+    ended = bench.see()
+    assert ended.transport.finished
     snapshot = bench.do(Play())
-    assert snapshot.session == 2 and snapshot.transport.frame <= 1
+    assert snapshot.session == ended.session and snapshot.transport.frame <= 1 and not snapshot.transport.finished
+    assert snapshot.notes == ended.notes != ()
     assert bench.pass_time(1.0).transport.frame == pytest.approx(10, abs=1)
+    assert bench.sessions[0].known == 59, "the frames that were processed are still known"
+
+
+def test_a_restart_keeps_the_notes() -> None:
+    bench = Bench()
+    notes = bench.do(Seek(30), AddNote("here")).notes
+    assert bench.do(Restart()).notes == notes
 
 
 def test_everything_the_page_draws_arrives() -> None:

@@ -6,9 +6,9 @@ import pytest
 import viser
 
 from app.server.protocol import (
+    Command,
     Pause,
     Play,
-    Restart,
     Seek,
     SetSpeed,
     StepFrame,
@@ -43,13 +43,6 @@ def test_the_play_button_plays_then_pauses(transport: Transporting) -> None:
     assert transport.panel._play.label == "Play"
 
 
-def test_playing_at_the_end_begins_anew(transport: Transporting) -> None:
-    snapshot = transport.engine.snapshot
-    transport.engine.publish(transport=replace(snapshot.transport, finished=True))
-    user_clicks(transport.panel._play)
-    assert transport.engine.sent == [Restart(), Play()]
-
-
 def test_the_slider_follows_the_frame_without_seeking(transport: Transporting) -> None:
     transport.engine.send(StepFrame(7))
     transport.tick()
@@ -59,8 +52,10 @@ def test_the_slider_follows_the_frame_without_seeking(transport: Transporting) -
     assert transport.engine.sent == [StepFrame(7)]
 
 
-@pytest.mark.parametrize(("button", "command"), [("◂ back", StepFrame(-1)), ("step ▸", StepFrame())])
-def test_buttons_step_back_and_on(transport: Transporting, button: str, command: StepFrame) -> None:
+@pytest.mark.parametrize(
+    ("button", "command"), [("◂ back", StepFrame(-1)), ("step ▸", StepFrame()), ("to start", Seek(0))]
+)
+def test_buttons_step_and_go_to_the_start(transport: Transporting, button: str, command: Command) -> None:
     user_sets(transport.panel._frames, button)
     assert transport.engine.sent == [command]
 
