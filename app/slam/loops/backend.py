@@ -2,8 +2,8 @@
 
 There are two layers. What was found is history: each keyframe appends to it, and going back means reading less of
 it. The user's edits lie over the history and belong to the present. The graph is a function of both, solved in the
-order in which keyframes and loops came, so undoing an edit is the same as never having made it. An edit removes
-nothing from the history, but later keyframes are looked at with the loops as they count then.
+order in which keyframes and loops came, so undoing an edit is the same as never having made it. Later keyframes are
+looked at with the loops as they count then, and again when an edit that counted then is undone.
 """
 
 from collections.abc import Iterable, Mapping
@@ -306,9 +306,34 @@ class LoopBackend:
             check(edit)
         known, before, self._edits = {*edits.done, *edits.undone}, self._edits.done, edits
         self._made = {edit: edge for edit, edge in self._made.items() if edit in known}
-        if [(edit, edit.since) for edit in before] != [(edit, edit.since) for edit in edits.done]:
+        then, now = ([(edit, edit.since) for edit in done] for done in (before, edits.done))
+        if then != now:
+            changed = [max(since, edit.pair[1]) for edit, since in {*then} ^ {*now} if edit.pair]
+            self._look_again(min(changed, default=self.known + 1))
             self._solve()
             self._resolve()
+
+    def _look_again(self, first: int) -> None:
+        """Look for loops again from a keyframe of the history on, as if the present edits had always been there."""
+        if first > self.known or not (self._ends or first < self.known):
+            return
+        count, finished, reached = len(self), self._finished, self._reached
+        for record in self._history[first:]:
+            record.found = None
+        self._ends = {end: found for end, found in self._ends.items() if end < first}
+        complete = first - self._start.submap_keyframes
+        self._made = {
+            edit: edge for edit, edge in self._made.items() if (0 < edit.since <= first) or edit.newer < complete
+        }
+        self._finished, self._reached = False, first
+        self._stand(first)
+        while len(self) < self.known:
+            self._next()
+            self._reach(len(self))
+        self.go_to(count)
+        if finished:
+            self.finish()
+        self._reach(reached)
 
     def preview(self, edit: LoopEdit) -> Preview:
         """What the graph would become by a edit, without doing it.

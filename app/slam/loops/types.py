@@ -122,12 +122,14 @@ class LoopEdge:
         return self.verdict is Verdict.ACCEPTED and self.represented_by is None
 
     def same(self, other: "LoopEdge") -> bool:
-        """Whether verdict, weight, reason, place in the graph and measurement are the same."""
+        """Whether everything is the same."""
         return self is other or (
             (self.pair, self.decided_at, self.verdict, self.reason, self.origin, self.edited, self.weight)
             == (other.pair, other.decided_at, other.verdict, other.reason, other.origin, other.edited, other.weight)
             and (self.represented_by, self.repeats) == (other.represented_by, other.repeats)
+            and repr(self.evidence) == repr(other.evidence)  # nan is then equal to nan
             and np.array_equal(self.T_older_newer, other.T_older_newer)
+            and np.array_equal(self.covariance, other.covariance)
         )
 
 

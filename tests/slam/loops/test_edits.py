@@ -118,6 +118,27 @@ def test_a_session_given_again_before_the_walk_goes_as_it_went(walked: Walked, b
     again.close()
 
 
+@pytest.mark.parametrize("kind", [Reject, Add])
+def test_an_edit_that_acted_while_loops_were_found_can_be_undone_and_redone(
+    walked: Walked, backend: LoopBackend, kind: type[Reject | Add]
+) -> None:
+    """Undone it was never made, and redone it always was, to the last bit."""
+    without = backend.edges, backend.poses.tobytes(), backend.g2o()
+    pair = accepted(backend)[0].pair if kind is Reject else (5, 62)
+    other = LoopBackend()
+    other.load(Edits((kind(*pair),)))
+    for keyframe in walked.keyframes:
+        other.add(keyframe, PARAMS)
+    other.finish()
+    edited = other.edges, other.poses.tobytes(), other.g2o()
+    assert edited[1:] != without[1:]
+    other.load(other.edits.undo())
+    assert same(other.edges, without[0]) and (other.poses.tobytes(), other.g2o()) == without[1:]
+    other.load(other.edits.redo())
+    assert same(other.edges, edited[0]) and (other.poses.tobytes(), other.g2o()) == edited[1:]
+    other.close()
+
+
 def test_a_list_written_by_hand_waits_for_its_keyframes(walked: Walked, backend: LoopBackend) -> None:
     commands = tuple(edits(walked, backend)[2:])
     early = LoopBackend()

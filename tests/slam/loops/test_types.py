@@ -49,7 +49,10 @@ def test_the_difference_lists_new_changed_and_lost_candidates() -> None:
 def test_a_candidate_differs_if_its_place_in_the_graph_or_its_measurement_does() -> None:
     one = edge(10)
     moved = replace(one, T_older_newer=np.diag([2.0, 1.0, 1.0, 1.0]))
-    for other in (replace(one, weight=2.0), replace(one, represented_by=(0, 9)), moved, replace(one, reason="other")):
+    surer = replace(one, covariance=np.eye(6) / 2)
+    judged = replace(one, evidence=Evidence(0.5, mahalanobis=1.2))
+    renamed = replace(one, reason="other")
+    for other in (replace(one, weight=2.0), replace(one, represented_by=(0, 9)), moved, renamed, surer, judged):
         assert difference((one,), (other,)) == ((other,), ())
 
 
