@@ -4,7 +4,6 @@ Lines of JSON are only appended, so a file that was cut anywhere holds the sessi
 is deterministic: the recording, the parameters by frame, the loop edits and the newest frame are all that is needed.
 
     {"hemislam": "0.3.0", "format": 2, "recording": "/data/walk.mcap", ...}    what was opened
-    {"frame": 120, "did": "SetParams", "values": {"ground.alpha": 30}}         what the user did, for people
     {"frame": 120, "state": {...}}                                             all of the state, where it changed
     {"frame": 131}                                                             how far the session has come
     {"frame": 512, "ended": true}                                              that the recording has ended
@@ -23,7 +22,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import IO, Annotated, Any
 
-import msgspec
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, TypeAdapter
 
 from app import __version__
@@ -164,11 +162,6 @@ class SessionWriter:
             self._failed(error)
         self._line(_head(opened))
 
-    def did(self, frame: int, command: msgspec.Struct) -> None:
-        """Write what the user did."""
-        values = msgspec.to_builtins(command, enc_hook=_plain)
-        self._line({"frame": frame, "did": type(command).__name__, **values})
-
     def write(self, frame: int, state: State, *, ended: bool = False, settled: bool = False) -> None:
         """Write where the session is, if that has changed.
 
@@ -287,12 +280,3 @@ def _entry(frame: int, ended: bool, state: State | None = None) -> dict[str, Any
     """Where the session is, and its state if that has changed."""
     entry: dict[str, Any] = {"frame": frame} | ({"ended": True} if ended else {})
     return entry if state is None else entry | {"state": _STATE.dump_python(state)}
-
-
-def _plain(value: Any) -> Any:
-    """What msgspec does not know, as JSON can hold it."""
-    if isinstance(value, Breakpoints):
-        return value.chosen
-    if isinstance(value, KeyframeId):
-        return str(value) if value.session else value.index
-    return str(value.resolve() if isinstance(value, Path) else value)

@@ -87,8 +87,6 @@ class Controller:
             return
         try:
             self._handle(command)
-            if self._player.session is not None:
-                self._writer.did(self._player.session.frame, command)
         except HemislamError as error:
             self._page.notice("error", str(error))
 

@@ -84,12 +84,11 @@ def test_a_session_file_cut_anywhere_holds_the_session_up_to_there(saved: SavedS
     writer.write(0, State(Params()))
     for frame in range(1, 40):
         now += EVERY_S / 4
-        writer.did(frame, SetParams({"ground.alpha": 30.0}))
         writer.write(frame, State(Params()) if frame < 20 else saved.state)
     writer.close()
     whole = (tmp_path / "b.hemislam").read_bytes()
     frames = []
-    for length in range(whole.index(b"state"), len(whole), 97):
+    for length in (*range(whole.index(b"state"), len(whole), 13), len(whole)):
         (tmp_path / "cut.hemislam").write_bytes(whole[:length])
         try:
             session = read_session(tmp_path / "cut.hemislam")

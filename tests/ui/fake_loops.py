@@ -271,25 +271,25 @@ def _found(truth: np.ndarray, rng: np.random.Generator) -> dict[Pair, LoopEdge]:
 
     edges = []
     for older in (4, 12, 27, 41, 55, 66):
-        e = Evidence(0.08 + 0.02 * rng.random(), 0.02, 0.71 + 0.1 * rng.random(), 0.014, 0.21, 0.006, np.inf,
+        e = Evidence(0.08 + 0.02 * rng.random(), 0.71 + 0.1 * rng.random(), 0.014, 0.21, 0.006, np.inf,
                      1.1 + rng.random(), 0.62, 3)  # fmt: skip
         reason = f"overlap {100 * e.overlap:.0f} %, residual 14 mm, {e.mahalanobis:.1f} σ from odometry, 3 agree"
         edges.append(edge((older, older + LAP + 1), Verdict.ACCEPTED, reason, 0.02, e))
     for older in (18, 34, 60):
-        e = Evidence(0.14, 0.05, 0.52, 0.021, 0.12, 0.017, np.inf, 2.2, 0.7, 1)
+        e = Evidence(0.14, 0.52, 0.021, 0.12, 0.017, np.inf, 2.2, 0.7, 1)
         reason = "fits, but only 1 other agrees where 2 are asked for"
         edges.append(edge((older, older + LAP + 2), Verdict.CANDIDATE, reason, 0.05, e))
     for k in range(20):
         older, newer = int(rng.integers(0, LAP - 5)), int(rng.integers(LAP, KEYFRAMES))
         distance = 0.2 + 0.2 * rng.random()
         if k % 3 == 0:
-            e = Evidence(distance, 1.2)
+            e = Evidence(distance)
             reason = f"Scan Contexts differ by {distance:.2f}, over 0.30"
         elif k % 3 == 1:
-            e = Evidence(distance, -0.4, 0.22, 0.047, 0.09, 0.02, np.inf, 4.4 + 3 * rng.random(), 0.8, 0)
+            e = Evidence(distance, 0.22, 0.047, 0.09, 0.02, np.inf, 4.4 + 3 * rng.random(), 0.8, 0)
             reason = "overlap 22 %, under 30 %"
         else:
-            e = Evidence(distance, 3.1, 0.61, 0.019, 0.001, 0.84, 6.2, 2.9, 0.8, 0)
+            e = Evidence(distance, 0.61, 0.019, 0.001, 0.84, 6.2, 2.9, 0.8, 0)
             reason = "slides by 84 cm along the corridor, over 5 cm"
         edges.append(edge((older, newer), Verdict.REJECTED, reason, 0.6, e))
     return {edge.pair: edge for edge in edges}

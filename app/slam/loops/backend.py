@@ -14,7 +14,7 @@ import numpy as np
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.detection import Detector, Head
+from app.slam.loops.detection import Detector
 from app.slam.loops.drift import Drift
 from app.slam.loops.edits import check, in_words, lay_over
 from app.slam.loops.factors import Closing, Factor, PositionPrior, loop_factors, odometry_factor, residuals
@@ -178,8 +178,14 @@ class LoopBackend:
     def _is_known(self, keyframe: Keyframe, params: LoopsParams) -> bool:
         """Whether the history has this keyframe next, with the same parameters."""
         index = len(self)
-        looked = index < self.known and self._history[index].params == params
-        return looked and self._detector.head(index).same(Head.of(keyframe))
+        if index == self.known or self._history[index].params != params:
+            return False
+        known = self._detector.head(index)
+        return (
+            known.stamp_ns == keyframe.stamp_ns
+            and np.array_equal(known.T_odom_imu, keyframe.T_odom_imu)
+            and np.array_equal(known.covariance, keyframe.covariance, equal_nan=True)
+        )
 
     def _stand(self, count: int) -> None:
         """Read from the history what was found with the first `count` keyframes, and solve."""

@@ -5,7 +5,7 @@ the older ones it is compared with.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -21,7 +21,7 @@ from app.slam.loops.submap import Submap, Submaps
 from app.slam.loops.types import LoopDetail
 from app.slam.loops.verification import Fit, Prepared
 from app.slam.sections import LoopsParams
-from app.slam.types import F64, I64, Keyframe
+from app.slam.types import F64, I64, Cloud, Keyframe
 
 NEAR_M = 3.0
 """Added to the reach of drift: places this far apart still see each other."""
@@ -29,6 +29,8 @@ KEPT_PREPARED = 2
 """Submaps that stay in memory, ready for registration: the newer one, and one older one at a time."""
 KEPT_SUBMAPS = 1
 """Submaps that stay in memory otherwise: the one just described is needed again."""
+_NUMBERS = np.empty(0, np.float32)
+_NO_POINTS = Cloud(_NUMBERS, np.empty(0, np.uint8), _NUMBERS, np.empty(0, np.uint16), np.empty(0, np.int32))
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,35 +38,12 @@ class Sighting:
     """A place that looks like an older one.
 
     Attributes:
-        older, newer: keyframes. distance: of their contexts at the best column shift. yaw: rad, of
-            that shift: heading of the newer's level frame in the older's.
+        older, newer: keyframes. distance: of their contexts at the best column shift.
     """
 
     older: KeyframeId
     newer: KeyframeId
     distance: float
-    yaw: float
-
-
-@dataclass(frozen=True, slots=True)
-class Head:
-    """A keyframe without its cloud; the fields are those of `Keyframe`."""
-
-    stamp_ns: int
-    T_odom_imu: F64
-    covariance: F64
-
-    @classmethod
-    def of(cls, keyframe: Keyframe) -> "Head":
-        return cls(keyframe.stamp_ns, keyframe.T_odom_imu, keyframe.covariance)
-
-    def same(self, other: "Head") -> bool:
-        """To the last bit."""
-        return (
-            self.stamp_ns == other.stamp_ns
-            and np.array_equal(self.T_odom_imu, other.T_odom_imu)
-            and np.array_equal(self.covariance, other.covariance, equal_nan=True)
-        )
 
 
 class Detector:
@@ -82,7 +61,7 @@ class Detector:
         self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS)
         self._around = lru_cache(KEPT_SUBMAPS)(self._make)
         self._prepared = lru_cache(KEPT_PREPARED)(lambda *key: verification.prepare(self._around(*key)))
-        self._heads: list[Head] = []
+        self._heads: list[Keyframe] = []
         self._poses = np.empty((0, 4, 4))
         self._stamps = np.empty(0, np.int64)
         self.stand(0, ())
@@ -95,8 +74,8 @@ class Detector:
         """How many keyframes, from the first on, can be looked for."""
         return len(self._contexts)
 
-    def head(self, index: int) -> Head:
-        """Of any keyframe that was taken, also beyond the present one."""
+    def head(self, index: int) -> Keyframe:
+        """Any keyframe that was taken, also beyond the present one, without its points."""
         return self._heads[index]
 
     @property
@@ -106,7 +85,7 @@ class Detector:
 
     def take(self, keyframe: Keyframe) -> None:
         """Store a new keyframe with its cloud; `go_on` and `stand` go to it."""
-        self._heads.append(Head.of(keyframe))
+        self._heads.append(replace(keyframe, cloud=_NO_POINTS))
         self._poses = np.concatenate([self._poses, keyframe.T_odom_imu[None]])
         self._stamps = np.append(self._stamps, keyframe.stamp_ns)
         self._submaps.append(keyframe)
@@ -228,10 +207,8 @@ class Detector:
         sigma = np.sqrt(expectation.covariance(older)[2, 2])
         away = np.abs(_wrapped(scan_context.YAWS - yaw))
         allowed = away <= params.max_mahalanobis * sigma + scan_context.SECTOR
-        shift = int(np.argmin(np.where(allowed, distances, np.inf)))
-        return Sighting(
-            KeyframeId(0, older), KeyframeId(0, newer), float(distances[shift]), float(scan_context.YAWS[shift])
-        )
+        distance = float(np.where(allowed, distances, np.inf).min())
+        return Sighting(KeyframeId(0, older), KeyframeId(0, newer), distance)
 
     def _last(self, index: int) -> int:
         """The last keyframe of a submap."""

@@ -7,11 +7,10 @@ import numpy as np
 
 from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.detection import Head
 from app.slam.loops.drift import Drift
 from app.slam.loops.support import laid
 from app.slam.loops.types import FactorResidual, LoopEdge, Pair
-from app.slam.types import F64
+from app.slam.types import F64, Keyframe
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +64,7 @@ EVEN_M = 1.0
 """m over which drift keeps its direction: over a distance L it grows to drift * sqrt(L * EVEN_M)."""
 
 
-def odometry_factor(second: int, before: Head, after: Head, drift: Drift) -> Factor:
+def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift) -> Factor:
     """From one keyframe to the next.
 
     The filter gives the covariance of each pose in its map, which it takes as exact, not that of the step between them.
@@ -82,7 +81,7 @@ def odometry_factor(second: int, before: Head, after: Head, drift: Drift) -> Fac
     return Factor(KeyframeId(0, second - 1), KeyframeId(0, second), T, (covariance + covariance.T) / 2)
 
 
-def _own_axes(head: Head) -> F64:
+def _own_axes(head: Keyframe) -> F64:
     """(6, 6) covariance with the position's error in the IMU's axes, as the rotation's is; zero if it is no number."""
     turn = np.eye(6)
     turn[3:, 3:] = head.T_odom_imu[:3, :3].T

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from app.slam.types import F32, F64, U8
+from app.slam.types import F32, F64
 
 RINGS, SECTORS = 20, 60
 RADIUS = 20.0
@@ -28,27 +28,15 @@ LEAST_COMMON = 0.4
 """At a shift, at least this share of the smaller context's seen cells must be seen in both."""
 
 
-UNSEEN = 255
-_SHARES: F32 = np.sqrt(np.arange(_BINS + 1) / _BINS).astype(np.float32)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanContext:
     """Attributes:
-    filled: (RINGS, SECTORS) uint8, how many height bins are occupied; UNSEEN where nothing is known.
+    cells: (RINGS, SECTORS), square root of the share of occupied height bins; 0 where unseen.
+    seen: (RINGS, SECTORS), whether anything is known.
     """
 
-    filled: U8
-
-    @property
-    def seen(self) -> npt.NDArray[np.bool_]:
-        """(RINGS, SECTORS)."""
-        return np.asarray(self.filled != UNSEEN)
-
-    @property
-    def cells(self) -> F32:
-        """(RINGS, SECTORS), square root of the share of occupied height bins; 0 where unseen."""
-        return np.asarray(_SHARES[np.where(self.seen, self.filled, 0)])
+    cells: F32
+    seen: npt.NDArray[np.bool_]
 
     @property
     def ring_key(self) -> F32:
@@ -69,7 +57,7 @@ def describe(points: F32) -> ScanContext:
     filled = occupied.sum(axis=2)
     # a sector was looked through as far as its farthest return; behind that nothing is known
     seen = np.cumsum(filled[::-1], axis=0)[::-1] > 0
-    return ScanContext(np.where(seen, filled, UNSEEN).astype(np.uint8))
+    return ScanContext(np.sqrt(filled / _BINS).astype(np.float32), seen)
 
 
 def shift_distances(a: ScanContext, b: ScanContext) -> F64:

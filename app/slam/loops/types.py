@@ -40,7 +40,6 @@ class Evidence:
 
     Attributes:
         context_distance: of the two Scan Contexts at the best column shift, 0 (same) to 1.
-        context_yaw: rad, heading of the newer in the older's level frame by that shift.
         overlap: share of points near both keyframes that have a partner in the other submap, 0-1.
         residual_rms: m, point to plane, of those.
         condition: smallest eigenvalue of the registration's translation information over its
@@ -54,7 +53,6 @@ class Evidence:
     """
 
     context_distance: float = float("nan")
-    context_yaw: float = float("nan")
     overlap: float = float("nan")
     residual_rms: float = float("nan")
     condition: float = float("nan")

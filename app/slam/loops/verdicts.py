@@ -29,7 +29,7 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
     older, newer = sighting.older, sighting.newer
     guess = detector.guess(older, newer, expectation.poses)
     sigma = float(expectation.position_sigmas()[older])
-    evidence = Evidence(sighting.distance, sighting.yaw, gate_m=sigma)
+    evidence = Evidence(sighting.distance, gate_m=sigma)
     now = len(detector) - 1
 
     def edge(T_older_newer: F64, covariance: F64, evidence: Evidence, reason: str) -> LoopEdge:
