@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -38,6 +39,30 @@ class JsonLines(logging.Formatter):
         return json.dumps(entry, default=str)
 
 
+class AtMost(logging.Filter):
+    """Lets a few warnings of one kind through each minute, so that nobody can fill the log from outside."""
+
+    PER_MINUTE: Final = 5
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._counts: Counter[tuple[str, str]] = Counter()
+        self._minute = 0
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.levelno != logging.WARNING:
+            return True
+        minute = int(record.created // 60)
+        if minute != self._minute:
+            self._minute = minute
+            self._counts.clear()
+        kind = (record.name, str(record.msg))
+        self._counts[kind] += 1
+        if self._counts[kind] == self.PER_MINUTE:
+            record.msg = f"{record.msg} (more of these within this minute are not logged)"
+        return self._counts[kind] <= self.PER_MINUTE
+
+
 def start_logging(*, json_lines: bool) -> None:
     """Log this process, the server: everything as JSON, or only warnings as sentences."""
     os.environ[_VARIABLE] = "1" if json_lines else "0"
@@ -58,12 +83,13 @@ def process_logs(process: str) -> Iterator[None]:
 def _log_to_stderr(process: str, json_lines: bool) -> None:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines(process) if json_lines else logging.Formatter("hemislam: %(message)s"))
+    handler.addFilter(AtMost())
     own = logging.getLogger("app")
     own.handlers = [handler]
     own.setLevel(logging.INFO if json_lines else logging.WARNING)
     own.propagate = False
+    logging.getLogger().handlers = [handler]  # of the libraries: warnings
     if json_lines:
-        logging.getLogger().handlers = [handler]
         logging.captureWarnings(True)
         threading.excepthook = _thread_ended
 

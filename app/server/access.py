@@ -112,14 +112,16 @@ class Guard:
         self._held = 0  # bytes of bodies
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and scope["method"] == "HEAD":
+            scope = {**scope, "method": "GET"}  # uvicorn, which knows better, leaves the body out
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
         elif refusal := self._refusal(HTTPConnection(scope)):
             status, reason = refusal
             client, _ = scope.get("client") or ("?", 0)
-            path = quote(scope["path"])  # quoted, it cannot forge a line of the log
+            path = quote(scope["path"])[:200]  # quoted, it cannot forge a line of the log
             log.warning("Refused %s from %s: %s", path, client, reason, extra={"status": status})
-            await _refuse(scope, receive, send, status, reason)
+            await _refuse(scope, receive, _with_headers(send), status, reason)
         elif response := self._cookie_response(HTTPConnection(scope)):
             await response(scope, receive, _with_headers(send))
         elif scope["type"] == "http":
@@ -185,7 +187,7 @@ class Guard:
         if not any(_same(one, self._access.viewer_token) for one in given):
             return 401, "Open hemislam by the link that it printed when it started; the token in it is needed once."
         scope[VIEWER] = True
-        if scope["type"] == "http" and scope["method"] not in ("GET", "HEAD"):
+        if scope["type"] == "http" and scope["method"] != "GET":
             return 403, "This link is view only; the other link that hemislam printed lets you control it."
         return None
 

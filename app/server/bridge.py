@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 import socket
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.typing import Subprotocol
 
 from app.server.access import MOST_BYTES
-from app.server.viser_adapter import KEY_HEADER, Viser
+from app.server.viser_adapter import KEY_HEADER, Viser, is_readable
 
 VIEWER_MESSAGES: Final = frozenset({"ViewerCameraMessage"})
 """What a view-only page may send to viser: where its own camera is."""
@@ -24,6 +25,11 @@ MOST_UPLOADS: Final = 4
 
 BUFFER_BYTES: Final = 1 << 20
 """Of each socket on the way to the browser. The system's default would let tens of megabytes of old frames queue."""
+
+
+NO_MESSAGE: Final = "This is not a message of the page."
+
+log = logging.getLogger(__name__)
 
 
 class Refused(Exception):
@@ -50,15 +56,18 @@ class Gate:
         try:
             message = msgspec.msgpack.decode(raw, type=dict[str, Any])
             kind = msgspec.convert(message.get("type"), str)
-        except msgspec.MsgspecError:
-            raise Refused(1007, "This is not a message of the page.") from None
+        except (msgspec.MsgspecError, RecursionError):
+            raise Refused(1007, NO_MESSAGE) from None
         if kind in NEVER or (self._viewer and kind not in VIEWER_MESSAGES):
             return None
         if kind == "FileTransferStartUpload":
             self._begin(message)
         elif kind == "FileTransferPart" and not self._take(message):
             return None
-        return msgspec.msgpack.encode(message)
+        again = msgspec.msgpack.encode(message)
+        if not is_readable(kind, again):
+            raise Refused(1007, NO_MESSAGE)
+        return again
 
     def _begin(self, message: dict[str, Any]) -> None:
         size = message.get("size_bytes")
@@ -131,6 +140,7 @@ async def _up(browser: WebSocket, upstream: ClientConnection, gate: Gate) -> Non
                 if (message := gate.let(received.get("bytes") or b"")) is not None:
                     await upstream.send(message)
         except Refused as refused:
+            log.warning("Closed a page that sent what it must not: %s", refused.reason)
             await browser.close(refused.code, refused.reason)
 
 

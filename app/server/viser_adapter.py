@@ -5,13 +5,18 @@
 
 import contextlib
 import io
+import math
 import secrets
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import msgspec
 import viser
+import viser._messages
+import viser.infra
 import websockets.asyncio.server
 
 KEY_HEADER: Final = "X-Hemislam-Key"
@@ -87,6 +92,25 @@ def _require_key(key: str) -> Iterator[None]:
         yield
     finally:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def is_readable(kind: str, raw: bytes) -> bool:
+    """Whether viser can handle a message of a page. It would log a traceback for one that it cannot read.
+
+    Args:
+        kind: what the message says it is. raw: all of it, as msgpack.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read = viser.infra.Message.deserialize(raw)
+        if kind != "ViewerCameraMessage":
+            return True
+        camera = vars(msgspec.convert(vars(read), viser._messages.ViewerCameraMessage, strict=True))
+    except Exception:  # whatever a message of any content may cause in there
+        return False
+    numbers = [n for value in camera.values() for n in (value if isinstance(value, tuple) else (value,))]
+    return all(isinstance(n, int | float) and math.isfinite(n) and abs(n) < 1e12 for n in numbers)
 
 
 def page_html() -> str:

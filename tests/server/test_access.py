@@ -1,6 +1,7 @@
 """Who is let in and how much they may send, over real sockets: the view-only token, sizes, what is logged."""
 
 import json
+import logging
 from collections.abc import Iterator
 from typing import Any
 
@@ -89,3 +90,27 @@ def test_a_refusal_is_logged_as_one_line_of_json_without_the_token(public_site: 
     entry = json.loads(line)
     assert entry["level"] == "warning" and entry["status"] == 401 and "127.0.0.1" in entry["message"]
     assert "my-guess" not in line
+
+
+@pytest.mark.parametrize("headers", [{}, {"Authorization": "Bearer wrong"}, OWNER | {"Origin": "http://evil.example"}])
+def test_a_refusal_binds_the_browser_as_every_answer_does(public_site: Site, headers: dict[str, str]) -> None:
+    answer = httpx.get(public_site.url("/api/state"), headers=headers)
+    assert answer.status_code in (401, 403)
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert "frame-ancestors" in answer.headers["content-security-policy"]
+
+
+def test_head_answers_as_get_without_the_body(public_site: Site) -> None:
+    for path in ("/", "/healthz", "/api/state"):
+        head, get = (httpx.request(method, public_site.url(path), headers=OWNER) for method in ("HEAD", "GET"))
+        assert head.status_code == get.status_code == 200 and head.content == b""
+        assert head.headers["content-type"] == get.headers["content-type"]
+    assert httpx.head(public_site.url("/api/state")).status_code == 401
+
+
+def test_a_path_of_any_length_is_one_short_line_of_the_log(public_site: Site, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("WARNING", logger="app"):
+        logging.getLogger("app").propagate = True
+        assert httpx.get(public_site.url("/" + "x" * 50_000)).status_code == 401
+    (line,) = [record.getMessage() for record in caplog.records if "Refused" in record.getMessage()]
+    assert len(line) < 400

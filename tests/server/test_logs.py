@@ -1,12 +1,15 @@
 """One format for the log lines of all processes."""
 
 import json
+import logging
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from app.logs import AtMost
 
 
 def entries(err: str) -> list[dict[str, Any]]:
@@ -76,3 +79,15 @@ def test_processes_follow_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
             assert [entry["process"] for entry in entries(done.stderr)] == ["one"]
         else:
             assert done.stderr.startswith("hemislam: The process ends: OSError: gone")
+
+
+def test_of_one_kind_of_warning_a_minute_has_only_a_few() -> None:
+    limit, kept = AtMost(), []
+    for n in range(1000):
+        record = logging.makeLogRecord({"name": "app.x", "levelno": logging.WARNING, "msg": "Refused %s", "args": (n,)})
+        record.created = 60.0 * (n // 500)
+        if limit.filter(record):
+            kept.append(record.getMessage())
+    assert len(kept) == 2 * AtMost.PER_MINUTE and "more of these" in kept[4]
+    error = logging.makeLogRecord({"name": "app.x", "levelno": logging.ERROR, "msg": "Refused %s", "args": (1,)})
+    assert all(limit.filter(error) for _ in range(100))
