@@ -1,5 +1,7 @@
 """The command line: the only place that wires the rooms together. It imports them when they are needed."""
 
+import io
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +30,23 @@ class _Commands(TyperGroup):
         except KeyboardInterrupt:
             typer.echo("\nhemislam: interrupted.", err=True)
             raise typer.Exit(130) from None
+        except (OSError, MemoryError, RuntimeError) as error:
+            if (sentence := _of_the_machine(error)) is None:
+                raise
+            typer.echo(f"hemislam: {sentence}", err=True)
+            raise typer.Exit(2) from None
+
+
+def _of_the_machine(error: Exception) -> str | None:
+    """A sentence about a limit of the machine or the account; None if the error is none of these."""
+    if isinstance(error, BrokenPipeError):
+        return None
+    if isinstance(error, MemoryError) or "can't start new thread" in str(error):
+        return "There is not enough memory; close other programs, or raise the limit (ulimit -v)."
+    if isinstance(error, OSError):
+        where = f" ({error.filename})" if error.filename else ""
+        return f"The system refused: {error.strerror or error}{where}; check space, permissions and limits (ulimit -a)."
+    return None
 
 
 cli = typer.Typer(
@@ -229,6 +248,9 @@ def main() -> None:
             " cache in your home folder can be written to; set NUMBA_CACHE_DIR to choose another place.",
             err=True,
         )
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a file name may be no UTF-8
     cli(prog_name="hemislam")
 
 

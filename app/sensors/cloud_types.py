@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from app.sensors.ros import stamp_ns
+from app.sensors.ros import printable, stamp_ns
 from app.slam.types import F32, U8
 
 Column = npt.NDArray[Any]
@@ -103,7 +103,7 @@ def read_point_cloud_2(message: Any) -> CloudMessage:
     """sensor_msgs/PointCloud2 of ROS 1 or ROS 2: any order, type, padding and byte order of the fields."""
     order = ">" if message.is_bigendian else "<"
     fields = {
-        field.name: (int(field.offset), np.dtype(order + _DATATYPES[field.datatype]))
+        printable(field.name): (int(field.offset), np.dtype(order + _DATATYPES[field.datatype]))
         for field in message.fields
         if field.datatype in _DATATYPES
     }

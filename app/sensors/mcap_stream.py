@@ -2,13 +2,16 @@
 
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from mcap.exceptions import EndOfFile, McapError
-from mcap.reader import NonSeekingReader
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 
-from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type
+from app.sensors.ros import ENCODINGS, Deserialiser, printable, ros2_type
+from app.sensors.unpacking import LIMIT, UNPACK, TooLarge
 
 
 class McapStream:
@@ -50,18 +53,35 @@ class McapStream:
 
     def _records(self) -> Iterator[tuple[str, str, int, str, bytes]]:
         """(topic, type, log time, encoding, bytes) up to the end or to where the file is cut."""
-        known: dict[int, str] = {}
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, tuple[str, str, str]] = {}  # topic, type, encoding
         with self._path.open("rb") as file:
-            reader = NonSeekingReader(file, record_size_limit=1 << 30)
             try:
-                for schema, channel, message in reader.iter_messages(log_time_order=False):
-                    encoding = channel.message_encoding
-                    if encoding not in ENCODINGS:
-                        continue
-                    if channel.id not in known:
-                        kind = known[channel.id] = ros2_type(schema.name) if schema else ""
+                for record in _unpacked(file):
+                    if isinstance(record, Schema):
+                        schemas[record.id] = record
+                    elif isinstance(record, Channel) and record.message_encoding in ENCODINGS:
+                        schema, encoding = schemas.get(record.schema_id), record.message_encoding
+                        kind = ros2_type(printable(schema.name)) if schema else ""
+                        channels[record.id] = (printable(record.topic), kind, encoding)
                         self._deserialiser.learn(kind, schema.data.decode(errors="replace") if schema else "", encoding)
-                    yield channel.topic, known[channel.id], message.log_time, encoding, message.data
+                    elif isinstance(record, Message) and record.channel_id in channels:
+                        topic, kind, encoding = channels[record.channel_id]
+                        yield topic, kind, record.log_time, encoding, record.data
             except (EndOfFile, McapError, struct.error):  # the last of a record that is cut in its middle
                 return
         self.complete = True
+
+
+def _unpacked(file: IO[bytes]) -> Iterator[McapRecord]:
+    """The records of a file and of its chunks. Raises TooLarge, or what mcap and the compressions raise."""
+    for record in StreamReader(file, emit_chunks=True, record_size_limit=LIMIT).records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        if record.uncompressed_size > LIMIT:
+            raise TooLarge
+        if record.compression:
+            data = UNPACK[record.compression](record.data, record.uncompressed_size)
+            record = replace(record, compression="", data=data)
+        yield from breakup_chunk(record)

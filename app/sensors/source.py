@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Protocol, Self
 
 from rosbags.highlevel import AnyReader
@@ -14,6 +15,8 @@ from app.sensors.live.capture import SUFFIXES as CAPTURES
 from app.sensors.live.capture import CaptureStream
 from app.sensors.live.pcap import CaptureError
 from app.sensors.mcap_stream import McapStream
+from app.sensors.ros import printable
+from app.sensors.unpacking import limit_rosbags
 from app.slam.errors import HemislamError
 
 SUFFIXES = (".bag", ".mcap", ".db3", *CAPTURES)
@@ -79,23 +82,35 @@ class RosbagsStream:
 
     def __init__(self, files: list[Path]) -> None:
         """Raises whatever the library raises for a file that it cannot read."""
+        limit_rosbags()
+        self._links = TemporaryDirectory()  # of names that end as rosbags expects
+        files = [self._in_small_letters(path) for path in files]
         self._reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         self._reader.open()
         self.counts: dict[str, tuple[str, int]] = {}
         for connection in self._reader.connections:
-            _, before = self.counts.get(connection.topic, ("", 0))
-            self.counts[connection.topic] = (connection.msgtype, before + connection.msgcount)
+            topic = printable(connection.topic)
+            _, before = self.counts.get(topic, ("", 0))
+            self.counts[topic] = (printable(connection.msgtype), before + connection.msgcount)
         self.start_ns, self.end_ns = int(self._reader.start_time), int(self._reader.end_time)
 
     def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
-        connections = [connection for connection in self._reader.connections if connection.topic in topics]
+        connections = [one for one in self._reader.connections if printable(one.topic) in topics]
         if not connections:  # which rosbags would take for all of them
             return
         for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
-            yield connection.topic, log_ns, self._reader.deserialize(raw, connection.msgtype)
+            yield printable(connection.topic), log_ns, self._reader.deserialize(raw, connection.msgtype)
 
     def close(self) -> None:
         self._reader.close()
+        self._links.cleanup()
+
+    def _in_small_letters(self, path: Path) -> Path:
+        if path.suffix == path.suffix.lower():
+            return path
+        link = Path(self._links.name) / path.with_suffix(path.suffix.lower()).name
+        link.symlink_to(path.resolve())
+        return link
 
 
 class Source:
@@ -170,7 +185,7 @@ class Source:
 def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
     """The file as a stream, and what is unusual about it."""
     files = _recording_files(path)
-    if path.suffix in CAPTURES:
+    if path.suffix.lower() in CAPTURES:
         capture = _open_capture(path)
         return capture, capture.findings
     try:
@@ -202,7 +217,7 @@ def _open_capture(path: Path) -> CaptureStream:
 def _salvage(path: Path, files: list[Path], why: str) -> tuple[Stream, tuple[Finding, ...]] | None:
     """A single MCAP read from front to back, if that yields anything."""
     inner = sorted(path.glob("*.mcap")) if files == [path] and path.is_dir() else files
-    if len(inner) != 1 or inner[0].suffix != ".mcap":
+    if len(inner) != 1 or inner[0].suffix.lower() != ".mcap":
         return None
     try:
         stream = McapStream(inner[0])
@@ -237,7 +252,7 @@ def _recording_files(path: Path) -> list[Path]:
             raise HemislamError(f"There is no recording {path}; check the path.")
         if path.is_dir():
             return _folder_files(path)
-        if path.suffix not in SUFFIXES:
+        if path.suffix.lower() not in SUFFIXES:
             raise HemislamError(f"{path} is no recording by its name; what can be read is {_KINDS}.")
         if path.stat().st_size == 0:
             raise HemislamError(f"{path} is empty (0 bytes); record or copy it again.")
@@ -247,9 +262,9 @@ def _recording_files(path: Path) -> list[Path]:
         raise HemislamError(
             f"{path} cannot be opened ({error.strerror}); check the path and its permissions."
         ) from error
-    if path.suffix in CAPTURES:
+    if path.suffix.lower() in CAPTURES:
         return [path]
-    magic = _MAGIC[path.suffix]
+    magic = _MAGIC[path.suffix.lower()]
     if not start.startswith(magic[: len(start)]):
         other = next((suffix for suffix, known in _MAGIC.items() if start.startswith(known)), None)
         hint = f"by its content it is a {other}: rename it" if other else f"what can be read is {_KINDS}"
@@ -272,7 +287,7 @@ def _repair(path: Path) -> str:
     if path.is_dir():
         inside = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
         path = inside[0] if len(inside) == 1 else path
-    return _REPAIR["" if path.is_dir() else path.suffix].format(path=path)
+    return _REPAIR["" if path.is_dir() else path.suffix.lower()].format(path=path)
 
 
 def _brief(error: BaseException) -> str:

@@ -95,6 +95,6 @@ def _entry(path: Path, suffixes: tuple[str, ...]) -> FolderEntry | None:
         is_recording = suffixes == RECORDINGS and (path / "metadata.yaml").is_file()
         size = sum(file.stat().st_size for file in path.iterdir() if file.is_file()) if is_recording else 0
         return FolderEntry(path, is_recording, size)
-    if path.suffix in suffixes and path.is_file():
+    if path.suffix.lower() in suffixes and path.is_file():
         return FolderEntry(path, True, path.stat().st_size)
     return None

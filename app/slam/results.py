@@ -85,7 +85,8 @@ def _write_report(path: Path, results: Results) -> None:
     if loops and info.truth is not None:
         made["accuracy_odometry"] = report.accuracy(results.log.odometry, info)
     results.report = report.finite(made)
-    path.write_text(json.dumps(results.report, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    text = json.dumps(results.report, indent=2, ensure_ascii=False) + "\n"
+    path.write_text(text, encoding="utf-8", errors="backslashreplace")  # of a path that is no UTF-8
 
 
 EXPORTS = (

@@ -288,3 +288,19 @@ def test_an_imu_that_reads_nothing_is_refused(tmp_path: Path) -> None:
         for topic, log, sent in rig.walk(turns=3, columns=4)
     ]
     assert "reads 0 on all axes" in refusal(rig.write(tmp_path / "walk", entries))
+
+
+@pytest.mark.parametrize(("container", "suffix"), [("bare-mcap", ".MCAP"), ("bag", ".BAG"), ("bare-db3", ".Db3")])
+def test_a_suffix_in_capitals_is_the_same_suffix(tmp_path: Path, container: str, suffix: str) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=3, columns=4, ros=1 if container == "bag" else 2), container)
+    with open_recording(path.rename(tmp_path / f"other{suffix}"), Params()) as recording:
+        assert len(list(recording.measurements())) == 3
+
+
+@pytest.mark.parametrize("container", ["bare-mcap", "bag", "bare-db3"])
+def test_a_topic_cannot_write_to_the_terminal(tmp_path: Path, container: str) -> None:
+    entries = rig.walk(turns=3, columns=4, lidar_topic="/\x1b[31mred", ros=1 if container == "bag" else 2)
+    path = rig.write(tmp_path / "walk", entries, container)
+    with open_recording(path, Params()) as recording:
+        assert recording.lidar_topic == "/\\x1b[31mred" and len(list(recording.measurements())) == 3
+        assert all(finding.text.isprintable() for finding in recording.findings)

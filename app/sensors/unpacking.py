@@ -1,0 +1,86 @@
+"""Unpacks compressed chunks of recordings, each to a limited size, in all the libraries that read them.
+
+A chunk of a few kilobytes may unpack to gigabytes of zeros.
+"""
+
+import bz2
+import io
+from types import SimpleNamespace
+from typing import IO, Any, Final, Self
+
+import lz4.frame
+import rosbags.rosbag1.reader
+import rosbags.rosbag2.reader
+import rosbags.rosbag2.storage_mcap
+import zstandard
+
+LIMIT: Final = 256 << 20
+"""Bytes of a chunk, or of a message that is compressed by itself. Writers make chunks of about 1 MB."""
+
+
+class TooLarge(ValueError):
+    """A chunk would unpack to more than `LIMIT`."""
+
+    def __init__(self) -> None:
+        super().__init__(f"a compressed chunk unpacks to more than {LIMIT >> 20} MB, which no recorder writes")
+
+
+def unpack_zstd(data: bytes, size: int = LIMIT) -> bytes:
+    """At most `size` bytes. Raises TooLarge, or zstandard's error."""
+    known = zstandard.frame_content_size(data)
+    size = min(size, LIMIT, known if known >= 0 else LIMIT)
+    if known > LIMIT:
+        raise TooLarge
+    return _checked(zstandard.ZstdDecompressor().stream_reader(data).read(size + 1), size)
+
+
+def unpack_lz4(data: bytes, size: int = LIMIT) -> bytes:
+    """At most `size` bytes. Raises TooLarge, or lz4's error."""
+    decompressor: Any = lz4.frame.LZ4FrameDecompressor
+    return _checked(decompressor().decompress(data, max_length=size + 1), size)
+
+
+def unpack_bz2(data: bytes) -> bytes:
+    """At most `LIMIT` bytes. Raises TooLarge, or bz2's error."""
+    return _checked(bz2.BZ2Decompressor().decompress(data, max_length=LIMIT + 1), LIMIT)
+
+
+UNPACK: Final = {"zstd": unpack_zstd, "lz4": unpack_lz4}
+"""By the name that an MCAP gives to a compression."""
+
+
+def _checked(data: bytes, size: int) -> bytes:
+    if len(data) > size:
+        raise TooLarge
+    return data
+
+
+class _LimitedFile:
+    """A zstd file that unpacks to at most 100 times its size; recordings shrink to a fifth or so."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        size = file.seek(0, io.SEEK_END)
+        file.seek(0)
+        self._left = max(LIMIT, 100 * size)
+        self._reader = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
+
+    def read(self, size: int = LIMIT) -> bytes:
+        data = self._reader.read(size)
+        self._left -= len(data)
+        if self._left < 0:
+            raise TooLarge
+        return data
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._reader.close()  # type: ignore[no-untyped-call]  # zstandard leaves it untyped
+
+
+def limit_rosbags() -> None:
+    """Let rosbags unpack by the functions above: it has no option for a limit."""
+    rosbags.rosbag1.reader.decompressors |= {"bz2": unpack_bz2, "lz4": unpack_lz4}
+    rosbags.rosbag2.storage_mcap.DECOMPRESSORS |= {"lz4": unpack_lz4, "zstd": unpack_zstd}
+    limited: Any = SimpleNamespace(decompress=unpack_zstd, open=lambda file, mode: _LimitedFile(file))
+    rosbags.rosbag2.reader.zstd = limited  # type: ignore[attr-defined]  # of messages and files that are compressed by themselves
