@@ -91,13 +91,10 @@ cli.command()(feed)
 
 
 @cli.command()
+@options.with_params
 def info(
     recording: options.RecordingPath,
-    preset: options.Preset = None,
-    config: options.Config = None,
-    assignments: options.Assignments = None,
-    lidar_topic: options.LidarTopic = None,
-    imu_topic: options.ImuTopic = None,
+    params_for: options.ParamsFor,
 ) -> None:
     """Examine a recording and report what is wrong.
 
@@ -116,7 +113,7 @@ def info(
     """
     from app.sensors.doctor import DAMAGE, examine
 
-    params = options.resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
+    params = params_for(recording)
     with options.progress_bar("Reading", total=1.0, bar_format="{desc}: {percentage:3.0f}% |{bar}|") as show:
         findings = examine(recording, params, progress=show)
     width = max((len(finding.subject) for finding in findings), default=0)

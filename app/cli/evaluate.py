@@ -6,18 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import (
-    Assignments,
-    Config,
-    Duration,
-    Imperfect,
-    ImuTopic,
-    LidarTopic,
-    Preset,
-    Start,
-    make_folder,
-    resolve,
-)
+from app.cli.options import Duration, Imperfect, ParamsFor, Start, make_folder, with_params
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
@@ -30,7 +19,9 @@ _TRUTH_HELP = (
 )
 
 
+@with_params
 def evaluate(
+    params_for: ParamsFor,
     recordings: Annotated[
         list[Path] | None, typer.Argument(metavar="RECORDING...", help="One or more recordings.")
     ] = None,
@@ -66,11 +57,6 @@ def evaluate(
     jobs: Annotated[
         int | None, typer.Option("--jobs", min=1, metavar="N", help="Parallel runs. Default: one per core.")
     ] = None,
-    preset: Preset = None,
-    config: Config = None,
-    assignments: Assignments = None,
-    lidar_topic: LidarTopic = None,
-    imu_topic: ImuTopic = None,
     start: Start = 0.0,
     duration: Duration = None,
 ) -> None:
@@ -121,7 +107,7 @@ def evaluate(
     subjects = []
     for path, name, text in zip(paths, names, _truth_texts(paths, truths or []), strict=True):
         truth: TruePoses | None = read_truth(text, path, arm) if text else None
-        params = resolve(path, preset, config, assignments, lidar_topic, imu_topic)
+        params = params_for(path)
         subjects.append(Subject(name, path, params, truth, tuple(others[name])))
     for variant in chosen:
         variant.applied(subjects[0].params)  # raises for a misspelt parameter before anything runs

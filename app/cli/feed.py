@@ -5,22 +5,14 @@ from typing import Annotated
 
 import typer
 
-from app.cli.options import (
-    Assignments,
-    Config,
-    Duration,
-    ImuTopic,
-    LidarTopic,
-    Preset,
-    RecordingPath,
-    progress_bar,
-    resolve,
-)
+from app.cli.options import Duration, ParamsFor, RecordingPath, progress_bar, with_params
 from app.slam.errors import HemislamError
 
 
+@with_params
 def feed(
     recording: RecordingPath,
+    params_for: ParamsFor,
     to: Annotated[
         str,
         typer.Option("--to", metavar="URL", help="rsbpearl://HOST:MSOP,DIFOP, or foxglove://HOST:PORT to serve at."),
@@ -34,11 +26,6 @@ def feed(
     speed: Annotated[
         float, typer.Option("--speed", metavar="X", help="Times real time; 0: as fast as possible.")
     ] = 1.0,
-    preset: Preset = None,
-    config: Config = None,
-    assignments: Assignments = None,
-    lidar_topic: LidarTopic = None,
-    imu_topic: ImuTopic = None,
     duration: Duration = None,
 ) -> None:
     """Send a recording as live data, to try `serve --live` without a sensor.
@@ -56,7 +43,7 @@ def feed(
 
     if not speed >= 0:  # nan neither
         raise HemislamError(f"`--speed {speed:g}` is negative; 1 is real time, 0 as fast as possible.")
-    params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
+    params = params_for(recording)
     target, beside = parse_address(to), parse_address(imu_to) if imu_to else None
     if "clock" in target.options:
         raise HemislamError(f"`{to}`: the receiver chooses the clock: serve --live '…?clock=…'.")

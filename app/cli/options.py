@@ -3,6 +3,8 @@
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from inspect import Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -66,6 +68,32 @@ def resolve(
     topics = {"recording.lidar_topic": lidar_topic, "recording.imu_topic": imu_topic}
     flags = [f"{name}={json.dumps(topic)}" for name, topic in topics.items() if topic is not None]
     return resolve_params(recording, preset, config, [*(assignments or []), *flags])
+
+
+ParamsFor = Callable[[Path | None], "Params"]
+"""Gives the parameters of a recording. Raises HemislamError as `resolve`."""
+
+
+def with_params(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options that choose parameters. It gets them as one function, `params_for: ParamsFor`."""
+
+    def with_options(
+        preset: Preset = None,
+        config: Config = None,
+        assignments: Assignments = None,
+        lidar_topic: LidarTopic = None,
+        imu_topic: ImuTopic = None,
+        **own: Any,
+    ) -> None:
+        resolve_for = partial(resolve, preset=preset, config=config, assignments=assignments)
+        command(params_for=partial(resolve_for, lidar_topic=lidar_topic, imu_topic=imu_topic), **own)
+
+    both = [*signature(command).parameters.values(), *signature(with_options).parameters.values()]
+    seen = [one for one in both if one.name not in ("params_for", "own")]
+    vars(with_options)["__signature__"] = Signature(seen)
+    with_options.__annotations__ = {one.name: one.annotation for one in seen}
+    with_options.__name__, with_options.__doc__ = command.__name__, command.__doc__
+    return with_options
 
 
 @contextmanager

@@ -7,19 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import (
-    Assignments,
-    Config,
-    Duration,
-    ImuTopic,
-    LidarTopic,
-    Preset,
-    RecordingPath,
-    Start,
-    Truth,
-    progress_bar,
-    resolve,
-)
+from app.cli.options import Duration, ParamsFor, RecordingPath, Start, Truth, progress_bar, with_params
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
@@ -27,22 +15,19 @@ if TYPE_CHECKING:
     from app.slam.loops.types import LoopEdit
 
 
+@with_params
 def run(
     recording: RecordingPath,
+    params_for: ParamsFor,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Where to write; else runs/NAME-1, -2, ...")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace results that DIR already holds.")] = False,
-    preset: Preset = None,
-    config: Config = None,
-    assignments: Assignments = None,
-    lidar_topic: LidarTopic = None,
-    imu_topic: ImuTopic = None,
     start: Start = 0.0,
     duration: Duration = None,
     truth: Truth = None,
     loops: Annotated[
-        Path | None, typer.Option("--loops", metavar="FILE", help="EditList of loops, as the workbench saves them.")
+        Path | None, typer.Option("--loops", metavar="FILE", help="Edits of loops, as the workbench saves them.")
     ] = None,
 ) -> None:
     """Process a recording without a browser and write the results.
@@ -67,19 +52,18 @@ def run(
     from app.evaluation.truth import read_poses
     from app.mapping.opening import open_session
     from app.slam.results import prepare_folder
-    from app.slam.trajectory import time_apart, truth_beside
+    from app.slam.trajectory import truth_beside
 
-    params = resolve(recording, preset, config, assignments, lidar_topic, imu_topic)
+    params = params_for(recording)
     edits = _read_edits(loops) if loops else ()
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
     session = open_session(recording, params, start, duration, truth=truth_path)
     try:
-        true_poses = read_poses(truth_path) if truth_path else None
-        if truth and true_poses:
-            info = session.feed.info
-            if apart := time_apart(truth, true_poses.stamps_ns, info.start_ns, info.duration_s or 0.0):
-                raise HemislamError(apart)
+        if truth_path:
+            read_poses(truth_path)  # raises for poses that cannot be true
+        if truth:
+            session.compare_with(truth)
         elif truth_path:
             typer.echo(f"Using the truth that lies beside the recording: {truth_path}")
         prepare_folder(folder, replace=force)

@@ -9,11 +9,13 @@ from typing import Annotated
 
 import typer
 
-from app.cli.options import Assignments, Config, Duration, ImuTopic, LidarTopic, Preset, Start, Truth, resolve
+from app.cli.options import Duration, ParamsFor, Start, Truth, with_params
 from app.slam.errors import HemislamError
 
 
+@with_params
 def serve(
+    params_for: ParamsFor,
     recording: Annotated[
         Path | None,
         typer.Argument(
@@ -74,11 +76,6 @@ def serve(
         Path | None, typer.Option("--key", metavar="PEM", help="The certificate's key, if it is in a file of its own.")
     ] = None,
     log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr, one JSON object per line.")] = False,
-    preset: Preset = None,
-    config: Config = None,
-    assignments: Assignments = None,
-    lidar_topic: LidarTopic = None,
-    imu_topic: ImuTopic = None,
     start: Start = 0.0,
     duration: Duration = None,
     truth: Truth = None,
@@ -114,14 +111,6 @@ def serve(
     from app.slam.trajectory import truth_beside
     from app.ui.workbench import Workbench
 
-    resolve_for = partial(
-        resolve,
-        preset=preset,
-        config=config,
-        assignments=assignments,
-        lidar_topic=lidar_topic,
-        imu_topic=imu_topic,
-    )
     if key is not None and certificate is None:
         raise HemislamError("--key needs --certificate; give both.")
     tls = Tls(certificate, key) if certificate else None
@@ -136,7 +125,7 @@ def serve(
             "--paused, --start, --duration and --truth belong to a recording; leave them out with --live."
         )
     session = read_session(recording) if recording is not None and recording.suffix == SUFFIX else None
-    params = session.state.params if session else resolve_for(recording)
+    params = session.state.params if session else params_for(recording)
     if recording is not None:
         opened = session.opened.recording if session else recording
         open_recording(opened, params).close()  # a mistake is reported here, not in the page
@@ -157,7 +146,7 @@ def serve(
                 params=params,
                 start_s=start,
                 duration_s=duration,
-                resolve=resolve_for,
+                resolve=params_for,
                 play=not paused or live is not None,
                 point_budget=point_budget,
                 checkpoint_bytes=checkpoint_memory << 20,

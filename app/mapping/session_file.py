@@ -22,7 +22,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import IO, Annotated, Any
 
-from pydantic import BeforeValidator, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator, TypeAdapter, WithJsonSchema
 
 from app import __version__
 from app.mapping.breakpoints import Breakpoints
@@ -80,11 +80,14 @@ _Path = Annotated[Path, PlainSerializer(lambda path: str(path.resolve()))]
 _Note = Annotated[
     Note, PlainValidator(lambda entry: Note(*entry)), PlainSerializer(lambda note: (note.frame, note.text))
 ]
-_Speed = Annotated[
+Speed = Annotated[
     float,
+    Field(ge=0.1),
     BeforeValidator(lambda speed: math.inf if speed == "max" else speed),
-    PlainSerializer(lambda speed: "max" if math.isinf(speed) else speed),
+    PlainSerializer(lambda speed: "max" if math.isinf(speed) else speed, when_used="json"),
+    WithJsonSchema({"anyOf": [{"type": "number", "minimum": 0.1}, {"const": "max"}]}),
 ]
+"""Times real time; inf is `max` in JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +105,7 @@ class State:
     truth: _Path | None = None
     notes: tuple[_Note, ...] = ()
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
-    speed: _Speed = 1.0
+    speed: Speed = 1.0
     labels: tuple[_LabelEdit, ...] = ()
 
 
@@ -279,4 +282,4 @@ def _head(opened: Opened) -> dict[str, Any]:
 def _entry(frame: int, ended: bool, state: State | None = None) -> dict[str, Any]:
     """Where the session is, and its state if that has changed."""
     entry: dict[str, Any] = {"frame": frame} | ({"ended": True} if ended else {})
-    return entry if state is None else entry | {"state": _STATE.dump_python(state)}
+    return entry if state is None else entry | {"state": _STATE.dump_python(state, mode="json")}

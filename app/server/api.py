@@ -4,7 +4,6 @@ A new action is one entry in `TRANSPORT`, `LABELS` or `LOOPS`.
 """
 
 import functools
-import math
 import operator
 import re
 import shutil
@@ -19,14 +18,14 @@ from typing import Annotated, Any, Final, Literal
 from fastapi import APIRouter, BackgroundTasks, HTTPException
 from fastapi import Path as PathParam
 from fastapi.responses import FileResponse, PlainTextResponse
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.session_file import SUFFIX
+from app.mapping.session_file import SUFFIX, Speed
 from app.server import protocol
 from app.server.folders import Folders
 from app.server.protocol import Command
-from app.server.views import LoopsState, Speed, StateView, loops_state, state_view
+from app.server.views import LoopsState, StateView, loops_state, state_view
 from app.server.worker import RunningEngine
 from app.slam.loops.types import Accept, Add, LoopEdit, Reject, SetWeight, Solve
 from app.slam.params import Params
@@ -56,7 +55,6 @@ def _edit(kind: Callable[..., LoopEdit]) -> Callable[..., Command]:
     return lambda **fields: protocol.EditLoop(kind(**fields))
 
 
-Replay = Annotated[Speed, AfterValidator(lambda speed: math.inf if speed == "max" else speed)]
 Index = Annotated[int, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 Weight = Annotated[float, Field(gt=0, description="Divides the loop's covariance.")]
@@ -74,7 +72,7 @@ TRANSPORT = {
     "restart": Action(protocol.Restart),
     "step": Action(protocol.StepFrame, {"frames": (Count, 1)}),
     "seek": Action(protocol.Seek, {"frame": (Index, ...)}),
-    "speed": Action(protocol.SetSpeed, {"factor": (Replay, ...)}),
+    "speed": Action(protocol.SetSpeed, {"factor": (Speed, ...)}),
 }
 LABELS = {
     "set": Action(protocol.EditLabels, {"keyframe": (Index, ...), "labels": (Labels, ...)}),

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import msgspec
 
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.session_file import Note
+from app.mapping.session_file import Note, Speed
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
 from app.slam.frames import READOUTS, Frame
@@ -192,7 +192,7 @@ class OpenedRecording:
 @dataclass(frozen=True, slots=True)
 class Transport:
     playing: bool = False
-    speed: float = 1.0
+    speed: Speed = 1.0
     frame: int = -1
     """Index of the newest processed frame; -1 before the first."""
     stamp_ns: int = 0

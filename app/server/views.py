@@ -3,22 +3,18 @@
 Fields are read from the values that `Snapshot` holds, by name; what has another name or unit there is converted.
 """
 
-import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from app.mapping.session_file import Note
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
-from app.server.protocol import LoopsView, Notice, Snapshot
+from app.server.protocol import LoopsView, Notice, Progress, Snapshot, Transport
 from app.slam.loops import edit_files
 from app.slam.types import StepResult
-
-Speed = Annotated[float, Field(ge=0.1)] | Literal["max"]
-"""Times real time."""
 
 
 class RestModel(BaseModel):
@@ -32,16 +28,6 @@ class RecordingView(RestModel):
     duration_s: float
     frames: int
     findings: list[Finding]
-
-
-class TransportView(RestModel):
-    playing: bool
-    speed: Annotated[Speed, BeforeValidator(lambda speed: "max" if math.isinf(speed) else speed)]
-    frame: int
-    stamp_ns: int
-    finished: bool
-    frames_per_second: float
-    dropped: int
 
 
 class FrameView(RestModel):
@@ -64,11 +50,6 @@ class FrameView(RestModel):
     timings_ms: dict[str, float]
     distance: float | None = Field(description="Length of the trajectory so far, m.")
     error: float | None = Field(description="To the truth, aligned to the trajectory so far, m.")
-
-
-class ProgressView(RestModel):
-    title: str
-    fraction: float | None
 
 
 class LoopView(RestModel):
@@ -98,10 +79,10 @@ class StateView(RestModel):
     revision: int
     engine_alive: bool
     recording: RecordingView | None
-    transport: TransportView
+    transport: Transport
     frame: FrameView | None
     keyframes: int
-    progress: ProgressView | None
+    progress: Progress | None
     pending_restart: list[str]
     notices: list[Notice]
     live: LiveState | None
