@@ -1,6 +1,5 @@
 """`hemislam serve`: the workbench in the browser."""
 
-import gc
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -133,8 +132,6 @@ def serve(
         read_poses(truth)
     elif recording is not None:
         truth = truth_beside(recording)
-    gc.collect()
-    gc.freeze()  # imported objects stay; collecting them again would stop every page for 0.08 s
     with (
         TemporaryDirectory(prefix="hemislam-") as folder_live,
         LiveProcess(live, params, imu, record) if live else nullcontext() as source,

@@ -13,10 +13,9 @@ import itertools
 import json
 import logging
 import math
-import time
 import zlib
 from base64 import b64decode, b64encode
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -37,8 +36,6 @@ log = logging.getLogger(__name__)
 
 SUFFIX = ".hemislam"
 FORMAT = 2
-EVERY_S = 0.5
-"""How often the frame is written: a process that dies loses no more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,13 +143,9 @@ class SessionWriter:
         path: of the file. error: why it cannot be written any more, in a sentence; "" if it can.
     """
 
-    def __init__(
-        self, path: Path | None = None, opened: Opened | None = None, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, path: Path | None = None, opened: Opened | None = None) -> None:
         self.path = path
         self.error = ""
-        self._clock = clock
-        self._written_at = -1e9
         self._state: State | None = None
         self._at: tuple[int, bool] | None = None
         self._file: IO[str] | None = None
@@ -165,19 +158,13 @@ class SessionWriter:
             self._failed(error)
         self._line(_head(opened))
 
-    def write(self, frame: int, state: State, *, ended: bool = False, settled: bool = False) -> None:
-        """Write where the session is, if that has changed.
-
-        A changed state is written at once; the frame alone every `EVERY_S`, or when the session stays there.
-        """
-        now, at = self._clock(), (frame, ended)
+    def write(self, frame: int, state: State, *, ended: bool = False) -> None:
+        """Write where the session is, and its state, if they have changed."""
         if state != self._state:
             self._line(_entry(frame, ended, state))
-        elif at != self._at and (settled or ended or now - self._written_at >= EVERY_S):
+        elif (frame, ended) != self._at:
             self._line(_entry(frame, ended))
-        else:
-            return
-        self._state, self._at, self._written_at = state, at, now
+        self._state, self._at = state, (frame, ended)
 
     def close(self) -> None:
         if self._file is not None:

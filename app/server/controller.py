@@ -170,7 +170,7 @@ class Controller:
         wait = self._work()
         session = self._player.session
         if session is not None and self._resuming is None:
-            self._writer.write(session.frame, self._state(session), ended=session.ended, settled=wait is None)
+            self._writer.write(session.frame, self._state(session), ended=session.ended)
         return wait
 
     def _work(self) -> float | None:
@@ -307,6 +307,6 @@ class Controller:
         session = self._player.session
         if session is not None:
             session.finish_saves()
-            self._writer.write(session.frame, self._state(session), ended=session.ended, settled=True)
+            self._writer.write(session.frame, self._state(session), ended=session.ended)
             session.close()
         self._writer.close()
