@@ -25,8 +25,10 @@ PRIMARY: Final = ("ground.scan_lines", "ground.alpha", "ground.sigma", "ground.v
 MARK: Final[dict[Effect, str]] = {"now": "", "frame": " ▸", "restart": " ↻"}
 _MOST_STEPS: Final = 2000
 """Of a slider. The IMU's noise spans decades: its usual values would share the first few pixels."""
+_DIGITS: Final = 9
+"""Most digits after the point that a box shows and takes."""
 _TYPING_S: Final = 0.5
-"""A value that can be typed is sent after this long without a change: "0.05" begins with "0"."""
+"""A text is sent after this long without a change, and a slider that does not act at once after this long at rest."""
 _HOLD_S: Final = 1.0
 """A control shows what the user set for this long, whatever older snapshots say."""
 
@@ -60,7 +62,13 @@ def label(leaf: Leaf) -> str:
 
 
 def add_control(gui: viser.GuiApi, leaf: Leaf, value: Any) -> Control:
-    text, hint = label(leaf), leaf.help
+    control = _control(gui, leaf, value, label(leaf), leaf.help)
+    if not isinstance(leaf.default, int) and hasattr(control, "precision"):
+        control.precision = _DIGITS
+    return control
+
+
+def _control(gui: viser.GuiApi, leaf: Leaf, value: Any, text: str, hint: str) -> Control:
     if leaf.choices:
         return gui.add_dropdown(text, leaf.choices, initial_value=value, hint=hint)
     if isinstance(leaf.default, bool):
@@ -73,7 +81,7 @@ def add_control(gui: viser.GuiApi, leaf: Leaf, value: Any) -> Control:
     low, high, step = (None if limit is None else kind(limit) for limit in (leaf.minimum, leaf.maximum, leaf.step))
     if low is not None and high is not None and step is not None and high - low <= _MOST_STEPS * step:
         return gui.add_slider(text, low, high, step, value, hint=hint)
-    return gui.add_number(text, value, min=low, max=high, step=step, hint=hint)
+    return gui.add_number(text, value, step=step, hint=hint)  # the engine says what is out of range
 
 
 class ParameterPanel:

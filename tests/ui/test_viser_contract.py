@@ -47,6 +47,10 @@ ASSUMPTIONS = {
         "dock/TabGroupFrame.tsx",
         "data-dock-tab={paneId}",
     ),
+    "A number box is no longer Mantine's: it acts on each keystroke.": (
+        "components/NumberInput.tsx",
+        'import { NumberInput } from "@mantine/core";',
+    ),
     "A slider no longer has a track and a number box side by side: the box may cut long numbers off.": (
         "components/Slider.tsx",
         '<Flex justify="space-between">\n      <Slider',

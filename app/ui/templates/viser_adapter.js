@@ -27,4 +27,40 @@ if (!window.hemislamSay) {
   document.documentElement.addEventListener('keyup', (event) => {
     if (event.key === ' ' && event.target.closest('button')) event.preventDefault();
   });
+
+  // A number box is taken as a whole, on Enter or when it is left; Escape brings the old number back.
+  let taking = false;
+  const isBox = (node) => node.classList && node.classList.contains('mantine-NumberInput-input');
+  const restore = (box) => { set.call(box, box.defaultValue); box.setCustomValidity(''); };
+  const take = (box, complain) => {
+    const text = box.value.trim().replace('−', '-').replace(',', '.'), value = Number(text);
+    const thumb = box.closest('.mantine-Flex-root').querySelector('[role=slider]');
+    const [low, high] = thumb ? ['min', 'max'].map((end) => Number(thumb.getAttribute('aria-value' + end))) : [];
+    const bad = !text || !isFinite(value) ? 'A number, please.' : value < low || value > high ? `${low} to ${high}` : '';
+    if (bad && complain) { box.setCustomValidity(bad); box.reportValidity(); return; }
+    restore(box);
+    if (bad) return;
+    box.select(); // the widget takes what follows for a paste over all of the old number
+    box.dispatchEvent(new KeyboardEvent('keydown', {key: 'Unidentified', bubbles: true}));
+    set.call(box, value.toFixed(12).replace(/\.?0+$/, ''));
+    taking = true; box.dispatchEvent(new Event('input', {bubbles: true})); taking = false;
+  };
+  document.addEventListener('input', (event) => {
+    if (!taking && isBox(event.target)) { event.stopImmediatePropagation(); event.target.setCustomValidity(''); }
+  }, true);
+  document.addEventListener('change', (event) => { // on Enter, and when a box is left
+    if (!isBox(event.target)) return;
+    event.stopImmediatePropagation();
+    if (!event.target.validity.valid) restore(event.target);
+    else if (event.target.value !== event.target.defaultValue) take(event.target, false);
+  }, true);
+  document.addEventListener('keydown', (event) => {
+    const box = event.target;
+    if (!isBox(box) || box.value === box.defaultValue) return;
+    if (event.key === 'Escape') restore(box);
+    if (!['Enter', 'ArrowUp', 'ArrowDown'].includes(event.key)) return;
+    event.stopImmediatePropagation();
+    event.preventDefault();
+    take(box, true);
+  }, true);
 }

@@ -1,0 +1,81 @@
+"""Numbers typed into boxes, in a real Chromium.
+
+Tests app/ui/parameters.py.
+"""
+
+import re
+
+import pytest
+from playwright.sync_api import Locator, expect
+
+from app.server.protocol import SetParams, StepFrame
+from tests.browser.conftest import Bench
+
+
+@pytest.fixture(autouse=True)
+def _fresh(bench: Bench) -> None:
+    bench.engine.sent.clear()
+
+
+def boxes(bench: Bench, label: str) -> Locator:
+    """The number boxes beside a label that begins so."""
+    row = bench.page.locator(".mantine-Flex-root", has=bench.page.locator("label", has_text=re.compile(f"^{label}")))
+    return row.locator("input.mantine-NumberInput-input")
+
+
+def type_over(bench: Bench, box: Locator, text: str) -> None:
+    box.click()
+    bench.page.keyboard.press("Control+a")
+    bench.page.keyboard.type(text, delay=40)
+
+
+def set_params(bench: Bench) -> list[dict[str, object]]:
+    return [command.values for command in bench.engine.sent if isinstance(command, SetParams)]
+
+
+def test_a_number_is_taken_whole_on_enter_whatever_the_engine_sends_meanwhile(bench: Bench) -> None:
+    alpha = boxes(bench, "α")
+    type_over(bench, alpha, "25")
+    bench.engine.send(StepFrame(3))
+    bench.page.wait_for_timeout(800)
+    bench.page.keyboard.type(".7")
+    bench.page.wait_for_timeout(800)
+    assert set_params(bench) == []
+    bench.page.keyboard.press("Enter")
+    bench.eventually(lambda: set_params(bench) == [{"ground.alpha": 25.7}])
+    expect(alpha).to_have_value("25.7")
+
+
+def test_a_number_is_taken_when_its_box_is_left_with_all_its_digits(bench: Bench) -> None:
+    sigma = boxes(bench, "σ")
+    type_over(bench, sigma, "0.0255")
+    bench.page.keyboard.press("Tab")
+    bench.eventually(lambda: set_params(bench) == [{"ground.sigma": 0.0255}])
+    bench.page.get_by_text("Sensor", exact=True).click()
+    for name, values in (("translation .m", (0.0175, 0.0276, -0.1083)), ("rotation .°", (1.2345, -0.5, 90.0))):
+        three = boxes(bench, name)
+        expect(three).to_have_count(3)
+        for box, value in zip(three.all(), values, strict=True):
+            type_over(bench, box, str(value))
+            bench.page.keyboard.press("Tab")
+        bench.eventually(lambda values=values: values in set_params(bench)[-1].values())
+        bench.page.wait_for_timeout(1500)
+        assert [float(box.input_value()) for box in three.all()] == list(values)
+    bench.page.get_by_text("Sensor", exact=True).click()
+
+
+def test_escape_restores_the_number_and_one_out_of_range_is_not_taken(bench: Bench) -> None:
+    bench.engine.send(SetParams({"ground.alpha": 40.0}))
+    bench.engine.sent.clear()
+    alpha = boxes(bench, "α")
+    expect(alpha).to_have_value("40")
+    type_over(bench, alpha, "12")
+    bench.page.keyboard.press("Escape")
+    expect(alpha).to_have_value("40")
+    type_over(bench, alpha, "257")
+    bench.page.keyboard.press("Enter")
+    assert alpha.evaluate("(box) => box.validationMessage") == "1 to 90"
+    bench.page.keyboard.press("Tab")
+    expect(alpha).to_have_value("40")
+    bench.page.wait_for_timeout(800)
+    assert set_params(bench) == []
