@@ -15,11 +15,15 @@ TRAJECTORIES = (".tum",)
 
 @dataclass(frozen=True, slots=True)
 class FolderEntry:
-    """A line of the file browser: a file to choose, with its size in bytes, or a folder to look into."""
+    """A line of the file browser: a file to choose, with its size in bytes, or a folder to look into.
+
+    outside: it is neither, but a link to a file outside, which cannot be opened.
+    """
 
     path: Path
     is_choice: bool
     size: int = 0
+    outside: bool = False
 
 
 class Folders:
@@ -66,8 +70,8 @@ class Folders:
         """
         place = self.inside(folder)
         try:
-            seen = [path for path in place.iterdir() if not path.name.startswith(".") and self._holds(path.resolve())]
-            found = [entry for path in seen if (entry := _entry(path, suffixes))]
+            seen = [path for path in place.iterdir() if not path.name.startswith(".")]
+            found = [entry for path in seen if (entry := self._entry(path, suffixes))]
         except OSError as error:
             raise HemislamError(f"The folder {place} cannot be read: {error.strerror}.") from None
         return sorted(found, key=lambda entry: (entry.is_choice, entry.path.name.casefold()))
@@ -81,13 +85,18 @@ class Folders:
             for entry in self.listing(waiting.pop()):
                 if entry.is_choice:
                     found.append(entry.path)
-                elif (real := entry.path.resolve()) not in seen:
+                elif not entry.outside and (real := entry.path.resolve()) not in seen:
                     seen.add(real)
                     waiting.append(real)
         return sorted(set(found))
 
     def _holds(self, real: Path) -> bool:
         return any(real.is_relative_to(root) for root in self.roots)
+
+    def _entry(self, path: Path, suffixes: tuple[str, ...]) -> FolderEntry | None:
+        if self._holds(path.resolve()):
+            return _entry(path, suffixes)
+        return FolderEntry(path, False, outside=True) if path.suffix in suffixes else None
 
 
 def _entry(path: Path, suffixes: tuple[str, ...]) -> FolderEntry | None:

@@ -53,8 +53,11 @@ class AppearancePanel:
             **{name: layer.value for name, layer in self._layers.items()},
         )
 
-    def look_freely(self) -> None:
-        show(self._follow, False)
+    def look_freely(self, client: viser.ClientHandle) -> None:
+        """Stop following, and say so if it was on."""
+        if self._follow.value:
+            show(self._follow, False)
+            client.add_notification("Follow is off", "So the view stays here. F follows the sensor again.")
 
     def draw(self, view: View, limits: Limits | None, points: int, budget: int) -> None:
         """Explain the colours as drawn and say how many points the page holds."""

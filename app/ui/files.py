@@ -175,7 +175,10 @@ class FileList:
         elif len(roots) > 1:
             self._button("..", viser.Icon.CORNER_LEFT_UP, partial(self._go, None))
         for entry in entries[:_MOST_ENTRIES]:
-            if entry.is_choice:
+            if entry.outside:
+                words = " leads out of these folders. To open it, start hemislam with --folder and the folder it is in."
+                self._text(panel("path", "", entry.path.name, words))
+            elif entry.is_choice:
                 text = f"{entry.path.name}   {size_text(entry.size)}"
                 self._button(text, viser.Icon.FILE_DATABASE, partial(self._chosen, entry.path))
             else:

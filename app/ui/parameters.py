@@ -14,9 +14,10 @@ import viser
 
 from app.server.fork import engine_number
 from app.server.protocol import LoadParams, Restart, SetParams, Snapshot
+from app.slam.errors import HemislamError
 from app.slam.params import Leaf, Params, leaves
 from app.slam.sections import Effect
-from app.ui.html import panel
+from app.ui.html import panel, source
 from app.ui.widgets import Edit, Page, as_set, by_user, dialog, show
 
 PRIMARY: Final = ("ground.scan_lines", "ground.alpha", "ground.sigma", "ground.voxel_size")
@@ -195,7 +196,7 @@ def add_yaml_buttons(page: Page, params: Callable[[], Params]) -> None:
 def _show_yaml(client: viser.ClientHandle, params: Params) -> None:
     text = params.to_yaml()
     with client.gui.add_modal("Parameters as YAML") as modal:
-        client.gui.add_html(panel("yaml_out"))
+        client.gui.add_html(panel("yaml_out", text, source("copy.js")))
         client.gui.add_text("yaml", text, multiline=True)
         download = client.gui.add_button("Download", icon=viser.Icon.DOWNLOAD)
         close = client.gui.add_button("Close", color="gray")
@@ -207,10 +208,16 @@ def _load_yaml(client: viser.ClientHandle, page: Page) -> None:
     with dialog(client, "Load parameters") as close:
         client.gui.add_html(panel("text", "Paste YAML or choose a file. Parameters it omits return to their defaults."))
         text = client.gui.add_text("yaml", "", multiline=True)
+        problem = client.gui.add_html("", visible=False)
         upload = client.gui.add_upload_button("Choose a file", icon=viser.Icon.UPLOAD, mime_type=".yaml,.yml,text/yaml")
         apply = client.gui.add_button("Apply", icon=viser.Icon.CHECK)
 
     def applied(_: Any) -> None:
+        try:
+            Params().merged_yaml(text.value)
+        except HemislamError as error:
+            problem.content, problem.visible = panel("problem", str(error)), True
+            return
         page.send(LoadParams(text.value))
         close()
 

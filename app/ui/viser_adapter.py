@@ -9,6 +9,7 @@ viser has no events for HTML, no way to run a script, and keys of its own. So th
 * Hotkeys are listened to on the html element, the camera's keys on the document.
 * A number box is an `<input class="mantine-NumberInput-input">` whose `input` events viser sends; that of a slider
   stands beside its track.
+* Tooltips have the class `mantine-Tooltip-tooltip`, and the scene is a `<canvas data-engine>`.
 * Dock tabs carry `data-dock-tab`; the box of a slider follows its track, with Mantine's class names.
 """
 

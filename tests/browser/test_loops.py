@@ -68,8 +68,12 @@ def test_an_arch_can_be_clicked_in_the_scene(bench: Bench) -> None:
 def test_a_loop_is_rejected_undone_and_rejected_again(bench: Bench) -> None:
     page = bench.page
     bench.engine.sent.clear()
-    page.get_by_role("button", name="Reject it").click()
+    reject = page.get_by_role("button", name="Reject it")
+    reject.evaluate("(button) => button.scrollIntoView({block: 'start'})")
+    reject.click()
     expect(page.get_by_text("Keyframes would move by up to")).to_be_visible()
+    for name in ("Commit", "Cancel"):
+        expect(page.get_by_role("button", name=name)).to_be_in_viewport(ratio=1)
     page.get_by_role("button", name="Commit").click()
     expect(page.get_by_role("button", name="Undo: reject 12–89")).to_be_visible()
     bench.eventually(lambda: EditLoop(Reject(*GOOD)) in bench.engine.sent)
@@ -93,6 +97,7 @@ def test_flying_to_a_loop_brings_its_submaps_before_the_camera(bench: Bench) -> 
     page = bench.page
     (client,) = bench.workbench._server.get_clients().values()
     page.get_by_role("button", name="fly there").click()
+    expect(page.get_by_text("Follow is off")).to_be_visible()
     poses = bench.engine.snapshot.keyframe_poses
     assert poses is not None
     middle = poses[list(GOOD), :3, 3].mean(axis=0)

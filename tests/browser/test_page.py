@@ -117,8 +117,11 @@ def test_the_recording_s_findings_are_in_their_panel(bench: Bench) -> None:
 
 
 def test_parameters_can_be_had_as_yaml_and_given(bench: Bench) -> None:
+    bench.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     bench.page.get_by_role("button", name="Copy as YAML").click()
     expect(bench.page.get_by_role("dialog").locator("textarea")).to_have_value(bench.engine.snapshot.params.to_yaml())
+    expect(bench.page.get_by_text("Copied.")).to_be_visible()
+    assert bench.page.evaluate("navigator.clipboard.readText()") == bench.engine.snapshot.params.to_yaml()
     bench.page.get_by_role("button", name="Close").click()
     expect(bench.page.get_by_role("dialog")).to_have_count(0)
     bench.page.get_by_role("button", name="Load YAML").click()
@@ -127,13 +130,32 @@ def test_parameters_can_be_had_as_yaml_and_given(bench: Bench) -> None:
     bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha == 33.0)
 
 
-def test_yaml_that_can_not_be_used_is_told_and_nothing_changes(bench: Bench) -> None:
+def test_yaml_that_can_not_be_used_is_told_in_the_dialog_which_keeps_it(bench: Bench) -> None:
     before = bench.engine.snapshot.params
     bench.page.get_by_role("button", name="Load YAML").click()
     bench.page.get_by_role("dialog").locator("textarea").fill("ground:\n  alhpa: 33\n")
     bench.page.get_by_role("button", name="Apply").click()
-    expect(bench.page.get_by_text("alhpa").first).to_be_visible()
-    assert bench.engine.snapshot.params == before
+    dialog = bench.page.get_by_role("dialog")
+    expect(dialog.get_by_text("alhpa").last).to_be_visible()
+    expect(dialog.locator("textarea")).to_have_value("ground:\n  alhpa: 33\n")
+    assert bench.engine.sent == [] and bench.engine.snapshot.params == before
+    dialog.get_by_role("button", name="Cancel").click()
+    expect(dialog).to_have_count(0)
+
+
+@pytest.mark.parametrize("control", ["step ▸", "α"])
+def test_a_tooltip_covers_no_control(bench: Bench, control: str) -> None:
+    page = bench.page
+    step, alpha = page.get_by_role("button", name="step ▸"), page.locator("[role=slider]").nth(ALPHA)
+    (step if control == "step ▸" else alpha).hover()
+    tip = page.locator(".mantine-Tooltip-tooltip")
+    expect(tip).to_be_visible()
+    page.wait_for_timeout(500)
+    box, scene = tip.bounding_box(), page.locator("canvas[data-engine]").bounding_box()
+    assert box is not None and scene is not None
+    assert scene["x"] <= box["x"] and box["x"] + box["width"] <= scene["x"] + scene["width"]
+    page.mouse.move(scene["x"] + 50, scene["y"] + 50)
+    expect(tip).to_have_count(0)
 
 
 def test_a_recording_is_chosen_from_the_allowed_folder(bench: Bench) -> None:

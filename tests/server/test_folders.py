@@ -54,9 +54,17 @@ def test_a_folder_whose_name_begins_alike_is_not_inside(disk: Path) -> None:
 
 def test_a_listing_shows_folders_and_recordings_but_no_way_out(disk: Path) -> None:
     listing = Folders([disk / "open"]).listing("")
-    assert [(entry.path.name, entry.is_choice, entry.size) for entry in listing] == [
-        ("loop", False, 0), ("walks", False, 0), ("a.mcap", True, 4), ("ros2", True, 4),
+    assert [(entry.path.name, entry.is_choice, entry.size, entry.outside) for entry in listing] == [
+        ("loop", False, 0, False), ("out.mcap", False, 0, True), ("walks", False, 0, False),
+        ("a.mcap", True, 4, False), ("ros2", True, 4, False),
     ]  # fmt: skip
+
+
+def test_a_file_behind_a_link_is_listed_and_opened_if_it_lies_inside(disk: Path) -> None:
+    (disk / "open/walks/again.mcap").symlink_to(disk / "open/a.mcap")
+    folders = Folders([disk / "open"])
+    assert ("again.mcap", True, 4) in [(e.path.name, e.is_choice, e.size) for e in folders.listing("walks")]
+    assert folders.inside("walks/again.mcap") == (disk / "open/a.mcap").resolve()
 
 
 def test_all_recordings_are_found_once_in_spite_of_loops(disk: Path) -> None:

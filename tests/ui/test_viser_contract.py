@@ -47,6 +47,10 @@ ASSUMPTIONS = {
         "dock/TabGroupFrame.tsx",
         "data-dock-tab={paneId}",
     ),
+    "Tooltips are no longer Mantine's: they cover the controls around.": (
+        "components/common.tsx",
+        "<Tooltip\n          zIndex={100}",
+    ),
     "A number box is no longer Mantine's: it acts on each keystroke.": (
         "components/NumberInput.tsx",
         'import { NumberInput } from "@mantine/core";',

@@ -12,6 +12,7 @@ from app.slam.loops import edit_files
 from app.slam.loops.types import Accept, LoopEdge, LoopEdit, Pair, Reject, SetWeight, Verdict
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
+from app.ui.html import panel
 from app.ui.loops.words import describe_edit, forecast, headline
 from app.ui.nodes import add_lines, segments
 from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, notify_error, poses_of, show
@@ -98,7 +99,8 @@ class Proposal:
         self._folder.visible = command is not None
         if command is not None:
             self._commit.disabled = preview is None
-            self._words.content = forecast(command, preview, poses, snapshot.loops.residuals, problem)
+            words = forecast(command, preview, poses, snapshot.loops.residuals, problem)
+            self._words.content = words + panel("into_view")
 
     def _problem(self, snapshot: Snapshot) -> str:
         """The engine's newest error since the edit was proposed."""

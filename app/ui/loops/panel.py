@@ -41,7 +41,7 @@ class LoopsPanel:
         look_freely: stops following the sensor, so that a camera can stay where it is put.
     """
 
-    def __init__(self, page: Page, look_freely: Callable[[], None]) -> None:
+    def __init__(self, page: Page, look_freely: Callable[[viser.ClientHandle], None]) -> None:
         gui = page.gui
         self._page, self._look_freely = page, look_freely
         self._send, self._snapshot = page.send, page.snapshot
@@ -190,7 +190,7 @@ class LoopsPanel:
             self._fly(client, ends.mean(axis=0), 7.0 + 1.2 * float(np.linalg.norm(ends[1] - ends[0])))
 
     def _fly(self, client: viser.ClientHandle, place: F64, distance: float) -> None:
-        self._look_freely()
+        self._look_freely(client)
         fly(client, place + self._page.offset(), distance)
 
     def _committed(self, command: LoopEdit) -> None:

@@ -28,6 +28,19 @@ if (!window.hemislamSay) {
     if (event.key === ' ' && event.target.closest('button')) event.preventDefault();
   });
 
+  // A tooltip stands beside its panel, over the scene: above its control it would hide the one before.
+  const beside = (tip) => {
+    const scene = document.querySelector('canvas[data-engine]').getBoundingClientRect(), box = tip.getBoundingClientRect();
+    if (scene.width < box.width + 16 || (box.left >= scene.left && box.right <= scene.right)) return;
+    const aside = box.left > scene.left ? scene.right - 8 - box.right : scene.left + 8 - box.left;
+    tip.style.translate = `${aside}px ${box.height / 2 + 18}px`;
+  };
+  new MutationObserver(() => {
+    for (const tip of document.getElementsByClassName('mantine-Tooltip-tooltip')) {
+      if (!tip.dataset.hsSeen) { tip.dataset.hsSeen = 1; requestAnimationFrame(() => beside(tip)); }
+    }
+  }).observe(document.body, {childList: true, subtree: true});
+
   // A number box is taken as a whole, on Enter or when it is left; Escape brings the old number back.
   let taking = false;
   const isBox = (node) => node.classList && node.classList.contains('mantine-NumberInput-input');
