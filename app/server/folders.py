@@ -4,13 +4,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from app.mapping.session_file import SUFFIX, read_session
+from app.mapping.session_file import SUFFIX, SavedSession, read_session
 from app.sensors.source import SUFFIXES
 from app.slam.errors import HemislamError
 
 RECORDINGS = (*SUFFIXES, SUFFIX)
 """Files that can be opened, session files included. A ROS 2 folder can be opened too."""
 TRAJECTORIES = (".tum",)
+_RECENT = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,19 @@ class Folders:
         except OSError as error:
             raise HemislamError(f"The folder {place} cannot be read: {error.strerror}.") from None
         return sorted(found, key=lambda entry: (entry.is_choice, entry.path.name.casefold()))
+
+    def sessions(self, kept: Path) -> list[tuple[Path, SavedSession]]:
+        """The newest session files in a folder whose recordings are inside, newest first, without those never begun."""
+        found = []
+        for path in sorted(kept.glob(f"*{SUFFIX}"), key=lambda path: path.stat().st_mtime_ns, reverse=True)[:_RECENT]:
+            try:
+                saved = read_session(path)
+                self.inside(saved.opened.recording)
+            except HemislamError:
+                continue
+            if saved.frame > 0:
+                found.append((path, saved))
+        return found
 
     def recordings(self) -> list[Path]:
         """All recordings below all folders, sorted by path."""

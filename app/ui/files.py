@@ -1,5 +1,6 @@
 """Opening a recording and saving results. The page sees only the folders that the command line allowed."""
 
+import itertools
 from collections.abc import Callable
 from datetime import datetime
 from functools import partial
@@ -8,16 +9,19 @@ from typing import Any, Final
 
 import viser
 
-from app.mapping.session_file import SUFFIX
+from app.mapping.session_file import SUFFIX, SavedSession
 from app.server.folders import RECORDINGS, TRAJECTORIES, FolderEntry, Folders
 from app.server.protocol import CompareWith, OpenRecording, Save, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.results import EXPORTS
 from app.slam.trajectory import truth_beside
 from app.ui.html import panel
-from app.ui.widgets import Page, by_user, dialog
+from app.ui.widgets import Changes, Page, by_user, dialog
 
 _MOST_ENTRIES: Final = 60
+_RECENT: Final = 3
+_EARLY: Final = 100
+"""Before this frame the last session is offered."""
 
 
 def size_text(size: int) -> str:
@@ -34,6 +38,58 @@ def result_folder_name(recording: Path, now: datetime) -> str:
     """`hall_bpearl-2026-05-01-134502`: sorts by recording, then by time; never overwrites an older run."""
     stem = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in recording.stem)
     return f"{stem}-{now:%Y-%m-%d-%H%M%S}"
+
+
+class RecentPanel:
+    """What to go on with, while the session has hardly begun: the last one, and recordings opened before.
+
+    Args:
+        kept: folder of the session files.
+    """
+
+    def __init__(self, page: Page, folders: Folders, kept: Path) -> None:
+        self._send, self._folders, self._kept = page.send, folders, kept
+        self._sessions: list[tuple[Path, SavedSession]] = []
+        self._changes = Changes()
+        icons = (viser.Icon.HISTORY, *[viser.Icon.FILE_DATABASE] * _RECENT)
+        self._buttons = [page.gui.add_button("", icon=icon, color="gray", visible=False) for icon in icons]
+        self._offers: list[tuple[str, Path]] = []
+        for number, button in enumerate(self._buttons):
+            button.on_click(by_user(partial(self._open, number)))
+
+    def draw(self, snapshot: Snapshot) -> None:
+        recording = snapshot.recording
+        if self._changes(snapshot.session, snapshot.session_file):
+            present, found = snapshot.session_file, self._folders.sessions(self._kept)
+            own = recording.path.resolve() if recording is not None else None
+            self._sessions = [
+                (path, saved)
+                for path, saved in found
+                if (present is None or path.resolve() != present.resolve()) and own in (None, saved.opened.recording)
+            ]
+        before = self._sessions
+        early = snapshot.transport.frame < _EARLY and snapshot.live is None and snapshot.progress is None
+        offers = [(f"Restore last session: {session_text(before[0][1])}", before[0][0])] if early and before else []
+        if early and recording is None:
+            recent = dict.fromkeys(saved.opened.recording for _, saved in before)
+            offers += [(f"Open {path.name}", path) for path in list(recent)[:_RECENT]]
+        self._offers = offers
+        for button, offer in itertools.zip_longest(self._buttons, offers):
+            button.visible = offer is not None
+            if offer is not None:
+                button.label = offer[0]
+
+    def _open(self, number: int, _value: Any, _client: viser.ClientHandle) -> None:
+        if number < len(self._offers):
+            path = self._offers[number][1]
+            self._send(OpenRecording(path, truth_beside(path)))
+
+
+def session_text(saved: SavedSession) -> str:
+    """How far a session came, and what the user did in it."""
+    counts = {"loop edit": len(saved.state.edits), "note": len(saved.state.notes)}
+    done = [f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count]
+    return ", ".join([saved.opened.recording.name, f"frame {saved.frame:,}", *done])
 
 
 class FilesPanel:

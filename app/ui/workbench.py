@@ -23,7 +23,7 @@ from app.server.setup import POINT_BUDGET, Setup
 from app.server.worker import RunningEngine
 from app.ui.appearance import AppearancePanel
 from app.ui.compare import ComparePanel, Sides
-from app.ui.files import FilesPanel
+from app.ui.files import FilesPanel, RecentPanel
 from app.ui.html import heading, render
 from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
@@ -77,7 +77,8 @@ class Workbench:
         page = Page(server, engine.send, lambda: engine.snapshot, now, lambda: self._scene.offset)
 
         prepare_page(gui)
-        self._header, self._transport, self._timeline = HeaderPanel(gui), TransportPanel(page), TimelinePanel(page)
+        self._header, self._recent = HeaderPanel(gui), RecentPanel(page, folders, results / "sessions")
+        self._transport, self._timeline = TransportPanel(page), TimelinePanel(page)
         with gui.add_folder("Pause when", expand_by_default=False):
             self._breakpoints = BreakpointPanel(page)
         with gui.add_folder("Notes", expand_by_default=False):
@@ -114,7 +115,7 @@ class Workbench:
         left.set_width(300)
 
         self._panels = (
-            self._transport, self._breakpoints, self._notes, self._notices, self._header, self._timeline,
+            self._transport, self._breakpoints, self._notes, self._notices, self._header, self._recent, self._timeline,
             self._readouts, self._doctor, self._live, self._files,
         )  # fmt: skip
         self._drawn: Snapshot | None = None

@@ -1,0 +1,71 @@
+"""The last session is offered while a new one has hardly begun.
+
+Tests app/ui/files.py, app/server/folders.py.
+"""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import viser
+
+from app.mapping.session_file import Note, Opened, SavedSession, State, write_session
+from app.server.folders import Folders
+from app.server.protocol import Command, OpenedRecording, OpenRecording, Snapshot, Transport
+from app.slam.loops.types import Reject
+from app.slam.params import Params
+from app.ui.files import RecentPanel
+from tests.ui.conftest import page_of, user_clicks
+
+STATE = State(Params(), edits=(Reject(3, 9), Reject(4, 9)), notes=(Note(4, "a door"),))
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Path:
+    """Sessions, from old to new: of walk, of walk, of hall, one of hall never begun, and one of a hidden recording."""
+    (tmp_path / "open").mkdir()
+    sessions = (("open/walk", 12), ("open/walk", 41), ("open/hall", 7), ("open/hall", -1), ("hidden", 9))
+    for number, (name, frame) in enumerate(sessions):
+        recording = tmp_path / f"{name}.mcap"
+        recording.write_bytes(b"12345")
+        path = tmp_path / f"kept/{number}.hemislam"
+        write_session(path, SavedSession(Opened(recording.resolve(), nbytes=5), STATE, frame))
+        os.utime(path, (number, number))
+    return tmp_path / "kept"
+
+
+def opened(path: Path, frame: int) -> Snapshot:
+    recording = OpenedRecording(path, 0, 10.0, 100, ())
+    return Snapshot(session=1, recording=recording, transport=Transport(frame=frame))
+
+
+def test_the_last_session_of_the_recording_is_offered_until_this_one_has_begun(
+    server: viser.ViserServer, kept: Path
+) -> None:
+    sent: list[Command] = []
+    panel = RecentPanel(page_of(server, sent.append), Folders([kept.parent / "open"]), kept)
+    start = opened(kept.parent / "open/walk.mcap", 0)
+    panel.draw(start)
+    shown = [button for button in panel._buttons if button.visible]
+    assert [button.label for button in shown] == [
+        "Restore last session: walk.mcap, frame 41, 2 loop edits, 1 note",
+    ]
+    user_clicks(shown[0])
+    assert sent == [OpenRecording(kept / "1.hemislam", None)]
+    panel.draw(replace(start, session=2, session_file=kept / "1.hemislam"))
+    assert panel._buttons[0].label.endswith("frame 12, 2 loop edits, 1 note"), "not the one that is open"
+    panel.draw(opened(kept.parent / "open/walk.mcap", 400))
+    assert not any(button.visible for button in panel._buttons)
+
+
+def test_without_a_recording_those_of_before_are_offered_too(server: viser.ViserServer, kept: Path) -> None:
+    sent: list[Command] = []
+    panel = RecentPanel(page_of(server, sent.append), Folders([kept.parent / "open"]), kept)
+    panel.draw(Snapshot())
+    labels = [button.label for button in panel._buttons if button.visible]
+    assert labels == [
+        "Restore last session: hall.mcap, frame 7, 2 loop edits, 1 note", "Open hall.mcap", "Open walk.mcap",
+    ]  # fmt: skip
+    user_clicks(panel._buttons[2])
+    assert sent == [OpenRecording((kept.parent / "open/walk.mcap").resolve(), None)]
