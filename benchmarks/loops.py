@@ -11,12 +11,13 @@ from tqdm import tqdm
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.slam.engine import Engine
+from app.slam.loops.edits import Reject
 from app.slam.loops.factors import Factor, residuals
 from app.slam.loops.messages import AddKeyframe, ApplyEdit, Ask, LoopState, Target
 from app.slam.loops.pose_graph import PoseGraph
 from app.slam.loops.service import LoopService, warm_up
 from app.slam.loops.solvers import optimise
-from app.slam.loops.types import Reject, Verdict
+from app.slam.loops.types import Verdict
 from app.slam.params import Params
 from app.slam.types import F64, Keyframe, Measurement
 from app.slam.warmup import compile_kernels

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from app.mapping.opening import open_session
+from app.slam.loops.edits import Reject
 from app.slam.loops.service import InlineLoops
-from app.slam.loops.types import Reject, Verdict
+from app.slam.loops.types import Verdict
 from app.slam.params import Params
 
 path = Path(sys.argv[1])

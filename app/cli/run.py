@@ -12,7 +12,7 @@ from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
     from app.mapping.session import Session
-    from app.slam.loops.types import LoopEdit
+    from app.slam.loops.edits import LoopEdit
 
 
 @with_params

@@ -19,10 +19,10 @@ from app.slam.engine import Engine
 from app.slam.errors import HemislamError
 from app.slam.frames import Frame
 from app.slam.log import Log
+from app.slam.loops.edits import Edits, LoopEdit
 from app.slam.loops.keyframe_log import KeyframeLog
 from app.slam.loops.messages import LoopClient
 from app.slam.loops.schedule import LoopSchedule
-from app.slam.loops.types import Edits, LoopEdit
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params, leaves
 from app.slam.results import EXPORTS, Results, save_results

@@ -29,7 +29,7 @@ from app.mapping.labels import LabelEdit
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import edit_files
-from app.slam.loops.types import LoopEdit
+from app.slam.loops.edits import LoopEdit
 from app.slam.params import Params
 
 log = logging.getLogger(__name__)

@@ -27,7 +27,7 @@ from app.server.folders import Folders
 from app.server.protocol import Command
 from app.server.views import LoopsState, StateView, loops_state, state_view
 from app.server.worker import RunningEngine
-from app.slam.loops.types import Accept, Add, LoopEdit, Reject, SetWeight, Solve
+from app.slam.loops.edits import Accept, Add, LoopEdit, Reject, SetWeight, Solve
 from app.slam.params import Params
 from app.slam.results import EXPORTS
 from app.slam.trajectory import truth_beside

@@ -18,7 +18,7 @@ from app.server.player import Player
 from app.server.protocol import Command
 from app.server.publisher import Publisher, opened_recording
 from app.slam.errors import HemislamError
-from app.slam.loops.types import Edits
+from app.slam.loops.edits import Edits
 from app.slam.params import Params
 
 log = logging.getLogger(__name__)

@@ -5,9 +5,10 @@ from dataclasses import replace
 from app.mapping.session import Session
 from app.server.protocol import EditLoop, InspectLoop, LoopCommand, LoopsView, RedoLoop, TryLoop, UndoLoop
 from app.server.publisher import Publisher
+from app.slam.loops.edits import Edits
 from app.slam.loops.messages import Answered, ApplyEdit, AskResiduals, Failure, Inspect, LoopState, TryOut
 from app.slam.loops.schedule import LoopSchedule
-from app.slam.loops.types import Edits, LoopDetail, Preview
+from app.slam.loops.types import LoopDetail, Preview
 
 
 class LoopCommands:

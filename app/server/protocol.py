@@ -16,6 +16,7 @@ from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
 from app.slam.frames import READOUTS, Frame
 from app.slam.loops import types as loops
+from app.slam.loops.edits import LoopEdit
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.types import F32, F64, I64, U8, U16, StepResult
@@ -126,7 +127,7 @@ class LoopCommand(Command, frozen=True):
 class EditLoop(LoopCommand, frozen=True):
     """Accept, reject, add or weigh a loop."""
 
-    command: loops.LoopEdit
+    command: LoopEdit
 
 
 class UndoLoop(LoopCommand, frozen=True):
@@ -140,7 +141,7 @@ class RedoLoop(LoopCommand, frozen=True):
 class TryLoop(LoopCommand, frozen=True):
     """Show in `LoopsView.tried` what an edit would make of the graph, without applying it; None: show nothing."""
 
-    command: loops.LoopEdit | None
+    command: LoopEdit | None
 
 
 class InspectLoop(LoopCommand, frozen=True):
@@ -238,10 +239,10 @@ class LoopsView:
 
     edges: tuple[loops.LoopEdge, ...] = ()
     residuals: tuple[loops.FactorResidual, ...] = ()
-    undo: tuple[loops.LoopEdit, ...] = ()
-    redo: tuple[loops.LoopEdit, ...] = ()
+    undo: tuple[LoopEdit, ...] = ()
+    redo: tuple[LoopEdit, ...] = ()
     inspected: tuple[loops.Pair, loops.LoopDetail] | None = None
-    tried: tuple[loops.LoopEdit, loops.Preview] | None = None
+    tried: tuple[LoopEdit, loops.Preview] | None = None
 
 
 SERIES = ("stamp_s", "distance", "error_m", *READOUTS)

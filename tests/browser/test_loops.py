@@ -8,7 +8,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from app.server.protocol import EditLoop, InspectLoop, RedoLoop, TryLoop, UndoLoop
-from app.slam.loops.types import Reject
+from app.slam.loops.edits import Reject
 from tests.browser.conftest import Bench, opened
 from tests.ui.fake_loops import LoopEngine
 

@@ -15,9 +15,10 @@ from app.child import Child, ChildDied, Link
 from app.mapping.loops import MOST_DEATHS, MOST_PENDING, LoopProcess
 from app.slam import lie
 from app.slam.keyframes import KeyframeStore
+from app.slam.loops.edits import Accept, Add, Edits, LoopEdit, Reject, rows
 from app.slam.loops.messages import Added, AddKeyframe, ApplyEdit, Ask, Failure, LoopState, Request, Target
 from app.slam.loops.service import LoopService
-from app.slam.loops.types import Accept, Add, Edits, LoopEdit, Reject, difference, rows
+from app.slam.loops.types import difference
 from app.slam.sections import LoopsParams
 from app.slam.types import NON_GROUND, Cloud, Keyframe
 from tests.slam.loops.held_session import EVERY, HeldSession, a_keyframe, shift_at

@@ -20,7 +20,8 @@ from app.server.controller import Controller
 from app.server.fold import Fold
 from app.server.protocol import Command, EditLoop, Play, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
 from app.server.publisher import Publisher
-from app.slam.loops.types import LoopEdge, Reject, Verdict
+from app.slam.loops.edits import Reject
+from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.params import Params
 
 SAMPLE = next((Path(__file__).resolve().parents[2] / "sample_data").glob("*.mcap"))

@@ -12,7 +12,8 @@ from app.server.fork import Workspace
 from app.server.protocol import EditLoop, Play, Seek, Snapshot, UndoLoop
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
-from app.slam.loops.types import Pair, SetWeight, Verdict
+from app.slam.loops.edits import SetWeight
+from app.slam.loops.types import Pair, Verdict
 
 BEFORE, LAST = 490, 498
 

@@ -31,7 +31,8 @@ from app.server.protocol import (
     UndoLoop,
 )
 from app.slam.loops import edit_files
-from app.slam.loops.types import Accept, LoopEdge, Reject, SetWeight, Verdict
+from app.slam.loops.edits import Accept, Reject, SetWeight
+from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.results import EXPORTS
 
 FILES = ("trajectory.tum", *(export.name for export in EXPORTS if export.of_loops))

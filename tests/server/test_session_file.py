@@ -48,7 +48,7 @@ from app.server.protocol import (
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
-from app.slam.loops.types import Accept, Add, Reject
+from app.slam.loops.edits import Accept, Add, Reject
 from app.slam.params import Params
 
 LENGTH_S = 8.0

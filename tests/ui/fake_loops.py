@@ -25,18 +25,8 @@ from app.server.protocol import (
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops import scan_context
-from app.slam.loops import types as loops
-from app.slam.loops.types import (
-    Accept,
-    Add,
-    Evidence,
-    FactorResidual,
-    LoopDetail,
-    LoopEdge,
-    Origin,
-    Pair,
-    Verdict,
-)
+from app.slam.loops.edits import Accept, Add, LoopEdit, SetWeight, Solve
+from app.slam.loops.types import Evidence, FactorResidual, LoopDetail, LoopEdge, Origin, Pair, Preview, Verdict
 from tests.ui.fake_engine import START_NS, FakeEngine
 
 LAP = 76
@@ -130,8 +120,8 @@ class LoopEngine(FakeEngine):
     def __init__(self) -> None:
         super().__init__(columns=30, frames=6 * KEYFRAMES, truth=False)
         self.truth, self.odometry, self._points, self._found, chunks = _world()
-        self._done: list[loops.LoopEdit] = []
-        self._undone: list[loops.LoopEdit] = []
+        self._done: list[LoopEdit] = []
+        self._undone: list[LoopEdit] = []
         frame = chunks[-1].frame
         self.publish(
             chunks=chunks,
@@ -188,7 +178,7 @@ class LoopEngine(FakeEngine):
                 assert tried is not None
                 self._check(tried)
                 done = [*self._done, tried]
-                preview = loops.Preview(self._poses(done), self._residuals(done))
+                preview = Preview(self._poses(done), self._residuals(done))
                 self.publish(loops=replace(view, tried=(tried, preview)))
             case InspectLoop(None):
                 self.publish(loops=replace(view, inspected=None))
@@ -198,7 +188,7 @@ class LoopEngine(FakeEngine):
             case _:
                 super()._obey(command)
 
-    def _check(self, command: loops.LoopEdit) -> None:
+    def _check(self, command: LoopEdit) -> None:
         pair = command.pair
         if pair and not isinstance(command, Add) and pair not in {edge.pair for edge in self._edges(self._done)}:
             raise HemislamError(f"There is no loop candidate of keyframes {pair[0]} and {pair[1]}.")
@@ -217,10 +207,10 @@ class LoopEngine(FakeEngine):
             ),
         )
 
-    def _edges(self, done: list[loops.LoopEdit]) -> tuple[LoopEdge, ...]:
+    def _edges(self, done: list[LoopEdit]) -> tuple[LoopEdge, ...]:
         edges = dict(self._found)
         for command in done:
-            if isinstance(command, loops.Solve):
+            if isinstance(command, Solve):
                 continue
             pair = command.older, command.newer
             if isinstance(command, Add):
@@ -228,7 +218,7 @@ class LoopEngine(FakeEngine):
                 if not command.register and command.guess is not None:
                     T = np.array(command.guess)
                 edges[pair] = LoopEdge(*pair, pair[1], *_measured(T), Verdict.ACCEPTED, "tied by hand", Origin.USER)
-            elif isinstance(command, loops.SetWeight):
+            elif isinstance(command, SetWeight):
                 edges[pair] = replace(edges[pair], weight=command.weight)
             else:
                 verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
@@ -236,16 +226,16 @@ class LoopEngine(FakeEngine):
                 edges[pair] = replace(edges[pair], verdict=verdict, edited=True, reason=reason)
         return tuple(edges[pair] for pair in sorted(edges))
 
-    def _poses(self, done: list[loops.LoopEdit]) -> np.ndarray:
+    def _poses(self, done: list[LoopEdit]) -> np.ndarray:
         """The more loops count, the nearer to the truth; nearer still solved at once."""
         counted = sum(edge.weight for edge in self._edges(done) if edge.verdict is Verdict.ACCEPTED)
-        counted += 5 * (loops.Solve() in done)
+        counted += 5 * (Solve() in done)
         share = counted / (counted + 1.5)
         poses = self.truth.copy()
         poses[:, :3, 3] += (1 - share) * (self.odometry[:, :3, 3] - self.truth[:, :3, 3])
         return poses
 
-    def _residuals(self, done: list[loops.LoopEdit]) -> tuple[FactorResidual, ...]:
+    def _residuals(self, done: list[LoopEdit]) -> tuple[FactorResidual, ...]:
         poses, out = self._poses(done), []
         for index in range(1, KEYFRAMES):
             bend = 0.01 * abs(np.sin(index))

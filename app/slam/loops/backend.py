@@ -16,26 +16,13 @@ from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.detection import Detector
 from app.slam.loops.drift import Drift
-from app.slam.loops.edits import check, in_words, lay_over
+from app.slam.loops.edits import Add, Edits, LoopEdit, Solve, check, in_words, lay_over, loses, rows
 from app.slam.loops.factors import Closing, Factor, PositionPrior, loop_factors, odometry_factor, residuals
 from app.slam.loops.messages import Target
 from app.slam.loops.pose_graph import PoseGraph
 from app.slam.loops.search import Found, search
 from app.slam.loops.solvers import g2o_text, optimise
-from app.slam.loops.types import (
-    Add,
-    Edits,
-    FactorResidual,
-    LoopDetail,
-    LoopEdge,
-    LoopEdit,
-    Pair,
-    Preview,
-    Solve,
-    Verdict,
-    loses,
-    rows,
-)
+from app.slam.loops.types import FactorResidual, LoopDetail, LoopEdge, Pair, Preview, Verdict
 from app.slam.loops.verdicts import by_hand, worth_correcting
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe

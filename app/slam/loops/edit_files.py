@@ -26,8 +26,8 @@ import yaml
 
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.edits import check
-from app.slam.loops.types import Accept, Add, LoopEdit, Pair, Reject, SetWeight, Solve, rows
+from app.slam.loops.edits import Accept, Add, LoopEdit, Reject, SetWeight, Solve, check, rows
+from app.slam.loops.types import Pair
 from app.slam.user_text import read_yaml
 
 _VERBS: Final[dict[str, Any]] = {

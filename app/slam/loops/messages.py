@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.types import Edits, FactorResidual, LoopDetail, LoopEdge, LoopEdit, Preview
+from app.slam.loops.edits import Edits, LoopEdit
+from app.slam.loops.types import FactorResidual, LoopDetail, LoopEdge, Preview
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe
 

@@ -15,6 +15,7 @@ import numpy as np
 from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
 from app.slam.log import Cursor
+from app.slam.loops.edits import Edits
 from app.slam.loops.files import LoopResults
 from app.slam.loops.keyframe_log import KeyframeEntry, KeyframeLog
 from app.slam.loops.messages import (
@@ -30,7 +31,7 @@ from app.slam.loops.messages import (
     Question,
     Target,
 )
-from app.slam.loops.types import Edits, LoopEdge, Verdict, difference
+from app.slam.loops.types import LoopEdge, Verdict, difference
 from app.slam.map_frame import MapFrame
 from app.slam.sections import LoopsParams
 from app.slam.types import Keyframe

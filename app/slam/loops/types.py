@@ -1,18 +1,17 @@
-"""Values of the loop back end: candidates with their verdicts, and the user's edits of them.
+"""Values of the loop back end: candidates with their verdicts.
 
 A loop is named by the two keyframes that it ties, `(older, newer)`. The name does not depend on what else is found,
 so a list of edits can be replayed.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from app.slam.arrays import F32, F64
-from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 
 LOOP_HUBER = 1.345
@@ -120,15 +119,12 @@ class LoopEdge:
         return self.verdict is Verdict.ACCEPTED and self.represented_by is None
 
     def same(self, other: "LoopEdge") -> bool:
-        """Whether everything is the same."""
-        return self is other or (
-            (self.pair, self.decided_at, self.verdict, self.reason, self.origin, self.edited, self.weight)
-            == (other.pair, other.decided_at, other.verdict, other.reason, other.origin, other.edited, other.weight)
-            and (self.represented_by, self.repeats) == (other.represented_by, other.repeats)
-            and repr(self.evidence) == repr(other.evidence)  # nan is then equal to nan
-            and np.array_equal(self.T_older_newer, other.T_older_newer)
-            and np.array_equal(self.covariance, other.covariance)
-        )
+        """Whether everything is the same, to the last bit."""
+        return self is other or self._values() == other._values()
+
+    def _values(self) -> list[bytes | str]:
+        values = (getattr(self, field.name) for field in fields(self))
+        return [value.tobytes() if isinstance(value, np.ndarray) else repr(value) for value in values]
 
 
 class LoopChange(NamedTuple):
@@ -151,105 +147,6 @@ def changed_by(change: LoopChange, before: Iterable[LoopEdge]) -> tuple[LoopEdge
     for pair in change.gone:
         del edges[pair]
     return tuple(edges[pair] for pair in sorted(edges))
-
-
-# --- the user's edits ----------------------------------------------------------------------------
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Edit:
-    """Attributes:
-    since: how many keyframes the session had when the edit was made, one more after its end. When a session is
-        repeated, the edit acts from there on; 0: from the start.
-    """
-
-    since: int = field(default=0, compare=False)
-
-    @property
-    def pair(self) -> Pair | None:
-        """The loop that it edits; None: the graph as a whole."""
-        return None
-
-
-@dataclass(frozen=True, slots=True)
-class _PairEdit(_Edit):
-    older: KeyframeId
-    newer: KeyframeId
-
-    @property
-    def pair(self) -> Pair:
-        return self.older, self.newer
-
-
-@dataclass(frozen=True, slots=True)
-class Accept(_PairEdit):
-    """Make a candidate a factor of the graph, whatever its verdict."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reject(_PairEdit):
-    """Take a loop out of the graph."""
-
-
-@dataclass(frozen=True, slots=True)
-class SetWeight(_PairEdit):
-    """Divide a loop's covariance by `weight` (> 0); 1 leaves it as registered."""
-
-    weight: float
-
-
-@dataclass(frozen=True, slots=True)
-class Add(_PairEdit):
-    """Tie two keyframes together by hand.
-
-    Attributes:
-        guess: (4, 4) T_older_newer of the IMU frames from which their submaps are registered;
-            None: as the graph has them now. Rows of numbers, so that edits can be compared.
-        register: False takes the guess as it is.
-    """
-
-    guess: tuple[tuple[float, ...], ...] | None = None
-    register: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class Solve(_Edit):
-    """From here on, take the poses from all factors solved at once (Levenberg-Marquardt).
-
-    They differ from the incremental ones where those only came near the optimum, and with a window.
-    """
-
-
-LoopEdit = Accept | Reject | SetWeight | Add | Solve
-
-
-@dataclass(frozen=True, slots=True)
-class Edits:
-    """The user's edits in force, in order, and those undone, of which the last is the next to redo."""
-
-    done: tuple[LoopEdit, ...] = ()
-    undone: tuple[LoopEdit, ...] = ()
-
-    def undo(self) -> "Edits":
-        """Raises HemislamError if there is nothing to undo."""
-        if not self.done:
-            raise HemislamError("There is no edit to undo.")
-        return Edits(self.done[:-1], (*self.undone, self.done[-1]))
-
-    def redo(self) -> "Edits":
-        """Raises HemislamError if there is nothing to redo."""
-        if not self.undone:
-            raise HemislamError("There is no edit to redo.")
-        return Edits((*self.done, self.undone[-1]), self.undone[:-1])
-
-    def cut(self, count: int, half: int) -> "Edits":
-        """The same after all keyframes but the first `count` were forgotten: edits go on acting.
-
-        Those that lost a keyframe (see `loses`) wait for another one.
-        """
-
-        def kept(edit: LoopEdit) -> LoopEdit:
-            return replace(edit, since=0 if loses(edit, count, half) else min(edit.since, count))
-
-        return Edits(tuple(map(kept, self.done)), tuple(map(kept, self.undone)))
 
 
 # --- what the inspector and the files show -------------------------------------------------------
@@ -307,13 +204,3 @@ class LoopDetail:
     newer_context: F32
     shift_distances: F64
     residuals: F64
-
-
-def rows(T: F64) -> tuple[tuple[float, ...], ...]:
-    """A matrix as an edit holds it."""
-    return tuple(tuple(float(value) for value in row) for row in np.asarray(T))
-
-
-def loses(edit: LoopEdit, count: int, half: int) -> bool:
-    """Whether an edit's submaps, of `half` keyframes on either side, reach beyond the first `count` keyframes."""
-    return edit.pair is not None and edit.pair[1] + half >= count

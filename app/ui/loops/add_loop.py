@@ -10,7 +10,8 @@ import viser
 from app.server.protocol import Chunk, Snapshot
 from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.types import Add, Pair, rows
+from app.slam.loops.edits import Add, rows
+from app.slam.loops.types import Pair
 from app.slam.types import F32, F64
 from app.ui.chunks import shown_points
 from app.ui.geometry import wxyz

@@ -9,7 +9,8 @@ import viser
 from app.server.protocol import EditLoop, RedoLoop, Snapshot, TryLoop, UndoLoop
 from app.slam.errors import HemislamError
 from app.slam.loops import edit_files
-from app.slam.loops.types import Accept, LoopEdge, LoopEdit, Pair, Reject, SetWeight, Verdict
+from app.slam.loops.edits import Accept, LoopEdit, Reject, SetWeight
+from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.html import panel

@@ -9,7 +9,8 @@ import numpy as np
 import viser
 
 from app.server.protocol import InspectLoop, Seek, Snapshot
-from app.slam.loops.types import LoopEdge, LoopEdit, Pair, SetWeight, Solve
+from app.slam.loops.edits import LoopEdit, SetWeight, Solve
+from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F64
 from app.ui.html import panel
 from app.ui.loops.add_loop import AddLoopPanel

@@ -6,19 +6,8 @@ from typing import Any, Final
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops.types import (
-    Accept,
-    Add,
-    FactorResidual,
-    LoopEdge,
-    LoopEdit,
-    Origin,
-    Pair,
-    Preview,
-    SetWeight,
-    Solve,
-    Verdict,
-)
+from app.slam.loops.edits import Accept, Add, LoopEdit, SetWeight, Solve
+from app.slam.loops.types import FactorResidual, LoopEdge, Origin, Pair, Preview, Verdict
 from app.slam.sections import LoopsParams
 from app.slam.types import F64
 from app.ui.colours import Rgb

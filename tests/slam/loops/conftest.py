@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from app.slam.loops.backend import LoopBackend
-from app.slam.loops.types import Edits, LoopEdge, LoopEdit, Verdict
+from app.slam.loops.edits import Edits, LoopEdit
+from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe
 from tests.slam.loops.walks import Walk, drive, take

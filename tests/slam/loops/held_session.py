@@ -7,10 +7,11 @@ import numpy as np
 from app.child import ChildDied
 from app.mapping.loops import RestartingLoops
 from app.slam.keyframes import KeyframeStore
+from app.slam.loops.edits import Edits
 from app.slam.loops.keyframe_log import KeyframeLog
 from app.slam.loops.messages import Added, AddKeyframe, Answered, ApplyEdit, AskG2o, LoopState, Reply, Request
 from app.slam.loops.schedule import LoopSchedule
-from app.slam.loops.types import Edits, Evidence, LoopEdge, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Verdict
 from app.slam.sections import LoopsParams
 from app.slam.types import Cloud, Keyframe
 

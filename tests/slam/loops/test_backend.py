@@ -15,9 +15,10 @@ import pytest
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.backend import LoopBackend
+from app.slam.loops.edits import Add, Edits, Solve, rows
 from app.slam.loops.factors import PositionPrior
 from app.slam.loops.files import loops_csv
-from app.slam.loops.types import Add, Edits, Origin, Solve, Verdict, rows
+from app.slam.loops.types import Origin, Verdict
 from app.slam.metrics import umeyama
 from app.slam.sections import LoopsParams
 from app.slam.types import F64

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.edit_files import read, write
-from app.slam.loops.types import Accept, Add, LoopEdit, Reject, SetWeight, Solve, rows
+from app.slam.loops.edits import Accept, Add, LoopEdit, Reject, SetWeight, Solve, rows
 
 
 @st.composite

@@ -8,20 +8,9 @@ from hypothesis import strategies as st
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops.backend import LoopBackend
+from app.slam.loops.edits import Accept, Add, Edits, LoopEdit, Reject, SetWeight, Solve, rows
 from app.slam.loops.factors import residuals
-from app.slam.loops.types import (
-    Accept,
-    Add,
-    Edits,
-    FactorResidual,
-    LoopEdit,
-    Origin,
-    Reject,
-    SetWeight,
-    Solve,
-    Verdict,
-    rows,
-)
+from app.slam.loops.types import FactorResidual, Origin, Verdict
 from app.slam.types import F64
 from tests.slam.loops.conftest import PARAMS, Walked, accepted, applied, same
 from tests.slam.loops.walks import drive, error

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from app.slam.loops.edits import Accept, Edits
 from app.slam.loops.messages import ApplyEdit, Failure
-from app.slam.loops.types import Accept, Edits
 from tests.slam.loops.held_session import LATENCY, HeldSession, shift_at
 
 

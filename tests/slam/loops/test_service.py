@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from app.slam.keyframes import KeyframeStore
+from app.slam.loops.edits import Accept, Add, Edits, Reject, Solve
 from app.slam.loops.keyframe_log import KeyframeEntry, KeyframeLog
 from app.slam.loops.messages import (
     Added,
@@ -24,7 +25,7 @@ from app.slam.loops.messages import (
     TryOut,
 )
 from app.slam.loops.service import InlineLoops, LoopService
-from app.slam.loops.types import Accept, Add, Edits, LoopDetail, Preview, Reject, Solve, Verdict, difference
+from app.slam.loops.types import LoopDetail, Preview, Verdict, difference
 from tests.slam.loops.conftest import PARAMS, Walked, same
 
 ALL = 10_000

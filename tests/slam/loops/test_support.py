@@ -8,11 +8,11 @@ import pytest
 
 from app.slam import lie
 from app.slam.loops.backend import LoopBackend
-from app.slam.loops.edits import lay_over
+from app.slam.loops.edits import Add, Reject, SetWeight, lay_over
 from app.slam.loops.factors import Factor, loop_factors
 from app.slam.loops.solvers import optimise
 from app.slam.loops.support import laid, placed
-from app.slam.loops.types import Add, Evidence, LoopEdge, Origin, Reject, SetWeight, Verdict
+from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.loops.verdicts import FLOOR_M, FLOOR_RAD
 from app.slam.types import F64
 from tests.slam.loops.conftest import Walked, accepted

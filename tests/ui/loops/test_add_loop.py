@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from app.server.protocol import InspectLoop, TryLoop
 from app.slam import lie
-from app.slam.loops.types import Add
+from app.slam.loops.edits import Add
 from tests.ui.conftest import user_clicks
 from tests.ui.fake_loops import KEYFRAMES
 from tests.ui.loops.conftest import Page

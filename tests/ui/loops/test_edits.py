@@ -7,7 +7,8 @@ import numpy as np
 
 from app.server.protocol import EditLoop, RedoLoop, TryLoop, UndoLoop
 from app.slam.loops import edit_files
-from app.slam.loops.types import Accept, Add, Reject, SetWeight, Verdict
+from app.slam.loops.edits import Accept, Add, Reject, SetWeight
+from app.slam.loops.types import Verdict
 from tests.ui.conftest import user_clicks, user_sets
 from tests.ui.loops.conftest import GOOD, WAITING, Page, rejected
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from app.server.protocol import EditLoop, TryLoop, UndoLoop
-from app.slam.loops.types import LOOP_HUBER, Accept, FactorResidual, Preview, Solve
+from app.slam.loops.edits import Accept, Solve
+from app.slam.loops.types import LOOP_HUBER, FactorResidual, Preview
 from app.ui.loops.words import forecast
 from tests.ui.conftest import user_clicks
 from tests.ui.fake_loops import KEYFRAMES
