@@ -17,16 +17,16 @@ on it acts; by default it acts from the start.
 """
 
 import re
-from collections.abc import Callable, Iterable
-from dataclasses import MISSING, fields
-from typing import Any, Final
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Final
 
-import numpy as np
 import yaml
+from pydantic import Field, Strict, TypeAdapter, ValidationError
 
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.edits import Accept, Add, LoopEdit, Reject, SetWeight, Solve, check, rows
+from app.slam.loops.edits import Accept, Add, LoopEdit, Reject, SetWeight, Solve, check
 from app.slam.loops.types import Pair
 from app.slam.user_text import read_yaml
 
@@ -34,6 +34,23 @@ _VERBS: Final[dict[str, Any]] = {
     "accept": Accept, "reject": Reject, "weigh": SetWeight, "add": Add, "solve": Solve
 }  # fmt: skip
 _AT_ONCE: Final = "at once"
+
+
+@dataclass
+class _Values:
+    since: Annotated[int, Strict(), Field(ge=0)] = 0
+    weight: Annotated[float, Strict()] = 1.0
+    register: Annotated[bool, Strict()] = True
+    guess: tuple[tuple[float, ...], ...] | None = None
+
+
+_VALUES: Final = TypeAdapter(_Values)
+_MUST_BE: Final = {
+    "since": "a number of keyframes",
+    "weight": "a number greater than 0",
+    "register": "true or false",
+    "guess": "a 4x4 matrix of numbers",
+}
 _EXAMPLE: Final = "write entries such as `- accept: [12, 340]`"
 _HEAD: Final = "# Edits of loops, in their order: hemislam run RECORDING --loops THIS_FILE\n"
 
@@ -75,10 +92,11 @@ def edits_of(entries: object, source: str = "the list of edits") -> tuple[LoopEd
 def _entry(edit: LoopEdit) -> dict[str, Any]:
     verb = next(verb for verb, kind in _VERBS.items() if isinstance(edit, kind))
     pair = [int(one) if one < KeyframeId(1, 0) else str(one) for one in edit.pair or ()]
-    entry = {verb: pair or _AT_ONCE} | {name: getattr(edit, name) for name in _fields(type(edit))}
-    if guess := entry.pop("guess", None):
-        entry["guess"] = [list(row) for row in guess]
-    return entry if entry.pop("since") == 0 else entry | {"since": edit.since}
+    values = {name: getattr(edit, name) for name in _names(type(edit))}
+    if guess := values.pop("guess", None):
+        values["guess"] = [list(row) for row in guess]
+    since = {"since": since} if (since := values.pop("since")) else {}
+    return {verb: pair or _AT_ONCE} | values | since
 
 
 def _edit(entry: object) -> LoopEdit:
@@ -89,22 +107,27 @@ def _edit(entry: object) -> LoopEdit:
             f" {_AT_ONCE}`."
         )
     (verb,) = verbs
-    defaults = _fields(_VERBS[verb])
-    if unknown := sorted(str(name) for name in entry.keys() - {verb, *defaults}):
-        known = " and ".join(name for name in defaults if name != "since") or "nothing else"
-        raise HemislamError(f"{verb} has no {unknown[0]}; it takes {known}.")
-    values = {name: _READ[name](entry.get(name, default)) for name, default in defaults.items()}
+    known = [name for name in _names(_VERBS[verb]) if name != "since"]
+    if unknown := sorted(str(name) for name in entry.keys() - {verb, "since", *known}):
+        raise HemislamError(f"{verb} has no {unknown[0]}; it takes {' and '.join(known) or 'nothing else'}.")
+    given = ({"weight": None} if verb == "weigh" else {}) | {name: entry[name] for name in entry if name != verb}
+    try:
+        read = _VALUES.validate_python(given)
+    except ValidationError as error:
+        name = str(error.errors()[0]["loc"][0])
+        raise HemislamError(f"{name} is {given[name]!r}; it must be {_MUST_BE[name]}.") from None
     if verb == "solve" and entry[verb] != _AT_ONCE:
         raise HemislamError(f"solve is {entry[verb]!r}; it can only be `{_AT_ONCE}`.")
-    edit: LoopEdit = _VERBS[verb](*(() if verb == "solve" else _pair(verb, entry[verb])), **values)
+    edit: LoopEdit = _VERBS[verb](
+        *(() if verb == "solve" else _pair(verb, entry[verb])), **{name: getattr(read, name) for name in given}
+    )
     check(edit)
     return edit
 
 
-def _fields(kind: type[LoopEdit]) -> dict[str, Any]:
-    """What an entry may hold beside its verb, with the values that it has without."""
-    own = [field for field in fields(kind) if field.name not in ("older", "newer", "since")]
-    return {field.name: None if field.default is MISSING else field.default for field in own} | {"since": 0}
+def _names(kind: type[LoopEdit]) -> list[str]:
+    """What an entry may hold beside its verb."""
+    return [field.name for field in fields(kind) if field.name not in ("older", "newer")]
 
 
 def _pair(verb: str, value: object) -> Pair:
@@ -113,36 +136,3 @@ def _pair(verb: str, value: object) -> Pair:
     if len(names) != 2 or len(pair) != 2 or pair[0] >= pair[1]:
         raise HemislamError(f"{verb} is {value!r}; it takes two keyframes, the older one first: [12, 340].")
     return pair[0], pair[1]
-
-
-def _since(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise HemislamError(f"since is {value!r}; it must be a number of keyframes.")
-    return int(value)
-
-
-def _weight(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise HemislamError(f"weight is {value!r}; it must be a number greater than 0.")
-    return float(value)
-
-
-def _register(value: object) -> bool:
-    if not isinstance(value, bool):
-        raise HemislamError(f"register is {value!r}; it must be true or false.")
-    return value
-
-
-def _guess(value: object) -> tuple[tuple[float, ...], ...] | None:
-    if value is None:
-        return None
-    try:
-        T = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        T = np.empty(0)
-    return rows(T) if T.ndim == 2 else ()  # what is no matrix is refused by `check`
-
-
-_READ: Final[dict[str, Callable[[Any], Any]]] = {
-    "since": _since, "weight": _weight, "register": _register, "guess": _guess
-}  # fmt: skip
