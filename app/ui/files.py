@@ -69,7 +69,9 @@ class RecentPanel:
             ]
         before = self._sessions
         early = snapshot.transport.frame < _EARLY and snapshot.live is None and snapshot.progress is None
-        offers = [(f"Restore last session: {session_text(before[0][1])}", before[0][0])] if early and before else []
+        offers = [("Restore last session", before[0][0])] if early and before else []
+        if offers:
+            self._buttons[0].hint = session_text(before[0][1])
         if early and recording is None:
             recent = dict.fromkeys(saved.opened.recording for _, saved in before)
             offers += [(f"Open {path.name}", path) for path in list(recent)[:_RECENT]]
