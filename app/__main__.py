@@ -1,5 +1,6 @@
 """The command line: the only place that wires the rooms together. It imports them when they are needed."""
 
+import contextlib
 import io
 import sys
 from pathlib import Path
@@ -16,6 +17,10 @@ from app.cli.replay import replay
 from app.cli.run import run
 from app.cli.serve import serve
 from app.slam.errors import HemislamError
+
+
+LEAST_MEMORY = 900 << 20
+"""Bytes of addresses that numba, its threads and a walk take."""
 
 
 class _Commands(TyperGroup):
@@ -237,8 +242,24 @@ def params(
     typer.echo(options.resolve(None, preset, config, assignments).to_yaml(), nl=False)
 
 
+def _require_memory() -> None:
+    """Libraries end the process without a word where the account's limit of memory is too small for their threads."""
+    with contextlib.suppress(ImportError):  # Windows has no such limits
+        import resource
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+        if limit != resource.RLIM_INFINITY and limit < LEAST_MEMORY:
+            typer.echo(
+                f"hemislam: This account may use {limit >> 20} MB of memory, and {LEAST_MEMORY >> 20} MB are needed at "
+                "least; raise the limit (ulimit -v).",
+                err=True,
+            )
+            sys.exit(2)
+
+
 def main() -> None:
     """The console script."""
+    _require_memory()
     if TEMPORARY_KERNEL_CACHE:
         typer.echo(
             f"hemislam: Compiled kernels are kept in {TEMPORARY_KERNEL_CACHE}, since neither the program's folder nor a"
