@@ -18,7 +18,6 @@ from app.cli.run import run
 from app.cli.serve import serve
 from app.slam.errors import HemislamError
 
-
 LEAST_MEMORY = 900 << 20
 """Bytes of addresses that numba, its threads and a walk take."""
 

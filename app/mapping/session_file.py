@@ -21,7 +21,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import IO, Annotated, Any
 
-from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator, TypeAdapter, WithJsonSchema
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    TypeAdapter,
+    ValidationError,
+    WithJsonSchema,
+)
 
 from app import __version__
 from app.mapping.breakpoints import Breakpoints
@@ -153,7 +161,7 @@ class SessionWriter:
             return
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("x", encoding="utf-8")
+            self._file = path.open("x", encoding="utf-8", errors="backslashreplace")  # a path may be no UTF-8
         except OSError as error:
             self._failed(error)
         self._line(_head(opened))
@@ -203,7 +211,7 @@ def write_session(path: Path, session: SavedSession) -> None:
     lines = [json.dumps(entry, ensure_ascii=False) + "\n" for entry in entries]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("".join(lines), encoding="utf-8")
+        path.write_text("".join(lines), encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise HemislamError(f"The session cannot be written to {path}: {error.strerror}.") from error
 
@@ -237,11 +245,19 @@ def read_session(path: Path) -> SavedSession:
         state = _STATE.validate_python(states[-1]["state"]) if states else State(Params())
         places = [entry for entry in entries if "frame" in entry and "did" not in entry]
         frame, ended = (int(places[-1]["frame"]), bool(places[-1].get("ended"))) if places else (-1, False)
-    except (KeyError, TypeError, ValueError, zlib.error) as error:
-        raise HemislamError(f"The session {path} is damaged ({error!r}); an older copy may be whole.") from None
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError, zlib.error) as error:
+        why = repr(error)
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise HemislamError(f"The session {path} is damaged ({why[:200]}); an older copy may be whole.") from None
     if not states:
         raise HemislamError(f"The session {path} ends before its first frame; open its recording {opened.recording}.")
-    if size_of(opened.recording) != opened.nbytes:
+    try:
+        same = size_of(opened.recording) == opened.nbytes
+    except OSError as error:
+        raise HemislamError(f"The session {path} names {opened.recording}: {error.strerror}.") from None
+    if not same:
         gone = "is a different file now" if opened.recording.exists() else "is gone"
         raise HemislamError(f"The recording {opened.recording} of the session {path} {gone}; put it back there.")
     return SavedSession(opened, state, frame, ended)

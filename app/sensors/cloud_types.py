@@ -12,7 +12,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from app.sensors.ros import printable, stamp_ns
+from app.sensors.ros import stamp_ns
+from app.slam.errors import printable
 from app.slam.types import F32, U8
 
 Column = npt.NDArray[Any]
@@ -136,6 +137,7 @@ def _in_true_byte_order(cloud: CloudMessage) -> CloudMessage:
     return other if _share_of_lengths(other) > 0.9 else cloud
 
 
+@np.errstate(invalid="ignore")
 def _share_of_lengths(cloud: CloudMessage) -> float:
     """Share of some numbers among the coordinates that are lengths in m; 1 if there are none."""
     xyz = np.stack([cloud.column(name)[:: max(len(cloud) // 300, 1)] for name in "xyz"]).astype(np.float64)

@@ -14,7 +14,7 @@ from app.sensors.clocks import clock_finding
 from app.sensors.findings import Finding as Finding
 from app.sensors.findings import Verdict
 from app.sensors.recording import ImuEntry, Recording, ScanEntry, open_recording
-from app.sensors.sequencer import Counts, Sequencer
+from app.sensors.sequencer import STUCK_SAMPLES, Counts, Sequencer
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.sections import ImuParams
@@ -151,6 +151,9 @@ def _imu_time(counts: Counts) -> Finding:
 def _imu_values(counts: Counts, samples: int, limits: ImuParams) -> Finding:
     bounds = f"{limits.max_acceleration:g} m/s² or {limits.max_rate:g} rad/s"
     wrong = _listed((counts.imu_out_of_range, f"beyond {bounds}"), (counts.imu_spikes, "single spikes"))
+    if counts.imu_stuck:
+        text = f"an axis reads the same number for {STUCK_SAMPLES} samples or more; check the IMU's driver"
+        return Finding("IMU values", "needs you", text)
     if not wrong:
         return Finding("IMU values", "fine", f"none beyond {bounds}, no spikes")
     verdict: Verdict = "corrected" if counts.imu_out_of_range + counts.imu_spikes < 0.01 * samples else "needs you"

@@ -19,9 +19,13 @@ from app.slam.sections import RecordingParams
 from app.slam.types import F64, I64
 
 STANDARD_GRAVITY = 9.80665
+ABSURD = 1e6
+"""No IMU reads as much, in any unit."""
 ACCELERATION_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000}
 GYROSCOPE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
 
+MOST_ACCEL = 200.0
+"""m/s^2; what is more is no walk."""
 WINDOW_S, STRIDE_S, SPAN_S, STEPS = 0.5, 0.25, 1.0, 50
 """Accelerations are averaged over a window, about a step of walking, and compared with those one span later."""
 CLEARLY, LEAST_ERROR = 0.5, 0.3
@@ -87,7 +91,8 @@ def settle_imu(probe: ImuProbe, chosen: RecordingParams) -> tuple[ImuUnits, list
     accel_unit, findings = _acceleration_unit(norm, chosen.acceleration_unit)
     accel = _reordered(probe.accel, accel_axes) * accel_unit
     gyro = _reordered(probe.gyro, gyro_axes)
-    sway = Sway.of(probe.stamps_ns, gyro, accel)
+    possible = (np.abs(accel) < MOST_ACCEL).all(axis=1)
+    sway = Sway.of(probe.stamps_ns[possible], gyro[possible], accel[possible])
     gyro_unit, more = _gyroscope_unit(gyro, sway, chosen.gyroscope_unit)
     findings += [*more, *_stuck(probe)]
     if sway is not None and not any(finding.verdict == "needs you" for finding in findings):
@@ -239,7 +244,7 @@ def gravity_findings(probe: ImuProbe, units: ImuUnits, params: Params) -> list[F
     """The direction of down in the LiDAR frame, by the IMU's first samples, and whether the mount was given."""
     first = probe.stamps_ns - probe.stamps_ns[0] <= params.imu.start_duration * 1e9
     accel, gyro = _reordered(probe.accel[first], units.accel), _reordered(probe.gyro[first], units.gyro)
-    specific = accel.mean(axis=0)
+    specific = np.median(accel, axis=0)
     norm = float(np.linalg.norm(specific))
     findings = []
     if norm > 1.0:

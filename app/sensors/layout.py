@@ -21,6 +21,7 @@ from app.slam.sections import RecordingParams
 from app.slam.types import F32, U16
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # odd numbers are left out, or a finding
 def settle_cloud(
     probes: list[Probe], chosen: RecordingParams, where: str, kind: CloudType = POINT_CLOUD_2
 ) -> tuple[CloudLayout, list[Finding]]:

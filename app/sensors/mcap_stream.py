@@ -10,8 +10,9 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from app.sensors.ros import ENCODINGS, Deserialiser, printable, ros2_type
+from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type
 from app.sensors.unpacking import LIMIT, UNPACK, TooLarge
+from app.slam.errors import printable
 
 
 class McapStream:

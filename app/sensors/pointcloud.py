@@ -36,6 +36,7 @@ class CloudLayout:
     stamped: bool = True
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what comes of odd numbers is left out
 def read_scan(message: Any, log_ns: int, layout: CloudLayout) -> tuple[CloudMessage | None, Scan | DroppedScan]:
     """A deserialised message: its content (None if malformed), and the scan, or why there is none."""
     cloud = None

@@ -7,7 +7,7 @@ import numpy as np
 
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, Probe, stamped
 from app.sensors.findings import Finding
-from app.sensors.imu_units import ImuProbe
+from app.sensors.imu_units import ABSURD, ImuProbe
 from app.sensors.ros import IMU, stamp_ns
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
@@ -112,10 +112,11 @@ def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProb
             break
     has_stamps = len(set(stamps)) > 1
     rows = np.array(values, np.float64).reshape(-1, 6)
-    good = np.isfinite(rows).all(axis=1)
+    good = (np.abs(rows) < ABSURD).all(axis=1)
     if not good.any():
         raise HemislamError(
-            f"The first {len(rows)} IMU samples on {topic} in {source.path} are all NaN; check the IMU's driver."
+            f"The first {len(rows)} IMU samples on {topic} in {source.path} are all NaN or absurd; "
+            "check the IMU's driver."
         )
     times = np.array(stamps if has_stamps else logs, np.int64) + round(time_offset_s * 1e9)
     probe = ImuProbe(np.array(logs, np.int64)[good], times[good], rows[good, :3], rows[good, 3:])

@@ -24,6 +24,8 @@ from app.slam.types import DroppedScan, Measurement, Scan
 
 LOG_MARGIN_NS = 2_000_000_000
 """How much later or earlier than usual a message may be logged and is still found by time."""
+SILENCE_S = 1.0
+"""Without a scan at the end, while the IMU goes on, is worth a word."""
 IMU_BEFORE_NS = 200_000_000
 """IMU samples given from before `start_s`."""
 
@@ -224,6 +226,8 @@ class Measurements(Iterator[Measurement | DroppedScan]):
                 damage = error
         self._ended = damage is None
         yield from sequencer.finish()
+        if stop_ns is None and damage is None and sequencer.silent_s > SILENCE_S:
+            yield DroppedScan(first_ns, "the LiDAR falls silent before the recording ends")
         if damage is not None:
             raise damage
         if not sequencer.counts.paired:

@@ -52,11 +52,6 @@ def ros2_type(name: str) -> str:
     return f"{package}/msg/{rest}" if slash and not rest.startswith("msg/") else name
 
 
-def printable(name: str) -> str:
-    """A name from a file, with characters that would drive a terminal shown as escapes."""
-    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in name)
-
-
 def stamp_ns(stamp: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 

@@ -30,6 +30,7 @@ MAX_HELD = 10_000
 GYRO, ACCEL = slice(0, 3), slice(3, 6)
 SPIKE_FLOOR = ((GYRO, 0.5), (ACCEL, 3.0))
 """rad/s, m/s^2: what differs less from its neighbours is never a spike."""
+STUCK_SAMPLES = 200
 SPIKE_TO_NEIGHBOURS, SPIKE_TO_USUAL = 4.0, 10.0
 """A spike is off the way between its neighbours by this many times their difference, and what is usual."""
 
@@ -43,6 +44,7 @@ class Counts:
     imu_invalid: int = 0
     imu_out_of_range: int = 0
     imu_spikes: int = 0
+    imu_stuck: int = 0
     imu_gaps: int = 0
     longest_imu_gap_s: float = 0.0
     paired: int = 0
@@ -74,6 +76,8 @@ class Sequencer:
     _usual: list[float] = field(default_factory=lambda: [0.0, 0.0])
     """How far samples usually are from the way between their neighbours: rad/s, m/s^2."""
     _begun: bool = False
+    _same: list[int] = field(default_factory=lambda: [0] * 6)
+    """For how many samples each axis has read the same number."""
 
     def copy(self) -> "Sequencer":
         """An independent copy in the same state. Scans and samples are shared: they never change."""
@@ -91,6 +95,7 @@ class Sequencer:
             _intervals_ns=self._intervals_ns.copy(),
             _usual=self._usual.copy(),
             _begun=self._begun,
+            _same=self._same.copy(),
         )
 
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector) -> None:
@@ -132,6 +137,7 @@ class Sequencer:
         if gap_s > self.limits.max_gap:
             self.counts.imu_gaps += 1
             self.counts.longest_imu_gap_s = max(self.counts.longest_imu_gap_s, gap_s)
+        self._note_stuck_axes(values)
         self._stamps.append(stamp_ns)
         self._values.append(values)
         if len(self._values) > 2:
@@ -139,6 +145,17 @@ class Sequencer:
             if not self._begun and len(self._values) > 2:  # the very first has neighbours on one side only
                 self._begun = True
                 self._check(-2, -3, -1)
+
+    def _note_stuck_axes(self, values: tuple[float, ...]) -> None:
+        """An axis with noise never reads the same number for long."""
+        if not self._values:
+            return
+        for axis, (last, value) in enumerate(zip(self._values[-1], values, strict=True)):
+            self._same[axis] = self._same[axis] + 1 if value == last else 0
+            if self._same[axis] == STUCK_SAMPLES:
+                self.counts.imu_stuck += 1
+                name = f"{'accelerometer' if axis > 2 else 'gyroscope'} {'xyz'[axis % 3]}"
+                self._notices.append(f"the {name} has read the same number for {STUCK_SAMPLES} samples: it is stuck")
 
     def _check(self, before: int, this: int, after: int) -> None:
         """Take out this sample if it differs from its neighbours as no motion does: for a single sample."""
@@ -167,6 +184,11 @@ class Sequencer:
     def add_scan(self, scan: Scan | DroppedScan) -> None:
         """One scan, or the news that one could not be read (it keeps its place in the sequence)."""
         bisect.insort(self._waiting, scan, key=lambda waiting: waiting.stamp_ns)
+
+    @property
+    def silent_s(self) -> float:
+        """For how long there have been IMU samples and no scan."""
+        return (self._stamps[-1] - self._last_end_ns) / 1e9 if self._stamps and self._last_end_ns is not None else 0.0
 
     def ready(self) -> Iterator[Measurement | DroppedScan]:
         """What the samples so far complete, in order of time."""

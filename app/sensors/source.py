@@ -15,9 +15,8 @@ from app.sensors.live.capture import SUFFIXES as CAPTURES
 from app.sensors.live.capture import CaptureStream
 from app.sensors.live.pcap import CaptureError
 from app.sensors.mcap_stream import McapStream
-from app.sensors.ros import printable
 from app.sensors.unpacking import limit_rosbags
-from app.slam.errors import HemislamError
+from app.slam.errors import HemislamError, printable
 
 SUFFIXES = (".bag", ".mcap", ".db3", *CAPTURES)
 _MAGIC = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}

@@ -56,7 +56,7 @@ class Gate:
         try:
             message = msgspec.msgpack.decode(raw, type=dict[str, Any])
             kind = msgspec.convert(message.get("type"), str)
-        except (msgspec.MsgspecError, RecursionError):
+        except (msgspec.MsgspecError, ValueError, RecursionError):
             raise Refused(1007, NO_MESSAGE) from None
         if kind in NEVER or (self._viewer and kind not in VIEWER_MESSAGES):
             return None

@@ -215,7 +215,7 @@ class Player:
             self.halt()
             self._page.show(finished=True)
             for doubt in doubts(session.log):
-                self._page.notice("warning", f"This run cannot be right. {doubt}")
+                self._page.notice("warning", f"This run is in doubt. {doubt}")
             return None
         if isinstance(entry, Quiet):
             if entry.status is not None:

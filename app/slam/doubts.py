@@ -1,4 +1,4 @@
-"""What shows that a run cannot be right, whatever its parameters: no person moves like that."""
+"""What shows that a run cannot be right: no person moves like that, or the sensors contradict each other."""
 
 import numpy as np
 
@@ -13,6 +13,9 @@ LEAP, LEAP_TIMES = 0.5, 4.0
 """m; a leap is a step between two frames longer than this, and so many times the usual one around it."""
 MOST_LOST, MOST_DROPPED = 0.1, 0.5
 """Shares of the frames that may be lost, and of the scans that may be dropped."""
+MOST_TURNED_DEG, MOST_MOVED = 0.2, 0.045
+"""deg, m: how far nine of ten updates at most may take the pose from where the IMU predicted it a tenth of a second
+before. Ten times what a clean sensor shows, and twice what one shows with the errors that data sheets admit."""
 
 
 def doubts(log: RunLog) -> tuple[str, ...]:
@@ -32,7 +35,22 @@ def doubts(log: RunLog) -> tuple[str, ...]:
     if dropped > MOST_DROPPED * (total + dropped):
         reason, _ = log.dropped.most_common(1)[0]
         found.append(f"{dropped} of {total + dropped} scans were dropped, mostly because {reason}.")
-    return tuple(found)
+    return (*found, *_of_imu(log))
+
+
+def _of_imu(log: RunLog) -> list[str]:
+    """Whether the scans turn or move the pose away from the IMU's prediction, again and again."""
+    turned, moved = (log.readout(name) for name in ("turned_deg", "moved_m"))
+    known = np.isfinite(turned)
+    if np.count_nonzero(known) < 20:
+        return []
+    degrees, metres = np.percentile(turned[known], 90), np.percentile(moved[known], 90)
+    if degrees < MOST_TURNED_DEG and metres < MOST_MOVED:
+        return []
+    return [
+        f"The scans contradict the IMU, by {degrees:.2f} deg and {1e3 * metres:.0f} mm a frame: check its units, axes "
+        "and clock, and the mounting of the LiDAR on it."
+    ]
 
 
 def _of_motion(positions: F64, times: F64) -> list[str]:

@@ -161,7 +161,9 @@ class Engine:
         with contextlib.suppress(np.linalg.LinAlgError):
             posterior, registration = iekf.update(predicted, points, self._map, self.params.filter)
             if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():
-                return posterior, registration
+                error = iekf.boxminus(posterior.state, predicted.state)
+                turned, moved = (float(np.linalg.norm(error[part])) for part in (imu.ROT, imu.POS))
+                return posterior, replace(registration, turned=turned, moved=moved)
         return predicted, replace(_NOT_REGISTERED, used=len(points), reason="the update gave no finite pose")
 
     def _insert(self, belief: Belief, points: np.ndarray) -> None:

@@ -1,9 +1,21 @@
 """The one error that users read."""
 
+LONGEST = 2000
+
+
+def printable(text: str) -> str:
+    """A text from outside, with characters that would drive a terminal or break the line shown as escapes."""
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+
 
 class HemislamError(Exception):
     """Something that the user gave cannot be used.
 
     The message is one sentence that says what is wrong, where, and what to do. The command line
     prints it and exits with code 2; the page shows it as a notification and the session goes on.
+    What it quotes is shown escaped, and cut if it is long.
     """
+
+    def __init__(self, sentence: str) -> None:
+        shown = printable(sentence)
+        super().__init__(shown if len(shown) <= LONGEST else f"{shown[: LONGEST - 300]} … {shown[-300:]}")

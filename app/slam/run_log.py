@@ -68,6 +68,10 @@ class RunLog:
         columns = [READOUTS.index(f"{stage}_ms") for stage in TIMINGS]
         return np.asarray(np.nan_to_num(self._table["readouts"][:, columns]))
 
+    def readout(self, name: str) -> F64:
+        """(n,) one of `READOUTS`; nan where there is none."""
+        return np.asarray(self._table["readouts"][:, READOUTS.index(name)])
+
     @property
     def odometry(self) -> Trajectory:
         """T_odom_imu at every scan's end; the origin while the filter waits at rest to start."""

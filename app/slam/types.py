@@ -218,6 +218,7 @@ class Registration:
             means that the scan hardly observes that direction.
         degenerate: whether this scan alone leaves a direction unobserved. reason: in words.
         matches: by point; None if nothing was looked up.
+        turned, moved: rad and m, how far the update took the pose from where the IMU predicted it.
     """
 
     converged: bool
@@ -229,6 +230,8 @@ class Registration:
     degenerate: bool
     reason: str = ""
     matches: Matches | None = None
+    turned: float = float("nan")
+    moved: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,8 @@ WALK = np.column_stack([0.12 * np.arange(200), 0.1 * np.sin(np.arange(200)), np.
 """(200, 3) m at 10 Hz: a walk at 1.2 m/s that sways."""
 
 
-def log(positions: F64, statuses: Sequence[FrameStatus] = (), dropped: int = 0) -> RunLog:
-    nothing = np.full(len(READOUTS), np.nan)
+def log(positions: F64, statuses: Sequence[FrameStatus] = (), dropped: int = 0, **readouts: float) -> RunLog:
+    nothing = np.array([readouts.get(name, np.nan) for name in READOUTS])
     frames = [Frame(n * 100_000_000, False, p, np.array([0.0, 0, 0, 1]), nothing) for n, p in enumerate(positions)]
     for n, status in enumerate(statuses):
         object.__setattr__(frames[n], "status", status)
@@ -59,3 +59,10 @@ def test_poses_that_are_not_finite_are_told() -> None:
     broken = WALK.copy()
     broken[50, 2] = np.nan
     assert doubts(log(broken)) == ("1 poses are not finite, first at 5.0 s.",)
+
+
+def test_scans_that_contradict_the_imu_in_every_frame_are_told() -> None:
+    assert doubts(log(WALK, turned_deg=0.1, moved_m=0.02)) == ()
+    for turned_deg, moved_m in ((0.5, 0.001), (0.01, 0.08)):
+        (doubt,) = doubts(log(WALK, turned_deg=turned_deg, moved_m=moved_m))
+        assert f"by {turned_deg:.2f} deg and {1e3 * moved_m:.0f} mm a frame" in doubt

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from app.sensors.clocks import TOLERANCE_S
-from app.sensors.imu_units import AS_RECORDED, ImuProbe, ImuUnits, settle_imu
+from app.sensors.imu_units import ABSURD, AS_RECORDED, ImuProbe, ImuUnits, settle_imu
 from app.sensors.live.clock import JUMP_NS, ClockMap, OffsetEstimate
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Counters, Kind, LiveState, Status
@@ -204,7 +204,7 @@ class Intake:
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         accel = np.array([sample.accel for sample in samples], np.float64)
         gyro = np.array([sample.gyro for sample in samples], np.float64)
-        finite = np.isfinite(accel).all(axis=1) & np.isfinite(gyro).all(axis=1)
+        finite = (np.abs(accel) < ABSURD).all(axis=1) & (np.abs(gyro) < ABSURD).all(axis=1)
         if not finite.any():
             return False
         probe = ImuProbe(stamps[finite], stamps[finite], gyro[finite], accel[finite])

@@ -1,0 +1,253 @@
+"""Damaged recordings of every format, run as a user runs them."""
+
+import io
+import math
+import os
+import random
+import re
+import resource
+import signal
+import struct
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as FolderWriter
+from rosbags.typesys import Stores, get_typestore
+
+from app.sensors.live.feed import packets_of
+from app.sensors.recording import open_recording
+from app.sensors.ros import CLOUD, IMU, IMU_TOPIC, LIDAR_TOPIC, definition, serialised
+from app.sensors.simulator import simulate
+from app.sensors.source import Source
+from app.slam.errors import HemislamError
+from app.slam.metrics import compare
+from app.slam.params import Params
+from app.slam.trajectory import read_tum
+from benchmarks.fuzz.damage import MESSAGES, Entry, bytes_damaged
+
+FORMATS = ("mcap", "mcap", "mcap-lz4", "mcap-plain", "bag", "bag-bz2", "bag-lz4", "db3", "pcap")
+MOST_S, MOST_BYTES = 60, 2 << 30
+"""What one run may take."""
+TOLERANCE = 0.01
+"""Of the way: a trajectory that is off by more must be said to be in doubt."""
+Packet = tuple[int, int, bytes]
+"""Time in ns, UDP port, payload."""
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
+ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+SAYS_SO = re.compile(r"^(WARNING|noted|dropped|needs you|corrected)\b.*", re.MULTILINE)
+
+
+class Recordings:
+    """Makes cases of a simulated walk and judges how they end. Close it at the end.
+
+    Attributes:
+        good: the undamaged walk. said: what a run of it says. packets: what the sensors would have sent.
+    """
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory()
+        self._path = Path(self._folder.name)
+        self.good = self._path / "good.mcap"
+        simulate("room", self.good, duration_s=8.0, every_block=10)
+        self._params = (self._path / "good.params.yaml").read_text(encoding="utf-8")
+        with Source(self.good) as source:
+            self._entries = list(source.messages((LIDAR_TOPIC, IMU_TOPIC)))
+        with open_recording(self.good, Params().merged_yaml(self._params)) as recording:
+            self.packets = [
+                (sent.time_ns, (6699, 7788, 7799)[sent.stream], sent.data) for sent in packets_of(recording)
+            ]
+        self._files = {kind: self._written(kind, self._entries).read_bytes() for kind in sorted({*FORMATS})}
+        code, said, _, _ = self._run(self.good)
+        assert code == 0, said
+        self.said = {*SAYS_SO.findall(said)}
+        self._truth = read_tum(self._path / "out" / "trajectory.tum")
+
+    def close(self) -> None:
+        self._folder.cleanup()
+
+    def broken(self, seed: int) -> str:
+        """Which invariant the case breaks, and how; "" if none."""
+        luck = random.Random(seed)
+        path, what = self._damaged(luck)
+        code, said, seconds, peak = self._run(path)
+        what = f"{what}: exit {code} after {seconds:.1f} s"
+        if code not in (0, 2):
+            return f"{what}; {said[-600:]}"
+        if at := re.search(r"Traceback|Warning:", said):
+            return f"{what}, with a traceback or a raw warning; {said[max(at.start() - 200, 0) :][:3000]}"
+        if code == 2 and not re.search(r"^hemislam: .{20,}", said, re.MULTILINE):
+            return f"{what} without a sentence; {said[-300:]}"
+        if seconds > MOST_S or peak > MOST_BYTES:
+            return f"{what} with {peak >> 20} MB"
+        return self._wrong(said, what) if code == 0 else ""
+
+    def _wrong(self, said: str, what: str) -> str:
+        """Whether a run that ended well is wrong without saying so."""
+        try:
+            ours = read_tum(self._path / "out" / "trajectory.tum")
+            error = compare(ours, self._truth)["ate_m"]["max"]
+        except HemislamError as problem:
+            ours, error = self._truth, math.inf
+            what = f"{what} ({problem})"
+        if not np.isfinite(ours.positions).all():
+            return f"{what}; the poses are not finite"
+        doubted = {*SAYS_SO.findall(said)} - self.said
+        whole = len(ours) > 0.98 * len(self._truth)
+        if not doubted and not (whole and error < TOLERANCE * self._truth.distance):
+            return f"{what}; {len(ours)} poses, off by {error:.3f} m, and nothing was said; {said[-600:]}"
+        return ""
+
+    def _damaged(self, luck: random.Random) -> tuple[Path, str]:
+        kind = luck.choice(FORMATS)
+        if kind == "pcap" or luck.random() < 0.5:
+            data = bytes_damaged(luck, self._files[kind])
+            path = self._path / f"case.{kind.partition('-')[0]}"
+            path.write_bytes(data)
+            return self._with_params(path), f"bytes of {kind}"
+        entries = [(topic, log_ns, _copied(message)) for topic, log_ns, message in self._entries]
+        chosen = luck.choices(MESSAGES, k=luck.choice([1, 1, 1, 2]))
+        for damage in chosen:
+            damage(luck, entries)
+        luck_of_schema = random.Random(luck.random()) if kind.startswith("mcap") and luck.random() < 0.1 else None
+        path = self._written(kind, entries, luck_of_schema)
+        names = ", ".join(damage.__name__ for damage in chosen) + (" and schema" if luck_of_schema else "")
+        return self._with_params(path), f"{names} of {kind}"
+
+    def _with_params(self, path: Path) -> Path:
+        path.with_name(f"{path.stem}.params.yaml").write_text(self._params, encoding="utf-8")
+        return path
+
+    def _written(self, kind: str, entries: list[Entry], luck_of_schema: random.Random | None = None) -> Path:
+        path = self._path / f"case.{kind.partition('-')[0]}"
+        path.unlink(missing_ok=True)
+        match kind.partition("-")[0]:
+            case "mcap":
+                _write_mcap(path, kind.partition("-")[2], entries, luck_of_schema)
+            case "bag":
+                _write_bag(path, kind.partition("-")[2], entries)
+            case "db3":
+                _write_db3(path, entries)
+            case "pcap":
+                path.write_bytes(pcap(self.packets))
+        return path
+
+    def _run(self, path: Path) -> tuple[int, str, float, int]:
+        """Exit code, all that was printed, seconds and bytes of memory at most, of `hemislam run`."""
+        begin = time.monotonic()
+        with tempfile.TemporaryFile() as said:
+            child = os.fork()
+            if not child:
+                _become_hemislam(["run", str(path), "--out", str(self._path / "out"), "--force"], said.fileno())
+            _, status, used = os.wait4(child, 0)
+            said.seek(0)
+            text = said.read().decode(errors="replace")
+        code = os.waitstatus_to_exitcode(status)
+        return code, text, time.monotonic() - begin, used.ru_maxrss * 1024
+
+
+def _become_hemislam(arguments: list[str], said: int) -> None:
+    """In a child process: run the command line and end."""
+    from app.__main__ import main
+
+    for stream in (1, 2):
+        os.dup2(said, stream)
+    sys.stdout, sys.stderr = (io.TextIOWrapper(os.fdopen(stream, "wb", 0), write_through=True) for stream in (1, 2))
+    signal.alarm(MOST_S + 10)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    sys.argv = ["hemislam", *arguments, "--set", "loops.enabled=false"]
+    code: object = 1
+    try:
+        main()
+    except SystemExit as end:
+        code = end.code or 0
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        os._exit(code if isinstance(code, int) else 1)
+
+
+def _copied(message: Any) -> Any:
+    """A message whose parts can be changed; its points are shared."""
+    import copy
+
+    return (
+        copy.deepcopy(message, {id(message.data): message.data}) if hasattr(message, "data") else copy.deepcopy(message)
+    )
+
+
+def _write_mcap(path: Path, compression: str, entries: list[Entry], luck: random.Random | None) -> None:
+    kinds = {"": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "plain": CompressionType.NONE}
+    with path.open("wb") as file:
+        writer = McapWriter(file, compression=kinds[compression], chunk_size=200_000)
+        writer.start(profile="ros2")
+        channels = {}
+        for topic, kind in ((LIDAR_TOPIC, CLOUD), (IMU_TOPIC, IMU)):
+            text, encoding = definition(kind).encode(), "cdr"
+            if luck is not None:
+                text = bytes_damaged(luck, text)
+                topic += luck.choice(["", "\x1b[31m", "\n", "é" * 300])
+                encoding = luck.choice(["cdr", "cdr", "ros1", "json"])
+            schema = writer.register_schema(kind, "ros2msg", text)
+            channels[topic[:5]] = writer.register_channel(topic, encoding, schema)
+        for topic, log_ns, message in entries:
+            writer.add_message(channels[topic[:5]], log_ns, _serialised(message), log_ns)
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
+
+
+def _serialised(message: Any) -> bytes:
+    with np.errstate(all="ignore"):
+        return serialised(message)
+
+
+def _write_bag(path: Path, compression: str, entries: list[Entry]) -> None:
+    writer = BagWriter(path)
+    writer.chunk_threshold = 200_000
+    if compression:
+        writer.set_compression(BagWriter.CompressionFormat[compression.upper()])
+    with writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=ROS1)
+            for topic, kind in ((LIDAR_TOPIC, CLOUD), (IMU_TOPIC, IMU))
+        }
+        for topic, log_ns, message in sorted(entries, key=lambda entry: entry[1]):
+            header, stamp = message.header, message.header.stamp
+            time_ = ROS1.types["builtin_interfaces/msg/Time"](sec=stamp.sec, nanosec=stamp.nanosec)
+            ours = ROS1.types["std_msgs/msg/Header"](seq=0, stamp=time_, frame_id=header.frame_id)
+            values = {**vars(message), "header": ours}
+            values = {name: value for name, value in values.items() if not name.startswith("__")}
+            made = ROS1.types[message.__msgtype__](**values)
+            writer.write(connections[topic], log_ns, ROS1.serialize_ros1(made, message.__msgtype__))
+
+
+def _write_db3(path: Path, entries: list[Entry]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        inside = Path(folder) / "walk"
+        with FolderWriter(inside, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+            connections = {
+                topic: writer.add_connection(topic, kind, typestore=ROS2)
+                for topic, kind in ((LIDAR_TOPIC, CLOUD), (IMU_TOPIC, IMU))
+            }
+            for topic, log_ns, message in entries:
+                writer.write(connections[topic], log_ns, _serialised(message))
+        path.write_bytes(next(inside.glob("*.db3")).read_bytes())
+
+
+def pcap(packets: list[Packet]) -> bytes:
+    """A capture with nanoseconds of UDP datagrams: time, port, payload."""
+    made = [struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 65535, 1)]
+    for time_ns, port, data in packets:
+        frame = bytes(12) + b"\x08\x00" + struct.pack(">BBHHHBBHII", 0x45, 0, 28 + len(data), 1, 0, 64, 17, 0, 1, 2)
+        frame += struct.pack(">4H", 40_000, port, 8 + len(data), 0) + data
+        made.append(struct.pack("<4I", *divmod(time_ns, 10**9), len(frame), len(frame)) + frame)
+    return b"".join(made)
