@@ -68,9 +68,9 @@ def test_a_biased_channel_is_off_by_the_same_distance_in_every_firing() -> None:
 def test_a_channels_elevation_error_bends_its_cone() -> None:
     unit = Unit(Imperfections(elevation=0.12), np.random.default_rng(1))
     pattern = EXACT.pattern
-    bent = unit.fired(pattern)
-    np.testing.assert_allclose(np.linalg.norm(bent.directions, axis=1), 1.0)
-    change = np.degrees(np.arcsin(bent.directions[:, 2]) - np.arcsin(pattern.directions[:, 2])).reshape(-1, 32)
+    bent, _ = unit.fired(pattern.directions, pattern.levers)
+    np.testing.assert_allclose(np.linalg.norm(bent, axis=1), 1.0)
+    change = np.degrees(np.arcsin(bent[:, 2]) - np.arcsin(pattern.directions[:, 2])).reshape(-1, 32)
     np.testing.assert_allclose(change, change[:1].repeat(len(change), axis=0), atol=1e-6)
     assert 0.07 < change[0].std() < 0.18
 
@@ -101,10 +101,11 @@ def test_beams_pass_a_pane_and_return_from_behind_it() -> None:
 
 def test_the_mounting_differs_by_its_angle_and_distance() -> None:
     pattern = EXACT.pattern
-    fired = Unit(Imperfections(mount_rotation=0.7, mount_translation=0.01), np.random.default_rng(3)).fired(pattern)
-    R, *_ = np.linalg.lstsq(pattern.directions, fired.directions, rcond=None)
+    unit = Unit(Imperfections(mount_rotation=0.7, mount_translation=0.01), np.random.default_rng(3))
+    directions, levers = unit.fired(pattern.directions, pattern.levers)
+    R, *_ = np.linalg.lstsq(pattern.directions, directions, rcond=None)
     assert abs(np.degrees(np.arccos((np.trace(R) - 1) / 2)) - 0.7) < 1e-6
-    shift = fired.levers - pattern.levers @ R
+    shift = levers - pattern.levers @ R
     np.testing.assert_allclose(np.linalg.norm(shift, axis=1), 0.01, atol=1e-9)
 
 

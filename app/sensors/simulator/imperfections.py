@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from app.sensors.rsbpearl import CHANNELS
-from app.sensors.simulator.lidar import Pattern
 from app.sensors.simulator.raycast import Hits, Mover, Raycaster
 from app.sensors.simulator.scenes.props import person_mesh
 from app.sensors.simulator.trajectory import SmoothTrajectory, Walker, seconds
@@ -116,13 +115,13 @@ class Unit:
         self._accel = _matrix(sizes.accel_scale, skew, rng)
         self._hum = rng.uniform(*VIBRATION_HZ, (2, 3)), rng.uniform(0, 2 * np.pi, (2, 3))
 
-    def fired(self, pattern: Pattern) -> Pattern:
-        """Where the firings really go, in the frame of the written mounting."""
-        level = pattern.directions[:, :2]
+    def fired(self, directions: F64, levers: F64) -> tuple[F64, F64]:
+        """Where the firings really go, in the frame of the written mounting; both (n, 3)."""
+        level = directions[:, :2]
         flat = np.linalg.norm(level, axis=1)
-        elevation = np.arctan2(pattern.directions[:, 2], flat) + np.resize(self._elevation, len(flat))
+        elevation = np.arctan2(directions[:, 2], flat) + np.resize(self._elevation, len(flat))
         bent = np.column_stack([level * (np.cos(elevation) / flat)[:, None], np.sin(elevation)])
-        return replace(pattern, directions=bent @ self._turn.T, levers=pattern.levers @ self._turn.T + self._shift)
+        return bent @ self._turn.T, levers @ self._turn.T + self._shift
 
     def see_through(
         self, hits: Hits, scene: Raycaster, origins: F64, directions: F64, times: F64, rng: np.random.Generator

@@ -1,7 +1,6 @@
 """The simulated RS-Bpearl: each of its firings has its own time, azimuth, origin and pose."""
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,12 +15,10 @@ from app.sensors.rsbpearl import (
     RINGS,
     Model,
 )
+from app.sensors.simulator.imperfections import Unit
 from app.sensors.simulator.raycast import Raycaster
 from app.sensors.simulator.trajectory import SmoothTrajectory, seconds
 from app.slam.types import F32, F64, I64, U16, Scan
-
-if TYPE_CHECKING:
-    from app.sensors.simulator.imperfections import Unit
 
 P_IMU_LIDAR: F64 = np.array([0.0175, 0.0276, -0.1083])
 """m, the LiDAR's place on H2LID's IMU; their axes agree."""
@@ -77,7 +74,7 @@ class Lidar:
     range_step: float = BPEARL.range_step
     coordinate_step: float = 0.0
     lossless: bool = False
-    unit: "Unit | None" = None
+    unit: Unit | None = None
 
     def turn(
         self, scene: Raycaster, trajectory: SmoothTrajectory, start_s: float, epoch_ns: int, rng: np.random.Generator
@@ -128,7 +125,10 @@ class Lidar:
         Poses are computed at both ends of each block and interpolated between: within 55 us a hand's motion deviates
         from a straight line by nanometres.
         """
-        pattern = self.pattern if self.unit is None else self.unit.fired(self.pattern)
+        pattern = self.pattern
+        if self.unit is not None:
+            directions, levers = self.unit.fired(pattern.directions, pattern.levers)
+            pattern = replace(pattern, directions=directions, levers=levers)
         begin = start_ns + pattern.blocks_ns
         p0, R0 = trajectory.poses(seconds(begin))
         p1, R1 = trajectory.poses(seconds(begin + pattern.block_ns))
