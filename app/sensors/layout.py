@@ -4,6 +4,7 @@ Every decision is a `Finding` that states its evidence and names the option that
 same for the IMU.
 """
 
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -30,6 +31,8 @@ def settle_cloud(
     Raises:
         HemislamError: the clouds have no x, y, z, or not the time field that was asked for.
     """
+    (usual, _), *_ = Counter(tuple(probe.cloud.fields) for probe in probes).most_common()
+    probes = [probe for probe in probes if tuple(probe.cloud.fields) == usual]  # others are left out later
     fields = probes[0].cloud.fields
     names = {name.lower(): name for name in reversed(fields)}
     if chosen.time_field not in ("auto", "none") and chosen.time_field not in fields:

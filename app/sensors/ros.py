@@ -40,6 +40,10 @@ class Deserialiser:
         except Exception:  # the parser lets its own errors and those of Python through
             return
 
+    def knows(self, kind: str, encoding: str) -> bool:
+        """Whether messages of this type can be read."""
+        return encoding in self._stores and kind in self._stores[encoding].types
+
     def read(self, data: bytes, kind: str, encoding: str) -> Any:
         """The message. Raises whatever the library raises for bytes that are no such message."""
         store = self._stores[encoding]

@@ -15,6 +15,7 @@ from app.sensors.live.capture import SUFFIXES as CAPTURES
 from app.sensors.live.capture import CaptureStream
 from app.sensors.live.pcap import CaptureError
 from app.sensors.mcap_stream import McapStream
+from app.sensors.ros import Deserialiser
 from app.sensors.unpacking import limit_rosbags
 from app.slam.errors import HemislamError, printable
 
@@ -84,6 +85,7 @@ class RosbagsStream:
         limit_rosbags()
         self._links = TemporaryDirectory()  # of names that end as rosbags expects
         files = [self._in_small_letters(path) for path in files]
+        self._standard = Deserialiser()
         self._reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         self._reader.open()
         self.counts: dict[str, tuple[str, int]] = {}
@@ -98,11 +100,18 @@ class RosbagsStream:
         if not connections:  # which rosbags would take for all of them
             return
         for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
-            yield printable(connection.topic), log_ns, self._reader.deserialize(raw, connection.msgtype)
+            yield printable(connection.topic), log_ns, self._deserialised(raw, connection.msgtype)
 
     def close(self) -> None:
         self._reader.close()
         self._links.cleanup()
+
+    def _deserialised(self, raw: bytes, kind: str) -> Any:
+        """Standard types are read as they are defined, whatever the file says of them."""
+        encoding = "cdr" if self._reader.is2 else "ros1"
+        if self._standard.knows(kind, encoding):
+            return self._standard.read(raw, kind, encoding)
+        return self._reader.deserialize(raw, kind)
 
     def _in_small_letters(self, path: Path) -> Path:
         if path.suffix == path.suffix.lower():

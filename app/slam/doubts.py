@@ -13,6 +13,8 @@ LEAP, LEAP_TIMES = 0.5, 4.0
 """m; a leap is a step between two frames longer than this, and so many times the usual one around it."""
 MOST_LOST, MOST_DROPPED = 0.1, 0.5
 """Shares of the frames that may be lost, and of the scans that may be dropped."""
+WALKING = 0.1
+"""m/s; a device at rest has nothing to say about its IMU."""
 MOST_TURNED_DEG, MOST_MOVED = 0.2, 0.045
 """deg, m: how far nine of ten updates at most may take the pose from where the IMU predicted it a tenth of a second
 before. Ten times what a clean sensor shows, and twice what one shows with the errors that data sheets admit."""
@@ -40,8 +42,8 @@ def doubts(log: RunLog) -> tuple[str, ...]:
 
 def _of_imu(log: RunLog) -> list[str]:
     """Whether the scans turn or move the pose away from the IMU's prediction, again and again."""
-    turned, moved = (log.readout(name) for name in ("turned_deg", "moved_m"))
-    known = np.isfinite(turned)
+    turned, moved, speed = (log.readout(name) for name in ("turned_deg", "moved_m", "speed"))
+    known = np.isfinite(turned) & ~(speed < WALKING)
     if np.count_nonzero(known) < 20:
         return []
     degrees, metres = np.percentile(turned[known], 90), np.percentile(moved[known], 90)
