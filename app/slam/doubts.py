@@ -15,9 +15,10 @@ MOST_LOST, MOST_DROPPED = 0.1, 0.5
 """Shares of the frames that may be lost, and of the scans that may be dropped."""
 WALKING = 0.1
 """m/s; a device at rest has nothing to say about its IMU."""
-MOST_TURNED_DEG, MOST_MOVED = 0.2, 0.045
-"""deg, m: how far nine of ten updates at most may take the pose from where the IMU predicted it a tenth of a second
-before. Ten times what a clean sensor shows, and twice what one shows with the errors that data sheets admit."""
+MOST_TURNED_DEG, MOST_MOVED = 0.15, 0.03
+"""deg, m: how far the usual update may take the pose from where the IMU predicted it a tenth of a second before, if it
+did only one of both. Twenty times what a clean sensor shows, and twice what one shows with the errors that data sheets
+admit."""
 
 
 def doubts(log: RunLog) -> tuple[str, ...]:
@@ -46,8 +47,8 @@ def _of_imu(log: RunLog) -> list[str]:
     known = np.isfinite(turned) & ~(speed < WALKING)
     if np.count_nonzero(known) < 20:
         return []
-    degrees, metres = np.percentile(turned[known], 90), np.percentile(moved[known], 90)
-    if degrees < MOST_TURNED_DEG and metres < MOST_MOVED:
+    degrees, metres = np.median(turned[known]), np.median(moved[known])
+    if degrees / MOST_TURNED_DEG + metres / MOST_MOVED < 1.0:
         return []
     return [
         f"The scans contradict the IMU, by {degrees:.2f} deg and {1e3 * metres:.0f} mm a frame: check its units, axes "

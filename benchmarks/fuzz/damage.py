@@ -94,9 +94,13 @@ def cloud_values(luck: random.Random, entries: list[Entry]) -> None:
     share, value, chosen = luck.choice([0.01, 0.1, 0.5, 1.0]), luck.choice([*HUGE, 30.0]), luck.randrange(6)
     for cloud in _part(luck, clouds(entries)):
         field = cloud.fields[chosen % len(cloud.fields)]
-        kind = {7: "<f4", 8: "<f8", 4: "<u2", 2: "u1"}[field.datatype]
+        kind = {7: "<f4", 8: "<f8", 4: "<u2", 2: "u1"}.get(field.datatype, "u1")
+        if field.offset + int(kind[-1]) > cloud.point_step:
+            continue
         if kind[-2] == "u":
             value = luck.randrange(256)
+        if not cloud.fields or cloud.width * cloud.point_step > len(cloud.data):
+            continue  # other damage got there first
         data = cloud.data.copy()
         column = np.ndarray((cloud.width,), kind, data.data, field.offset, (cloud.point_step,))
         with np.errstate(over="ignore"):

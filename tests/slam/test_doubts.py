@@ -62,7 +62,7 @@ def test_poses_that_are_not_finite_are_told() -> None:
 
 
 def test_scans_that_contradict_the_imu_in_every_frame_are_told() -> None:
-    assert doubts(log(WALK, turned_deg=0.1, moved_m=0.02)) == ()
-    for turned_deg, moved_m in ((0.5, 0.001), (0.01, 0.08)):
+    assert doubts(log(WALK, turned_deg=0.07, moved_m=0.01)) == ()
+    for turned_deg, moved_m in ((0.5, 0.001), (0.01, 0.08), (0.1, 0.02)):
         (doubt,) = doubts(log(WALK, turned_deg=turned_deg, moved_m=moved_m))
         assert f"by {turned_deg:.2f} deg and {1e3 * moved_m:.0f} mm a frame" in doubt
