@@ -326,3 +326,29 @@ def test_recording_over_a_file_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / "x.mcap").read_bytes() == b"precious"
     with open_live(wire.url, Params(), wire.imu_url):  # the ports were given back
         pass
+
+
+@pytest.mark.parametrize("bad", [(0.0, 0.0, 1e30), (float("nan"), 0.0, 9.81), (0.0, 80.0, 9.81)])
+def test_a_bad_sample_is_left_out_and_nothing_else(bad: tuple[float, float, float]) -> None:
+    rig = Rig()
+    for _ in range(12):
+        rig.turn()
+    rig.intake.put_imu(rig.imu_ns + 6_500_000, (0.0, 0.0, 0.0), bad, rig.now + 6_500_000)
+    for _ in range(5):
+        rig.turn()
+    found = ports.measurements(rig.events())
+    assert scans(list(found)) == list(range(17))
+    assert sum("left out" in notice for one in found for notice in one.notices) == 1
+    assert max(np.abs(one.imu.accel).max() for one in found) < 20
+
+
+def test_an_accelerometer_that_reads_nothing_is_told_and_waited_for() -> None:
+    rig = Rig()
+    for turn in range(140):
+        if turn < 20:
+            for k in range(20):
+                rig.intake.put_imu(rig.imu_ns + k * 5_000_000, (0, 0, 0), (0.0, 0.0, 0.0), rig.now + k * 5_000_000)
+        rig.turn(imu=turn >= 20)
+    events = rig.events()
+    assert ("units", "IMU") in kinds(events)
+    assert len(scans(events)) >= 100
