@@ -166,3 +166,22 @@ def test_a_person_walking_by_does_not_take_the_map_along() -> None:
         results.append(engine.step(seen.scan, m.imu))
     metres, _ = worst(results, walk)
     assert metres < 0.03
+
+
+@pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")  # that is the point of these numbers
+@pytest.mark.parametrize("value", [1e300, np.inf, np.nan])
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_samples_that_break_the_numbers_cost_no_more_than_their_frames(sensor: str, value: float) -> None:
+    """Whoever drives the engine without the sequencer may hand it anything."""
+    engine, results = Engine(params_for(REAL)), []
+    for k, m in enumerate(room_walk(60)):
+        imu = m.imu
+        if k == 40:
+            values = getattr(imu, sensor).copy()
+            values[len(values) // 2] = value
+            imu = replace(imu, **{sensor: values})
+        results.append(engine.step(m.scan, imu))
+    for result in results:
+        assert np.isfinite(result.state.T_odom_imu).all() and np.isfinite(result.state.v_odom_imu).all()
+    metres, _ = worst(results, Walk(), since=45)
+    assert metres < 0.1 or results[-1].status is FrameStatus.LOST
