@@ -19,6 +19,8 @@ MOST_TURNED_DEG, MOST_MOVED = 0.15, 0.03
 """deg, m: how far the usual update may take the pose from where the IMU predicted it a tenth of a second before, if it
 did only one of both. Twenty times what a clean sensor shows, and twice what one shows with the errors that data sheets
 admit."""
+MOST_BIAS = 0.5
+"""m/s^2, 50 mg: accelerometers are off by less, those of phones too."""
 
 
 def doubts(log: RunLog) -> tuple[str, ...]:
@@ -47,6 +49,9 @@ def _of_imu(log: RunLog) -> list[str]:
     known = np.isfinite(turned) & ~(speed < WALKING)
     if np.count_nonzero(known) < 20:
         return []
+    bias = float(np.percentile(log.readout("accel_bias")[known], 95))
+    if bias > MOST_BIAS:
+        return [f"The accelerometer seems to be off by {bias:.2f} m/s², as none is: check its unit and axes."]
     degrees, metres = np.median(turned[known]), np.median(moved[known])
     if degrees / MOST_TURNED_DEG + metres / MOST_MOVED < 1.0:
         return []

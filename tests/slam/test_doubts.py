@@ -15,7 +15,7 @@ WALK = np.column_stack([0.12 * np.arange(200), 0.1 * np.sin(np.arange(200)), np.
 
 
 def log(positions: F64, statuses: Sequence[FrameStatus] = (), dropped: int = 0, **readouts: float) -> RunLog:
-    nothing = np.array([readouts.get(name, np.nan) for name in READOUTS])
+    nothing = np.array([{"accel_bias": 0.0, **readouts}.get(name, np.nan) for name in READOUTS])
     frames = [Frame(n * 100_000_000, False, p, np.array([0.0, 0, 0, 1]), nothing) for n, p in enumerate(positions)]
     for n, status in enumerate(statuses):
         object.__setattr__(frames[n], "status", status)
@@ -66,3 +66,9 @@ def test_scans_that_contradict_the_imu_in_every_frame_are_told() -> None:
     for turned_deg, moved_m in ((0.5, 0.001), (0.01, 0.08), (0.1, 0.02)):
         (doubt,) = doubts(log(WALK, turned_deg=turned_deg, moved_m=moved_m))
         assert f"by {turned_deg:.2f} deg and {1e3 * moved_m:.0f} mm a frame" in doubt
+
+
+def test_a_bias_that_no_accelerometer_has_is_told() -> None:
+    assert doubts(log(WALK, turned_deg=0.01, moved_m=0.001, accel_bias=0.2)) == ()
+    (doubt,) = doubts(log(WALK, turned_deg=0.01, moved_m=0.001, accel_bias=1.2))
+    assert "off by 1.20 m/s²" in doubt
