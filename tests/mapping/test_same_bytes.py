@@ -14,13 +14,25 @@ from app.__main__ import cli
 from app.mapping.checkpoints import DEFAULT_BYTES
 from app.mapping.opening import open_session
 from app.mapping.session import Session
-from app.mapping.session_file import SUFFIX
+from app.mapping.session_file import SUFFIX, read_session, write_session
 from app.sensors.presets import resolve_params
 from app.server.controller import Controller
 from app.server.fold import Fold
-from app.server.protocol import Command, EditLoop, Play, Save, Seek, SetParams, SetSpeed, Snapshot, StepFrame
+from app.server.protocol import (
+    Command,
+    EditLoop,
+    OpenRecording,
+    Play,
+    Save,
+    Seek,
+    SetParams,
+    SetSpeed,
+    Snapshot,
+    StepFrame,
+    UndoLoop,
+)
 from app.server.publisher import Publisher
-from app.slam.loops.edits import Reject
+from app.slam.loops.edits import Add, Reject
 from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.params import Params
 
@@ -31,13 +43,13 @@ START_S = 0.0
 
 
 class Workbench:
-    """The part of the recording in the engine's side of the workbench."""
+    """The engine's side of the workbench."""
 
-    def __init__(self) -> None:
-        self._params = resolve_params(SAMPLE, None, None, [])
+    def __init__(self, recording: Path) -> None:
+        self._params = resolve_params(recording, None, None, [])
         self._page, self._fold = Publisher(self._params), Fold()
         self.controller = Controller(self._page, self._params, self._open)
-        self.controller.open(SAMPLE, None)
+        self.controller.open(recording, None)
         self.do(SetSpeed(math.inf))
 
     @staticmethod
@@ -75,34 +87,55 @@ def hemislam(folder: Path, *words: str) -> dict[str, bytes]:
     return read(folder)
 
 
+@pytest.fixture(scope="module", params=["museum", "room", "room --imperfect --seed 3"])
+def recording(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample, and two that are simulated."""
+    if request.param == "museum":
+        return SAMPLE
+    path = tmp_path_factory.mktemp("simulated") / "room.mcap"
+    words = [*request.param.split(), "--out", str(path), "--duration", "30", "--every-block", "8"]
+    result = CliRunner().invoke(cli, ["simulate", *words])
+    assert result.exit_code == 0, result.output
+    return path
+
+
 @pytest.fixture
-def workbench() -> Workbench:
-    return Workbench()
+def workbench(recording: Path) -> Workbench:
+    return Workbench(recording)
 
 
-def test_an_undisturbed_session_a_replay_and_a_run_write_the_same(workbench: Workbench, tmp_path: Path) -> None:
+def test_an_undisturbed_session_a_replay_and_a_run_write_the_same(
+    recording: Path, workbench: Workbench, tmp_path: Path
+) -> None:
     ended = workbench.do(Play())
     assert ended.transport.finished and accepted(ended)
     ours = workbench.saved(tmp_path / "page")
     workbench.controller.close()
-    assert hemislam(tmp_path / "run", "run", str(SAMPLE), "--start", str(START_S)) == ours
+    assert hemislam(tmp_path / "run", "run", str(recording), "--start", str(START_S)) == ours
     assert hemislam(tmp_path / "replay", "replay", str(tmp_path / "page" / f"session{SUFFIX}")) == ours
 
 
-def test_a_session_with_detours_edits_and_other_parameters_is_replayed_to_the_same(
+def test_a_session_with_detours_edits_other_parameters_and_a_fork_is_replayed_to_the_same(
     workbench: Workbench, tmp_path: Path
 ) -> None:
-    workbench.do(
-        Seek(120), SetParams({"filter.max_iterations": 3}), StepFrame(30), Seek(90), SetParams({"ground.sigma": 0.05})
-    )
-    last = accepted(workbench.do(Play()))
-    assert last, "else there is nothing to edit"
-    workbench.do(EditLoop(Reject(*last[-1].pair)))
-    at_end = workbench.saved(tmp_path / "end")
+    opened = workbench.do().recording
+    assert opened is not None
+    middle = opened.frames // 2
+    workbench.do(Seek(middle), SetParams({"filter.max_iterations": 3}), EditLoop(Add(0, 5, register=False)))
+    workbench.do(StepFrame(30), Seek(middle - 30), SetParams({"ground.sigma": 0.05}))
+    found = [edge.pair for edge in accepted(workbench.do(Play())) if edge.pair != (0, 5)]
+    assert found, "else there is nothing to edit"
+    workbench.do(EditLoop(Reject(*found[0])), UndoLoop(), EditLoop(Reject(*found[-1])))
+    saved = {"end": workbench.saved(tmp_path / "end")}
     workbench.do(StepFrame(-3))
-    before_end = workbench.saved(tmp_path / "before")
+    saved["before"] = workbench.saved(tmp_path / "before")
+    assert saved["end"]["graph.g2o"] != saved["before"]["graph.g2o"], "the end brings loops"
+    session = read_session(tmp_path / "end" / f"session{SUFFIX}")
+    write_session(tmp_path / f"fork{SUFFIX}", session.forked(middle, Params()))
+    assert workbench.do(OpenRecording(tmp_path / f"fork{SUFFIX}"), Play()).transport.finished
+    saved["fork"] = workbench.saved(tmp_path / "fork")
+    assert saved["fork"]["trajectory.tum"] != saved["end"]["trajectory.tum"]
     workbench.controller.close()
-    assert at_end["loops.csv"] != before_end["loops.csv"], "the end brings loops"
-    for name, expected in (("end", at_end), ("before", before_end)):
+    for name, expected in saved.items():
         again = hemislam(tmp_path / f"{name}-again", "replay", str(tmp_path / name / f"session{SUFFIX}"))
         assert again == expected, name
