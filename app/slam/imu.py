@@ -20,6 +20,9 @@ MAX_KNOT_STEP = 0.0025
 """s; poses in between are interpolated linearly."""
 LONG_GAP = 0.4
 """s, half the time of a step. Over a longer gap the accelerations at both ends do not determine the velocity."""
+CLOCK_ERROR, SCALE_ERROR = 0.006, 0.006
+"""s by which the IMU's clock may be off, and the share by which its gyroscope may be: what they do grows with the
+motion. At rest both are harmless, and the noise of the data sheet is all there is."""
 GAP_NOISE = (0.5, 3.0)
 """Noise densities (rad/s/√Hz, m/s²/√Hz) for bridging a gap: those of walking and turning."""
 
@@ -61,6 +64,7 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -
     R, p, v = state.R_odom_imu.copy(), state.p_odom_imu.copy(), state.v_odom_imu.copy()
     P = belief.covariance.copy()
     noise = np.array([params.gyro_noise, params.accel_noise, params.gyro_bias_walk, params.accel_bias_walk, *GAP_NOISE])
+    noise[:2] = np.hypot(noise[:2], _unsteady(times, gyro - state.b_gyro, accel))
     knots = int(np.sum(np.ceil(np.maximum(np.diff(times), 0) / MAX_KNOT_STEP))) + 2 * len(times)
     knot_t, knot_T = np.empty(knots), np.empty((knots, 3, 4))
     basis = manifold.tangent_basis(state.g_odom)
@@ -77,6 +81,17 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -
     P = 0.5 * (P + P.T)
     moved = replace(state, stamp_ns=end_ns, R_odom_imu=R, p_odom_imu=p, v_odom_imu=v)
     return Belief(moved, P), Path(knot_t[:n] - times[-1], knot_T[:n])
+
+
+def _unsteady(times: F64, rates: F64, forces: F64) -> F64:
+    """Noise densities (2,) (rad/s/√Hz, m/s²/√Hz) that do over these (k,) s what errors of clock and scale do.
+
+    rates, forces (k, 3) rad/s, m/s². A clock late by c gives an angle wrong by c times the change of the rate.
+    """
+    lasting = max(times[-1] - times[0], 1e-3)
+    turn = np.linalg.norm(rates.mean(axis=0))
+    jerked = [np.abs(values - values.mean(axis=0)).max() / np.sqrt(lasting) for values in (rates, forces)]
+    return np.hypot(CLOCK_ERROR * np.array(jerked), [SCALE_ERROR * turn * np.sqrt(lasting), 0.0])
 
 
 def deskew(scan: Scan, path: Path, state: NavState) -> F32:

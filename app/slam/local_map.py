@@ -10,9 +10,6 @@ from app.slam.kernels import map as kernels
 from app.slam.sections import FilterParams, MapParams
 from app.slam.types import F32, F64, I32, U8
 
-LEAST_SCATTER = 2.0
-"""Least scatter assumed of a plane's points, as a multiple of the point noise: a few points lie flat by chance."""
-
 
 @dataclass(frozen=True, slots=True)
 class MapState:
@@ -20,7 +17,8 @@ class MapState:
 
     Attributes:
         cells: (v, 3) indices of the voxels, in order of insertion. counts: (v,) points in each.
-        points: (sum of counts, 3) m, voxel by voxel. center: (3,) m, the sensor at the last eviction.
+        points: (sum of counts, 4) x, y, z in m and hits, voxel by voxel. center: (3,) m, the sensor at the last
+            eviction.
     """
 
     cells: I32
@@ -35,7 +33,7 @@ class Planes:
 
     Attributes:
         normals: (n, 3) unit. centers: (n, 3) m, odom.
-        variances: (n,) m², spread of each patch across its plane; negative where there is no plane.
+        variances: (n,) m², of a point's distance from its plane; negative where there is no plane.
     """
 
     normals: F64
@@ -52,7 +50,7 @@ class LocalMap:
         self._table = np.full(1 << int(np.ceil(np.log2(2 * size))), -1, dtype=np.int32)
         self._cells = np.zeros((size, 3), dtype=np.int32)
         self._counts = np.zeros(size, dtype=np.uint8)
-        self._store = np.zeros((size, params.points_per_voxel, 3), dtype=np.float32)
+        self._store = np.zeros((size, params.points_per_voxel, 4), dtype=np.float32)
         self._used = 0
         self._center = np.zeros(3)
 
@@ -93,9 +91,8 @@ class LocalMap:
         n = len(queries)
         out = Planes(np.empty((n, 3)), np.empty((n, 3)), np.empty(n))
         reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(relaxed * params.plane_tilt)
-        least = LEAST_SCATTER * params.point_noise
         kernels.planes(
-            queries, self._voxel, reach, params.neighbours, params.plane_threshold, tilt, least,
+            queries, self._voxel, reach, params.neighbours, params.plane_threshold, tilt, params.point_noise,
             self._table, self._cells, self._counts, self._store, out.normals, out.centers, out.variances,
         )  # fmt: skip
         return out

@@ -173,7 +173,7 @@ def footprint(engine: Engine) -> int:
 
 
 def test_memory_does_not_grow_with_the_distance() -> None:
-    """Fifty metres of corridor: the engine holds as much at the end as after a third of it."""
+    """Fifty metres of corridor: the engine holds as much at the end as half way, where the map's radius has filled."""
     rig, length = replace(REAL, columns=16), 60.0
     values = {"map.radius": 15.0, "map.max_voxels": 3000, "sensor.max_range": 12.0}
     engine = Engine(params_for(rig, values))
@@ -184,8 +184,8 @@ def test_memory_does_not_grow_with_the_distance() -> None:
         held.append(footprint(engine))
         voxels.append(len(engine.checkpoint().map.cells) if r.index % 20 == 0 else 0)
     assert r.state.p_odom_imu @ r.state.p_odom_imu > 45**2
-    third = frames // 3
-    assert max(held[third:]) <= 1.02 * max(held[:third])
-    assert 0 < max(voxels[third:]) <= 1.2 * max(voxels[:third]) < 3000
-    assert len(engine.keyframes) > 100
+    half = frames // 2
+    assert max(held[half:]) <= 1.02 * max(held[:half])
+    assert 0 < max(voxels[half:]) <= 1.1 * max(voxels[:half]) < 3000
+    assert len(engine.keyframes) > 80
     engine.close()

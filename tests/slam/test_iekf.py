@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from app.slam import iekf
 from app.slam.iekf import boxminus, boxplus
 from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
-from app.slam.kernels.registration import RESIDUAL_HUBER, SHARED
+from app.slam.kernels.registration import EDGE_ON, REPEATED, RESIDUAL_HUBER
 from app.slam.local_map import LocalMap
 from app.slam.sections import FilterParams, MapParams
 from app.slam.types import NavState
@@ -243,8 +243,11 @@ class Problem:
         self.normals, self.centers = planes.normals, planes.centers
         ranges = np.linalg.norm(self.points, axis=1)
         all_distances = self._all_distances(prior.state)
+        x = prior.state
+        incidence = np.einsum("ij,ij->i", self.normals @ x.R_odom_imu @ x.R_imu_lidar, self.points) / ranges
         self.used = (planes.variances >= 0) & (np.abs(all_distances) <= params.gate * np.sqrt(ranges))
-        self.sigma = np.sqrt(params.point_noise**2 + SHARED * planes.variances[self.used])
+        self.used &= np.abs(incidence) >= EDGE_ON
+        self.sigma = np.sqrt(planes.variances[self.used])
 
     def _world(self, x: NavState) -> np.ndarray:
         imu = self.points @ x.R_imu_lidar.T + x.p_imu_lidar
@@ -279,13 +282,13 @@ def test_one_iteration_is_the_textbook_kalman_update(room: LocalMap, extrinsics:
     A residual over RESIDUAL_HUBER standard deviations counts as noisier, so that it pulls as one at that limit would.
     """
     params = FilterParams(max_iterations=1, estimate_extrinsics=extrinsics)
-    prior, points = correlated_prior(5e-3), points_of(furnished_room())
+    prior, points = correlated_prior(1e-2), points_of(furnished_room())
     problem = Problem(room, prior, points, params)
     free = slice(0, DIM if extrinsics else 17)
     H, P = problem.jacobian(prior.state)[:, free], prior.covariance[free, free]
     over = np.abs(problem.distances(prior.state)) / (RESIDUAL_HUBER * problem.sigma)
     assert 0.01 < (over > 1.0).mean() < 0.5
-    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(problem.sigma**2 * np.maximum(over, 1.0)))
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(REPEATED * problem.sigma**2 * np.maximum(over, 1.0)))
     step = np.zeros(DIM)
     step[free] = -K @ problem.distances(prior.state)
 
@@ -302,7 +305,7 @@ def test_the_iteration_ends_at_the_minimum_of_equation_7(room: LocalMap, extrins
     params = FilterParams(max_iterations=20, estimate_extrinsics=extrinsics, gate=1.0)
     prior, points = correlated_prior(2e-4), points_of(furnished_room())
     moved = np.random.default_rng(4).random(len(points)) < strays
-    points[moved] *= np.float32(1.03)
+    points[moved] *= np.float32(1.06)
     problem = Problem(room, prior, points, params)
     free = DIM if extrinsics else 17
     whiten = np.linalg.inv(np.linalg.cholesky(prior.covariance[:free, :free]))
@@ -311,7 +314,8 @@ def test_the_iteration_ends_at_the_minimum_of_equation_7(room: LocalMap, extrins
         x = boxplus(prior.state, np.concatenate([d, np.zeros(DIM - free)]))
         off = problem.distances(x) / problem.sigma
         beyond = np.sqrt(2.0 * RESIDUAL_HUBER * np.maximum(np.abs(off), RESIDUAL_HUBER) - RESIDUAL_HUBER**2)
-        return np.concatenate([whiten @ d, np.where(np.abs(off) > RESIDUAL_HUBER, beyond, off)])
+        pulls = np.where(np.abs(off) > RESIDUAL_HUBER, beyond, off) / np.sqrt(REPEATED)
+        return np.concatenate([whiten @ d, pulls])
 
     best = least_squares(residuals, np.zeros(free), method="lm", xtol=1e-12, ftol=1e-12).x
     posterior, registration = iekf.update(prior, points, room, params)
@@ -357,3 +361,54 @@ def test_switching_the_extrinsics_on_and_off_keeps_the_covariance_one(room: Loca
     for extrinsics in (True, False, False, True, False, True):
         belief, _ = iekf.update(belief, points, room, FilterParams(estimate_extrinsics=extrinsics))
         assert np.linalg.eigvalsh(belief.covariance)[0] > 0
+
+
+def test_points_along_the_cone_of_a_scan_line_do_not_hold_the_heading(room: LocalMap) -> None:
+    """A thicket seen from one place: the returns of a line lie on its cone, at all depths. Such a patch looks flat,
+    and turning on the spot moves points off it, but it is no surface."""
+    rng = np.random.default_rng(0)
+    bearing, depth = rng.uniform(-0.3, 0.3, 4000), rng.uniform(4.0, 9.0, 4000)
+    cone = np.column_stack([depth * np.cos(bearing), depth * np.sin(bearing), rng.normal(scale=0.005, size=4000)])
+    local_map = LocalMap(MapParams(spacing=0.05))
+    local_map.insert(cone.astype(np.float32), np.zeros(3), MapParams(spacing=0.05))
+    level = replace(
+        truth(), R_odom_imu=np.eye(3), p_odom_imu=np.zeros(3), R_imu_lidar=np.eye(3), p_imu_lidar=np.zeros(3)
+    )
+    seen = cone[:500].astype(np.float32)
+    assert np.count_nonzero(local_map.planes(seen.astype(float), FilterParams()).variances >= 0) > 100
+    _, registration = iekf.update(Belief(level, uncertain(1e-2, 1e-2)), seen, local_map, FilterParams())
+    assert registration.inliers == 0
+
+
+def footpath() -> LocalMap:
+    """Two scan lines 0.3 m apart, whose normal across them is good to some two degrees; they lead to a wide floor."""
+    rng = np.random.default_rng(1)
+    path, floor = (
+        np.stack(np.meshgrid(x, y, [-1.3]), axis=-1).reshape(-1, 3)
+        for x, y in ((np.arange(-4.0, 4.0, 0.15), (0.0, 0.3)), (np.arange(6.0, 10.0, 0.3), np.arange(-2.0, 2.0, 0.3)))
+    )
+    points = np.concatenate([path, floor])
+    points[:, 2] += rng.normal(scale=0.01, size=len(points))
+    params = MapParams(spacing=0.05)
+    local_map = LocalMap(params)
+    local_map.insert(points.astype(np.float32), np.zeros(3), params)
+    return local_map
+
+
+@pytest.mark.parametrize(("speed", "used"), [(0.0, False), (1.0, True)])
+def test_poor_planes_are_used_where_good_ones_are_few_but_only_under_way(speed: float, used: bool) -> None:
+    floor = footpath()
+    rng = np.random.default_rng(2)
+    points = rng.uniform((-3.0, 0.0, -1.3), (3.0, 0.3, -1.3), (400, 3))
+    points[::4] = rng.uniform((7.0, -1.0, -1.3), (9.0, 1.0, -1.3), (100, 3))
+    level = replace(
+        truth(),
+        **{"R_odom_imu": np.eye(3), "R_imu_lidar": np.eye(3), "p_odom_imu": np.zeros(3), "p_imu_lidar": np.zeros(3)},
+        v_odom_imu=np.array([speed, 0.0, 0.0]),
+    )
+    good = np.count_nonzero(floor.planes(points, FilterParams()).variances >= 0)
+    assert iekf.ENOUGH_PLANES < good < iekf.ENOUGH_SHARE * len(points)
+    _, registration = iekf.update(
+        Belief(level, uncertain(1e-2, 1e-2)), points.astype(np.float32), floor, FilterParams()
+    )
+    assert (registration.inliers > good + 100) == used

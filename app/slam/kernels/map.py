@@ -23,13 +23,20 @@ def _find(table, cells, a, b, c):
         h = (h + 1) & mask
 
 
+MOST_HITS = 4
+"""Hits that count. A point that went on following the scans would let the map drift with them."""
+
+
 @njit(cache=True)
 def insert(points, voxel, spacing, table, cells, counts, store, used):
     """Add points that are not within `spacing` of a point in their own voxel. Returns (used, refused).
 
+    A point within `spacing` is another hit of the nearest there, which becomes the mean of its first MOST_HITS. So
+    noise averages out.
+
     points (n, 3) f32 m, odom; voxel, spacing m. In and out: table (2^k,) i32, slot by hash or -1; cells (v, 3) i32,
-    voxel indices; counts (v,) u8; store (v, m, 3) f32 m. The first `used` slots are taken. A full voxel takes no more
-    points, a full store no new voxel; `refused` counts the points that needed one.
+    voxel indices; counts (v,) u8; store (v, m, 4) f32: x, y, z in m, hits. The first `used` slots are taken. A full
+    voxel takes no more points, a full store no new voxel; `refused` counts the points that needed one.
     """
     mask = len(table) - 1
     inverse, near2 = 1.0 / voxel, spacing * spacing
@@ -49,21 +56,26 @@ def insert(points, voxel, spacing, table, cells, counts, store, used):
                 used += 1
                 table[h] = k
                 cells[k, 0], cells[k, 1], cells[k, 2] = a, b, c
-                store[k, 0, 0], store[k, 0, 1], store[k, 0, 2] = x, y, z
+                store[k, 0, 0], store[k, 0, 1], store[k, 0, 2], store[k, 0, 3] = x, y, z, 1.0
                 counts[k] = 1
                 break
             if cells[k, 0] == a and cells[k, 1] == b and cells[k, 2] == c:
-                n = counts[k]
-                if n >= room:
-                    break
-                free = True
+                n = np.int64(counts[k])
+                nearest, at = float(near2), -1
                 for i in range(n):
                     dx, dy, dz = store[k, i, 0] - x, store[k, i, 1] - y, store[k, i, 2] - z
-                    if dx * dx + dy * dy + dz * dz < near2:
-                        free = False
-                        break
-                if free:
-                    store[k, n, 0], store[k, n, 1], store[k, n, 2] = x, y, z
+                    d2 = dx * dx + dy * dy + dz * dz
+                    if d2 < nearest:
+                        nearest, at = d2, i
+                if at >= 0:
+                    hits = store[k, at, 3] + np.float32(1.0)
+                    if hits <= MOST_HITS:
+                        store[k, at, 0] += (x - store[k, at, 0]) / hits
+                        store[k, at, 1] += (y - store[k, at, 1]) / hits
+                        store[k, at, 2] += (z - store[k, at, 2]) / hits
+                        store[k, at, 3] = hits
+                elif n < room:
+                    store[k, n, 0], store[k, n, 1], store[k, n, 2], store[k, n, 3] = x, y, z, 1.0
                     counts[k] = n + 1
                 break
             h = (h + 1) & mask
@@ -88,7 +100,8 @@ def evict(center, radius, voxel, table, cells, counts, store, used):
             for i in range(3):
                 cells[kept, i] = cells[k, i]
             for i in range(n):
-                store[kept, i, 0], store[kept, i, 1], store[kept, i, 2] = store[k, i, 0], store[k, i, 1], store[k, i, 2]
+                for c in range(4):
+                    store[kept, i, c] = store[k, i, c]
         kept += 1
     table[:] = -1
     for k in range(kept):
@@ -103,6 +116,13 @@ MOST = 40
 """Most neighbours of a patch; one that is still uncertain with them is not used."""
 BINS = 64
 """Steps of squared distance by which neighbours are ranked. Exact sorting takes three times as long."""
+SURE_TILT = math.radians(1.5)
+"""A plane whose normal is less certain than this counts for less, in proportion to the variance of its normal."""
+LEAST_SCATTER = 2.0
+"""Least scatter assumed of a plane's points, as a multiple of the point noise: a few points lie flat by chance."""
+SHARED = 4.0
+"""Weight of a plane's variance beside the point's own: points on the same patch share its error, so it does not
+average out between them."""
 
 
 @njit(cache=True, inline="always")
@@ -153,7 +173,8 @@ def _nearest(x, y, z, voxel, reach2, table, cells, counts, store, near, bins, be
 
 @njit(cache=True, error_model="numpy")
 def _fit(near, order, n, first, flat, tilt, noise, normal, center):
-    """A plane through the nearest of n ranked offsets (`planes` says how many). Returns l3 of the patch in m², or -1.
+    """A plane through the nearest of n ranked offsets (`planes` says how many). Returns the variance of a point's
+    distance from it in m², or -1.
 
     Out: normal (3,) unit, center (3,) m, relative to the query.
     """
@@ -179,14 +200,15 @@ def _fit(near, order, n, first, flat, tilt, noise, normal, center):
             xx * s - mx * mx, xy * s - mx * my, xz * s - mx * mz,
             yy * s - my * my, yz * s - my * mz, zz * s - mz * mz, normal,
         )  # fmt: skip
-        if max(l3, noise * noise) < tilt * tilt * take * l2:
+        scatter = max(l3, LEAST_SCATTER * LEAST_SCATTER * noise * noise)
+        if scatter < tilt * tilt * take * l2:
             for i in range(take):
                 k = order[i]
                 ex, ey, ez = near[k, 0] - mx, near[k, 1] - my, near[k, 2] - mz
                 if abs(ex * normal[0] + ey * normal[1] + ez * normal[2]) > flat:
                     return -1.0
             center[0], center[1], center[2] = mx, my, mz
-            return l3
+            return (noise * noise + SHARED * l3) * max(1.0, scatter / (SURE_TILT * SURE_TILT * take * l2))
         if take == n:
             break
         take = min(2 * take, n)
@@ -202,8 +224,8 @@ def planes(queries, voxel, reach, first, flat, tilt, noise, table, cells, counts
     surface across it), the patch is widened to twice as many points, up to MOST. The plane is accepted once it is
     certain enough and every neighbour lies within `flat` m of it.
 
-    queries (n, 3) f64 m, odom; noise: least scatter of the points, m; the map as in `insert`. Out: normals (n, 3) unit,
-    centers (n, 3) m, variances (n,): l3 of the patch in m², negative where there is no plane.
+    queries (n, 3) f64 m, odom; noise: of a point, m; the map as in `insert`. Out: normals (n, 3) unit, centers (n, 3)
+    m, variances (n,): of a point's distance from its plane in m², negative where there is no plane.
     """
     total = len(queries)
     for chunk in prange(CHUNKS):
@@ -219,8 +241,7 @@ def planes(queries, voxel, reach, first, flat, tilt, noise, table, cells, counts
             n = min(
                 _nearest(x, y, z, voxel, reach * reach, table, cells, counts, store, near, bins, begin, order), MOST
             )
-            l3 = _fit(near, order, n, first, flat, tilt, noise, normal, center)
-            variances[j] = l3
-            if l3 >= 0.0:
+            variances[j] = _fit(near, order, n, first, flat, tilt, noise, normal, center)
+            if variances[j] >= 0.0:
                 normals[j, 0], normals[j, 1], normals[j, 2] = normal[0], normal[1], normal[2]
                 centers[j, 0], centers[j, 1], centers[j, 2] = x + center[0], y + center[1], z + center[2]

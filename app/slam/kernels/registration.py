@@ -7,9 +7,12 @@ from numba import njit, prange
 
 from app.slam.kernels.small import CHUNKS
 
-SHARED = 4.0
-"""Weight of a plane's variance beside the point's own: points on the same patch share its error, so it does not
-average out between them."""
+REPEATED = 2.0
+"""How many times the variance of a distance counts: errors of a calibration and of a patch of the map repeat from
+frame to frame, so they do not average out over time."""
+EDGE_ON = 0.15
+"""Least cosine between a beam and the normal of its plane. Points of one scan line at different depths lie on the cone
+that the line sweeps. That looks like a surface seen edge-on, and it turns with the scanner."""
 RESIDUAL_HUBER = 2.0
 """Standard deviations beyond which a residual has constant influence (Huber 1964). Without that, one point of 400 on
 a wrong plane could move the pose by millimetres."""
@@ -27,16 +30,14 @@ def to_world(points, R, p, R_il, p_il, out):
 
 
 @njit(cache=True, parallel=True)
-def normal_equations(
-    points, R, p, R_il, p_il, normals, centers, variances, noise, gate, extrinsics, H, b, stats, residuals
-):
+def normal_equations(points, R, p, R_il, p_il, normals, centers, variances, gate, extrinsics, H, b, stats, residuals):
     """Accumulate H^T W H and H^T W z of eq. 5-6 over all points with a plane.
 
     Columns: rotation (right perturbation), position, extrinsic rotation, extrinsic translation; the last two are zero
     unless `extrinsics`. points (n, 3) f32 m, LiDAR frame; R, p: pose of the IMU in odom; R_il, p_il: pose of the LiDAR
-    in the IMU frame; normals, centers (n, 3), variances (n,) m²: planes as from `kernels.map.planes`; noise: standard
-    deviation of a point, m; gate m/√m. Out: H (12, 12), b (12,), stats (2,): inliers and their sum of squared
-    distances in m²; residuals (n,) m, signed, nan if not used.
+    in the IMU frame; normals, centers (n, 3), variances (n,) m²: planes as from `kernels.map.planes`; gate m/√m.
+    Out: H (12, 12), b (12,), stats (2,): inliers and their sum of squared distances in m²; residuals (n,) m, signed,
+    nan if not used.
     """
     n = len(points)
     H_part = np.zeros((CHUNKS, 12, 12))
@@ -66,18 +67,19 @@ def normal_equations(
             ax = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz  # R^T n: the normal in the IMU frame
             ay = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
             az = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
+            lx = R_il[0, 0] * ax + R_il[1, 0] * ay + R_il[2, 0] * az  # and in the LiDAR frame
+            ly = R_il[0, 1] * ax + R_il[1, 1] * ay + R_il[2, 1] * az
+            lz = R_il[0, 2] * ax + R_il[1, 2] * ay + R_il[2, 2] * az
+            if abs(lx * x + ly * y + lz * z) < EDGE_ON * reach:
+                continue
             row[0], row[1], row[2] = iy * az - iz * ay, iz * ax - ix * az, ix * ay - iy * ax
             row[3], row[4], row[5] = nx, ny, nz
             if extrinsics:
-                lx = R_il[0, 0] * ax + R_il[1, 0] * ay + R_il[2, 0] * az
-                ly = R_il[0, 1] * ax + R_il[1, 1] * ay + R_il[2, 1] * az
-                lz = R_il[0, 2] * ax + R_il[1, 2] * ay + R_il[2, 2] * az
                 row[6], row[7], row[8] = y * lz - z * ly, z * lx - x * lz, x * ly - y * lx
                 row[9], row[10], row[11] = ax, ay, az
-            variance = noise * noise + SHARED * variances[j]
-            w = 1.0 / variance
-            if d * d > RESIDUAL_HUBER * RESIDUAL_HUBER * variance:
-                w *= RESIDUAL_HUBER * math.sqrt(variance) / abs(d)
+            w = 1.0 / (REPEATED * variances[j])
+            if d * d > RESIDUAL_HUBER * RESIDUAL_HUBER * variances[j]:
+                w *= RESIDUAL_HUBER * math.sqrt(variances[j]) / abs(d)
             residuals[j] = d
             s_part[chunk, 0] += 1.0
             s_part[chunk, 1] += d * d
