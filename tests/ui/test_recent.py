@@ -13,7 +13,7 @@ import viser
 from app.mapping.session_file import Note, Opened, SavedSession, State, write_session
 from app.server.folders import Folders
 from app.server.protocol import Command, OpenedRecording, OpenRecording, Snapshot, Transport
-from app.slam.loops.types import Reject
+from app.slam.loops.edits import Reject
 from app.slam.params import Params
 from app.ui.files import RecentPanel
 from tests.ui.conftest import page_of, user_clicks
