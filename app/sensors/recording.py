@@ -24,7 +24,7 @@ from app.slam.types import DroppedScan, Measurement, Scan
 
 LOG_MARGIN_NS = 2_000_000_000
 """How much later or earlier than usual a message may be logged and is still found by time."""
-SILENCE_S = 1.0
+SILENCE_S = 0.5
 """Without a scan at the end, while the IMU goes on, is worth a word."""
 IMU_BEFORE_NS = 200_000_000
 """IMU samples given from before `start_s`."""
