@@ -1,28 +1,15 @@
-"""A slice of the fuzzer: cases that once broke an invariant, and a few more of each kind."""
+"""A slice of the fuzzer: cases that once broke an invariant, and the first few of each kind."""
 
-from collections.abc import Iterator
+import subprocess
+import sys
+from pathlib import Path
 
-import pytest
-
-from benchmarks.fuzz.__main__ import WORTH, Fuzzer, kept
-
-NEW = 8
-"""Cases of a kind, times its worth."""
+ROOT = Path(__file__).resolve().parents[1]
 
 
-@pytest.fixture(scope="module")
-def fuzzer() -> Iterator[Fuzzer]:
-    with Fuzzer() as made:
-        yield made
-
-
-@pytest.mark.parametrize("case", kept())
-def test_what_once_broke_holds(fuzzer: Fuzzer, case: str) -> None:
-    assert fuzzer.broken(case) == ""
-
-
-@pytest.mark.parametrize("kind", WORTH)
-def test_damaged_input_is_refused_in_a_sentence_or_taken(fuzzer: Fuzzer, kind: str) -> None:
-    count = 2 if kind == "recordings" else NEW * WORTH[kind]
-    broken = {seed: found for seed in range(count) if (found := fuzzer.broken(f"{kind}:{seed}"))}
-    assert not broken
+def test_damaged_input_is_refused_in_a_sentence_or_taken() -> None:
+    """In a process of its own: the fuzzer forks, which the threads of kernels that ran before would not survive."""
+    command = [sys.executable, "-m", "benchmarks.fuzz", "--kept"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert int(done.stdout.split()[-2]) > 60

@@ -24,7 +24,7 @@ _WIDE_FROM_PX: Final = 700
 """Where the scene is at least this wide, the strips lie along its lower edge; else under the transport."""
 COLUMNS: Final = 480
 """Most columns that a recording is thinned to, however long."""
-DEGENERATE_CM: Final = 5.0
+DEGENERATE_CM: Final = 10.0
 """A direction more uncertain than this is called degenerate (`app.slam.iekf.DEGENERATE_SIGMA`)."""
 _NOTES: Final = 50
 _NOTE_LETTERS: Final = 120

@@ -64,12 +64,18 @@ def main() -> int:
     parser.add_argument("--only", choices=WORTH, help="one kind of input")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--case", help="one case again, such as recordings:17")
+    parser.add_argument("--kept", action="store_true", help="the kept cases and the first few of each kind")
     chosen = parser.parse_args()
     with Fuzzer() as fuzzer:
         if chosen.case:
             found = fuzzer.broken(chosen.case)
             print(found or "It holds.")
             return bool(found)
+        if chosen.kept:
+            cases = [*kept(), *(f"{kind}:{seed}" for kind, worth in WORTH.items() for seed in range(2 * worth))]
+            wrong = {case: found for case in cases if (found := fuzzer.broken(case))}
+            print(*(f"{case}  {found}" for case, found in wrong.items()), f"{len(cases)} cases", sep="\n")
+            return bool(wrong)
         kinds = [chosen.only] if chosen.only else [*WORTH]
         tried, broken = Counter[str](), []
         seeds, until = {kind: count(chosen.first) for kind in kinds}, time.monotonic() + chosen.seconds
