@@ -92,7 +92,7 @@ class Engine:
         posterior, registration = predicted, _NOT_REGISTERED
         if self._map.voxels:
             chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
-            posterior, registration = self._update(predicted, chosen)
+            posterior, registration = self._update(belief, predicted, chosen)
         status = _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 
@@ -156,14 +156,16 @@ class Engine:
         """Give the disk space of the keyframes back."""
         self.keyframes.close()
 
-    def _update(self, predicted: Belief, points: F32) -> tuple[Belief, Registration]:
+    def _update(self, last: Belief, predicted: Belief, points: F32) -> tuple[Belief, Registration]:
         """As `iekf.update`; if the numbers break down, the prediction stands and the frame is lost."""
         with contextlib.suppress(np.linalg.LinAlgError):
             posterior, registration = iekf.update(predicted, points, self._map, self.params.filter)
             if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():
-                error = iekf.boxminus(posterior.state, predicted.state)
-                turned, moved = (float(np.linalg.norm(error[part])) for part in (imu.ROT, imu.POS))
-                return posterior, replace(registration, turned=turned, moved=moved)
+                change, correction = (
+                    float(np.linalg.norm(after.v_odom_imu - before.v_odom_imu))
+                    for before, after in ((last.state, predicted.state), (predicted.state, posterior.state))
+                )
+                return posterior, replace(registration, predicted_change=change, correction=correction)
         return predicted, replace(_NOT_REGISTERED, used=len(points), reason="the update gave no finite pose")
 
     def _insert(self, belief: Belief, points: np.ndarray) -> None:

@@ -14,12 +14,12 @@ READOUTS = (
     "planarity", "seeds", "ground_share", "points_in", "points_reduced", "points_filter",
     "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "loops_ms",
     "total_ms",
-    "iterations", "used", "inliers", "residual_rms", "degeneracy", "turned_deg", "moved_m", "imu_gap_s", "dropped",
-    "speed", "gyro_bias", "accel_bias", "turn_x", "turn_y", "turn_z",
+    "iterations", "used", "inliers", "residual_rms", "degeneracy", "predicted_change", "correction",
+    "imu_gap_s", "dropped", "speed", "gyro_bias", "accel_bias", "turn_x", "turn_y", "turn_z",
 )  # fmt: skip
 """Numbers of one frame, nan where there is none. `used` points were looked up in the map. `degeneracy` is the smallest
-eigenvalue of the pose information. `turned_deg` and `moved_m`: how far the update took the pose from where the IMU
-predicted it. `imu_gap_s` and `dropped` are as in `StepResult`. `speed` is in m/s. The biases are norms. `turn_*` is the
+eigenvalue of the pose information. `predicted_change` and `correction`, of the velocity by the IMU and by the update,
+are in m/s. `imu_gap_s` and `dropped` are as in `StepResult`. `speed` is in m/s. The biases are norms. `turn_*` is the
 rotation vector (rad) of R_odom_imu."""
 
 FRAME = np.dtype(
@@ -94,8 +94,8 @@ def _readouts(result: StepResult) -> F64:
         "used": registration.used,
         "inliers": registration.inliers,
         "residual_rms": registration.residual_rms,
-        "turned_deg": np.degrees(registration.turned),
-        "moved_m": registration.moved,
+        "predicted_change": registration.predicted_change,
+        "correction": registration.correction,
         "degeneracy": registration.eigenvalues[0] if len(registration.eigenvalues) else np.nan,
         "imu_gap_s": result.imu_gap_s,
         "dropped": result.dropped,

@@ -218,7 +218,8 @@ class Registration:
             means that the scan hardly observes that direction.
         degenerate: whether this scan alone leaves a direction unobserved. reason: in words.
         matches: by point; None if nothing was looked up.
-        turned, moved: rad and m, how far the update took the pose from where the IMU predicted it.
+        predicted_change, correction: m/s, how much the IMU changed the velocity since the last frame, and how much of
+            that, or in addition, the update changed.
     """
 
     converged: bool
@@ -230,8 +231,8 @@ class Registration:
     degenerate: bool
     reason: str = ""
     matches: Matches | None = None
-    turned: float = float("nan")
-    moved: float = float("nan")
+    predicted_change: float = float("nan")
+    correction: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,7 +62,10 @@ def test_poses_that_are_not_finite_are_told() -> None:
 
 
 def test_scans_that_contradict_the_imu_in_every_frame_are_told() -> None:
-    assert doubts(log(WALK, turned_deg=0.05, moved_m=0.006, accel_bias=0.1)) == ()
-    for turned_deg, moved_m, accel_bias in ((0.5, 0.001, 0), (0.01, 0.08, 0), (0.12, 0.02, 0), (0.01, 0.002, 1.2)):
-        (doubt,) = doubts(log(WALK, turned_deg=turned_deg, moved_m=moved_m, accel_bias=accel_bias))
-        assert f"by {turned_deg:.2f} deg and {1e3 * moved_m:.0f} mm a frame and {accel_bias:.2f} m/s²" in doubt
+    assert doubts(log(WALK, predicted_change=0.25, correction=0.01)) == ()
+    (doubt,) = doubts(log(WALK, predicted_change=0.25, correction=0.06))
+    assert "they take 24% back" in doubt
+
+
+def test_a_cart_that_hardly_changes_its_velocity_raises_no_doubt() -> None:
+    assert doubts(log(WALK, predicted_change=0.004, correction=0.003)) == ()
