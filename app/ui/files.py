@@ -44,13 +44,17 @@ class RecentPanel:
     """What to go on with, while the session has hardly begun: the last one, and recordings opened before.
 
     Args:
-        kept: folder of the session files.
+        kept: folder of the session files. browse: asks for a recording.
     """
 
-    def __init__(self, page: Page, folders: Folders, kept: Path) -> None:
+    def __init__(
+        self, page: Page, folders: Folders, kept: Path, browse: Callable[[Any, viser.ClientHandle], None]
+    ) -> None:
         self._send, self._folders, self._kept = page.send, folders, kept
         self._sessions: list[tuple[Path, SavedSession]] = []
         self._changes = Changes()
+        self._browse = page.gui.add_button("Open a recording…", icon=viser.Icon.FOLDER_OPEN, visible=False)
+        self._browse.on_click(by_user(browse))
         icons = (viser.Icon.HISTORY, *[viser.Icon.FILE_DATABASE] * _RECENT)
         self._buttons = [page.gui.add_button("", icon=icon, color="gray", visible=False) for icon in icons]
         self._offers: list[tuple[str, Path]] = []
@@ -59,6 +63,7 @@ class RecentPanel:
 
     def draw(self, snapshot: Snapshot) -> None:
         recording = snapshot.recording
+        self._browse.visible = recording is None and snapshot.progress is None and snapshot.engine_alive
         if self._changes(snapshot.session, snapshot.session_file):
             present, found = snapshot.session_file, self._folders.sessions(self._kept)
             own = recording.path.resolve() if recording is not None else None
@@ -102,10 +107,13 @@ class FilesPanel:
     """
 
     def __init__(self, page: Page, folders: Folders, results: Path) -> None:
-        gui = page.gui
         self._page = page
         self._folders = folders
         self._results = results
+
+    def add_buttons(self) -> None:
+        """Add the buttons to the present container."""
+        gui = self._page.gui
         self._open = gui.add_button("Open a recording…", icon=viser.Icon.FOLDER_OPEN, color="gray")
         self._compare = gui.add_button(
             "Compare with a trajectory…",
@@ -117,7 +125,7 @@ class FilesPanel:
         )
         self._save = gui.add_button("Save results…", icon=viser.Icon.DEVICE_FLOPPY, color="gray", disabled=True)
         self._saved = gui.add_html("", visible=False)
-        self._open.on_click(by_user(self._browse))
+        self._open.on_click(by_user(self.browse))
         self._compare.on_click(by_user(self._browse_trajectories))
         self._save.on_click(by_user(lambda _, client: self._ask_where(client)))
 
@@ -129,7 +137,7 @@ class FilesPanel:
         if done:
             self._saved.content = panel("path", "Saved in ", str(done[-1]))
 
-    def _browse(self, _: Any, client: viser.ClientHandle) -> None:
+    def browse(self, _: Any, client: viser.ClientHandle) -> None:
         def choose(path: Path) -> None:
             path = self._folders.openable(path)
             self._page.send(OpenRecording(path, truth_beside(path) if with_truth.value else None))

@@ -8,8 +8,8 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 _FOLDER: Final = Path(__file__).parent / "templates"
-GOOD, WARN, BAD, QUIET = "#3ecf9a", "#ffb020", "#ff6b6b", "#8b97a8"
-"""CSS colours of a reading, from fine to bad, and of what matters little."""
+GOOD, WARN, BAD, QUIET = (f"var(--hs-{name})" for name in ("good", "warn", "bad", "quiet"))
+"""CSS colours of a reading, from fine to bad, and of what matters little: readable on either background."""
 
 ONE_PIXEL: Final = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 """The smallest image: its `onload` is how HTML in viser's page runs a script."""

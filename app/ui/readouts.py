@@ -3,6 +3,7 @@
 from typing import Any, Final
 
 import numpy as np
+import viser
 
 from app.server.protocol import Snapshot
 from app.slam.types import F64, I64, STAGES, StepResult
@@ -126,6 +127,11 @@ class ReadoutPanel:
         self._changes = Changes(page.now, PANEL_PERIOD_S)
         self._tiles = gui.add_html("")
         self._time = gui.add_html("")
+        self._plots = gui.add_folder(None, visible=False)
+        with self._plots:
+            self._add_plots(gui)
+
+    def _add_plots(self, gui: viser.GuiApi) -> None:
         colours = [css(STAGE_COLOURS[stage]) for stage in reversed(STAGES)]
         self._whole = gui.add_checkbox(
             "all frames", False, hint="In the plots; where frames share a place, the worst is drawn. Off: the last 300."
@@ -148,8 +154,9 @@ class ReadoutPanel:
         if not self._changes(snapshot.result, snapshot.series, snapshot.params, dropped, self._whole.value):
             return
         result = snapshot.result
+        self._plots.visible = result is not None
         if result is None:
-            self._tiles.content = panel("quiet", "Numbers appear with the first frame.")
+            self._tiles.content = panel("quiet", "Press Play or Step below: numbers appear with the first frame.")
             self._time.content = ""
         else:
             sections = [

@@ -8,7 +8,7 @@ import viser
 from app.sensors.doctor import Finding
 from app.server.protocol import Notice, Snapshot
 from app.slam.types import FrameStatus
-from app.ui.html import BAD, GOOD, QUIET, WARN, panel
+from app.ui.html import BAD, GOOD, QUIET, WARN, heading, panel
 
 _LOG_LINES: Final = 20
 _LOOKS: Final = {"fine": ("✓ fine", GOOD), "corrected": ("↻ corrected", WARN), "needs you": ("! needs you", BAD)}
@@ -93,9 +93,11 @@ class DoctorPanel:
     """The findings of the open recording."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
-        self._html = gui.add_html(findings_html(()))
+        self._title = gui.add_html(heading("What the doctor found"), visible=False)
+        self._html = gui.add_html("", visible=False)
 
     def draw(self, snapshot: Snapshot) -> None:
+        self._title.visible = self._html.visible = snapshot.recording is not None
         self._html.content = findings_html(snapshot.recording.findings if snapshot.recording else ())
 
 
@@ -104,7 +106,8 @@ class NoticePanel:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._log = server.gui.add_html(log_html(()))
+        self._title = server.gui.add_html(heading("Messages"), visible=False)
+        self._log = server.gui.add_html("", visible=False)
         self._shown: set[int] = set()
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -113,6 +116,7 @@ class NoticePanel:
         if not new:
             return
         self._shown |= {notice.number for notice in new}
+        self._title.visible = self._log.visible = True
         self._log.content = log_html(snapshot.notices)
         for client in self._server.get_clients().values():
             for notice in new:

@@ -1,4 +1,4 @@
-"""Why did it drift: strips of what was measured at every frame of the recording; a click goes there.
+"""Diagnostics: strips of what was measured at every frame of the recording, unfolded above the transport.
 
 Frames are thinned to columns in which spikes stay visible.
 """
@@ -15,13 +15,10 @@ import numpy as np
 from app.server.protocol import Chunk, Seek, Snapshot
 from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.types import F64, I64
-from app.ui.html import BAD, GOOD, QUIET, panel, source
-from app.ui.viser_adapter import Bridge
+from app.ui.html import panel
 from app.ui.widgets import Changes, Page
 
 _PERIOD_S: Final = 0.5
-_WIDE_FROM_PX: Final = 700
-"""Where the scene is at least this wide, the strips lie along its lower edge; else under the transport."""
 COLUMNS: Final = 480
 """Most columns that a recording is thinned to, however long."""
 DEGENERATE_CM: Final = 10.0
@@ -180,7 +177,7 @@ def loop_frames(edges: tuple[LoopEdge, ...], chunks: tuple[Chunk, ...]) -> dict[
 
 
 def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
-    """What the page's script draws (`templates/timeline.js`), as JSON-ready values."""
+    """What the page's script draws (`templates/transport.js`), as JSON-ready values."""
     columns, bad = history.columns(), limits(snapshot)
     recording = snapshot.recording
     strips = []
@@ -222,7 +219,7 @@ def packed(numbers: F64) -> str:
 
 
 class TimelinePanel:
-    """The strips in the caller's container."""
+    """The strips' numbers, which `templates/transport.js` draws above the transport and marks on its track."""
 
     def __init__(self, page: Page) -> None:
         gui = page.gui
@@ -230,9 +227,6 @@ class TimelinePanel:
         self._history = History()
         self._changes = Changes(page.now, _PERIOD_S)
         self._latest = Snapshot()
-        self._bridge = Bridge(gui, "timeline", lambda word, _: self._asked(word))
-        colours = {"bad": BAD, "good": GOOD, "quiet": QUIET}
-        gui.add_html(self._bridge.live(panel("timeline", colours, _WIDE_FROM_PX, source("timeline.js"))))
         self._data = gui.add_html(panel("timeline_data", ""))
         gui.add_command("Go to the next problem", hotkey="N").on_trigger(lambda _: self._jump(1))
         gui.add_command("Go to the previous problem", hotkey="B").on_trigger(lambda _: self._jump(-1))
@@ -249,12 +243,6 @@ class TimelinePanel:
         self._history.see(snapshot)
         text = json.dumps(message(self._history, snapshot), separators=(",", ":")) if snapshot.result else ""
         self._data.content = panel("timeline_data", text)
-
-    def _asked(self, word: str) -> None:
-        """What the page's script sends: "seek 812"."""
-        verb, _, frame = word.partition(" ")
-        if verb == "seek" and frame.isdecimal():
-            self._page.send(Seek(int(frame)))
 
     def _jump(self, by: int) -> None:
         """To the next frame, or the one before, at which a problem begins."""

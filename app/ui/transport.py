@@ -1,5 +1,6 @@
-"""Play, pause, step, speed and the time slider, the same by keyboard; where playing pauses; notes on frames."""
+"""The bar at the scene's lower edge: play, step, speed and time, the same by keyboard; where playing pauses; notes."""
 
+import json
 import math
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -9,7 +10,6 @@ import viser
 from app.mapping.breakpoints import BREAKPOINTS, Breakpoints
 from app.server.protocol import (
     AddNote,
-    Command,
     Pause,
     Play,
     Seek,
@@ -18,8 +18,9 @@ from app.server.protocol import (
     Snapshot,
     StepFrame,
 )
-from app.ui.html import number, panel
-from app.ui.widgets import PANEL_PERIOD_S, Changes, Edit, Page, as_set, by_user, show
+from app.ui.html import number, panel, source
+from app.ui.viser_adapter import Bridge
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, as_set, by_user, show
 
 SPEEDS: Final = {
     "0.1×": 0.1,
@@ -29,41 +30,26 @@ SPEEDS: Final = {
     "2×": 2.0,
     "5×": 5.0,
     "10×": 10.0,
-    "as fast as it can": math.inf,
+    "maximum": math.inf,
 }
 _SWITCHES: Final = tuple(one for one in BREAKPOINTS if one.limit is None)
 _LIMITS: Final = tuple((one, one.limit) for one in BREAKPOINTS if one.limit is not None)
-_BACK, _STEP, _START = "◂ back", "step ▸", "to start"
-_FRAME_COMMANDS: Final[dict[str, Command]] = {_BACK: StepFrame(-1), _STEP: StepFrame(), _START: Seek(0)}
-_DRAG_REST_S: Final = 0.2
-"""The slider seeks after resting this long: frames on the way may have to be processed."""
-_SEEK_HOLD_S: Final = 1.0
 _SHOWN_NOTES: Final = 30
 
 
 class TransportPanel:
-    """The controls; `draw` seeks to where the slider was dragged and shows where the engine is."""
+    """The bar, a piece of HTML that `templates/transport.js` moves to the scene's lower edge.
+
+    The strips of `app.ui.timeline` unfold above it.
+    """
 
     def __init__(self, page: Page) -> None:
         gui, send = page.gui, page.send
-        self._send = page.send
-        self._snapshot = page.snapshot
-        self._now = page.now
-        self._edit: Edit | None = None  # of the slider
-        self._follows = Changes(page.now, PANEL_PERIOD_S)
-        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY_FILLED, hint="space")
-        self._frames = gui.add_button_group(
-            "frame", (_BACK, _STEP, _START), hint="Keys: ← and →. Going back loses nothing."
-        )
-        self._slider = gui.add_slider("time (frame)", 0, 1, 1, 0, hint="Drag to go to a frame, back or forward.")
-        self._where = gui.add_html("")
-        self._speed = gui.add_dropdown(
-            "speed", tuple(SPEEDS), initial_value="1×", hint="Times real time; the engine never skips a frame."
-        )
-        self._play.on_click(lambda _: self.toggle())
-        self._frames.on_click(by_user(lambda chosen, _: send(_FRAME_COMMANDS[chosen])))
-        self._speed.on_update(as_set(lambda chosen, _: send(SetSpeed(SPEEDS[chosen]))))
-        self._slider.on_update(as_set(self._drag))
+        self._send, self._snapshot = page.send, page.snapshot
+        self._changes = Changes(page.now, PANEL_PERIOD_S)
+        self._bridge = Bridge(gui, "transport", lambda word, _: self._asked(word))
+        gui.add_html(self._bridge.live(panel("transport", list(SPEEDS), source("transport.js"))))
+        self._state = gui.add_html("")
         gui.add_command("Play or pause", hotkey="space").on_trigger(lambda _: self.toggle())
         gui.add_command("Step one frame", hotkey="arrowright").on_trigger(lambda _: send(StepFrame()))
         gui.add_command("Step one frame back", hotkey="arrowleft").on_trigger(lambda _: send(StepFrame(-1)))
@@ -72,35 +58,40 @@ class TransportPanel:
         self._send(Pause() if self._snapshot().transport.playing else Play())
 
     def draw(self, snapshot: Snapshot) -> None:
-        transport, now, edit = snapshot.transport, self._now(), self._edit
-        if edit is not None and not edit.sent and now - edit.at >= _DRAG_REST_S:
-            self._edit = Edit(edit.value, now, sent=True)
-            self._send(Seek(edit.value))
-        elif edit is not None and edit.sent:
-            refused = now - edit.at > _SEEK_HOLD_S and snapshot.progress is None
-            self._edit = None if refused or transport.frame == edit.value else edit
-        self._slider.max = last = max(snapshot.recording.frames - 1, 1) if snapshot.recording else 1
-        if self._follows(snapshot, self._edit is None, at_once=not transport.playing):
-            self._where.content = where(snapshot)
-            if self._edit is None:
-                show(self._slider, min(max(transport.frame, 0), last))
-        live = snapshot.live is not None
-        self._play.disabled = snapshot.recording is None
-        # A live source has no past and its own pace. viser cannot disable a group of buttons.
-        self._slider.disabled = self._speed.disabled = live or snapshot.recording is None
-        self._frames.visible = not live
-        self._play.label = "Pause" if transport.playing else "Play"
-        self._play.icon = viser.Icon.PLAYER_PAUSE_FILLED if transport.playing else viser.Icon.PLAYER_PLAY_FILLED
-        show(self._speed, speed_name(transport.speed))
+        if self._changes(snapshot.transport, snapshot.recording, snapshot.live, at_once=not snapshot.transport.playing):
+            self._state.content = panel("transport_state", json.dumps(state(snapshot)))
 
-    def _drag(self, frame: int, _: Any) -> None:
-        self._edit = Edit(frame, self._now())
+    def _asked(self, word: str) -> None:
+        """What the page's script sends: "play", "step -1", "seek 812", "speed 2×"."""
+        match word.split(" ", 1):
+            case ["play"]:
+                self.toggle()
+            case ["step", ("1" | "-1") as frames]:
+                self._send(StepFrame(int(frames)))
+            case ["seek", frame] if frame.isdecimal():
+                self._send(Seek(int(frame)))
+            case ["speed", name] if name in SPEEDS:
+                self._send(SetSpeed(SPEEDS[name]))
+
+
+def state(snapshot: Snapshot) -> dict[str, Any]:
+    """What the bar shows, as JSON-ready values. A live source has no past and its own pace."""
+    recording, transport = snapshot.recording, snapshot.transport
+    return {
+        "open": recording is not None,
+        "live": snapshot.live is not None,
+        "playing": transport.playing,
+        "frame": max(transport.frame, 0),
+        "last": max(recording.frames - 1, 1) if recording else 1,
+        "speed": speed_name(transport.speed),
+        "words": where(snapshot),
+    }
 
 
 def speed_name(factor: float) -> str:
     """The offered speed that is nearest to `factor`."""
     if math.isinf(factor):
-        return "as fast as it can"
+        return "maximum"
     finite = {name: value for name, value in SPEEDS.items() if math.isfinite(value)}
     return min(finite, key=lambda name: abs(math.log(finite[name] / max(factor, 1e-3))))
 

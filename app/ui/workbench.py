@@ -24,7 +24,7 @@ from app.server.worker import RunningEngine
 from app.ui.appearance import AppearancePanel
 from app.ui.compare import ComparePanel, Sides
 from app.ui.files import FilesPanel, RecentPanel
-from app.ui.html import heading, render
+from app.ui.html import render
 from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
@@ -72,47 +72,43 @@ class Workbench:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=ACCENT)
         gui.set_panel_label("hemislam")
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(340)
+        gui.main_panel.set_width(360)
         self._scene = Scene(server)
         page = Page(server, engine.send, lambda: engine.snapshot, now, lambda: self._scene.offset)
 
         prepare_page(gui)
-        self._header, self._recent = HeaderPanel(gui), RecentPanel(page, folders, results / "sessions")
+        self._header = HeaderPanel(gui)
         self._transport, self._timeline = TransportPanel(page), TimelinePanel(page)
-        with gui.add_folder("Pause when", expand_by_default=False):
-            self._breakpoints = BreakpointPanel(page)
-        with gui.add_folder("Notes", expand_by_default=False):
-            self._notes = NotesPanel(page)
+        files = FilesPanel(page, folders, results)
+        self._recent = RecentPanel(page, folders, results / "sessions", files.browse)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Tune", viser.Icon.ADJUSTMENTS_HORIZONTAL):
             self._sides = Sides(gui, forks)
             tuned = replace(page, send=self._sides.send)
             self._parameters = ParameterPanel(tuned, engine.snapshot.params)
             add_yaml_buttons(tuned, lambda: self._sides.tuned(engine.snapshot).params)
+        with tabs.add_tab("Readouts", viser.Icon.CHART_LINE):
+            self._readouts = ReadoutPanel(page)
+            with gui.add_folder("Pause when", expand_by_default=False):
+                self._breakpoints = BreakpointPanel(page)
+        with tabs.add_tab("Loops", viser.Icon.INFINITY):
+            self._loops = LoopsPanel(page, lambda client: self._appearance.look_freely(client))
+        with tabs.add_tab("Study", viser.Icon.MICROSCOPE):
+            self._study = StudyPanel(page, taken=self._loops.points_at)
+        with tabs.add_tab("A/B", viser.Icon.GIT_COMPARE):
+            self._compare = ComparePanel(page, forks, self._sides)
         with tabs.add_tab("View", viser.Icon.EYE):
             self._appearance = AppearancePanel(gui)
-        with tabs.add_tab("Study", viser.Icon.MICROSCOPE):
-            self._study = StudyPanel(page, taken=lambda origin, direction: self._loops.points_at(origin, direction))
-        with tabs.add_tab("Files", viser.Icon.FOLDER):
-            self._files = FilesPanel(page, folders, results)
+        with tabs.add_tab("Recording", viser.Icon.STETHOSCOPE):
+            files.add_buttons()
+            self._live = LivePanel(gui)
+            self._doctor = DoctorPanel(gui)
+            with gui.add_folder("Notes"):
+                self._notes = NotesPanel(page)
+            self._notices = NoticePanel(server)
         with tabs.add_tab("Help", viser.Icon.HELP):
             gui.add_html(render("help.html"))
-
-        left = gui.add_panel()
-        with left.add_tab("Readouts", viser.Icon.CHART_LINE):
-            self._readouts = ReadoutPanel(page)
-        with left.add_tab("Recording", viser.Icon.STETHOSCOPE):
-            self._live = LivePanel(gui)
-            gui.add_html(heading("Recording doctor"))
-            self._doctor = DoctorPanel(gui)
-            gui.add_html(heading("Log"))
-            self._notices = NoticePanel(server)
-        with left.add_tab("Loops", viser.Icon.INFINITY):
-            self._loops = LoopsPanel(page, self._appearance.look_freely)
-        with left.add_tab("A/B", viser.Icon.GIT_COMPARE):
-            self._compare = ComparePanel(page, forks, self._sides)
-        left.dock_left()
-        left.set_width(300)
+        self._files = files
 
         self._panels = (
             self._transport, self._breakpoints, self._notes, self._notices, self._header, self._recent, self._timeline,

@@ -72,8 +72,8 @@ class Bench:
         return np.asarray(seen[-1])
 
     def pixels(self) -> np.ndarray:
-        """(h, w, 3) of the scene between the panels."""
-        shot = self.page.screenshot(clip={"x": 310, "y": 150, "width": 340, "height": 460})
+        """(h, w, 3) of the scene's middle."""
+        shot = self.page.screenshot(clip={"x": 150, "y": 150, "width": 340, "height": 390})
         return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
 

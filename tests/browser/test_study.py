@@ -20,7 +20,7 @@ def _fresh(bench: Bench) -> None:
 
 
 def timeline(bench: Bench) -> Locator:
-    return bench.page.locator("canvas[aria-label=timeline]")
+    return bench.page.locator("canvas[aria-label=diagnostics]")
 
 
 def place_of(bench: Bench, frame: int) -> tuple[float, float]:
@@ -60,38 +60,37 @@ def drawn(bench: Bench) -> int:
 
 def test_a_click_on_the_timeline_goes_there_and_what_is_passed_is_drawn(bench: Bench) -> None:
     bench.eventually(lambda: timeline(bench).count() == 1)
+    expect(timeline(bench)).to_be_hidden()
+    bench.page.get_by_role("button", name="Diagnostics").click()
     before = drawn(bench)
     bench.engine.send(StepFrame(120))
     bench.engine.sent.clear()
     bench.eventually(lambda: drawn(bench) > before + 300)
     click_goes_to(bench, 60)
     bench.eventually(lambda: bench.engine.snapshot.transport.frame == seeks(bench)[-1])
-    assert bench.page.evaluate("document.querySelectorAll('[data-hs-to] canvas').length") == 1
+    assert bench.page.evaluate("document.querySelectorAll('canvas[aria-label=diagnostics]').length") == 1
 
 
-def test_along_the_scene_it_is_as_wide_as_that_and_works_the_same_also_after_a_reload(bench: Bench) -> None:
-    panel = timeline(bench).bounding_box()
-    assert panel is not None
-
-    def x() -> float:
-        box = timeline(bench).bounding_box() if timeline(bench).count() == 1 else None
-        return box["x"] if box is not None else np.nan
-
-    bench.page.get_by_role("button", name="timeline place").click()
-    bench.eventually(lambda: x() < panel["x"] - 100)
-    click_goes_to(bench, 30)
-    bench.page.reload()
-    bench.eventually(lambda: x() < panel["x"] - 100)
-    bench.eventually(lambda: drawn(bench) > 300)
+def test_the_transport_lies_along_the_scene_and_what_was_unfolded_stays_so_after_a_reload(bench: Bench) -> None:
+    page = bench.page
+    scene, bar = page.locator("canvas[data-engine]"), page.get_by_role("toolbar", name="transport")
+    inside, outside = bar.bounding_box(), scene.bounding_box()
+    assert inside is not None and outside is not None
+    assert inside["width"] > 0.9 * outside["width"]
+    assert 0 <= outside["y"] + outside["height"] - inside["y"] - inside["height"] < 20
+    page.reload()
+    bench.eventually(lambda: timeline(bench).count() == 1 and drawn(bench) > 300)
     click_goes_to(bench, 20)
-    bench.page.get_by_role("button", name="timeline place").click()
-    bench.eventually(lambda: abs(x() - panel["x"]) < 2)
+    page.get_by_role("button", name="Diagnostics").click()
+    expect(timeline(bench)).to_be_hidden()
+    page.get_by_role("button", name="Diagnostics").click()
+    expect(timeline(bench)).to_be_visible()
 
 
 def test_a_copy_of_the_strips_that_the_page_drops_while_it_loads_leaves_the_strips_alone(bench: Bench) -> None:
     dropped = (
         "() => new Promise((done) => { const box = document.createElement('div');"
-        "box.innerHTML = document.querySelector('canvas[aria-label=timeline]').closest('[data-hs-to]').outerHTML;"
+        "box.innerHTML = document.querySelector('canvas[aria-label=diagnostics]').closest('[data-hs-to]').outerHTML;"
         "const image = box.querySelector('img'); box.firstChild.remove();"
         "image.addEventListener('load', () => setTimeout(done, 1000)); })"
     )
@@ -100,6 +99,7 @@ def test_a_copy_of_the_strips_that_the_page_drops_while_it_loads_leaves_the_stri
 
 
 def test_a_breakpoint_is_switched_on(bench: Bench) -> None:
+    bench.page.get_by_role("tab", name="Readouts").click()
     bench.page.get_by_text("Pause when").click()
     bench.page.get_by_role("checkbox", name="no ground").click()
     bench.eventually(lambda: SetBreakpoints(Breakpoints(no_ground=True)) in bench.engine.sent)

@@ -13,7 +13,7 @@ import viser
 from app.sensors.live.status import Counters, LiveState
 from app.ui.html import BAD, GOOD, WARN
 from app.ui.live import LivePanel, live_html, verdict
-from app.ui.transport import TransportPanel
+from app.ui.transport import TransportPanel, state
 from tests.ui.conftest import Clock, Wire, page_of
 from tests.ui.fake_engine import FakeEngine
 
@@ -106,13 +106,13 @@ def test_nothing_is_sent_while_nothing_changes(server: viser.ViserServer, engine
 
 def test_a_live_session_cannot_go_back_and_the_page_says_why(server: viser.ViserServer, engine: FakeEngine) -> None:
     panel = TransportPanel(page_of(server, engine.send, lambda: engine.snapshot, now=Clock()))
-    panel.draw(replace(engine.snapshot, live=WELL))
-    assert panel._slider.disabled and panel._speed.disabled and not panel._frames.visible
-    assert not panel._play.disabled
-    assert "--record" in panel._where.content
+    live = replace(engine.snapshot, live=WELL)
+    panel.draw(live)
+    assert state(live)["live"] and state(live)["open"]
+    assert "--record" in panel._state.content
     panel.draw(engine.snapshot)
-    assert not panel._slider.disabled and not panel._speed.disabled and panel._frames.visible
-    assert "--record" not in panel._where.content
+    assert not state(engine.snapshot)["live"]
+    assert "--record" not in panel._state.content
 
 
 def test_the_panel_tells_the_end_although_no_new_reading_came(server: viser.ViserServer, engine: FakeEngine) -> None:

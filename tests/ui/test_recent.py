@@ -44,7 +44,7 @@ def test_the_last_session_of_the_recording_is_offered_until_this_one_has_begun(
     server: viser.ViserServer, kept: Path
 ) -> None:
     sent: list[Command] = []
-    panel = RecentPanel(page_of(server, sent.append), Folders([kept.parent / "open"]), kept)
+    panel = RecentPanel(page_of(server, sent.append), Folders([kept.parent / "open"]), kept, lambda *_: None)
     start = opened(kept.parent / "open/walk.mcap", 0)
     panel.draw(start)
     shown = [button for button in panel._buttons if button.visible]
@@ -61,7 +61,7 @@ def test_the_last_session_of_the_recording_is_offered_until_this_one_has_begun(
 
 def test_without_a_recording_those_of_before_are_offered_too(server: viser.ViserServer, kept: Path) -> None:
     sent: list[Command] = []
-    panel = RecentPanel(page_of(server, sent.append), Folders([kept.parent / "open"]), kept)
+    panel = RecentPanel(page_of(server, sent.append), Folders([kept.parent / "open"]), kept, lambda *_: None)
     panel.draw(Snapshot())
     labels = [button.label for button in panel._buttons if button.visible]
     assert labels == ["Restore last session", "Open hall.mcap", "Open walk.mcap"]

@@ -183,10 +183,6 @@ class Bench:
         text = html.unescape(self.panel._data.content.partition(">")[2].rpartition("<")[0])
         return dict(json.loads(text))
 
-    def says(self, word: str) -> None:
-        """What the page's script writes into the field that nobody sees."""
-        user_sets(self.panel._bridge._field, word + " #1")
-
 
 @pytest.fixture
 def bench(server: viser.ViserServer, engine: FakeEngine) -> Bench:
@@ -225,17 +221,6 @@ def test_frames_played_just_before_going_back_stay(bench: Bench) -> None:
     assert bench.shown["present"] == 3
     assert bench.panel._history.columns().high["residual"][16] == pytest.approx(12.3)
     assert residual["unit"] == "mm"
-
-
-def test_a_click_goes_to_its_frame(bench: Bench) -> None:
-    bench.says("seek 123")
-    assert bench.sent == [Seek(123)]
-
-
-@pytest.mark.parametrize("word", ["", "seek", "seek x", "seek -3", "reboot 1"])
-def test_anything_else_that_comes_from_a_page_is_left_alone(bench: Bench, word: str) -> None:
-    bench.says(word)
-    assert bench.sent == []
 
 
 def test_keys_go_to_the_next_trouble_and_to_the_one_before(bench: Bench) -> None:

@@ -43,9 +43,17 @@ ASSUMPTIONS = {
         "CommandPalette.tsx",
         "useHotkeys(hotkeyItems);",
     ),
-    "Dock tabs no longer carry data-dock-tab: the left tabs wrap onto more lines.": (
+    "Dock tabs no longer carry data-dock-tab: the tabs are no grid.": (
         "dock/TabGroupFrame.tsx",
         "data-dock-tab={paneId}",
+    ),
+    "A phone's panel is no longer styled so: it covers the transport.": (
+        "ControlPanel/BottomPanel.tsx",
+        'maxHeight: "60%",\n            width: "20em",',
+    ),
+    "A folder is no longer a bordered Paper: folded ones look like empty boxes.": (
+        "components/Folder.tsx",
+        "<Paper\n      withBorder",
     ),
     "Tooltips are no longer Mantine's: they cover the controls around.": (
         "components/common.tsx",

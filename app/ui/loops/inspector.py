@@ -15,7 +15,7 @@ from app.slam.sections import LoopsParams
 from app.slam.types import F32, F64, NON_GROUND, U8
 from app.ui.chunks import below_ceiling
 from app.ui.colours import TABLES
-from app.ui.html import WARN, heading, panel
+from app.ui.html import heading, panel
 from app.ui.loops.words import NEWER, OLDER, evidence
 from app.ui.nodes import add_exact_points, place
 from app.ui.widgets import ROOT, Changes, Page, View, by_user, chart, poses_of
@@ -131,7 +131,7 @@ class Inspector:
         )
         self._contexts = gui.add_image(_NO_CONTEXTS, format="png")
         self._shifts_title = gui.add_html("")
-        line, limit = {"stroke": "#40b8f0", "width": 1.5}, {"stroke": WARN, "width": 1.5, "dash": [3, 3]}
+        line, limit = {"stroke": "#40b8f0", "width": 1.5}, {"stroke": "#e08a00", "width": 1.5, "dash": [3, 3]}
         self._shifts = chart(gui, (np.zeros(1),) * 3, [line, limit])
         self._residuals_title = gui.add_html(heading("Points over their distance to the other submap's surface, mm"))
         self._residuals = chart(gui, (np.zeros(1),) * 3, [line | {"fill": "#40b8f080"}, limit])

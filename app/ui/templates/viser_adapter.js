@@ -6,7 +6,7 @@ if (!window.hemislamSay) {
   const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set;
   window.hemislamSay = (event) => {
     const element = event.target.closest && event.target.closest('[data-hs]');
-    if (!element || (event.type === 'keydown' && event.key !== 'Enter')) return;
+    if (!element || (event.type === 'keydown' && (event.key !== 'Enter' || element.tagName === 'BUTTON'))) return;
     const name = element.closest('[data-hs-to]').dataset.hsTo;
     const bridge = document.querySelector(`.hs-bridge[data-name="${name}"]`);
     const input = bridge.parentElement.previousElementSibling.querySelector('input');

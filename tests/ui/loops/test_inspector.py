@@ -66,7 +66,7 @@ def test_numbers_have_units_and_are_red_beyond_their_limits(page: Page) -> None:
     assert "84.0<small>cm</small>" in shown and "19<small>mm</small>" in shown and "61<small>%</small>" in shown
     slide = shown.split("slide</div>")[1].split("84.0")[0]
     overlap = shown.split("overlap</div>")[1].split("61")[0]
-    assert "#ff6b6b" in slide and "#3ecf9a" in overlap
+    assert "--hs-bad" in slide and "--hs-good" in overlap
     assert "slides by 84 cm along the corridor" in page.loops._verdict._headline.content
 
 

@@ -1,15 +1,24 @@
-// Draws the strips on a canvas, reads the pointer, and asks the server to seek (see viser_adapter.js).
+// The bar at the scene's lower edge and the strips above it: draws them, reads the pointer, and tells the server what
+// was asked for (see viser_adapter.js).
 if (!this.isConnected) return; // a copy that the page has dropped already
-const shell = this.parentElement, mover = shell.closest('[data-hs-to]'), home = mover.parentElement;
-const canvas = shell.querySelector('canvas'), button = shell.querySelector('button');
-const pen = canvas.getContext('2d');
-for (const old of document.querySelectorAll('body > [data-hs-to]')) if (old.querySelector('.hs-tl')) old.remove();
-const HEAD = 20, NAME = 78, VALUE = 72;
-let ROW = 17;
-const {bad: BAD, good: GOOD, quiet: QUIET, wideFrom: WIDE_FROM} = canvas.dataset;
-let d = null, text = '', hover = null, scrubbing = false, said = 0;
-const scene = () => [...document.querySelectorAll('canvas')].filter((c) => c !== canvas)
-  .sort((a, b) => b.width * b.height - a.width * a.height)[0];
+const dock = this.parentElement, mover = dock.closest('[data-hs-to]'), home = mover.parentElement;
+const shell = dock.querySelector('.hs-tl'), canvas = shell.querySelector('canvas'), pen = canvas.getContext('2d');
+const bar = dock.querySelector('.hs-transport'), [play, fold] = ['.hs-play', '.hs-fold'].map((c) => bar.querySelector(c));
+const slider = bar.querySelector('input'), speed = bar.querySelector('select'), when = bar.querySelector('.hs-when');
+const marks = bar.querySelector('.hs-track canvas'), ink = marks.getContext('2d');
+for (const old of document.querySelectorAll('body > [data-hs-to]')) if (old.querySelector('.hs-dock')) old.remove();
+const HEAD = 20, NAME = 78, VALUE = 72, ROW = 19, HELD_MS = 1000;
+let TEXT, QUIET, GOOD, BAD, NOTE, d = null, text = '', hover = null, scrubbing = false, said = 0, touched = -HELD_MS;
+const paint = () => { // in the colours of the theme
+  const style = getComputedStyle(dock);
+  [TEXT, QUIET, GOOD, BAD, NOTE] = ['text', 'quiet', 'good', 'bad', 'warn'].map((n) => style.getPropertyValue('--hs-' + n));
+  draw(); mark();
+};
+const tell = (word) => {
+  dock.dataset.hs = word;
+  window.hemislamSay({type: 'click', target: dock});
+  delete dock.dataset.hs;
+};
 
 const unpack = (data) => new Float32Array(Uint8Array.from(atob(data), (c) => c.charCodeAt(0)).buffer);
 const read = () => {
@@ -21,7 +30,7 @@ const read = () => {
     d.stamps = unpack(d.stamps);
     for (const s of d.strips) s.data = unpack(s.data);
   }
-  draw();
+  draw(); mark();
 };
 const beyond = (s, v) => s.limit !== null && (s.low ? v < s.limit : v > s.limit);
 const columnOf = (frame) => {
@@ -34,7 +43,6 @@ const say = (text, x, y, colour, align = 'left') => {
 };
 function draw() {
   const ratio = window.devicePixelRatio || 1, W = canvas.clientWidth, rows = d ? d.strips.length + 1 : 0;
-  ROW = shell.classList.contains('wide') ? 19 : 17;
   const H = HEAD + ROW * rows + 2;
   if (!W) return;
   canvas.style.height = H + 'px';
@@ -45,7 +53,7 @@ function draw() {
   pen.clearRect(0, 0, W, H);
   pen.font = '10.5px system-ui, sans-serif';
   pen.textBaseline = 'middle';
-  say('Why did it drift', 8, HEAD / 2, '#e6ebf2');
+  say(d ? 'Diagnostics' : 'Diagnostics appear with the first frame.', 8, HEAD / 2, TEXT);
   if (!d) return;
   const gw = W - NAME - VALUE, C = d.starts.length, X = (frame) => NAME + frame / d.frames * gw;
   const at = columnOf(hover ?? Math.max(d.present, 0)), end = (c) => c + 1 < C ? d.starts[c + 1] : d.frames;
@@ -53,7 +61,7 @@ function draw() {
   const seconds = isNaN(stamp) ? first / d.frames * d.duration : stamp;
   const which = last > first ? `frames ${first.toLocaleString('en')}–${last.toLocaleString('en')}`
     : `frame ${first.toLocaleString('en')}`;
-  say(`${which} · ${seconds.toFixed(2)} s`, W - 30, HEAD / 2, hover === null ? QUIET : '#e6ebf2', 'right');
+  say(`${which} · ${seconds.toFixed(2)} s`, W - 8, HEAD / 2, hover === null ? QUIET : TEXT, 'right');
   d.strips.forEach((s, i) => {
     const top = HEAD + ROW * i, base = top + ROW - 2, full = ROW - 4, Y = (v) => base - Math.min(v / s.top, 1) * full;
     pen.fillStyle = 'rgba(127,140,160,.09)';
@@ -77,7 +85,7 @@ function draw() {
     }
     const v = s.data[s.low ? at : C + at], mid = top + ROW / 2 - 1;
     say(s.name, 8, mid, QUIET);
-    say(isNaN(v) ? '–' : `${v.toFixed(s.digits)} ${s.unit}`, W - 8, mid, beyond(s, v) ? BAD : '#e6ebf2', 'right');
+    say(isNaN(v) ? '–' : `${v.toFixed(s.digits)} ${s.unit}`, W - 8, mid, beyond(s, v) ? BAD : TEXT, 'right');
   });
   const top = HEAD + ROW * d.strips.length, mid = top + ROW / 2 - 1, counts = [];
   pen.fillStyle = 'rgba(127,140,160,.09)';
@@ -95,16 +103,16 @@ function draw() {
   }
   pen.globalAlpha = 1;
   say('loops', 8, mid, QUIET);
-  say(counts.join('  ') || '–', W - 8, mid, '#e6ebf2', 'right');
+  say(counts.join('  ') || '–', W - 8, mid, TEXT, 'right');
   const bottom = H - 3;
-  pen.fillStyle = '#ffd166';
+  pen.fillStyle = NOTE;
   for (const [frame] of d.notes) pen.fillRect(X(frame + 0.5) - 1, HEAD - 5, 2, 5);
   if (d.present >= 0) {
-    pen.fillStyle = '#ffffff';
+    pen.fillStyle = TEXT;
     pen.fillRect(X(d.present + 0.5) - 0.75, HEAD - 3, 1.5, bottom - HEAD + 3);
   }
   if (hover !== null) {
-    pen.fillStyle = 'rgba(255,255,255,.45)';
+    pen.fillStyle = QUIET;
     pen.fillRect(X(hover + 0.5) - 0.5, HEAD - 3, 1, bottom - HEAD + 3);
   }
 }
@@ -115,9 +123,7 @@ const frameAt = (event) => {
 const ask = (frame, now) => {
   if (!now && performance.now() - said < 150) return;
   said = performance.now();
-  canvas.dataset.hs = 'seek ' + frame;
-  window.hemislamSay({type: 'click', target: canvas});
-  delete canvas.dataset.hs;
+  tell('seek ' + frame);
 };
 canvas.onpointermove = (event) => {
   if (!d) return;
@@ -139,38 +145,70 @@ canvas.onpointerdown = (event) => {
 };
 canvas.onpointerup = (event) => { if (scrubbing) { scrubbing = false; ask(frameAt(event), true); } };
 canvas.onpointerleave = () => { if (!scrubbing) { hover = null; draw(); } };
-const place = (wide) => {
-  const over = scene();
-  if (wide && over) {
-    const box = over.getBoundingClientRect();
-    if (mover.parentElement !== document.body) document.body.append(mover);
-    Object.assign(mover.style, {position: 'fixed', zIndex: 5, left: box.left + 8 + 'px', width: box.width - 16 + 'px',
-      bottom: innerHeight - box.bottom + 8 + 'px'});
-  } else {
-    if (mover.parentElement !== home) home.append(mover);
-    mover.removeAttribute('style');
-  }
-  shell.classList.toggle('wide', Boolean(wide && over));
-  button.textContent = wide ? '⤡' : '⤢';
-  button.title = wide ? 'Back under the transport' : 'Along the lower edge of the scene';
+// --- the bar
+const mark = () => { // above the track: loops, notes and where trouble begins
+  const ratio = window.devicePixelRatio || 1, W = marks.clientWidth, H = marks.clientHeight, edge = 8;
+  if (!W) return;
+  marks.width = Math.round(W * ratio); marks.height = Math.round(H * ratio);
+  ink.setTransform(ratio, 0, 0, ratio, 0, 0);
+  if (!d) return;
+  const tick = (frame, colour, top, high) => {
+    ink.fillStyle = colour; ink.fillRect(edge + (frame + 0.5) / d.frames * (W - 2 * edge) - 1, top, 2, high);
+  };
+  const bad = d.starts.map((_, c) => d.strips.some((s) => beyond(s, s.data[s.low ? c : d.starts.length + c])));
+  d.starts.forEach((start, c) => { if (bad[c] && !bad[c - 1]) tick(start, BAD, H - 6, 6); });
+  for (const [verdict, colour] of [['rejected', BAD], ['accepted', GOOD]])
+    (d.loops[verdict] || []).forEach((n, c) => { if (n) tick(d.starts[c], colour, 0, 6); });
+  for (const [frame] of d.notes) tick(frame, NOTE, 0, H);
+};
+const PAUSE = 'M6 5h4v14H6zM14 5h4v14h-4z', PLAY = play.querySelector('path').getAttribute('d');
+const show = () => {
+  const node = document.querySelector('.hs-state');
+  if (!node) return;
+  const now = JSON.parse(node.dataset.state), held = performance.now() - touched < HELD_MS;
+  when.innerHTML = now.words;
+  slider.max = now.last;
+  if (!held) slider.value = now.frame;
+  slider.setAttribute('aria-valuenow', slider.value);
+  if (speed !== document.activeElement) speed.value = now.speed;
+  play.querySelector('path').setAttribute('d', now.playing ? PAUSE : PLAY);
+  play.setAttribute('aria-label', now.playing ? 'Pause' : 'Play');
+  for (const part of bar.querySelectorAll('button,input,select')) part.disabled = !now.open;
+  fold.disabled = false;
+  for (const part of bar.querySelectorAll('.hs-past')) part.hidden = now.live;
+};
+const dragged = (event) => { touched = performance.now(); ask(Number(slider.value), event.type === 'change'); };
+slider.oninput = slider.onchange = dragged;
+slider.onpointerup = () => slider.blur(); // so that space plays again
+speed.onchange = () => { tell('speed ' + speed.value); speed.blur(); };
+const unfold = (open) => {
+  shell.hidden = !open;
+  fold.setAttribute('aria-expanded', open);
+  localStorage.setItem('hemislam-diagnostics', open ? 'open' : '');
   draw();
 };
-const chosen = () => localStorage.getItem('hemislam-timeline');
-const wanted = () => chosen() ? chosen() === 'wide' : Boolean(scene()) && scene().clientWidth >= Number(WIDE_FROM);
-button.onclick = () => {
-  localStorage.setItem('hemislam-timeline', wanted() ? 'narrow' : 'wide'); place(wanted());
+fold.onclick = () => unfold(shell.hidden);
+const settle = () => {
+  const scene = document.querySelector('canvas[data-engine]');
+  if (!home.isConnected) { mover.remove(); return; }
+  if (scene) {
+    const box = scene.getBoundingClientRect(), phone = innerWidth < 577;
+    if (mover.parentElement !== document.body) { document.body.append(mover); dock.hidden = false; }
+    Object.assign(mover.style, {position: 'fixed', zIndex: 11, left: box.left + (phone ? 0 : 8) + 'px',
+      width: box.width - (phone ? 0 : 16) + 'px', bottom: phone ? 0 : innerHeight - box.bottom + 8 + 'px'});
+    dock.classList.toggle('narrow', box.width < 640);
+    const high = bar.offsetHeight + 'px', style = document.documentElement.style;
+    if (style.getPropertyValue('--hs-bar') !== high) style.setProperty('--hs-bar', high);
+  }
+  setTimeout(settle, 300);
 };
-new ResizeObserver(draw).observe(shell);
-const settle = setInterval(() => {
-  if (!home.isConnected) { clearInterval(settle); mover.remove(); return; }
-  const over = scene(), box = over && over.getBoundingClientRect();
-  const here = box ? [box.left, box.bottom, box.width].join() : '';
-  if (here !== shell.dataset.here) { shell.dataset.here = here; place(wanted()); }
-}, 300);
-const watch = () => {
-  const node = document.querySelector('.hs-tl-data');
-  if (!node) { if (home.isConnected) setTimeout(watch, 200); return; }
-  new MutationObserver(read).observe(node.parentElement, {childList: true});
-  read();
+new ResizeObserver(paint).observe(dock);
+const watch = (name, act) => {
+  const node = document.querySelector(name);
+  if (!node) { if (home.isConnected) setTimeout(() => watch(name, act), 200); return; }
+  new MutationObserver(act).observe(node.parentElement, {childList: true});
+  act();
 };
-watch(); draw();
+new MutationObserver(paint).observe(document.documentElement, {attributes: true});
+watch('.hs-tl-data', read); watch('.hs-state', show); unfold(localStorage.getItem('hemislam-diagnostics') === 'open');
+settle();
