@@ -22,12 +22,11 @@ CONVERGED_TRANSLATION = 1e-4
 """rad, m: an increment below these ends the iteration."""
 MIN_INLIERS = 30
 """Least number of planes for an update; with fewer the prediction stands."""
-RELAXED = 4.0
-"""Where too few planes are found, planes of RELAXED times the allowed tilt are used too, weighted by their certainty:
-where the map is noisy or cluttered, poor planes are better than none."""
 ENOUGH_PLANES, ENOUGH_SHARE, WALKING = 50, 0.45, 0.3
-"""Too few are fewer than ENOUGH_PLANES, and above WALKING m/s less than ENOUGH_SHARE of the points. Before the first
-step the map was seen from one place only, and poor planes along its scan lines would hold the scanner there."""
+"""Fewer good planes than ENOUGH_PLANES are too few, and above WALKING m/s less than ENOUGH_SHARE of the points. Then
+poor planes are used too, weighted by their certainty: where the map is noisy or cluttered, they are better than none.
+Before the first step the map was seen from one place only, and poor planes along its scan lines would hold the scanner
+there."""
 DEGENERATE_SIGMA = 0.1
 """m (rotation: rad times the RMS range of the points): a direction that one scan alone leaves more
 uncertain than this is degenerate."""
@@ -81,7 +80,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
     covariance, step = np.empty((free, free)), np.empty(DIM)
     planes: Planes | None = None
     since_search = np.zeros(DIM)
-    converged, iteration, relaxed = False, 0, 1.0
+    converged, iteration, poor = False, 0, False
     walking = np.linalg.norm(prior.state.v_odom_imu) > WALKING
     enough = max(ENOUGH_PLANES, ENOUGH_SHARE * n) if walking else ENOUGH_PLANES
 
@@ -89,10 +88,9 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
         R, p, R_il, p_il = x[0:9].reshape(3, 3), x[9:12], x[24:33].reshape(3, 3), x[33:36]
         if planes is None or _over(since_search, RESEARCH_ROTATION, RESEARCH_TRANSLATION):
             kernels.to_world(points, R, p, R_il, p_il, world)
-            planes = local_map.planes(world, params, relaxed)
-            if relaxed == 1.0 and np.count_nonzero(planes.variances >= 0.0) < enough:
-                relaxed = RELAXED
-                planes = local_map.planes(world, params, relaxed)
+            planes, poorer = local_map.planes(world, params)
+            poor = poor or bool(np.count_nonzero(planes.variances >= 0.0) < enough)
+            planes = poorer if poor else planes
             since_search[:] = 0.0
         kernels.normal_equations(
             points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,

@@ -10,6 +10,9 @@ from app.slam.kernels import map as kernels
 from app.slam.sections import FilterParams, MapParams
 from app.slam.types import F32, F64, I32, U8
 
+RELAXED = 4.0
+"""Tilt allowed to a poor plane, as a multiple of that of a good one."""
+
 
 @dataclass(frozen=True, slots=True)
 class MapState:
@@ -86,16 +89,20 @@ class LocalMap:
         )
         self._center = np.array(center)
 
-    def planes(self, queries: F64, params: FilterParams, relaxed: float = 1.0) -> Planes:
-        """A plane for each of (n, 3) odom points; see `kernels.map.planes`. `relaxed` multiplies the tilt allowed."""
+    def planes(self, queries: F64, params: FilterParams) -> tuple[Planes, Planes]:
+        """Good and poor planes for (n, 3) odom points, see `kernels.map.planes`.
+
+        The normal of a poor one may be RELAXED times as uncertain as that of a good one.
+        """
         n = len(queries)
-        out = Planes(np.empty((n, 3)), np.empty((n, 3)), np.empty(n))
-        reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(relaxed * params.plane_tilt)
+        normals, centers, variances = np.empty((2, n, 3)), np.zeros((2, n, 3)), np.empty((2, n))
+        reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(params.plane_tilt)
         kernels.planes(
-            queries, self._voxel, reach, params.neighbours, params.plane_threshold, tilt, params.point_noise,
-            self._table, self._cells, self._counts, self._store, out.normals, out.centers, out.variances,
+            queries, self._voxel, reach, params.neighbours, params.plane_threshold, np.array([RELAXED * tilt, tilt]),
+            params.point_noise, self._table, self._cells, self._counts, self._store, normals, centers, variances,
         )  # fmt: skip
-        return out
+        poor, good = (Planes(*parts) for parts in zip(normals, centers, variances, strict=True))
+        return good, poor
 
     def checkpoint(self) -> MapState:
         n = self._used

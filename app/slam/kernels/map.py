@@ -172,14 +172,14 @@ def _nearest(x, y, z, voxel, reach2, table, cells, counts, store, near, bins, be
 
 
 @njit(cache=True, error_model="numpy")
-def _fit(near, order, n, first, flat, tilt, noise, normal, center):
-    """A plane through the nearest of n ranked offsets (`planes` says how many). Returns the variance of a point's
-    distance from it in m², or -1.
+def _fit(near, order, n, first, flat, tilts, noise, normal, j, normals, centers, variances):
+    """Planes through the nearest of n ranked offsets, one for each of `tilts` (`planes` says how many points).
 
-    Out: normal (3,) unit, center (3,) m, relative to the query.
+    Out, in row j of each tilt: normals, unit; centers, m, relative to the query; variances, m² or -1. Scratch: normal.
     """
+    variances[:, j] = -1.0
     sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
-    done, take = 0, first
+    done, take, level = 0, first, 0
     while take <= n:
         for i in range(done, take):
             k = order[i]
@@ -201,31 +201,42 @@ def _fit(near, order, n, first, flat, tilt, noise, normal, center):
             yy * s - my * my, yz * s - my * mz, zz * s - mz * mz, normal,
         )  # fmt: skip
         scatter = max(l3, LEAST_SCATTER * LEAST_SCATTER * noise * noise)
-        if scatter < tilt * tilt * take * l2:
-            for i in range(take):
-                k = order[i]
-                ex, ey, ez = near[k, 0] - mx, near[k, 1] - my, near[k, 2] - mz
-                if abs(ex * normal[0] + ey * normal[1] + ez * normal[2]) > flat:
-                    return -1.0
-            center[0], center[1], center[2] = mx, my, mz
-            return (noise * noise + SHARED * l3) * max(1.0, scatter / (SURE_TILT * SURE_TILT * take * l2))
-        if take == n:
+        begin = level
+        while level < len(tilts) and scatter < tilts[level] * tilts[level] * take * l2:
+            level += 1
+        if level > begin and _is_flat(near, order, take, mx, my, mz, normal, flat):
+            doubt = max(1.0, scatter / (SURE_TILT * SURE_TILT * take * l2))
+            for i in range(begin, level):
+                normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = normal[0], normal[1], normal[2]
+                centers[i, j, 0], centers[i, j, 1], centers[i, j, 2] = mx, my, mz
+                variances[i, j] = (noise * noise + SHARED * l3) * doubt
+        if level == len(tilts) or take == n:
             break
         take = min(2 * take, n)
-    return -1.0
+
+
+@njit(cache=True, inline="always")
+def _is_flat(near, order, n, x, y, z, normal, flat):
+    """Whether the nearest n offsets lie within `flat` m of the plane through (x, y, z)."""
+    for i in range(n):
+        k = order[i]
+        ex, ey, ez = near[k, 0] - x, near[k, 1] - y, near[k, 2] - z
+        if abs(ex * normal[0] + ey * normal[1] + ez * normal[2]) > flat:
+            return False
+    return True
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def planes(queries, voxel, reach, first, flat, tilt, noise, table, cells, counts, store, normals, centers, variances):
-    """A plane through the nearest map points of each query.
+def planes(queries, voxel, reach, first, flat, tilts, noise, table, cells, counts, store, normals, centers, variances):
+    """Planes through the nearest map points of each query, one for each of the falling `tilts` (k,) rad.
 
     The `first` nearest points within `reach` m are tried first. The normal of a plane through k points of scatter s is
-    uncertain by s / sqrt(k l2) rad. While that exceeds `tilt` (neighbours on one scan line do not determine the
+    uncertain by s / sqrt(k l2) rad. While that exceeds the tilt (neighbours on one scan line do not determine the
     surface across it), the patch is widened to twice as many points, up to MOST. The plane is accepted once it is
     certain enough and every neighbour lies within `flat` m of it.
 
-    queries (n, 3) f64 m, odom; noise: of a point, m; the map as in `insert`. Out: normals (n, 3) unit, centers (n, 3)
-    m, variances (n,): of a point's distance from its plane in m², negative where there is no plane.
+    queries (n, 3) f64 m, odom; noise: of a point, m; the map as in `insert`. Out: normals (k, n, 3) unit, centers
+    (k, n, 3) m, variances (k, n): of a point's distance from its plane in m², negative where there is no plane.
     """
     total = len(queries)
     for chunk in prange(CHUNKS):
@@ -235,13 +246,13 @@ def planes(queries, voxel, reach, first, flat, tilt, noise, table, cells, counts
         order = np.empty(room, np.int32)
         begin = np.empty(BINS + 2, np.int32)
         normal = np.empty(3)
-        center = np.empty(3)
         for j in range(chunk * total // CHUNKS, (chunk + 1) * total // CHUNKS):
             x, y, z = queries[j, 0], queries[j, 1], queries[j, 2]
             n = min(
                 _nearest(x, y, z, voxel, reach * reach, table, cells, counts, store, near, bins, begin, order), MOST
             )
-            variances[j] = _fit(near, order, n, first, flat, tilt, noise, normal, center)
-            if variances[j] >= 0.0:
-                normals[j, 0], normals[j, 1], normals[j, 2] = normal[0], normal[1], normal[2]
-                centers[j, 0], centers[j, 1], centers[j, 2] = x + center[0], y + center[1], z + center[2]
+            _fit(near, order, n, first, flat, tilts, noise, normal, j, normals, centers, variances)
+            for i in range(len(tilts)):
+                centers[i, j, 0] += x
+                centers[i, j, 1] += y
+                centers[i, j, 2] += z
