@@ -41,12 +41,8 @@ def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundRe
     if len(points) == 0:
         return replace(none, reason="the scan has no points")
 
-    present = np.zeros(int(ring.max()) + 1, dtype=np.bool_)
-    present[ring] = True
-    candidate = np.zeros_like(present)
-    candidate[np.flatnonzero(present)[: params.scan_lines]] = True
     sums = np.zeros(12)
-    seeds = kernels.seed_moments(points, ring, candidate, down, np.cos(np.radians(params.alpha)), labels, sums)
+    seeds = kernels.seed_moments(points, ring, params.scan_lines, down, np.cos(np.radians(params.alpha)), labels, sums)
     if seeds < MIN_SEEDS:
         labels[:] = NON_GROUND
         return replace(none, reason=f"only {seeds} seed points; a plane takes {MIN_SEEDS}", seeds=seeds)
@@ -66,7 +62,7 @@ def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundRe
     elif slope > params.max_slope:
         reason = f"the seeds' plane is {slope:.0f}° steep, over {params.max_slope:g}°"
     else:
-        kernels.label(points, centroid, normal, params.sigma, labels)
-        return replace(result, found=True, share=float(np.count_nonzero(labels)) / len(points))
+        count = kernels.label(points, centroid, normal, params.sigma, labels)
+        return replace(result, found=True, share=count / len(points))
     labels[:] = NON_GROUND
     return replace(result, reason=reason)

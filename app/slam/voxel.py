@@ -57,10 +57,12 @@ class VoxelGrid:
         self._generation += 1
         if chosen is None:
             chosen = np.ones(n, dtype=np.uint8)
+        out = np.empty((n, 3), dtype=np.float32)
         m = clouds.centroids(
-            points, chosen, voxel_size, self._table, self._stamp, self._generation, self._cells, self._sums, self._order
-        )
-        return Downsampled(self._sums[:m, :3].astype(np.float32), self._order[:m].copy())
+            points, chosen, voxel_size, self._table, self._stamp, self._generation, self._cells, self._sums,
+            self._order, out,
+        )  # fmt: skip
+        return Downsampled(out[:m], self._order[:m].copy())
 
 
 def spread(points: F32, most: int, voxel_size: float) -> F32:

@@ -28,13 +28,13 @@ def in_range(points, nearest, farthest, keep):
 
 
 @njit(cache=True)
-def centroids(points, chosen, voxel, table, stamp, generation, cells, sums, order):
+def centroids(points, chosen, voxel, table, stamp, generation, cells, sums, order, out):
     """Replace the chosen points of each voxel by their centroid; copy the others unchanged.
 
     points (n, 3) f32 and voxel in the same unit; chosen (n,) u8, non-zero where a point takes part. Scratch: table
     (2^k,) i32 and stamp (2^k,) i32, where `generation` marks live slots, so that nothing has to be cleared; cells
-    (n, 3) i32. Out: sums (n, 4) f64: x y z count, in order of first appearance; order (n,) i32: the first point of each
-    output. Returns the number of outputs.
+    (n, 3) i32; sums (n, 4) f64: x y z count. Out, in order of first appearance: out (n, 3) f32; order (n,) i32, the
+    first point of each. Returns the number of outputs.
     """
     mask = len(table) - 1
     inverse = 1.0 / voxel
@@ -67,7 +67,6 @@ def centroids(points, chosen, voxel, table, stamp, generation, cells, sums, orde
             h = (h + 1) & mask
     for k in range(m):
         s = 1.0 / sums[k, 3]
-        sums[k, 0] *= s
-        sums[k, 1] *= s
-        sums[k, 2] *= s
+        for i in range(3):
+            out[k, i] = sums[k, i] * s
     return m

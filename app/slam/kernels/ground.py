@@ -2,23 +2,31 @@
 
 import math
 
+import numpy as np
 from numba import njit, prange
 
 
 @njit(cache=True)
-def seed_moments(points, ring, candidate, down, cos_alpha, labels, sums):
+def seed_moments(points, ring, lines, down, cos_alpha, labels, sums):
     """Mark seeds (label 2) and add up their first and second moments about the first seed.
 
-    A seed is a point on a candidate line within the angle alpha of down.
+    A seed is a point on one of the outermost `lines` present, within the angle alpha of down.
 
-    points (n, 3) f32 m, LiDAR frame; ring (n,) u16, line of each point; candidate (lines,) bool; down (3,) unit.
+    points (n, 3) f32 m, LiDAR frame; ring (n,) u16, line of each point, 0 the outermost; down (3,) unit.
     Out: labels (n,) u8; sums (12,) f64: origin (the first seed, m), sum of offsets from it (m), and of their products
     xx xy xz yy yz zz (m²). Returns the number of seeds.
     """
+    present = np.zeros(1 << 16, np.bool_)
+    for j in range(len(points)):
+        present[ring[j]] = True
+    last = found = 0
+    while found < lines and last < len(present):
+        found += present[last]
+        last += 1
     count = 0
     for j in range(len(points)):
         labels[j] = 0
-        if not candidate[ring[j]]:
+        if ring[j] >= last:
             continue
         x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
         along = x * down[0] + y * down[1] + z * down[2]
@@ -45,8 +53,10 @@ def seed_moments(points, ring, candidate, down, cos_alpha, labels, sums):
 def label(points, centroid, normal, sigma, labels):
     """Paper eq. 2-3: a point p is ground if |(mu - p) . n| < sigma |p|. Seeds that are ground stay seeds.
 
-    points (n, 3) f32 m; centroid mu (3,) m; normal n (3,) unit; sigma m/m; labels (n,) u8, in and out.
+    points (n, 3) f32 m; centroid mu (3,) m; normal n (3,) unit; sigma m/m; labels (n,) u8, in and out. Returns the
+    number of ground points.
     """
+    count = 0
     for j in prange(len(points)):
         x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
         d = (centroid[0] - x) * normal[0] + (centroid[1] - y) * normal[1] + (centroid[2] - z) * normal[2]
@@ -55,3 +65,5 @@ def label(points, centroid, normal, sigma, labels):
             labels[j] = 0
         elif labels[j] == 0:
             labels[j] = 1
+        count += ground
+    return count
