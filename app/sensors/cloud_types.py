@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from app.sensors.livox import CUSTOM_MSGS, CustomMsg
 from app.sensors.ros import stamp_ns
 from app.slam.errors import printable
 from app.slam.types import F32, U8
@@ -154,7 +155,20 @@ POINT_CLOUD_2 = CloudType(
     intensities=("intensity", "intensities", "reflectivity", "reflectance", "i"),
 )
 
-CLOUD_TYPES: dict[str, CloudType] = {kind.name: kind for kind in (POINT_CLOUD_2,)}
+
+def read_custom_msg(message: CustomMsg) -> CloudMessage:
+    """CustomMsg of the Livox drivers: all points of a tenth of a second, without scan lines."""
+    count, step = len(message.points), message.points.itemsize
+    if message.stated != count:
+        raise CloudError(f"the cloud states {message.stated} points, but holds {count}")
+    return CloudMessage(stamp_ns(message.header.stamp), 1, count, step, count * step, message.fields, message.data)
+
+
+LIVOX_CUSTOM_MSGS = tuple(
+    CloudType(name, read_custom_msg, ("offset_time",), (), ("reflectivity",), time_unit="ns") for name in CUSTOM_MSGS
+)
+
+CLOUD_TYPES: dict[str, CloudType] = {kind.name: kind for kind in (POINT_CLOUD_2, *LIVOX_CUSTOM_MSGS)}
 """Every type that can be read, by name."""
 
 

@@ -240,8 +240,12 @@ def _window_means(times: F64, values: F64, starts: F64) -> F64:
     return np.asarray((sums[last] - sums[first]) / np.maximum(last - first, 1)[:, None])
 
 
-def gravity_findings(probe: ImuProbe, units: ImuUnits, params: Params) -> list[Finding]:
-    """The direction of down in the LiDAR frame, by the IMU's first samples, and whether the mount was given."""
+def gravity_findings(probe: ImuProbe, units: ImuUnits, params: Params, preset: str = "") -> list[Finding]:
+    """The direction of down in the LiDAR frame, by the IMU's first samples, and whether the mount was given.
+
+    Args:
+        preset: of the sensor that the clouds look like, "" if they look like none.
+    """
     first = probe.stamps_ns - probe.stamps_ns[0] <= params.imu.start_duration * 1e9
     accel, gyro = _reordered(probe.accel[first], units.accel), _reordered(probe.gyro[first], units.gyro)
     specific = np.median(accel, axis=0)
@@ -266,5 +270,7 @@ def gravity_findings(probe: ImuProbe, units: ImuUnits, params: Params) -> list[F
     else:
         text = "no pose of the LiDAR on the IMU is given; taken as the same axes and origin"
         option = "--set 'sensor.translation=[x, y, z]' --set 'sensor.rotation=[roll, pitch, yaw]'"
+        if preset:
+            text, option = f"{text}; the clouds look like those of preset {preset}, which has it", f"--preset {preset}"
         findings.append(Finding("mount", "needs you", text, option))
     return findings

@@ -50,7 +50,8 @@ def settle_cloud(
         if spin.start is None:  # then only the cloud's own first or last point can be at the header stamp
             timing = replace(timing, anchor="last" if timing.shift_ns else "first", shift_ns=0)
     else:
-        time_findings.append(_rotation_finding(clouds[-1], probes[-1].column(timing.field), timing))
+        if rings.of_lines:
+            time_findings.append(_rotation_finding(clouds[-1], probes[-1].column(timing.field), timing))
     layout = CloudLayout(
         timing=timing,
         rings=rings,

@@ -3,8 +3,13 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from app.sensors.livox import CUSTOM_MSGS
+from app.sensors.rings import elevation
 from app.slam.errors import HemislamError
 from app.slam.params import Params
+from app.slam.types import F32
 
 _H2LID_MOUNT = {"translation": [0.0175, 0.0276, -0.1083], "rotation": [0.0, 0.0, 0.0]}
 
@@ -15,11 +20,25 @@ PRESETS: dict[str, dict[str, Any]] = {
         "sensor": _H2LID_MOUNT,
     },
     "h2lid-mount": {"sensor": _H2LID_MOUNT},
+    "mid360": {
+        "recording": {"lidar_topic": "/livox/lidar", "imu_topic": "/livox/imu"},
+        "sensor": {"translation": [-0.011, -0.02329, 0.04412]},
+    },
     "close": {"scan": {"voxel_size": 0.3}, "map": {"spacing": 0.15}},
 }
 """One entry each. `rslidar`: the vendor's ROS driver. `h2lid`: the authors' published recordings. `h2lid-mount`: only
-their pose of the LiDAR on the IMU, for recordings under other topics. `close`: most things are at arm's length (a desk,
+their pose of the LiDAR on the IMU, for recordings under other topics. `mid360`: Livox's ROS drivers, with the IMU
+inside the Mid-360 at the place that its manual states. `close`: most things are at arm's length (a desk,
 a cabin, a shaft)."""
+
+
+def preset_for(kind: str, points: F32) -> str:
+    """The preset of the sensor whose clouds are of this type and look like this one ((n, 3) m); "" if none is known."""
+    angles = np.degrees(elevation(points))
+    lowest, highest = np.percentile(angles, [0.5, 99.5])
+    around = np.histogram(np.arctan2(points[:, 1], points[:, 0]), 12, (-np.pi, np.pi))[0]
+    is_mid360 = kind in CUSTOM_MSGS and lowest > -9 and 40 < highest < 56 and np.count_nonzero(around) > 8
+    return "mid360" if is_mid360 else ""
 
 
 def sidecar(recording: Path) -> Path:

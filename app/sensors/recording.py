@@ -14,6 +14,7 @@ from app.sensors.findings import Finding
 from app.sensors.imu_units import gravity_findings, settle_imu
 from app.sensors.layout import settle_cloud
 from app.sensors.pointcloud import decode, read_scan
+from app.sensors.presets import preset_for
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu
 from app.sensors.ros import Vector, stamp_ns
 from app.sensors.sequencer import Sequencer
@@ -89,7 +90,7 @@ class Recording:
             *imu_probe_findings,
             *imu_findings,
             self._clocks,
-            *gravity_findings(imu, self._imu_units, params),
+            *gravity_findings(imu, self._imu_units, params, preset_for(lidar.type, probes[0].points)),
         )
 
     def measurements(

@@ -15,6 +15,10 @@ from app.slam.types import F32, F64, I64, U16
 
 _ENOUGH = 50_000
 """Points that suffice to separate the lines."""
+_LEAST_LINES = 4
+"""Fewer are no scan lines: the pattern does not repeat."""
+RING_DEG = 2.0
+"""Elevation that counts as a line where there are none."""
 _COMMON_LINES = (16, 32, 40, 64, 80, 128)
 
 
@@ -29,6 +33,7 @@ class Rings:
             the rank already.
         bounds: (lines - 1,) rad, ascending, the elevations that separate the lines.
         centre: (radial, height) m, where the beams start from as seen by `bounds`.
+        of_lines: False if the sensor has no scan lines, and rings are equal steps of elevation.
     """
 
     field: str | None = None
@@ -36,6 +41,7 @@ class Rings:
     rank: U16 | None = None
     bounds: F64 | None = None
     centre: tuple[float, float] = (0.0, 0.0)
+    of_lines: bool = True
 
     def of(self, cloud: CloudMessage, points: F32, index: npt.NDArray[np.intp]) -> U16:
         """(n,) uint16 ring of the kept points, whose places in the message are `index`."""
@@ -67,8 +73,12 @@ def settle_rings(probes: list[Probe], kind: CloudType, names: dict[str, str]) ->
     if field is not None:
         raw = np.concatenate([probe.column(field) for probe in probes]).astype(np.int64)
         if raw.min() >= 0 and raw.max() < 4096 and raw.max() > raw.min():
-            return _settle_field(field, raw[far], elevation(points[far]), int(raw.max()) + 1)
-        why = f"field `{field}` is always {raw[0]}" if raw.max() == raw.min() else f"field `{field}` is no line number"
+            if _spread(raw[far], elevation(points[far])) < 1.0:
+                return _settle_field(field, raw[far], elevation(points[far]), int(raw.max()) + 1)
+            why = f"points of each `{field}` have all elevations"
+        else:
+            constant = raw.max() == raw.min()
+            why = f"field `{field}` is always {raw[0]}" if constant else f"field `{field}` is no line number"
     else:
         why = "the clouds have no ring field"
     by_place = _settle_place(probes)
@@ -79,10 +89,13 @@ def settle_rings(probes: list[Probe], kind: CloudType, names: dict[str, str]) ->
         )
     bounds, centre = _settle_elevation(points)
     lines = len(bounds) + 1
-    text = f"{why}; {lines} scan lines were separated by their elevation"
-    if lines < 4:
-        text += ", too few for seed points: the ground needs `ring` or clearly separate lines"
-    return Rings(bounds=bounds, centre=centre), Finding("ring order", "corrected" if lines >= 4 else "needs you", text)
+    if lines >= _LEAST_LINES:
+        text = f"{why}; {lines} scan lines were separated by their elevation"
+        return Rings(bounds=bounds, centre=centre), Finding("ring order", "corrected", text)
+    lowest, highest = np.percentile(elevation(points), [0.5, 99.5])
+    bounds = np.arange(lowest, highest, np.radians(RING_DEG))[1:]
+    text = f"{why}, and no scan lines can be told apart; M counts {len(bounds) + 1} rings of {RING_DEG:g} deg instead"
+    return Rings(bounds=bounds, of_lines=False), Finding("ring order", "corrected", text)
 
 
 def _far(points: F32) -> npt.NDArray[np.intp]:
@@ -125,8 +138,7 @@ def _settle_place(probes: list[Probe]) -> tuple[Rings, int] | None:
         present, medians = _line_medians(raw, angles)
         if len(present) < max(3, lines // 2):
             continue
-        within = np.median(np.abs(angles - medians[np.searchsorted(present, raw).clip(max=len(present) - 1)]))
-        if within < 0.25 * np.median(np.diff(np.sort(medians))):
+        if _spread(raw, angles) < 0.25:
             return Rings(place=(step, lines), rank=_ranked(present, medians, lines)), lines
     return None
 
@@ -159,6 +171,14 @@ def _settle_elevation(points: F32) -> tuple[F64, tuple[float, float]]:
             kept.append(int(peak))
     centres = 0.5 * (edges[kept] + edges[np.asarray(kept, int) + 1])
     return 0.5 * (centres[1:] + centres[:-1]), centre
+
+
+def _spread(raw: I64, angles: F32) -> float:
+    """How far points lie from the elevation of their line, over the distance between two lines."""
+    present, medians = _line_medians(raw, angles)
+    within = np.median(np.abs(angles - medians[np.searchsorted(present, raw).clip(max=len(present) - 1)]))
+    between = np.median(np.diff(np.sort(medians))) if len(medians) > 1 else np.inf
+    return float(within / between) if between > 0 else np.inf
 
 
 def _line_medians(raw: I64, angles: F32) -> tuple[I64, F64]:

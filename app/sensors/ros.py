@@ -10,6 +10,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from app.sensors.livox import CUSTOM_MSGS, CustomMsg
 from app.slam.types import Scan
 
 LIDAR_TOPIC, IMU_TOPIC = "/rslidar_points", "/imu/data"
@@ -42,10 +43,12 @@ class Deserialiser:
 
     def knows(self, kind: str, encoding: str) -> bool:
         """Whether messages of this type can be read."""
-        return encoding in self._stores and kind in self._stores[encoding].types
+        return encoding in self._stores and (kind in CUSTOM_MSGS or kind in self._stores[encoding].types)
 
     def read(self, data: bytes, kind: str, encoding: str) -> Any:
         """The message. Raises whatever the library raises for bytes that are no such message."""
+        if kind in CUSTOM_MSGS:
+            return CustomMsg.of(data, encoding)
         store = self._stores[encoding]
         return store.deserialize_ros1(data, kind) if encoding == "ros1" else store.deserialize_cdr(data, kind)
 

@@ -73,12 +73,15 @@ def process(path: Path, truth_path: Path, params: Params) -> Pass:
 
 @pytest.fixture(scope="session")
 def passed(shared_data: Path) -> Callable[[str], Pass]:
-    """The outcome of "hall", "outdoor" or "garage"."""
+    """The outcome of "hall", "outdoor", "garage" or "mid360"."""
 
     @cache
     def outcome(name: str) -> Pass:
         if name == "garage":
             return process(shared_data / "garage_hdl32e.mcap", shared_data / "garage_hdl32e_reference.tum", Params())
+        if name == "mid360":
+            mid360 = Params().merged(PRESETS["mid360"])
+            return process(shared_data / "hall_mid360.mcap", shared_data / "hall_mid360_truth.tum", mid360)
         return process(shared_data / f"{name}_bpearl.mcap", shared_data / f"{name}_bpearl_truth.tum", H2LID_MOUNT)
 
     return outcome

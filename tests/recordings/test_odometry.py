@@ -42,6 +42,13 @@ def test_a_real_sensor_of_another_kind_agrees_with_its_reference(passed: Passed)
     assert len(outcome.estimate) == 45
 
 
+def test_a_livox_mid360_is_mapped_by_its_preset_alone(passed: Passed) -> None:
+    """Points without scan lines, an IMU in g. Of FAST-LIO2, iG-LIO and DLIO the best errs by 4 mm."""
+    outcome = passed("mid360")
+    assert ate(outcome.estimate, outcome.truth).position.rmse <= 0.005
+    assert outcome.statuses[FrameStatus.LOST] == 0
+
+
 @pytest.mark.parametrize("name", ["hall", "outdoor", "garage"])
 def test_no_frame_is_lost(passed: Passed, name: str) -> None:
     statuses = passed(name).statuses

@@ -1,0 +1,123 @@
+"""CustomMsg of the Livox drivers: what rosbags writes of any message, we read point by point."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import get_types_from_msg
+
+from app.sensors.cloud_types import CloudError, read_custom_msg
+from app.sensors.doctor import examine
+from app.sensors.livox import DRIVERS
+from app.sensors.presets import preset_for
+from app.sensors.recording import open_recording
+from app.sensors.ros import Deserialiser
+from app.slam.params import Params
+from app.slam.types import DroppedScan, Measurement
+from tests.sensors import rig
+
+POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line"
+MESSAGE = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n{}/CustomPoint[] points"
+)
+for store in rig.TYPESTORES.values():
+    for driver in DRIVERS:
+        store.register(get_types_from_msg(POINT, f"{driver}/msg/CustomPoint"))
+        store.register(get_types_from_msg(MESSAGE.format(driver), f"{driver}/msg/CustomMsg"))
+
+
+def message(turn: rig.Turn, driver: str = DRIVERS[0], ros: int = 2, **other: Any) -> Any:
+    """The turn's points with reflectivity 10, 11, …, tag 16 and line 0 to 3, stamped at the first of them."""
+    types = rig.TYPESTORES[ros].types
+    tags = other.pop("tags", np.full(len(turn), 16))
+    points = [
+        types[f"{driver}/msg/CustomPoint"](int(after), *map(float, xyz), 10 + n % 200, int(tag), n % 4)
+        for n, (after, xyz, tag) in enumerate(zip(turn.offsets_ns, turn.points, tags, strict=True))
+    ]
+    content = {"timebase": turn.begin_ns, "point_num": len(points), "lidar_id": 192, "rsvd": np.zeros(3, np.uint8)}
+    header = rig.header(turn.begin_ns, ros)
+    return types[f"{driver}/msg/CustomMsg"](header=header, points=points, **content | other)
+
+
+def encoded(made: Any, ros: int = 2, *, little: bool = True) -> tuple[bytes, str, str]:
+    """Its bytes, type and encoding."""
+    kind, store = made.__msgtype__, rig.TYPESTORES[ros]
+    if ros == 1:
+        return bytes(store.serialize_ros1(made, kind)), kind, "ros1"
+    return bytes(store.serialize_cdr(made, kind, little_endian=little)), kind, "cdr"
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize(("ros", "little"), [(1, True), (2, True), (2, False)])
+def test_every_point_is_read_as_it_was_written(driver: str, ros: int, little: bool) -> None:
+    turn = rig.turn(columns=30)
+    cloud = read_custom_msg(Deserialiser().read(*encoded(message(turn, driver, ros), ros, little=little)))
+    assert cloud.stamp_ns == turn.begin_ns and len(cloud) == len(turn)
+    np.testing.assert_array_equal(cloud.xyz(), turn.points.astype(np.float32))
+    np.testing.assert_array_equal(cloud.column("offset_time"), turn.offsets_ns)
+    np.testing.assert_array_equal(cloud.column("reflectivity"), 10 + np.arange(len(turn)) % 200)
+    np.testing.assert_array_equal(cloud.column("line"), np.arange(len(turn)) % 4)
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_half_a_message_and_a_count_that_lies_are_refused_with_both_numbers(ros: int) -> None:
+    turn = rig.turn(columns=30)
+    data, kind, encoding = encoded(message(turn, ros=ros), ros)
+    with pytest.raises(CloudError, match=r"states 240 points, but holds 1\d\d"):
+        read_custom_msg(Deserialiser().read(data[: len(data) // 2], kind, encoding))
+    for stated in (0, 239, 241, 2**32 - 1):
+        lying = Deserialiser().read(*encoded(message(turn, ros=ros, point_num=stated), ros))
+        with pytest.raises(CloudError, match=f"states {stated} points, but holds 240"):
+            read_custom_msg(lying)
+
+
+def test_returns_of_low_confidence_are_left_out() -> None:
+    turn = rig.turn(columns=30)
+    tags = np.where(np.arange(len(turn)) % 3, 16, 32)
+    cloud = read_custom_msg(Deserialiser().read(*encoded(message(turn, tags=tags))))
+    kept = np.flatnonzero(np.abs(cloud.xyz()).any(axis=1))
+    np.testing.assert_array_equal(kept, np.flatnonzero(tags == 16))
+
+
+def walk(tmp_path: Path, turns: int = 14, **damage: Any) -> Path:
+    """A recording; `damage`: what every second message states otherwise."""
+    entries = []
+    for topic, log_ns, made in rig.walk(turns=turns, columns=60):
+        if topic == "/points":
+            number = (log_ns - rig.START_NS) // rig.PERIOD_NS - 1
+            made = message(rig.turn(number, 60), **(damage if number % 2 else {}))
+        entries.append((topic, log_ns, made))
+    return rig.write(tmp_path / "livox", entries, "mcap")
+
+
+def test_a_recording_is_read_without_an_option(tmp_path: Path) -> None:
+    path = walk(tmp_path)
+    with open_recording(path, Params()) as recording:
+        found = [entry for entry in recording.measurements() if isinstance(entry, Measurement)]
+    assert len(found) >= 10
+    for number, measurement in enumerate(found):
+        turn = rig.turn(number, 60)
+        assert measurement.scan.stamp_ns == turn.begin_ns
+        np.testing.assert_array_equal(measurement.scan.points, turn.points.astype(np.float32))
+        np.testing.assert_array_equal(measurement.scan.offsets_ns, turn.offsets_ns)
+    (timing,) = (finding for finding in examine(path, Params()) if finding.subject == "point time")
+    assert timing.verdict == "fine" and "`offset_time` (uint32) in ns" in timing.text
+
+
+def test_a_message_that_lies_is_dropped_and_the_others_stay(tmp_path: Path) -> None:
+    with open_recording(walk(tmp_path, point_num=7), Params()) as recording:
+        found = list(recording.measurements())
+    dropped = [entry.reason for entry in found if isinstance(entry, DroppedScan)]
+    assert len(dropped) == 7 and set(dropped) == {"the cloud states 7 points, but holds 480"}
+    assert sum(isinstance(entry, Measurement) for entry in found) >= 5
+
+
+def test_a_mid360_is_recognised_by_what_it_sees() -> None:
+    azimuth, elevation = np.random.default_rng(1).uniform([-np.pi, -0.12], [np.pi, 0.91], (5000, 2)).T
+    points = 5 * np.column_stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    ).astype(np.float32)
+    assert preset_for(f"{DRIVERS[0]}/msg/CustomMsg", points) == "mid360"
+    assert preset_for("sensor_msgs/msg/PointCloud2", points) == ""
+    assert preset_for(f"{DRIVERS[0]}/msg/CustomMsg", points[points[:, 0] > 0]) == ""
