@@ -17,13 +17,15 @@ from tqdm import tqdm
 
 from benchmarks.fuzz import inputs
 from benchmarks.fuzz.recordings import Recordings
+from benchmarks.fuzz.rest import REQUESTS_AT_ONCE, Rest
 
 SEEDS = Path(__file__).with_name("seeds.txt")
 """`KIND:SEED` of cases that once broke an invariant, one a line."""
 MOST_NEW = 5
 """Cases that one run adds to them."""
-WORTH = {"recordings": 1, "packets": 2, "session": 5, "text": 5, "page": 20}
+WORTH = {"recordings": 1, "packets": 2, "rest": 2, "session": 5, "text": 5, "page": 20}
 """How many cases of each kind are tried in turn, so that each kind takes about as long."""
+EACH = {"packets": f" of {inputs.PACKETS_AT_ONCE} packets", "rest": f" of {REQUESTS_AT_ONCE} requests"}
 
 
 class Fuzzer:
@@ -31,9 +33,11 @@ class Fuzzer:
 
     def __init__(self) -> None:
         self._recordings = Recordings()
+        self._rest = Rest(self._recordings.good)
         self._kinds: dict[str, Callable[[int], str]] = {
             "recordings": self._recordings.broken,
             "packets": lambda seed: inputs.packets(seed, self._recordings.packets),
+            "rest": self._rest.broken,
             "session": lambda seed: inputs.session(seed, self._recordings.good),
             "text": inputs.text,
             "page": inputs.page,
@@ -43,6 +47,7 @@ class Fuzzer:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._rest.close()
         self._recordings.close()
 
     def broken(self, case: str) -> str:
@@ -90,7 +95,7 @@ def main() -> int:
                         tqdm.write(f"{case}  {found}\n")
     for kind in kinds:
         failures = sum(case.startswith(f"{kind}:") for case in broken)
-        each = f" of {inputs.PACKETS_AT_ONCE} packets" if kind == "packets" else ""
+        each = EACH.get(kind, "")
         print(f"{kind:12} {tried[kind]:7,} cases{each}, {failures} break an invariant")
     if new := [case for case in broken if case not in kept()][:MOST_NEW]:
         with SEEDS.open("a", encoding="utf-8") as file:

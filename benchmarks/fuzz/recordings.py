@@ -20,11 +20,12 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from app.sensors.cloud_types import read_point_cloud_2
 from app.sensors.live.feed import packets_of
 from app.sensors.recording import open_recording
-from app.sensors.ros import CLOUD, IMU, IMU_TOPIC, LIDAR_TOPIC, definition, serialised
+from app.sensors.ros import CLOUD, IMU, IMU_TOPIC, LIDAR_TOPIC, header, serialised
 from app.sensors.simulator import simulate
 from app.sensors.source import Source
 from app.slam.errors import HemislamError
@@ -33,7 +34,9 @@ from app.slam.params import Params
 from app.slam.trajectory import read_tum
 from benchmarks.fuzz.damage import MESSAGES, Entry, bytes_damaged
 
-FORMATS = ("mcap", "mcap", "mcap-lz4", "mcap-plain", "bag", "bag-bz2", "bag-lz4", "db3", "pcap")
+FORMATS = ("mcap-livox", "mcap", "mcap-lz4", "mcap-plain", "bag", "bag-bz2", "bag-lz4", "db3", "pcap")
+ONLY_BYTES = ("mcap-livox", "pcap")
+"""Of these the messages are not damaged one by one."""
 MOST_S, MOST_BYTES = 60, 2 << 30
 """What one run may take."""
 TOLERANCE = 0.01
@@ -42,6 +45,17 @@ Packet = tuple[int, int, bytes]
 """Time in ns, UDP port, payload."""
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+CUSTOM_POINT, CUSTOM_MSG = "livox_ros_driver2/msg/CustomPoint", "livox_ros_driver2/msg/CustomMsg"
+ROS2.register(
+    get_types_from_msg(
+        "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line", CUSTOM_POINT
+    )
+    | get_types_from_msg(
+        "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+        "livox_ros_driver2/CustomPoint[] points",
+        CUSTOM_MSG,
+    )
+)
 SAYS_SO = re.compile(r"^(WARNING|noted|dropped|needs you|corrected)\b.*", re.MULTILINE)
 
 
@@ -107,7 +121,7 @@ class Recordings:
 
     def _damaged(self, luck: random.Random) -> tuple[Path, str]:
         kind = luck.choice(FORMATS)
-        if kind == "pcap" or luck.random() < 0.5:
+        if kind in ONLY_BYTES or luck.random() < 0.5:
             data = bytes_damaged(luck, self._files[kind])
             path = self._path / f"case.{kind.partition('-')[0]}"
             path.write_bytes(data)
@@ -187,13 +201,14 @@ def _copied(message: Any) -> Any:
 
 
 def _write_mcap(path: Path, compression: str, entries: list[Entry], luck: random.Random | None) -> None:
-    kinds = {"": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "plain": CompressionType.NONE}
+    kinds = {"": CompressionType.ZSTD, "lz4": CompressionType.LZ4}
+    cloud = CUSTOM_MSG if compression == "livox" else CLOUD
     with path.open("wb") as file:
-        writer = McapWriter(file, compression=kinds[compression], chunk_size=200_000)
+        writer = McapWriter(file, compression=kinds.get(compression, CompressionType.NONE), chunk_size=200_000)
         writer.start(profile="ros2")
         channels = {}
-        for topic, kind in ((LIDAR_TOPIC, CLOUD), (IMU_TOPIC, IMU)):
-            text, encoding = definition(kind).encode(), "cdr"
+        for topic, kind in ((LIDAR_TOPIC, cloud), (IMU_TOPIC, IMU)):
+            text, encoding = ROS2.generate_msgdef(kind)[0].encode(), "cdr"
             if luck is not None:
                 text = bytes_damaged(luck, text)
                 topic += luck.choice(["", "\x1b[31m", "\n", "é" * 300])
@@ -201,8 +216,26 @@ def _write_mcap(path: Path, compression: str, entries: list[Entry], luck: random
             schema = writer.register_schema(kind, "ros2msg", text)
             channels[topic[:5]] = writer.register_channel(topic, encoding, schema)
         for topic, log_ns, message in entries:
-            writer.add_message(channels[topic[:5]], log_ns, _serialised(message), log_ns)
+            data = _as_custom_msg(message) if compression == "livox" and topic == LIDAR_TOPIC else _serialised(message)
+            writer.add_message(channels[topic[:5]], log_ns, data, log_ns)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
+
+
+def _as_custom_msg(message: Any) -> bytes:
+    """The same cloud as Livox's driver sends it."""
+    cloud = read_point_cloud_2(message)
+    times = cloud.column("timestamp")
+    begin_ns = round(float(times.min()) * 1e9)
+    after = np.rint((times - times.min()) * 1e9).astype(int).tolist()
+    points = [
+        ROS2.types[CUSTOM_POINT](offset_time=at, x=x, y=y, z=z, reflectivity=10, tag=16, line=0)
+        for at, (x, y, z) in zip(after, cloud.xyz().tolist(), strict=True)
+    ]
+    made = ROS2.types[CUSTOM_MSG](
+        header=header(begin_ns, "livox_frame"), timebase=begin_ns, point_num=len(points), lidar_id=0,
+        rsvd=np.zeros(3, np.uint8), points=points,
+    )  # fmt: skip
+    return bytes(ROS2.serialize_cdr(made, CUSTOM_MSG))
 
 
 def _serialised(message: Any) -> bytes:

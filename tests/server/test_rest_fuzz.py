@@ -6,7 +6,6 @@ import httpx
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rest_fuzz import Document, Sent
 from server_site import TIMEOUT_S, Site, engine_recording, serving
 from test_rewind import SAMPLE
 
@@ -17,6 +16,7 @@ from app.server.viser_adapter import Viser
 from app.server.web import make_app
 from app.server.worker import EngineProcess
 from app.slam.params import Params
+from benchmarks.fuzz.requests import Document, Sent
 
 JSON = {"Content-Type": "application/json"}
 EXPORT = "/api/export/{name}"
