@@ -8,6 +8,8 @@ from app.ui.colours import COLOUR_BY, Limits, legend
 from app.ui.html import panel
 from app.ui.widgets import View, choose_next, show
 
+_ACCENTS: Final = {False: (38, 166, 154), True: (13, 110, 102)}
+"""On a dark and on a light background."""
 _LAYERS: Final = (
     ("ceilings", "ceilings", "Hidden, you can look into a building from above. Ceilings labelled ground stay."),
     ("map", "map", "Points of the keyframes."),
@@ -19,15 +21,24 @@ _LAYERS: Final = (
 )
 
 
-class AppearancePanel:
-    """Widgets whose values are the `View`; the engine does not know of them."""
+def apply_theme(gui: viser.GuiApi, *, light: bool) -> None:
+    gui.configure_theme(dark_mode=not light, show_logo=False, show_share_button=False, brand_color=_ACCENTS[light])
 
-    def __init__(self, gui: viser.GuiApi) -> None:
+
+class AppearancePanel:
+    """Widgets whose values are the `View`; the engine does not know of them.
+
+    legend: what `templates/transport.js` copies into the scene.
+    """
+
+    def __init__(self, gui: viser.GuiApi, legend: viser.GuiHtmlHandle) -> None:
         default = View()
+        self._legend = legend
         self._colour_by = gui.add_dropdown(
             "colour by", COLOUR_BY, initial_value=default.colour_by, hint="What colours mean. C: the next."
         )
-        self._legend = gui.add_html(legend(default.colour_by, None))
+        self._light = gui.add_checkbox("light background", False, hint="For bright rooms and for print.")
+        self._light.on_update(lambda _: apply_theme(gui, light=self._light.value))
         self._follow = gui.add_checkbox(
             "follow", default.follow, hint="Keep the sensor in the middle; orbit and zoom as you like. F toggles."
         )
@@ -50,6 +61,7 @@ class AppearancePanel:
             colour_by=self._colour_by.value,
             point_size=self._point_size.value / 100,
             follow=self._follow.value,
+            light=self._light.value,
             **{name: layer.value for name, layer in self._layers.items()},
         )
 
@@ -61,6 +73,6 @@ class AppearancePanel:
 
     def draw(self, view: View, limits: Limits | None, points: int, budget: int) -> None:
         """Explain the colours as drawn and say how many points the page holds."""
-        self._legend.content = legend(view.colour_by, limits)
+        self._legend.content = panel("legend", legend(view.colour_by, limits), view.grid)
         words = f"{points:,} map points in the page, at most {budget:,}, and fewer the longer the trajectory."
         self._count.content = panel("note", f"{words} The engine keeps the whole map.")

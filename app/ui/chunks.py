@@ -13,9 +13,10 @@ import viser
 
 from app.server.protocol import Chunk
 from app.slam.types import F32, F64, NON_GROUND, U8
-from app.ui.colours import HEIGHT, MODES, Limits, PointSet, colours, grown
+from app.ui.colours import BY_POSE, INTENSITY, MODES, Limits, PointSet, colours, grown
 from app.ui.geometry import STILL_M
 from app.ui.nodes import add_points, place
+from app.ui.shading import light
 from app.ui.widgets import View
 
 _STILL: Final[F32] = np.array([5e-5, 5e-5, 5e-5, STILL_M], np.float32)
@@ -26,6 +27,8 @@ _LEAST_SHARE: Final = 0.004
 _FLATNESS_M: Final = 0.12
 """Most median deviation of the points overhead from their median height: treetops are rougher."""
 _MARGIN_M: Final = 0.25
+_SAMPLE: Final = 200
+"""Points of each keyframe that say how large the map is."""
 Chosen: TypeAlias = npt.NDArray[np.bool_] | slice
 """Which points of a chunk."""
 
@@ -35,12 +38,13 @@ class _Drawn:
     """A keyframe in the scene.
 
     Attributes:
-        limits: ends of the colour maps with this keyframe and those before it.
+        limits: ends of the colour maps with this keyframe and those before it. light: (n,) of the chunk's points.
         count: points shown. handle: None while there are none.
     """
 
     chunk: Chunk
     limits: dict[str, Limits]
+    light: F32
     count: int = 0
     handle: viser.PointCloudHandle | None = None
 
@@ -54,7 +58,7 @@ class MapChunks:
         self._drawn: list[_Drawn] = []
         self._T_map_imu: F64 = np.empty((0, 3, 4))  # of each keyframe, as drawn
         self._view = View()
-        self._coloured: Limits | None = None
+        self._coloured: tuple[Limits | None, Limits | None] = None, None
         self._fixed: dict[str, Limits] = {}
         self._start_ns = 0
 
@@ -83,22 +87,24 @@ class MapChunks:
         known = len(self._drawn)
         moved = self._move(poses[: len(chunks), :3])
         for chunk, T in zip(chunks[known:], self._T_map_imu[known:], strict=True):
-            self._drawn.append(_Drawn(chunk, self._grown(chunk, T)))
-        seen, limits = self._view, self.limits.get(view.colour_by)
+            self._drawn.append(_Drawn(chunk, self._grown(chunk, T), light(chunk.points, T @ chunk.T_imu_lidar)))
+        seen, limits = self._view, (self.limits.get(view.colour_by), self.limits.get(INTENSITY))
         recolour = view.colour_by != seen.colour_by or limits != self._coloured
         self._view, self._coloured = view, limits
         for index, (drawn, chunk) in enumerate(zip(self._drawn, chunks, strict=True)):
             if index >= known or chunk is not drawn.chunk or view.ceilings != seen.ceilings:
-                drawn.chunk = chunk
+                if chunk is not drawn.chunk:
+                    drawn.chunk = chunk
+                    drawn.light = light(chunk.points, self._T_map_imu[index] @ chunk.T_imu_lidar)
                 self._send(drawn, self._T_map_imu[index])
             elif drawn.handle is not None:
                 T = self._T_map_imu[index]
                 if moved[index]:
                     place(drawn.handle, T @ chunk.T_imu_lidar)
-                if view.point_size != seen.point_size or view.map != seen.map:
-                    drawn.handle.point_size, drawn.handle.visible = view.point_size, view.map
-                if recolour or (moved[index] and view.colour_by == HEIGHT):
-                    drawn.handle.colors = self._colours(self._shown(chunk, T))
+                if view.map_point_size != seen.map_point_size or view.map != seen.map:
+                    drawn.handle.point_size, drawn.handle.visible = view.map_point_size, view.map
+                if recolour or (moved[index] and view.colour_by in BY_POSE):
+                    drawn.handle.colors = self._colours(self._shown(drawn, T))
 
     def _keep(self, count: int) -> None:
         for drawn in self._drawn[count:]:
@@ -122,7 +128,13 @@ class MapChunks:
                 limits = {**limits, name: wider}
         return limits
 
-    def _cloud(self, chunk: Chunk, T_map_imu: F64, shown: Chosen = slice(None)) -> PointSet:
+    def sample(self) -> F64:
+        """(m, 3) some points of all keyframes, in the map."""
+        every = zip(self._drawn, self._T_map_imu, strict=False)
+        some = [(T @ drawn.chunk.T_imu_lidar, drawn.chunk.points[:_SAMPLE]) for drawn, T in every]
+        return np.concatenate([np.empty((0, 3)), *(points @ T[:3, :3].T + T[:3, 3] for T, points in some)])
+
+    def _cloud(self, chunk: Chunk, T_map_imu: F64, shown: Chosen = slice(None), light: F32 | None = None) -> PointSet:
         return PointSet(
             chunk.points[shown],
             chunk.labels[shown],
@@ -130,10 +142,13 @@ class MapChunks:
             chunk.ring[shown],
             T_map_imu @ chunk.T_imu_lidar,
             (chunk.stamp_ns - self._start_ns) * 1e-9,
+            light,
         )
 
-    def _shown(self, chunk: Chunk, T_map_imu: F64) -> PointSet:
-        return self._cloud(chunk, T_map_imu, shown_points(chunk, T_map_imu @ chunk.T_imu_lidar, self._view.ceilings))
+    def _shown(self, drawn: _Drawn, T_map_imu: F64) -> PointSet:
+        chunk = drawn.chunk
+        shown = shown_points(chunk, T_map_imu @ chunk.T_imu_lidar, self._view.ceilings)
+        return self._cloud(chunk, T_map_imu, shown, drawn.light[shown])
 
     def _send(self, drawn: _Drawn, T_map_imu: F64) -> None:
         """Send a keyframe's points in place of those sent before.
@@ -141,7 +156,7 @@ class MapChunks:
         Under the same name instead of through the handle's properties: a page that connects later is
         then not sent what was thinned away.
         """
-        cloud = self._shown(drawn.chunk, T_map_imu)
+        cloud = self._shown(drawn, T_map_imu)
         drawn.count = len(cloud.points)
         if not drawn.count:  # the page cannot draw a cloud without points
             if drawn.handle is not None:
@@ -153,13 +168,13 @@ class MapChunks:
             f"{self._root}/{drawn.chunk.index}",
             cloud.points,
             self._colours(cloud),
-            self._view.point_size,
+            self._view.map_point_size,
             cloud.T_map_lidar,
             visible=self._view.map,
         )
 
     def _colours(self, cloud: PointSet) -> U8:
-        return colours(cloud, self._view.colour_by, self._coloured)
+        return colours(cloud, self._view.colour_by, self.limits)
 
 
 def shown_points(chunk: Chunk, T_map_lidar: F64, ceilings: bool) -> Chosen:

@@ -1,6 +1,6 @@
 """Colours of points: by label, or by a number through a perceptually uniform map. `MODES` declares every mode."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -26,6 +26,7 @@ _ANCHORS: Final[dict[str, str]] = {
     # Their dark ends are left out: they would vanish on the dark page.
     "viridis": "3b518b 2c718e 21908d 27ad81 5cc863 aadc32 fde725",
     "plasma": "7e03a8 a92395 cc4778 e56b5d f89540 fdc527 f0f921",
+    "cividis": "3b496c 575d6d 707173 8a8678 a59c74 c3b369 e1cc55 fee838",
     "magma": "812581 b5367a e55964 fb8761 fec287 fcfdbf",
 }
 
@@ -57,7 +58,7 @@ class PointSet:
 
     Attributes:
         points: (n, 3) m, LiDAR frame. labels, intensity, ring: (n,). T_map_lidar: (4, 4).
-        seconds: of the scan, since the recording's start.
+        seconds: of the scan, since the recording's start. light: (n,) brightness up to 1, or None.
     """
 
     points: F32
@@ -66,6 +67,7 @@ class PointSet:
     ring: U16
     T_map_lidar: F64
     seconds: float
+    light: F32 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,13 +97,21 @@ def _height(cloud: PointSet) -> F64:
 LABEL: Final = "label"
 """The mode without numbers: each label has its colour."""
 HEIGHT: Final = "height"
-"""The mode whose colours change when a pose does."""
+INTENSITY: Final = "intensity"
+LOOK: Final = "height × intensity"
+"""The usual mode: colour by height, brightness by intensity, and the labels as a tint."""
+BY_POSE: Final = (HEIGHT, LOOK)
+"""The modes whose colours change when a pose does."""
+_TINT: Final = 0.35
+_DIMMEST: Final = 0.75
+"""Brightness of the least intensity."""
 
 MODES: Final[dict[str, ColourMode]] = {
     mode.name: mode
     for mode in (
+        ColourMode(LOOK, "m", "cividis", _height, share=1.0),
         ColourMode(HEIGHT, "m", "viridis", _height, share=1.0),
-        ColourMode("intensity", "sensor's scale", "magma", lambda cloud: cloud.intensity, step=16.0, share=1.0),
+        ColourMode(INTENSITY, "sensor's scale", "magma", lambda cloud: cloud.intensity, step=16.0, share=1.0),
         ColourMode("ring", "0 = outermost line", "viridis", lambda cloud: cloud.ring.astype(np.float32)),
         ColourMode(
             "time",
@@ -114,14 +124,26 @@ MODES: Final[dict[str, ColourMode]] = {
 }
 """Every other mode, in the order shown."""
 
-COLOUR_BY: Final = (LABEL, *MODES)
+COLOUR_BY: Final = (LOOK, LABEL, *(name for name in MODES if name != LOOK))
 
 
-def colours(cloud: PointSet, by: str, limits: Limits | None) -> U8:
-    """(n, 3) colours of points. limits: ends of the colour map; not used for labels."""
-    if by == LABEL or limits is None:
-        return label_colours(cloud.labels)
-    return value_colours(MODES[by].values(cloud), limits, TABLES[MODES[by].table])
+def colours(cloud: PointSet, by: str, limits: Mapping[str, Limits]) -> U8:
+    """(n, 3) colours of points. limits: ends of the colour maps by mode; labels need none."""
+    found = label_colours(cloud.labels)
+    if by != LABEL and by in limits:
+        values = value_colours(MODES[by].values(cloud), limits[by], TABLES[MODES[by].table])
+        found = _tinted(values, found, cloud, limits[INTENSITY]) if by == LOOK else values
+    if cloud.light is None or by not in (LOOK, LABEL):
+        return found
+    return np.asarray(found * cloud.light[:, None], dtype=np.uint8)
+
+
+def _tinted(values: U8, labels: U8, cloud: PointSet, limits: Limits) -> U8:
+    """(n, 3) colours by height, as bright as their intensity; ground and seeds with a tint of their labels' colours."""
+    share = np.clip((cloud.intensity - limits.low) / (limits.high - limits.low), 0.0, 1.0)
+    found = values * (_DIMMEST + (1 - _DIMMEST) * np.nan_to_num(share))[:, None]
+    tint = np.where(cloud.labels == NON_GROUND, 0.0, _TINT)[:, None]
+    return np.asarray(found + tint * (labels - found), dtype=np.uint8)
 
 
 def label_colours(labels: U8) -> U8:
@@ -158,4 +180,6 @@ def legend(by: str, limits: Limits | None) -> str:
         return panel("keys", [(LABEL_COLOURS[label], name) for label, name in LABEL_NAMES.items()])
     mode = MODES[by]
     low, high = ("", "") if limits is None else (f"{limits.low:g}", f"{limits.high:g}")
+    if by == LOOK:
+        return panel("colour_bar", TABLES[mode.table][::32], low, "height · m", high) + legend(LABEL, None)
     return panel("colour_bar", TABLES[mode.table][::32], low, f"{mode.name} · {mode.legend}", high)

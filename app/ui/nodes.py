@@ -11,7 +11,7 @@ from app.ui.colours import Rgb
 from app.ui.geometry import STILL_M, wxyz
 
 PATH_COLOUR: Final = (255, 92, 141)
-TRUTH_COLOUR: Final = (240, 244, 250)
+TRUTH_COLOUR: Final = (120, 150, 255)
 BLOCK: Final = 256
 """Segments per node: a new frame sends only the newest node again, not an hour's path."""
 _MOST_TRUTH_POINTS: Final = 4000

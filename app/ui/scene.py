@@ -4,13 +4,14 @@ All nodes hang below one frame. To follow the sensor, that frame is shifted so t
 at the origin: the camera of every browser is left to its user, who may orbit and zoom while following.
 """
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import viser
 
 from app.server.protocol import Snapshot
 from app.slam.types import F64, StepResult
+from app.ui.camera import FOV, whole
 from app.ui.chunks import MapChunks
 from app.ui.colours import Limits
 from app.ui.nodes import TrajectoryNode, Truth
@@ -23,6 +24,10 @@ _FOLLOW_RATE: Final = 0.3
 _FOLLOW_JUMP_M: Final = 4.0
 _GROUND_BEFORE_SEEN_M: Final = -1.2
 _GRID_STEP_M: Final = 0.03
+_GRID: Final = {False: ((42, 48, 58), (62, 72, 88)), True: ((214, 220, 228), (186, 195, 207))}
+"""Colours of its cells and of every fifth line, on a dark and on a light background."""
+_FRAMED_AGAIN: Final = 1.25
+"""The view that pages open with is chosen again when the map has so many times as many keyframes."""
 
 
 class Scene:
@@ -39,24 +44,24 @@ class Scene:
             f"{ROOT}/grid",
             infinite_grid=True,
             cell_size=1.0,
-            cell_color=(70, 80, 98),
+            cell_color=_GRID[False][0],
             section_size=5.0,
-            section_color=(96, 110, 134),
+            section_color=_GRID[False][1],
             section_thickness=1.2,
             fade_distance=60.0,
             shadow_opacity=0.0,
             position=(0.0, 0.0, _GROUND_BEFORE_SEEN_M),
         )
-        self._session = -1
+        self._session, self._light = -1, False
         self._shown: StepResult | None = None
         self._changes = Changes()
         self._chunks = MapChunks(scene, f"{ROOT}/keyframes")
         self._sensor = SensorScene(scene, f"{ROOT}/sensor")
         self._trajectory = TrajectoryNode(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
-        server.initial_camera.position = (-4.0, -4.0, 9.0)  # high enough to look into a corridor without its ceiling
-        server.initial_camera.look_at = (0.3, 0.2, -0.6)
-        server.initial_camera.fov = float(np.radians(60.0))
+        server.initial_camera.fov = FOV
+        self._framed = 0
+        self._frame(np.empty((0, 3)))
 
     @property
     def offset(self) -> F64:
@@ -67,6 +72,10 @@ class Scene:
     def points(self) -> int:
         return self._chunks.points
 
+    def sample(self) -> F64:
+        """(n, 3) some points of the map."""
+        return self._chunks.sample()
+
     def limits(self, by: str) -> Limits | None:
         """Ends of a colour map as drawn; None for labels and before there is anything to colour."""
         return self._chunks.limits.get(by)
@@ -76,7 +85,7 @@ class Scene:
             recording, result = current.recording, current.result
             start_ns = recording.start_ns if recording else 0
             if current.session != self._session:
-                self._session, self._shown = current.session, None
+                self._session, self._shown, self._framed = current.session, None, 0
                 self._chunks.clear(start_ns, recording.duration_s if recording else 1.0)
                 self._sensor.clear()
             poses = poses_of(current)
@@ -84,9 +93,12 @@ class Scene:
             self._trajectory.draw(current.trajectory if current.trajectory is not None else np.empty((0, 3)), view.path)
             self._truth.draw(recording.truth_positions if recording else None, current.T_map_truth, view.path)
             self._grid.visible = view.grid
+            if view.light != self._light:
+                self._light = view.light
+                self._grid.cell_color, self._grid.section_color = _GRID[view.light]
             if result is None:
                 return
-            limits = self.limits(view.colour_by)
+            limits = self._chunks.limits
             if self._changes(result, current.params, view, limits):
                 self._sensor.draw(self._shown, result, current.params, view, limits, start_ns)
             z = self._sensor.ground_z
@@ -95,6 +107,19 @@ class Scene:
             if view.follow:
                 self._follow(result.T_map_imu[:3, 3], jump=self._shown is None)
             self._shown = result
+            keyframes = len(current.chunks)
+            if not self._framed <= keyframes < _FRAMED_AGAIN * self._framed + 1:
+                first, self._framed = not self._framed, keyframes
+                self._frame(self.sample(), at_once=first)
+
+    def _frame(self, points: F64, at_once: bool = False) -> None:
+        """Let pages that open later see all points, (n, 3) in the map; at_once: also those that are open."""
+        stand, offset = whole(points), self.offset
+        cameras: list[Any] = [self._server.initial_camera]
+        if at_once:
+            cameras += [client.camera for client in self._server.get_clients().values()]
+        for camera in cameras:
+            camera.position, camera.look_at = stand.position + offset, stand.look_at + offset
 
     def _follow(self, position: F64, jump: bool) -> None:
         behind = -position - self._root.position

@@ -1,5 +1,6 @@
 """The sensor and what it sees just now: scan, field of view, seed wedge, ground plane."""
 
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -7,7 +8,7 @@ import viser
 
 from app.slam.params import Params
 from app.slam.types import F64, GROUND, SEED, StepResult
-from app.ui.colours import LABEL_COLOURS, Limits, PointSet, colours
+from app.ui.colours import LABEL, LABEL_COLOURS, LOOK, Limits, PointSet, colours
 from app.ui.geometry import disc, field_of_view, foot, ring_elevations, rotation_to, seed_wedge, wxyz
 from app.ui.nodes import NO_COLOURS, NO_LINES, NO_POINTS, add_lines, add_points, add_surface, place
 from app.ui.widgets import View
@@ -58,13 +59,13 @@ class SensorScene:
         result: StepResult,
         params: Params,
         view: View,
-        limits: Limits | None,
+        limits: Mapping[str, Limits],
         start_ns: int,
     ) -> None:
         """Draw `result`; of a frame that was only labelled again, only colours are sent.
 
         Args:
-            previous: what is drawn now. limits: ends of the colour map in use; None for labels.
+            previous: what is drawn now. limits: ends of the colour maps by mode.
             start_ns: of the recording.
         """
         self._imu.visible = True
@@ -80,7 +81,8 @@ class SensorScene:
                 T_map_lidar,
                 (result.stamp_ns - start_ns) * 1e-9,
             )
-            self._scan.colors = colours(points, view.colour_by, limits)
+            by = LABEL if view.colour_by == LOOK else view.colour_by  # what is tuned stands out from the map
+            self._scan.colors = colours(points, by, limits)
             if another:
                 self._scan.points = points.points.astype(np.float16)
         if another:

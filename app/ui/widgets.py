@@ -12,13 +12,17 @@ import viser
 
 from app.server.protocol import Command, Snapshot
 from app.slam.types import F64
-from app.ui.colours import LABEL, Limits
+from app.ui.colours import LOOK, Limits
 
 SCENE_PERIOD_S: Final = 1 / 15
 PANEL_PERIOD_S: Final = 1 / 4
 """The scene and the panels are drawn at most this often."""
 ROOT: Final = "/map"
 """Scene node of the map. It is moved while the sensor is followed; everything in the map's frame hangs below it."""
+
+
+_STANDING_BACK: Final = 0.35
+"""Size of the map's points while parameters are tuned, as a share of the usual."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,10 +32,11 @@ class View:
     Attributes:
         colour_by: a name of `app.ui.colours.COLOUR_BY`. point_size: m. follow: keep the sensor in the middle.
         ceilings: show points above the ceiling too. map, scan, wedge, plane, path, grid: whether shown.
+        light: a light background. tuning: the map stands back behind the present scan.
     """
 
-    colour_by: str = LABEL
-    point_size: float = 0.02
+    colour_by: str = LOOK
+    point_size: float = 0.04
     follow: bool = True
     ceilings: bool = False
     map: bool = True
@@ -40,6 +45,12 @@ class View:
     plane: bool = True
     path: bool = True
     grid: bool = True
+    light: bool = False
+    tuning: bool = False
+
+    @property
+    def map_point_size(self) -> float:
+        return self.point_size * (_STANDING_BACK if self.tuning else 1.0)
 
 
 @dataclass(frozen=True, slots=True)

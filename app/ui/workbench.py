@@ -21,7 +21,8 @@ from app.server.fork import Workspace
 from app.server.protocol import Snapshot
 from app.server.setup import POINT_BUDGET, Setup
 from app.server.worker import RunningEngine
-from app.ui.appearance import AppearancePanel
+from app.ui.appearance import AppearancePanel, apply_theme
+from app.ui.camera import CameraPanel
 from app.ui.compare import ComparePanel, Sides
 from app.ui.files import FilesPanel, RecentPanel
 from app.ui.html import render
@@ -39,7 +40,8 @@ from app.ui.widgets import PANEL_PERIOD_S, SCENE_PERIOD_S, Changes, Page, View
 
 log = logging.getLogger(__name__)
 
-ACCENT: Final = (38, 166, 154)
+_TUNING_S: Final = 4.0
+"""So long after a parameter was changed the map stands back behind the present scan."""
 _TICK_S: Final = 0.04
 """How long the drawing thread waits for a snapshot before it looks at the page's own controls."""
 
@@ -69,7 +71,7 @@ class Workbench:
         self._engine = engine
         self._budget = point_budget
         gui = server.gui
-        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=ACCENT)
+        apply_theme(gui, light=False)
         gui.set_panel_label("hemislam")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(360)
@@ -79,6 +81,7 @@ class Workbench:
         prepare_page(gui)
         self._header = HeaderPanel(gui)
         self._transport, self._timeline = TransportPanel(page), TimelinePanel(page)
+        legend = gui.add_html("")
         files = FilesPanel(page, folders, results)
         self._recent = RecentPanel(page, folders, results / "sessions", files.browse)
         tabs = gui.add_tab_group()
@@ -98,7 +101,8 @@ class Workbench:
         with tabs.add_tab("A/B", viser.Icon.GIT_COMPARE):
             self._compare = ComparePanel(page, forks, self._sides)
         with tabs.add_tab("View", viser.Icon.EYE):
-            self._appearance = AppearancePanel(gui)
+            self._appearance = AppearancePanel(gui, legend)
+            CameraPanel(page, self._scene.sample, self._appearance.look_freely)
         with tabs.add_tab("Recording", viser.Icon.STETHOSCOPE):
             files.add_buttons()
             self._live = LivePanel(gui)
@@ -116,6 +120,8 @@ class Workbench:
         )  # fmt: skip
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
+        self._tuned_at = -_TUNING_S
+        self._now = now
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="workbench", daemon=True)
 
@@ -154,6 +160,9 @@ class Workbench:
     def _draw_scene(self, current: Snapshot, view: View) -> None:
         drawn = self._drawn
         tuned = drawn is None or drawn.params != current.params
+        if tuned and drawn is not None:
+            self._tuned_at = self._now()
+        view = replace(view, tuning=self._now() - self._tuned_at < _TUNING_S)
         if self._scene_due(current, view, at_once=tuned):
             if current.result is not None and (drawn is None or drawn.result is None):
                 self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)

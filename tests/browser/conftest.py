@@ -59,6 +59,14 @@ class Bench:
 
         self.eventually(pressed)
 
+    def look(self, position: Any, look_at: Any) -> None:
+        """Put the page's camera somewhere, and wait until it is there."""
+        self.eventually(lambda: bool(self.server.get_clients()))
+        (client,) = self.server.get_clients().values()
+        self.resting_camera(client)
+        client.camera.position, client.camera.look_at = position, look_at
+        self.resting_camera(client)
+
     def resting_camera(self, client: viser.ClientHandle) -> np.ndarray:
         """(3,) where the page's camera is, once it has said so and stays there."""
         seen = [client.camera.position]
@@ -118,14 +126,15 @@ def opened(
     """
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     workbench = Workbench(server, engine, Folders([folder]))
-    if camera is not None:
-        server.initial_camera.position, server.initial_camera.look_at = camera
     workbench.start()
     page = new_page(chromium, width, height)
     url = f"http://127.0.0.1:{server.get_port()}/"
     page.goto(url)
     expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
-    yield Bench(server, workbench, engine, page, url)
+    bench = Bench(server, workbench, engine, page, url)
+    if camera is not None:
+        bench.look(*camera)
+    yield bench
     workbench.close()
     page.close()
     server.stop()

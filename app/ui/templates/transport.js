@@ -155,7 +155,7 @@ const mark = () => { // above the track: loops, notes and where trouble begins
   const tick = (frame, colour, top, high) => {
     ink.fillStyle = colour; ink.fillRect(edge + (frame + 0.5) / d.frames * (W - 2 * edge) - 1, top, 2, high);
   };
-  const bad = d.starts.map((_, c) => d.strips.some((s) => beyond(s, s.data[s.low ? c : d.starts.length + c])));
+  const bad = d.starts.map((_, c) => d.strips.some((s) => s.name !== 'frame time' && beyond(s, s.data[s.low ? c : d.starts.length + c])));
   d.starts.forEach((start, c) => { if (bad[c] && !bad[c - 1]) tick(start, BAD, H - 6, 6); });
   for (const [verdict, colour] of [['rejected', BAD], ['accepted', GOOD]])
     (d.loops[verdict] || []).forEach((n, c) => { if (n) tick(d.starts[c], colour, 0, 6); });
@@ -210,5 +210,8 @@ const watch = (name, act) => {
   act();
 };
 new MutationObserver(paint).observe(document.documentElement, {attributes: true});
+watch('.hs-legend-data', () => {
+  dock.querySelector('.hs-legend').innerHTML = document.querySelector('.hs-legend-data').innerHTML;
+});
 watch('.hs-tl-data', read); watch('.hs-state', show); unfold(localStorage.getItem('hemislam-diagnostics') === 'open');
 settle();

@@ -1,0 +1,67 @@
+"""Where cameras stand and how points are lit.
+
+Tests app/ui/camera.py, app/ui/shading.py.
+"""
+
+import numpy as np
+import pytest
+
+from app.slam import lie
+from app.ui.camera import FOV, FRONT, SIDE, TOP, whole
+from app.ui.colours import INTENSITY, LOOK, Limits, PointSet, colours
+from app.ui.shading import light
+
+RANDOM = np.random.default_rng(3)
+HALL = RANDOM.uniform((-10, 5, 0), (50, 25, 6), (4000, 3))
+
+
+@pytest.mark.parametrize("way", ["fit", TOP, FRONT, SIDE])
+def test_all_of_a_hall_but_a_few_points_is_inside_the_picture(way: str) -> None:
+    stand = whole(np.concatenate((HALL, [[900.0, 0.0, 0.0]])), way)
+    forward = stand.look_at - stand.position
+    forward /= np.linalg.norm(forward)
+    towards = HALL - stand.position
+    off = np.arccos(towards @ forward / np.linalg.norm(towards, axis=1))
+    assert np.mean(off < FOV / 2) > 0.9
+    assert off.max() > FOV / 8, "and it fills the picture"
+
+
+def test_from_above_one_looks_down_and_from_the_front_along_the_floor() -> None:
+    assert (s := whole(HALL, TOP)).position[2] - s.look_at[2] > 10 * np.linalg.norm((s.position - s.look_at)[:2])
+    assert (s := whole(HALL, FRONT)).position[2] - s.look_at[2] < 0.1 * np.linalg.norm((s.position - s.look_at)[:2])
+
+
+def test_an_empty_map_is_looked_at_from_above_the_sensor() -> None:
+    assert whole(np.empty((0, 3))).position[2] > 2.0
+
+
+def plane(normal: int) -> np.ndarray:
+    points = RANDOM.uniform(-3, 3, (3000, 3)).astype(np.float32)
+    points[:, normal] = 1.0
+    return points
+
+
+def test_floors_are_brighter_than_walls_and_walls_at_right_angles_differ() -> None:
+    x, y, floor = (float(np.median(light(plane(axis), np.eye(4)))) for axis in range(3))
+    assert floor > y + 0.05 > x + 0.1
+
+
+def test_a_floor_is_as_bright_however_the_sensor_is_held() -> None:
+    turned = lie.transform(lie.exp(np.array([1.1, -0.4, 0.3])), np.zeros(3))
+    seen = (plane(2) @ turned[:3, :3]).astype(np.float32)  # in the sensor's frame
+    assert np.median(light(seen, turned)) == pytest.approx(np.median(light(plane(2), np.eye(4))), abs=0.01)
+
+
+def test_points_on_no_surface_are_darker_and_few_points_are_left_alone() -> None:
+    leaves = RANDOM.uniform(-1, 1, (3000, 3)).astype(np.float32)
+    assert np.median(light(leaves, np.eye(4))) < np.median(light(plane(2), np.eye(4)))
+    assert (light(leaves[:5], np.eye(4)) == 1).all() and len(light(leaves[:0], np.eye(4))) == 0
+
+
+def test_by_height_and_intensity_what_reflects_more_is_brighter_and_ground_is_tinted() -> None:
+    points = np.zeros((3, 3), np.float32)
+    labels, intensity = np.array([0, 0, 1], np.uint8), np.array([0, 255, 255], np.float32)
+    cloud = PointSet(points, labels, intensity, np.zeros(3, np.uint16), np.eye(4), 0.0)
+    dull, shiny, ground = colours(cloud, LOOK, {LOOK: Limits(-1, 3), INTENSITY: Limits(0, 255)}).astype(int)
+    assert (shiny > dull).all()
+    assert ground[1] - ground[0] > shiny[1] - shiny[0], "towards teal"
