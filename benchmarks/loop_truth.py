@@ -19,7 +19,7 @@ from app.mapping.opening import open_session
 from app.mapping.session import Session
 from app.sensors.presets import resolve_params
 from app.slam import lie
-from app.slam.loops.types import LoopEdge, Verdict
+from app.slam.loops.types import OPEN_M, LoopEdge, Verdict
 from app.slam.metrics import ate, interpolate
 from app.slam.params import Params
 from app.slam.trajectory import Trajectory, read_tum, truth_beside
@@ -151,9 +151,11 @@ def score(walk: Walk, without: Trajectory, truth: Trajectory) -> Score:
 
 
 def _error(edge: LoopEdge, older: F64, newer: F64) -> tuple[float, float]:
-    """m and deg between a loop and the true poses (4, 4) of its ends."""
+    """m and deg between a loop and the true poses (4, 4) of its ends, in the directions that it holds."""
     wrong = lie.inverse(lie.inverse(older) @ newer) @ edge.T_older_newer
-    return float(np.linalg.norm(wrong[:3, 3])), float(np.degrees(np.linalg.norm(lie.log(wrong[:3, :3]))))
+    squares, directions = np.linalg.eigh(edge.covariance[3:, 3:])
+    held = directions[:, squares < OPEN_M**2]
+    return float(np.linalg.norm(held.T @ wrong[:3, 3])), float(np.degrees(np.linalg.norm(lie.log(wrong[:3, :3]))))
 
 
 def _good(errors: F64) -> np.ndarray:

@@ -233,19 +233,22 @@ class LoopsParams(Section):
     )
     submap_voxel: float = _on_restart(0.25, "Edge of the voxels that downsample submaps.", (0.05, 2, 0.05), "m")
     min_overlap: float = _next_frame(
-        0.3, "Least share of the points near both keyframes that must have a partner.", (0, 1, 0.01)
+        0.3, "Least share of what stands upright near both keyframes that must have a partner.", (0, 1, 0.01)
     )
     max_residual: float = _next_frame(
         0.05, "Largest point-to-plane residual of a registration (RMS).", (0.005, 1, 0.005), "m"
     )
     max_slide: float = _next_frame(
         0.05,
-        "A registration pushed along its weakest direction must come back this close; otherwise it slides.",
+        "A registration pushed along its weakest direction must come back this close; else it is left open.",
         (0.005, 1, 0.005),
         "m",
     )
     max_mahalanobis: float = _next_frame(
-        3.5, "Most standard deviations from where odometry expects a loop.", (0.5, 20, 0.1), "σ"
+        3.5,
+        "Standard deviations from where odometry expects a loop; one farther off must be borne out by several others.",
+        (0.5, 20, 0.1),
+        "σ",
     )
     support: int = _next_frame(2, "Candidates nearby that must agree before one is accepted.", (0, 10, 1))
     drift_translation: float = _next_frame(

@@ -19,12 +19,14 @@ from app.slam.loops.drift import Expectation
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.submap import Submap, Submaps
 from app.slam.loops.types import LoopDetail
-from app.slam.loops.verification import Fit, Prepared
+from app.slam.loops.verification import Prepared
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, I64, Cloud, Keyframe
 
 NEAR_M = 3.0
 """Added to the reach of drift: places this far apart still see each other."""
+WIDER = 2.0
+"""Odometry that slipped is farther off than the model of drift allows, so it is searched this many times as far."""
 KEPT_PREPARED = 2
 """Submaps that stay in memory, ready for registration: the newer one, and one older one at a time."""
 KEPT_SUBMAPS = 1
@@ -152,17 +154,10 @@ class Detector:
         T_older_newer = lie.inverse(poses[older]) @ poses[newer]
         return np.asarray(self.T_level_imu(older) @ T_older_newer @ lie.inverse(self.T_level_imu(newer)))
 
-    def register(self, older: int, newer: int, T_guess: F64) -> Fit:
-        """Lay the newer submap on the older one from a guess of the level frames' transform."""
-        target, source = self._both(older, newer)
-        return verification.assess(target, source, verification.register(target, source, T_guess))
-
-    def assess(self, older: int, newer: int, T: F64) -> Fit:
-        """How the newer submap lies on the older one, as the level frames' transform has it."""
-        return verification.assess(*self._both(older, newer), T)
-
-    def slide(self, older: int, newer: int, fit: Fit) -> float:
-        return verification.slide(*self._both(older, newer), fit)
+    def both(self, older: int, newer: int) -> tuple[Prepared, Prepared]:
+        """Their submaps; the newer one is made first, since it is needed again next."""
+        source = self.submap(newer)
+        return self.submap(older), source
 
     def detail(self, older: int, newer: int, poses: F64, T_older_newer: F64 | None) -> LoopDetail:
         """Both places, and how they fit at a loop's measurement; None: as the graph has them.
@@ -183,20 +178,15 @@ class Detector:
             older_context=np.where(a.seen, a.cells, np.float32(np.nan)),
             newer_context=np.where(b.seen, b.cells, np.float32(np.nan)),
             shift_distances=scan_context.shift_distances(a, b),
-            residuals=self.assess(older, newer, T).residuals,
+            residuals=verification.assess(*self.both(older, newer), T).residuals,
         )
-
-    def _both(self, older: int, newer: int) -> tuple[Prepared, Prepared]:
-        """Their submaps; the newer one first, since it is needed again next."""
-        source = self.submap(newer)
-        return self.submap(older), source
 
     def _eligible(self, newer: int, expectation: Expectation, params: LoopsParams) -> I64:
         """Keyframes old enough and within the reach of drift."""
         stamps = self._stamps
         old = np.flatnonzero(stamps[: self.described] <= stamps[newer] - round(params.min_time * 1e9))
         away = np.linalg.norm(expectation.poses[old, :3, 3] - expectation.poses[newer, :3, 3], axis=1)
-        reach = params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M
+        reach = WIDER * params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M
         return np.asarray(old[away < reach])
 
     def _compare(self, older: int, newer: int, expectation: Expectation, params: LoopsParams) -> Sighting:
@@ -206,7 +196,7 @@ class Detector:
         yaw = np.arctan2(expected[1, 0], expected[0, 0])
         sigma = np.sqrt(expectation.covariance(older)[2, 2])
         away = np.abs(_wrapped(scan_context.YAWS - yaw))
-        allowed = away <= params.max_mahalanobis * sigma + scan_context.SECTOR
+        allowed = away <= WIDER * params.max_mahalanobis * sigma + scan_context.SECTOR
         distance = float(np.where(allowed, distances, np.inf).min())
         return Sighting(KeyframeId(0, older), KeyframeId(0, newer), distance)
 

@@ -79,7 +79,7 @@ class Expectation:
 
 def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift) -> Expectation:
     """What the graph of poses (k, 4, 4) T_map_imu with these loops expects, seen from keyframe `root`."""
-    count = len(poses)
+    count, loops = len(poses), [loop for loop in loops if not loop.open]
     p = poses[:, :3, 3]
     steps = np.linalg.norm(np.diff(p, axis=0), axis=1)
     pairs = np.array([loop.pair for loop in loops], dtype=np.int64).reshape(-1, 2)
@@ -105,18 +105,3 @@ def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift) -> Ex
         tied = tied[tied]
     lever = way[:, None] * p[root] - moment
     return Expectation(root, poses, np.asarray(way), lever, drift)
-
-
-def agree(a: LoopEdge, b: LoopEdge, poses: F64, way: float, drift: Drift) -> bool:
-    """Whether two loops agree: going round by both leads back to the start, within drift.
-
-    Args:
-        poses: (k, 4, 4) by odometry, which is exact enough between ends that are near each other.
-        way: m along the trajectory between the older ends, plus between the newer ends.
-    """
-    older = lie.inverse(poses[a.older]) @ poses[b.older]
-    newer = lie.inverse(poses[a.newer]) @ poses[b.newer]
-    around = lie.inverse(older @ b.T_older_newer) @ a.T_older_newer @ newer
-    far = 2 * POSITION_M + 3 * drift.translation * way
-    turned = 2 * ROTATION + 3 * drift.rotation * way
-    return bool(np.linalg.norm(around[:3, 3]) < far and np.linalg.norm(lie.log(around[:3, :3])) < turned)

@@ -6,7 +6,7 @@ import numpy as np
 
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops import scan_context, verification
+from app.slam.loops import placing, scan_context, verification
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.factors import Factor
 from app.slam.loops.keyframe_log import Follower, KeyframeLog
@@ -26,6 +26,7 @@ from app.slam.loops.messages import (
     Request,
     TryOut,
 )
+from app.slam.loops.plan import Window
 from app.slam.loops.pose_graph import PoseGraph
 from app.slam.loops.submap import Submap
 from app.slam.voxel import VoxelGrid
@@ -120,8 +121,8 @@ def warm_up() -> None:
     points[np.arange(len(sides)), sides] = 0.0  # a corner of three walls
     thin = VoxelGrid().downsample(points, 0.1).points
     place = verification.prepare(Submap(0, thin, np.full_like(thin, 2.0)))
-    fit = verification.assess(place, place, verification.register(place, place, np.eye(4)))
-    verification.slide(place, place, fit)
+    found = placing.place(place, place, np.eye(4), Window(1.0, 0.1), lambda T: 0.0, most_sigmas=1.0, most_slide=0.1)
+    verification.refine(place, place, found.fit.T_target_source)
     context = scan_context.describe(thin)
     scan_context.shift_distances(context, context)
     graph, ends = PoseGraph(np.eye(4)), (KeyframeId(0, 0), KeyframeId(0, 1))

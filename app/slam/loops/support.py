@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops.drift import Drift, agree
+from app.slam.loops.drift import Drift
 from app.slam.loops.types import LOOP_HUBER, LoopEdge, Origin, Pair, Verdict
 from app.slam.sections import LoopsParams
 from app.slam.types import F64
@@ -19,6 +19,10 @@ NEIGHBOURHOOD_M = 15.0
 """Loops whose ends are farther apart than this along the trajectory, on either side, are not compared."""
 SAME = 2 * LOOP_HUBER
 """Standard deviations up to which two loops near each other measured the same; there Huber's loss halves the pull."""
+AGREE = 3.0
+"""Standard deviations up to which two loops agree."""
+OUTVOTING, STRETCH_M = 2, 4.0
+"""To outvote odometry, so many times as many must agree, and the newer ends of all must stretch over this way."""
 NO_NEWS = 1.0
 """The same limit beyond a submap's length. It is strict, as the covariances of loops are generous."""
 
@@ -55,20 +59,38 @@ def settle(
             continue
         others = [o for o in near if o.pair != edge.pair and max(ways(edge, o)) < NEIGHBOURHOOD_M]
         # an ambiguous candidate supports nothing: all that was seen there may belong to a place that looks the same
-        verdicts = [not o.evidence.ambiguous and agree(edge, o, poses, sum(ways(edge, o)), drift) for o in others]
-        support = len({other.newer for other, yes in zip(others, verdicts, strict=True) if yes} - {edge.newer})
-        against = verdicts.count(False)
+        verdicts = [not o.evidence.ambiguous and _agree(edge, o, poses, sum(ways(edge, o)), drift) for o in others]
+        agreeing = [other.newer for other, yes in zip(others, verdicts, strict=True) if yes]
+        support, against = len({*agreeing} - {edge.newer}), verdicts.count(False)
+        alone = edge.evidence.mahalanobis > params.max_mahalanobis
+        stretch = float(np.ptp(walked[[edge.newer, *agreeing]]))
+        needed = params.support * (OUTVOTING if alone else 1)
         evidence = replace(edge.evidence, support=support)
-        if support >= params.support and support > 2 * against:
-            reason = f"{evidence.summary}; {support} others agree"
+        if support >= needed and support > 2 * against and (not alone or stretch >= STRETCH_M):
+            outvoted = f"; together they outvote odometry ({stretch:.0f} m)" if alone else ""
+            reason = f"{evidence.summary}; {support} others agree{outvoted}"
             out[edge.pair] = replace(
                 edge, verdict=Verdict.ACCEPTED, reason=reason, evidence=evidence, decided_at=now, weight=1.0
             )
         elif edge.pair in out:
-            waits = f"{evidence.summary}; {support} of {params.support} others agree"
+            waits = f"{evidence.summary}; {support} of {needed} others agree"
+            if alone:
+                waits = f"{edge.evidence.against_odometry(params.max_mahalanobis)}; {support} of {needed} others agree"
+                waits += f" over {stretch:.0f} m (least {STRETCH_M:g} m)"
             contradicted = f", {against} contradict it" if against else ""
             out[edge.pair] = replace(edge, reason=waits + contradicted, evidence=evidence, weight=1.0)
     return list(out.values())
+
+
+def _agree(a: LoopEdge, b: LoopEdge, poses: F64, way: float, drift: Drift) -> bool:
+    """Whether two loops agree: going round by both leads back to the start, within what they and odometry err by.
+
+    Args:
+        poses: (k, 4, 4) by odometry. way: m along the trajectory between the older ends, plus between the newer ends.
+    """
+    T, covariance = laid(b, a, poses)
+    walked = np.array([drift.rotation * way] * 3 + [drift.translation * way] * 3)
+    return _off(a, T, covariance + np.diag(walked**2)) < AGREE
 
 
 def _ends(edges: Iterable[LoopEdge], walked: F64) -> F64:
@@ -102,6 +124,7 @@ def placed(
 
 
 def _placed(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_map_imu: F64, half: int) -> LoopEdge:
+    counting = [other for other in counting if edge.open or not other.open]
     near = next((other for other in counting if _apart(edge, other) <= half // 2), None)
     if near is not None:
         return replace(edge, represented_by=near.pair)

@@ -17,6 +17,9 @@ from app.slam.keyframe_id import KeyframeId
 LOOP_HUBER = 1.345
 """Whitened error from which a loop pulls with constant force (95 % efficient for a Gaussian)."""
 
+OPEN_M = 1.0
+"""A direction is open if a loop's standard deviation along it is greater than this."""
+
 Pair = tuple[KeyframeId, KeyframeId]
 """(older, newer) keyframe."""
 
@@ -65,6 +68,12 @@ class Evidence:
     def ambiguous(self) -> bool:
         return self.alternative_m < float("inf")
 
+    def against_odometry(self, most_sigmas: float) -> str:
+        """What odometry says, in words."""
+        return (
+            f"odometry rules it out: {self.mahalanobis:.1f} σ (most {most_sigmas:g} σ, one being {self.gate_m:.2f} m)"
+        )
+
     @property
     def summary(self) -> str:
         """The numbers of a registered candidate, for its reason."""
@@ -112,6 +121,11 @@ class LoopEdge:
     def __post_init__(self) -> None:
         self.T_older_newer.setflags(write=False)
         self.covariance.setflags(write=False)
+
+    @property
+    def open(self) -> bool:
+        """Whether it leaves a direction open."""
+        return bool(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1] > OPEN_M**2)
 
     @property
     def counts(self) -> bool:

@@ -7,16 +7,20 @@ import numpy as np
 
 from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.ambiguity import nearest_alternative
-from app.slam.loops.detection import Detector, Sighting
+from app.slam.loops.detection import WIDER, Detector, Sighting
 from app.slam.loops.drift import Expectation
+from app.slam.loops.placing import Place, place
+from app.slam.loops.plan import Window
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
-from app.slam.loops.verification import Fit
+from app.slam.loops.verification import Fit, assess, refine
+from app.slam.loops.verification import register as align
 from app.slam.sections import LoopsParams
 from app.slam.types import F64
 
-FARTHEST_M = 10.0
-"""Beyond this the submaps no longer overlap enough to fit as well."""
+SURE_M = 0.1
+"""If odometry knows its position better than this (standard deviation), places are not searched beside its guess."""
+OPEN_M = 10.0
+"""Standard deviation of a registration along a direction that nothing holds."""
 FLOOR_M, FLOOR_RAD = 0.04, np.radians(0.5)
 """Least standard deviations of a registration, however many points it has."""
 POINT_M, INDEPENDENT = 0.1, 0.05
@@ -42,25 +46,25 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
         )
         return edge(_imu(detector, older, newer, guess), np.eye(6), evidence, reason)
 
-    fit = detector.register(older, newer, guess)
-    T = _imu(detector, older, newer, fit.T_target_source)
+    def deviation(T_level: F64) -> float:
+        return expectation.mahalanobis(older, _imu(detector, older, newer, T_level))
+
+    reach = WIDER * params.max_mahalanobis
+    window = Window(reach * sigma if sigma > SURE_M else 0.0, reach * np.sqrt(expectation.covariance(older)[2, 2]))
+    target, source = detector.both(older, newer)
+    found = place(target, source, guess, window, deviation, params.max_mahalanobis, params.max_slide)
+    fit = found.fit
     evidence = replace(
         evidence,
         overlap=fit.overlap,
         residual_rms=fit.residual_rms,
         condition=fit.condition,
-        mahalanobis=expectation.mahalanobis(older, T),
+        slide=found.slides,
+        alternative_m=found.alternative_m,
+        mahalanobis=found.deviation,
     )
-    reason = _objection(evidence, fit, params)
-    if not reason:
-        evidence = replace(evidence, slide=detector.slide(older, newer, fit))
-        reason = _objection(evidence, fit, params)
-    if not reason:
-        evidence = replace(
-            evidence, alternative_m=_nearest_alternative(older, newer, detector, expectation, fit, params)
-        )
-        reason = _objection(evidence, fit, params)
-    return edge(T, covariance(detector, newer, fit), evidence, reason)
+    T = _imu(detector, older, newer, fit.T_target_source)
+    return edge(T, covariance(detector, newer, fit, found.open), evidence, _objection(found, evidence, params))
 
 
 def by_hand(
@@ -68,7 +72,8 @@ def by_hand(
 ) -> LoopEdge:
     """A loop that the user proposes, registered from the given (4, 4) or taken as it is."""
     guess = detector.T_level_imu(older) @ T_older_newer @ lie.inverse(detector.T_level_imu(newer))
-    fit = detector.register(older, newer, guess) if register else detector.assess(older, newer, guess)
+    both = detector.both(older, newer)
+    fit = assess(*both, refine(*both, align(*both, guess)) if register else guess)
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
     reason = f"added by hand: overlap {fit.overlap:.2f}, residual {fit.residual_rms * 1e3:.0f} mm"
     T = _imu(detector, older, newer, fit.T_target_source) if register else T_older_newer
@@ -76,44 +81,39 @@ def by_hand(
     return LoopEdge(older, newer, newer, T, sigma, evidence, Verdict.ACCEPTED, reason, Origin.USER, edited=True)
 
 
-def covariance(detector: Detector, newer: int, fit: Fit) -> F64:
-    """(6, 6) of a registration, rotation then translation, in the newer's IMU frame."""
+def covariance(detector: Detector, newer: int, fit: Fit, along: F64 | None = None) -> F64:
+    """(6, 6) of a registration, rotation then translation, in the newer's IMU frame.
+
+    Args:
+        along: (3,) unit, axes of the older's level frame; nothing holds it in this direction.
+    """
     information = fit.information * (INDEPENDENT / POINT_M**2)
     level = np.linalg.pinv(information) + np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
+    if along is not None:
+        level[3:, 3:] += OPEN_M**2 * np.outer(along, along)
     R = (fit.T_target_source @ detector.T_level_imu(newer))[:3, :3]
     turn = np.kron(np.eye(2), R.T)
     out = turn @ level @ turn.T
     return np.asarray((out + out.T) / 2)
 
 
-def _objection(e: Evidence, fit: Fit, p: LoopsParams) -> str:
+def _objection(place: Place, e: Evidence, p: LoopsParams) -> str:
     """The first limit that is not met, in words and numbers; "" if all are met."""
+    fit = place.fit
     if len(fit.residuals) < 100:
         return f"only {len(fit.residuals)} points correspond (least 100)"
     if e.overlap < p.min_overlap:
         return f"the submaps overlap by {e.overlap:.2f} (least {p.min_overlap:g})"
     if e.residual_rms > p.max_residual:
         return f"the residual is {e.residual_rms:.3f} m (most {p.max_residual:g} m)"
-    if e.mahalanobis > p.max_mahalanobis:
-        return (
-            f"odometry rules it out: {e.mahalanobis:.1f} σ (most {p.max_mahalanobis:g} σ, one being {e.gate_m:.2f} m)"
-        )
-    if e.slide > p.max_slide:
-        return f"it slides: pushed along its weakest direction it ends {e.slide:.2f} m off (most {p.max_slide:g} m)"
+    if place.loose:
+        return f"it slides in all directions: pushed, it ends {e.slide:.2f} m off (most {p.max_slide:g} m)"
     if e.ambiguous:
         away = f"{e.alternative_m:.1f} m away"
         return f"it is ambiguous: {away} it fits as well, and odometry (σ {e.gate_m:.2f} m) allows both"
+    if place.open is not None and e.mahalanobis > p.max_mahalanobis:
+        return f"it slides, and {e.against_odometry(p.max_mahalanobis)}"
     return ""
-
-
-def _nearest_alternative(
-    older: int, newer: int, detector: Detector, expectation: Expectation, fit: Fit, params: LoopsParams
-) -> float:
-    def allowed(T_level: F64) -> bool:
-        return expectation.mahalanobis(older, _imu(detector, older, newer, T_level)) <= params.max_mahalanobis
-
-    reach = 2 * params.max_mahalanobis * float(expectation.position_sigmas()[older])
-    return nearest_alternative(detector.submap(older), detector.submap(newer), fit, min(reach, FARTHEST_M), allowed)
 
 
 def _imu(detector: Detector, older: int, newer: int, T_level: F64) -> F64:

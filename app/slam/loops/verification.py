@@ -24,18 +24,22 @@ NEIGHBOURS = 10
 """Points of a patch, to estimate its normal."""
 FLAT_M = 0.04
 """A patch is flat if its points spread less than this along the normal (standard deviation)."""
+LEVEL = 0.8
+"""Least cosine between the vertical and the normal of ground or ceiling."""
 FACING = 0.7
 """Least cosine between the normals of corresponding points."""
-PASSES = ((1.2, 0.3, 8), (0.5, 0.08, 12))
-"""Reach of correspondences, m; residual from which they count less, m; most iterations."""
+COARSE, FINE = (1.2, 0.3, 8), (0.5, 0.08, 12)
+"""Passes: reach of correspondences, m; residual from which they count less, m; most iterations."""
 ENOUGH = 2e-4
 """Change (rad, m) that ends a pass."""
 MOST_POINTS, FEW_POINTS = 2500, 800
-"""Points of the source that take part in a registration, and in a rough one; all points are judged."""
+"""Points of the source that take part in a registration, and in a rough one; all flat points are judged."""
 PARTNER_M = 0.3
 """A point with another within this distance in the other submap has a partner."""
-COMMON_M = 10.0
+COMMON_M = 15.0
 """Overlap is judged on points this near to both keyframes: there both submaps are dense."""
+LEAST_UPRIGHT = 50
+"""So few points that stand upright near both keyframes say nothing."""
 DISTURBANCE_M = 0.4
 """How far the test for sliding pushes the result along its weakest direction."""
 
@@ -46,17 +50,21 @@ class Prepared:
 
     Attributes:
         points: (n, 3). normals: (n, 3) unit, towards where the point was seen from.
-        flat: (n,) bool. tree: over the points. chosen, few: indices of flat points that take part as
-            source, and of those that do for a rough answer.
+        flat: (n,) bool. level: (n,) of ground; upright: (n,) of what is neither ground nor ceiling.
+        tree: over the points. chosen, few: indices of flat points that take part as source, and of those that do
+            for a rough answer. judged: indices of upright points on which overlap is judged.
     """
 
     submap: Submap
     points: F64
     normals: F64
     flat: Flags
+    level: Flags
+    upright: Flags
     tree: small_gicp.KdTree
     chosen: I64
     few: I64
+    judged: I64
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +93,9 @@ class Fit:
         return float(max(values[0], 0.0) / values[-1]) if values[-1] > 0 else 0.0
 
     @property
-    def weakest(self) -> F64:
-        """(3,) unit direction of translation, target's axes, that the points say least about."""
-        return np.asarray(np.linalg.eigh(self._translation())[1][:, 0])
+    def directions(self) -> F64:
+        """(3, 3) unit, target's axes, one a row: of translation, those that the points say least about first."""
+        return np.asarray(np.linalg.eigh(self._translation())[1].T)
 
     def _translation(self) -> F64:
         H = self.information
@@ -100,33 +108,43 @@ def prepare(submap: Submap) -> Prepared:
     index, _ = tree.batch_knn_search(points, NEIGHBOURS, ONE_THREAD)
     normals, flat = np.empty_like(points), np.empty(len(points), np.bool_)
     patches.planes(points, np.asarray(index, np.int64), submap.eyes, FLAT_M, normals, flat)
-    candidates = np.flatnonzero(flat)
-    chosen, few = (candidates[:: max(1, -(-len(candidates) // most))] for most in (MOST_POINTS, FEW_POINTS))
-    return Prepared(submap, points, normals, flat, tree, chosen, few)
+    level = flat & (np.abs(normals[:, 2]) > LEVEL)
+    chosen, few = _thinned(flat, MOST_POINTS), _thinned(flat, FEW_POINTS)
+    ground, upright = level & (normals[:, 2] > 0), ~level
+    return Prepared(submap, points, normals, flat, ground, upright, tree, chosen, few, _thinned(upright, MOST_POINTS))
 
 
-def register(target: Prepared, source: Prepared, T_guess: F64, *, rough: bool = False) -> F64:
-    """(4, 4) T_target_source of the level frames, by Gauss-Newton with Cauchy weights from a guess.
+def _thinned(which: Flags, most: int) -> I64:
+    """Indices of at most so many of them, evenly."""
+    indices = np.flatnonzero(which)
+    return indices[:: max(1, -(-len(indices) // most))]
 
-    `rough`: from nearby, to a centimetre or so, in a fraction of the time.
-    """
+
+def register(target: Prepared, source: Prepared, T_guess: F64) -> F64:
+    """(4, 4) T_target_source of the level frames, to a centimetre or so, by Gauss-Newton with Cauchy weights."""
+    return _align(target, source, _align(target, source, T_guess, source.few, COARSE), source.few, FINE)
+
+
+def refine(target: Prepared, source: Prepared, T: F64) -> F64:
+    """The same from where `register` ends, with more points."""
+    return _align(target, source, T, source.chosen, FINE)
+
+
+def _align(target: Prepared, source: Prepared, T_guess: F64, chosen: I64, one_pass: tuple[float, float, int]) -> F64:
     T = T_guess.copy()
-    coarse, fine = PASSES
-    for (reach, scale, iterations), chosen in (
-        [(fine, source.few)] if rough else [(coarse, source.few), (fine, source.chosen)]
-    ):
-        for _ in range(iterations):
-            moved, partner, residual = _correspond(target, source, chosen, T, reach)
-            if len(moved) < 6:
-                return T
-            weight = 1.0 / (1.0 + (residual / scale) ** 2)
-            J = _jacobian(moved, target.normals[partner], T)
-            H = (J * weight[:, None]).T @ J
-            step = -np.linalg.lstsq(H + 1e-6 * np.trace(H) * np.eye(6), J.T @ (weight * residual), rcond=None)[0]
-            T[:3, :3] = lie.exp(step[:3]) @ T[:3, :3]
-            T[:3, 3] += step[3:]
-            if np.abs(step).max() < ENOUGH:
-                break
+    reach, scale, iterations = one_pass
+    for _ in range(iterations):
+        moved, partner, residual = _correspond(target, source, chosen, T, reach)
+        if len(moved) < 6:
+            return T
+        weight = 1.0 / (1.0 + (residual / scale) ** 2)
+        J = _jacobian(moved, target.normals[partner], T)
+        H = (J * weight[:, None]).T @ J
+        step = -np.linalg.lstsq(H + 1e-6 * np.trace(H) * np.eye(6), J.T @ (weight * residual), rcond=None)[0]
+        T[:3, :3] = lie.exp(step[:3]) @ T[:3, :3]
+        T[:3, 3] += step[3:]
+        if np.abs(step).max() < ENOUGH:
+            break
     return T
 
 
@@ -140,17 +158,17 @@ def assess(target: Prepared, source: Prepared, T: F64) -> Fit:
     return Fit(T, overlap, residuals, J.T @ J)
 
 
-def slide(target: Prepared, source: Prepared, fit: Fit) -> float:
-    """m that registrations pushed off along the weakest direction, both ways, end from the result.
+def slide(target: Prepared, source: Prepared, fit: Fit, direction: F64) -> float:
+    """m that registrations pushed off along a direction (3,), both ways, end from the result along it.
 
     Between features that hold, both come back; along a plain corridor they stay where they were put.
     """
     ends = []
     for sign in (-1.0, 1.0):
         pushed = fit.T_target_source.copy()
-        pushed[:3, 3] += sign * DISTURBANCE_M * fit.weakest
-        ends.append(register(target, source, pushed, rough=True)[:3, 3])
-    return float(max(np.linalg.norm(end - fit.T_target_source[:3, 3]) for end in ends))
+        pushed[:3, 3] += sign * DISTURBANCE_M * direction
+        ends.append(_align(target, source, pushed, source.few, FINE)[:3, 3])
+    return float(max(abs(direction @ (end - fit.T_target_source[:3, 3])) for end in ends))
 
 
 def _correspond(target: Prepared, source: Prepared, chosen: I64, T: F64, reach: float) -> tuple[F64, I64, F64]:
@@ -170,9 +188,9 @@ def _jacobian(moved: F64, normals: F64, T: F64) -> F64:
 
 
 def _overlap(target: Prepared, source: Prepared, T: F64) -> float:
-    moved = source.points @ T[:3, :3].T + T[:3, 3]
+    moved = source.points[source.judged] @ T[:3, :3].T + T[:3, 3]
     near = moved[_near(moved, T[:3, 3])]
-    return float((_nearest(target, near)[1] < PARTNER_M**2).mean()) if len(near) else 0.0
+    return float((_nearest(target, near)[1] < PARTNER_M**2).mean()) if len(near) >= LEAST_UPRIGHT else 0.0
 
 
 def _near(points: F64, origin: F64) -> Flags:

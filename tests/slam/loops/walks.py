@@ -12,7 +12,7 @@ from app.sensors.simulator.scenes import build_scene
 from app.sensors.simulator.trajectory import Walker, walk
 from app.slam import lie
 from app.slam.loops.backend import LoopBackend
-from app.slam.loops.types import LoopEdge
+from app.slam.loops.types import OPEN_M, LoopEdge
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, NON_GROUND, Cloud, Keyframe
 
@@ -106,10 +106,12 @@ def drive(
 
 
 def error(edge: LoopEdge, truth: F64) -> tuple[float, float]:
-    """m and deg between a loop's measurement and the truth (k, 4, 4)."""
+    """m and deg between a loop's measurement and the truth (k, 4, 4), in the directions that it holds."""
     real = lie.inverse(truth[edge.older]) @ truth[edge.newer]
     wrong = lie.inverse(real) @ edge.T_older_newer
-    return float(np.linalg.norm(wrong[:3, 3])), float(np.degrees(np.linalg.norm(lie.log(wrong[:3, :3]))))
+    squares, directions = np.linalg.eigh(edge.covariance[3:, 3:])
+    held = directions[:, squares < OPEN_M**2]
+    return float(np.linalg.norm(held.T @ wrong[:3, 3])), float(np.degrees(np.linalg.norm(lie.log(wrong[:3, :3]))))
 
 
 def revisits(walk: Walk, within_m: float = 2.0, apart_s: float = 15.0) -> list[int]:

@@ -1,0 +1,105 @@
+"""Where a place lies on an older one: all the alignments that fit, and the one that odometry and structure prefer.
+
+A registration shows that two submaps fit, not that they fit nowhere else, as they may in corridors and rooms that
+repeat. So it begins at every placement that the plans allow (`plan`), within what odometry might be off by.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.slam import lie
+from app.slam.loops.plan import Window, placements
+from app.slam.loops.verification import Fit, Prepared, assess, refine, register, slide
+from app.slam.types import F64
+
+APART_M, APART_RAD = 0.8, float(np.radians(10.0))
+"""Alignments nearer to each other than this are the same one."""
+LEAST_OVERLAP, MOST_RESIDUAL, RESIDUAL_M = 0.6, 1.6, 0.002
+"""An alignment fits as well with at least this share of the overlap, and at most this many times the residual plus so
+many metres. (In a place that does not repeat, wrong alignments share less.)"""
+ALONG = 0.9
+"""Least cosine between the way from one alignment to another and a direction that is open, for them to be the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Attributes:
+    fit: the best alignment. deviation: of it from odometry, in standard deviations.
+    slides: m, by which it slid along the direction that holds least. open: that direction, (3,) unit in the target's
+        axes, if nothing holds it there. loose: whether the next direction slides too.
+    alternative_m: m to the nearest other alignment that fits as well and that odometry allows no less; inf if none.
+    """
+
+    fit: Fit
+    deviation: float
+    slides: float
+    open: F64 | None
+    loose: bool
+    alternative_m: float
+
+
+def place(
+    target: Prepared,
+    source: Prepared,
+    T_guess: F64,
+    window: Window,
+    deviation: Callable[[F64], float],
+    most_sigmas: float,
+    most_slide: float,
+) -> Place:
+    """Lay a submap on another.
+
+    Args:
+        T_guess: (4, 4) of the level frames, by odometry; along a direction that is open, the result stays there.
+        deviation: of such a transform from odometry, in standard deviations. most_sigmas: up to which it is allowed.
+        most_slide: m, up to which a direction holds.
+    """
+    starts = [T_guess, *(placements(target, source, T_guess, window) if window.reach_m >= APART_M else ())]
+    fits: list[Fit] = []
+    for start in starts:
+        T = register(target, source, start)
+        if not any(_apart(T, fit.T_target_source) < 1.0 for fit in fits):
+            fits.append(assess(target, source, T))
+    best = max(fits, key=lambda fit: fit.overlap)
+    good = [fit for fit in fits if _as_good(fit, best)]
+    allowed = [fit for fit in good if deviation(fit.T_target_source) <= most_sigmas] or good
+    chosen = max(allowed, key=lambda fit: fit.overlap)
+    fit = assess(target, source, refine(target, source, chosen.T_target_source))
+
+    weakest, second, _ = fit.directions
+    slides = slide(target, source, fit, weakest) if fit.overlap else float("inf")
+    is_open = slides > most_slide
+    loose = is_open and fit.overlap > 0 and slide(target, source, fit, second) > most_slide
+    if is_open:
+        T = fit.T_target_source.copy()
+        T[:3, 3] += weakest * (weakest @ (T_guess - T)[:3, 3])
+        fit = assess(target, source, T)
+    ways = [other.T_target_source[:3, 3] - chosen.T_target_source[:3, 3] for other in allowed if other is not chosen]
+    lengths = [float(np.linalg.norm(way)) for way in ways if not (is_open and _along(way, weakest))]
+    return Place(
+        fit=fit,
+        deviation=deviation(fit.T_target_source),
+        slides=slides,
+        open=weakest if is_open else None,
+        loose=loose,
+        alternative_m=min(lengths, default=float("inf")),
+    )
+
+
+def _as_good(other: Fit, fit: Fit) -> bool:
+    return (
+        other.overlap >= LEAST_OVERLAP * fit.overlap
+        and other.residual_rms <= MOST_RESIDUAL * fit.residual_rms + RESIDUAL_M
+    )
+
+
+def _apart(a: F64, b: F64) -> float:
+    """How far two alignments (4, 4) are from each other; from 1 on they are two."""
+    turned = float(np.linalg.norm(lie.log(a[:3, :3] @ b[:3, :3].T)))
+    return max(float(np.linalg.norm(a[:3, 3] - b[:3, 3])) / APART_M, turned / APART_RAD)
+
+
+def _along(way: F64, direction: F64) -> bool:
+    return abs(float(way @ direction)) >= ALONG * float(np.linalg.norm(way))

@@ -1,0 +1,97 @@
+"""Where one submap lies on another, without a good guess: their plans are compared at every shift and turn.
+
+A plan is a raster of what stands upright: the taller, the more it counts. Ground fits anywhere; it only tells that
+nothing stands there. The shifts at which two plans agree best are found at once, by a circular correlation for each
+turn; heights follow from the ground. Registration begins at the best few.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from app.slam import lie
+from app.slam.loops.verification import Prepared
+from app.slam.types import F64, I64
+
+CELL_M, CELLS = 0.4, 128
+"""Of a plan. It wraps around; submaps reach 20 m, so shifts of up to `FARTHEST_M` are told from one another."""
+FARTHEST_M = 11.0
+TURN = np.radians(3.0)
+"""Step of the turns that are tried; at the rim of a submap it moves a point by a metre."""
+TALLEST = 8
+"""Occupied cells above one another from which a column counts no more."""
+BARE = -0.4
+"""What a cell with nothing but ground counts; a column of two cells counts 1."""
+PEAKS = 6
+LEAST = 0.4
+"""A peak counts with at least this share of the highest."""
+SAME = 7
+"""Turns, and cells along both axes, within half of which only the highest peak counts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Where to look: m in plan, and rad about the vertical, on either side of a guess."""
+
+    reach_m: float
+    turn: float
+
+
+def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window) -> list[F64]:
+    """Alignments (4, 4) T_target_source of the level frames from which to register, the likeliest first."""
+    steps = min(int(np.ceil(window.turn / TURN)), round(np.pi / TURN))
+    yaws = np.arctan2(T_guess[1, 0], T_guess[0, 0]) + np.arange(-steps, steps + 1) * TURN
+    reach = int(np.ceil(min(window.reach_m, FARTHEST_M) / CELL_M))
+    shifts = np.arange(-reach, reach + 1)
+    spectrum = np.fft.rfft2(_plan(target, np.eye(4)))
+    alike = np.empty((len(yaws), len(shifts), len(shifts)))
+    for index, yaw in enumerate(yaws):
+        plan = _plan(source, _upright(yaw, T_guess[:3, 3]))
+        alike[index] = np.fft.irfft2(spectrum * np.fft.rfft2(plan).conj(), plan.shape)[np.ix_(shifts, shifts)]
+    alike[:, np.hypot(shifts[:, None], shifts) > reach] = 0.0
+    highest = ndimage.maximum_filter(alike, SAME, mode="constant")  # type: ignore[attr-defined]  # no types
+    found = np.argwhere((alike >= highest) & (alike > LEAST * alike.max()))
+    best = found[np.argsort(-alike[tuple(found.T)], kind="stable")[:PEAKS]]
+    return [
+        _on_ground(target, source, _upright(yaws[k], T_guess[:3, 3] + CELL_M * np.array([i - reach, j - reach, 0.0])))
+        for k, i, j in best
+    ]
+
+
+def _plan(prepared: Prepared, T: F64) -> F64:
+    """(CELLS, CELLS) of a submap that lies at T (4, 4); the origin is in the first cell."""
+    ground, upright = (_moved(prepared.points[which], T) for which in (prepared.level, prepared.upright))
+    plan = np.zeros(CELLS * CELLS)
+    plan[_cells(ground)] = BARE
+    layer = np.floor(upright[:, 2] / CELL_M).astype(np.int64) % CELLS
+    boxes = np.unique(_cells(upright) * CELLS + layer)
+    tall = np.bincount(boxes // CELLS, minlength=CELLS * CELLS)
+    standing = tall > 0
+    plan[standing] = np.sqrt(np.minimum(tall[standing], TALLEST) / 2)
+    return plan.reshape(CELLS, CELLS)
+
+
+def _on_ground(target: Prepared, source: Prepared, T: F64) -> F64:
+    """The same, raised or lowered until the source's ground lies on the target's."""
+    below, above = target.points[target.level], _moved(source.points[source.level], T)
+    there, here = _cells(below), _cells(above)
+    count = np.bincount(there, minlength=CELLS * CELLS)
+    height = np.bincount(there, below[:, 2], CELLS * CELLS)
+    both = count[here] > 0
+    if both.any():
+        T[2, 3] -= np.median(above[both, 2] - height[here[both]] / count[here[both]])
+    return T
+
+
+def _cells(points: F64) -> I64:
+    index = np.floor(points[:, :2] / CELL_M).astype(np.int64) % CELLS
+    return np.asarray(index[:, 0] * CELLS + index[:, 1])
+
+
+def _moved(points: F64, T: F64) -> F64:
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def _upright(yaw: float, position: F64) -> F64:
+    return lie.transform(lie.exp(np.array([0.0, 0.0, yaw])), position)

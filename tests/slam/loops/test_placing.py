@@ -1,0 +1,106 @@
+"""Places are laid on each other without a good guess, and places that fit twice are noticed.
+
+Tests app/slam/loops/plan.py.
+"""
+
+import numpy as np
+import pytest
+
+from app.slam import lie
+from app.slam.loops.placing import Place, place
+from app.slam.loops.plan import Window, placements
+from app.slam.loops.verification import Prepared
+from app.slam.types import F64
+from tests.slam.loops.test_verification import FINS, corridor, pose, seen, wall
+
+EVEN = tuple(np.repeat(np.arange(-14.0, 14.0, 4.0), 2))
+EVERYWHERE = Window(11.0, np.pi)
+
+
+def square(rng: np.random.Generator) -> F64:
+    """A place under the open sky: sloping ground, two houses, a fence and eight trunks, none like another."""
+    ground = np.column_stack([rng.uniform(-18, 18, (14_000, 2)), np.zeros(14_000)])
+    parts = [ground, wall((-9.0, 12.0), (3.0, 13.0), rng, 5.0), wall((3.0, 13.0), (4.0, 17.0), rng, 5.0)]
+    parts += [wall((10.0, -16.0), (13.0, -4.0), rng, 4.0), wall((-15.0, -8.0), (-12.0, 1.0), rng, 1.9)]
+    for x, y in ((-6, -5), (2, -9), (7, 3), (-3, 6), (-8, -12), (14, 8), (5, -3), (-11, 7)):
+        turn, height = rng.uniform(0, 2 * np.pi, 200), rng.uniform(-1.2, 2.5, 200)
+        parts.append(np.column_stack([x + 0.25 * np.cos(turn), y + 0.25 * np.sin(turn), height]))
+    points = np.vstack(parts)
+    points[:, 2] += 0.06 * points[:, 0] - 1.2 * (np.arange(len(points)) < len(ground))
+    return np.asarray(points + rng.normal(scale=0.01, size=points.shape))
+
+
+def laid(target: Prepared, source: Prepared, guess: F64, window: Window, allowed_m: float = 100.0) -> Place:
+    """Odometry allows all that is within `allowed_m` of its guess along x."""
+    return place(
+        target,
+        source,
+        guess,
+        window,
+        lambda T: abs(float(T[0, 3] - guess[0, 3])),
+        most_sigmas=allowed_m,
+        most_slide=0.05,
+    )
+
+
+@pytest.mark.parametrize("heading", [0.0, 75.0, 140.0, -160.0, -60.0])
+@pytest.mark.parametrize("way", [0.4, 2.5, 4.6])
+def test_a_place_is_found_from_ten_metres_off_whatever_the_heading(heading: float, way: float) -> None:
+    truth = pose(1.5, -1.0, 0.1, 20.0)
+    target = seen(square(np.random.default_rng(0)), np.eye(4))
+    source = seen(square(np.random.default_rng(1)), truth)
+    guess = pose(1.5 + 10 * np.cos(way), -1.0 + 10 * np.sin(way), 0.8, 20.0 + heading)
+    found = laid(target, source, guess, EVERYWHERE)
+    missed = lie.inverse(truth) @ found.fit.T_target_source
+    assert np.linalg.norm(missed[:3, 3]) < 0.03
+    assert np.degrees(np.linalg.norm(lie.log(missed[:3, :3]))) < 0.2
+    assert found.open is None and found.alternative_m == np.inf
+
+
+def test_the_search_gives_the_same_to_the_last_bit() -> None:
+    target = seen(square(np.random.default_rng(0)), np.eye(4))
+    source = seen(square(np.random.default_rng(1)), pose(1.5, -1.0, 0.1, 20.0))
+    one, two = (placements(target, source, pose(6.0, 3.0, 0.0, 80.0), EVERYWHERE) for _ in range(2))
+    assert np.array(one).tobytes() == np.array(two).tobytes()
+
+
+def test_heights_follow_from_the_ground() -> None:
+    target = seen(square(np.random.default_rng(0)), np.eye(4))
+    source = seen(square(np.random.default_rng(1)), pose(0.0, 0.0, 0.7, 0.0))
+    likeliest = placements(target, source, pose(0.0, 0.0, -2.0, 0.0), Window(2.0, 0.2))[0]
+    assert likeliest[2, 3] == pytest.approx(0.7, abs=0.05)
+
+
+def test_a_bare_corridor_holds_across_and_leaves_the_way_along_it_to_odometry() -> None:
+    target = seen(corridor(np.random.default_rng(0)), np.eye(4))
+    source = seen(corridor(np.random.default_rng(1)), np.eye(4))
+    found = laid(target, source, pose(0.7, 0.3, 0.1, 3.0), Window(3.0, 0.3))
+    assert found.open is not None and abs(found.open[0]) > 0.99
+    assert not found.loose
+    x, y, z = found.fit.T_target_source[:3, 3]
+    assert x == pytest.approx(0.7, abs=0.02)
+    assert max(abs(y), abs(z)) < 0.03
+    assert found.alternative_m == np.inf, "other places along it are the same one"
+
+
+def test_where_fins_repeat_another_place_one_period_away_fits_unless_odometry_rules_it_out() -> None:
+    target = seen(corridor(np.random.default_rng(0), EVEN), np.eye(4))
+    source = seen(corridor(np.random.default_rng(1), EVEN), np.eye(4))
+    window = Window(6.0, 0.2)
+    assert laid(target, source, np.eye(4), window).alternative_m == pytest.approx(4.0, abs=0.1)
+    assert laid(target, source, np.eye(4), window, allowed_m=3.0).alternative_m == np.inf
+    assert laid(target, source, np.eye(4), Window(0.0, 0.2)).alternative_m == np.inf
+
+
+def test_of_two_places_that_fit_odometry_has_the_choice() -> None:
+    target = seen(corridor(np.random.default_rng(0), EVEN), np.eye(4))
+    source = seen(corridor(np.random.default_rng(1), EVEN), np.eye(4))
+    found = laid(target, source, pose(3.1, 0.0, 0.0, 0.0), Window(6.0, 0.2), allowed_m=2.0)
+    assert found.fit.T_target_source[0, 3] == pytest.approx(4.0, abs=0.05)
+    assert found.deviation < 1.0
+
+
+def test_where_nothing_repeats_no_other_place_fits() -> None:
+    target = seen(corridor(np.random.default_rng(0), FINS), np.eye(4))
+    source = seen(corridor(np.random.default_rng(1), FINS), np.eye(4))
+    assert laid(target, source, np.eye(4), Window(6.0, 0.2)).alternative_m == np.inf
