@@ -71,6 +71,8 @@ def run(
             if finding.verdict != "fine":
                 typer.echo(f"{finding.verdict}: {finding.subject}: {finding.text} {finding.option}".rstrip())
         prepare(session)
+        if session.loops:
+            session.loops.only_results()
         if edits:
             session.edit_loops(edits)
         stop = process(session)

@@ -38,6 +38,10 @@ from app.slam.types import Keyframe
 
 Request = Question | Callable[[Edits], Edits]
 """What the user asks, or makes of the edits: `Edits.undo`, for example, which may raise HemislamError."""
+EVERY: Final = 8
+"""Keyframes after which a state is asked for if no frame needs one: so many travel together."""
+MOST_AHEAD: Final = 8
+"""Questions without an answer at which frames wait all the same, so that keyframes do not pile up in memory."""
 STATES: Final = 512
 """States that are kept, so that going back need not solve the graph again."""
 
@@ -89,6 +93,7 @@ class LoopSchedule:
         self._edits = Edits()
         self._acting = 0  # how many of them act already
         self._finished = False
+        self._at_end = False  # nothing takes effect before the results
         self._most_states = STATES
         self._states: dict[Moment, LoopState] = {}  # with the present edits
         self._wanted = Moment(0)  # what should be in effect
@@ -108,6 +113,11 @@ class LoopSchedule:
         Returns:
             Candidates that are new since the frame before or have another verdict.
         """
+        if self._at_end:
+            while len(self._asked) >= MOST_AHEAD and self._receive(None):
+                pass
+            self.poll()
+            return ()
         self._wait_for_wanted()
         if self._reported is None:
             self._reported = self.edges
@@ -158,6 +168,10 @@ class LoopSchedule:
     def never_go_back(self) -> None:
         """The session only goes on, so no past states are kept."""
         self._most_states = 0
+
+    def only_results(self) -> None:
+        """Nobody looks at loops before `results`: until then nothing takes effect, and frames do not wait for it."""
+        self._at_end, self._most_states = True, 0
 
     def finish(self) -> None:
         """The session has ended: look for loops at the last keyframes too, and put all that comes into effect."""
@@ -216,6 +230,8 @@ class LoopSchedule:
 
     def results(self) -> LoopResults:
         """All that is written of loops, with all keyframes so far, whether in effect or not. Waits for it."""
+        if self._at_end:
+            self.command(AskState())
         self.command(AskG2o())
         self._settle()
         state = self._states.get(Moment(self._log.count, self._finished), self.state)
@@ -240,7 +256,11 @@ class LoopSchedule:
         if self._editing:
             return
         outstanding = {asked.moment for asked in self._asked}
-        for moment in (self._wanted, *map(Moment, range(self._wanted.count + 1, self._log.count + 1))):
+        count = self._log.count
+        counts = range(self._wanted.count + 1, count + 1)
+        if self._at_end:
+            counts = range(count, count + (count % EVERY == 0))
+        for moment in (self._wanted, *map(Moment, counts)):
             if moment != self._shown and moment not in self._states and moment not in outstanding:
                 self._ask(Ask(Target(moment.count, self._edits, moment.finished)))
 
@@ -300,6 +320,8 @@ class LoopSchedule:
         if self._log.keep(Cursor(asked.version, state.count)) < state.count:
             return  # of keyframes that were replaced since
         moment = Moment(state.count, state.finished)
+        if self._at_end:
+            self._states.clear()
         self._states[moment] = state
         if asked.user and asked.visit == self._visit and moment >= self._wanted:
             self._wanted = moment

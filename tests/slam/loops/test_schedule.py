@@ -141,3 +141,36 @@ def test_a_session_that_never_goes_back_keeps_no_past_states(session: HeldSessio
         session.worker.answered = 10
         assert session.step()[1] == shift_at(frame)
     assert len(session.loops._states) <= LATENCY
+
+
+@pytest.mark.parametrize("speed", [0, 1, 100])
+def test_if_only_results_are_wanted_no_frame_waits_for_a_slow_search_and_they_are_the_same(speed: int) -> None:
+    others = []
+    for only_results in (False, True):
+        session = HeldSession()
+        if only_results:
+            session.loops.only_results()
+        for _ in range(100):
+            session.worker.answered = speed
+            session.step()
+            if only_results:
+                assert not session.worker.waits and session.shift == 0.0
+        session.loops.finish()
+        results = session.loops.results()
+        others.append(
+            (results.frame.newest.tobytes(), results.stamps_ns.tobytes(), results.g2o, results.edges[-1].pair)
+        )
+        session.store.close()
+    assert others[0] == others[1]
+
+
+def test_if_only_results_are_wanted_frames_wait_before_keyframes_pile_up() -> None:
+    session = HeldSession()
+    session.loops.only_results()
+    most = 0
+    for _ in range(600):
+        session.step()
+        most = max(most, session.worker.pending)
+    assert session.worker.waits
+    assert most < 100
+    session.store.close()
