@@ -4,10 +4,11 @@ import os
 import sys
 from pathlib import Path
 
-from benchmarks import fed, frame, kill, latency, live, loops, packets, page, replay, rewind, seek, walk
+from benchmarks import consistency, fed, frame, kill, latency, live, loops, packets, page, replay, rewind, seek, walk
 from benchmarks.record import show
 
 BENCHMARKS = {
+    "consistency": consistency.run,
     "fed": fed.run,
     "frame": frame.run,
     "kill": kill.run,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam import ground, iekf, imu, keyframes, rest, start
+from app.slam.certainty import Certainty
 from app.slam.imu import Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
@@ -22,7 +23,7 @@ class EngineProgress:
 
     Attributes:
         frame: index of the next one. belief: None until the start is over. still: samples of the rest so far.
-        T_odom_keyframe: T_odom_imu of the last keyframe.
+        T_odom_keyframe: T_odom_imu of the last keyframe. certainty: of its pose; both None before the first.
     """
 
     frame: int = 0
@@ -30,6 +31,7 @@ class EngineProgress:
     still: ImuSamples | None = None
     status: FrameStatus = FrameStatus.INITIALISING
     T_odom_keyframe: F64 | None = None
+    certainty: Certainty | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +105,10 @@ class Engine:
         cloud = Cloud(points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns)
         for array in (points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns):
             array.setflags(write=False)
-        keyframe = None if waiting else self._keyframe(posterior, cloud)
+        keyframe, certainty = None, before.certainty
+        if not waiting and keyframes.is_due(before.T_odom_keyframe, posterior.state.T_odom_imu, p.keyframe):
+            certainty = (certainty or Certainty.begin(posterior)).moved(posterior)
+            keyframe = self._keyframe(posterior, cloud, certainty)
         watch.lap("keyframe")
 
         if status is not before.status and FrameStatus.LOST in (status, before.status):
@@ -128,7 +133,7 @@ class Engine:
         )
         T_odom_keyframe = before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu
         self._progress = EngineProgress(
-            before.frame + 1, None if waiting else posterior, still, status, T_odom_keyframe
+            before.frame + 1, None if waiting else posterior, still, status, T_odom_keyframe, certainty
         )
         return result
 
@@ -172,17 +177,15 @@ class Engine:
         T = (belief.state.T_odom_imu @ belief.state.T_imu_lidar).astype(np.float32)
         self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map)
 
-    def _keyframe(self, belief: Belief, cloud: Cloud) -> Keyframe | None:
+    def _keyframe(self, belief: Belief, cloud: Cloud, certainty: Certainty) -> Keyframe:
         state = belief.state
-        if not keyframes.is_due(self._progress.T_odom_keyframe, state.T_odom_imu, self.params.keyframe):
-            return None
         keyframe = Keyframe(
             index=len(self.keyframes),
             frame=self._progress.frame,
             stamp_ns=state.stamp_ns,
             T_odom_imu=state.T_odom_imu,
             T_imu_lidar=state.T_imu_lidar,
-            covariance=belief.covariance[:6, :6].copy(),
+            covariance=certainty.covariance(belief),
             cloud=cloud,
         )
         self.keyframes.append(keyframe)

@@ -242,7 +242,7 @@ class Keyframe:
     Attributes:
         index: 0, 1, 2, ... frame: index of the frame it was taken from. stamp_ns: scan end.
         T_odom_imu: (4, 4) pose by odometry. T_imu_lidar: (4, 4) at that moment.
-        covariance: (6, 6) of the pose, rotation then translation, error in the IMU frame/odom.
+        covariance: (6, 6) of the pose since the first keyframe, rotation (IMU frame) then translation (odom).
         cloud: in the LiDAR frame at `stamp_ns`.
     """
 
