@@ -111,6 +111,11 @@ class Controller:
                 if len(self._notes) >= MOST_NOTES:
                     raise HemislamError(f"A session keeps {MOST_NOTES:,} notes; this one was not kept.")
                 self._show_notes((*self._notes, Note(self._need_session().frame, text.strip())))
+            case protocol.EditNote(place, before, text) if (
+                0 <= place < len(self._notes) and self._notes[place].text == before
+            ):
+                changed = (Note(self._notes[place].frame, text.strip()),) if text.strip() else ()
+                self._show_notes((*self._notes[:place], *changed, *self._notes[place + 1 :]))
             case protocol.SetParams(values):
                 self._set_params(self._params.with_values(values))
             case protocol.LoadParams(text):

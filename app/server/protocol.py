@@ -73,6 +73,17 @@ class AddNote(Command, frozen=True):
     text: str
 
 
+class EditNote(Command, frozen=True):
+    """Replace the text of the note with this place in `Snapshot.notes`; an empty text deletes it.
+
+    before: its text until now. If another page has changed it meanwhile, nothing happens.
+    """
+
+    place: int
+    before: str
+    text: str
+
+
 class SetParams(Command, frozen=True):
     """Change parameters by dotted name, for example {"ground.alpha": 30}."""
 

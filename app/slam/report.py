@@ -103,7 +103,7 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
     ]
     if loops:
         lines.append(
-            ("loops", f"{loops['accepted']} accepted, {loops['candidate']} undecided, {loops['rejected']} rejected")
+            ("loops", f"{loops['accepted']} accepted, {loops['candidate']} candidates, {loops['rejected']} rejected")
         )
     lines += [("dropped", f"{count} x {reason}") for reason, count in frames["dropped_reasons"].items()]
     if ground["f1"] is not None:

@@ -125,6 +125,8 @@ class FilesPanel:
         )
         self._save = gui.add_button("Save results…", icon=viser.Icon.DEVICE_FLOPPY, color="gray", disabled=True)
         self._saved = gui.add_html("", visible=False)
+        self._download = gui.add_button("Download…", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
+        self._download.on_click(by_user(lambda _, client: self._offer(client)))
         self._open.on_click(by_user(self.browse))
         self._compare.on_click(by_user(self._browse_trajectories))
         self._save.on_click(by_user(lambda _, client: self._ask_where(client)))
@@ -133,7 +135,7 @@ class FilesPanel:
         self._save.disabled = snapshot.result is None
         self._compare.disabled = snapshot.recording is None or snapshot.live is not None
         done = [saved.folder for saved in snapshot.saved if not saved.error]
-        self._saved.visible = bool(done)
+        self._saved.visible = self._download.visible = bool(done)
         if done:
             self._saved.content = panel("path", "Saved in ", str(done[-1]))
 
@@ -169,6 +171,20 @@ class FilesPanel:
             )
             if recording is not None and recording.truth is not None:
                 gui.add_button(f"Stop comparing with {recording.truth.name}", color="gray").on_click(stop)
+
+    def _offer(self, client: viser.ClientHandle) -> None:
+        """Every file of the results that were saved last, each to be downloaded by a click."""
+        done = [saved.folder for saved in self._page.snapshot().saved if not saved.error]
+        files = sorted(path for path in done[-1].iterdir() if path.is_file()) if done and done[-1].is_dir() else []
+        with dialog(client, "Download results"):
+            for path in files:
+                text = f"{path.name}   {size_text(path.stat().st_size)}"
+                button = client.gui.add_button(text, icon=viser.Icon.DOWNLOAD, color="gray")
+                button.on_click(partial(self._send_file, client, path))
+
+    @staticmethod
+    def _send_file(client: viser.ClientHandle, path: Path, _: object) -> None:
+        client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
 
     def _ask_where(self, client: viser.ClientHandle) -> None:
         recording = self._page.snapshot().recording

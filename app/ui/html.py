@@ -7,6 +7,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from app.ui.hints import HINTS
+
 _FOLDER: Final = Path(__file__).parent / "templates"
 GOOD, WARN, BAD, QUIET = (f"var(--hs-{name})" for name in ("good", "warn", "bad", "quiet"))
 """CSS colours of a reading, from fine to bad, and of what matters little: readable on either background."""
@@ -29,7 +31,7 @@ class Tile(NamedTuple):
 @cache
 def _environment() -> Environment:
     found = Environment(loader=FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, undefined=StrictUndefined)
-    found.globals["ONE_PIXEL"] = ONE_PIXEL
+    found.globals |= {"ONE_PIXEL": ONE_PIXEL, "HINTS": HINTS}
     return found
 
 

@@ -30,6 +30,7 @@ _DIGITS: Final = 9
 """Most digits after the point that a box shows and takes."""
 _TYPING_S: Final = 0.5
 """A text is sent after this long without a change, and a slider that does not act at once after this long at rest."""
+_MOST_UNDONE: Final = 50
 _HOLD_S: Final = 1.0
 """A control shows what the user set for this long, whatever older snapshots say."""
 
@@ -85,6 +86,35 @@ def _control(gui: viser.GuiApi, leaf: Leaf, value: Any, text: str, hint: str) ->
     return gui.add_number(text, value, step=step, hint=hint)  # the engine says what is out of range
 
 
+class History:
+    """The parameters as they were after each change; changes that follow each other closely are one."""
+
+    def __init__(self) -> None:
+        self._states: list[Params] = []
+        self._at = -1
+        self._changed_at = -_HOLD_S
+
+    def see(self, params: Params, now: float) -> None:
+        """Take in the present parameters, wherever a change came from."""
+        if self._at >= 0 and params == self._states[self._at]:
+            return
+        merged = self._at > 0 and now - self._changed_at < _HOLD_S
+        del self._states[self._at + (0 if merged else 1) :]
+        self._states = [*self._states, params][-_MOST_UNDONE:]
+        self._at, self._changed_at = len(self._states) - 1, now
+
+    def change(self, by: int) -> dict[str, Any]:
+        """What leads to the state before (-1) or after (1): values by dotted name; empty if there is none."""
+        if not 0 <= self._at + by < len(self._states):
+            return {}
+        here, there = self._states[self._at], self._states[self._at + by]
+        return {leaf.path: v for leaf in leaves() if (v := there.value(leaf.path)) != here.value(leaf.path)}
+
+    def go(self, by: int) -> None:
+        self._at += by
+        self._changed_at = -_HOLD_S
+
+
 class ParameterPanel:
     """A control for every parameter; `draw` sends what was typed and shows what the snapshot says."""
 
@@ -100,6 +130,13 @@ class ParameterPanel:
         for leaf in leaves():
             group = "primary" if leaf.path in PRIMARY else leaf.section
             self._sections.setdefault(group, {})[leaf.name] = leaf
+        self._history = History()
+        self._undo, self._redo = (
+            gui.add_button(name, icon=icon, color="gray", visible=False)
+            for name, icon in (("Undo", viser.Icon.ARROW_BACK_UP), ("Redo", viser.Icon.ARROW_FORWARD_UP))
+        )
+        self._undo.on_click(by_user(lambda _, __: self._step(-1)))
+        self._redo.on_click(by_user(lambda _, __: self._step(1)))
         self._pending = gui.add_html("", visible=False)
         self._restart = gui.add_button("Restart now", icon=viser.Icon.REFRESH, color="orange", visible=False)
         self._restart.on_click(lambda _: self._send(Restart()))
@@ -128,8 +165,22 @@ class ParameterPanel:
             value = snapshot.params.value(path)
             if path not in self._edits:
                 show(control, value)
+        self._history.see(snapshot.params, now)
+        for button, verb, by in ((self._undo, "Undo", -1), (self._redo, "Redo", 1)):
+            names = self._history.change(by)
+            button.visible = bool(names)
+            if names:
+                button.label = f"{verb} {', '.join(_short(name.partition('.')[2]) for name in list(names)[:2])}"
         self._show_resets(snapshot.params)
         self._show_pending(snapshot.pending_restart)
+
+    def _step(self, by: int) -> None:
+        """Undo or redo the last change of parameters."""
+        values = self._history.change(by)
+        if values:
+            self._history.go(by)
+            self._edits.clear()
+            self._send(SetParams(values))
 
     def fit_lines(self, lines: int) -> None:
         """End the slider of M at the number of scan lines that the open recording has."""
@@ -152,7 +203,7 @@ class ParameterPanel:
 
     def _add_reset(self, group: str) -> None:
         """A button for each parameter of the group that is not at its default, and one for all."""
-        buttons = self._gui.add_button_group("default", ("all",), visible=False, hint="Back to the default value.")
+        buttons = self._gui.add_button_group("reset", ("all",), visible=False, hint="Back to the default value.")
         self._resets[group] = buttons
 
         def reset(chosen: str, _: viser.ClientHandle) -> None:

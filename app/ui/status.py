@@ -1,17 +1,23 @@
 """What is going on: the head of the page, the recording doctor's findings and the engine's notices."""
 
+import shlex
 from typing import Final, Literal
 
 import numpy as np
 import viser
 
 from app.sensors.doctor import Finding
-from app.server.protocol import Notice, Snapshot
+from app.sensors.presets import PRESETS
+from app.server.protocol import Notice, Restart, SetParams, Snapshot
+from app.slam.errors import HemislamError
+from app.slam.params import Params, leaves
 from app.slam.types import FrameStatus
 from app.ui.html import BAD, GOOD, QUIET, WARN, heading, panel
+from app.ui.viser_adapter import Bridge
+from app.ui.widgets import Changes, Page
 
 _LOG_LINES: Final = 20
-_LOOKS: Final = {"fine": ("✓ fine", GOOD), "corrected": ("↻ corrected", WARN), "needs you": ("! needs you", BAD)}
+_LOOKS: Final = {"fine": ("✓ fine", GOOD), "corrected": ("↻ corrected", WARN), "needs you": ("! needs attention", BAD)}
 _LEVELS: Final[dict[str, tuple[str, str, Literal["blue", "yellow", "red"], float | None]]] = {
     "info": ("Note", QUIET, "blue", 6.0),
     "warning": ("Warning", WARN, "yellow", 12.0),
@@ -71,17 +77,43 @@ class HeaderPanel:
             self._bar.value = percent  # type: ignore[misc]  # mypy overlooks viser's setter
 
 
-def findings_html(findings: tuple[Finding, ...]) -> str:
-    """The findings, those that need the user first."""
+def settled(params: Params, option: str) -> Params | None:
+    """The parameters with a finding's option, as the command line would take it; None if it is no parameter."""
+    try:
+        words = shlex.split(option)
+        if words[:1] == ["--set"] and len(words) == 2:
+            return params.with_assignments(words[1:])
+        if words[:1] == ["--preset"] and len(words) == 2:
+            return params.merged(PRESETS[words[1]])
+    except (HemislamError, KeyError, ValueError):  # one that only a person can fill in: "[x, y, z]"
+        pass
+    return None
+
+
+def findings_html(findings: tuple[Finding, ...], params: Params) -> str:
+    """The findings, those that need the user first, each with a button for what would change something."""
     order = list(_LOOKS)[::-1]
     ranked = sorted(findings, key=lambda finding: order.index(finding.verdict))
-    return panel("findings", [(finding, *_LOOKS[finding.verdict]) for finding in ranked])
+    rows = []
+    for finding in ranked:
+        after = settled(params, finding.option)
+        change = (
+            "" if after in (None, params) else "Settle it" if finding.verdict == "needs you" else "Use this instead"
+        )
+        rows.append((finding, *_LOOKS[finding.verdict], change))
+    return panel("findings", rows)
 
 
-def verdicts(findings: tuple[Finding, ...]) -> list[tuple[str, str]]:
-    """How many findings there are of each verdict, in words, and its colour."""
+def verdicts(findings: tuple[Finding, ...]) -> tuple[str, str] | None:
+    """All findings in a few words, and the colour of the worst."""
+    if not findings:
+        return None
     counts = {verdict: sum(finding.verdict == verdict for finding in findings) for verdict in _LOOKS}
-    return [(f"{_LOOKS[verdict][0]} {count}", _LOOKS[verdict][1]) for verdict, count in counts.items() if count]
+    parts = [f"{counts['fine']} check{'s' * (counts['fine'] != 1)} passed"]
+    parts += [f"{counts['corrected']} corrected"] * bool(counts["corrected"])
+    needing = counts["needs you"]
+    parts += [f"{needing} need{'s' * (needing == 1)} attention"] * bool(needing)
+    return ", ".join(parts), BAD if needing else WARN if counts["corrected"] else GOOD
 
 
 def log_html(notices: tuple[Notice, ...]) -> str:
@@ -90,15 +122,35 @@ def log_html(notices: tuple[Notice, ...]) -> str:
 
 
 class DoctorPanel:
-    """The findings of the open recording."""
+    """The findings of the open recording, with buttons that settle them."""
 
-    def __init__(self, gui: viser.GuiApi) -> None:
+    def __init__(self, page: Page) -> None:
+        gui = page.gui
+        self._page = page
+        self._changes = Changes()
+        self._bridge = Bridge(gui, "doctor", lambda word, _: self._settle(word.removeprefix("settle ")))
         self._title = gui.add_html(heading("What the doctor found"), visible=False)
         self._html = gui.add_html("", visible=False)
 
     def draw(self, snapshot: Snapshot) -> None:
+        if not self._changes(snapshot.recording, snapshot.params):
+            return
         self._title.visible = self._html.visible = snapshot.recording is not None
-        self._html.content = findings_html(snapshot.recording.findings if snapshot.recording else ())
+        findings = snapshot.recording.findings if snapshot.recording else ()
+        self._html.content = self._bridge.live(findings_html(findings, snapshot.params))
+
+    def _settle(self, option: str) -> None:
+        """Apply a finding's option; where it is about reading the recording, read it again."""
+        snapshot = self._page.snapshot()
+        known = {finding.option for finding in (snapshot.recording.findings if snapshot.recording else ())}
+        after = settled(snapshot.params, option) if option in known else None
+        if after is None:
+            return
+        values = {leaf.path: after.value(leaf.path) for leaf in leaves()}
+        changed = {path: value for path, value in values.items() if value != snapshot.params.value(path)}
+        self._page.send(SetParams(changed))
+        if any(leaf.effect == "restart" for leaf in leaves() if leaf.path in changed):
+            self._page.send(Restart())
 
 
 class NoticePanel:

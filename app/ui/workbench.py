@@ -106,7 +106,7 @@ class Workbench:
         with tabs.add_tab("Recording", viser.Icon.STETHOSCOPE):
             files.add_buttons()
             self._live = LivePanel(gui)
-            self._doctor = DoctorPanel(gui)
+            self._doctor = DoctorPanel(page)
             with gui.add_folder("Notes"):
                 self._notes = NotesPanel(page)
             self._notices = NoticePanel(server)

@@ -29,7 +29,7 @@ ALPHA = 1
 def test_the_first_screen_says_what_it_is_and_what_to_do(bench: Bench) -> None:
     expect(bench.page.get_by_text("hall_bpearl.mcap")).to_be_visible()
     expect(bench.page.get_by_text("goes one frame")).to_be_visible()
-    expect(bench.page.get_by_text("needs you 1")).to_be_visible()
+    expect(bench.page.get_by_text("1 needs attention")).to_be_visible()
 
 
 def test_the_arrow_key_steps_a_frame_and_leaves_the_camera_alone(bench: Bench) -> None:
@@ -113,8 +113,10 @@ def test_dragging_the_time_slider_seeks(bench: Bench) -> None:
 
 
 def test_the_recording_s_findings_are_in_their_panel(bench: Bench) -> None:
-    bench.page.get_by_role("tab", name="Recording").click()
+    bench.page.get_by_role("button", name="1 needs attention").click()
     expect(bench.page.get_by_text("--set imu.max_gap=0.4")).to_be_visible()
+    bench.page.get_by_role("button", name="Settle it").click()
+    bench.eventually(lambda: SetParams({"imu.max_gap": 0.4}) in bench.engine.sent)
     bench.page.get_by_role("tab", name="Tune").click()
 
 

@@ -128,6 +128,7 @@ def pixel_of(bench: Bench, index: int) -> tuple[float, float]:
 
 
 def test_a_clicked_point_tells_its_numbers_until_another_frame_comes(bench: Bench) -> None:
+    bench.look((-4.0, -4.0, 9.0), (0.3, 0.2, -0.6))
     bench.page.get_by_role("tab", name="Study").click()
     asks = bench.page.get_by_text("Pause and click a point")
     expect(asks).to_be_visible()

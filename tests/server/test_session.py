@@ -13,6 +13,7 @@ from app.server.protocol import (
     AddNote,
     Command,
     CompareWith,
+    EditNote,
     LoadParams,
     Pause,
     Play,
@@ -129,6 +130,15 @@ def test_playing_a_finished_recording_goes_back_to_its_start_and_loses_nothing()
     assert snapshot.notes == ended.notes != ()
     assert bench.pass_time(1.0).transport.frame == pytest.approx(10, abs=1)
     assert bench.sessions[0].known == 59, "the frames that were processed are still known"
+
+
+def test_a_note_is_changed_and_deleted_unless_another_page_has_changed_it() -> None:
+    bench = Bench()
+    bench.do(Seek(30), AddNote("here"), AddNote("there"))
+    notes = bench.do(EditNote(0, "here", " at the door "), EditNote(1, "seen before", "x")).notes
+    assert [note.text for note in notes] == ["at the door", "there"]
+    assert [note.text for note in bench.do(EditNote(0, "at the door", "")).notes] == ["there"]
+    assert bench.do(EditNote(5, "there", "")).notes == bench.do(EditNote(-1, "there", "")).notes != ()
 
 
 def test_a_restart_keeps_the_notes() -> None:

@@ -217,12 +217,12 @@ class LoopEngine(FakeEngine):
                 T = lie.inverse(self.truth[pair[0]]) @ self.truth[pair[1]]
                 if not command.register and command.guess is not None:
                     T = np.array(command.guess)
-                edges[pair] = LoopEdge(*pair, pair[1], *_measured(T), Verdict.ACCEPTED, "tied by hand", Origin.USER)
+                edges[pair] = LoopEdge(*pair, pair[1], *_measured(T), Verdict.ACCEPTED, "tied manually", Origin.USER)
             elif isinstance(command, SetWeight):
                 edges[pair] = replace(edges[pair], weight=command.weight)
             else:
                 verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
-                reason = f"{verdict} by hand; found {edges[pair].verdict}: {edges[pair].reason}"
+                reason = f"{verdict} manually; found {edges[pair].verdict}: {edges[pair].reason}"
                 edges[pair] = replace(edges[pair], verdict=verdict, edited=True, reason=reason)
         return tuple(edges[pair] for pair in sorted(edges))
 

@@ -6,7 +6,7 @@ import pytest
 import viser
 
 from app.mapping.session_file import Note
-from app.server.protocol import AddNote, Command, Snapshot
+from app.server.protocol import AddNote, Command, EditNote, Seek, Snapshot
 from app.ui.transport import _SHOWN_NOTES, NotesPanel
 from tests.ui.conftest import BusyThreads, Wire, browser_sends, page_of, user_clicks, user_sets
 
@@ -16,7 +16,7 @@ class Notes:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.sent: list[Command] = []
-        self.panel = NotesPanel(page_of(server, self.sent.append))
+        self.panel = NotesPanel(page_of(server, self.sent.append, lambda: self.snapshot))
         self.snapshot = Snapshot()
 
     def write(self, text: str) -> None:
@@ -71,6 +71,22 @@ def test_of_many_the_last_are_shown(notes: Notes) -> None:
     assert (
         shown.count("remark") == _SHOWN_NOTES and "remark 99." in shown and f"remark {99 - _SHOWN_NOTES}." not in shown
     )
+
+
+@pytest.mark.parametrize(
+    ("word", "command"),
+    [
+        ("go 70", Seek(70)),
+        ("delete 1", EditNote(1, "the lift", "")),
+        ("delete 2", None),
+        ("go x", None),
+        ("edit -1", None),
+    ],
+)
+def test_a_note_is_gone_to_and_deleted_by_a_click(notes: Notes, word: str, command: Command | None) -> None:
+    notes.show(Note(70, "a turn"), Note(12_345, "the lift"))
+    user_sets(notes.panel._bridge._field, word + " #1")
+    assert notes.sent == ([command] if command else [])
 
 
 def test_a_remark_is_no_html(notes: Notes) -> None:

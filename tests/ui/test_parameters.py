@@ -13,7 +13,7 @@ from app.server.protocol import (
     Snapshot,
 )
 from app.slam.params import Params, leaves
-from app.ui.parameters import PRIMARY, ParameterPanel
+from app.ui.parameters import PRIMARY, History, ParameterPanel
 from tests.ui.conftest import BusyThreads, Clock, browser_sends, page_of, user_clicks, user_sets
 
 
@@ -153,3 +153,16 @@ def test_a_value_set_in_a_browser_is_sent_although_an_older_snapshot_is_drawn_me
     busy.catch_up()
     assert parameters.sent == [SetParams({"ground.alpha": 33.0})]
     assert parameters.control("ground.alpha").value == 33.0
+
+
+def test_changes_are_undone_and_redone_one_by_one_and_a_drag_is_one_change() -> None:
+    history, alphas = History(), (25.0, 30.0, 31.0, 40.0)
+    for seconds, alpha in zip((0.0, 10.0, 10.3, 20.0), alphas, strict=True):
+        history.see(Params().with_values({"ground.alpha": alpha}), seconds)
+    assert history.change(1) == {}
+    for expected in (31.0, 25.0):
+        assert history.change(-1) == {"ground.alpha": expected}
+        history.go(-1)
+    assert history.change(-1) == {} and history.change(1) == {"ground.alpha": 31.0}
+    history.see(Params().with_values({"ground.sigma": 0.2, "ground.alpha": 25.0}), 30.0)
+    assert history.change(1) == {}, "another change takes the place of what was undone"

@@ -1,8 +1,9 @@
 """What the panels say, and how they plot.
 
-Tests app/ui/files.py, app/ui/readouts.py, app/ui/status.py.
+Tests app/ui/files.py, app/ui/readouts.py, app/ui/status.py, app/ui/hints.py.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
@@ -12,31 +13,36 @@ import numpy as np
 import pytest
 
 from app.sensors.live.status import LiveState
+from app.sensors.presets import PRESETS
 from app.server.protocol import (
     Notice,
     Snapshot,
     StepFrame,
     Transport,
 )
+from app.slam.params import Params
+from app.ui import hints
 from app.ui.colours import LABEL, Limits, legend
 from app.ui.files import result_folder_name, size_text
-from app.ui.html import Tile, panel
+from app.ui.hints import HINTS
+from app.ui.html import BAD, GOOD, Tile, panel
 from app.ui.readouts import HISTORY, plotted, stacked_stages
-from app.ui.status import findings_html, log_html, title, verdicts
+from app.ui.status import findings_html, log_html, settled, title, verdicts
 from tests.ui.fake_engine import FINDINGS, FakeEngine
 
 
 def test_findings_that_need_the_user_come_first_with_their_option() -> None:
-    text = findings_html(FINDINGS)
-    assert text.index("needs you") < text.index("corrected") < text.index("fine")
+    text = findings_html(FINDINGS, Params())
+    assert text.index("needs attention") < text.index("corrected") < text.index("fine")
     assert "<code>--set imu.max_gap=0.4</code>" in text
-    assert [text for text, _ in verdicts(FINDINGS)] == ["✓ fine 2", "↻ corrected 1", "! needs you 1"]
+    assert verdicts(FINDINGS) == ("2 checks passed, 1 corrected, 1 needs attention", BAD)
+    assert verdicts(FINDINGS[:1]) == ("1 check passed", GOOD) and verdicts(()) is None
 
 
 @pytest.mark.parametrize(
     "render",
     [
-        lambda text: findings_html((replace(FINDINGS[0], subject=text, text=text, option=text),)),
+        lambda text: findings_html((replace(FINDINGS[0], subject=text, text=text, option=text),), Params()),
         lambda text: log_html((Notice(1, "error", text),)),
         lambda text: panel("tile_grid", [Tile(text, text, text, text)]),
         lambda text: title(Snapshot(recording=replace(FakeEngine(frames=2).snapshot.recording, path=Path(text)))),  # type: ignore[type-var]
@@ -44,6 +50,23 @@ def test_findings_that_need_the_user_come_first_with_their_option() -> None:
 )
 def test_names_from_a_recording_are_never_markup(render: Callable[[str], str]) -> None:
     assert "<script" not in render("<script>alert(1)<")
+
+
+def test_a_finding_is_settled_by_a_button_where_its_option_changes_a_parameter() -> None:
+    gap = settled(Params(), "--set imu.max_gap=0.4")
+    assert gap is not None and gap.imu.max_gap == 0.4
+    assert settled(Params(), "--preset h2lid") == Params().merged(PRESETS["h2lid"])
+    for beyond in ("", "--set 'sensor.translation=[x, y, z]'", "--lidar-topic /points", "--set 'x", "--preset nobody"):
+        assert settled(Params(), beyond) is None
+    assert findings_html(FINDINGS, Params()).count("settle --set imu.max_gap=0.4") == 1
+    assert gap is not None and "settle --set imu" not in findings_html(FINDINGS, gap)
+
+
+def test_every_tile_is_explained_in_a_sentence() -> None:
+    folder = Path(hints.__file__).parent
+    named = {name for path in folder.rglob("*.py") for name in re.findall(r'Tile\(\s*"([^"]+)"', path.read_text())}
+    assert len(named) > 40 and named <= HINTS.keys()
+    assert all(text.endswith(".") and ". " not in text for text in HINTS.values())
 
 
 def test_a_live_run_waits_for_its_first_scan_and_asks_for_no_button() -> None:

@@ -179,7 +179,7 @@ def _edited(edge: LoopEdge, edit: LoopEdit) -> LoopEdge:
     verdict = Verdict.ACCEPTED if isinstance(edit, Accept) else Verdict.REJECTED
     if verdict is edge.verdict:
         return replace(edge, edited=True)
-    reason = f"{verdict} by hand; found {edge.verdict}: {edge.reason}"
+    reason = f"{verdict} manually; found {edge.verdict}: {edge.reason}"
     return replace(edge, verdict=verdict, edited=True, reason=reason)
 
 

@@ -15,6 +15,8 @@ from app.slam.loops.types import LOOP_HUBER, LoopEdge, Origin, Pair, Verdict
 from app.slam.sections import LoopsParams
 from app.slam.types import F64
 
+NAMED = 5
+"""Most loops that are named as contradicting a candidate."""
 NEIGHBOURHOOD_M = 15.0
 """Loops whose ends are farther apart than this along the trajectory, on either side, are not compared."""
 SAME = 2 * LOOP_HUBER
@@ -78,7 +80,10 @@ def settle(
                 waits = f"{edge.evidence.against_odometry(params.max_mahalanobis)}; {support} of {needed} others agree"
                 waits += f" over {stretch:.0f} m (least {STRETCH_M:g} m)"
             contradicted = f", {against} contradict it" if against else ""
-            out[edge.pair] = replace(edge, reason=waits + contradicted, evidence=evidence, weight=1.0)
+            named = tuple(other.pair for other, yes in zip(others, verdicts, strict=True) if not yes)[:NAMED]
+            out[edge.pair] = replace(
+                edge, reason=waits + contradicted, evidence=evidence, weight=1.0, contradicted_by=named
+            )
     return list(out.values())
 
 

@@ -98,6 +98,7 @@ class LoopEdge:
             points, or the last loop that ties poses if the graph already says the same.
         repeats: a loop up to a submap's length away that measured the same. This one becomes a further measurement
             between that loop's keyframes and ties no poses of its own.
+        contradicted_by: loops nearby that do not agree with this candidate, at most `support.NAMED` of them.
     """
 
     older: KeyframeId
@@ -113,6 +114,7 @@ class LoopEdge:
     weight: float = 1.0
     represented_by: Pair | None = None
     repeats: Pair | None = None
+    contradicted_by: tuple[Pair, ...] = ()
 
     @property
     def pair(self) -> Pair:

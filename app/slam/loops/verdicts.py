@@ -75,7 +75,7 @@ def by_hand(
     both = detector.both(older, newer)
     fit = assess(*both, refine(*both, align(*both, guess)) if register else guess)
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
-    reason = f"added by hand: overlap {fit.overlap:.2f}, residual {fit.residual_rms * 1e3:.0f} mm"
+    reason = f"added manually: overlap {fit.overlap:.2f}, residual {fit.residual_rms * 1e3:.0f} mm"
     T = _imu(detector, older, newer, fit.T_target_source) if register else T_older_newer
     sigma = covariance(detector, newer, fit)
     return LoopEdge(older, newer, newer, T, sigma, evidence, Verdict.ACCEPTED, reason, Origin.USER, edited=True)

@@ -18,7 +18,7 @@ from app.ui.loops.edges import LoopEdges
 from app.ui.loops.edits import EditsPanel, Proposal, VerdictPanel
 from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
 from app.ui.loops.table import COLUMNS, Order, chips, listed, table
-from app.ui.loops.words import KINDS, largest_factors
+from app.ui.loops.words import BRIDGE, KINDS, largest_factors
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of
 
@@ -54,18 +54,20 @@ class LoopsPanel:
         self._order = Order()
         self._changes = Changes()
         self._edges = LoopEdges(page.scene, f"{ROOT}/loops")
-        self._bridge = Bridge(gui, "loops", self._act)
+        self._bridge = Bridge(gui, BRIDGE, self._act)
         self._table = gui.add_html(panel("quiet", _NONE_YET))
         self._proposal = Proposal(page, self._committed)
         self._folder = gui.add_folder("The chosen loop", visible=False)
         with self._folder:
             self._verdict = VerdictPanel(page, self._proposal.propose)
             self._inspector = Inspector(page, self._go)
-        with gui.add_folder("Add a loop by hand", expand_by_default=False):
+        with gui.add_folder("Add a loop manually", expand_by_default=False):
             self._add_loop = AddLoopPanel(page, self._proposal.propose, self._fly)
-        with gui.add_folder("Edits"):
+        self._edits_folder = gui.add_folder("Manual edits", visible=False)
+        with self._edits_folder:
             self._edits = EditsPanel(page)
-        with gui.add_folder("Graph residuals", expand_by_default=False):
+        self._residuals_folder = gui.add_folder("Graph residuals", expand_by_default=False, visible=False)
+        with self._residuals_folder:
             self._solve = gui.add_button(
                 "Solve all at once …", icon=viser.Icon.MATH_FUNCTION, color="gray", hint=_SOLVE_HINT
             )
@@ -121,6 +123,8 @@ class LoopsPanel:
         self._solving.visible = isinstance(command, Solve)
         self._solve.disabled = Solve() in loops.undo or not any(edge.counts for edge in loops.edges)
         self._folder.visible = edge is not None
+        self._edits_folder.visible = len(poses) > 1
+        self._residuals_folder.visible = bool(loops.edges)
         self._draw_tables(snapshot)
 
     def _draw_tables(self, snapshot: Snapshot) -> None:
@@ -197,7 +201,7 @@ class LoopsPanel:
     def _committed(self, command: LoopEdit) -> None:
         self._add_loop.done()
         if (pair := command.pair) is not None:
-            self._chosen = self._coming = pair  # a loop added by hand arrives later
+            self._chosen = self._coming = pair  # a loop added manually arrives later
 
 
 def stand(position: F64, look_at: F64, target: F64, distance: float) -> F64:

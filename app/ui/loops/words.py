@@ -34,7 +34,9 @@ class LoopKind:
     knob_m: float
 
 
-EDITED: Final = "by hand"
+BRIDGE: Final = "loops"
+"""Name of the bridge of everything about loops that can be clicked."""
+EDITED: Final = "edited"
 KINDS: Final[dict[str, LoopKind]] = {
     kind.name: kind
     for kind in (
@@ -78,7 +80,8 @@ def describe_edit(command: LoopEdit) -> str:
 
 
 def headline(edge: LoopEdge) -> str:
-    return panel("loops.headline", edge, kind_of(edge).colour)
+    """Verdict and reason; loops that contradict it can be clicked, as rows of the table."""
+    return panel("bridged", BRIDGE, panel("loops.headline", edge, kind_of(edge).colour))
 
 
 def evidence(edge: LoopEdge, params: LoopsParams) -> str:

@@ -14,6 +14,15 @@ if (!window.hemislamSay) {
     input.dispatchEvent(new Event('input', {bubbles: true}));
   };
 
+  // Show a tab, docked or on a phone.
+  window.hemislamOpenTab = (name) => {
+    const tab = [...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === name);
+    if (!tab) return;
+    tab.click();
+    tab.dispatchEvent(new KeyboardEvent('keydown', {key: 'Enter', bubbles: true}));
+    tab.scrollIntoView({block: 'nearest'});
+  };
+
   // Keys. On its way up an event passes widgets (the page's root), the body, viser's hotkeys (the html element) and
   // viser's camera (the document). Left and right move a focused slider or tab, else step a frame, never the camera.
   const sideways = (event) => event.key === 'ArrowLeft' || event.key === 'ArrowRight';

@@ -197,7 +197,7 @@ def test_with_every_loop_rejected_the_map_is_the_odometry(walked: Walked, backen
         backend.apply(Reject(edge.older, edge.newer))
     np.testing.assert_allclose(backend.poses, [k.T_odom_imu for k in walked.keyframes], atol=1e-9)
     assert all(
-        edge.edited and "by hand" in edge.reason for edge in backend.edges if edge.pair in backend_pairs(backend)
+        edge.edited and "manually" in edge.reason for edge in backend.edges if edge.pair in backend_pairs(backend)
     )
 
 

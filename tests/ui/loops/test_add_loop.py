@@ -81,4 +81,4 @@ def test_a_loop_added_by_hand_is_chosen_once_it_arrives(page: Page) -> None:
     page.draw()
     page.draw()
     assert page.loops.chosen == (20, 97) and page.engine.sent[-1] == InspectLoop((20, 97))
-    assert page.says("by hand 1")
+    assert page.says("edited 1")

@@ -29,9 +29,9 @@ def test_a_rejected_loop_is_accepted_in_two_steps_with_a_ghost_between(page: Pag
     assert page.engine.sent[1:3] == [EditLoop(Accept(*pair)), TryLoop(None)]
     assert page.edge(pair).verdict is Verdict.ACCEPTED
     assert page.node("/map/ghost/path") is None
-    assert page.node("/map/loops/by-hand-in") is None  # it is the chosen one, drawn in white
+    assert page.node("/map/loops/edited-in") is None  # it is the chosen one, drawn in white
     page.choose(None)
-    assert page.node("/map/loops/by-hand-in").points.shape == (2, 2, 3)
+    assert page.node("/map/loops/edited-in").points.shape == (2, 2, 3)
 
 
 def test_cancelling_leaves_all_as_it_was(page: Page) -> None:

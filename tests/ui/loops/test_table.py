@@ -12,7 +12,7 @@ from tests.ui.loops.conftest import GOOD, Page, rejected
 
 
 def test_the_table_counts_and_lists_what_is_shown(page: Page) -> None:
-    assert page.says("accepted 6", "candidate 3", "rejected 20", "by hand 0", "12–89")
+    assert page.says("accepted 6", "candidate 3", "rejected 20", "edited 0", "12–89")
     hidden = "–".join(str(index) for index in rejected(page))
     assert not page.says(hidden)
     page.loops._act("show rejected", SOMEONE)  # type: ignore[arg-type]

@@ -1,0 +1,61 @@
+"""One sentence for every tile, with its unit, as the page shows it on hover."""
+
+from typing import Final
+
+HINTS: Final[dict[str, str]] = {
+    # ground, filter, motion, time
+    "λ3/λ2": "Flatness of the seeds: their smallest spread over the middle one, without unit; a plane is near 0.",
+    "seeds": "Points among the outermost scan lines and within α of straight down, from which the plane is found.",
+    "ground": "Points of the scan labelled ground, in percent.",
+    "points: scan → ground thinned → filter": "Points in the scan, after thinning the ground, and in the filter.",
+    "iterations": "Updates of the filter until the pose no longer changed.",
+    "residual": "Distance of points to the planes they are matched with, RMS in mm.",
+    "inliers": "Points that found a plane in the map, in percent of those used.",
+    "degeneracy": "Whether the scan leaves a direction open, by the least eigenvalue of its information.",
+    "velocity": "Speed of the IMU in m/s, and its parts along x, y and z of the odometry frame.",
+    "distance": "Length of the trajectory so far, in m.",
+    "gyroscope bias": "Estimated constant error of the gyroscope in mrad/s, and its parts.",
+    "acceleration bias": "Estimated constant error of the accelerometer in mm/s², and its parts.",
+    "position error to truth": "Distance to the truth in cm, both trajectories aligned.",
+    "frame": "Time that the engine took for the frame, in ms.",
+    "dropped": "Scans left out because the engine was behind.",
+    # loops
+    "overlap": "Points near both keyframes that have a partner in the other submap, in percent.",
+    "slide": "How far registrations from disturbed starts end from one another, in cm.",
+    "to odometry": "Distance to what odometry expects, in its standard deviations (σ).",
+    "odometry ±": "Standard deviation of what odometry expects, in m.",
+    "support": "Loops nearby that agree with this one.",
+    "other place": "Distance in m to another place where it would fit as well.",
+    "condition": "Least over greatest information of the registration, 0 to 1; near 0 it slides.",
+    "contexts": "Difference of the two Scan Contexts, 0 (the same) to 1.",
+    # A/B
+    "A to B": "Distance between the two positions at this frame, in cm.",
+    "turned": "Angle between the two orientations at this frame, in degrees.",
+    "only in A": "Points that A calls ground and B does not.",
+    "only in B": "Points that B calls ground and A does not.",
+    "in both": "Points that both call ground.",
+    "frame, mean of A → B": "Mean time of a frame in A and in B, in ms.",
+    "error to truth, RMS of A → B": "Distance to the truth in A and in B, RMS in cm.",
+    # a point
+    "label": "What the point was labelled: ground, seed or not ground.",
+    "ring": "Scan line of the point; 0 is the outermost.",
+    "range": "Distance from the sensor, in m.",
+    "angle to down": "Angle between the ray to the point and straight down, in degrees.",
+    "intensity": "Strength of the echo, on the sensor's scale.",
+    "time in scan": "When the point was measured, in ms after the scan began.",
+    "distance to plane": "Distance to the ground plane in cm; under σ · range it is ground.",
+    "plane of its neighbours": "Slope of the plane through its nearest points, in degrees from level.",
+    "thickness": "Scatter of the nearest points about their plane, RMS in mm.",
+    "nearest plane in the map": "Distance in mm to the plane of the map that the filter matched.",
+    # live
+    "LiDAR": "Scans received a second (Hz), and the age of the newest.",
+    "IMU": "Samples received a second (Hz), and the age of the newest.",
+    "packets lost": "Packets that never arrived, by their numbers.",
+    "not usable": "Packets that arrived but could not be read.",
+    "duplicates": "Packets that arrived twice; the second is ignored.",
+    "scans dropped": "Scans left out because too many waited for the engine.",
+    "waiting": "Scans that wait for the engine.",
+    "IMU behind LiDAR": "How much later the IMU's data arrives than the scans of the same time, in ms.",
+    "recorded": "Bytes written to the recording so far.",
+    "clock in use": "Whose clock stamps the data.",
+}
