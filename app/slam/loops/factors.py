@@ -104,7 +104,7 @@ def loop_factors(
             first = by_pair[edge.repeats] if edge.repeats and not window else edge
             T, covariance = edge.T_older_newer, edge.covariance
             if first is not edge:
-                T, covariance = laid(edge, first, T_odom_imu)
+                (T,), (covariance,) = laid([edge], first, T_odom_imu)
             factors.append(Factor(first.older, first.newer, T, covariance / edge.weight, True, edge.pair))
     return factors
 

@@ -3,11 +3,12 @@
 A place that looks the same can fool one registration; it rarely fools several at different keyframes in the same way.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
 from app.slam import lie
 from app.slam.loops.drift import Drift
@@ -61,7 +62,8 @@ def settle(
             continue
         others = [o for o in near if o.pair != edge.pair and max(ways(edge, o)) < NEIGHBOURHOOD_M]
         # an ambiguous candidate supports nothing: all that was seen there may belong to a place that looks the same
-        verdicts = [not o.evidence.ambiguous and _agree(edge, o, poses, sum(ways(edge, o)), drift) for o in others]
+        agree = _agree(edge, others, poses, np.array([sum(ways(edge, o)) for o in others]), drift) if others else ()
+        verdicts = [bool(yes) and not o.evidence.ambiguous for yes, o in zip(agree, others, strict=True)]
         agreeing = [other.newer for other, yes in zip(others, verdicts, strict=True) if yes]
         support, against = len({*agreeing} - {edge.newer}), verdicts.count(False)
         alone = edge.evidence.mahalanobis > params.max_mahalanobis
@@ -87,15 +89,15 @@ def settle(
     return list(out.values())
 
 
-def _agree(a: LoopEdge, b: LoopEdge, poses: F64, way: float, drift: Drift) -> bool:
-    """Whether two loops agree: going round by both leads back to the start, within what they and odometry err by.
+def _agree(edge: LoopEdge, others: Sequence[LoopEdge], poses: F64, ways: F64, drift: Drift) -> npt.NDArray[np.bool_]:
+    """Which of the others agree with a loop: going round by both leads back, within what they and odometry err by.
 
     Args:
-        poses: (k, 4, 4) by odometry. way: m along the trajectory between the older ends, plus between the newer ends.
+        poses: (k, 4, 4) by odometry. ways: (n,) m along the trajectory between the older ends, plus between the newer.
     """
-    T, covariance = laid(b, a, poses)
-    walked = np.array([drift.rotation * way] * 3 + [drift.translation * way] * 3)
-    return _off(a, T, covariance + np.diag(walked**2)) < AGREE
+    T, covariances = laid(others, edge, poses)
+    walked = np.array([drift.rotation] * 3 + [drift.translation] * 3) * ways[:, None]
+    return _off(edge, T, covariances + np.eye(6) * walked[:, None, :] ** 2) < AGREE
 
 
 def _ends(edges: Iterable[LoopEdge], walked: F64) -> F64:
@@ -136,9 +138,9 @@ def _placed(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_m
     ties = [other for other in counting if other.repeats is None]
     found = (tie for tie in ties if tie.origin is Origin.DETECTED)
     around = sorted((tie for tie in found if _apart(edge, tie) <= 2 * half), key=partial(_apart, edge))
-    same = next((tie for tie in around if _off(edge, *laid(tie, edge, T_odom_imu)) <= SAME), None)
-    if same is not None:
-        return replace(edge, repeats=same.pair)
+    same = _off(edge, *laid(around, edge, T_odom_imu)) <= SAME if around else np.empty(0)
+    if same.any():
+        return replace(edge, repeats=around[int(same.argmax())].pair)
     last = min(ties, key=lambda tie: abs(edge.newer - tie.newer), default=edge)
     ago = abs(edge.newer - last.newer)
     if last is not edge and ago <= 4 * half:
@@ -148,17 +150,19 @@ def _placed(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_m
     return edge
 
 
-def laid(edge: LoopEdge, first: LoopEdge, T_odom_imu: F64) -> tuple[F64, F64]:
-    """A loop's measurement, transported by odometry to the keyframes of a nearby loop: T (4, 4), covariance (6, 6).
+def laid(edges: Sequence[LoopEdge], first: LoopEdge, T_odom_imu: F64) -> tuple[F64, F64]:
+    """Loops' measurements, transported by odometry to the keyframes of one nearby: T (n, 4, 4), covariances (n, 6, 6).
 
     Args:
         T_odom_imu: (k, 4, 4); taken as exact between ends that are near each other.
     """
-    older = lie.inverse(T_odom_imu[first.older]) @ T_odom_imu[edge.older]
-    newer = lie.inverse(T_odom_imu[edge.newer]) @ T_odom_imu[first.newer]
+    ends = np.array([edge.pair for edge in edges])
+    older = lie.inverse(T_odom_imu[first.older]) @ T_odom_imu[ends[:, 0]]
+    newer = lie.inverse(T_odom_imu[ends[:, 1]]) @ T_odom_imu[first.newer]
     turn = lie.adjoint(lie.inverse(newer))
-    covariance = turn @ edge.covariance @ turn.T
-    return older @ edge.T_older_newer @ newer, (covariance + covariance.T) / 2
+    covariances = turn @ np.array([edge.covariance for edge in edges]) @ np.swapaxes(turn, -1, -2)
+    measured = np.array([edge.T_older_newer for edge in edges])
+    return older @ measured @ newer, (covariances + np.swapaxes(covariances, -1, -2)) / 2
 
 
 def _apart(a: LoopEdge, b: LoopEdge) -> int:
@@ -166,7 +170,8 @@ def _apart(a: LoopEdge, b: LoopEdge) -> int:
     return max(abs(a.older - b.older), abs(a.newer - b.newer))
 
 
-def _off(edge: LoopEdge, T_older_newer: F64, covariance: F64 | float = 0.0) -> float:
-    """Standard deviations between a loop's measurement and this one. covariance: (6, 6) of this one; 0 if exact."""
+def _off(edge: LoopEdge, T_older_newer: F64, covariances: F64 | float = 0.0) -> F64:
+    """Standard deviations between a loop and other measurements (..., 4, 4), exact or with covariances (..., 6, 6)."""
     missed = lie.log_se3(lie.inverse(edge.T_older_newer) @ T_older_newer)
-    return float(np.sqrt(missed @ np.linalg.solve(edge.covariance + covariance, missed)))
+    whitened = np.linalg.solve(edge.covariance + covariances, missed[..., None])[..., 0]
+    return np.asarray(np.sqrt((missed * whitened).sum(axis=-1)))

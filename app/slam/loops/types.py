@@ -127,7 +127,7 @@ class LoopEdge:
     @property
     def open(self) -> bool:
         """Whether it leaves a direction open."""
-        return bool(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1] > OPEN_M**2)
+        return bool(np.trace(self.covariance[3:, 3:]) > OPEN_M**2)  # the other directions are held to centimetres
 
     @property
     def counts(self) -> bool:

@@ -8,12 +8,14 @@ import pytest
 
 from app.slam import lie
 from app.slam.loops.backend import LoopBackend
+from app.slam.loops.drift import Drift
 from app.slam.loops.edits import Add, Reject, SetWeight, lay_over
 from app.slam.loops.factors import Factor, loop_factors
 from app.slam.loops.solvers import optimise
-from app.slam.loops.support import laid, placed
+from app.slam.loops.support import laid, placed, settle
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.loops.verdicts import FLOOR_M, FLOOR_RAD
+from app.slam.sections import LoopsParams
 from app.slam.types import F64
 from tests.slam.loops.conftest import Walked, accepted
 
@@ -104,12 +106,12 @@ def test_a_loop_laid_on_other_keyframes_errs_there_by_what_its_error_becomes() -
     half = rng.normal(0.0, 0.1, (6, 6))
     ends = {"older": 1, "newer": 6, "decided_at": 6}
     edge = replace(loop(40), **ends, T_older_newer=lie.exp_se3(rng.normal(0.0, 1.0, 6)), covariance=half @ half.T)
-    T, covariance = laid(edge, replace(edge, older=0, newer=7), poses)
+    (T,), (covariance,) = laid([edge], replace(edge, older=0, newer=7), poses)
     errors = 1e-6 * np.linalg.cholesky(edge.covariance).T  # their squares add up to the covariance
     there = []
     for error in errors:
         off = replace(edge, T_older_newer=edge.T_older_newer @ lie.exp_se3(error))
-        there.append(lie.log_se3(lie.inverse(T) @ laid(off, replace(off, older=0, newer=7), poses)[0]))
+        there.append(lie.log_se3(lie.inverse(T) @ laid([off], replace(off, older=0, newer=7), poses)[0][0]))
     np.testing.assert_allclose(1e12 * np.transpose(there) @ there, covariance, atol=1e-3 * np.abs(covariance).max())
     own = lie.inverse(poses[0]) @ poses[1] @ edge.T_older_newer @ lie.inverse(poses[6]) @ poses[7]
     np.testing.assert_allclose(T, own, atol=1e-12)
@@ -216,3 +218,66 @@ def test_with_a_window_each_loop_is_between_its_own_keyframes() -> None:
         factors = loop_factors(edges.values(), edges, POSES, window=window)
         assert [factor.keyframes for factor in factors] == pairs
         assert [factor.name for factor in factors] == [*edges]
+
+
+# --- judged together -----------------------------------------------------------------------------
+SLIPPED = Evidence(overlap=0.8, residual_rms=0.03, slide=0.01, mahalanobis=9.0, gate_m=0.1, alternative_m=np.inf)
+
+
+def judged(loops: list[LoopEdge], evidence: Evidence = SLIPPED) -> dict[int, LoopEdge]:
+    """By their older ends, once all are there; odometry walks as `POSES`."""
+    found = {edge.pair: replace(edge, verdict=Verdict.CANDIDATE, evidence=evidence) for edge in loops}
+    settled = settle(found, found, POSES, Drift(0.01, np.radians(0.02)), LoopsParams(), 2 * TURN - 1)
+    return {edge.older: edge for edge in settled}
+
+
+def test_one_loop_against_odometry_stays_undecided_and_says_so() -> None:
+    (edge,) = judged([loop(40)]).values()
+    assert edge.verdict is Verdict.CANDIDATE
+    assert "odometry rules it out: 9.0 σ" in edge.reason and "0 of 4 others agree" in edge.reason
+
+
+def test_loops_that_agree_over_a_stretch_outvote_odometry() -> None:
+    edges = judged([loop(older) for older in range(40, 34, -1)])
+    assert all(edge.verdict is Verdict.ACCEPTED and "outvote odometry" in edge.reason for edge in edges.values())
+
+
+def test_loops_that_agree_at_one_spot_do_not_outvote_odometry() -> None:
+    newer = 2 * TURN - 1 - 40
+    at_one_spot = []
+    for step in range(6):
+        edge = loop(40 + step % 2)
+        edge = replace(edge, older=38 + step, newer=newer + step % 3)
+        T = lie.inverse(POSES[edge.older]) @ POSES[edge.newer]
+        at_one_spot.append(replace(edge, T_older_newer=T))
+    assert all(edge.verdict is Verdict.CANDIDATE for edge in judged(at_one_spot).values())
+
+
+def test_with_odometry_half_as_many_are_enough() -> None:
+    near = replace(SLIPPED, mahalanobis=1.0)
+    assert {edge.verdict for edge in judged([loop(40), loop(39), loop(38)], near).values()} == {Verdict.ACCEPTED}
+    assert {edge.verdict for edge in judged([loop(40), loop(39), loop(38)]).values()} == {Verdict.CANDIDATE}
+
+
+def test_a_loop_that_others_contradict_is_not_accepted() -> None:
+    off = np.array([0.0, 2.0, 0.0])
+    edges = judged([*(loop(older) for older in (40, 39, 38, 37, 36, 35)), loop(34, off)])
+    assert edges.pop(34).verdict is Verdict.CANDIDATE
+    assert {edge.verdict for edge in edges.values()} == {Verdict.ACCEPTED}
+
+
+def test_along_a_direction_that_both_leave_open_loops_need_not_agree() -> None:
+    """In a corridor they say nothing of how far along it the walk is."""
+    apart = [loop(older, np.array([0.8 * (older % 2), 0.0, 0.0])) for older in range(40, 34, -1)]
+    near = replace(SLIPPED, mahalanobis=1.0)
+    assert Verdict.ACCEPTED not in {edge.verdict for edge in judged(apart[:3], near).values()}
+    along = np.diag([FLOOR_RAD**2] * 3 + [100.0, FLOOR_M**2, FLOOR_M**2])
+    opened = [replace(edge, covariance=along) for edge in apart]
+    assert {edge.verdict for edge in judged(opened, near).values()} == {Verdict.ACCEPTED}
+
+
+def test_a_loop_that_leaves_a_direction_open_stands_for_none_that_does_not() -> None:
+    along = np.diag([FLOOR_RAD**2] * 3 + [100.0, FLOOR_M**2, FLOOR_M**2])
+    opened = replace(loop(40), covariance=along)
+    assert [edge.represented_by for edge in placed([loop(39)], [opened], POSES, POSES, HALF)] == [None]
+    assert [edge.represented_by for edge in placed([opened], [loop(39)], POSES, POSES, HALF)] == [loop(39).pair]
