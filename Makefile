@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 INSTALL := $(PIP) install --require-hashes --only-binary :all:
 
 .DEFAULT_GOAL := help
-.PHONY: help run install test check docs bench bench-peers image-test lock clean
+.PHONY: help run install test check docs pictures bench bench-peers image-test lock clean
 
 help: ## List these targets.
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 20
@@ -33,6 +33,9 @@ check: $(VENV)/.installed-dev ## Check format, lint, types and the direction of 
 
 docs: $(VENV)/.installed-dev ## Build the documentation as a site in build/site/.
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
+pictures: $(VENV)/.installed-dev ## Make every picture of docs/ and the README anew; needs chromium.
+	$(BIN)/python docs/pictures.py
 
 bench: $(VENV)/.installed-dev ## Time the engine stage by stage and the page; adds to benchmarks/results.csv.
 	$(BIN)/python -m benchmarks

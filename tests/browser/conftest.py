@@ -98,10 +98,12 @@ def chromium() -> Iterator[Browser]:
         browser.close()
 
 
-def new_page(chromium: Browser, width: int, height: int) -> Page:
-    """A page on which an error or a warning of our own fails the test."""
+def new_page(chromium: Browser, width: int, height: int, *, tour: bool = False) -> Page:
+    """A page on which an error or a warning of our own fails the test. tour: as on a first visit."""
     page = chromium.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(SLOW_MS)
+    if not tour:
+        page.add_init_script("localStorage.setItem('hemislam-tour', 'seen')")
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
     return page

@@ -225,3 +225,24 @@ def test_the_page_reaches_out_to_nobody(bench: Bench, chromium: Browser) -> None
         assert hosts <= {Path(bench.url).name, bench.url.split("/")[2]}
     finally:
         page.close()
+
+
+def test_the_first_visit_is_shown_around_once(bench: Bench, chromium: Browser) -> None:
+    page = new_page(chromium, 1000, 620, tour=True)
+    try:
+        page.goto(bench.url)
+        tour = page.get_by_role("dialog", name="Tour")
+        for title in ("Play, or step", "Go anywhere", "Tune the ground", "Judge a loop", "That is all"):
+            expect(tour.get_by_text(title)).to_be_visible()
+            tour.locator(".hs-next").click()
+        expect(tour).to_have_count(0)
+        page.reload()
+        expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+        page.wait_for_timeout(3000)
+        expect(tour).to_have_count(0)
+        page.get_by_role("tab", name="Help").click()
+        page.get_by_role("button", name="Tour of one minute").click()
+        page.keyboard.press("Escape")
+        expect(tour).to_have_count(0)
+    finally:
+        page.close()

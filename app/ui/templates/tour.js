@@ -1,0 +1,48 @@
+// One minute through the page on the first visit: what is spoken of is outlined, Esc or Skip ends it.
+if (!window.hemislamTour) {
+  const STEPS = [
+    ['.hs-steps', '', 'Play, or step', 'Space plays and pauses. ← and → go one frame; going back loses nothing.'],
+    ['.hs-track', '', 'Go anywhere', 'Drag the track. Marks show loops, notes and trouble; Diagnostics says what it was.'],
+    ['[role=slider][aria-valuenow]:not(input)', 'Tune', 'Tune the ground', 'Move M, α or σ: the present frame is labelled again '
+      + 'at once. Teal is ground, amber are the seeds it was found from.'],
+    ['', 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click a row to see both sides and '
+      + 'why it was accepted or refused; change that, and undo it.'],
+    ['', 'Help', 'That is all', 'Every number says on hover what it is. This tour and all keys are under Help.'],
+  ];
+  const seen = () => { try { localStorage.setItem('hemislam-tour', 'seen'); } catch { /* private window */ } };
+  window.hemislamTour = () => {
+    document.querySelector('.hs-tour')?.remove();
+    const box = document.createElement('div');
+    let at = 0, outlined = null;
+    const end = () => { outlined?.classList.remove('hs-outlined'); box.remove(); seen(); window.removeEventListener('keydown', key); };
+    const key = (event) => { if (event.key === 'Escape') end(); };
+    const show = () => {
+      const [target, tab, title, text] = STEPS[at];
+      if (tab) window.hemislamOpenTab(tab);
+      outlined?.classList.remove('hs-outlined');
+      outlined = target ? document.querySelector(target) : null;
+      outlined?.classList.add('hs-outlined');
+      box.innerHTML = `<b>${title}</b><p>${text}</p><div class="hs-row"><span class="hs-note">${at + 1} of ${STEPS.length}</span>`
+        + '<span><button class="hs-button">Skip</button><button class="hs-button hs-next"></button></span></div>';
+      const [skip, next] = box.querySelectorAll('button');
+      next.textContent = at + 1 < STEPS.length ? 'Next' : 'Done';
+      skip.onclick = end;
+      next.onclick = () => { at += 1; if (at < STEPS.length) show(); else { end(); window.hemislamOpenTab('Tune'); } };
+      next.focus();
+    };
+    box.className = 'hs-tour hs';
+    box.setAttribute('role', 'dialog');
+    box.setAttribute('aria-label', 'Tour');
+    window.addEventListener('keydown', key); // not this image's own
+    document.body.append(box);
+    show();
+  };
+  const first = () => { try { return !localStorage.getItem('hemislam-tour'); } catch { return false; } };
+  const wait = () => { // until there is something to show
+    const node = document.querySelector('.hs-state');
+    if (!first()) return;
+    if (node && JSON.parse(node.dataset.state).open && document.querySelector('body > * .hs-transport')) window.hemislamTour();
+    else setTimeout(wait, 1000);
+  };
+  setTimeout(wait, 1500);
+}
