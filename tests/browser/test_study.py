@@ -139,7 +139,7 @@ def test_a_clicked_point_tells_its_numbers_until_another_frame_comes(bench: Benc
     bench.page.mouse.click(*pixel_of(bench, int(seeds[len(seeds) // 2])))
     told = bench.page.get_by_text("plane of its neighbours")
     expect(told).to_be_visible()
-    expect(bench.page.get_by_text("seed", exact=True)).to_be_visible()
+    expect(bench.page.locator(".hs-value").get_by_text("seed", exact=True)).to_be_visible()
     bench.engine.send(StepFrame(1))
     expect(asks).to_be_visible()
 
