@@ -5,16 +5,21 @@ Opening a recording already examines its first messages (`Recording.findings`); 
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from app.sensors.clocks import clock_finding
+from app.sensors.cloud_types import CLOUD_TYPES
 from app.sensors.findings import Finding as Finding
 from app.sensors.findings import Verdict
-from app.sensors.recording import ImuEntry, Recording, ScanEntry, open_recording
+from app.sensors.layout import settle_cloud
+from app.sensors.probe import choose_topic, probe_clouds
+from app.sensors.recording import ImuEntry, ScanEntry, open_recording
 from app.sensors.sequencer import STUCK_SAMPLES, Counts, Sequencer
+from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.sections import ImuParams
@@ -33,9 +38,13 @@ def examine(
         progress: called with the fraction read, 0-1, now and then.
 
     Raises:
-        HemislamError: the recording cannot be opened. Damage further on is a finding.
+        HemislamError: the file cannot be opened. Damage further on, or a missing sensor, is a finding.
     """
-    with open_recording(path, params) as recording:
+    try:
+        recording = open_recording(path, params)
+    except HemislamError as error:
+        return _not_mappable(path, params, str(error))
+    with recording:
         census = _Census(Sequencer(params.imu))
         damage = []
         try:
@@ -52,7 +61,7 @@ def examine(
         counts = census.sequencer.counts
         return (
             *damage,
-            _topics(recording),
+            _topics(recording.topics, recording.duration_s),
             *(finding for finding in recording.findings if finding.subject not in known),
             _rate("scan rate", scans[:, 1], 4.0),
             _rate("IMU rate", imu[:, 1], 90.0),
@@ -110,9 +119,21 @@ class _Census:
         return np.array(self.scan_times, np.int64).reshape(-1, 3), np.array(self.imu_times, np.int64).reshape(-1, 2)
 
 
-def _topics(recording: Recording) -> Finding:
-    listed = ", ".join(f"{topic.name} ({topic.type.split('/')[-1]}, {topic.messages})" for topic in recording.topics)
-    return Finding("topics", "fine", f"{recording.duration_s:.1f} s; {listed}")
+def _not_mappable(path: Path, params: Params, why: str) -> tuple[Finding, ...]:
+    """What can be said of a recording that cannot be mapped: why, its topics, and how its clouds are read."""
+    with Source(path) as source:
+        findings = [Finding("use", "needs you", why), _topics(source.topics, (source.end_ns - source.start_ns) / 1e9)]
+        with suppress(HemislamError):
+            lidar, lidar_finding = choose_topic(source, "lidar", params.recording.lidar_topic)
+            probes, probe_findings = probe_clouds(source, lidar)
+            _, cloud_findings = settle_cloud(probes, params.recording, lidar.name, CLOUD_TYPES[lidar.type])
+            findings += [lidar_finding, *probe_findings, *cloud_findings]
+        return (*source.findings, *findings)
+
+
+def _topics(topics: tuple[Topic, ...], duration_s: float) -> Finding:
+    listed = ", ".join(f"{topic.name} ({topic.type.split('/')[-1]}, {topic.messages})" for topic in topics)
+    return Finding("topics", "fine", f"{duration_s:.1f} s; {listed}")
 
 
 def _rate(subject: str, stamps: I64, least: float) -> Finding:

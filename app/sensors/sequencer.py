@@ -263,8 +263,10 @@ class Sequencer:
         if self._last_stamp_ns is None:
             return
         interval = scan.stamp_ns - self._last_stamp_ns
-        usual = float(np.median(self._intervals_ns)) if len(self._intervals_ns) >= 5 else None
-        if usual is not None and interval > 1.5 * usual:
+        # at first only the scan itself tells how often one comes
+        lasts = max(scan.end_ns - scan.stamp_ns, 100_000_000)
+        usual = float(np.median(self._intervals_ns)) if len(self._intervals_ns) >= 5 else lasts
+        if interval > 1.5 * usual:
             missing = round(interval / usual) - 1
             self._notices.append(f"no usable scan for {interval / 1e9:.3f} s before this one ({missing} missing)")
         self._intervals_ns = [*self._intervals_ns[-20:], interval]

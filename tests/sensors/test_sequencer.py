@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -215,8 +216,9 @@ def test_repeated_and_reversed_scans_are_dropped_and_the_next_is_used() -> None:
     assert [e.scan.stamp_ns // MS for e in out if isinstance(e, Measurement)] == [0, 100, 200]
 
 
-def test_missing_scans_are_reported_with_the_next() -> None:
-    begins = [*range(0, 1000, 100), 1300]
+@pytest.mark.parametrize("before", [1, 2, 10])
+def test_missing_scans_are_reported_with_the_next(before: int) -> None:
+    begins = [*range(0, 100 * before, 100), 100 * before + 300]
     out, _ = feed(samples(0, 1500), [scan(begin) for begin in begins])
     assert isinstance(out[-1], Measurement)
     assert out[-1].notices == ("no usable scan for 0.400 s before this one (3 missing)",)
