@@ -63,7 +63,7 @@ def place(
         if not any(_apart(T, fit.T_target_source) < 1.0 for fit in fits):
             fits.append(assess(target, source, T))
     best = max(fits, key=lambda fit: fit.overlap)
-    good = [fit for fit in fits if _as_good(fit, best)]
+    good = [fit for fit in fits if fit is best or _as_good(fit, best)]  # without overlap it is not even itself
     allowed = [fit for fit in good if deviation(fit.T_target_source) <= most_sigmas] or good
     chosen = max(allowed, key=lambda fit: fit.overlap)
     fit = assess(target, source, refine(target, source, chosen.T_target_source))

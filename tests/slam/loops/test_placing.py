@@ -104,3 +104,12 @@ def test_where_nothing_repeats_no_other_place_fits() -> None:
     target = seen(corridor(np.random.default_rng(0), FINS), np.eye(4))
     source = seen(corridor(np.random.default_rng(1), FINS), np.eye(4))
     assert laid(target, source, np.eye(4), Window(6.0, 0.2)).alternative_m == np.inf
+
+
+def test_places_that_share_nothing_do_not_fit_rather_than_fail() -> None:
+    """Where no point has a partner there is no residual, and so nothing to compare alignments by."""
+    target = seen(square(np.random.default_rng(0)), np.eye(4))
+    source = seen(square(np.random.default_rng(1)), np.eye(4))
+    found = laid(target, source, pose(500.0, 0.0, 0.0, 0.0), Window(0.0, 0.0))
+    assert found.fit.overlap == 0.0 and np.isnan(found.fit.residual_rms)
+    assert found.alternative_m == np.inf
