@@ -28,12 +28,15 @@ for edge in found.edges:
 accepted = [edge for edge in found.edges if edge.verdict is Verdict.ACCEPTED]
 if accepted:
     before = found.frame.trajectory(session.log.odometry).positions
-    session.edit_loops((Reject(accepted[0].older, accepted[0].newer),))
+    first = accepted[0]
+    session.edit_loops((Reject(first.older, first.newer),))
     edited = session.loops.results()
     after = edited.frame.trajectory(session.log.odometry).positions
     # 0 mm is usual: loops that odometry meets already move nothing (docs/decisions/019)
     moved = np.linalg.norm(after - before, axis=1).max()
-    print(f"{edited.count(Verdict.ACCEPTED)} of {len(accepted)} loops are left")
+    left = [edge for edge in edited.edges if edge.verdict is Verdict.ACCEPTED]
+    still = any((edge.older, edge.newer) == (first.older, first.newer) for edge in left)
+    print(f"{first.older} - {first.newer} is {'still' if still else 'no longer'} among the {len(left)} accepted loops")
     print(f"the trajectory moves by up to {1e3 * moved:.2f} mm")
     print(f"the graph has {sum(line.startswith('EDGE') for line in edited.g2o.splitlines())} factors")
 session.close()

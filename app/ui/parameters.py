@@ -86,7 +86,7 @@ def _control(gui: viser.GuiApi, leaf: Leaf, value: Any, text: str, hint: str) ->
     return gui.add_number(text, value, step=step, hint=hint)  # the engine says what is out of range
 
 
-class History:
+class ParameterHistory:
     """The parameters as they were after each change; changes that follow each other closely are one."""
 
     def __init__(self) -> None:
@@ -130,7 +130,7 @@ class ParameterPanel:
         for leaf in leaves():
             group = "primary" if leaf.path in PRIMARY else leaf.section
             self._sections.setdefault(group, {})[leaf.name] = leaf
-        self._history = History()
+        self._history = ParameterHistory()
         self._undo, self._redo = (
             gui.add_button(name, icon=icon, color="gray", visible=False)
             for name, icon in (("Undo", viser.Icon.ARROW_BACK_UP), ("Redo", viser.Icon.ARROW_FORWARD_UP))

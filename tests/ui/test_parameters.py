@@ -13,7 +13,7 @@ from app.server.protocol import (
     Snapshot,
 )
 from app.slam.params import Params, leaves
-from app.ui.parameters import PRIMARY, History, ParameterPanel
+from app.ui.parameters import PRIMARY, ParameterHistory, ParameterPanel
 from tests.ui.conftest import BusyThreads, Clock, browser_sends, page_of, user_clicks, user_sets
 
 
@@ -156,7 +156,7 @@ def test_a_value_set_in_a_browser_is_sent_although_an_older_snapshot_is_drawn_me
 
 
 def test_changes_are_undone_and_redone_one_by_one_and_a_drag_is_one_change() -> None:
-    history, alphas = History(), (25.0, 30.0, 31.0, 40.0)
+    history, alphas = ParameterHistory(), (25.0, 30.0, 31.0, 40.0)
     for seconds, alpha in zip((0.0, 10.0, 10.3, 20.0), alphas, strict=True):
         history.see(Params().with_values({"ground.alpha": alpha}), seconds)
     assert history.change(1) == {}

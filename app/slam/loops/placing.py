@@ -24,7 +24,7 @@ ALONG = 0.9
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Placement:
     """Attributes:
     fit: the best alignment. deviation: of it from odometry, in standard deviations.
     slides: m, by which it slid along the direction that holds least. open: that direction, (3,) unit in the target's
@@ -48,7 +48,7 @@ def place(
     deviation: Callable[[F64], float],
     most_sigmas: float,
     most_slide: float,
-) -> Place:
+) -> Placement:
     """Lay a submap on another.
 
     Args:
@@ -78,7 +78,7 @@ def place(
         fit = assess(target, source, T)
     ways = [other.T_target_source[:3, 3] - chosen.T_target_source[:3, 3] for other in allowed if other is not chosen]
     lengths = [float(np.linalg.norm(way)) for way in ways if not (is_open and _along(way, weakest))]
-    return Place(
+    return Placement(
         fit=fit,
         deviation=deviation(fit.T_target_source),
         slides=slides,

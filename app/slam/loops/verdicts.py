@@ -9,7 +9,7 @@ from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.detection import WIDER, Detector, Sighting
 from app.slam.loops.drift import Expectation
-from app.slam.loops.placing import Place, place
+from app.slam.loops.placing import Placement, place
 from app.slam.loops.plan import Window
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.loops.verification import Fit, assess, refine
@@ -97,7 +97,7 @@ def covariance(detector: Detector, newer: int, fit: Fit, along: F64 | None = Non
     return np.asarray((out + out.T) / 2)
 
 
-def _objection(place: Place, e: Evidence, p: LoopsParams) -> str:
+def _objection(place: Placement, e: Evidence, p: LoopsParams) -> str:
     """The first limit that is not met, in words and numbers; "" if all are met."""
     fit = place.fit
     if len(fit.residuals) < 100:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.slam import lie
-from app.slam.loops.placing import Place, place
+from app.slam.loops.placing import Placement, place
 from app.slam.loops.plan import Window, placements
 from app.slam.loops.verification import Prepared
 from app.slam.types import F64
@@ -30,7 +30,7 @@ def square(rng: np.random.Generator) -> F64:
     return np.asarray(points + rng.normal(scale=0.01, size=points.shape))
 
 
-def laid(target: Prepared, source: Prepared, guess: F64, window: Window, allowed_m: float = 100.0) -> Place:
+def laid(target: Prepared, source: Prepared, guess: F64, window: Window, allowed_m: float = 100.0) -> Placement:
     """Odometry allows all that is within `allowed_m` of its guess along x."""
     return place(
         target,
