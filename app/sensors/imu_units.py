@@ -28,6 +28,7 @@ MOST_ACCEL = 200.0
 """m/s^2; what is more is no walk."""
 WINDOW_S, STRIDE_S, SPAN_S, STEPS = 0.5, 0.25, 1.0, 50
 """Accelerations are averaged over a window, about a step of walking, and compared with those one span later."""
+GAP_NS = 1_000_000_000
 CLEARLY, LEAST_ERROR = 0.5, 0.3
 """Another unit or other axes are proposed if they leave less than this share of the error, which is at least so many
 m/s^2."""
@@ -202,8 +203,12 @@ class Sway:
 
     @classmethod
     def of(cls, stamps_ns: I64, gyro: F64, accel: F64) -> "Sway | None":
-        """None if the samples are too few."""
-        times = (stamps_ns - stamps_ns[0]) / 1e9
+        """In the longest part without a gap, since a wrong stamp can be years off. None if the samples are too few."""
+        edges = np.r_[0, np.flatnonzero(np.abs(np.diff(stamps_ns)) > GAP_NS) + 1, len(stamps_ns)]
+        longest = int(np.argmax(np.diff(edges)))
+        part = slice(edges[longest], edges[longest + 1])
+        stamps_ns, gyro, accel = stamps_ns[part], gyro[part], accel[part]
+        times = (stamps_ns - stamps_ns[:1]) / 1e9
         if len(times) < 100 or not (np.diff(times) > 0).all() or times[-1] < SPAN_S + WINDOW_S + STRIDE_S:
             return None
         starts = np.arange(0.0, times[-1] - SPAN_S - WINDOW_S, STRIDE_S)

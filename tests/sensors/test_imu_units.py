@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from app.sensors.imu_units import AS_RECORDED, ImuProbe, gravity_findings, settle_imu
+from app.sensors.imu_units import AS_RECORDED, ImuProbe, Sway, gravity_findings, settle_imu
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.sections import RecordingParams
@@ -83,6 +83,15 @@ def test_a_mirrored_gyroscope_is_mended_by_its_own_axes() -> None:
     _, findings = settle_imu(
         ImuProbe(walk.log_ns, walk.stamps_ns, walk.gyro * [1, -1, 1], walk.accel), RecordingParams()
     )
+    assert findings[-1].option == "--set recording.gyroscope_axes=x-yz"
+
+
+def test_a_gap_of_hours_neither_takes_long_nor_hides_exchanged_axes() -> None:
+    walk = carried()
+    stamps = walk.stamps_ns + np.where(np.arange(4000) < 100, 0, 30_000_000_000_000)
+    sway = Sway.of(stamps, walk.gyro, walk.accel)
+    assert sway is not None and 60 < len(sway.begin) < 80  # four a second of the 19.5 s after the gap
+    _, findings = settle_imu(ImuProbe(stamps, stamps, walk.gyro * [1, -1, 1], walk.accel), RecordingParams())
     assert findings[-1].option == "--set recording.gyroscope_axes=x-yz"
 
 
