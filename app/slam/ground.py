@@ -1,4 +1,8 @@
-"""Seed-point ground segmentation (paper 2.2, eq. 1-3)."""
+"""Seed-point ground segmentation (paper 2.2, eq. 1-3).
+
+A scanner that sees nothing within alpha of straight down, such as a Mid-360 held upright, takes its seeds farther out:
+where polar cells of its lowest rings are flat.
+"""
 
 from dataclasses import replace
 
@@ -41,11 +45,15 @@ def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundRe
     if len(points) == 0:
         return replace(none, reason="the scan has no points")
 
-    sums = np.zeros(12)
-    seeds = kernels.seed_moments(points, ring, params.scan_lines, down, np.cos(np.radians(params.alpha)), labels, sums)
+    cos_alpha, cos_slope = np.cos(np.radians([params.alpha, params.max_slope]))
+    seeds, steep = kernels.steep_seeds(points, ring, params.scan_lines, down, cos_alpha, labels)
+    if steep == 0:  # a scanner held upright
+        seeds = kernels.flat_seeds(points, ring, params.scan_lines, down, params.sigma, cos_slope, labels)
     if seeds < MIN_SEEDS:
         labels[:] = NON_GROUND
         return replace(none, reason=f"only {seeds} seed points; a plane takes {MIN_SEEDS}", seeds=seeds)
+    sums = np.zeros(12)
+    kernels.moments(points, labels, sums)
 
     # eq. 1: principal components of the seeds
     mean = sums[3:6] / seeds
