@@ -155,6 +155,17 @@ def simulate(
         float,
         typer.Option("--range-step", metavar="METRES", help="Step of distances; 0.0025 for a newer unit, 0: none."),
     ] = 0.005,
+    scanner: Annotated[
+        str, typer.Option("--scanner", metavar="NAME", help="bpearl, airy, jt128 or mid360.")
+    ] = "bpearl",
+    tables: Annotated[
+        Path | None,
+        typer.Option("--tables", metavar="FOLDER", help="Holds the maker's tables of a jt128 or mid360."),
+    ] = None,
+    upright: Annotated[
+        bool | None,
+        typer.Option("--upright/--forward", help="The scanner's z looks up or forward; else as usual for it."),
+    ] = None,
     imperfect: options.Imperfect = False,
     errors: Annotated[
         list[str] | None,
@@ -164,9 +175,9 @@ def simulate(
 ) -> None:
     """Simulate a recording in a modelled scene.
 
-    A person carries an RS-Bpearl and an IMU through it and stands still for the first seconds.
+    A person carries an RS-Bpearl (or another scanner) and an IMU through it and stands still for the first seconds.
     FILE_truth.tum has the true poses, FILE.params.yaml has the pose of the LiDAR on the IMU, both
-    beside FILE.mcap. Each point has its true label in the field `ground`.
+    beside FILE.mcap. Each point has its true label in the field `ground`, where the driver's layout has fields.
 
     \b
     Examples:
@@ -174,6 +185,7 @@ def simulate(
       hemislam simulate outdoor --out outdoor.mcap --duration 120 --seed 7
       hemislam simulate room --out small.mcap --duration 20 --every-block 6
       hemislam simulate outdoor --out real.mcap --imperfect --error companions=0
+      hemislam simulate corridor --out livox.mcap --scanner mid360 --tables tables/
       hemislam simulate --suite paper --out suite/
     """
     from app.cli.suite import make_suite
@@ -184,7 +196,7 @@ def simulate(
     if (scene is not None) if suite is not None else short:
         raise HemislamError("SCENE takes --duration, --suite takes --short; give either SCENE or --suite.")
     if suite is not None:
-        only = ("duration", "rate", "coordinate_step", "range_step", "force")
+        only = ("duration", "rate", "coordinate_step", "range_step", "scanner", "tables", "upright", "force")
         sources = {name: ctx.get_parameter_source(name) for name in only}
         if given := [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]:
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
@@ -206,6 +218,9 @@ def simulate(
             range_step=range_step,
             coordinate_step=coordinate_step,
             imperfections=imperfections,
+            scanner=scanner,
+            tables=tables,
+            upright=upright,
             progress=show,
         )
     typer.echo(

@@ -1,4 +1,4 @@
-"""`CustomMsg` of livox_ros_driver and livox_ros_driver2, read from its bytes; an object for each point is too slow."""
+"""`CustomMsg` of livox_ros_driver and livox_ros_driver2, read and written as bytes; an object a point is too slow."""
 
 import struct
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.slam.types import U8
+from app.slam.types import U8, Scan
 
 DRIVERS = ("livox_ros_driver2", "livox_ros_driver")
 CUSTOM_MSGS = tuple(f"{driver}/msg/CustomMsg" for driver in DRIVERS)
@@ -16,6 +16,34 @@ _POINT = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": 
 """Members of a point: ns after the first one, m, m, m. They are packed in ROS 1; CDR aligns each point to 4 bytes."""
 _DOUBTFUL = 0x20
 """Bit of `tag` that marks a return of low confidence (Mid-360), or a second one (earlier units)."""
+_SURE = 0x10
+"""`tag` of an ordinary return."""
+_FRAME = b"livox_frame\0"
+DEFINITION = """std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+CustomPoint[] points
+================================================================================
+MSG: livox_ros_driver2/CustomPoint
+uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+"""Of livox_ros_driver2's message in ROS 2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +89,19 @@ class CustomMsg:
     def data(self) -> U8:
         """(bytes,) of the points."""
         return self.points.view(np.uint8)
+
+
+def encoded(scan: Scan) -> bytes:
+    """The scan as livox_ros_driver2 sends it: CDR, stamped at the first point, lines 0 to 3 in turn."""
+    points = np.zeros(len(scan), _dtype("<", 20))
+    points["x"], points["y"], points["z"] = scan.points.T
+    points["offset_time"], points["reflectivity"] = scan.offsets_ns, scan.intensity
+    points["tag"], points["line"] = _SURE, np.arange(len(scan)) % 4
+    seconds, nanoseconds = divmod(scan.stamp_ns, 1_000_000_000)
+    head = struct.pack("<4x3I", seconds, nanoseconds, len(_FRAME)) + _FRAME
+    head = b"\0\1\0\0" + head[4:] + bytes(-(len(head) - 4) % 8)
+    body = points.tobytes()
+    return head + struct.pack("<QIB3xI", scan.stamp_ns, len(scan), 0, len(scan)) + body[: len(body) - 1]
 
 
 def _dtype(order: str, step: int) -> np.dtype[Any]:

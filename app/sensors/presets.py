@@ -1,15 +1,16 @@
 """Partial parameter trees for known devices, and the order in which settings override each other."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from app.sensors.cloud_types import POINT_CLOUD_2, Probe
 from app.sensors.livox import CUSTOM_MSGS
 from app.sensors.rings import elevation
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import F32
 
 _H2LID_MOUNT = {"translation": [0.0175, 0.0276, -0.1083], "rotation": [0.0, 0.0, 0.0]}
 
@@ -24,21 +25,68 @@ PRESETS: dict[str, dict[str, Any]] = {
         "recording": {"lidar_topic": "/livox/lidar", "imu_topic": "/livox/imu"},
         "sensor": {"translation": [-0.011, -0.02329, 0.04412]},
     },
+    "airy": {
+        "recording": {"lidar_topic": "/rslidar_points", "imu_topic": "/rslidar_imu_data"},
+        "sensor": {"translation": [0.0, 0.0, 0.0], "rotation": [180.0, 0.0, -90.0]},
+    },
+    "jt128": {"recording": {"lidar_topic": "/lidar_points", "imu_topic": "/lidar_imu"}},
+    "ouster": {
+        "recording": {"lidar_topic": "/ouster/points", "imu_topic": "/ouster/imu"},
+        "sensor": {"translation": [-0.006253, 0.011775, 0.028535], "rotation": [0.0, 0.0, 180.0]},
+    },
+    "hesai-xt": {"recording": {"lidar_topic": "/lidar_points"}},
+    "velodyne": {"recording": {"lidar_topic": "/velodyne_points"}},
     "close": {"scan": {"voxel_size": 0.3}, "map": {"spacing": 0.15}},
 }
 """One entry each. `rslidar`: the vendor's ROS driver. `h2lid`: the authors' published recordings. `h2lid-mount`: only
 their pose of the LiDAR on the IMU, for recordings under other topics. `mid360`: Livox's ROS drivers, with the IMU
-inside the Mid-360 at the place that its manual states. `close`: most things are at arm's length (a desk,
-a cabin, a shaft)."""
+inside the Mid-360 at the place that its manual states. `airy`: RoboSense's ROS driver and the IMU inside, whose axes
+are those of the vendor's examples; each unit states its own pose in DIFOP packets. `jt128`: Hesai's ROS driver; the
+axes agree. `ouster`: Ouster's ROS driver with clouds in `os_lidar`, the IMU's place from the metadata. `hesai-xt`,
+`velodyne`: their ROS drivers; the IMU is your own. `close`: most things are at arm's length (a desk, a cabin,
+a shaft)."""
 
 
-def preset_for(kind: str, points: F32) -> str:
-    """The preset of the sensor whose clouds are of this type and look like this one ((n, 3) m); "" if none is known."""
-    angles = np.degrees(elevation(points))
-    lowest, highest = np.percentile(angles, [0.5, 99.5])
-    around = np.histogram(np.arctan2(points[:, 1], points[:, 0]), 12, (-np.pi, np.pi))[0]
-    is_mid360 = kind in CUSTOM_MSGS and lowest > -9 and 40 < highest < 56 and np.count_nonzero(around) > 8
-    return "mid360" if is_mid360 else ""
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What the clouds of a scanner with an IMU of its own look like.
+
+    Attributes:
+        kinds: types of message. fields: that they have among others. lines: numbers of scan lines; (): any.
+        lowest, highest: deg, bounds of the lowest and of the highest elevation.
+    """
+
+    kinds: tuple[str, ...]
+    fields: frozenset[str]
+    lines: tuple[int, ...]
+    lowest: tuple[float, float]
+    highest: tuple[float, float]
+
+    def fits(self, kind: str, probe: Probe) -> bool:
+        points, angles = probe.points, np.degrees(elevation(probe.points))
+        lowest, highest = np.percentile(angles, [0.5, 99.5])
+        around = np.histogram(np.arctan2(points[:, 1], points[:, 0]), 12, (-np.pi, np.pi))[0]
+        return (
+            kind in self.kinds
+            and self.fields <= probe.cloud.fields.keys()
+            and (not self.lines or int(probe.column("ring").max()) + 1 in self.lines)
+            and self.lowest[0] < lowest < self.lowest[1]
+            and self.highest[0] < highest < self.highest[1]
+            and bool(np.count_nonzero(around) > 8)
+        )
+
+
+_LOOKS = {
+    "mid360": _Look(CUSTOM_MSGS, frozenset(), (), (-9, 90), (40, 56)),
+    "airy": _Look((POINT_CLOUD_2.name,), frozenset({"ring", "timestamp"}), (96,), (-3, 20), (60, 91)),
+    "jt128": _Look((POINT_CLOUD_2.name,), frozenset({"ring", "timestamp"}), (128,), (-8, 20), (60, 91)),
+    "ouster": _Look((POINT_CLOUD_2.name,), frozenset({"ring", "t", "reflectivity"}), (32, 64, 128), (-90, 0), (0, 91)),
+}
+
+
+def preset_for(kind: str, probe: Probe) -> str:
+    """The preset of the scanner whose clouds are of this type and look like this one; "" if none is known."""
+    return next((name for name, look in _LOOKS.items() if look.fits(kind, probe)), "")
 
 
 def sidecar(recording: Path) -> Path:

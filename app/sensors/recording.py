@@ -90,7 +90,7 @@ class Recording:
             *imu_probe_findings,
             *imu_findings,
             self._clocks,
-            *gravity_findings(imu, self._imu_units, params, preset_for(lidar.type, probes[0].points)),
+            *gravity_findings(imu, self._imu_units, params, preset_for(lidar.type, probes[0])),
         )
 
     def measurements(

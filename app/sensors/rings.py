@@ -81,6 +81,8 @@ def settle_rings(probes: list[Probe], kind: CloudType, names: dict[str, str]) ->
             why = f"field `{field}` is always {raw[0]}" if constant else f"field `{field}` is no line number"
     else:
         why = "the clouds have no ring field"
+    if not kind.rings:
+        return _settle_steps(points, why)
     by_place = _settle_place(probes)
     if by_place is not None:
         rings, lines = by_place
@@ -92,9 +94,13 @@ def settle_rings(probes: list[Probe], kind: CloudType, names: dict[str, str]) ->
     if lines >= _LEAST_LINES:
         text = f"{why}; {lines} scan lines were separated by their elevation"
         return Rings(bounds=bounds, centre=centre), Finding("ring order", "corrected", text)
+    return _settle_steps(points, f"{why}, and no scan lines can be told apart")
+
+
+def _settle_steps(points: F32, why: str) -> tuple[Rings, Finding]:
     lowest, highest = np.percentile(elevation(points), [0.5, 99.5])
     bounds = np.arange(lowest, highest, np.radians(RING_DEG))[1:]
-    text = f"{why}, and no scan lines can be told apart; M counts {len(bounds) + 1} rings of {RING_DEG:g} deg instead"
+    text = f"{why}; M counts {len(bounds) + 1} rings of {RING_DEG:g} deg instead"
     return Rings(bounds=bounds, of_lines=False), Finding("ring order", "corrected", text)
 
 

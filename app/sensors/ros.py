@@ -4,6 +4,8 @@ Clouds are made in the vendor's layout: x, y, z, intensity (f32), ring (u16), `g
 known) and the absolute time of each point. Their stamp is that of the last point.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, BinaryIO, Final
 
 import numpy as np
@@ -68,11 +70,12 @@ def new(kind: str, **fields: Any) -> Any:
     return _ROS2.types[kind](**fields)
 
 
-def cloud_message(scan: Scan, *, exact: bool = False) -> Any:
+def cloud_message(scan: Scan, *, exact: bool = False, stamp_ns: int | None = None, frame: str = "rslidar") -> Any:
     """A PointCloud2 with the points' absolute times in `timestamp`, in f64 seconds as drivers write them.
 
     Args:
         exact: the times in int64 ns instead, which loses nothing but is no standard type of a field.
+        stamp_ns: of the message; None: that of the last point. frame: its name.
     """
     point = _point_type("<i8" if exact else "<f8", scan.truth_ground is not None)
     points = np.zeros(len(scan), point)
@@ -85,7 +88,7 @@ def cloud_message(scan: Scan, *, exact: bool = False) -> Any:
     columns: dict[str, Any] = dict(point.fields or {})
     return new(
         CLOUD,
-        header=header(scan.end_ns, "rslidar"),
+        header=header(scan.end_ns if stamp_ns is None else stamp_ns, frame),
         height=1,
         width=len(points),
         fields=[
@@ -138,20 +141,37 @@ def definition(kind: str) -> str:
     return str(_ROS2.generate_msgdef(kind)[0])
 
 
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How a driver records its scanner.
+
+    Attributes:
+        kind: type of the clouds. text: its definition; "": that of ROS. encode: a cloud as CDR.
+    """
+
+    lidar_topic: str = LIDAR_TOPIC
+    imu_topic: str = IMU_TOPIC
+    kind: str = CLOUD
+    text: str = ""
+    encode: Callable[[Scan], bytes] = lambda scan: serialised(cloud_message(scan))
+
+
 class RecordingWriter:
     """A ROS 2 recording of one LiDAR and one IMU as a bare .mcap, written in the order of the calls."""
 
-    def __init__(self, file: BinaryIO) -> None:
+    def __init__(self, file: BinaryIO, layout: Layout | None = None) -> None:
+        layout = layout or Layout()
+        self._encode = layout.encode
         self._mcap = Writer(file, compression=CompressionType.ZSTD)
         self._mcap.start(profile="ros2")
-        self._lidar = self._channel(LIDAR_TOPIC, CLOUD)
-        self._imu = self._channel(IMU_TOPIC, IMU)
+        self._lidar = self._channel(layout.lidar_topic, layout.kind, layout.text)
+        self._imu = self._channel(layout.imu_topic, IMU)
 
     def add_scan(self, scan: Scan, log_ns: int) -> None:
-        self._add(self._lidar, cloud_message(scan), log_ns)
+        self._add(self._lidar, self._encode(scan), log_ns)
 
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, log_ns: int) -> None:
-        self._add(self._imu, imu_message(stamp_ns, gyro, accel), log_ns)
+        self._add(self._imu, serialised(imu_message(stamp_ns, gyro, accel)), log_ns)
 
     def flush(self) -> None:
         """End a chunk, so that what was written can be read even if the end of the file never comes."""
@@ -161,12 +181,12 @@ class RecordingWriter:
         """Write the index and the end of the file."""
         self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
 
-    def _channel(self, topic: str, kind: str) -> int:
-        schema = self._mcap.register_schema(kind, "ros2msg", definition(kind).encode())
+    def _channel(self, topic: str, kind: str, text: str = "") -> int:
+        schema = self._mcap.register_schema(kind, "ros2msg", (text or definition(kind)).encode())
         return self._mcap.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
 
-    def _add(self, channel: int, message: Any, log_ns: int) -> None:
-        self._mcap.add_message(channel, log_ns, serialised(message), publish_time=log_ns)
+    def _add(self, channel: int, data: bytes, log_ns: int) -> None:
+        self._mcap.add_message(channel, log_ns, data, publish_time=log_ns)
 
 
 def _vector(values: Vector) -> Any:

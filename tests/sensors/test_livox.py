@@ -10,7 +10,6 @@ from rosbags.typesys import get_types_from_msg
 from app.sensors.cloud_types import CloudError, read_custom_msg
 from app.sensors.doctor import examine
 from app.sensors.livox import DRIVERS
-from app.sensors.presets import preset_for
 from app.sensors.recording import open_recording
 from app.sensors.ros import Deserialiser
 from app.slam.params import Params
@@ -111,13 +110,3 @@ def test_a_message_that_lies_is_dropped_and_the_others_stay(tmp_path: Path) -> N
     dropped = [entry.reason for entry in found if isinstance(entry, DroppedScan)]
     assert len(dropped) == 7 and set(dropped) == {"the cloud states 7 points, but holds 480"}
     assert sum(isinstance(entry, Measurement) for entry in found) >= 5
-
-
-def test_a_mid360_is_recognised_by_what_it_sees() -> None:
-    azimuth, elevation = np.random.default_rng(1).uniform([-np.pi, -0.12], [np.pi, 0.91], (5000, 2)).T
-    points = 5 * np.column_stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    ).astype(np.float32)
-    assert preset_for(f"{DRIVERS[0]}/msg/CustomMsg", points) == "mid360"
-    assert preset_for("sensor_msgs/msg/PointCloud2", points) == ""
-    assert preset_for(f"{DRIVERS[0]}/msg/CustomMsg", points[points[:, 0] > 0]) == ""

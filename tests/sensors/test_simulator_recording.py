@@ -148,7 +148,7 @@ def test_coordinates_can_be_rounded(tmp_path: Path) -> None:
     ("arguments", "sentence"),
     [
         ({"scene": "moon"}, "no scene `moon`; there are corridor"),
-        ({"rate_hz": 15}, "turns at 10 or 20 Hz, not 15"),
+        ({"rate_hz": 15}, "10 or 20 scans a second, not 15"),
         ({"duration_s": 0.0}, "duration_s cannot be 0; choose 0.5"),
         ({"every_block": 0}, "every_block cannot be 0; choose 1 to 90"),
         ({"range_step": float("nan")}, "range_step cannot be nan"),

@@ -102,12 +102,12 @@ IMPERFECT = Imperfections(
 
 
 class Unit:
-    """One scanner with its own errors, the same in every scan."""
+    """One scanner with its own errors, the same in every scan; its firings go round `channels`."""
 
-    def __init__(self, sizes: Imperfections, rng: np.random.Generator) -> None:
-        self.sizes = sizes
-        self._elevation = np.deg2rad(sizes.elevation) * rng.normal(size=CHANNELS)
-        self._range_bias = sizes.range_bias * rng.normal(size=CHANNELS)
+    def __init__(self, sizes: Imperfections, rng: np.random.Generator, channels: int = CHANNELS) -> None:
+        self.sizes, self._channels = sizes, channels
+        self._elevation = np.deg2rad(sizes.elevation) * rng.normal(size=channels)
+        self._range_bias = sizes.range_bias * rng.normal(size=channels)
         self._turn = exp(np.deg2rad(sizes.mount_rotation) * _direction(rng))
         self._shift = sizes.mount_translation * _direction(rng)
         skew = np.deg2rad(sizes.misalignment)
@@ -142,7 +142,7 @@ class Unit:
     def ranges(self, hits: Hits, rng: np.random.Generator) -> F64:
         """(n,) m, distances with their systematic errors and mixed pixels, without noise; n as the pattern's."""
         distance = hits.distance + self.sizes.incidence_bias * (1.0 - hits.incidence)
-        turns = distance.reshape(-1, CHANNELS) + self._range_bias
+        turns = distance.reshape(-1, self._channels) + self._range_bias
         mixed = turns.copy()
         for shift in (1, -1):  # the neighbours on the same cone
             with np.errstate(invalid="ignore"):
@@ -180,7 +180,8 @@ def companions(
     def company(who: int) -> Mover:
         def pose(t: F64) -> tuple[F64, F64]:
             places, R_world_imu = trajectory.poses(t)
-            heading = np.arctan2(R_world_imu[:, 1, 2], R_world_imu[:, 0, 2])  # the IMU's z looks forward
+            forward = R_world_imu @ trajectory.R_body_imu[0]
+            heading = np.arctan2(forward[:, 1], forward[:, 0])
             u, v = np.sin(swing[who] * t[:, None] + phase[who]).T
             along, left = ((1.9 + 0.6 * u, 0.5 * v), (-1.7 + 0.5 * u, 0.6 * v), (1.8 + 0.4 * u, 2.2 * v))[who]
             c, s = np.cos(heading), np.sin(heading)

@@ -1,4 +1,4 @@
-"""The simulated RS-Bpearl: each of its firings has its own time, azimuth, origin and pose."""
+"""A simulated LiDAR: each of its firings has its own time, direction, origin and pose."""
 
 from dataclasses import dataclass, field, replace
 
@@ -29,12 +29,13 @@ STRAY_LOSS = 0.005
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """The firings of one revolution, block by block in channel order; n = blocks * 32.
+    """The firings of one scan, block by block; all b blocks have the same number of firings, n in all.
 
     Attributes:
-        offsets_ns: (n,) time after the revolution's start.
+        offsets_ns: (n,) time after the scan's start.
         directions, levers: (n, 3) in the LiDAR frame: a point is lever + distance * direction.
         ring: (n,). blocks_ns: (b,) time of each block. block_ns: a block's duration.
+        channels: lasers, which fire one after the other.
     """
 
     offsets_ns: I64
@@ -43,10 +44,11 @@ class Pattern:
     ring: U16
     blocks_ns: I64
     block_ns: int
+    channels: int
 
 
 def firing_pattern(model: Model = BPEARL, rate_hz: int = 10, every_block: int = 1) -> Pattern:
-    """The sensor turns from azimuth 0 at the revolution's start; only every k-th block fires."""
+    """An RS-Bpearl's. The sensor turns from azimuth 0 at the revolution's start; only every k-th block fires."""
     blocks_ns = np.arange(0, model.blocks_per_turn(rate_hz), every_block, dtype=np.int64) * model.block_ns
     offsets_ns = (blocks_ns[:, None] + model.firing_offsets_ns).ravel()
     azimuth = 2 * np.pi * rate_hz * 1e-9 * offsets_ns
@@ -58,18 +60,24 @@ def firing_pattern(model: Model = BPEARL, rate_hz: int = 10, every_block: int = 
     levers = np.column_stack(
         [model.rx * np.cos(block_azimuth), -model.rx * np.sin(block_azimuth), np.full(len(azimuth), model.rz)]
     )
-    return Pattern(offsets_ns, directions, levers, np.tile(RINGS, len(blocks_ns)), blocks_ns, model.block_ns)
+    return Pattern(offsets_ns, directions, levers, np.tile(RINGS, len(blocks_ns)), blocks_ns, model.block_ns, CHANNELS)
 
 
 @dataclass(frozen=True, slots=True)
 class Lidar:
     """Attributes:
+    R_imu_lidar, p_imu_lidar: its mounting, p in m.
+    farthest: m, the longest distance. rated: (m, reflectivity) at which half of the beams return.
     range_noise: m, spread of a distance before it is rounded to `range_step` (m, 0 = not rounded).
     coordinate_step: m, rounding of x, y, z (0 = none). lossless: whether every beam that hits returns.
     unit: the errors of one scanner; None: it has none.
     """
 
     pattern: Pattern = field(default_factory=firing_pattern)
+    R_imu_lidar: F64 = field(default_factory=lambda: np.eye(3))
+    p_imu_lidar: F64 = field(default_factory=P_IMU_LIDAR.copy)
+    farthest: float = MAX_RANGE_M
+    rated: tuple[float, float] = (RATED_RANGE_M, RATED_REFLECTIVITY)
     range_noise: float = 0.005
     range_step: float = BPEARL.range_step
     coordinate_step: float = 0.0
@@ -97,11 +105,11 @@ class Lidar:
         distance = exact + noise * rng.normal(size=n)
         if self.range_step > 0:
             distance = np.rint(distance / self.range_step) * self.range_step
-        seen = (distance >= MIN_RANGE_M) & (distance <= MAX_RANGE_M)
+        seen = (distance >= MIN_RANGE_M) & (distance <= self.farthest)
         luck = rng.random(n)
         grain = rng.normal(scale=0.03, size=n)
         if not self.lossless:
-            seen &= luck < _detection(hits.distance, hits.incidence, hits.reflectivity)
+            seen &= luck < _detection(hits.distance, hits.incidence, hits.reflectivity, self.rated)
         brightness = 255.0 * hits.reflectivity * (0.35 + 0.65 * hits.incidence) * (1.0 + grain)
 
         kept = np.flatnonzero(seen)
@@ -133,11 +141,9 @@ class Lidar:
         p0, R0 = trajectory.poses(seconds(begin))
         p1, R1 = trajectory.poses(seconds(begin + pattern.block_ns))
         blocks = len(begin)
-        share = ((pattern.offsets_ns.reshape(blocks, CHANNELS) - pattern.blocks_ns[:, None]) / pattern.block_ns)[
-            :, :, None
-        ]
-        directions = pattern.directions.reshape(blocks, CHANNELS, 3)
-        levers = pattern.levers.reshape(blocks, CHANNELS, 3) + P_IMU_LIDAR
+        share = ((pattern.offsets_ns.reshape(blocks, -1) - pattern.blocks_ns[:, None]) / pattern.block_ns)[:, :, None]
+        directions = (pattern.directions @ self.R_imu_lidar.T).reshape(blocks, -1, 3)
+        levers = (pattern.levers @ self.R_imu_lidar.T).reshape(blocks, -1, 3) + self.p_imu_lidar
 
         # Contiguous, so that numpy multiplies the rows (v^T R^T) by BLAS: seven times as fast.
         first_T = np.ascontiguousarray(R0.transpose(0, 2, 1))
@@ -150,9 +156,9 @@ class Lidar:
         return origins.reshape(-1, 3), at_own_time(directions).reshape(-1, 3)
 
 
-def _detection(distance: F64, incidence: F32, reflectivity: F32) -> F64:
+def _detection(distance: F64, incidence: F32, reflectivity: F32, rated: tuple[float, float]) -> F64:
     """Chance of a return: the echo, reflectivity * cos(incidence) / distance^2, against the data sheet's limit."""
     with np.errstate(divide="ignore"):
         echo = reflectivity * incidence / np.maximum(distance, MIN_RANGE_M) ** 2
-        margin = np.log(echo * (RATED_RANGE_M**2 / RATED_REFLECTIVITY))
+        margin = np.log(echo * (rated[0] ** 2 / rated[1]))
     return np.asarray((1.0 - STRAY_LOSS) / (1.0 + np.exp(-np.clip(4.0 * margin, -50.0, 50.0))))

@@ -1,21 +1,24 @@
 """One trajectory through one scene, measured and written to disk."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
 from app.sensors.ros import RecordingWriter
-from app.sensors.rsbpearl import BPEARL, ROTATION_RATES_HZ
+from app.sensors.rsbpearl import BPEARL
 from app.sensors.simulator.imperfections import NONE, Imperfections, Unit, companions, livelier
-from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
+from app.sensors.simulator.lidar import Lidar
 from app.sensors.simulator.raycast import Raycaster, SimulatedScene
+from app.sensors.simulator.scanners import SCANNERS, Scanner
 from app.sensors.simulator.scenes import build_scene
 from app.sensors.simulator.trajectory import (
     IMU_RATE_HZ,
+    R_BODY_IMU,
     ImuNoise,
     SmoothTrajectory,
     Walker,
@@ -25,7 +28,7 @@ from app.sensors.simulator.trajectory import (
 )
 from app.slam.errors import HemislamError
 from app.slam.trajectory import Trajectory, write_tum
-from app.slam.types import I64
+from app.slam.types import F64, I64
 
 START_NS = 1_700_000_000_000_000_000
 """Every recording starts at this moment."""
@@ -69,9 +72,12 @@ def simulate(
     coordinate_step: float = 0.0,
     walker: Walker | None = None,
     imperfections: Imperfections = NONE,
+    scanner: str = "bpearl",
+    tables: Path | None = None,
+    upright: bool | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulationSummary:
-    """Simulate a person who carries an RS-Bpearl and an IMU, and write it as a ROS 2 recording.
+    """Simulate a person who carries a LiDAR and an IMU, and write it as a ROS 2 recording.
 
     Beside `out` (`<stem>.mcap`, streamed scan by scan) it writes the truth `<stem>_truth.tum`
     (T_world_imu at every scan's end, absolute seconds, exact; the world's z is up) and
@@ -82,13 +88,15 @@ def simulate(
         scene: a name in SCENES. out: ends in .mcap; its folder must exist.
         duration_s: of the recording, the still start (walker.still) included.
         seed: of everything random: the scene's details, the trajectory, noise and biases.
-        rate_hz: 10 or 20 revolutions a second. every_block: fire every k-th azimuth block only,
-            so that a scan has 57,632 / k firings at 10 Hz and the file is small.
+        rate_hz: scans a second. every_block: fire every k-th block only, so that a scan of an
+            RS-Bpearl has 57,632 / k firings at 10 Hz and the file is small.
         range_step: m, rounding of distances: 0.005, or 0.0025 for a newer unit; 0 = none.
         coordinate_step: m, rounding of x, y, z; 0 = none. A power of two near the noise, such as
             0.00390625, makes the file a third smaller.
         walker: how the person walks; None = the defaults.
         imperfections: errors of a real scanner and hand, and people beside the operator.
+        scanner: a name in SCANNERS. tables: folder with its maker's tables, where it takes some.
+        upright: held with the LiDAR's z up rather than looking forward; None: as usual for it.
         progress: called with (scans done, scans in all).
 
     Raises:
@@ -96,19 +104,30 @@ def simulate(
             or open3d that cannot be loaded.
     """
     out = Path(out)
-    _check(out, rate_hz)
+    device = _device(scanner, upright, rate_hz)
+    _check(out)
     _check_range("duration_s", duration_s, 0.5, 86_400.0, "s")
     _check_range("every_block", every_block, 1, 90, "blocks")
     _check_range("range_step", range_step, 0.0, 0.1, "m")
     _check_range("coordinate_step", coordinate_step, 0.0, 0.1, "m")
     place = build_scene(scene, seed)
     walker = livelier(walker or Walker(), imperfections.hand)
-    trajectory = trajectory_through(place, duration_s, seed, walker)
+    trajectory = trajectory_through(place, duration_s, seed, walker, device.R_body_imu)
     company = companions(imperfections.companions, trajectory, place.height, _random(seed, _PEOPLE))
     caster = Raycaster(place.mesh, (*place.movers, *company))
-    unit = None if imperfections == NONE else Unit(imperfections, _random(seed, _UNIT))
-    pattern = firing_pattern(BPEARL, rate_hz, every_block)
-    lidar = Lidar(pattern, range_step=range_step, coordinate_step=coordinate_step, unit=unit)
+    turns = device.patterns(rate_hz, every_block, tables)
+    unit = None if imperfections == NONE else Unit(imperfections, _random(seed, _UNIT), turns(0).channels)
+    lidar = Lidar(
+        turns(0),
+        device.R_imu_lidar,
+        device.p_imu_lidar,
+        farthest=device.farthest,
+        rated=device.rated,
+        range_noise=device.range_noise,
+        range_step=range_step,
+        coordinate_step=coordinate_step or device.coordinate_step,
+        unit=unit,
+    )
     imu_stamps = START_NS + np.arange(round(duration_s * IMU_RATE_HZ) + 1, dtype=np.int64) * _IMU_PERIOD_NS
     imu = measured(trajectory, imu_stamps, START_NS, ImuNoise(), _random(seed, _IMU))
     if unit is not None:
@@ -124,14 +143,15 @@ def simulate(
         nonlocal written
         for k in range(written, stop):
             stamp = int(imu.stamps_ns[k])
-            recording.add_imu(stamp, imu.gyro[k], imu.accel[k], stamp)
+            recording.add_imu(stamp, imu.gyro[k], imu.accel[k] / device.accel_unit, stamp)
         written = max(written, stop)
 
     try:
         with unfinished.open("wb") as file:
-            recording = RecordingWriter(file)
+            recording = RecordingWriter(file, device.layout)
             for index in range(total):
                 start_s = _FIRST_TURN_S + index / rate_hz
+                lidar = replace(lidar, pattern=turns(index))
                 scan = lidar.turn(caster, trajectory, start_s, START_NS, _random(seed, _LIDAR, index))
                 if not len(scan):
                     continue
@@ -144,7 +164,7 @@ def simulate(
             add_imu(len(imu))
             recording.finish()
         _write_truth(truth, trajectory, np.array(ends, np.int64))
-        params.write_text(_SIDECAR + yaml.safe_dump({"sensor": {"translation": P_IMU_LIDAR.tolist()}}))
+        params.write_text(_SIDECAR + yaml.safe_dump(_settings(device)))
         unfinished.replace(out)
     except OSError as error:
         raise HemislamError(f"{out} cannot be written ({error.strerror}); choose another place.") from error
@@ -162,13 +182,35 @@ def simulate(
     )
 
 
-def trajectory_through(place: SimulatedScene, duration_s: float, seed: int, walker: Walker) -> SmoothTrajectory:
+def trajectory_through(
+    place: SimulatedScene, duration_s: float, seed: int, walker: Walker, R_body_imu: F64 = R_BODY_IMU
+) -> SmoothTrajectory:
     """The trajectory that `simulate` follows."""
     rng = _random(seed, _TRAJECTORY)
-    return walk(place.path, duration_s, rng, walker=walker, closed=place.closed, height=place.height)
+    return walk(
+        place.path, duration_s, rng, walker=walker, closed=place.closed, height=place.height, R_body_imu=R_body_imu
+    )
 
 
-_SIDECAR = "# Mounting of the simulated scanner (as H2LID); read with the recording beside it.\n"
+_SIDECAR = "# Mounting of the simulated scanner; read with the recording beside it.\n"
+
+
+def _settings(device: Scanner) -> dict[str, Any]:
+    """The parameters that a recording of it is read with."""
+    sensor = {"translation": device.p_imu_lidar.tolist()}
+    if not np.array_equal(device.R_imu_lidar, np.eye(3)):
+        sensor["rotation"] = Rotation.from_matrix(device.R_imu_lidar).as_euler("xyz", degrees=True).tolist()
+    return {"sensor": sensor}
+
+
+def _device(name: str, upright: bool | None, rate_hz: int) -> Scanner:
+    if name not in SCANNERS:
+        raise HemislamError(f"There is no scanner `{name}` to simulate; choose one of {', '.join(SCANNERS)}.")
+    device = SCANNERS[name]
+    if rate_hz not in device.rates_hz:
+        rates = " or ".join(map(str, device.rates_hz))
+        raise HemislamError(f"The {name} makes {rates} scans a second, not {rate_hz}; choose one of these.")
+    return device if upright is None else replace(device, upright=upright)
 
 
 def _random(seed: int, *stream: int) -> np.random.Generator:
@@ -180,13 +222,11 @@ def _write_truth(path: Path, trajectory: SmoothTrajectory, stamps_ns: I64) -> No
     write_tum(path, Trajectory(stamps_ns, positions, Rotation.from_matrix(rotations).as_quat()))
 
 
-def _check(out: Path, rate_hz: int) -> None:
+def _check(out: Path) -> None:
     if out.suffix != ".mcap":
         raise HemislamError(f"The recording must be named *.mcap, not `{out.name}`.")
     if not out.parent.is_dir():
         raise HemislamError(f"The folder {out.parent} does not exist; make it first or choose another.")
-    if rate_hz not in ROTATION_RATES_HZ:
-        raise HemislamError(f"The RS-Bpearl turns at 10 or 20 Hz, not {rate_hz}; choose one of these.")
 
 
 def _check_range(name: str, value: float, low: float, high: float, unit: str) -> None:

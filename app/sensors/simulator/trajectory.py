@@ -3,8 +3,8 @@
 The curve is a quintic spline through samples of (x, y, z, yaw, pitch, roll), so that every derivative is exact: poses,
 angular rates and specific forces belong to the same curve.
 
-Frames: `world` has z up; `body` has x forward, y left, z up. The IMU is mounted as on H2LID: z forward, x down, y left,
-so that at rest it reads -9.81 m/s^2 on x.
+Frames: `world` has z up; `body` has x forward, y left, z up. Unless told otherwise the IMU is mounted as on H2LID:
+z forward, x down, y left, so that at rest it reads -9.81 m/s^2 on x.
 """
 
 from collections.abc import Callable
@@ -31,8 +31,9 @@ def seconds(ns: I64) -> F64:
 class SmoothTrajectory:
     """Where the IMU is, at any time. Times are seconds from the recording's start, (n,) arrays."""
 
-    def __init__(self, times: F64, samples: F64) -> None:
+    def __init__(self, times: F64, samples: F64, R_body_imu: F64 = R_BODY_IMU) -> None:
         """Args: times (n,) increasing; samples (n, 6) of x, y, z (m), yaw, pitch, roll (rad) of the body."""
+        self.R_body_imu = R_body_imu
         self._spline: BSpline = make_interp_spline(times, samples, k=5)
         self._rate = self._spline.derivative(1)
         self._acceleration = self._spline.derivative(2)
@@ -40,7 +41,7 @@ class SmoothTrajectory:
     def poses(self, t: F64) -> tuple[F64, F64]:
         """Positions (n, 3) and rotations (n, 3, 3): R_world_imu, p_world_imu in reverse order."""
         values = self._spline(t)
-        return values[:, :3], _rotation(values[:, 3:]) @ R_BODY_IMU
+        return values[:, :3], _rotation(values[:, 3:]) @ self.R_body_imu
 
     def motion(self, t: F64) -> tuple[F64, F64]:
         """What a perfect IMU reads: angular rate (n, 3) rad/s and specific force (n, 3) m/s^2, IMU frame."""
@@ -55,7 +56,7 @@ class SmoothTrajectory:
         )
         _, R_world_imu = self.poses(t)
         force = self._acceleration(t)[:, :3] + np.array([0.0, 0.0, GRAVITY])
-        return body_rate @ R_BODY_IMU, np.einsum("nji,nj->ni", R_world_imu, force)
+        return body_rate @ self.R_body_imu, np.einsum("nji,nj->ni", R_world_imu, force)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,11 +118,13 @@ def walk(
     walker: Walker,
     closed: bool = True,
     height: Callable[[F64], F64] | None = None,
+    R_body_imu: F64 = R_BODY_IMU,
 ) -> SmoothTrajectory:
     """A person walks along waypoints, round a closed path for all of the time, or to the end of an open one.
 
     Args:
         path: (n, 2) waypoints in plan, m. height: the ground's z at (n, 2) points; None is z = 0.
+        R_body_imu: how the IMU is mounted.
     """
     t = np.arange(-1.0, duration_s + 1.0, 1.0 / _SAMPLE_HZ)
     awake = _smoothstep((t - walker.still) / 1.5)
@@ -162,7 +165,7 @@ def walk(
             rng.normal(scale=np.deg2rad(1.0)) + awake * walker.roll * _wander(t, rng, (0.2, 1.0)),
         ]
     )
-    return SmoothTrajectory(t, samples)
+    return SmoothTrajectory(t, samples, R_body_imu)
 
 
 def _rotation(angles: F64) -> F64:

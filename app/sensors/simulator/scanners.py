@@ -1,0 +1,171 @@
+"""The scanners that can be simulated: one entry in `SCANNERS` and one function that makes their firings."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app.sensors import livox, ros, rsbpearl
+from app.sensors.presets import PRESETS
+from app.sensors.simulator.lidar import P_IMU_LIDAR, Pattern, firing_pattern
+from app.sensors.simulator.trajectory import GRAVITY, R_BODY_IMU
+from app.slam import lie
+from app.slam.errors import HemislamError
+from app.slam.types import F64
+
+Turns = Callable[[int], Pattern]
+"""The firings of the k-th scan."""
+
+_RATE_HZ = 10
+_RING_DEG = 2.0
+_MID360_RATE_HZ = 200_000
+_MID360_BLOCK = 20
+"""Firings within which the motion is taken for straight: 0.1 ms."""
+_MID360_LASERS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Scanner:
+    """A LiDAR with its IMU, and how its driver writes both.
+
+    Attributes:
+        patterns: (rate in Hz, fire every k-th block, folder with the maker's tables) -> its firings.
+        upright: held with the LiDAR's z up and its x forward; otherwise its z looks forward and its x down.
+        R_imu_lidar, p_imu_lidar: its mounting, p in m.
+        farthest: m. rated: (m, reflectivity) at which half of the beams return.
+        range_noise, coordinate_step: m. rates_hz: at which it can turn.
+        layout: of its recordings. accel_unit: m/s² that its driver calls 1.
+    """
+
+    patterns: Callable[[int, int, Path | None], Turns]
+    upright: bool = False
+    R_imu_lidar: F64 = field(default_factory=lambda: np.eye(3))
+    p_imu_lidar: F64 = field(default_factory=lambda: np.zeros(3))
+    farthest: float = 100.0
+    rated: tuple[float, float] = (30.0, 0.1)
+    range_noise: float = 0.005
+    coordinate_step: float = 0.0
+    rates_hz: tuple[int, ...] = (_RATE_HZ,)
+    layout: ros.Layout = field(default_factory=ros.Layout)
+    accel_unit: float = 1.0
+
+    @property
+    def R_body_imu(self) -> F64:
+        """How the IMU lies in the walker's frame: x forward, y left, z up."""
+        R_body_lidar = np.eye(3) if self.upright else R_BODY_IMU
+        return np.asarray(R_body_lidar @ self.R_imu_lidar.T)
+
+
+def _bpearl(rate_hz: int, every_block: int, _: Path | None) -> Turns:
+    pattern = firing_pattern(rsbpearl.BPEARL, rate_hz, every_block)
+    return lambda turn: pattern
+
+
+def _airy(rate_hz: int, every_block: int, _: Path | None) -> Turns:
+    """A RoboSense Airy [rs_driver, decoder_RSAIRY.hpp]: 96 channels, eight at a time, over a hemisphere.
+
+    A unit's own elevations are in its DIFOP packet; these are evenly spaced.
+    """
+    us = np.repeat([0.0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104], 8)
+    elevation = np.radians((np.arange(96) + 0.5) * 90.0 / 96)
+    lever = (float(np.hypot(0.0108, 0.00375)), 0.06056)
+    pattern = _turning(elevation, np.zeros(96), us, 111.08, rate_hz, every_block, lever)
+    return lambda turn: pattern
+
+
+def _jt128(rate_hz: int, every_block: int, tables: Path | None) -> Turns:
+    """A Hesai JT128: 128 channels, far apart in azimuth [HesaiLidar_SDK_2.0, angles and firing times]."""
+    folder = _tables(tables, "jt128_angles.csv", "jt128_firetimes.csv")
+    angles = np.genfromtxt(folder / "jt128_angles.csv", delimiter=",", skip_header=1, max_rows=128)
+    us = np.genfromtxt(folder / "jt128_firetimes.csv", delimiter=",", skip_header=1, max_rows=128)[:, 1]
+    elevation, azimuth = np.radians(angles[:, 1:]).T
+    pattern = _turning(elevation, azimuth, us, 1e6 / _RATE_HZ / 900, rate_hz, every_block, (0.0, 0.0))
+    return lambda turn: pattern
+
+
+def _turning(
+    elevation: F64, azimuth: F64, us: F64, block_us: float, rate_hz: int, every_block: int, lever: tuple[float, float]
+) -> Pattern:
+    """A head that turns from azimuth 0 at the scan's start, from x towards -y.
+
+    elevation, azimuth: (c,) rad by channel, azimuth beside the head's. us: (c,) firing time within a block.
+    lever: m, radial and height, of the lasers.
+    """
+    block_ns = round(block_us * 1000)
+    blocks_ns = np.arange(0, 1_000_000_000 // rate_hz // block_ns, every_block, dtype=np.int64) * block_ns
+    offsets_ns = (blocks_ns[:, None] + np.rint(us * 1000).astype(np.int64)).ravel()
+    head = 2 * np.pi * rate_hz * 1e-9 * offsets_ns
+    along, up = head + np.tile(azimuth, len(blocks_ns)), np.tile(elevation, len(blocks_ns))
+    directions = np.column_stack([np.cos(up) * np.cos(along), -np.cos(up) * np.sin(along), np.sin(up)])
+    levers = np.column_stack([lever[0] * np.cos(head), -lever[0] * np.sin(head), np.full(len(head), lever[1])])
+    rings = np.tile(np.argsort(np.argsort(elevation)).astype(np.uint16), len(blocks_ns))
+    return Pattern(offsets_ns, directions, levers, rings, blocks_ns, block_ns, len(elevation))
+
+
+def _mid360(rate_hz: int, every_block: int, tables: Path | None) -> Turns:
+    """A Livox Mid-360: its pattern of 4 s, which does not repeat from scan to scan."""
+    pattern = np.load(_tables(tables, "mid360_pattern.npy") / "mid360_pattern.npy").astype(np.float64)
+    firings = _MID360_RATE_HZ // rate_hz
+    starts = np.arange(0, firings // _MID360_BLOCK, every_block, dtype=np.int64) * _MID360_BLOCK
+    fired = (starts[:, None] + np.arange(_MID360_BLOCK)).ravel()
+    ns = 1_000_000_000 // _MID360_RATE_HZ
+
+    def scan(turn: int) -> Pattern:
+        azimuth, elevation = pattern[(turn * firings + fired) % len(pattern)].T
+        level = np.cos(elevation)
+        directions = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+        rings = np.maximum((np.degrees(elevation) + 7.5) / _RING_DEG, 0).astype(np.uint16)
+        levers = np.zeros_like(directions)
+        return Pattern(fired * ns, directions, levers, rings, starts * ns, _MID360_BLOCK * ns, _MID360_LASERS)
+
+    return scan
+
+
+def _tables(folder: Path | None, *names: str) -> Path:
+    """The folder, if it holds these files. Raises HemislamError otherwise."""
+    missing = [name for name in names if folder is None or not (folder / name).is_file()]
+    if folder is None or missing:
+        raise HemislamError(
+            f"This scanner is simulated from its maker's tables ({', '.join(missing)}); "
+            "name the folder that holds them: --tables FOLDER."
+        )
+    return folder
+
+
+def _hesai(scan: Any) -> bytes:
+    return ros.serialised(ros.cloud_message(scan, stamp_ns=scan.stamp_ns, frame="hesai_lidar"))
+
+
+def _rotation(preset: str) -> F64:
+    return lie.from_rpy_degrees(PRESETS[preset]["sensor"]["rotation"])
+
+
+def _translation(preset: str) -> F64:
+    return np.array(PRESETS[preset]["sensor"]["translation"])
+
+
+SCANNERS: dict[str, Scanner] = {
+    "bpearl": Scanner(_bpearl, p_imu_lidar=P_IMU_LIDAR, rates_hz=rsbpearl.ROTATION_RATES_HZ),
+    "airy": Scanner(
+        _airy,
+        R_imu_lidar=_rotation("airy"),
+        layout=ros.Layout(imu_topic="/rslidar_imu_data"),
+        accel_unit=GRAVITY,
+    ),
+    "jt128": Scanner(_jt128, farthest=60.0, layout=ros.Layout("/lidar_points", "/lidar_imu", encode=_hesai)),
+    "mid360": Scanner(
+        _mid360,
+        upright=True,
+        p_imu_lidar=_translation("mid360"),
+        farthest=70.0,
+        rated=(40.0, 0.1),
+        range_noise=0.01,
+        coordinate_step=0.001,
+        layout=ros.Layout("/livox/lidar", "/livox/imu", livox.CUSTOM_MSGS[0], livox.DEFINITION, livox.encoded),
+        accel_unit=GRAVITY,
+    ),
+}
+"""By name. `bpearl`: an RS-Bpearl on H2LID's IMU. The others bring their own IMU; an Airy and a JT128 are held as the
+RS-Bpearl is, a Mid-360 upright. Rated ranges and noise: the data sheets."""

@@ -1,0 +1,82 @@
+"""Recordings of the simulated scanners: recognised, read by their drivers' conventions, and walked as it was.
+
+Tests app/sensors/simulator/scanners.py and the presets of these scanners.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.sensors.doctor import examine
+from app.sensors.presets import resolve_params
+from app.sensors.recording import open_recording
+from app.sensors.simulator import simulate
+from app.slam.engine import Engine
+from app.slam.errors import HemislamError
+from app.slam.metrics import GroundScore, ate
+from app.slam.params import Params
+from app.slam.trajectory import Trajectory, read_tum
+from app.slam.types import Measurement
+
+FOLDERS = {"mid360": "livox", "jt128": "hesai"}
+"""Of the makers' tables, under ../shared/data/sensors."""
+
+Make = Callable[[str], Path]
+
+
+@pytest.fixture(scope="module")
+def make(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Make:
+    """Simulates six seconds in a room with a scanner, its mounting untold."""
+    folder = tmp_path_factory.mktemp("scanners")
+
+    @cache
+    def made(scanner: str) -> Path:
+        out = folder / f"{scanner}.mcap"
+        tables = shared_data / "sensors" / FOLDERS.get(scanner, "")
+        simulate("room", out, duration_s=6.0, every_block=6, scanner=scanner, tables=tables)
+        out.with_name(f"{scanner}.params.yaml").rename(folder / f"{scanner}.mounting")
+        return out
+
+    return made
+
+
+@pytest.mark.parametrize("scanner", ["airy", "jt128", "mid360"])
+def test_a_scanner_is_recognised_and_its_preset_alone_maps_the_walk(make: Make, scanner: str) -> None:
+    path = make(scanner)
+    assert f"--preset {scanner}" in [finding.option for finding in examine(path, Params())]
+    params = resolve_params(path, scanner, None, [])
+    told = Params().merged_yaml(path.with_suffix(".mounting").read_text(), "mounting")
+    assert params.sensor == told.sensor
+    engine, stamps, poses, score = Engine(params), [], [], GroundScore()
+    with open_recording(path, params) as recording:
+        for entry in recording.measurements():
+            assert isinstance(entry, Measurement)
+            result = engine.step(entry.scan, entry.imu)
+            stamps.append(result.stamp_ns)
+            poses.append(result.T_map_imu)
+            if result.truth_ground is not None:
+                score += GroundScore.of(result.cloud.labels, result.truth_ground)
+    error = ate(Trajectory.from_poses(stamps, np.array(poses)), read_tum(path.with_name(f"{scanner}_truth.tum")))
+    assert len(stamps) >= 58
+    assert error.position.max < 0.01  # m
+    if scanner != "mid360":  # CustomMsg has no labels
+        assert score.f1 > 0.9
+
+
+def test_a_bpearl_is_not_taken_for_a_scanner_with_an_imu_of_its_own(make: Make) -> None:
+    assert not [option for finding in examine(make("bpearl"), Params()) if "--preset" in (option := finding.option)]
+
+
+def test_a_scanner_without_its_tables_is_refused_by_their_names(tmp_path: Path) -> None:
+    for scanner, table in (("mid360", "mid360_pattern.npy"), ("jt128", "jt128_firetimes.csv")):
+        for tables in (None, tmp_path):
+            with pytest.raises(HemislamError, match=rf"{table}.*--tables"):
+                simulate("room", tmp_path / "x.mcap", scanner=scanner, tables=tables)
+    with pytest.raises(HemislamError, match=r"no scanner `bpeal`.*bpearl, airy"):
+        simulate("room", tmp_path / "x.mcap", scanner="bpeal")
+    with pytest.raises(HemislamError, match="10 scans a second, not 20"):
+        simulate("room", tmp_path / "x.mcap", scanner="airy", rate_hz=20)
+    assert not list(tmp_path.iterdir())
