@@ -1,7 +1,6 @@
 """What happens in the engine's process: commands in, one piece of work at a time, changes out."""
 
 import logging
-import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -220,7 +219,7 @@ class Controller:
     def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
         """Let `work` open it, so that the page first says that this takes a moment."""
         self._opening, self._waiting = opening, []
-        self._page.put(progress=protocol.Progress(f"Opening {path.name}", math.nan), urgent=True)
+        self._page.put(progress=protocol.Progress.opening(path), urgent=True)
 
     def _do_opening(self, opening: Callable[[], None]) -> None:
         """Open; if that is not possible, everything stays as it is."""

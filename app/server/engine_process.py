@@ -93,7 +93,7 @@ def run_loop(
             early.extend(updates.exchange(0.0))
 
         prepare(progress)
-        page.put(progress=None)
+    page.put(progress=None)
     if setup.recording is not None:
         controller.open(setup.recording, setup.truth, play=setup.play)
     try:

@@ -4,6 +4,7 @@ Both are frozen values. Session files record commands. A snapshot is cumulative:
 nothing.
 """
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -219,6 +220,12 @@ class Progress:
 
     title: str
     fraction: float
+
+    @classmethod
+    def opening(cls, recording: Path | None) -> "Progress":
+        if recording is None:
+            return cls("Starting", math.nan)
+        return cls("Connecting to the sensor" if recording == LIVE else f"Opening {recording.name}", math.nan)
 
 
 @dataclass(frozen=True, slots=True)

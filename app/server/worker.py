@@ -48,7 +48,7 @@ class EngineProcess:
     def __init__(self, setup: Setup, *, main: Main = _run_engine) -> None:
         self._setup = setup
         self._main = main
-        self._fold = Fold(Snapshot(params=setup.params), setup.point_budget)
+        self._fold = Fold(Snapshot(params=setup.params, progress=Progress.opening(setup.recording)), setup.point_budget)
         self._changed = threading.Condition()
         self._restarts = RestartLimit(MOST_RESTARTS)
         self._child: Child | None = None

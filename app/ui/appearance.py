@@ -40,7 +40,9 @@ class AppearancePanel:
         self._light = gui.add_checkbox("light background", False, hint="For bright rooms and for print.")
         self._light.on_update(lambda _: apply_theme(gui, light=self._light.value))
         self._follow = gui.add_checkbox(
-            "follow", default.follow, hint="Keep the sensor in the middle; orbit and zoom as you like. F toggles."
+            "follow",
+            default.follow,
+            hint="Keep the sensor in the middle; orbit and zoom as you like. F toggles; G shows the whole map again.",
         )
         self._point_size = gui.add_slider(
             "points (cm)", 0.5, 15.0, 0.5, 100 * default.point_size, hint="Diameter of the points drawn."

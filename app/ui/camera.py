@@ -1,5 +1,6 @@
 """Where a browser's camera stands: the whole map, from above or the side, without perspective, and kept views."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -27,6 +28,13 @@ _WAYS: Final[dict[str, tuple[float, float, float]]] = {
 }
 """From the map's middle towards the camera."""
 _MOST_KEPT: Final = 6
+_EASE: Final = 0.2
+"""Share of the way to the newest extent of the map that cameras go per drawing, so that they glide as it grows."""
+_ARRIVED: Final = 0.01
+"""So near, as a share of the map's size, cameras rest."""
+_PUT: Final = 300
+"""Places of cameras that are remembered: a slow browser says late where its camera was put."""
+_FOLLOWED_FROM_M: Final = 25.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,31 +45,122 @@ class Stand:
     look_at: F64
 
 
-def whole(points: F64, way: str = FIT, fov: float = FOV) -> Stand:
-    """From where all of (n, 3) points are seen but for a few far ones. fov: rad, of the smaller side of the picture."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Extent:
+    """A ball around a map: middle (3,) and radius, m."""
+
+    middle: F64
+    radius: float
+
+    def towards(self, other: "Extent", share: float) -> "Extent":
+        return Extent(
+            self.middle + share * (other.middle - self.middle), self.radius + share * (other.radius - self.radius)
+        )
+
+    def apart(self, other: "Extent") -> float:
+        """How far the other one is off, as a share of this one's size."""
+        return float(np.linalg.norm(other.middle - self.middle) + abs(other.radius - self.radius)) / self.radius
+
+
+NOTHING: Final = Extent(np.array([0.3, 0.2, -0.6]), 5.0)
+"""What is looked at before there is a map: around the sensor."""
+
+
+def extent(points: F64) -> Extent:
+    """The ball around all of (n, 3) points but a few far ones."""
     if not len(points):
-        return Stand(np.array([-4.0, -4.0, 9.0]), np.array([0.3, 0.2, -0.6]))
+        return NOTHING
     low, high = np.percentile(points, (_SHARE, 100 - _SHARE), axis=0)
-    radius = max(float(np.linalg.norm(high - low)) / 2, _LEAST_M)
+    return Extent((low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, _LEAST_M))
+
+
+def whole(map_: Extent, way: str = FIT, fov: float = FOV) -> Stand:
+    """From where all of it is seen. fov: rad, of the smaller side of the picture."""
     towards = np.array(_WAYS[way])
-    middle = (low + high) / 2
-    return Stand(middle + towards / np.linalg.norm(towards) * 1.1 * radius / np.tan(fov / 2), middle)
+    distance = 1.05 * map_.radius / np.tan(fov / 2)
+    return Stand(map_.middle + towards / np.linalg.norm(towards) * distance, map_.middle)
+
+
+class Framing:
+    """Keeps the whole map in the picture of every browser while it grows, until its user looks elsewhere."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._ways: dict[int, str] = {}  # from which side browsers look; FIT unless it was chosen
+        self._put: deque[F64] = deque(maxlen=_PUT)
+        self._wanted = self._shown = NOTHING
+        self._at_once = False
+        server.initial_camera.fov = FOV
+        self._begin(np.zeros(3))
+
+    def see(self, points: F64, *, at_once: bool) -> None:
+        """Take in some points of the map, (n, 3); at_once: it is another map."""
+        self._wanted, self._at_once = extent(points), at_once
+
+    def draw(self, offset: F64) -> bool:
+        """Move the cameras on; False while they are on their way. offset: (3,) m, of the map in the scene."""
+        if not self._at_once and self._shown.apart(self._wanted) < _ARRIVED:
+            return True
+        self._shown = self._wanted if self._at_once else self._shown.towards(self._wanted, _EASE)
+        self._at_once = False
+        clients = {number: client for number, client in self._server.get_clients().items() if self._untouched(client)}
+        self._begin(offset)
+        for number, client in clients.items():
+            self._place(client, self._ways.get(number, FIT), offset)
+        return False
+
+    def show(self, client: viser.ClientHandle, way: str, offset: F64) -> None:
+        """Let a browser look at the whole map from one side, and keep doing so."""
+        self._shown = self._wanted
+        self._ways[client.client_id] = way
+        self._place(client, way, offset)
+
+    def follow(self) -> None:
+        """Let every browser look at the sensor, which is kept at the scene's origin."""
+        for client in self._server.get_clients().values():
+            camera = client.camera
+            back = np.array(camera.position) - camera.look_at
+            back *= min(1.0, _FOLLOWED_FROM_M / max(float(np.linalg.norm(back)), 1e-6))
+            with client.atomic():
+                camera.position, camera.look_at = back, np.zeros(3)
+
+    def _begin(self, offset: F64) -> None:
+        """Where pages that open later look from."""
+        stand, camera = whole(self._shown), self._server.initial_camera
+        camera.position, camera.look_at = stand.position + offset, stand.look_at + offset
+        self._put.append(camera.position)
+
+    def _place(self, client: viser.ClientHandle, way: str, offset: F64) -> None:
+        stand = whole(self._shown, way, client.camera.fov)
+        move(client, Stand(stand.position + offset, stand.look_at + offset))
+        self._put.append(stand.position + offset)
+
+    def _untouched(self, client: viser.ClientHandle) -> bool:
+        """Whether the browser's camera is where it was put."""
+        off = np.linalg.norm(np.array(self._put) - client.camera.position, axis=1)
+        return bool(off.min() < 1e-3 * self._shown.radius)
+
+
+def move(client: viser.ClientHandle, stand: Stand) -> None:
+    """Put a browser's camera somewhere in the scene, and its clipping planes around what it sees."""
+    camera, distance = client.camera, float(np.linalg.norm(stand.position - stand.look_at))
+    with client.atomic():
+        camera.far, camera.near = _FAR * max(distance, 100.0), max(distance / 1e4, 0.01)
+        camera.position, camera.look_at = stand.position, stand.look_at
 
 
 class CameraPanel:
     """Buttons that move the camera of the browser they are clicked in.
 
     Args:
-        sample: some points of the map, (n, 3). look_freely: stops following the sensor.
+        framing: keeps the whole map in the picture. look_freely: stops following the sensor.
     """
 
-    def __init__(
-        self, page: Page, sample: Callable[[], F64], look_freely: Callable[[viser.ClientHandle], None]
-    ) -> None:
+    def __init__(self, page: Page, framing: Framing, look_freely: Callable[[viser.ClientHandle], None]) -> None:
         gui = page.gui
-        self._page, self._sample, self._look_freely = page, sample, look_freely
+        self._page, self._framing, self._look_freely = page, framing, look_freely
         self._kept: list[Stand] = []
-        ways = gui.add_button_group("camera", tuple(_WAYS), hint="G frames the whole map.")
+        ways = gui.add_button_group("camera", tuple(_WAYS), hint="The whole map, also while it grows; G does the same.")
         ways.on_click(by_user(self.look))
         self._parallel = gui.add_checkbox(
             "orthographic", False, hint="Parallel lines stay parallel, and lengths can be compared."
@@ -76,10 +175,9 @@ class CameraPanel:
         )
 
     def look(self, way: str, client: viser.ClientHandle) -> None:
-        """Show the whole map from one side."""
-        if way != FIT:
-            self._look_freely(client)
-        self._go(client, whole(self._sample(), way))
+        """Show the whole map from one side, also as it grows."""
+        self._look_freely(client)
+        self._framing.show(client, way, self._page.offset())
 
     def _stand(self, client: viser.ClientHandle) -> Stand:
         """Where the usual lens would show what this camera shows."""
@@ -97,8 +195,5 @@ class CameraPanel:
         """Move a camera to a stand that is meant for the usual lens."""
         fov = _NARROW if self._parallel.value else FOV
         offset, back = self._page.offset(), (stand.position - stand.look_at) * np.tan(FOV / 2) / np.tan(fov / 2)
-        camera = client.camera
-        with client.atomic():
-            distance = float(np.linalg.norm(back))
-            camera.fov, camera.far, camera.near = fov, _FAR * max(distance, 100.0), distance / 1e4
-            camera.position, camera.look_at = stand.look_at + back + offset, stand.look_at + offset
+        client.camera.fov = fov
+        move(client, Stand(stand.look_at + back + offset, stand.look_at + offset))

@@ -4,14 +4,14 @@ All nodes hang below one frame. To follow the sensor, that frame is shifted so t
 at the origin: the camera of every browser is left to its user, who may orbit and zoom while following.
 """
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import viser
 
 from app.server.protocol import Snapshot
 from app.slam.types import F64, StepResult
-from app.ui.camera import FOV, whole
+from app.ui.camera import Framing
 from app.ui.chunks import MapChunks
 from app.ui.colours import Limits
 from app.ui.nodes import TrajectoryNode, Truth
@@ -26,8 +26,8 @@ _GROUND_BEFORE_SEEN_M: Final = -1.2
 _GRID_STEP_M: Final = 0.03
 _GRID: Final = {False: ((42, 48, 58), (62, 72, 88)), True: ((214, 220, 228), (186, 195, 207))}
 """Colours of its cells and of every fifth line, on a dark and on a light background."""
-_FRAMED_AGAIN: Final = 1.25
-"""The view that pages open with is chosen again when the map has so many times as many keyframes."""
+_FRAMED_AGAIN: Final = 1.05
+"""The view of the whole map is chosen again when it has so many times as many keyframes."""
 
 
 class Scene:
@@ -59,9 +59,8 @@ class Scene:
         self._sensor = SensorScene(scene, f"{ROOT}/sensor")
         self._trajectory = TrajectoryNode(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
-        server.initial_camera.fov = FOV
-        self._framed = 0
-        self._frame(np.empty((0, 3)))
+        self.framing = Framing(server)
+        self._framed, self._followed = 0, False
 
     @property
     def offset(self) -> F64:
@@ -72,54 +71,58 @@ class Scene:
     def points(self) -> int:
         return self._chunks.points
 
-    def sample(self) -> F64:
-        """(n, 3) some points of the map."""
-        return self._chunks.sample()
-
     def limits(self, by: str) -> Limits | None:
         """Ends of a colour map as drawn; None for labels and before there is anything to colour."""
         return self._chunks.limits.get(by)
 
-    def draw(self, current: Snapshot, view: View) -> None:
+    def draw(self, current: Snapshot, view: View) -> bool:
+        """Bring the scene up to `current`; False if it is to be called again for the rest, even if nothing changes."""
+        limits = self._chunks.limits
         with self._server.atomic():
-            recording, result = current.recording, current.result
-            start_ns = recording.start_ns if recording else 0
-            if current.session != self._session:
-                self._session, self._shown, self._framed = current.session, None, 0
-                self._chunks.clear(start_ns, recording.duration_s if recording else 1.0)
-                self._sensor.clear()
+            self._draw_scan(current, view)
+        with self._server.atomic():
             poses = poses_of(current)
             self._chunks.draw(current.chunks[: len(poses)], poses, view)
             self._trajectory.draw(current.trajectory if current.trajectory is not None else np.empty((0, 3)), view.path)
+            recording = current.recording
             self._truth.draw(recording.truth_positions if recording else None, current.T_map_truth, view.path)
-            self._grid.visible = view.grid
-            if view.light != self._light:
-                self._light = view.light
-                self._grid.cell_color, self._grid.section_color = _GRID[view.light]
-            if result is None:
-                return
-            limits = self._chunks.limits
-            if self._changes(result, current.params, view, limits):
-                self._sensor.draw(self._shown, result, current.params, view, limits, start_ns)
-            z = self._sensor.ground_z
-            if z is not None and abs(z - self._grid.position[2]) > _GRID_STEP_M:  # smaller steps would make it shiver
-                self._grid.position = (0.0, 0.0, z)
-            if view.follow:
-                self._follow(result.T_map_imu[:3, 3], jump=self._shown is None)
-            self._shown = result
-            keyframes = len(current.chunks)
-            if not self._framed <= keyframes < _FRAMED_AGAIN * self._framed + 1:
-                first, self._framed = not self._framed, keyframes
-                self._frame(self.sample(), at_once=first)
+        return self._look(current, view) and self._chunks.limits is limits
 
-    def _frame(self, points: F64, at_once: bool = False) -> None:
-        """Let pages that open later see all points, (n, 3) in the map; at_once: also those that are open."""
-        stand, offset = whole(points), self.offset
-        cameras: list[Any] = [self._server.initial_camera]
-        if at_once:
-            cameras += [client.camera for client in self._server.get_clients().values()]
-        for camera in cameras:
-            camera.position, camera.look_at = stand.position + offset, stand.look_at + offset
+    def _draw_scan(self, current: Snapshot, view: View) -> None:
+        """What is measured just now. It does not wait for the map."""
+        recording, result = current.recording, current.result
+        start_ns = recording.start_ns if recording else 0
+        if current.session != self._session:
+            self._session, self._shown, self._framed = current.session, None, 0
+            self._chunks.clear(start_ns, recording.duration_s if recording else 1.0)
+            self._sensor.clear()
+        self._grid.visible = view.grid
+        if view.light != self._light:
+            self._light = view.light
+            self._grid.cell_color, self._grid.section_color = _GRID[view.light]
+        if result is None:
+            return
+        limits = self._chunks.limits
+        if self._changes(result, current.params, view, limits):
+            self._sensor.draw(self._shown, result, current.params, view, limits, start_ns)
+        z = self._sensor.ground_z
+        if z is not None and abs(z - self._grid.position[2]) > _GRID_STEP_M:  # smaller steps would make it shiver
+            self._grid.position = (0.0, 0.0, z)
+        if view.follow:
+            self._follow(result.T_map_imu[:3, 3], jump=self._shown is None)
+        self._shown = result
+
+    def _look(self, current: Snapshot, view: View) -> bool:
+        """Keep the map or the sensor in the picture; False while cameras are on their way."""
+        if view.follow != self._followed:
+            self._followed = view.follow
+            if view.follow:
+                self.framing.follow()
+        keyframes = len(current.chunks)
+        if current.result is not None and not self._framed <= keyframes < _FRAMED_AGAIN * self._framed + 1:
+            first, self._framed = not self._framed, keyframes
+            self.framing.see(self._chunks.sample(), at_once=first)
+        return view.follow or self.framing.draw(self.offset)
 
     def _follow(self, position: F64, jump: bool) -> None:
         behind = -position - self._root.position

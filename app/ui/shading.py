@@ -1,18 +1,19 @@
 """Light on the points of a keyframe, so that a map reads at first sight: flat things by their slope, edges darker.
 
-Computed once per keyframe, where it is drawn first.
+Computed once per keyframe, where it is drawn first, by cells that grow with their distance as the gaps of a scan do.
 """
 
 from typing import Final
 
 import numpy as np
-from scipy.spatial import KDTree
 
-from app.slam.types import F32, F64, I64
+from app.slam.types import F32, F64
 
-_NEIGHBOURS: Final = 8
-_MOST: Final = 2000
-"""Points whose normals are computed; the others take their nearest one's light."""
+_CELL: Final = 0.12
+"""Edge of a cell over its distance from the sensor, at least; up to twice that."""
+_NEAR_M: Final = 2.5
+_LEAST_POINTS: Final = 6
+"""Cells with fewer have no slope."""
 _SUN: Final[F64] = np.array([0.37, -0.53, 0.76])
 """Unit vector towards the light in the map: floors are brightest, walls at right angles to each other differ."""
 _LEAST: Final = 0.62
@@ -21,19 +22,29 @@ _EDGE: Final = 0.3
 
 
 def light(points: F32, T_map_lidar: F64) -> F32:
-    """(n,) brightness up to 1 of (n, 3) points in random order, in the LiDAR frame, by the normals around them."""
-    some = points[:_MOST]
-    if len(some) < 2 * _NEIGHBOURS:
-        return np.ones(len(points), np.float32)
-    tree = KDTree(some)  # type: ignore[no-untyped-call]  # no types
-    near = tree.query(some, _NEIGHBOURS)[1]  # type: ignore[no-untyped-call]
-    around = some[near].astype(np.float64)
-    around -= around.mean(axis=1, keepdims=True)
-    spread, axes = np.linalg.eigh(around.transpose(0, 2, 1) @ around)
+    """(n,) brightness up to 1 of (n, 3) points in the LiDAR frame, by the plane through all points of their cell."""
+    if not len(points):
+        return np.ones(0, np.float32)
+    cell, counts = _cells(points)
+    some = np.flatnonzero(counts >= _LEAST_POINTS)
+    x = points.T.astype(np.float64)
+    sums = np.stack([np.bincount(cell, axis) for axis in x])[:, some] / counts[some]
+    spread = np.empty((len(some), 3, 3))
+    for i, j in zip(*np.triu_indices(3), strict=True):
+        spread[:, i, j] = spread[:, j, i] = np.bincount(cell, x[i] * x[j])[some] / counts[some] - sums[i] * sums[j]
+    sizes, axes = np.linalg.eigh(spread)
     facing = np.abs(axes[:, :, 0] @ (T_map_lidar[:3, :3].T @ _SUN))
-    roughness = 3 * spread[:, 0] / np.maximum(spread.sum(axis=1), 1e-12)
-    lit: F32 = ((_LEAST + (1 - _LEAST) * facing) * (1 - _EDGE * roughness)).astype(np.float32)
-    if len(points) == len(some):
-        return lit
-    nearest: I64 = tree.query(points[_MOST:])[1]  # type: ignore[no-untyped-call]
-    return np.concatenate((lit, lit[nearest]))
+    roughness = 3 * np.maximum(sizes[:, 0], 0.0) / np.maximum(sizes.sum(axis=1), 1e-12)
+    lit = np.full(len(counts), _LEAST + (1 - _LEAST) / 2)
+    lit[some] = (_LEAST + (1 - _LEAST) * facing) * (1 - _EDGE * roughness)
+    return np.asarray(lit[cell], np.float32)
+
+
+def _cells(points: F32) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) the cell of each point, and (m,) how many points each has."""
+    distance = np.maximum(np.linalg.norm(points, axis=1), _NEAR_M)
+    level = np.floor(np.log2(distance / _NEAR_M))
+    at = np.floor(points / (_CELL * _NEAR_M * np.exp2(level))[:, None]).astype(np.int64) + (1 << 13)
+    keys = ((level.astype(np.int64) << 14 | at[:, 0]) << 14 | at[:, 1]) << 14 | at[:, 2]
+    _, cell, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    return cell, counts

@@ -13,6 +13,7 @@ from app.slam.errors import HemislamError
 from app.slam.params import Params, leaves
 from app.slam.types import FrameStatus
 from app.ui.html import BAD, GOOD, QUIET, WARN, heading, panel
+from app.ui.transport import working
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import Changes, Page
 
@@ -72,9 +73,8 @@ class HeaderPanel:
         self._work.visible = self._bar.visible = progress is not None
         if progress is not None:
             known = bool(np.isfinite(progress.fraction))
-            percent = 100 * min(max(progress.fraction, 0.0), 1.0) if known else 100.0
-            self._work.content = panel("text", progress.title + (f" · {percent:.0f} %" if known else " …"))
-            self._bar.value = percent  # type: ignore[misc]  # mypy overlooks viser's setter
+            self._work.content = panel("text", working(progress))
+            self._bar.value = 100 * min(max(progress.fraction, 0.0), 1.0) if known else 100.0  # type: ignore[misc]  # mypy overlooks viser's setter
 
 
 def settled(params: Params, option: str) -> Params | None:

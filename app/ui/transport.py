@@ -13,6 +13,7 @@ from app.server.protocol import (
     EditNote,
     Pause,
     Play,
+    Progress,
     Seek,
     SetBreakpoints,
     SetSpeed,
@@ -59,7 +60,13 @@ class TransportPanel:
         self._send(Pause() if self._snapshot().transport.playing else Play())
 
     def draw(self, snapshot: Snapshot) -> None:
-        if self._changes(snapshot.transport, snapshot.recording, snapshot.live, at_once=not snapshot.transport.playing):
+        if self._changes(
+            snapshot.transport,
+            snapshot.recording,
+            snapshot.live,
+            snapshot.progress,
+            at_once=not snapshot.transport.playing,
+        ):
             self._state.content = panel("transport_state", json.dumps(state(snapshot)))
 
     def _asked(self, word: str) -> None:
@@ -101,7 +108,7 @@ def where(snapshot: Snapshot) -> str:
     """Frame, seconds into the recording, and the stamp in UTC; of a live source, why there is no way back."""
     recording, transport = snapshot.recording, snapshot.transport
     if recording is None:
-        return panel("quiet", "No recording is open.")
+        return panel("quiet", "No recording is open." if snapshot.progress is None else working(snapshot.progress))
     frame, stamp, rate = f"{transport.frame:,}", _utc(transport.stamp_ns), number(transport.frames_per_second, 1)
     if snapshot.live is not None:
         forward = "A live session only goes forward. To go back, record it (--record) and open the file."
@@ -114,6 +121,12 @@ def where(snapshot: Snapshot) -> str:
     seconds = number((transport.stamp_ns - recording.start_ns) * 1e-9)
     of, duration = f" of {recording.frames:,}", f" of {number(recording.duration_s, 1)} s"
     return panel("where", frame, of, seconds, duration, stamp, rate)
+
+
+def working(progress: Progress) -> str:
+    """What takes long, and how far it is."""
+    known = math.isfinite(progress.fraction)
+    return progress.title + (f" · {100 * min(max(progress.fraction, 0.0), 1.0):.0f} %" if known else " …")
 
 
 def _utc(stamp_ns: int) -> str:

@@ -37,7 +37,7 @@ class View:
 
     colour_by: str = LOOK
     point_size: float = 0.04
-    follow: bool = True
+    follow: bool = False
     ceilings: bool = False
     map: bool = True
     scan: bool = True

@@ -102,7 +102,7 @@ class Workbench:
             self._compare = ComparePanel(page, forks, self._sides)
         with tabs.add_tab("View", viser.Icon.EYE):
             self._appearance = AppearancePanel(gui, legend)
-            CameraPanel(page, self._scene.sample, self._appearance.look_freely)
+            CameraPanel(page, self._scene.framing, self._appearance.look_freely)
         with tabs.add_tab("Recording", viser.Icon.STETHOSCOPE):
             files.add_buttons()
             self._live = LivePanel(gui)
@@ -121,6 +121,7 @@ class Workbench:
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
         self._tuned_at = -_TUNING_S
+        self._more = 0
         self._now = now
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="workbench", daemon=True)
@@ -163,10 +164,10 @@ class Workbench:
         if tuned and drawn is not None:
             self._tuned_at = self._now()
         view = replace(view, tuning=self._now() - self._tuned_at < _TUNING_S)
-        if self._scene_due(current, view, at_once=tuned):
+        if self._scene_due(current, view, self._more, at_once=tuned):
             if current.result is not None and (drawn is None or drawn.result is None):
                 self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
-            self._scene.draw(current, view)
+            self._more += not self._scene.draw(current, view)
             self._drawn = current
         if self._legend_due(current, view):
             limits = self._scene.limits(view.colour_by)

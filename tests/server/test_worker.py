@@ -63,6 +63,13 @@ def engine(process: EngineProcess) -> EngineProcess:
     return process
 
 
+def test_from_the_first_moment_it_says_what_is_being_opened() -> None:
+    engine = EngineProcess(Setup(recording=Path("walk-3.mcap")), main=fakes.fake_main)
+    first = engine.snapshot
+    engine.close()
+    assert first.recording is None and first.progress is not None and "walk-3.mcap" in first.progress.title
+
+
 def test_everything_arrives_whole_and_read_only(engine: EngineProcess) -> None:
     engine.send(SetSpeed(float("inf")))
     engine.send(Play())

@@ -3,11 +3,14 @@
 Tests app/ui/camera.py, app/ui/shading.py.
 """
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from app.slam import lie
-from app.ui.camera import FOV, FRONT, SIDE, TOP, whole
+from app.ui.camera import FOV, FRONT, SIDE, TOP, Framing, extent, whole
 from app.ui.colours import INTENSITY, LOOK, Limits, PointSet, colours
 from app.ui.shading import light
 
@@ -17,7 +20,7 @@ HALL = RANDOM.uniform((-10, 5, 0), (50, 25, 6), (4000, 3))
 
 @pytest.mark.parametrize("way", ["fit", TOP, FRONT, SIDE])
 def test_all_of_a_hall_but_a_few_points_is_inside_the_picture(way: str) -> None:
-    stand = whole(np.concatenate((HALL, [[900.0, 0.0, 0.0]])), way)
+    stand = whole(extent(np.concatenate((HALL, [[900.0, 0.0, 0.0]]))), way)
     forward = stand.look_at - stand.position
     forward /= np.linalg.norm(forward)
     towards = HALL - stand.position
@@ -27,12 +30,16 @@ def test_all_of_a_hall_but_a_few_points_is_inside_the_picture(way: str) -> None:
 
 
 def test_from_above_one_looks_down_and_from_the_front_along_the_floor() -> None:
-    assert (s := whole(HALL, TOP)).position[2] - s.look_at[2] > 10 * np.linalg.norm((s.position - s.look_at)[:2])
-    assert (s := whole(HALL, FRONT)).position[2] - s.look_at[2] < 0.1 * np.linalg.norm((s.position - s.look_at)[:2])
+    assert (s := whole(extent(HALL), TOP)).position[2] - s.look_at[2] > 10 * np.linalg.norm(
+        (s.position - s.look_at)[:2]
+    )
+    assert (s := whole(extent(HALL), FRONT)).position[2] - s.look_at[2] < 0.1 * np.linalg.norm(
+        (s.position - s.look_at)[:2]
+    )
 
 
 def test_an_empty_map_is_looked_at_from_above_the_sensor() -> None:
-    assert whole(np.empty((0, 3))).position[2] > 2.0
+    assert whole(extent(np.empty((0, 3)))).position[2] > 2.0
 
 
 def plane(normal: int) -> np.ndarray:
@@ -52,10 +59,17 @@ def test_a_floor_is_as_bright_however_the_sensor_is_held() -> None:
     assert np.median(light(seen, turned)) == pytest.approx(np.median(light(plane(2), np.eye(4))), abs=0.01)
 
 
-def test_points_on_no_surface_are_darker_and_few_points_are_left_alone() -> None:
+def test_points_on_no_surface_are_darker_and_few_points_are_lit_alike() -> None:
     leaves = RANDOM.uniform(-1, 1, (3000, 3)).astype(np.float32)
     assert np.median(light(leaves, np.eye(4))) < np.median(light(plane(2), np.eye(4)))
-    assert (light(leaves[:5], np.eye(4)) == 1).all() and len(light(leaves[:0], np.eye(4))) == 0
+    assert len(set(light(leaves[:5], np.eye(4)))) == 1 and len(light(leaves[:0], np.eye(4))) == 0
+
+
+def test_a_wall_is_lit_evenly_however_far_it_is() -> None:
+    """Its points lie farther apart with distance, and so the cells grow."""
+    near = plane(1) * np.float32(0.5)
+    for distance in (1.0, 4.0, 20.0, 60.0):
+        assert np.ptp(np.percentile(light(near * np.float32(distance), np.eye(4)), (5, 95))) < 0.02
 
 
 def test_by_height_and_intensity_what_reflects_more_is_brighter_and_ground_is_tinted() -> None:
@@ -65,3 +79,70 @@ def test_by_height_and_intensity_what_reflects_more_is_brighter_and_ground_is_ti
     dull, shiny, ground = colours(cloud, LOOK, {LOOK: Limits(-1, 3), INTENSITY: Limits(0, 255)}).astype(int)
     assert (shiny > dull).all()
     assert ground[1] - ground[0] > shiny[1] - shiny[0], "towards teal"
+
+
+class Browser:
+    """A browser's camera, which is where it was put unless its user moves it."""
+
+    def __init__(self, position: np.ndarray) -> None:
+        self.client_id, self.camera = 1, SimpleNamespace(position=position, look_at=np.zeros(3), fov=FOV)
+
+    atomic = staticmethod(nullcontext)
+
+    def distance(self) -> float:
+        return float(np.linalg.norm(self.camera.position - self.camera.look_at))
+
+
+class Server:
+    def __init__(self) -> None:
+        self.initial_camera, self.browsers = SimpleNamespace(), dict[int, Browser]()
+
+    def get_clients(self) -> dict[int, Browser]:
+        return self.browsers
+
+
+@pytest.fixture
+def framed() -> tuple[Framing, Browser, Server]:
+    """A hall that one has begun to see, and a browser."""
+    server = Server()
+    framing = Framing(server)  # type: ignore[arg-type]
+    server.browsers[1] = Browser(server.initial_camera.position)
+    framing.see(HALL / 4, at_once=True)
+    framing.draw(np.zeros(3))
+    return framing, server.browsers[1], server
+
+
+def settle(framing: Framing) -> int:
+    """How many drawings cameras need until they rest."""
+    return next(n for n in range(100) if framing.draw(np.zeros(3)))
+
+
+def test_the_map_stays_in_the_picture_as_it_grows(framed: tuple[Framing, Browser, Server]) -> None:
+    framing, browser, server = framed
+    near = browser.distance()
+    assert browser.camera.position == pytest.approx(whole(extent(HALL / 4)).position)
+    framing.see(HALL, at_once=False)
+    assert settle(framing) > 5, "it glides"
+    assert browser.distance() == pytest.approx(4 * near, rel=0.05)
+    assert server.initial_camera.position == pytest.approx(browser.camera.position), "pages that open now"
+
+
+def test_who_moves_the_camera_keeps_it_until_he_asks_for_the_whole_map(framed: tuple[Framing, Browser, Server]) -> None:
+    framing, browser, _ = framed
+    browser.camera.position = browser.camera.position + 0.5
+    mine = browser.camera.position
+    framing.see(HALL, at_once=False)
+    settle(framing)
+    assert (browser.camera.position == mine).all()
+    framing.show(browser, TOP, np.zeros(3))  # type: ignore[arg-type]
+    assert browser.camera.look_at == pytest.approx(extent(HALL).middle)
+    framing.see(2 * HALL, at_once=False)
+    settle(framing)
+    assert browser.camera.position == pytest.approx(whole(extent(2 * HALL), TOP).position, rel=0.05)
+
+
+def test_following_looks_at_the_sensor_from_nearby(framed: tuple[Framing, Browser, Server]) -> None:
+    framing, browser, _ = framed
+    framing.show(browser, TOP, np.zeros(3))  # type: ignore[arg-type]
+    framing.follow()
+    assert (browser.camera.look_at == 0).all() and 5 < browser.distance() < 30

@@ -244,7 +244,7 @@ def test_of_keyframes_that_gave_their_points_away_no_node_is_left(
 def test_following_keeps_the_sensor_near_the_origin_and_leaves_the_camera_alone(drawn: Drawn, wire: Wire) -> None:
     for _ in range(60):
         drawn.engine.send(StepFrame(1))
-        drawn.draw()
+        drawn.draw(View(follow=True))
     root = next(
         m.position for m in reversed(wire.messages) if getattr(m, "name", "") == "/map" and hasattr(m, "position")
     )

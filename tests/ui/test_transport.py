@@ -6,12 +6,13 @@ Tests app/ui/transport.py.
 import html
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import viser
 
-from app.server.protocol import Command, Pause, Play, Seek, SetSpeed, StepFrame
+from app.server.protocol import Command, Pause, Play, Progress, Seek, SetSpeed, StepFrame
 from app.ui.transport import SPEEDS, TransportPanel, speed_name, where
 from tests.ui.conftest import Clock, Wire, page_of, user_sets
 from tests.ui.fake_engine import FakeEngine
@@ -50,6 +51,15 @@ def test_the_track_follows_the_frame_and_ends_at_the_last(transport: Transportin
     assert transport.shown["frame"] == 0
     transport.engine.send(StepFrame(7))
     assert (transport.shown["frame"], transport.shown["last"]) == (6, transport.engine.frames - 1)
+
+
+def test_before_a_recording_is_open_the_bar_says_that_it_is_being_opened_and_how_far(transport: Transporting) -> None:
+    transport.engine.publish(recording=None, progress=Progress.opening(Path("hall.mcap")))
+    assert "Opening hall.mcap …" in transport.shown["words"]
+    transport.engine.publish(progress=Progress("Compiling deskew", 0.25))
+    assert "Compiling deskew · 25 %" in transport.shown["words"]
+    transport.engine.publish(progress=None)
+    assert "No recording is open." in transport.shown["words"]
 
 
 @pytest.mark.parametrize(

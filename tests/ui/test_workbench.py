@@ -135,6 +135,8 @@ def test_long_work_shows_what_it_is_and_how_far(page: Page) -> None:
 def test_the_thread_outlives_a_snapshot_that_can_not_be_drawn(page: Page, caplog: pytest.LogCaptureFixture) -> None:
     import time
 
+    for _ in range(5):
+        page.draw(1.0)  # until it rests
     page.clock.now += 1000
     page.workbench.start()
     page.engine.publish(trajectory=np.zeros((3, 7)))
