@@ -39,8 +39,8 @@ def _garage() -> list[Line]:
     for factor in tqdm(odometry, desc=GARAGE.stem, unit=" poses", leave=False, disable=None):
         closing = [loop for loop in loops if loop.second == factor.second]
         begin = time.perf_counter()
-        graph.extend(factor)
-        graph.close(closing)
+        graph.do(factor)
+        graph.do(closing)
         times.append((time.perf_counter() - begin) * 1e3)
     factors = [*odometry, *loops]
     batch = optimise(first, factors, start)

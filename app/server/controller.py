@@ -252,7 +252,7 @@ class Controller:
     def _reopen(self) -> None:
         """Begin again with the present parameters. Notes and loop edits stay."""
         before, notes = self._need_session(), self._notes
-        info, edits = before.feed.info, Edits(*before.edits).cut(0, 0)
+        info, edits = before.feed.info, Edits(*before.edits)
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
         self._take(session)
         self._show_notes(notes)

@@ -120,13 +120,13 @@ class Detector:
 
     def describe(self, index: int) -> ScanContext:
         """The context of a keyframe, from the keyframes around it."""
-        return scan_context.describe(self._around(index, self._last(index)).points)
+        return scan_context.describe(self._around(index, self.last(index)).points)
 
     def context(self, index: int) -> ScanContext:
         return self._contexts[index] if index < self.described else self.describe(index)
 
     def submap(self, index: int) -> Prepared:
-        return self._prepared(index, self._last(index))
+        return self._prepared(index, self.last(index))
 
     def T_level_imu(self, index: int) -> F64:
         """(4, 4) from a keyframe's IMU frame to its level frame: a rotation."""
@@ -200,8 +200,8 @@ class Detector:
         distance = float(np.where(allowed, distances, np.inf).min())
         return Sighting(KeyframeId(0, older), KeyframeId(0, newer), distance)
 
-    def _last(self, index: int) -> int:
-        """The last keyframe of a submap."""
+    def last(self, index: int) -> int:
+        """The last keyframe of the submap about one."""
         return min(len(self) - 1, index + self.half)
 
     def _make(self, index: int, last: int) -> Submap:

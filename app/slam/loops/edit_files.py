@@ -10,10 +10,9 @@
     - solve: at once
 
 A loop is named by its older and its newer keyframe: an index, or `session/index` in another session than the first.
-`guess` is T_older_newer of the IMU frames; without it, the graph's
-present one is used. `register` is true by default. `solve: at once` takes the poses from all factors at once
-(Levenberg-Marquardt) instead of one after the other. Any entry may have `since`: the number of keyframes from which
-on it acts; by default it acts from the start.
+`guess` is T_older_newer of the IMU frames; without it, the place is searched from where odometry has it. `register` is
+true by default. `solve: at once` takes the poses from all factors at once
+(Levenberg-Marquardt) instead of one after the other.
 """
 
 import re
@@ -22,7 +21,7 @@ from dataclasses import dataclass, fields
 from typing import Annotated, Any, Final
 
 import yaml
-from pydantic import Field, Strict, TypeAdapter, ValidationError
+from pydantic import Strict, TypeAdapter, ValidationError
 
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
@@ -38,7 +37,6 @@ _AT_ONCE: Final = "at once"
 
 @dataclass
 class _Values:
-    since: Annotated[int, Strict(), Field(ge=0)] = 0
     weight: Annotated[float, Strict()] = 1.0
     register: Annotated[bool, Strict()] = True
     guess: tuple[tuple[float, ...], ...] | None = None
@@ -46,7 +44,6 @@ class _Values:
 
 _VALUES: Final = TypeAdapter(_Values)
 _MUST_BE: Final = {
-    "since": "a number of keyframes",
     "weight": "a number greater than 0",
     "register": "true or false",
     "guess": "a 4x4 matrix of numbers",
@@ -95,8 +92,7 @@ def _entry(edit: LoopEdit) -> dict[str, Any]:
     values = {name: getattr(edit, name) for name in _names(type(edit))}
     if guess := values.pop("guess", None):
         values["guess"] = [list(row) for row in guess]
-    since = {"since": since} if (since := values.pop("since")) else {}
-    return {verb: pair or _AT_ONCE} | values | since
+    return {verb: pair or _AT_ONCE} | values
 
 
 def _edit(entry: object) -> LoopEdit:
@@ -107,8 +103,11 @@ def _edit(entry: object) -> LoopEdit:
             f" {_AT_ONCE}`."
         )
     (verb,) = verbs
-    known = [name for name in _names(_VERBS[verb]) if name != "since"]
-    if unknown := sorted(str(name) for name in entry.keys() - {verb, "since", *known}):
+    entry = {
+        name: value for name, value in entry.items() if name != "since"
+    }  # older files hold it; it said nothing new
+    known = _names(_VERBS[verb])
+    if unknown := sorted(str(name) for name in entry.keys() - {verb, *known}):
         raise HemislamError(f"{verb} has no {unknown[0]}; it takes {' and '.join(known) or 'nothing else'}.")
     given = ({"weight": None} if verb == "weigh" else {}) | {name: entry[name] for name in entry if name != verb}
     try:

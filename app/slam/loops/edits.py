@@ -5,7 +5,7 @@ for it, so a list of edits can be given before the session begins.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,15 +15,8 @@ from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.types import LoopEdge, Origin, Pair, Verdict
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class _Edit:
-    """Attributes:
-    since: how many keyframes the session had when the edit was made, one more after its end. When a session is
-        repeated, the edit acts from there on; 0: from the start.
-    """
-
-    since: int = field(default=0, compare=False)
-
     @property
     def pair(self) -> Pair | None:
         """The loop that it edits; None: the graph as a whole."""
@@ -63,7 +56,7 @@ class Add(_PairEdit):
 
     Attributes:
         guess: (4, 4) T_older_newer of the IMU frames from which their submaps are registered;
-            None: as the graph has them now. Rows of numbers, so that edits can be compared.
+            None: as odometry and structure have them. Rows of numbers, so that edits can be compared.
         register: False takes the guess as it is.
     """
 
@@ -73,7 +66,7 @@ class Add(_PairEdit):
 
 @dataclass(frozen=True, slots=True)
 class Solve(_Edit):
-    """From here on, take the poses from all factors solved at once (Levenberg-Marquardt).
+    """Take the poses from all factors solved at once (Levenberg-Marquardt).
 
     They differ from the incremental ones where those only came near the optimum, and with a window.
     """
@@ -101,42 +94,24 @@ class Edits:
             raise HemislamError("There is no edit to redo.")
         return Edits((*self.done, self.undone[-1]), self.undone[:-1])
 
-    def cut(self, count: int, half: int) -> "Edits":
-        """The same after all keyframes but the first `count` were forgotten: edits go on acting.
-
-        Those that lost a keyframe (see `loses`) wait for another one.
-        """
-
-        def kept(edit: LoopEdit) -> LoopEdit:
-            return replace(edit, since=0 if loses(edit, count, half) else min(edit.since, count))
-
-        return Edits(tuple(map(kept, self.done)), tuple(map(kept, self.undone)))
-
 
 def rows(T: F64) -> tuple[tuple[float, ...], ...]:
     """A matrix as an edit holds it."""
     return tuple(tuple(float(value) for value in row) for row in np.asarray(T))
 
 
-def loses(edit: LoopEdit, count: int, half: int) -> bool:
-    """Whether an edit's submaps, of `half` keyframes on either side, reach beyond the first `count` keyframes."""
-    return edit.pair is not None and edit.pair[1] + half >= count
-
-
 def lay_over(
-    found: Mapping[Pair, LoopEdge], edits: Iterable[LoopEdit], made: Mapping[Add, LoopEdge], count: int
+    found: Mapping[Pair, LoopEdge], edits: Iterable[LoopEdit], made: Mapping[Add, LoopEdge]
 ) -> dict[Pair, LoopEdge]:
     """What was found, as it counts with the edits.
 
     Args:
-        made: the loops by hand; an Add without one waits for its keyframes. count: number of keyframes; loops by hand
-            beyond them do not count.
+        made: the loops by hand; an Add without one waits for its keyframes.
     """
     edges = dict(found)
     for edit in edits:
         if isinstance(edit, Add) and edit in made:
-            if edit.newer < count:
-                edges[edit.pair] = made[edit]
+            edges[edit.pair] = made[edit]
         elif edit.pair is not None and edit.pair in edges:
             edges[edit.pair] = _edited(edges[edit.pair], edit)
     return {pair: _standing(edges[pair], edges) for pair in sorted(edges)}

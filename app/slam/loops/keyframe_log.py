@@ -75,4 +75,4 @@ class Follower:
             self._cursor = replace(log.cursor, length=index)
             return None
         self._cursor = replace(log.cursor, length=index + 1)
-        return AddKeyframe(log.store[index], log[index].params, target.edits)
+        return AddKeyframe(log.store[index], log[index].params)

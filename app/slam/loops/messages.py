@@ -18,7 +18,7 @@ from app.slam.types import F64, Keyframe
 # --- to the back end -----------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class AddKeyframe:
-    """The next keyframe of the log, with its cloud, its parameters, and the edits that hold. Answered by `Added`.
+    """The next keyframe of the log, with its cloud, and its parameters. Answered by `Added`.
 
     If the back end has another keyframe at this index, it forgets that one and all later ones. Parameters that act
     on restart are read from the first keyframe.
@@ -26,7 +26,6 @@ class AddKeyframe:
 
     keyframe: Keyframe
     params: LoopsParams
-    edits: Edits = field(default_factory=Edits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,7 @@ class AskState:
 class ApplyEdit:
     """Add an edit to those of the target. One for a pair that does not exist yet waits for it. Answered by `LoopState`.
 
-    The reply holds the edit as it must be repeated: with `since`, and with the guess that was used.
+    The reply holds the edit as it must be repeated: with the guess that was used.
     """
 
     edit: LoopEdit
@@ -111,7 +110,6 @@ class LoopState:
         corrections: (count, 4, 4), T_map_odom at each keyframe: its T_map_imu is corrections[i] @ T_odom_imu.
         edges: all candidates as they count now, by keyframes.
         undo, redo: edits in force and taken back; the last of each is the next one.
-        acting: how many edits in force act already; one with a later `since` does not.
         notices: new since the last reply.
     """
 
@@ -121,7 +119,6 @@ class LoopState:
     edges: tuple[LoopEdge, ...]
     undo: tuple[LoopEdit, ...] = ()
     redo: tuple[LoopEdit, ...] = ()
-    acting: int = 0
     notices: tuple[str, ...] = ()
 
 

@@ -1,10 +1,10 @@
 """The graph of keyframe poses (paper 2.4, eq. 8), solved incrementally, and sound whatever the solver fails with.
 
-A list keeps every step that was done to the graph. To take a factor out, or to recover from an exception (after which
-gtsam's solver stays broken), the rest of the list is done again. The poses are a function of the list, to the last bit.
+The poses are a function of a list of steps, to the last bit. A list that goes on from the one before costs only what is
+new. Any other is done from its beginning, as is all after an exception, which leaves gtsam's solver broken.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +24,8 @@ class PoseGraph:
 
     def __init__(self, first: F64, window: int = 0) -> None:
         self._first, self._window = np.array(first, dtype=np.float64), window
+        self._asked: list[Step] = []  # of `follow`
+        self._failed: tuple[Closing, ...] = ()  # among them
         self._reset()
 
     def __len__(self) -> int:
@@ -36,44 +38,56 @@ class PoseGraph:
 
     @property
     def steps(self) -> tuple[Step, ...]:
+        """Those that were done, without what the solver failed with."""
         return tuple(self._steps)
 
-    def extend(self, odometry: Factor) -> tuple[Closing, ...]:
-        """Add the next pose by its odometry factor.
+    def follow(self, steps: Sequence[Step]) -> tuple[Closing, ...]:
+        """Do these steps from the start; those that are the same objects as before are not done again.
 
         Returns:
-            The factor if the solver failed with it; one with a large covariance takes its place.
+            All factors among them that the solver failed with; `do` says what became of each.
         """
-        return self._do(odometry)
+        known = len(self._asked)
+        if len(steps) < known or any(one is not other for one, other in zip(self._asked, steps, strict=False)):
+            known, self._failed = 0, ()
+            self._reset()
+        self._asked = list(steps)
+        for step in steps[known:]:
+            self._failed += self.do(step)
+        return self._failed
 
-    def close(self, factors: Sequence[Closing]) -> tuple[Closing, ...]:
-        """Add loops or position priors. Returns those that the solver failed with; they are not in the graph."""
-        return self._do(tuple(factors)) if factors else ()
+    def do(self, step: Factor | Sequence[Closing]) -> tuple[Closing, ...]:
+        """Add the next pose by its odometry factor, or loops and position priors of poses that are there.
 
-    def replay(self, steps: Iterable[Step]) -> tuple[Closing, ...]:
-        """Start again and do these steps. Returns the factors that the solver failed with."""
-        self._reset()
-        return tuple(failed for step in steps for failed in self._do(step))
-
-    def _reset(self) -> None:
-        self._steps: list[Step] = []
-        self._solver = Windowed(self._first, self._window) if self._window else Incremental(self._first)
-
-    def _do(self, step: Step) -> tuple[Closing, ...]:
+        Returns:
+            What the solver failed with. Loops and priors are left out then; odometry is replaced by a factor with a
+            large covariance.
+        """
+        if not isinstance(step, Factor):
+            step = tuple(step)
+        if not step:
+            return ()
         try:
             self._try(step)
             self._steps.append(step)
             return ()
         except (RuntimeError, ValueError, IndexError, ArithmeticError):  # gtsam's exceptions, and our own below
-            self.replay(self._steps)
+            done = self._steps
+            self._reset()
+            for before in done:
+                self.do(before)
         if isinstance(step, Factor):
             sound = np.isfinite(step.T_first_second).all()
             T = step.T_first_second if sound else np.eye(4)
-            self._do(replace(step, T_first_second=T, covariance=np.eye(6)))
+            self.do(replace(step, T_first_second=T, covariance=np.eye(6)))
             return (step,)
         if len(step) == 1:
             return step
-        return tuple(failed for factor in step for failed in self.close([factor]))
+        return tuple(failed for factor in step for failed in self.do([factor]))
+
+    def _reset(self) -> None:
+        self._steps: list[Step] = []
+        self._solver = Windowed(self._first, self._window) if self._window else Incremental(self._first)
 
     def _try(self, step: Step) -> None:
         self._solver.update(step)

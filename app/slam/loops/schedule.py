@@ -91,7 +91,6 @@ class LoopSchedule:
         self._client = client(self._log)
         self._params = self._start = params
         self._edits = Edits()
-        self._acting = 0  # how many of them act already
         self._finished = False
         self._at_end = False  # nothing takes effect before the results
         self._most_states = STATES
@@ -154,9 +153,7 @@ class LoopSchedule:
         self._reported = None
         if self._editing:
             self._forget_states()
-        else:  # states from before an edit began to act are of the past
-            self._states = {moment: state for moment, state in self._states.items() if state.acting == self._acting}
-        if self._wanted.count == 0 and not self._editing:
+        elif self._wanted.count == 0:
             self._states.setdefault(self._wanted, self._empty())
         self._ask_next()
         self._take_wanted()
@@ -313,10 +310,7 @@ class LoopSchedule:
         self._notices += state.notices
         if asked.edits:
             self._edits = Edits(state.undo, state.redo)
-            if state.count > len(self._log):
-                self._edits = self._edits.cut(len(self._log), self._start.submap_keyframes)
             self._forget_states()
-        self._acting = state.acting
         if self._log.keep(Cursor(asked.version, state.count)) < state.count:
             return  # of keyframes that were replaced since
         moment = Moment(state.count, state.finished)
@@ -342,7 +336,6 @@ class LoopSchedule:
         """Keep the first `count` keyframes."""
         if count < len(self._log):
             self._log.truncate(count)
-            self._edits = self._edits.cut(count, self._start.submap_keyframes)
             self._states = {moment: state for moment, state in self._states.items() if moment.count <= count}
 
     def _forget_states(self) -> None:

@@ -1,64 +1,195 @@
-"""Search for loops of keyframes: recognise places, judge each candidate, then compare candidates."""
+"""The search for loops: what each keyframe of a session brought. The user's edits have no part in it.
 
-from collections.abc import Callable
+Each keyframe appends to a history; going back means reading less of it. What is found with a keyframe depends only on
+the keyframes up to it, so it is looked for once. The search has a graph of its own, of the loops as they were found,
+which tells it where to look.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from app.slam.errors import HemislamError
 from app.slam.loops.detection import Detector
-from app.slam.loops.drift import Drift, expect
+from app.slam.loops.drift import Drift, Expectation, expect
+from app.slam.loops.edits import lay_over
+from app.slam.loops.factors import PositionPrior, odometry_factor
+from app.slam.loops.graph import Graph, Measured
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.support import placed, settle
 from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.loops.verdicts import judge
 from app.slam.sections import LoopsParams
-from app.slam.types import F64
+from app.slam.types import F64, Keyframe
 
 SURE_M = 0.3
 """If odometry knows its position better than this (standard deviation), one place that fits is enough."""
 
-Edges = dict[Pair, LoopEdge]
-
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Result of a search: contexts of the keyframes that had none, and candidates that are new or changed."""
+    """Result of a search: contexts from keyframe `first` on, which had none, and candidates, new or changed."""
 
+    first: int = 0
     contexts: tuple[ScanContext, ...] = ()
     updates: tuple[LoopEdge, ...] = ()
 
 
-def search(
-    detector: Detector,
-    keyframes: range,
-    found: Edges,
-    counting: Callable[[Edges], Edges],
-    poses: F64,
-    params: LoopsParams,
-) -> Found:
-    """Look for loops of some keyframes; those before the last that lack a context get one.
+class Search:
+    """Finds loops among the keyframes of one session. It keeps a thinned cloud of each on disk until `close`.
 
-    Args:
-        found: candidates so far. counting: returns them as they count with the user's edits.
-        poses: (k, 4, 4) T_map_imu.
+    Attributes:
+        start: parameters that act on restart. detector: holds the keyframes.
+        found: candidates with the first `len` keyframes, with their verdicts; changed in place.
+        finished: whether the session ends there. graph: without any edits.
     """
-    drift = Drift.of(params)
-    described, updates, now = detector.described, Edges(), len(detector) - 1
-    while detector.described < keyframes.stop:
-        detector.learn([detector.describe(detector.described)])
-    for newer in keyframes:
-        known = {**found, **updates}
-        accepted = [edge for edge in counting(known).values() if edge.verdict is Verdict.ACCEPTED]
-        expectation = expect(newer, poses, accepted, drift)
-        seen = []
-        for sighting in detector.look(newer, expectation, params):
-            seen.append(judge(sighting, detector, expectation, params))
-            if seen[-1].verdict is Verdict.CANDIDATE and seen[-1].evidence.gate_m < SURE_M:
-                break
-        fresh = {edge.pair: edge for edge in seen if edge.pair not in known}
-        updates.update(fresh)
-        if any(edge.verdict is Verdict.CANDIDATE for edge in fresh.values()):
-            counted = counting({**known, **fresh})
-            settled = settle(fresh, counted, detector.poses, drift, params, now)
-            settled = placed(settled, counted.values(), detector.poses, poses, detector.half)
+
+    def __init__(self) -> None:
+        self.start = LoopsParams()
+        self.detector = Detector(self.start)
+        self.found: dict[Pair, LoopEdge] = {}
+        self.finished = False
+        self._params: list[LoopsParams] = []  # with each keyframe
+        self._measured: list[Measured] = []
+        self._found: list[Found | None] = []  # with each; None until loops were looked for
+        self._ends: dict[int, Found] = {}  # found in addition where the session ended, by the number of keyframes
+        self.graph = Graph(np.eye(4), 0)
+
+    def __len__(self) -> int:
+        return len(self.detector)
+
+    @property
+    def known(self) -> int:
+        """Keyframes of the history, including those beyond the present one."""
+        return len(self._found)
+
+    @property
+    def measured(self) -> Sequence[Measured]:
+        """Of the first `len` keyframes."""
+        return self._measured[: len(self)]
+
+    @property
+    def solved(self) -> tuple[F64, dict[Pair, LoopEdge]]:
+        """(k, 4, 4) T_map_imu of the first `len` keyframes, and the loops as they count, without any edits."""
+        edges = lay_over(self.found, (), {})
+        poses = self.graph.solve(self.measured, edges, self.detector.poses)
+        return poses, self.graph.sound(edges)
+
+    def close(self) -> None:
+        self.detector.close()
+
+    def add(self, keyframe: Keyframe, params: LoopsParams, priors: tuple[PositionPrior, ...] = ()) -> None:
+        """Take the next keyframe, and look for loops of the newest one whose surroundings are complete.
+
+        If the history has the same keyframe next, nothing is computed again. Raises HemislamError if one is missing.
+
+        Args:
+            priors: what was measured of this keyframe alone.
+        """
+        index = len(self)
+        if keyframe.index != index:
+            raise HemislamError(f"Keyframe {keyframe.index} cannot follow on {index} keyframes; one is missing.")
+        self.go_to(index)
+        if not self._is_known(keyframe, params):
+            self.forget()
+            if not index:
+                self.detector.close()
+                self.start, self.detector = params, Detector(params)
+                self.graph = Graph(keyframe.T_odom_imu, params.window)
+            self.detector.take(keyframe)
+            before, after = self.detector.head(max(index - 1, 0)), self.detector.head(index)
+            odometry = odometry_factor(index, before, after, Drift.of(params)) if index else None
+            self._params.append(params)
+            self._measured.append(Measured(odometry, priors))
+            self._found.append(None)
+        self._next()
+
+    def finish(self) -> None:
+        """The session ends here: look for loops of the last keyframes too. `add` and `go_to` take that back."""
+        if self.finished or not len(self):
+            return
+        count = len(self)
+        if count not in self._ends:
+            self._ends[count] = self._look(range(self.detector.described, count))
+        self.finished = True
+        self._take(self._ends[count])
+
+    def go_to(self, count: int) -> None:
+        """Go to the state after `count` keyframes of the history. Raises HemislamError if it has fewer."""
+        if not 0 <= count <= self.known:
+            raise HemislamError(f"The loop search knows {self.known} keyframes and cannot go to {count}.")
+        if self.finished or count < len(self):
+            self.finished = False
+            found = [one for one in self._found[:count] if one is not None]
+            self.detector.stand(count, [context for one in found for context in one.contexts])
+            self.found = {edge.pair: edge for one in found for edge in one.updates}
+        while len(self) < count:
+            self._next()
+
+    def forget(self) -> None:
+        """Forget the history beyond the present keyframe."""
+        count = len(self)
+        for history in (self._params, self._measured, self._found):
+            del history[count:]
+        self._ends = {end: found for end, found in self._ends.items() if end <= count}
+        self.detector.forget()
+
+    def _is_known(self, keyframe: Keyframe, params: LoopsParams) -> bool:
+        """Whether the history has this keyframe next, with the same parameters."""
+        index = len(self)
+        if index == self.known or self._params[index] != params:
+            return False
+        known = self.detector.head(index)
+        return (
+            known.stamp_ns == keyframe.stamp_ns
+            and np.array_equal(known.T_odom_imu, keyframe.T_odom_imu)
+            and np.array_equal(known.covariance, keyframe.covariance, equal_nan=True)
+        )
+
+    def _next(self) -> None:
+        """Go to the next keyframe of the history, and look for loops if that was not done yet."""
+        index = len(self)
+        self.detector.go_on()
+        found = self._found[index]
+        if found is None:
+            complete = index - self.start.submap_keyframes
+            found = self._found[index] = self._look(range(max(complete, self.detector.described), complete + 1))
+        self._take(found)
+
+    def _take(self, found: Found) -> None:
+        self.detector.learn(found.contexts[self.detector.described - found.first :])
+        self.found.update((edge.pair, edge) for edge in found.updates)
+
+    def _look(self, keyframes: range) -> Found:
+        """Look for loops of some keyframes; those before the last that lack a context get one."""
+        detector, now = self.detector, len(self) - 1
+        params = self._params[now]
+        if not params.enabled or not keyframes:
+            return Found()
+        first, drift = detector.described, Drift.of(params)
+        while detector.described < keyframes.stop:
+            detector.learn([detector.describe(detector.described)])
+        poses, known = self.solved
+        updates: dict[Pair, LoopEdge] = {}
+        for newer in keyframes:
+            accepted = [edge for edge in known.values() if edge.verdict is Verdict.ACCEPTED]
+            expectation = expect(newer, poses, accepted, drift)
+            fresh = {edge.pair: edge for edge in self._judged(newer, expectation, params) if edge.pair not in known}
+            known, settled = known | fresh, list(fresh.values())
+            if any(edge.verdict is Verdict.CANDIDATE for edge in settled):
+                settled = settle(fresh, known, detector.poses, drift, params, now)
+                settled = placed(settled, known.values(), detector.poses, poses, detector.half)
             updates.update((edge.pair, edge) for edge in settled)
-    contexts = tuple(detector.context(index) for index in range(described, keyframes.stop))
-    return Found(contexts, tuple(updates.values()))
+            known.update(updates)
+        contexts = tuple(detector.context(index) for index in range(first, keyframes.stop))
+        return Found(first, contexts, tuple(updates.values()))
+
+    def _judged(self, newer: int, expectation: Expectation, params: LoopsParams) -> list[LoopEdge]:
+        """Candidates with a verdict on each alone."""
+        out: list[LoopEdge] = []
+        for sighting in self.detector.look(newer, expectation, params):
+            out.append(judge(sighting, self.detector, expectation, params))
+            if out[-1].verdict is Verdict.CANDIDATE and out[-1].evidence.gate_m < SURE_M:
+                break
+        return out

@@ -48,7 +48,6 @@ class LoopService:
     def add(self, request: AddKeyframe) -> Added:
         """Raises HemislamError if a keyframe before it is missing."""
         backend = self._backend
-        backend.load(request.edits)
         backend.go_to(min(request.keyframe.index, backend.known))
         backend.add(request.keyframe, request.params)
         return Added(len(backend))
@@ -77,7 +76,6 @@ class LoopService:
             edges=backend.edges,
             undo=backend.edits.done,
             redo=backend.edits.undone,
-            acting=len(backend.acting),
             notices=backend.take_notices(),
         )
 
@@ -126,5 +124,5 @@ def warm_up() -> None:
     context = scan_context.describe(thin)
     scan_context.shift_distances(context, context)
     graph, ends = PoseGraph(np.eye(4)), (KeyframeId(0, 0), KeyframeId(0, 1))
-    graph.extend(Factor(*ends, np.eye(4), np.eye(6)))
-    graph.close([Factor(*ends, np.eye(4), np.eye(6), robust=True)])
+    graph.do(Factor(*ends, np.eye(4), np.eye(6)))
+    graph.do([Factor(*ends, np.eye(4), np.eye(6), robust=True)])

@@ -8,7 +8,8 @@ import numpy as np
 from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.detection import WIDER, Detector, Sighting
-from app.slam.loops.drift import Expectation
+from app.slam.loops.drift import Drift, Expectation, expect
+from app.slam.loops.edits import Add
 from app.slam.loops.placing import Placement, place
 from app.slam.loops.plan import Window
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
@@ -46,13 +47,7 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
         )
         return edge(_imu(detector, older, newer, guess), np.eye(6), evidence, reason)
 
-    def deviation(T_level: F64) -> float:
-        return expectation.mahalanobis(older, _imu(detector, older, newer, T_level))
-
-    reach = WIDER * params.max_mahalanobis
-    window = Window(reach * sigma if sigma > SURE_M else 0.0, reach * np.sqrt(expectation.covariance(older)[2, 2]))
-    target, source = detector.both(older, newer)
-    found = place(target, source, guess, window, deviation, params.max_mahalanobis, params.max_slide)
+    found = _place(older, newer, detector, expectation, params)
     fit = found.fit
     evidence = replace(
         evidence,
@@ -67,16 +62,37 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
     return edge(T, covariance(detector, newer, fit, found.open), evidence, _objection(found, evidence, params))
 
 
-def by_hand(
-    older: KeyframeId, newer: KeyframeId, detector: Detector, T_older_newer: F64, *, register: bool
-) -> LoopEdge:
-    """A loop that the user proposes, registered from the given (4, 4) or taken as it is."""
-    guess = detector.T_level_imu(older) @ T_older_newer @ lie.inverse(detector.T_level_imu(newer))
+def _place(
+    older: KeyframeId, newer: KeyframeId, detector: Detector, expectation: Expectation, params: LoopsParams
+) -> Placement:
+    """Where the newer place lies on the older one, searched as far as odometry might be off."""
+
+    def deviation(T_level: F64) -> float:
+        return expectation.mahalanobis(older, _imu(detector, older, newer, T_level))
+
+    sigma = float(expectation.position_sigmas()[older])
+    reach = WIDER * params.max_mahalanobis
+    window = Window(reach * sigma if sigma > SURE_M else 0.0, reach * np.sqrt(expectation.covariance(older)[2, 2]))
+    guess = detector.guess(older, newer, expectation.poses)
+    return place(*detector.both(older, newer), guess, window, deviation, params.max_mahalanobis, params.max_slide)
+
+
+def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
+    """A loop that the user proposes, as registered from its guess; without one, as odometry and structure have it."""
+    older, newer = edit.older, edit.newer
+    poses = detector.poses
+    T_older_newer = np.array(edit.guess) if edit.guess else lie.inverse(poses[older]) @ poses[newer]
     both = detector.both(older, newer)
-    fit = assess(*both, refine(*both, align(*both, guess)) if register else guess)
+    guess = detector.T_level_imu(older) @ T_older_newer @ lie.inverse(detector.T_level_imu(newer))
+    if not edit.register:
+        fit = assess(*both, guess)
+    elif edit.guess:
+        fit = assess(*both, refine(*both, align(*both, guess)))
+    else:
+        fit = _place(older, newer, detector, expect(newer, poses, (), Drift.of(params)), params).fit
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
     reason = f"added manually: overlap {fit.overlap:.2f}, residual {fit.residual_rms * 1e3:.0f} mm"
-    T = _imu(detector, older, newer, fit.T_target_source) if register else T_older_newer
+    T = _imu(detector, older, newer, fit.T_target_source) if edit.register else T_older_newer
     sigma = covariance(detector, newer, fit)
     return LoopEdge(older, newer, newer, T, sigma, evidence, Verdict.ACCEPTED, reason, Origin.USER, edited=True)
 

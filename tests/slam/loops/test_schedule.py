@@ -111,17 +111,6 @@ def test_edits_given_without_waiting_are_applied_in_their_order(session: HeldSes
     assert session.loops.take_answers() == [Failure("There is no edit to undo.")]
 
 
-def test_keyframes_that_come_while_an_edit_is_applied_are_looked_at_with_it(session: HeldSession) -> None:
-    for _ in range(4):
-        session.step()
-    session.loops.command(ApplyEdit(Accept(0, 1)))
-    for _ in range(6):
-        session.step()
-    session.until_idle()
-    later = [request for request in session.worker.requests if getattr(request, "keyframe", None) is not None][2:]
-    assert later and all(getattr(request, "edits", None) == Edits((Accept(0, 1),)) for request in later)
-
-
 def test_results_hold_all_keyframes_whether_in_effect_or_not(session: HeldSession) -> None:
     for _ in range(20):
         session.step()
