@@ -18,7 +18,8 @@ from app.evaluation.measured import Evaluated, Outcome
 from app.slam.types import F64, STAGES, U16
 
 PALETTE = ("#2563eb", "#ea580c", "#16a34a", "#9333ea", "#dc2626", "#0891b2", "#ca8a04", "#db2777")
-TRUTH = "#111827"
+TRUTH = "var(--ink)"
+"""Of the page, light or dark."""
 _MOST_POINTS = 700
 _WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 560, 56, 14, 12, 40
 _TEMPLATES = Environment(
@@ -56,7 +57,10 @@ def chart(
     from_zero: bool = False,
     height: int = 300,
 ) -> Markup:
-    """Lines over axes. `equal`: the same scale on both axes, as for a map. `from_zero`: the y axis begins at 0."""
+    """Lines over axes, later ones thinner, so that those below them show.
+
+    `equal`: the same scale on both axes, as for a map. `from_zero`: the y axis begins at 0.
+    """
     x0, x1 = _range([line.x for line in lines])
     y0, y1 = _range([line.y for line in lines], from_zero=from_zero)
     right, bottom = _WIDTH - _RIGHT, height - _BOTTOM
@@ -118,11 +122,11 @@ def stacked(rows: Sequence[tuple[str, Sequence[float]]], parts: Sequence[str], u
     return Markup(render("bars.svg", rows=drawn))
 
 
-def density_image(counts: U16, brightest: float) -> str:
-    """Points per pixel as a PNG in a data URL, dark to bright on a logarithmic scale up to `brightest`."""
-    level = np.log1p(counts.astype(np.float64)) / np.log1p(max(brightest, 1.0))
+def density_image(counts: U16, densest: float) -> str:
+    """Points per pixel as a PNG in a data URL, light to dark on a logarithmic scale up to `densest`."""
+    level = np.log1p(counts.astype(np.float64)) / np.log1p(max(densest, 1.0))
     level = np.where(counts > 0, 0.25 + 0.75 * level, 0.0)  # a single point is visible too
-    stops = np.array([[13, 17, 33], [46, 69, 140], [72, 166, 180], [190, 227, 150], [255, 255, 240]])
+    stops = np.array([[255, 255, 255], [168, 200, 236], [84, 140, 210], [38, 78, 158], [12, 18, 58]])
     ramp = [np.interp(np.linspace(0, 1, 256), np.linspace(0, 1, 5), stops[:, channel]) for channel in range(3)]
     image = Image.fromarray(np.rint(255 * level.clip(0, 1)).astype(np.uint8))
     image.putpalette(np.rint(ramp).astype(np.uint8).T.tobytes())
@@ -152,7 +156,7 @@ Legend = list[tuple[str, str]]
 
 CROP_NOTE = (
     f"{2 * crops.HALF_M:g} × {2 * crops.HALF_M:g} m from above, from {crops.SLICE_M[0]:+g} to {crops.SLICE_M[1]:+g} m"
-    " relative to the sensor's height; brighter where more points are. Double or thick walls are errors."
+    " relative to the sensor's height; darker where more points are. Double or thick walls are errors."
 )
 
 
@@ -189,8 +193,6 @@ def pictures(recording: Evaluated, colour: dict[str, str]) -> Pictures:
 def _from_above(recording: Evaluated, colour: dict[str, str]) -> Figure | None:
     """All trajectories, in the truth's world if there is one."""
     lines, path = [], recording.truth_path
-    if path is not None:
-        lines.append(Line("truth", TRUTH, path[:, 0], path[:, 1], dashed=True))
     for outcome in recording.outcomes:
         places = None
         if outcome.accuracy is not None:
@@ -199,6 +201,8 @@ def _from_above(recording: Evaluated, colour: dict[str, str]) -> Figure | None:
             places = outcome.trajectory.positions
         if places is not None:
             lines.append(Line(outcome.name, colour[outcome.name], places[:, 0], places[:, 1]))
+    if path is not None:
+        lines.append(Line("truth", TRUTH, path[:, 0], path[:, 1], dashed=True))
     if not lines:
         return None
     return Figure(chart(lines, "x (m)", "y (m)", equal=True, height=420), "From above", [])
@@ -231,12 +235,12 @@ def _times(outcomes: list[Outcome], colour: dict[str, str]) -> list[Figure]:
 
 
 def _maps(recording: Evaluated) -> dict[str, list[tuple[str, str]]]:
-    """The same piece of every variant's map, equally bright."""
+    """The same piece of every variant's map, on one scale."""
     found = {}
     for place in crops.PLACES:
         pieces = {outcome.name: outcome.crops[place] for outcome in recording.outcomes if place in outcome.crops}
         filled = [counts[counts > 0] for counts in pieces.values() if counts.any()]
-        brightest = float(np.percentile(np.concatenate(filled), 99)) if filled else 1.0
+        densest = float(np.percentile(np.concatenate(filled), 99)) if filled else 1.0
         if pieces:
-            found[place] = [(name, density_image(counts, brightest)) for name, counts in pieces.items()]
+            found[place] = [(name, density_image(counts, densest)) for name, counts in pieces.items()]
     return found

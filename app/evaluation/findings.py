@@ -6,14 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.evaluation.measured import START_S, Evaluated
+from app.evaluation.variants import PAPER
 
 LIKE = 0.02
 """Two values that differ by less than this share count as equal."""
+MOST_TOLD = 5
+"""So many sentences stand at the top of a report."""
 MOST_NAMED = 4
 """Most recordings that are named when they differ; of more, only the number is given."""
 CHANCE = 2.0
 """A mean difference of fewer standard errors than this, over the recordings, may be chance."""
 
+_SAME = "stays the same"
 _CLAIMS = (
     ("FAST-LIO-GD", "FAST-LIO", "downsampling the ground"),
     ("FAST-LIO-L", "FAST-LIO", "closing loops"),
@@ -21,13 +25,61 @@ _CLAIMS = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Attributes:
+    size: share by which a value changes, 0 if that may be chance; inf where something went wrong.
+    own: it is about a variant of the user's.
+    """
+
+    text: str
+    size: float
+    own: bool = False
+
+
 def findings(recordings: Sequence[Evaluated]) -> list[str]:
-    """One sentence each; the claims of the paper first, then what is missing or went wrong."""
-    found = []
+    """One sentence each, the biggest difference first; every variant of the user's is among the first `MOST_TOLD`."""
+    found = _own(recordings) + _mishaps(recordings)
     for name, base, what in _CLAIMS:
         for metric in _METRICS:
             chosen = [recording for recording in recordings if recording.name.startswith(metric.where)]
-            found.append(_claim(chosen, name, base, what, metric))
+            difference = _difference(chosen, name, base, metric)
+            if difference is not None:
+                found.append(Finding(_claim(name, base, what, difference, metric), difference.size))
+    found.sort(key=lambda finding: -finding.size)
+    own = [finding for finding in found if finding.own][:MOST_TOLD]
+    others = [finding for finding in found if finding not in own]
+    first = sorted(own + others[: MOST_TOLD - len(own)], key=lambda finding: -finding.size)
+    return [finding.text for finding in first + [finding for finding in found if finding not in first]]
+
+
+def _own(recordings: Sequence[Evaluated]) -> list[Finding]:
+    """The user's variants against ours; those without a difference are named together."""
+    outcomes = {o.name: o for recording in recordings for o in recording.outcomes if o.run is not None}
+    names = [name for name in outcomes if name not in {variant.name for variant in PAPER}]
+    base = "Ours" if "Ours" in outcomes else next(iter(outcomes), "")
+    found, alike = [], []
+    for name in names:
+        if name == base:
+            continue
+        compared = [(metric, _difference(recordings, name, base, metric)) for metric in _OWN_METRICS]
+        told = [(metric, difference) for metric, difference in compared if difference is not None and difference.size]
+        if not told:
+            alike.append(name)
+            continue
+        words = "; ".join(f"the mean {metric.name} {difference.words}" for metric, difference in told)
+        size = max(difference.size for _, difference in told)
+        found.append(
+            Finding(f"{name} against {base} ({outcomes[name].meaning or 'as given'}): {words}.", size, own=True)
+        )
+    if alike:
+        found.append(Finding(f"{', '.join(alike)}: no difference from {base} that may not be chance.", 0.0, own=True))
+    return found
+
+
+def _mishaps(recordings: Sequence[Evaluated]) -> list[Finding]:
+    """What is missing or went wrong."""
+    found = []
     missing: dict[str, list[str]] = {}
     for recording in recordings:
         for outcome in recording.outcomes:
@@ -44,7 +96,7 @@ def findings(recordings: Sequence[Evaluated]) -> list[str]:
                 found.append(f"{who}: {sum(run['dropped'].values())} scans were dropped.")
     for text, names in missing.items():
         found.append(f"{text}." if len(names) == len(recordings) else f"{', '.join(names)}: {text}.")
-    return [sentence for sentence in found if sentence]
+    return [Finding(text, np.inf) for text in found]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +127,27 @@ _METRICS = (
 )
 
 
-def _claim(recordings: Sequence[Evaluated], name: str, base: str, what: str, metric: _Metric) -> str:
-    """`name` against `base`, over all recordings that have both; "" if none has."""
+_OWN_METRICS = (
+    _Metric("error (ATE)", _ATE, "m", ".3g"),
+    _Metric("CPU time per frame", _CPU, "ms", ".2f"),
+    _Metric("plane thickness", "map_sharpness/thickness", "m", ".3g"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Difference:
+    """Attributes:
+    words: how the mean of a metric differs. size: see `Finding`. against: it got worse. rest: where it rises.
+    """
+
+    words: str
+    size: float
+    against: bool
+    rest: str
+
+
+def _difference(recordings: Sequence[Evaluated], name: str, base: str, metric: _Metric) -> _Difference | None:
+    """`name` against `base`, over all recordings that have both; None if none has."""
     pairs = []
     for recording in recordings:
         outcomes = {outcome.name: outcome for outcome in recording.outcomes}
@@ -85,18 +156,26 @@ def _claim(recordings: Sequence[Evaluated], name: str, base: str, what: str, met
             if ours is not None and theirs is not None:
                 pairs.append((recording.name, ours, theirs))
     if not pairs:
-        return ""
+        return None
     ours, theirs = (float(np.mean([pair[k] for pair in pairs])) for k in (1, 2))
     verdict, against = _compare(ours, theirs)
-    sentence = f"{name} against {base} ({what}): the mean {metric.name} {verdict},"
-    sentence += f" {theirs:{metric.digits}} to {ours:{metric.digits}} {metric.unit}"
+    words = f"{verdict}, {theirs:{metric.digits}} to {ours:{metric.digits}} {metric.unit}"
+    certainty, rest = _certainty(pairs), ""
     worse = [pair[0] for pair in pairs if _compare(pair[1], pair[2])[1]]
     if len(pairs) > 1:
-        sentence += f" over {len(pairs)} recordings{_certainty(pairs)}"
+        words += f" over {len(pairs)} recordings{certainty}"
         where = ", ".join(worse) if len(worse) <= MOST_NAMED else f"{len(worse)} of them"
         where = "all" if len(worse) == len(pairs) else where
-        sentence += f"; it rises on {where}" if worse else ""
-    return sentence + ("; this goes against what the paper found." if against and metric.promised else ".")
+        rest = f"; it rises on {where}" if worse else ""
+    told = verdict != _SAME and "chance" not in certainty
+    return _Difference(words, abs(ours - theirs) / max(abs(theirs), 1e-9) if told else 0.0, against, rest)
+
+
+def _claim(name: str, base: str, what: str, difference: _Difference, metric: _Metric) -> str:
+    """What the paper says of `name` and what was found."""
+    sentence = f"{name} against {base} ({what}): the mean {metric.name} {difference.words}{difference.rest}"
+    surprising = difference.against and metric.promised
+    return sentence + ("; this goes against what the paper found." if surprising else ".")
 
 
 def _certainty(pairs: Sequence[tuple[str, float, float]]) -> str:
@@ -113,6 +192,6 @@ def _certainty(pairs: Sequence[tuple[str, float, float]]) -> str:
 def _compare(ours: float, theirs: float) -> tuple[str, bool]:
     """In words, and whether it got worse."""
     if abs(ours - theirs) <= LIKE * max(abs(theirs), 1e-9):
-        return "stays the same", False
+        return _SAME, False
     change = 100 * abs(ours - theirs) / theirs
     return (f"falls by {change:.0f} %", False) if ours < theirs else (f"rises by {change:.0f} %", True)

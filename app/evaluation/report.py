@@ -10,7 +10,7 @@ from typing import Any
 
 from app import __version__
 from app.evaluation.figures import CROP_NOTE, colours, pictures, render
-from app.evaluation.findings import findings
+from app.evaluation.findings import MOST_TOLD, findings
 from app.evaluation.job import GROUND_RANGES_M, code_digest
 from app.evaluation.measured import Evaluated
 from app.evaluation.tables import make_tables
@@ -32,7 +32,8 @@ def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
     shown = {
         "made_by": f"hemislam {__version__} on {machine['processor']}, {machine['cores']} cores, {machine['system']};"
         f" {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
-        "findings": found,
+        "findings": found[:MOST_TOLD],
+        "further": found[MOST_TOLD:],
         "tables": make_tables(recordings),
         "recordings": recordings,
         "variants": {o.name: o.missing or o.meaning or "as given" for o in outcomes},

@@ -84,3 +84,28 @@ def test_a_difference_that_recordings_do_not_share_may_be_chance() -> None:
 def test_a_difference_that_all_recordings_share_is_none_of_chance() -> None:
     text = about(said("indoor", [11.0, 11.1, 10.9], [10.0, 10.0, 10.0]), "error (ATE)")
     assert "(± 0.6 %, one standard error)" in text
+
+
+def walks(*variants: tuple[str, float, float]) -> list[Evaluated]:
+    """Three recordings with the same results: names of variants, errors (mm) and CPU times (ms)."""
+    outcomes = tuple(column(name, 1e-3 * error, cpu) for name, error, cpu in variants)
+    return [Evaluated(f"outdoor_{number}", Path("x"), "", outcomes) for number in range(3)]
+
+
+def test_the_biggest_difference_comes_first_and_what_went_wrong_before_it() -> None:
+    found = findings(walks(("FAST-LIO", 4.0, 3.0), ("FAST-LIO-GD", 3.0, 3.0), ("Ours", 1.0, 3.0)))
+    assert found[0].startswith("Ours against FAST-LIO") and "falls by 75 %" in found[0]
+    (first, *_) = recordings = walks(("FAST-LIO", 4.0, 3.0), ("Ours", 1.0, 3.0))
+    assert first.outcomes[0].run is not None
+    first.outcomes[0].run.update(lost=3, frames=400)
+    assert "lost in 3 of 400 frames" in findings(recordings)[0]
+
+
+def test_every_variant_of_the_user_s_is_among_the_first_five() -> None:
+    paper = [("FAST-LIO", 9.0, 9.0), ("FAST-LIO-GD", 5.0, 6.0), ("FAST-LIO-L", 3.0, 4.0), ("Ours", 1.0, 3.0)]
+    own = [("tight", 1.0, 2.7), ("loose", 1.01, 3.0), ("wide", 1.0, 3.01), ("odd", 1.2, 3.0)]
+    first = "\n".join(findings(walks(*paper, *own))[:5])
+    assert "odd against Ours (as given): the mean error (ATE) rises by 20 %" in first
+    assert "tight against Ours (as given): the mean CPU time per frame falls by 10 %" in first
+    assert "loose, wide: no difference from Ours that may not be chance." in first
+    assert "FAST-LIO" in first, "and the biggest of the others"

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app.evaluation.figures import Line, chart
 from app.evaluation.measured import Accuracy, Evaluated, Outcome, ratios
 from app.evaluation.report import write_report
+from app.evaluation.tables import _row
 from app.slam.types import TIMINGS
 
 LENGTH_M = 200.0
@@ -115,3 +117,16 @@ def test_it_is_said_that_cpu_time_is_of_whole_frames(folder: Path) -> None:
     assert rows(page, "Run time per frame")["CPU time per frame, mean (ms)"] == ["1.00"] * 3
     assert "CPU time is measured over whole frames" in page.split("## Run time per frame")[1].split("## ")[0]
     assert "CPU time is measured over whole frames" in page.split("## Stages")[1].split("## ")[0]
+
+
+def test_only_what_differs_by_more_than_its_uncertainty_is_highlighted() -> None:
+    assert _row("hall", "ATE", [0.0100, 0.0101, 0.0200], ".4f").best == (0, 1), "the first two are alike"
+    assert _row("hall", "ATE", [0.0100, 0.0101, None], ".4f").best == (), "and then there is nothing to see"
+    assert _row("hall", "median", [5.0, 5.2, 5.3], ".2f", like=0.05).best == (0, 1), "time differs from run to run"
+
+
+def test_a_curve_below_another_shows_beside_it() -> None:
+    line = np.arange(3.0)
+    svg = chart([Line(name, "red", line, line) for name in "abc"], "x", "y")
+    widths = [float(width) for width in re.findall(r'stroke-width="([\d.]+)"', svg)]
+    assert widths == sorted(widths, reverse=True) and widths[0] > widths[1] + 1 > widths[2] + 2
