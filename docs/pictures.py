@@ -73,6 +73,7 @@ def opened(browser: Browser, url: str, width: int, height: int) -> Iterator[Page
 
 
 def shoot(page: Page, name: str) -> None:
+    page.mouse.move(400, 300)  # away from what has a tooltip
     page.wait_for_timeout(3000)
     page.screenshot(path=IMAGES / f"{name}.png", timeout=PATIENCE_MS)
     print(name, flush=True)

@@ -85,6 +85,8 @@ _Path = Annotated[Path, PlainSerializer(lambda path: str(path.resolve()))]
 _Note = Annotated[
     Note, PlainValidator(lambda entry: Note(*entry)), PlainSerializer(lambda note: (note.frame, note.text))
 ]
+_Place = tuple[float, float, float]
+KeptView = tuple[_Place, _Place]
 Speed = Annotated[
     float,
     Field(ge=0.1),
@@ -101,6 +103,7 @@ class State:
     params: as chosen now. history: parameters by the frame from which they apply, ascending.
     edits: of loops, in force. undone: those that can be redone, the next one last. labels: edits of labels.
     truth: trajectory to compare with. notes: in the order in which they were made. speed: to play at.
+    views: where cameras stood that the user kept, and what they looked at, (x, y, z) each, m, in the map.
     """
 
     params: _Params
@@ -112,6 +115,7 @@ class State:
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     speed: Speed = 1.0
     labels: tuple[_LabelEdit, ...] = ()
+    views: tuple[KeptView, ...] = ()
 
 
 _OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)

@@ -206,6 +206,16 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
         """Add a note on the current frame to the session; the state lists them."""
         _send(engine, protocol.AddNote(body.text))
 
+    @router.put("/notes/{place}", status_code=202)
+    def edit_note(place: Index, body: NoteBody) -> None:
+        """Replace the text of the note with this place in the state's list."""
+        _send(engine, protocol.EditNote(place, _note(engine, place), body.text))
+
+    @router.delete("/notes/{place}", status_code=202)
+    def delete_note(place: Index) -> None:
+        """Delete the note with this place in the state's list."""
+        _send(engine, protocol.EditNote(place, _note(engine, place), ""))
+
     @router.get("/recordings")
     def recordings() -> list[str]:
         """The recordings and sessions that can be opened."""
@@ -239,6 +249,14 @@ def _send(engine: RunningEngine, command: Command) -> None:
     if not engine.snapshot.engine_alive and not isinstance(command, protocol.Restart | protocol.OpenRecording):
         raise HTTPException(503, "The engine's process has ended; the action `restart` starts it again.")
     engine.send(command)
+
+
+def _note(engine: RunningEngine, place: int) -> str:
+    """The text of the note with this place."""
+    notes = engine.snapshot.notes
+    if place >= len(notes):
+        raise HTTPException(404, f"There are {len(notes)} notes.")
+    return notes[place].text
 
 
 def _exported(engine: RunningEngine, name: str, background: BackgroundTasks) -> FileResponse:

@@ -103,6 +103,13 @@ def _joined(chunk: Chunk, after: Chunk, poses: F64) -> Chunk:
     return _at_level(joined, after.level) if after.level else joined
 
 
+def as_thin(chunk: Chunk, held: Chunk | None) -> Chunk:
+    """A chunk thinned as often as the one that it replaces, so that a changed label costs no other keyframe points."""
+    while held is not None and chunk.level < held.level:
+        chunk = coarser(chunk) if chunk.level < COARSEST_LEVEL else _chosen(chunk, np.empty(0, np.int64), EMPTY_LEVEL)
+    return chunk
+
+
 def coarser(chunk: Chunk) -> Chunk:
     """A chunk at the next level."""
     return _at_level(chunk, chunk.level + 1)

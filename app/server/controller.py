@@ -10,7 +10,7 @@ from typing import Any
 
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session import EFFECT, Session
-from app.mapping.session_file import SUFFIX, Note, SavedSession, SessionWriter, State, new_path, read_session
+from app.mapping.session_file import SUFFIX, KeptView, Note, SavedSession, SessionWriter, State, new_path, read_session
 from app.server import protocol
 from app.server.loop_commands import LoopCommands
 from app.server.player import Player
@@ -28,10 +28,15 @@ POLL_S = 0.02
 MOST_NOTES = 1000
 """Every page and every REST answer holds all of them."""
 
+MOST_VIEWS = 6
+"""Older ones are left out."""
+
 _AT_ONCE = protocol.OpenRecording | protocol.Restart | protocol.SetSpeed | protocol.SetBreakpoints
 """Commands that do not wait for the session that is being opened."""
 _OF_LABELS = protocol.EditLabels | protocol.UndoLabels
-_FOR_THE_FRAME = protocol.LoopCommand | _OF_LABELS | protocol.AddNote | protocol.CompareWith | protocol.Save
+_FOR_THE_FRAME = (
+    protocol.LoopCommand | _OF_LABELS | protocol.AddNote | protocol.KeepView | protocol.CompareWith | protocol.Save
+)
 """Commands that wait until a reopened session is at its frame."""
 
 
@@ -64,6 +69,7 @@ class Controller:
         self._open_session, self._resolve, self._session_folder = open_session, resolve, session_folder
         self._params = self._base = params  # with and without the user's changes
         self._notes: tuple[Note, ...] = ()
+        self._views: tuple[KeptView, ...] = ()
         self._resuming: SavedSession | None = None  # that is being repeated
         self._opening: Callable[[], None] | None = None  # opens the next session
         self._waiting: list[Command] = []  # until that session is at its frame
@@ -115,6 +121,8 @@ class Controller:
             ):
                 changed = (Note(self._notes[place].frame, text.strip()),) if text.strip() else ()
                 self._show_notes((*self._notes[:place], *changed, *self._notes[place + 1 :]))
+            case protocol.KeepView(view):
+                self._show_views((*self._views, view)[-MOST_VIEWS:])
             case protocol.SetParams(values):
                 self._set_params(self._params.with_values(values))
             case protocol.LoadParams(text):
@@ -156,6 +164,10 @@ class Controller:
     def _show_notes(self, notes: tuple[Note, ...]) -> None:
         self._notes = notes
         self._page.put(notes=notes, urgent=True)
+
+    def _show_views(self, views: tuple[KeptView, ...]) -> None:
+        self._views = views
+        self._page.put(views=views, urgent=True)
 
     def _show_params(self) -> None:
         """Show the parameters, and which of them wait for a restart."""
@@ -210,6 +222,7 @@ class Controller:
             undone=session.edits[1],
             truth=session.truth_path,
             notes=self._notes,
+            views=self._views,
             breakpoints=self._player.breakpoints,
             speed=self._page.transport.speed,
             labels=session.keyframes.edits,
@@ -250,12 +263,13 @@ class Controller:
         self._take(session)
 
     def _reopen(self) -> None:
-        """Begin again with the present parameters. Notes and loop edits stay."""
-        before, notes = self._need_session(), self._notes
+        """Begin again with the present parameters. Notes, kept views and loop edits stay."""
+        before, notes, views = self._need_session(), self._notes, self._views
         info, edits = before.feed.info, Edits(*before.edits)
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
         self._take(session)
         self._show_notes(notes)
+        self._show_views(views)
         if session.loops is not None and edits != Edits():
             session.edit_loops(edits.done, edits.undone)
 
@@ -283,6 +297,7 @@ class Controller:
         self._loops.clear()
         self._player.take(session)
         self._show_notes(saved.state.notes if saved is not None else ())
+        self._show_views(saved.state.views if saved is not None else ())
         self._resuming = None
         if saved is not None:
             self._writer.write(saved.frame, saved.state, ended=saved.ended)  # this process may die on the way there

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from app.mapping.truth import compared
-from app.server.chunks import within_budget
+from app.server.chunks import as_thin, within_budget
 from app.server.protocol import Chunk, Delta, Notice, OpenedRecording, Snapshot
 from app.server.setup import POINT_BUDGET
 from app.slam.frames import FRAME, READOUTS, as_table
@@ -95,7 +95,9 @@ class Fold:
     def _take_chunks(self, delta: Delta, now: Snapshot) -> None:
         held = self._chunks[: int(np.searchsorted(self._keyframes, delta.keep))]
         if delta.chunks:
-            held = tuple({chunk.index: chunk for chunk in (*held, *read_only(delta.chunks))}.values())
+            known = {chunk.index: chunk for chunk in held}
+            again = {chunk.index: as_thin(chunk, known.get(chunk.index)) for chunk in read_only(delta.chunks)}
+            held = tuple((known | again).values())
             sensor = self._poses[len(held) - 1] if now.result is None else now.result.T_map_imu
             held = within_budget(held, self._poses, sensor[:3, 3], self._point_budget)
         self._chunks = held

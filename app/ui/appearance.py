@@ -1,5 +1,6 @@
 """The controls of how the scene looks, and the legend that explains its colours."""
 
+from collections.abc import Callable
 from typing import Final
 
 import viser
@@ -11,7 +12,6 @@ from app.ui.widgets import View, choose_next, show
 _ACCENTS: Final = {False: (38, 166, 154), True: (13, 110, 102)}
 """On a dark and on a light background."""
 _LAYERS: Final = (
-    ("ceilings", "ceilings", "Hidden, you can look into a building from above. Ceilings labelled ground stay."),
     ("map", "map", "Points of the keyframes."),
     ("scan", "scan", "Points of the newest frame."),
     ("wedge", "seed wedge", "Where seeds are looked for: within α of straight down, on the M outermost lines."),
@@ -19,6 +19,8 @@ _LAYERS: Final = (
     ("path", "path, truth", "The sensor's trajectory, and the truth when it is loaded."),
     ("grid", "grid", "1 m cells on the ground below the sensor."),
 )
+
+_BY_ITSELF, _SHOWN, _HIDDEN = "hidden from above", "shown", "hidden"
 
 
 def apply_theme(gui: viser.GuiApi, *, light: bool) -> None:
@@ -28,11 +30,12 @@ def apply_theme(gui: viser.GuiApi, *, light: bool) -> None:
 class AppearancePanel:
     """Widgets whose values are the `View`; the engine does not know of them.
 
-    legend: what `templates/transport.js` copies into the scene.
+    above: whether a browser looks down from above. legend: what `templates/transport.js` copies into the scene.
     """
 
-    def __init__(self, gui: viser.GuiApi, legend: viser.GuiHtmlHandle) -> None:
+    def __init__(self, gui: viser.GuiApi, legend: viser.GuiHtmlHandle, above: Callable[[], bool]) -> None:
         default = View()
+        self._above = above
         self._legend = legend
         self._colour_by = gui.add_dropdown(
             "colour by", COLOUR_BY, initial_value=default.colour_by, hint="What colours mean. C: the next."
@@ -48,6 +51,11 @@ class AppearancePanel:
             "points (cm)", 0.5, 15.0, 0.5, 100 * default.point_size, hint="Diameter of the points drawn."
         )
         with gui.add_folder("Layers", expand_by_default=True):
+            self._ceilings = gui.add_dropdown(
+                "ceilings",
+                (_BY_ITSELF, _SHOWN, _HIDDEN),
+                hint="From above they would hide what is below them. Ceilings labelled ground always stay.",
+            )
             self._layers = {
                 name: gui.add_checkbox(text, getattr(default, name), hint=hint) for name, text, hint in _LAYERS
             }
@@ -64,6 +72,7 @@ class AppearancePanel:
             point_size=self._point_size.value / 100,
             follow=self._follow.value,
             light=self._light.value,
+            ceilings=self._ceilings.value == _SHOWN or (self._ceilings.value == _BY_ITSELF and not self._above()),
             **{name: layer.value for name, layer in self._layers.items()},
         )
 

@@ -8,8 +8,9 @@ from typing import Final
 import numpy as np
 import viser
 
+from app.server.protocol import KeepView, Snapshot
 from app.slam.types import F64
-from app.ui.widgets import Page, by_user
+from app.ui.widgets import Changes, Page, by_user
 
 FOV: Final = float(np.radians(60.0))
 _NARROW: Final = float(np.radians(2.0))
@@ -27,7 +28,6 @@ _WAYS: Final[dict[str, tuple[float, float, float]]] = {
     SIDE: (-1.0, 0.0, 0.05),
 }
 """From the map's middle towards the camera."""
-_MOST_KEPT: Final = 6
 _EASE: Final = 0.2
 """Share of the way to the newest extent of the map that cameras go per drawing, so that they glide as it grows."""
 _ARRIVED: Final = 0.01
@@ -159,7 +159,7 @@ class CameraPanel:
     def __init__(self, page: Page, framing: Framing, look_freely: Callable[[viser.ClientHandle], None]) -> None:
         gui = page.gui
         self._page, self._framing, self._look_freely = page, framing, look_freely
-        self._kept: list[Stand] = []
+        self._changes = Changes()
         ways = gui.add_button_group("camera", tuple(_WAYS), hint="The whole map, also while it grows; G does the same.")
         ways.on_click(by_user(self.look))
         self._parallel = gui.add_checkbox(
@@ -168,8 +168,10 @@ class CameraPanel:
         self._parallel.on_update(by_user(lambda _, client: self._go(client, self._stand(client))))
         keep = gui.add_button("Keep this view", icon=viser.Icon.BOOKMARK, color="gray")
         keep.on_click(by_user(lambda _, client: self._keep(client)))
-        self._list = gui.add_button_group("kept views", ("1",), visible=False, hint="Go back to a view that was kept.")
-        self._list.on_click(by_user(lambda name, client: self._go(client, self._kept[int(name) - 1])))
+        self._list = gui.add_button_group(
+            "kept views", ("1",), visible=False, hint="Go back to a view that was kept in this session."
+        )
+        self._list.on_click(by_user(lambda name, client: self._return(client, int(name) - 1)))
         gui.add_command("Frame the whole map", hotkey="G").on_trigger(
             lambda event: self.look(FIT, event.client) if event.client else None
         )
@@ -186,10 +188,23 @@ class CameraPanel:
         look_at = np.array(camera.look_at) - self._page.offset()
         return Stand(look_at + back, look_at)
 
+    def draw(self, snapshot: Snapshot) -> None:
+        """Offer the views that the session keeps."""
+        if self._changes(snapshot.views):
+            self._list.visible = bool(snapshot.views)
+            self._list.options = tuple(str(number + 1) for number in range(len(snapshot.views))) or ("1",)
+
     def _keep(self, client: viser.ClientHandle) -> None:
-        self._kept = [*self._kept, self._stand(client)][-_MOST_KEPT:]
-        self._list.options = tuple(str(number + 1) for number in range(len(self._kept)))
-        self._list.visible = True
+        stand = self._stand(client)
+        x, y, z = stand.position.tolist()
+        at_x, at_y, at_z = stand.look_at.tolist()
+        self._page.send(KeepView(((x, y, z), (at_x, at_y, at_z))))
+
+    def _return(self, client: viser.ClientHandle, number: int) -> None:
+        views = self._page.snapshot().views
+        if number < len(views):
+            self._look_freely(client)
+            self._go(client, Stand(*map(np.array, views[number])))
 
     def _go(self, client: viser.ClientHandle, stand: Stand) -> None:
         """Move a camera to a stand that is meant for the usual lens."""

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import viser
 
+from app.server.chunks import voxel_of_level
 from app.server.protocol import Chunk
 from app.slam.types import F32, F64, NON_GROUND, U8
 from app.ui.colours import BY_POSE, INTENSITY, MODES, Limits, PointSet, colours, grown
@@ -27,6 +28,7 @@ _LEAST_SHARE: Final = 0.004
 _FLATNESS_M: Final = 0.12
 """Most median deviation of the points overhead from their median height: treetops are rougher."""
 _MARGIN_M: Final = 0.25
+_SIZE_BY_GAP: Final = 0.5
 _SAMPLE: Final = 200
 """Points of each keyframe that say how large the map is."""
 Chosen: TypeAlias = npt.NDArray[np.bool_] | slice
@@ -92,7 +94,8 @@ class MapChunks:
         recolour = view.colour_by != seen.colour_by or limits != self._coloured
         self._view, self._coloured = view, limits
         for index, (drawn, chunk) in enumerate(zip(self._drawn, chunks, strict=True)):
-            if index >= known or chunk is not drawn.chunk or view.ceilings != seen.ceilings:
+            roofed = view.ceilings != seen.ceilings and self._roofed(chunk, self._T_map_imu[index])
+            if index >= known or chunk is not drawn.chunk or roofed:
                 if chunk is not drawn.chunk:
                     drawn.chunk = chunk
                     drawn.light = light(chunk.points, self._T_map_imu[index] @ chunk.T_imu_lidar)
@@ -102,7 +105,7 @@ class MapChunks:
                 if moved[index]:
                     place(drawn.handle, T @ chunk.T_imu_lidar)
                 if view.map_point_size != seen.map_point_size or view.map != seen.map:
-                    drawn.handle.point_size, drawn.handle.visible = view.map_point_size, view.map
+                    drawn.handle.point_size, drawn.handle.visible = self._size(chunk), view.map
                 if recolour or (moved[index] and view.colour_by in BY_POSE):
                     drawn.handle.colors = self._colours(self._shown(drawn, T))
 
@@ -168,10 +171,19 @@ class MapChunks:
             f"{self._root}/{drawn.chunk.index}",
             cloud.points,
             self._colours(cloud),
-            self._view.map_point_size,
+            self._size(drawn.chunk),
             cloud.T_map_lidar,
             visible=self._view.map,
         )
+
+    def _size(self, chunk: Chunk) -> float:
+        """m: points that are far apart, because they were thinned, are drawn larger, so that surfaces stay closed."""
+        gap = voxel_of_level(chunk.level) if chunk.level else 0.0
+        return self._view.map_point_size * max(1.0, _SIZE_BY_GAP * gap / self._view.point_size)
+
+    @staticmethod
+    def _roofed(chunk: Chunk, T_map_imu: F64) -> bool:
+        return not isinstance(shown_points(chunk, T_map_imu @ chunk.T_imu_lidar, ceilings=False), slice)
 
     def _colours(self, cloud: PointSet) -> U8:
         return colours(cloud, self._view.colour_by, self.limits)
@@ -184,11 +196,11 @@ def shown_points(chunk: Chunk, T_map_lidar: F64, ceilings: bool) -> Chosen:
 
 
 def _same(drawn: Chunk, chunk: Chunk) -> bool:
-    """Whether one is the other, or what it has become: thinned, or with another keyframe's points added."""
+    """Whether one is the other, or what it has become: thinned, relabelled, or with another keyframe's points added."""
     if drawn is chunk:
         return True
     return (drawn.index, drawn.frame, drawn.stamp_ns) == (chunk.index, chunk.frame, chunk.stamp_ns) and (
-        drawn.level + drawn.joined < chunk.level + chunk.joined
+        drawn.level + drawn.joined <= chunk.level + chunk.joined
     )
 
 

@@ -30,6 +30,7 @@ from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.readouts import ReadoutPanel
+from app.ui.scale import FromAbove, ScaleBars
 from app.ui.scene import Scene
 from app.ui.status import DoctorPanel, HeaderPanel, NoticePanel
 from app.ui.study import StudyPanel
@@ -79,7 +80,7 @@ class Workbench:
         page = Page(server, engine.send, lambda: engine.snapshot, now, lambda: self._scene.offset)
 
         prepare_page(gui)
-        self._header = HeaderPanel(gui)
+        self._header, self._scale = HeaderPanel(gui), ScaleBars(page)
         self._transport, self._timeline = TransportPanel(page), TimelinePanel(page)
         legend = gui.add_html("")
         files = FilesPanel(page, folders, results)
@@ -101,8 +102,8 @@ class Workbench:
         with tabs.add_tab("A/B", viser.Icon.GIT_COMPARE):
             self._compare = ComparePanel(page, forks, self._sides)
         with tabs.add_tab("View", viser.Icon.EYE):
-            self._appearance = AppearancePanel(gui, legend)
-            CameraPanel(page, self._scene.framing, self._appearance.look_freely)
+            self._appearance = AppearancePanel(gui, legend, FromAbove(server))
+            self._camera = CameraPanel(page, self._scene.framing, self._appearance.look_freely)
         with tabs.add_tab("Recording", viser.Icon.STETHOSCOPE):
             files.add_buttons()
             self._live = LivePanel(gui)
@@ -116,7 +117,7 @@ class Workbench:
 
         self._panels = (
             self._transport, self._breakpoints, self._notes, self._notices, self._header, self._recent, self._timeline,
-            self._readouts, self._doctor, self._live, self._files,
+            self._readouts, self._doctor, self._live, self._files, self._camera,
         )  # fmt: skip
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
@@ -157,6 +158,7 @@ class Workbench:
         self._study.draw(current, view)
         for panel in self._panels:
             panel.draw(current)
+        self._scale.draw()
 
     def _draw_scene(self, current: Snapshot, view: View) -> None:
         drawn = self._drawn

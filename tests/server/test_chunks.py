@@ -131,6 +131,20 @@ def test_keyframes_that_are_shown_again_are_as_they_were_and_within_the_budget()
     assert session.show(120) == every[:120], "levels never fall"
 
 
+def test_labels_that_are_changed_over_and_over_make_the_map_no_coarser() -> None:
+    session = Session(50_000)
+    for _ in range(300):
+        session.add()
+    before = session.show(300)
+    for keyframe in (0, 5, 299, 5):
+        session.page.show_again(keyframe)
+        after = session.show(300)
+        assert [one.level for one in after] == [one.level for one in before]
+        assert (
+            np.array_equal(after[keyframe].points, before[keyframe].points) and after[keyframe] is not before[keyframe]
+        )
+
+
 def test_a_reader_far_behind_gets_some_clouds_at_a_time() -> None:
     session = Session(10**9)
     for _ in range(3 * CHUNKS_AT_ONCE):

@@ -152,6 +152,14 @@ def test_a_note_stays_with_its_frame(site: Site) -> None:
         assert time.monotonic() < deadline
     assert notes[-1] == {"frame": 9, "text": "the door opens"}
     assert httpx.post(site.url("/api/notes"), json={"text": ""}).status_code == 422
+    there = f"/api/notes/{len(notes) - 1}"
+    assert httpx.put(site.url(there), json={"text": "it closes"}).status_code == 202
+    while httpx.get(site.url("/api/state")).json()["notes"][-1:] != [{"frame": 9, "text": "it closes"}]:
+        assert time.monotonic() < deadline
+    assert httpx.delete(site.url(there)).status_code == 202
+    while len(httpx.get(site.url("/api/state")).json()["notes"]) == len(notes):
+        assert time.monotonic() < deadline
+    assert httpx.delete(site.url("/api/notes/999")).status_code == 404
 
 
 def test_an_edit_that_has_no_effect_is_noticed(site: Site) -> None:

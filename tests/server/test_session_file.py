@@ -35,6 +35,7 @@ from app.sensors.presets import resolve_params
 from app.server.controller import MOST_NOTES, Controller
 from app.server.protocol import (
     AddNote,
+    KeepView,
     OpenRecording,
     Pause,
     Play,
@@ -154,10 +155,13 @@ class Kept(Bench):
         return path
 
 
+VIEW = ((1.0, 2.0, 30.5), (0.0, 0.0, 0.0))
+
+
 def walk_about(bench: Kept) -> Snapshot:
     """On, back, other parameters, on, and one last wish that no frame has seen yet."""
     bench.do(Seek(30), SetParams({"ground.sigma": 0.02}), Seek(60), Seek(45), SetParams({"scan.voxel_size": 0.6}))
-    bench.do(Seek(80), Seek(70), AddNote("a turn"))
+    bench.do(Seek(80), Seek(70), AddNote("a turn"), KeepView(VIEW))
     return bench.do(StepFrame(2), SetParams({"ground.alpha": 35.0}))
 
 
@@ -170,6 +174,7 @@ def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path)
     assert again.trajectory is not None and there.trajectory is not None
     np.testing.assert_array_equal(again.trajectory, there.trajectory)
     assert again.notes == there.notes == (Note(70, "a turn"),)
+    assert again.views == there.views == (VIEW,)
     assert again.result is not None and there.result is not None
     np.testing.assert_array_equal(again.result.cloud.labels, there.result.cloud.labels, "relabelled by the last wish")
     third = Kept(tmp_path, second.session_file)  # the one reopened is kept as well

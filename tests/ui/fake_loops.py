@@ -222,7 +222,7 @@ class LoopEngine(FakeEngine):
                 edges[pair] = replace(edges[pair], weight=command.weight)
             else:
                 verdict = Verdict.ACCEPTED if isinstance(command, Accept) else Verdict.REJECTED
-                reason = f"{verdict} manually; found {edges[pair].verdict}: {edges[pair].reason}"
+                reason = f"{verdict} manually; the search had {edges[pair].verdict} it: {edges[pair].reason}"
                 edges[pair] = replace(edges[pair], verdict=verdict, edited=True, reason=reason)
         return tuple(edges[pair] for pair in sorted(edges))
 

@@ -1,6 +1,6 @@
 """Where cameras stand and how points are lit.
 
-Tests app/ui/camera.py, app/ui/shading.py.
+Tests app/ui/camera.py, app/ui/scale.py, app/ui/shading.py.
 """
 
 from contextlib import nullcontext
@@ -8,11 +8,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import viser
 
+from app.server.protocol import Command, KeepView, Snapshot
 from app.slam import lie
-from app.ui.camera import FOV, FRONT, SIDE, TOP, Framing, extent, whole
+from app.ui.camera import FOV, FRONT, SIDE, TOP, CameraPanel, Framing, extent, whole
 from app.ui.colours import INTENSITY, LOOK, Limits, PointSet, colours
+from app.ui.scale import FromAbove, bar, scale_html
 from app.ui.shading import light
+from tests.ui.conftest import page_of
 
 RANDOM = np.random.default_rng(3)
 HALL = RANDOM.uniform((-10, 5, 0), (50, 25, 6), (4000, 3))
@@ -101,8 +105,11 @@ class Server:
         return self.browsers
 
 
+Framed = tuple[Framing, Browser, Server]
+
+
 @pytest.fixture
-def framed() -> tuple[Framing, Browser, Server]:
+def framed() -> Framed:
     """A hall that one has begun to see, and a browser."""
     server = Server()
     framing = Framing(server)  # type: ignore[arg-type]
@@ -117,7 +124,7 @@ def settle(framing: Framing) -> int:
     return next(n for n in range(100) if framing.draw(np.zeros(3)))
 
 
-def test_the_map_stays_in_the_picture_as_it_grows(framed: tuple[Framing, Browser, Server]) -> None:
+def test_the_map_stays_in_the_picture_as_it_grows(framed: Framed) -> None:
     framing, browser, server = framed
     near = browser.distance()
     assert browser.camera.position == pytest.approx(whole(extent(HALL / 4)).position)
@@ -127,7 +134,7 @@ def test_the_map_stays_in_the_picture_as_it_grows(framed: tuple[Framing, Browser
     assert server.initial_camera.position == pytest.approx(browser.camera.position), "pages that open now"
 
 
-def test_who_moves_the_camera_keeps_it_until_he_asks_for_the_whole_map(framed: tuple[Framing, Browser, Server]) -> None:
+def test_who_moves_the_camera_keeps_it_until_he_asks_for_the_whole_map(framed: Framed) -> None:
     framing, browser, _ = framed
     browser.camera.position = browser.camera.position + 0.5
     mine = browser.camera.position
@@ -141,8 +148,49 @@ def test_who_moves_the_camera_keeps_it_until_he_asks_for_the_whole_map(framed: t
     assert browser.camera.position == pytest.approx(whole(extent(2 * HALL), TOP).position, rel=0.05)
 
 
-def test_following_looks_at_the_sensor_from_nearby(framed: tuple[Framing, Browser, Server]) -> None:
+def test_following_looks_at_the_sensor_from_nearby(framed: Framed) -> None:
     framing, browser, _ = framed
     framing.show(browser, TOP, np.zeros(3))  # type: ignore[arg-type]
     framing.follow()
     assert (browser.camera.look_at == 0).all() and 5 < browser.distance() < 30
+
+
+def test_a_view_is_kept_in_the_session_and_gone_back_to(server: viser.ViserServer, framed: Framed) -> None:
+    framing, browser, _ = framed
+    browser.camera.position, browser.camera.look_at = np.array([3.0, 4.0, 20.0]), np.array([3.0, 0.0, 1.0])
+    sent: list[Command] = []
+    kept = ((3.0, 4.0, 20.0), (3.0, 0.0, 1.0))
+    panel = CameraPanel(page_of(server, sent.append, lambda: Snapshot(views=(kept,))), framing, lambda _: None)
+    panel._keep(browser)  # type: ignore[arg-type]
+    assert sent == [KeepView(kept)]
+    panel.draw(Snapshot(views=(kept, kept)))
+    assert panel._list.visible and panel._list.options == ("1", "2")
+    browser.camera.position = np.zeros(3)
+    panel._return(browser, 0)  # type: ignore[arg-type]
+    assert browser.camera.position == pytest.approx(kept[0]) and browser.camera.look_at == pytest.approx(kept[1])
+    panel.draw(Snapshot())
+    assert not panel._list.visible, "in another session"
+
+
+@pytest.mark.parametrize(("seen_m", "bar_m"), [(100.0, 10.0), (40.0, 5.0), (6.4, 1.0), (1.3, 0.2), (4000.0, 500.0)])
+def test_the_scale_bar_is_a_round_length_that_fits(seen_m: float, bar_m: float) -> None:
+    assert bar(seen_m) == pytest.approx(bar_m)
+    assert 0.06 < bar(seen_m) / seen_m <= 0.16
+
+
+def test_the_bar_measures_the_middle_of_the_picture_and_the_needle_points_along_x() -> None:
+    down = scale_html(np.array([0.0, -1e-3, 50.0]), np.zeros(3), FOV)  # 57.7 m are seen, y is up in the picture
+    assert ">5 m<" in down and "width:8.7vh" in down and "rotate(90)" in down
+    assert "rotate(0)" in scale_html(np.array([-30.0, 0.0, 1.0]), np.zeros(3), FOV), "looking along x, it is ahead"
+
+
+def test_ceilings_go_where_one_looks_from_above_and_come_back_inside() -> None:
+    server = Server()
+    above = FromAbove(server)  # type: ignore[arg-type]
+    assert above(), "so that a map opens without them"
+    seen = []
+    for degrees in (60, 15, 5, 15, 30):
+        back = np.array([np.cos(np.radians(degrees)), 0.0, np.sin(np.radians(degrees))])
+        server.browsers[1] = Browser(9 * back)
+        seen.append(above())
+    assert seen == [True, True, False, False, True], "not to and fro in between"

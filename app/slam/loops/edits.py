@@ -6,6 +6,7 @@ for it, so a list of edits can be given before the session begins.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -145,6 +146,13 @@ def in_words(edit: LoopEdit) -> str:
     return f"{type(edit).__name__} {pair[0]}-{pair[1]}" if pair else type(edit).__name__
 
 
+_FOUND: Final = {
+    Verdict.ACCEPTED: "accepted it",
+    Verdict.REJECTED: "rejected it",
+    Verdict.CANDIDATE: "left it undecided",
+}
+
+
 def _edited(edge: LoopEdge, edit: LoopEdit) -> LoopEdge:
     edge = replace(edge, represented_by=None, repeats=None)  # what the user has a word on is in the graph itself
     if isinstance(edit, SetWeight):
@@ -154,7 +162,7 @@ def _edited(edge: LoopEdge, edit: LoopEdit) -> LoopEdge:
     verdict = Verdict.ACCEPTED if isinstance(edit, Accept) else Verdict.REJECTED
     if verdict is edge.verdict:
         return replace(edge, edited=True)
-    reason = f"{verdict} manually; found {edge.verdict}: {edge.reason}"
+    reason = f"{verdict} manually; the search {_FOUND[edge.verdict]}: {edge.reason}"
     return replace(edge, verdict=verdict, edited=True, reason=reason)
 
 

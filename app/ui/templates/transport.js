@@ -210,8 +210,7 @@ const watch = (name, act) => {
   act();
 };
 new MutationObserver(paint).observe(document.documentElement, {attributes: true});
-watch('.hs-legend-data', () => {
-  dock.querySelector('.hs-legend').innerHTML = document.querySelector('.hs-legend-data').innerHTML;
-});
+for (const name of ['.hs-legend', '.hs-scale'])
+  watch(name + '-data', () => { dock.querySelector(name).innerHTML = document.querySelector(name + '-data').innerHTML; });
 watch('.hs-tl-data', read); watch('.hs-state', show); unfold(localStorage.getItem('hemislam-diagnostics') === 'open');
 settle();

@@ -42,7 +42,8 @@ if (!window.hemislamSay) {
     const scene = document.querySelector('canvas[data-engine]').getBoundingClientRect(), box = tip.getBoundingClientRect();
     if (scene.width < box.width + 16 || (box.left >= scene.left && box.right <= scene.right)) return;
     const aside = box.left > scene.left ? scene.right - 8 - box.right : scene.left + 8 - box.left;
-    tip.style.translate = `${aside}px ${box.height / 2 + 18}px`;
+    const dock = document.querySelector('body > * > .hs-dock'), room = (dock ? dock.getBoundingClientRect().top : innerHeight) - 8;
+    tip.style.translate = `${aside}px ${Math.min(box.height / 2 + 18, room - box.bottom)}px`;
   };
   new MutationObserver(() => {
     for (const tip of document.getElementsByClassName('mantine-Tooltip-tooltip')) {
