@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 
 from app import TEMPORARY_KERNEL_CACHE, __version__
 from app.cli import options
+from app.cli.calibrate import calibrate
 from app.cli.evaluate import evaluate
 from app.cli.feed import feed
 from app.cli.replay import replay
@@ -90,6 +91,7 @@ def hemislam(
 cli.command()(serve)
 cli.command()(run)
 cli.command()(replay)
+cli.command()(calibrate)
 cli.command()(evaluate)
 cli.command()(feed)
 
@@ -118,6 +120,7 @@ def info(
     from app.sensors.doctor import DAMAGE, examine
 
     params = params_for(recording)
+    options.say_calibrated(recording)
     with options.progress_bar("Reading", total=1.0, bar_format="{desc}: {percentage:3.0f}% |{bar}|") as show:
         findings = examine(recording, params, progress=show)
     width = max((len(finding.subject) for finding in findings), default=0)

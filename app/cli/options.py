@@ -70,6 +70,14 @@ def resolve(
     return resolve_params(recording, preset, config, [*(assignments or []), *flags])
 
 
+def say_calibrated(recording: Path) -> None:
+    """Say that a calibration beside the recording is in force, if there is one."""
+    from app.sensors.presets import calibrated_beside
+
+    if sentence := calibrated_beside(recording):
+        typer.echo(sentence)
+
+
 ParamsFor = Callable[[Path | None], "Params"]
 """Gives the parameters of a recording. Raises HemislamError as `resolve`."""
 

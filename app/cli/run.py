@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import Duration, ParamsFor, RecordingPath, Start, Truth, progress_bar, with_params
+from app.cli.options import Duration, ParamsFor, RecordingPath, Start, Truth, progress_bar, say_calibrated, with_params
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ def run(
     from app.slam.trajectory import truth_beside
 
     params = params_for(recording)
+    say_calibrated(recording)
     edits = _read_edits(loops) if loops else ()
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)

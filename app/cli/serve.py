@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from app.cli.options import Duration, ParamsFor, Start, Truth, with_params
+from app.cli.options import Duration, ParamsFor, Start, Truth, say_calibrated, with_params
 from app.slam.errors import HemislamError
 
 
@@ -127,6 +127,7 @@ def serve(
     params = session.state.params if session else params_for(recording)
     if recording is not None:
         opened = session.opened.recording if session else recording
+        say_calibrated(opened)
         open_recording(opened, params).close()  # a mistake is reported here, not in the page
     if truth is not None:
         read_poses(truth)

@@ -89,9 +89,24 @@ def preset_for(kind: str, probe: Probe) -> str:
     return next((name for name, look in _LOOKS.items() if look.fits(kind, probe)), "")
 
 
+CALIBRATED = "# Written by `hemislam calibrate`"
+"""How a parameter file begins that nobody wrote by hand."""
+
+
 def sidecar(recording: Path) -> Path:
     """Where a recording's own parameters would be: `<stem>.params.yaml` beside it."""
     return recording.parent / f"{recording.name if recording.is_dir() else recording.stem}.params.yaml"
+
+
+def calibrated_beside(recording: Path) -> str:
+    """That a calibration is used that lies beside a recording, in a sentence; "" if none does."""
+    path = sidecar(recording)
+    try:
+        with path.open(encoding="utf-8") as file:
+            ours = file.readline().startswith(CALIBRATED)
+    except (OSError, UnicodeDecodeError):
+        return ""
+    return f"Using the calibration that lies beside the recording: {path}; delete it to undo that." if ours else ""
 
 
 def resolve_params(recording: Path | None, preset: str | None, config: Path | None, assignments: list[str]) -> Params:

@@ -1,0 +1,156 @@
+"""From a recording to the pose of the LiDAR on the IMU: odometry by scans alone, then with the IMU's own help."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from app.calibration.guide import Guide
+from app.calibration.inertial import Inertial
+from app.calibration.odometry import track
+from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation
+from app.calibration.translation import Moved, fit_translation
+from app.calibration.walk import LONGEST_S, Walk, read_walk
+from app.sensors.recording import open_recording
+from app.slam import lie
+from app.slam.params import Params
+from app.slam.types import F64
+
+ROUNDS = 3
+"""Times that the scans are laid again with the IMU's help; after each the fit is better, and so is the help."""
+READING, ROUND = 0.1, 0.9 / (ROUNDS + 1)
+LARGEST_ROTATION, LARGEST_PLACE, LARGEST_OFFSET = np.radians(1.0), 0.05, 0.002
+"""rad, m, s: what is less certain than this is not observable."""
+SURE = 3.0
+"""Standard deviations by which two values must differ to be different."""
+APART_ROTATION, APART_PLACE = np.radians(3.0), 0.1
+"""rad, m: a mounting that is off by more spoils a map."""
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What a recording tells of its sensors. `params` are those that it was opened with.
+
+    Attributes:
+        recording: the file. params: what was taken so far. lasted_s: the part that was used.
+        turned, moved: the fits. down: (3,) unit direction of gravity in the LiDAR frame at the begin.
+        residuals: m, RMS of the scans on the map without the IMU, and with it.
+    """
+
+    recording: Path
+    params: Params
+    lasted_s: float
+    turned: Turned
+    moved: Moved
+    down: F64
+    residuals: tuple[float, float]
+
+    @property
+    def rotation(self) -> tuple[float, float, float]:
+        """Roll, pitch, yaw in degrees, as `sensor.rotation`."""
+        yaw, pitch, roll = Rotation.from_matrix(self.turned.R_imu_lidar).as_euler("ZYX", degrees=True)
+        return float(roll), float(pitch), float(yaw)
+
+    @property
+    def sigmas(self) -> dict[str, F64]:
+        """Standard deviations (3,) or (1,) of rotation (rad, about the LiDAR's axes), offset (s), gyroscope's bias
+        (rad/s), translation (m) and accelerometer's bias (m/s²)."""
+        turned, moved = np.sqrt(np.diag(self.turned.covariance)), np.sqrt(np.diag(self.moved.covariance))
+        return {
+            "rotation": turned[:3], "offset": turned[3:4], "gyro_bias": turned[4:],
+            "translation": moved[:3], "accel_bias": moved[3:],
+        }  # fmt: skip
+
+    @property
+    def observed(self) -> dict[str, bool]:
+        """Whether the motion told rotation, translation and offset."""
+        s = self.sigmas
+        rotation = bool((s["rotation"] < LARGEST_ROTATION).all())
+        return {
+            "rotation": rotation,
+            "translation": rotation and bool((s["translation"] < LARGEST_PLACE).all()),
+            "offset": bool((s["offset"] < LARGEST_OFFSET).all()),
+        }
+
+    def found(self) -> dict[str, Any]:
+        """Parameters that the recording tells, by their dotted names."""
+        observed = self.observed
+        values: dict[str, Any] = {}
+        if observed["rotation"]:
+            values["sensor.rotation"] = [round(angle, 3) for angle in self.rotation]
+        if observed["translation"]:
+            values["sensor.translation"] = [round(float(x), 4) for x in self.moved.p_imu_lidar]
+        if observed["offset"] and abs(self.turned.late) > max(0.001, SURE * float(self.sigmas["offset"][0])):
+            late = self.params.recording.imu_time_offset + self.turned.late
+            values["recording.imu_time_offset"] = round(late, 4)
+        return values
+
+    @property
+    def apart(self) -> float:
+        """rad, between the rotation found and the one taken so far."""
+        given = lie.from_rpy_degrees(self.params.sensor.rotation)
+        return float(np.linalg.norm(lie.log(given.T @ self.turned.R_imu_lidar)))
+
+    def contradiction(self) -> str:
+        """What is wrong with the mounting or the clock taken so far, in a sentence; "" if nothing is, or if it cannot
+        be told."""
+        found, parts = self.found(), []
+        if "sensor.rotation" in found and self.apart > APART_ROTATION:
+            angles = ", ".join(f"{angle:.0f}°" for angle in self.rotation)
+            parts.append(f"the LiDAR seems to be turned by {angles} on the IMU")
+        off = self.moved.p_imu_lidar - self.params.sensor.translation
+        if "sensor.translation" in found and np.linalg.norm(off) > APART_PLACE:
+            place = ", ".join(f"{x:.2f}" for x in self.moved.p_imu_lidar)
+            parts.append(f"it seems to be at {place} m on the IMU")
+        if "recording.imu_time_offset" in found and abs(self.turned.late) > 5 * LARGEST_OFFSET:
+            parts.append(f"the IMU's clock seems to be off by {self.turned.late * 1e3:+.0f} ms")
+        text = ", and ".join(parts)
+        return text[:1].upper() + text[1:]
+
+
+def calibrate(
+    path: Path, params: Params, duration_s: float = LONGEST_S, progress: Progress = lambda step, fraction: None
+) -> Calibration:
+    """Find the mounting, the clock offset and the biases from the recording alone; `sensor.rotation` and
+    `sensor.translation` are not used.
+
+    Args:
+        duration_s: only so much of it. progress: called with what is done and the fraction, 0-1.
+
+    Raises:
+        HemislamError: the recording cannot be read, or is too short.
+    """
+    with open_recording(path, params) as recording:
+        walk = read_walk(recording, params, duration_s, lambda done: progress("reading", READING * done))
+    return calibrate_walk(path, params, walk, progress)
+
+
+def calibrate_walk(
+    path: Path, params: Params, walk: Walk, progress: Progress = lambda step, fraction: None
+) -> Calibration:
+    """As `calibrate`, of what was read already."""
+    inertial = Inertial(walk.seconds(walk.imu.stamps_ns), walk.imu.gyro, walk.imu.accel)
+    given = lie.from_rpy_degrees(params.sensor.rotation), np.array(params.sensor.translation, np.float64)
+
+    def report(number: int) -> Callable[[float], None]:
+        return lambda done: progress("odometry", READING + ROUND * (number + done))
+
+    way = track(walk, None, report(0))
+    alone = way.residual
+    late = find_offset(way, inertial)
+    turned = fit_rotation(way, inertial, first_rotation(way, inertial, late), late, given[0])
+    guide = Guide.of(inertial, turned.R_imu_lidar, turned.late, turned.bias)
+    for number in range(ROUNDS):
+        way = track(walk, guide, report(number + 1))
+        turned = fit_rotation(way, inertial, turned.R_imu_lidar, turned.late, given[0])
+        moved = fit_translation(way, inertial, turned, given[1])
+        guide = Guide.of(
+            inertial, turned.R_imu_lidar, turned.late, turned.bias, moved.p_imu_lidar, moved.bias, moved.gravity
+        )
+    down = moved.gravity / np.linalg.norm(moved.gravity)
+    return Calibration(path, params, walk.duration_s, turned, moved, down, (alone, way.residual))

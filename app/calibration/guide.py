@@ -1,0 +1,86 @@
+"""The motion of the LiDAR within a scan, by the IMU, once its mounting is roughly known."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.calibration.inertial import Inertial
+from app.slam import lie
+from app.slam.types import F64
+
+STEP_S = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Guide:
+    """Motion by the IMU.
+
+    Attributes:
+        knots: (m,) s. attitudes: (m, 3, 3) of the IMU at these, in any one frame. rates: (m, 3) rad/s, forces: (m, 3)
+            m/s², IMU frame, without biases.
+        R_imu_lidar: (3, 3). p_imu_lidar: (3,) m. gravity: (3,) m/s² in the world of the odometry; None: unknown.
+    """
+
+    knots: F64
+    attitudes: F64
+    rates: F64
+    forces: F64
+    R_imu_lidar: F64
+    p_imu_lidar: F64
+    gravity: F64 | None
+
+    @classmethod
+    def of(
+        cls, inertial: Inertial, R_imu_lidar: F64, late: float, gyro_bias: F64,
+        p_imu_lidar: F64 | None = None, accel_bias: F64 | None = None, gravity: F64 | None = None,
+    ) -> "Guide":  # fmt: skip
+        knots = np.arange(inertial.times[0] + late, inertial.times[-1] + late + STEP_S, STEP_S)
+        zero = np.zeros(3)
+        return cls(
+            knots,
+            inertial.attitudes(knots, late, gyro_bias),
+            inertial.rates(knots - late) - gyro_bias,
+            inertial.forces(knots - late) - (zero if accel_bias is None else accel_bias),
+            R_imu_lidar,
+            zero if p_imu_lidar is None else p_imu_lidar,
+            gravity,
+        )
+
+    def turned(self, end: float, back: F64) -> F64:
+        """(k, 3, 3) rotations R_end_then of the LiDAR at the times `end` + `back` (k,) s."""
+        return np.asarray(self.R_imu_lidar.T @ self._turned(end, back)[0] @ self.R_imu_lidar)
+
+    def swayed(self, end: float, back: F64, R_world_lidar: F64) -> tuple[F64, F64]:
+        """How far (k, 3) m and how fast (k, 3) m/s the LiDAR was off a motion of constant velocity that it had at the
+        end; in its frame at the end.
+
+        Args:
+            back: (k,) s, ascending to 0. R_world_lidar: (3, 3) at the end.
+        """
+        nothing = np.zeros((len(back), 3))
+        if self.gravity is None:
+            return nothing, nothing
+        turned, at = self._turned(end, back)
+        forces = np.stack([np.interp(end + back, self.knots, self.forces[:, i]) for i in range(3)], axis=1)
+        R_world_imu = R_world_lidar @ self.R_imu_lidar.T
+        felt = (turned @ forces[:, :, None])[:, :, 0] + R_world_imu.T @ self.gravity
+        h = np.diff(back)[:, None]
+        speeds, ways = nothing.copy(), nothing.copy()  # of the IMU, integrated back from the end
+        for k in range(len(back) - 2, -1, -1):
+            mean = 0.5 * (felt[k] + felt[k + 1])
+            speeds[k] = speeds[k + 1] - mean * h[k]
+            ways[k] = ways[k + 1] - speeds[k + 1] * h[k] + 0.5 * mean * h[k] ** 2
+        spin = lie.hat(at)
+        arm, whirl = self.p_imu_lidar, turned @ spin  # the LiDAR at the end of its lever
+        ways = ways + turned @ arm - arm - back[:, None] * (spin[-1] @ arm)
+        speeds = speeds + whirl @ arm - spin[-1] @ arm
+        return ways @ self.R_imu_lidar, speeds @ self.R_imu_lidar
+
+    def _turned(self, end: float, back: F64) -> tuple[F64, F64]:
+        """(k, 3, 3) R_end_then of the IMU, and its rates (k, 3) then."""
+        times = end + back
+        k = np.clip(np.searchsorted(self.knots, times) - 1, 0, len(self.knots) - 2)
+        rates = np.stack([np.interp(times, self.knots, self.rates[:, i]) for i in range(3)], axis=1)
+        middle = 0.5 * (self.rates[k] + rates)
+        then = self.attitudes[k] @ lie.exp(middle * (times - self.knots[k])[:, None])
+        return np.asarray(then[-1].T @ then), rates

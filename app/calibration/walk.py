@@ -1,0 +1,115 @@
+"""A recording as calibration needs it: scans thinned to a few thousand points, and all IMU samples."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from app.sensors.recording import Recording, ScanEntry
+from app.slam import rest
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import F64, I64, ImuSamples, Scan
+from app.slam.voxel import VoxelGrid
+
+LONGEST_S = 120.0
+"""More of a recording costs time and tells little more."""
+LEAST_SCANS = 50
+REST_S = 1.0
+VOXEL = 0.3
+"""m; of each voxel the first point stays, with its own time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """Scans in order of their ends, and the IMU samples around them, in order of time."""
+
+    scans: tuple[Scan, ...]
+    imu: ImuSamples
+
+    @property
+    def ends_ns(self) -> I64:
+        return np.array([scan.end_ns for scan in self.scans], np.int64)
+
+    @property
+    def duration_s(self) -> float:
+        return float(self.ends_ns[-1] - self.ends_ns[0]) * 1e-9
+
+    def seconds(self, stamps_ns: I64) -> F64:
+        """Times after the end of the first scan."""
+        return np.asarray((stamps_ns - self.scans[0].end_ns) * 1e-9)
+
+
+def read_walk(
+    recording: Recording,
+    params: Params,
+    duration_s: float = LONGEST_S,
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> Walk:
+    """The first `duration_s` of a recording.
+
+    Args:
+        progress: called with the fraction read, 0-1.
+
+    Raises:
+        HemislamError: too short, or damaged from the start.
+    """
+    scans: list[Scan] = []
+    stamps: list[int] = []
+    values: list[tuple[float, ...]] = []
+    grid = VoxelGrid()
+    stop_ns = recording.start_ns + round(duration_s * 1e9)
+    for entry in recording.entries(None, stop_ns):
+        if not isinstance(entry, ScanEntry):
+            stamps.append(entry.stamp_ns)
+            values.append((*entry.gyro, *entry.accel))
+        elif isinstance(entry.scan, Scan) and entry.scan.end_ns < stop_ns:
+            scans.append(_thinned(entry.scan, params, grid))
+            progress(min((entry.scan.end_ns - recording.start_ns) / min(duration_s, recording.duration_s) * 1e-9, 1.0))
+    scans.sort(key=lambda scan: scan.end_ns)
+    usable = [after for before, after in pairwise(scans) if after.end_ns > before.end_ns and len(after)]
+    if len(usable) < LEAST_SCANS or len(stamps) < 10:
+        raise HemislamError(
+            f"{recording.path} has {len(usable)} usable scans and {len(stamps)} IMU samples; to calibrate it takes"
+            f" {LEAST_SCANS} scans at least, better 30 s of lively motion."
+        )
+    imu = _samples(stamps, values)
+    return Walk(tuple(scan for scan in usable if scan.end_ns >= _sets_off_ns(imu)), imu)
+
+
+def _sets_off_ns(imu: ImuSamples) -> int:
+    """REST_S before the IMU first moves; a map of many scans from one place would hold the LiDAR there."""
+    rest_ns = round(REST_S * 1e9)
+    for begin in range(int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]), rest_ns // 4):
+        part = slice(*np.searchsorted(imu.stamps_ns, [begin, begin + rest_ns // 2]))
+        if part.stop - part.start > 3 and rest.is_moving(
+            ImuSamples(imu.stamps_ns[part], imu.gyro[part], imu.accel[part])
+        ):
+            return begin - rest_ns
+    return int(imu.stamps_ns[0])
+
+
+def _samples(stamps: list[int], values: list[tuple[float, ...]]) -> ImuSamples:
+    """In order of time, each once, without those that are not numbers."""
+    rows = np.array(values, np.float64)
+    times, first = np.unique(np.array(stamps, np.int64), return_index=True)
+    rows = rows[first]
+    good = np.isfinite(rows).all(axis=1)
+    return ImuSamples(times[good], rows[good, :3], rows[good, 3:])
+
+
+def _thinned(scan: Scan, params: Params, grid: VoxelGrid) -> Scan:
+    near, far = params.sensor.min_range, params.sensor.max_range
+    distance = np.linalg.norm(scan.points, axis=1)
+    within = np.flatnonzero((distance > near) & (distance < far))
+    first = within[grid.downsample(np.ascontiguousarray(scan.points[within]), VOXEL).source]
+    late = np.argmax(scan.offsets_ns) if len(scan) else 0
+    kept = np.unique(np.append(first, late)) if len(first) else first  # the last point gives the scan's end
+    return Scan(
+        scan.stamp_ns,
+        np.ascontiguousarray(scan.points[kept]),
+        np.ascontiguousarray(scan.offsets_ns[kept]),
+        scan.intensity[kept],
+        scan.ring[kept],
+    )

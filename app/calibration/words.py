@@ -1,0 +1,120 @@
+"""A calibration in words, as a table, as JSON and as the parameter file beside its recording."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from app.calibration.calibrate import Calibration
+from app.sensors.presets import CALIBRATED, sidecar
+from app.slam.errors import HemislamError
+from app.slam.user_text import read_yaml
+
+WALK = "not observable: walk a figure of eight, tilting the scanner"
+
+
+def table(calibration: Calibration) -> list[tuple[str, str]]:
+    """What was found, each with its unit and standard deviation."""
+    c, sigmas, observed = calibration, calibration.sigmas, calibration.observed
+    roll, pitch, yaw = c.rotation
+    x, y, z = c.moved.p_imu_lidar
+    sx, sy, sz = sigmas["translation"]
+    rotation, offset = np.degrees(sigmas["rotation"].max()), float(sigmas["offset"][0]) * 1e3
+    return [
+        ("rotation of the LiDAR on the IMU", _if(
+            observed["rotation"], f"roll {roll:.2f}, pitch {pitch:.2f}, yaw {yaw:.2f} ± {rotation:.2f} deg"
+        )),
+        ("position of the LiDAR on the IMU", _if(
+            observed["translation"], f"{x:.3f} ± {sx:.3f}, {y:.3f} ± {sy:.3f}, {z:.3f} ± {sz:.3f} m"
+        )),
+        ("added to the IMU's clock", _if(observed["offset"], f"{c.turned.late * 1e3:+.1f} ± {offset:.1f} ms")),
+        ("bias of the gyroscope", _vector(np.degrees(c.turned.bias), np.degrees(sigmas["gyro_bias"]), "deg/s")),
+        ("bias of the accelerometer", _vector(c.moved.bias, sigmas["accel_bias"], "m/s²")),
+        ("down at the begin, LiDAR frame", ", ".join(f"{value:+.3f}" for value in c.down)),
+        ("turning by scans against IMU", f"{_degrees(c.turned.before)} deg before, {_degrees(c.turned.after)} after"),
+        ("motion by scans against IMU", f"{_mm(c.moved.before)} mm before, {_mm(c.moved.after)} after"),
+        ("scans on the map", f"{c.residuals[0] * 1e3:.1f} mm by themselves, {c.residuals[1] * 1e3:.1f} with the IMU"),
+    ]  # fmt: skip
+
+
+def as_json(calibration: Calibration) -> dict[str, Any]:
+    """The same as numbers; units as in the parameters, standard deviations in rad, s, m, rad/s and m/s²."""
+    c = calibration
+    return {
+        "recording": str(c.recording),
+        "used_s": c.lasted_s,
+        "rotation_deg": list(c.rotation),
+        "translation_m": c.moved.p_imu_lidar.tolist(),
+        "imu_time_offset_s": c.params.recording.imu_time_offset + c.turned.late,
+        "gyro_bias": c.turned.bias.tolist(),
+        "accel_bias": c.moved.bias.tolist(),
+        "down_lidar": c.down.tolist(),
+        "sigmas": {name: values.tolist() for name, values in c.sigmas.items()},
+        "observed": c.observed,
+        "residuals": {
+            "turning_rad": [_rms(c.turned.before), _rms(c.turned.after)],
+            "motion_m": [_rms(c.moved.before), _rms(c.moved.after)],
+            "scans_m": list(c.residuals),
+        },
+        "parameters": c.found(),
+        "contradiction": c.contradiction(),
+    }
+
+
+def params_yaml(calibration: Calibration) -> str:
+    """What was found as the text of a parameter file."""
+    tree: dict[str, dict[str, Any]] = {}
+    for name, value in calibration.found().items():
+        section, _, leaf = name.partition(".")
+        tree.setdefault(section, {})[leaf] = value
+    return f"{CALIBRATED}; delete this file to undo it.\n" + yaml.safe_dump(tree, default_flow_style=None)
+
+
+def write_beside(calibration: Calibration, *, replace: bool = False) -> Path:
+    """Keep what was found beside the recording, where `run`, `serve` and `info` read it.
+
+    Args:
+        replace: a file that a person wrote, too. Its other parameters stay, and it is kept as `.old`.
+
+    Raises:
+        HemislamError: nothing was found; or there is such a file.
+    """
+    if not calibration.found():
+        raise HemislamError(f"{calibration.recording} tells nothing to keep: {WALK}.")
+    path, text = sidecar(calibration.recording), params_yaml(calibration)
+    try:
+        before = path.read_text(encoding="utf-8") if path.exists() else ""
+        if before and not before.startswith(CALIBRATED):
+            if not replace:
+                raise HemislamError(f"{path} is yours; add --force to put these values into it (it is kept as .old).")
+            tree = read_yaml(before, str(path), "write it anew") or {}
+            for name, value in calibration.found().items():
+                section, _, leaf = name.partition(".")
+                tree[section] = {**(tree.get(section) or {}), leaf: value}
+            text = f"{CALIBRATED} into the one kept as .old.\n" + yaml.safe_dump(tree, default_flow_style=None)
+            path.with_name(path.name + ".old").write_text(before, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise HemislamError(f"{path} cannot be written ({error.strerror}); set the values by --set.") from None
+    return path
+
+
+def _if(observed: bool, text: str) -> str:
+    return text if observed else WALK
+
+
+def _vector(values: np.ndarray, sigmas: np.ndarray, unit: str) -> str:
+    return ", ".join(f"{v:.3f} ± {s:.3f}" for v, s in zip(values, sigmas, strict=True)) + f" {unit}"
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _degrees(values: np.ndarray) -> str:
+    return f"{np.degrees(_rms(values)):.3f}"
+
+
+def _mm(values: np.ndarray) -> str:
+    return f"{_rms(values) * 1e3:.1f}"

@@ -1,0 +1,123 @@
+"""Tests app/calibration/walk.py, app/calibration/odometry.py, app/calibration/calibrate.py, app/calibration/words.py,
+app/cli/calibrate.py and app/cli/calibration_plot.py: a recording alone tells how the LiDAR sits on the IMU."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from app.__main__ import cli
+from app.calibration.calibrate import Calibration, calibrate_walk
+from app.calibration.rotation import Turned
+from app.calibration.translation import Moved
+from app.calibration.walk import Walk, read_walk
+from app.calibration.words import WALK, as_json, params_yaml, table, write_beside
+from app.cli.calibration_plot import residual_plot
+from app.sensors.presets import calibrated_beside, resolve_params, sidecar
+from app.sensors.recording import open_recording
+from app.slam import lie
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+
+MID360 = np.array([-0.011, -0.02329, 0.04412])
+"""Of the IMU in a Mid-360, by its manual."""
+TURN = Rotation.from_euler("ZYX", [104.0, -50.0, 70.0], degrees=True).as_matrix()
+
+
+@pytest.fixture(scope="module")
+def walk(shared_data: Path) -> Walk:
+    params = Params()
+    with open_recording(shared_data / "hall_mid360.mcap", params) as recording:
+        return read_walk(recording, params)
+
+
+def test_a_lidar_turned_on_its_imu_and_a_late_clock_are_found_from_the_recording_alone(walk: Walk) -> None:
+    scans = tuple(replace(s, points=np.ascontiguousarray(s.points @ TURN.astype(np.float32))) for s in walk.scans)
+    imu = replace(walk.imu, stamps_ns=walk.imu.stamps_ns - 30_000_000)
+    found = calibrate_walk(Path("walk.mcap"), Params(), Walk(scans, imu))
+    assert np.degrees(Rotation.from_matrix(TURN.T @ found.turned.R_imu_lidar).magnitude()) < 0.3
+    assert abs(found.turned.late - 0.030) < 1e-3
+    off = np.abs(found.moved.p_imu_lidar - MID360)
+    assert (off < np.maximum(0.03, 3 * found.sigmas["translation"])).all()
+    assert found.observed["rotation"] and found.observed["offset"]
+    named = lie.from_rpy_degrees(tuple(found.found()["sensor.rotation"]))
+    assert np.allclose(named, found.turned.R_imu_lidar, atol=1e-4)
+    assert "turned by 70°, -50°, 104°" in found.contradiction()
+    assert "+30 ms" in found.contradiction()
+
+
+def test_reading_skips_the_rest_at_the_start(walk: Walk, shared_data: Path) -> None:
+    """It stands still for three seconds, and a second of that is enough."""
+    with open_recording(shared_data / "hall_mid360.mcap", Params()) as recording:
+        assert 1.5 < (walk.scans[0].end_ns - recording.start_ns) * 1e-9 < 3.0
+    assert all(a.end_ns < b.end_ns for a, b in zip(walk.scans, walk.scans[1:], strict=False))
+
+
+def known(recording: Path, *, sure: bool = True, params: Params | None = None) -> Calibration:
+    """What might have been found."""
+    wide = 1e-6 if sure else 1.0
+    rows = np.linspace(0.0, 0.01, 30).reshape(-1, 3)
+    turned = Turned(TURN, 0.02, np.zeros(3), np.eye(7) * wide, rows * 2, rows)
+    moved = Moved(MID360, np.zeros(3), np.array([0.0, 0.0, -9.81]), np.eye(6) * wide, rows * 2, rows)
+    return Calibration(recording, params or Params(), 30.0, turned, moved, np.array([0.0, 0.0, -1.0]), (0.02, 0.01))
+
+
+def test_what_was_found_is_kept_beside_the_recording_and_undone_by_deleting_it(tmp_path: Path) -> None:
+    recording = tmp_path / "walk.mcap"
+    path = write_beside(known(recording))
+    params = resolve_params(recording, "mid360", None, [])
+    assert np.allclose(params.sensor.rotation, [70.0, -50.0, 104.0], atol=1e-2)
+    assert params.recording.imu_time_offset == pytest.approx(0.02)
+    assert str(path) in calibrated_beside(recording)
+    write_beside(known(recording))  # its own file may be replaced
+    path.unlink()
+    assert calibrated_beside(recording) == ""
+    assert resolve_params(recording, None, None, []) == Params()
+
+
+def test_a_file_that_a_person_wrote_is_never_overwritten_unasked(tmp_path: Path) -> None:
+    recording = tmp_path / "walk.mcap"
+    mine = "# mine\nsensor:\n  max_range: 40\nfilter:\n  max_points: 700\n"
+    sidecar(recording).write_text(mine)
+    with pytest.raises(HemislamError, match="is yours; add --force"):
+        write_beside(known(recording))
+    assert sidecar(recording).read_text() == mine
+    assert calibrated_beside(recording) == ""
+    write_beside(known(recording), replace=True)
+    params = resolve_params(recording, None, None, [])
+    assert (params.sensor.max_range, params.filter.max_points) == (40, 700)
+    assert params.sensor.translation[0] == pytest.approx(-0.011)
+    assert (tmp_path / "walk.params.yaml.old").read_text() == mine
+
+
+def test_what_the_motion_does_not_tell_is_said_and_not_kept(tmp_path: Path) -> None:
+    found = known(tmp_path / "walk.mcap", sure=False)
+    assert [text for _, text in table(found)[:3]] == [WALK] * 3
+    assert found.found() == {} and found.contradiction() == ""
+    with pytest.raises(HemislamError, match="tells nothing to keep"):
+        write_beside(found)
+
+
+def test_a_mounting_that_agrees_with_the_parameters_is_no_contradiction(tmp_path: Path) -> None:
+    values = yaml.safe_load(params_yaml(known(tmp_path / "walk.mcap")))
+    right = Params().merged({"sensor": values["sensor"]})
+    found = known(tmp_path / "walk.mcap", params=right)
+    assert "turned" not in found.contradiction() and "ms" in found.contradiction()
+
+
+def test_numbers_for_programs_are_json_and_the_plot_is_an_image(tmp_path: Path) -> None:
+    found = known(tmp_path / "walk.mcap")
+    assert json.loads(json.dumps(as_json(found)))["observed"]["rotation"] is True
+    drawn = ElementTree.fromstring(residual_plot(found))
+    assert drawn.tag.endswith("svg") and len(list(drawn.iter("{http://www.w3.org/2000/svg}polyline"))) == 4
+
+
+def test_a_recording_that_is_too_short_is_refused_in_a_sentence(shared_data: Path) -> None:
+    result = CliRunner().invoke(cli, ["calibrate", str(shared_data / "hall_mid360.mcap"), "--duration", "5"])
+    assert result.exit_code == 2 and "to calibrate it takes 50 scans" in result.output
