@@ -45,7 +45,7 @@ def examine(
     except HemislamError as error:
         return _not_mappable(path, params, str(error))
     with recording:
-        census = _Census(Sequencer(params.imu))
+        census = _Census(recording.sequencer())
         damage = []
         try:
             for number, entry in enumerate(recording.entries()):
@@ -56,21 +56,24 @@ def examine(
             damage = [Finding(DAMAGE, "needs you", str(error))]
         census.take(last=True)
         progress(1.0)
-        known = ("clocks", DAMAGE) if damage else ("clocks",)
         scans, imu = census.times()
         counts = census.sequencer.counts
-        return (
-            *damage,
-            _topics(recording.topics, recording.duration_s),
-            *(finding for finding in recording.findings if finding.subject not in known),
-            _rate("scan rate", scans[:, 1], 4.0),
+        known = ("clocks", DAMAGE) if damage else ("clocks",)
+        of_imu = (
             _rate("IMU rate", imu[:, 1], 90.0),
             clock_finding(scans, imu, params.recording.imu_time_offset),
             _imu_gaps(counts, params.imu.max_gap),
             _imu_time(counts),
             _imu_values(counts, len(imu), params.imu),
+        )
+        return (
+            *damage,
+            _topics(recording.topics, recording.duration_s),
+            *(finding for finding in recording.findings if finding.subject not in known),
+            _rate("scan rate", scans[:, 1], 4.0),
+            *(of_imu if recording.imu_topic else ()),
             *_scan_time(scans),
-            _pairing(counts.paired, census.reasons),
+            _pairing(counts.paired, census.reasons, recording.imu_topic),
             _returns(census, len(scans)),
         )
 
@@ -194,10 +197,12 @@ def _scan_time(scans: I64) -> list[Finding]:
     return [Finding("scan time", "corrected" if wrong else "fine", text)]
 
 
-def _pairing(paired: int, reasons: Counter[str]) -> Finding:
+def _pairing(paired: int, reasons: Counter[str], imu_topic: str) -> Finding:
     dropped = reasons.total()
     if not dropped:
-        return Finding("pairing", "fine", f"all {paired} scans are covered by IMU samples")
+        return Finding(
+            "pairing", "fine", f"all {paired} scans " + ("are covered by IMU samples" if imu_topic else "can be used")
+        )
     why = ", ".join(f"{count} because {reason}" for reason, count in reasons.most_common(3))
     verdict: Verdict = "corrected" if dropped < 0.1 * (dropped + paired) else "needs you"
     return Finding("pairing", verdict, f"{paired} scans can be used, {dropped} are left out: {why}")

@@ -11,22 +11,27 @@ import numpy as np
 from app.sensors.clocks import clock_finding
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
 from app.sensors.findings import Finding
-from app.sensors.imu_units import gravity_findings, settle_imu
+from app.sensors.imu_units import AS_RECORDED, gravity_findings, settle_imu
 from app.sensors.layout import settle_cloud
 from app.sensors.pointcloud import decode, read_scan
 from app.sensors.presets import preset_for
-from app.sensors.probe import choose_topic, probe_clouds, probe_imu
+from app.sensors.probe import choose_topic, probe_clouds, probe_imu, usable_types
 from app.sensors.ros import Vector, stamp_ns
 from app.sensors.sequencer import Sequencer
 from app.sensors.source import Mark, Source
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import DroppedScan, Measurement, Scan
+from app.slam.types import I64, DroppedScan, Measurement, Scan
 
 LOG_MARGIN_NS = 2_000_000_000
 """How much later or earlier than usual a message may be logged and is still found by time."""
 SILENCE_S = 0.5
 """Without a scan at the end, while the IMU goes on, is worth a word."""
+NO_IMU = Finding(
+    "IMU topic",
+    "corrected",
+    "there is no IMU: the LiDAR alone tells the motion, less accurately, and not through quick turns",
+)
 IMU_BEFORE_NS = 200_000_000
 """IMU samples given from before `start_s`."""
 
@@ -54,7 +59,7 @@ class Recording:
     """An open recording, made by `open_recording`. A context manager.
 
     Attributes:
-        path, params: as given. topics: all there are. lidar_topic, imu_topic: the ones used.
+        path, params: as given. topics: all there are. lidar_topic, imu_topic: the ones used; "" without an IMU.
         scan_count: messages on the LiDAR topic. findings: of the first messages.
         start_ns: first point of the first usable scan. duration_s: from there to the last message.
     """
@@ -66,32 +71,45 @@ class Recording:
         self.topics = source.topics
         chosen = params.recording
         lidar, lidar_finding = choose_topic(source, "lidar", chosen.lidar_topic)
-        imu_topic, imu_finding = choose_topic(source, "imu", chosen.imu_topic)
-        self.lidar_topic, self.imu_topic = lidar.name, imu_topic.name
+        self.lidar_topic, self.imu_topic, imu_finding = lidar.name, "", NO_IMU
+        if chosen.imu_topic or any(topic.type in usable_types("imu") and topic.messages for topic in source.topics):
+            imu_topic, imu_finding = choose_topic(source, "imu", chosen.imu_topic)
+            self.imu_topic = imu_topic.name
         self.scan_count = lidar.messages
 
         probes, probe_findings = probe_clouds(source, lidar)
         self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic, CLOUD_TYPES[lidar.type])
-        imu, self._imu_stamped, imu_probe_findings = probe_imu(source, self.imu_topic, chosen.imu_time_offset)
-        self._imu_units, imu_findings = settle_imu(imu, chosen)
         probes, scans = self._decode_probes(probes, cloud_findings)
         self.start_ns = scans[0].stamp_ns
         self._log_after_stamp_ns = probes[0].log_ns - self.start_ns
         self.duration_s = max((source.end_ns - probes[0].log_ns) / 1e9, 0.0) + (scans[0].end_ns - self.start_ns) / 1e9
         scan_times = [(probe.log_ns, scan.stamp_ns, scan.end_ns) for probe, scan in zip(probes, scans, strict=True)]
-        imu_times = np.column_stack([imu.log_ns, imu.stamps_ns])
-        self._clocks = clock_finding(np.array(scan_times, np.int64), imu_times, chosen.imu_time_offset)
+        self._clocks = Finding("clocks", "fine", "there is one only")
+        imu_findings = self._look_at_imu(np.array(scan_times, np.int64), preset_for(lidar.type, probes[0]))
         self.findings: tuple[Finding, ...] = (
             *source.findings,
             lidar_finding,
             imu_finding,
             *probe_findings,
             *cloud_findings,
-            *imu_probe_findings,
             *imu_findings,
-            self._clocks,
-            *gravity_findings(imu, self._imu_units, params, preset_for(lidar.type, probes[0])),
         )
+
+    def _look_at_imu(self, scan_times: I64, preset: str) -> list[Finding]:
+        """Settle how its samples are read, by the first ones; `scan_times` as for `clock_finding`."""
+        self._imu_stamped, self._imu_units = True, AS_RECORDED
+        if not self.imu_topic:
+            return []
+        chosen = self.params.recording
+        imu, self._imu_stamped, probe_findings = probe_imu(self._source, self.imu_topic, chosen.imu_time_offset)
+        self._imu_units, imu_findings = settle_imu(imu, chosen)
+        self._clocks = clock_finding(scan_times, np.column_stack([imu.log_ns, imu.stamps_ns]), chosen.imu_time_offset)
+        gravity = gravity_findings(imu, self._imu_units, self.params, preset)
+        return [*probe_findings, *imu_findings, self._clocks, *gravity]
+
+    def sequencer(self) -> Sequencer:
+        """A new one that pairs scans with what this recording has."""
+        return Sequencer(self.params.imu, without_imu=not self.imu_topic)
 
     def measurements(
         self, start_s: float = 0.0, duration_s: float | None = None, *, after: "Place | None" = None
@@ -117,7 +135,7 @@ class Recording:
         offset = self._log_after_stamp_ns
         log_first = None if first_ns is None else first_ns + offset - LOG_MARGIN_NS
         log_stop = None if stop_ns is None else stop_ns + offset + LOG_MARGIN_NS
-        topics = (self.lidar_topic, self.imu_topic)
+        topics = tuple(filter(None, (self.lidar_topic, self.imu_topic)))
         for topic, log_ns, message in self._source.messages(topics, log_first, log_stop, after):
             if topic == self.lidar_topic:
                 yield ScanEntry(log_ns, *read_scan(message, log_ns, self._layout))
@@ -191,7 +209,7 @@ class Measurements(Iterator[Measurement | DroppedScan]):
         self._recording = recording
         self._part = (start_s, duration_s)
         self._message = after.message if after else None
-        self._sequencer = after.sequencer.copy() if after else Sequencer(recording.params.imu)
+        self._sequencer = after.sequencer.copy() if after else recording.sequencer()
         self._reasons = after.reasons.copy() if after else Counter[str]()
         self._ended = after is not None and after.ended
         self._entries = self._read()
@@ -239,7 +257,7 @@ def open_recording(path: Path, params: Params) -> Recording:
     """Open and look at the first messages.
 
     Raises:
-        HemislamError: the file cannot be read, has no LiDAR or IMU, or nothing usable on them.
+        HemislamError: the file cannot be read, has no LiDAR, or nothing usable on its topics.
     """
     source = Source(path)
     try:

@@ -57,10 +57,12 @@ class Sequencer:
     Attributes:
         limits: `max_gap`: a longer interval between IMU samples is a gap: reported, and a scan that lies mostly
             inside it is dropped. `max_rate`, `max_acceleration`: samples beyond are refused.
+        without_imu: there is no IMU: scans go out as they come, without samples.
         counts: what was met so far.
     """
 
     limits: ImuParams
+    without_imu: bool = False
     counts: Counts = field(default_factory=Counts)
     _stamps: list[int] = field(default_factory=list)
     _values: list[tuple[float, ...]] = field(default_factory=list)
@@ -87,6 +89,7 @@ class Sequencer:
         """A sequencer that takes over after this one's last scan, and notices what is missing in between."""
         return Sequencer(
             self.limits,
+            self.without_imu,
             replace(self.counts),
             _stamps=self._stamps[-1:],
             _values=self._values[-1:],
@@ -196,6 +199,7 @@ class Sequencer:
             scan = self._waiting[0]
             end_ns = scan.end_ns if isinstance(scan, Scan) else scan.stamp_ns
             covered = len(self._stamps) > 1 and self._stamps[-2] >= end_ns  # the newest may be a spike
+            covered = covered or (self.without_imu and len(self._waiting) > 1)  # the next may have come too early
             if not covered and len(self._waiting) <= MAX_WAITING:
                 return
             yield self._take(self._waiting.pop(0))
@@ -211,7 +215,7 @@ class Sequencer:
         if reason or isinstance(scan, DroppedScan):
             return DroppedScan(scan.stamp_ns, reason)
         end_ns = scan.end_ns
-        begin_ns = self._stamps[0] if self._last_end_ns is None else self._last_end_ns
+        begin_ns = self._stamps[0] if self._last_end_ns is None and self._stamps else self._last_end_ns or 0
         first = max(bisect.bisect_right(self._stamps, begin_ns) - 1, 0)
         last = bisect.bisect_left(self._stamps, end_ns)
         self._note_missing_scans(scan)
@@ -245,6 +249,8 @@ class Sequencer:
                 return "it repeats the scan before it (same time)"
             if begin_ns < self._last_stamp_ns or end_ns <= self._last_end_ns:
                 return "its time steps back before the scan before it"
+        if self.without_imu:
+            return ""
         if not self._stamps:
             return "there is no IMU sample"
         if begin_ns < self._stamps[0]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.slam import ground, iekf, imu, keyframes, rest, start
+from app.slam import coast, ground, iekf, imu, keyframes, rest, start
 from app.slam.certainty import Certainty
 from app.slam.imu import Belief
 from app.slam.kernels import clouds
@@ -67,18 +67,27 @@ class Engine:
         self._progress = EngineProgress()
 
     def step(self, scan: Scan, samples: ImuSamples) -> StepResult:
-        """Process one scan with the samples that cover the time from the previous scan's end to its own."""
+        """Process one scan with the samples that cover the time from the previous scan's end to its own.
+
+        Without any samples the velocities are taken to be constant.
+        """
         p, before, watch = self.params, self._progress, _Stopwatch()
         end_ns, notices = scan.end_ns, []
         scan = _in_range(scan, p.sensor.min_range, p.sensor.max_range)
 
         belief, still, waiting = before.belief, before.still, False
-        if belief is None:
+        if belief is None and not len(samples):
+            belief = coast.begin(scan, p)
+            notices.append("There is no IMU: the LiDAR alone tells the motion, less accurately.")
+        elif belief is None:
             started = start.proceed(still, scan, samples, p)
             belief, still, waiting = started.belief, started.still, started.waiting
             notices += [started.notice] if started.notice else []
-        predicted, path = imu.propagate(belief, samples, end_ns, p.imu)
-        predicted = rest.hold(predicted, samples)
+        if len(samples):
+            predicted, path = imu.propagate(belief, samples, end_ns, p.imu)
+            predicted = rest.hold(predicted, samples)
+        else:
+            predicted, path = coast.propagate(belief, end_ns)
         watch.lap("propagate")
         points = imu.deskew(scan, path, predicted.state)
         watch.lap("deskew")
@@ -95,6 +104,8 @@ class Engine:
         if self._map.voxels:
             chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
             posterior, registration = self._update(belief, predicted, chosen)
+            if not len(samples):  # the prediction was no measurement that the scan could contradict
+                registration = replace(registration, predicted_change=np.nan, correction=np.nan)
         status = _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 

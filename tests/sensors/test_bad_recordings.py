@@ -131,12 +131,21 @@ def test_a_recording_without_messages_says_so(tmp_path: Path) -> None:
     assert "without a single message" in refusal(rig.write(tmp_path / "walk", [], "mcap"))
 
 
-def test_without_lidar_or_imu_the_topics_that_there_are_are_listed(tmp_path: Path) -> None:
-    entries = rig.walk(turns=3, columns=4)
-    blind = rig.write(tmp_path / "blind", [entry for entry in entries if entry[0] == "/imu"])
-    deaf = rig.write(tmp_path / "deaf", [entry for entry in entries if entry[0] == "/points"])
+def test_without_a_lidar_the_topics_that_there_are_are_listed(tmp_path: Path) -> None:
+    blind = rig.write(tmp_path / "blind", [entry for entry in rig.walk(turns=3, columns=4) if entry[0] == "/imu"])
     assert "no point clouds" in refusal(blind) and "/imu (sensor_msgs/msg/Imu)" in refusal(blind)
-    assert "no IMU samples" in refusal(deaf) and "/points" in refusal(deaf)
+
+
+def test_without_an_imu_the_scans_come_alone_and_in_order(tmp_path: Path) -> None:
+    entries = [entry for entry in rig.walk(turns=8, columns=12) if entry[0] == "/points"]
+    entries[4], entries[5] = (entries[4][0], *entries[5][1:]), (entries[5][0], *entries[4][1:])
+    with open_recording(rig.write(tmp_path / "deaf", entries), Params()) as recording:
+        assert recording.imu_topic == ""
+        assert "no IMU" in next(finding.text for finding in recording.findings if finding.subject == "IMU topic")
+        found = list(recording.measurements())
+    assert len(found) == 8 and all(isinstance(entry, Measurement) and len(entry.imu) == 0 for entry in found)
+    begins = [entry.scan.stamp_ns for entry in found if isinstance(entry, Measurement)]
+    assert begins == sorted(begins)
 
 
 def test_a_missing_topic_is_refused_with_the_topics_of_the_recording(tmp_path: Path) -> None:

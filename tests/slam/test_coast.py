@@ -1,0 +1,91 @@
+"""Without an IMU: constant velocity between scans, gravity from the floor.
+
+Tests app/slam/coast.py.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from app.slam import coast
+from app.slam.engine import Engine
+from app.slam.iekf import boxminus, boxplus
+from app.slam.imu import DIM, Belief
+from app.slam.types import FrameStatus, ImuSamples, NavState
+from tests.slam.engine_runs import run, worst
+from tests.slam.scenes import FORWARD, UPRIGHT, Rig, Walk, furnished_room, measurements, params_for, sweep
+
+NOTHING = ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))
+
+
+def moving() -> Belief:
+    """A device on the move, uncertain in everything and with correlations."""
+    rng = np.random.default_rng(2)
+    state = NavState(
+        stamp_ns=1_000,
+        R_odom_imu=Rotation.from_rotvec(rng.normal(size=3)).as_matrix(),
+        p_odom_imu=rng.normal(size=3),
+        v_odom_imu=rng.normal(size=3),
+        b_gyro=0.5 * rng.normal(size=3),
+        b_accel=np.zeros(3),
+        g_odom=np.array([0.0, 0.0, -9.81]),
+        R_imu_lidar=np.eye(3),
+        p_imu_lidar=np.zeros(3),
+    )
+    spread = 1e-3 * rng.normal(size=(DIM, DIM))
+    return Belief(state, spread @ spread.T + 1e-8 * np.eye(DIM))
+
+
+def test_the_device_goes_on_in_a_straight_line_and_turns_on_at_its_rate() -> None:
+    belief = moving()
+    end, path = coast.propagate(belief, 1_000 + 100_000_000)
+    before, after = belief.state, end.state
+    np.testing.assert_allclose(after.p_odom_imu, before.p_odom_imu + 0.1 * before.v_odom_imu, rtol=0, atol=1e-12)
+    turn = Rotation.from_matrix(before.R_odom_imu.T @ after.R_odom_imu).as_rotvec()
+    np.testing.assert_allclose(turn, -0.1 * before.b_gyro, rtol=0, atol=1e-9)
+    middle = len(path.times) // 2
+    share = 1.0 + path.times[middle] / 0.1
+    np.testing.assert_allclose(
+        path.poses[middle][:, 3], before.p_odom_imu + share * 0.1 * before.v_odom_imu, atol=1e-12
+    )
+    np.testing.assert_allclose(path.poses[-1], after.T_odom_imu[:3], atol=1e-12)
+
+
+def test_its_covariance_is_that_of_states_drawn_from_the_belief_beside_the_noise() -> None:
+    belief, end_ns = moving(), 1_000 + 100_000_000
+    end, _ = coast.propagate(belief, end_ns)
+    rest, _ = coast.propagate(replace(belief, covariance=np.zeros((DIM, DIM))), end_ns)
+    rng = np.random.default_rng(3)
+    drawn = rng.multivariate_normal(np.zeros(DIM), belief.covariance, size=4000)
+    ends = np.array(
+        [
+            boxminus(coast.propagate(Belief(boxplus(belief.state, d), belief.covariance), end_ns)[0].state, end.state)
+            for d in drawn
+        ]
+    )
+    expected = end.covariance - rest.covariance
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(np.cov(ends.T) / np.outer(size, size), expected / np.outer(size, size), atol=0.1)
+
+
+@pytest.mark.parametrize("device", [FORWARD, UPRIGHT], ids=["forward", "upright"])
+def test_a_walk_in_a_room_is_followed_by_the_lidar_alone(device: np.ndarray) -> None:
+    walk, rig = Walk(device), Rig()
+    room = [replace(entry, imu=NOTHING) for entry in measurements(furnished_room(), walk, rig, 60)]
+    results = run(Engine(params_for(rig)), iter(room))
+    metres, degrees = worst(results, walk)
+    assert metres < 0.1
+    assert degrees < 3.0
+    assert results[-1].status is FrameStatus.TRACKING
+    assert "no IMU" in results[0].notices[0]
+
+
+@pytest.mark.parametrize("tilt", [-10.0, 5.0])
+def test_up_is_the_normal_of_the_floor(tilt: float) -> None:
+    R_world_lidar = FORWARD @ Rotation.from_euler("y", tilt, degrees=True).as_matrix()
+    scan = sweep(furnished_room(), Walk(R_world_lidar, still=100), Rig(columns=120), 0.0, seed=3)
+    begun = coast.begin(scan, params_for(Rig())).state
+    up = begun.R_imu_lidar.T @ begun.R_odom_imu.T @ [0.0, 0.0, 1.0]
+    assert np.degrees(np.arccos(up @ (R_world_lidar.T @ [0.0, 0.0, 1.0]))) < 1.0
