@@ -5,7 +5,7 @@ import time
 import numpy as np
 
 from app.sensors.live.decoder import Decoder
-from app.sensors.live.difop import NOMINAL, Calibration, Difop
+from app.sensors.live.difop import NOMINAL, ChannelAngles, Difop
 from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.msop import PacketWriter
 from app.sensors.rsbpearl import BPEARL, BPV4, CHANNELS, Model
@@ -22,7 +22,7 @@ def run() -> list[Line]:
 def measure(model: Model) -> list[Line]:
     """ms to put the packets of a revolution in order, and to decode it, if every firing has a return."""
     assembler, decoder = Assembler(), Decoder()
-    decoder.configure(Difop(calibration=Calibration(NOMINAL.elevations_deg, np.linspace(-1.0, 0.0, CHANNELS))))
+    decoder.configure(Difop(calibration=ChannelAngles(NOMINAL.elevations_deg, np.linspace(-1.0, 0.0, CHANNELS))))
     assembling: list[float] = []
     decoding: list[float] = []
     points = 0

@@ -26,7 +26,7 @@ _CLAIMS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Claim:
     """Attributes:
     size: share by which a value changes, 0 if that may be chance; inf where something went wrong.
     own: it is about a variant of the user's.
@@ -45,7 +45,7 @@ def findings(recordings: Sequence[Evaluated]) -> list[str]:
             chosen = [recording for recording in recordings if recording.name.startswith(metric.where)]
             difference = _difference(chosen, name, base, metric)
             if difference is not None:
-                found.append(Finding(_claim(name, base, what, difference, metric), difference.size))
+                found.append(Claim(_claim(name, base, what, difference, metric), difference.size))
     found.sort(key=lambda finding: -finding.size)
     own = [finding for finding in found if finding.own][:MOST_TOLD]
     others = [finding for finding in found if finding not in own]
@@ -53,7 +53,7 @@ def findings(recordings: Sequence[Evaluated]) -> list[str]:
     return [finding.text for finding in first + [finding for finding in found if finding not in first]]
 
 
-def _own(recordings: Sequence[Evaluated]) -> list[Finding]:
+def _own(recordings: Sequence[Evaluated]) -> list[Claim]:
     """The user's variants against ours; those without a difference are named together."""
     outcomes = {o.name: o for recording in recordings for o in recording.outcomes if o.run is not None}
     names = [name for name in outcomes if name not in {variant.name for variant in PAPER}]
@@ -69,15 +69,13 @@ def _own(recordings: Sequence[Evaluated]) -> list[Finding]:
             continue
         words = "; ".join(f"the mean {metric.name} {difference.words}" for metric, difference in told)
         size = max(difference.size for _, difference in told)
-        found.append(
-            Finding(f"{name} against {base} ({outcomes[name].meaning or 'as given'}): {words}.", size, own=True)
-        )
+        found.append(Claim(f"{name} against {base} ({outcomes[name].meaning or 'as given'}): {words}.", size, own=True))
     if alike:
-        found.append(Finding(f"{', '.join(alike)}: no difference from {base} that may not be chance.", 0.0, own=True))
+        found.append(Claim(f"{', '.join(alike)}: no difference from {base} that may not be chance.", 0.0, own=True))
     return found
 
 
-def _mishaps(recordings: Sequence[Evaluated]) -> list[Finding]:
+def _mishaps(recordings: Sequence[Evaluated]) -> list[Claim]:
     """What is missing or went wrong."""
     found = []
     missing: dict[str, list[str]] = {}
@@ -96,7 +94,7 @@ def _mishaps(recordings: Sequence[Evaluated]) -> list[Finding]:
                 found.append(f"{who}: {sum(run['dropped'].values())} scans were dropped.")
     for text, names in missing.items():
         found.append(f"{text}." if len(names) == len(recordings) else f"{', '.join(names)}: {text}.")
-    return [Finding(text, np.inf) for text in found]
+    return [Claim(text, np.inf) for text in found]
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +135,7 @@ _OWN_METRICS = (
 @dataclass(frozen=True, slots=True)
 class _Difference:
     """Attributes:
-    words: how the mean of a metric differs. size: see `Finding`. against: it got worse. rest: where it rises.
+    words: how the mean of a metric differs. size: see `Claim`. against: it got worse. rest: where it rises.
     """
 
     words: str

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from app.sensors.live.difop import NOMINAL, Calibration, Difop
+from app.sensors.live.difop import NOMINAL, ChannelAngles, Difop
 from app.sensors.live.frames import Revolution
 from app.sensors.live.kernels import decode_blocks
 from app.sensors.live.msop import BLOCK_BYTES, BLOCKS, HEADER_BYTES, PACKET_BYTES, TURN
@@ -21,7 +21,7 @@ class Decoder:
         difop: the device's settings. bad_blocks: without their mark or azimuth.
     """
 
-    def __init__(self, angles: Calibration | None = None) -> None:
+    def __init__(self, angles: ChannelAngles | None = None) -> None:
         self._angles = angles
         self.difop = Difop()
         self.calibration = NOMINAL

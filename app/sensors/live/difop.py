@@ -20,7 +20,7 @@ _ELEVATION_AT, _HORIZONTAL_AT = 468, 564
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class ChannelAngles:
     """The direction of each channel of one unit.
 
     Attributes:
@@ -35,14 +35,14 @@ class Calibration:
         """(32,) ring by channel: the rank of its elevation."""
         return np.argsort(np.argsort(self.elevations_deg, kind="stable")).astype(np.uint16)
 
-    def same(self, other: "Calibration") -> bool:
+    def same(self, other: "ChannelAngles") -> bool:
         return bool(
             np.array_equal(self.elevations_deg, other.elevations_deg)
             and np.array_equal(self.horizontal_deg, other.horizontal_deg)
         )
 
 
-NOMINAL = Calibration(ELEVATIONS_DEG, np.zeros(CHANNELS))
+NOMINAL = ChannelAngles(ELEVATIONS_DEG, np.zeros(CHANNELS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Difop:
     serial: str = ""
     return_mode: str = "strongest"
     reverse: bool = False
-    calibration: Calibration | None = None
+    calibration: ChannelAngles | None = None
 
     def same(self, other: "Difop") -> bool:
         """Whether all that matters for decoding is equal."""
@@ -81,7 +81,7 @@ def read_difop(packet: bytes) -> Difop | None:
     calibration = None
     # A unit without calibration sends invalid signs, or zeros, which cannot be elevations.
     if elevations is not None and elevations.any() and np.abs(elevations).max() <= 91.0:
-        calibration = Calibration(elevations, np.zeros(CHANNELS) if horizontal is None else horizontal)
+        calibration = ChannelAngles(elevations, np.zeros(CHANNELS) if horizontal is None else horizontal)
     mode = packet[300]
     return Difop(
         rpm=rpm if 60 <= rpm <= 6000 else 600,
@@ -111,7 +111,7 @@ def write_difop(difop: Difop, stamp_ns: int) -> bytes:
     return bytes(packet)
 
 
-def read_angles(path: Path) -> Calibration:
+def read_angles(path: Path) -> ChannelAngles:
     """A calibration from CSV: 32 lines by channel, `elevation, horizontal correction` in degrees.
 
     Raises:
@@ -130,7 +130,7 @@ def read_angles(path: Path) -> Calibration:
             f"{path} is no calibration of an RS-Bpearl; it must hold {CHANNELS} lines, one for each channel, of "
             "elevation and horizontal correction in degrees."
         )
-    return Calibration(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
+    return ChannelAngles(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
 
 
 def _read_angles(packet: bytes, at: int) -> F64 | None:

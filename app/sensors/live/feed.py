@@ -12,7 +12,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from app.sensors import ros
-from app.sensors.live.difop import NOMINAL, Calibration, Difop, read_angles, write_difop
+from app.sensors.live.difop import NOMINAL, ChannelAngles, Difop, read_angles, write_difop
 from app.sensors.live.firings import firings_of, fit_angles, rate_of
 from app.sensors.live.foxglove_server import FoxgloveServer, Offer
 from app.sensors.live.imu_udp import ImuSample, write_imu
@@ -53,7 +53,7 @@ class Pace:
 
 
 def packets_of(
-    recording: Recording, duration_s: float | None = None, model: Model = BPEARL, angles: Calibration | None = None
+    recording: Recording, duration_s: float | None = None, model: Model = BPEARL, angles: ChannelAngles | None = None
 ) -> Iterator[Sent]:
     """Everything that the sensors would have sent, in order of time.
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.sensors.live.difop import NOMINAL, Calibration
+from app.sensors.live.difop import NOMINAL, ChannelAngles
 from app.sensors.live.msop import TURN
 from app.sensors.rsbpearl import BPEARL, CHANNELS, Model
 from app.slam.errors import HemislamError
@@ -41,7 +41,7 @@ class Firings:
     intensity: U8
 
 
-def firings_of(scan: Scan, calibration: Calibration = NOMINAL, model: Model = BPEARL, rate_hz: int = 10) -> Firings:
+def firings_of(scan: Scan, calibration: ChannelAngles = NOMINAL, model: Model = BPEARL, rate_hz: int = 10) -> Firings:
     """The blocks that give this scan: all from its first to its last, also those without a return.
 
     Raises:
@@ -89,7 +89,7 @@ def rate_of(scans: list[Scan]) -> int:
     return 20 if len(starts) > 1 and np.median(np.diff(starts)) < 75_000_000 else 10
 
 
-def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> Calibration:
+def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> ChannelAngles:
     """The unit's angles from a few of its scans; the nominal ones if they explain the points.
 
     Its channels must be in the nominal order: points have a ring, but no channel.
@@ -118,7 +118,7 @@ def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> C
     # is such that none begins before; a scan that begins later may have had no return until then.
     if -_CUT_DEG < (start := min(starts)) < 0.0:
         sideways += start
-    return Calibration(np.round(elevations, 2), np.round(sideways, 2))
+    return ChannelAngles(np.round(elevations, 2), np.round(sideways, 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ class _Turn:
     step_deg: float
 
 
-def _turn(scan: Scan, calibration: Calibration, model: Model, rate_hz: int) -> _Turn:
+def _turn(scan: Scan, calibration: ChannelAngles, model: Model, rate_hz: int) -> _Turn:
     """The turn that fits the points' times and azimuths."""
     channel = np.argsort(calibration.rings)[np.minimum(scan.ring, CHANNELS - 1)]
     block, base_ns = _blocks(scan, channel, model)

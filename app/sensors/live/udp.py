@@ -10,7 +10,7 @@ import time
 from collections import deque
 
 from app.sensors.live.decoder import Decoder
-from app.sensors.live.difop import DIFOP_ID, Calibration, Difop, read_difop
+from app.sensors.live.difop import DIFOP_ID, ChannelAngles, Difop, read_difop
 from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.imu_udp import ImuOrder
 from app.sensors.live.intake import Intake
@@ -86,7 +86,7 @@ class RsbpearlReceiver:
         HemislamError: a port cannot be opened.
     """
 
-    def __init__(self, host: str, msop_port: int, difop_port: int, angles: Calibration | None = None) -> None:
+    def __init__(self, host: str, msop_port: int, difop_port: int, angles: ChannelAngles | None = None) -> None:
         self._sockets = [open_socket(host, msop_port)]
         if difop_port != msop_port:
             try:

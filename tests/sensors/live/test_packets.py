@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from app.sensors.live.decoder import Decoder
-from app.sensors.live.difop import NOMINAL, Calibration, Difop, read_angles, read_difop, write_difop
+from app.sensors.live.difop import NOMINAL, ChannelAngles, Difop, read_angles, read_difop, write_difop
 from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.msop import PacketWriter, stamp_of, write_packet
 from app.sensors.rsbpearl import BPEARL, BPV4
@@ -177,7 +177,7 @@ def test_packets_run_on_over_the_end_of_a_revolution_but_not_over_a_pause() -> N
 
 def test_nominal_angles_are_the_data_sheets() -> None:
     np.testing.assert_allclose(NOMINAL.elevations_deg, sensor.ELEVATIONS)
-    assert isinstance(NOMINAL, Calibration)
+    assert isinstance(NOMINAL, ChannelAngles)
 
 
 def test_no_bytes_of_a_device_packet_stop_the_decoder() -> None:
