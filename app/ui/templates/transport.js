@@ -6,6 +6,8 @@ const shell = dock.querySelector('.hs-tl'), canvas = shell.querySelector('canvas
 const bar = dock.querySelector('.hs-transport'), [play, fold] = ['.hs-play', '.hs-fold'].map((c) => bar.querySelector(c));
 const slider = bar.querySelector('input'), speed = bar.querySelector('select'), when = bar.querySelector('.hs-when');
 const marks = bar.querySelector('.hs-track canvas'), ink = marks.getContext('2d');
+mover.home = home;
+window.hemislamDock = mover;
 for (const old of document.querySelectorAll('body > [data-hs-to]')) if (old.querySelector('.hs-dock')) old.remove();
 const HEAD = 20, NAME = 78, VALUE = 72, ROW = 19, HELD_MS = 1000;
 let TEXT, QUIET, GOOD, BAD, NOTE, d = null, text = '', hover = null, scrubbing = false, said = 0, touched = -HELD_MS;
@@ -191,7 +193,10 @@ fold.onclick = () => unfold(shell.hidden);
 const settle = () => {
   const scene = document.querySelector('canvas[data-engine]');
   if (!home.isConnected) { mover.remove(); return; }
-  if (scene) {
+  const other = window.hemislamDock !== mover && window.hemislamDock;
+  if (other && other.home.isConnected) mover.remove(); // viser has made the panel twice: the newest shows
+  else if (scene) {
+    window.hemislamDock = mover;
     const box = scene.getBoundingClientRect(), phone = innerWidth < 577;
     if (mover.parentElement !== document.body) { document.body.append(mover); dock.hidden = false; }
     Object.assign(mover.style, {position: 'fixed', zIndex: 11, left: box.left + (phone ? 0 : 8) + 'px',
