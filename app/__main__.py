@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 
 from app import TEMPORARY_KERNEL_CACHE, __version__
 from app.cli import options
-from app.cli.calibrate import calibrate
+from app.cli.calibrate import calibrate as calibrate_command
 from app.cli.evaluate import evaluate
 from app.cli.feed import feed
 from app.cli.replay import replay
@@ -91,7 +91,7 @@ def hemislam(
 cli.command()(serve)
 cli.command()(run)
 cli.command()(replay)
-cli.command()(calibrate)
+cli.command("calibrate")(calibrate_command)
 cli.command()(evaluate)
 cli.command()(feed)
 
@@ -101,6 +101,7 @@ cli.command()(feed)
 def info(
     recording: options.RecordingPath,
     params_for: options.ParamsFor,
+    calibrate: options.Calibrate = True,
 ) -> None:
     """Examine a recording and report what is wrong.
 
@@ -117,6 +118,8 @@ def info(
       hemislam info walk.mcap
       hemislam info indoor1.bag --preset h2lid
     """
+    from app.calibration.by_itself import is_mounting_unknown
+    from app.cli.run import look_for_mounting
     from app.sensors.doctor import DAMAGE, examine
 
     params = params_for(recording)
@@ -128,6 +131,8 @@ def info(
         typer.echo(f"{finding.verdict:<9}  {finding.subject:<{width}}  {finding.text}")
         if finding.option:
             typer.echo(f"{'':<9}  {'':<{width}}  -> {finding.option}")
+    if calibrate and is_mounting_unknown(params) and (told := look_for_mounting(recording, params)):
+        typer.echo(told)
     waiting = sum(finding.verdict == "needs you" for finding in findings)
     typer.echo(f"{waiting} of {len(findings)} findings need you." if waiting else "Nothing here needs you.")
     if broken := next((f for f in findings if f.subject == DAMAGE and f.verdict == "needs you"), None):

@@ -16,6 +16,7 @@ from app.calibration.translation import Moved, fit_translation
 from app.calibration.walk import LONGEST_S, Walk, read_walk
 from app.sensors.recording import open_recording
 from app.slam import lie
+from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import F64
 
@@ -127,7 +128,10 @@ def calibrate(
     """
     with open_recording(path, params) as recording:
         walk = read_walk(recording, params, duration_s, lambda done: progress("reading", READING * done))
-    return calibrate_walk(path, params, walk, progress)
+    try:
+        return calibrate_walk(path, params, walk, progress)
+    except np.linalg.LinAlgError as error:
+        raise HemislamError(f"{path} cannot be calibrated ({error}); walk slowly where there are walls.") from None
 
 
 def calibrate_walk(

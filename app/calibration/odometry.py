@@ -94,6 +94,8 @@ def track(walk: Walk, guide: Guide | None = None, progress: Callable[[float], No
         here = _predicted(here, float(times[k - 1]), float(times[k]), guide, _changes(walk, scan.end_ns))
         path = _Path.of(scan, float(times[k]), here.R, guide)
         here, residual = _laid(scan, here, path, local_map, params)
+        if not (np.isfinite(here.p).all() and np.isfinite(here.R).all()):
+            raise np.linalg.LinAlgError("the odometry gave no finite pose")
         points = path.deskewed(scan, here)
         world = points @ here.R.T.astype(np.float32) + here.p.astype(np.float32)
         local_map.insert(np.ascontiguousarray(world), here.p, mapping)

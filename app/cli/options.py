@@ -39,6 +39,13 @@ Duration = Annotated[
 Imperfect = Annotated[
     bool, typer.Option("--imperfect", help="With the errors of a real scanner and hand, and with people beside.")
 ]
+Calibrate = Annotated[
+    bool,
+    typer.Option(
+        "--calibrate/--no-calibrate",
+        help="If no mounting is given, or the run is in doubt, find how the LiDAR sits on the IMU.",
+    ),
+]
 Truth = Annotated[
     Path | None,
     typer.Option(

@@ -7,12 +7,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import Duration, ParamsFor, RecordingPath, Start, Truth, progress_bar, say_calibrated, with_params
+from app.cli.options import (
+    Calibrate,
+    Duration,
+    ParamsFor,
+    RecordingPath,
+    Start,
+    Truth,
+    progress_bar,
+    say_calibrated,
+    with_params,
+)
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
     from app.mapping.session import Session
     from app.slam.loops.edits import LoopEdit
+    from app.slam.params import Params
 
 
 @with_params
@@ -29,6 +40,7 @@ def run(
     loops: Annotated[
         Path | None, typer.Option("--loops", metavar="FILE", help="Edits of loops, as the workbench saves them.")
     ] = None,
+    calibrate: Calibrate = True,
 ) -> None:
     """Process a recording without a browser and write the results.
 
@@ -51,12 +63,14 @@ def run(
     """
     from app.evaluation.truth import read_poses
     from app.mapping.opening import open_session
+    from app.slam.doubts import doubts
     from app.slam.results import prepare_folder
     from app.slam.trajectory import truth_beside
 
     params = params_for(recording)
     say_calibrated(recording)
     edits = _read_edits(loops) if loops else ()
+    params, told = settle_mounting(recording, params) if calibrate else (params, "")
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
     session = open_session(recording, params, start, duration, truth=truth_path)
@@ -81,7 +95,9 @@ def run(
             with contextlib.suppress(OSError):
                 folder.rmdir()  # only if it is empty
             raise stop or HemislamError(_nothing_processed(session))
-        save(session, folder, stop, replace=force)
+        if calibrate and not told and doubts(session.log):
+            told = look_for_mounting(recording, params)
+        save(session, folder, stop, replace=force, calibration=told)
     finally:
         session.close()
 
@@ -93,8 +109,36 @@ def prepare(session: "Session") -> None:
         session.loops.wait_ready()
 
 
-def save(session: "Session", folder: Path, stop: BaseException | None, *, replace: bool) -> None:
+def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
+    """The parameters with the mounting that the recording itself tells, if none is given; and that, in a sentence."""
+    from app.calibration.by_itself import advice, contradicted, is_mounting_unknown
+
+    if not is_mounting_unknown(params):
+        return params, ""
+    with progress_bar(
+        "Finding how the LiDAR sits on the IMU", total=1.0, bar_format="{desc} |{bar}| {elapsed}"
+    ) as show:
+        found = contradicted(recording, params, lambda step, fraction: show(fraction))
+    if found is None:
+        return params, ""
+    typer.echo(told := advice(found, used=True))
+    return params.with_values(found.found()), told
+
+
+def look_for_mounting(recording: Path, params: "Params") -> str:
+    """What the recording tells of its mounting against the parameters, in a sentence; "" if nothing."""
+    from app.calibration.by_itself import advice, contradicted
+
+    with progress_bar("Looking for the cause", total=1.0, bar_format="{desc} |{bar}| {elapsed}") as show:
+        found = contradicted(recording, params, lambda step, fraction: show(fraction))
+    return advice(found, used=False) if found else ""
+
+
+def save(session: "Session", folder: Path, stop: BaseException | None, *, replace: bool, calibration: str = "") -> None:
     """Write the results and sum them up.
+
+    Args:
+        calibration: what the recording tells of its mounting, in a sentence.
 
     Raises:
         BaseException: `stop`, what ended the run early, once the frames so far are saved.
@@ -102,7 +146,7 @@ def save(session: "Session", folder: Path, stop: BaseException | None, *, replac
     from app.slam.report import summarise
 
     stopped = "" if stop is None else str(stop) or type(stop).__name__
-    report = session.save(folder, replace=replace, stopped=stopped).result()
+    report = session.save(folder, replace=replace, stopped=stopped, calibration=calibration).result()
     typer.echo(summarise(report, folder))
     if session.loops:
         for notice in (*session.loops.take_notices(), *session.loops.take_alarms()):

@@ -317,18 +317,22 @@ class Session:
         trajectory_only: bool = False,
         replace: bool = True,
         stopped: str = "",
+        calibration: str = "",
     ) -> "Future[dict[str, Any]]":
         """Write the results of the frames so far in a thread of its own, with all loops, in effect or not.
 
         Args:
             session: to be written beside them. trajectory_only: nothing but trajectory.tum.
             replace: overwrite older results. stopped: why the session ended early, if it did.
+            calibration: what the recording tells of its mounting, in a sentence.
 
         Returns:
             The content of report.json, or HemislamError if the folder cannot be written to.
         """
         info = self.feed.info
-        made_from = RunInfo(info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped)
+        made_from = RunInfo(
+            info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped, calibration
+        )
         results = Results(self.log, self.keyframes.now(), made_from, self.loops.results() if self.loops else None)
 
         def write() -> dict[str, Any]:

@@ -53,7 +53,7 @@ def _of_imu(log: RunLog) -> list[str]:
         return []
     return [
         f"The scans contradict the IMU: of the changes of velocity that it measures they take {share:.0%} back. "
-        "Check its units, axes and clock, and the mounting of the LiDAR on it."
+        "Check its units, axes and clock, and the mounting of the LiDAR on it: `hemislam calibrate` finds the last two."
     ]
 
 

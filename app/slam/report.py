@@ -26,6 +26,7 @@ def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo) -> dict[str,
         "hemislam": __version__,
         "stopped_early": info.stopped or None,
         "doubts": list(doubts(log)),
+        "calibration": info.calibration or None,
         "recording": {
             "path": str(info.recording),
             "sha256": hash_input(info.recording),
@@ -120,6 +121,8 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
             lines.append(("", f"no rotation error: {accuracy['ate_deg_withheld']}"))
         if (before := report.get("accuracy_odometry")) and "ate_m" in before:
             lines.append(("", f"without loops ATE {before['ate_m']['rmse']:.4f} m"))
+    if report["calibration"]:
+        lines.append(("calibrated", report["calibration"]))
     lines += [("noted", f"{count} x {notice}") for notice, count in [*report["notices"].items()][:MOST_NOTED]]
     lines += [("memory", f"{report['peak_memory_mb']:.0f} MB at most"), ("saved in", str(folder))]
     return "\n".join(f"{name:<10} {text}" for name, text in (*warning, *lines, *warning))

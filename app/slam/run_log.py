@@ -25,6 +25,7 @@ class RunInfo:
         recording: the input. params: as used last. start_s, duration_s: the part asked for.
         truth: to compare with. truth_path: its file.
         stopped: why the run ended before the recording did, in a sentence; "" if it did not.
+        calibration: what the recording tells of its mounting beside the parameters, in a sentence; "" if nothing.
     """
 
     recording: Path
@@ -34,6 +35,7 @@ class RunInfo:
     truth: Trajectory | None = None
     truth_path: Path | None = None
     stopped: str = ""
+    calibration: str = ""
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from app.__main__ import cli
-from app.calibration.calibrate import Calibration, calibrate_walk
-from app.calibration.rotation import Turned
-from app.calibration.translation import Moved
+from app.calibration.calibrate import calibrate_walk
 from app.calibration.walk import Walk, read_walk
 from app.calibration.words import WALK, as_json, params_yaml, table, write_beside
 from app.cli.calibration_plot import residual_plot
@@ -24,10 +22,7 @@ from app.sensors.recording import open_recording
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-
-MID360 = np.array([-0.011, -0.02329, 0.04412])
-"""Of the IMU in a Mid-360, by its manual."""
-TURN = Rotation.from_euler("ZYX", [104.0, -50.0, 70.0], degrees=True).as_matrix()
+from tests.calibration.rehearsal import MID360, TURN, known
 
 
 @pytest.fixture(scope="module")
@@ -57,15 +52,6 @@ def test_reading_skips_the_rest_at_the_start(walk: Walk, shared_data: Path) -> N
     with open_recording(shared_data / "hall_mid360.mcap", Params()) as recording:
         assert 1.5 < (walk.scans[0].end_ns - recording.start_ns) * 1e-9 < 3.0
     assert all(a.end_ns < b.end_ns for a, b in zip(walk.scans, walk.scans[1:], strict=False))
-
-
-def known(recording: Path, *, sure: bool = True, params: Params | None = None) -> Calibration:
-    """What might have been found."""
-    wide = 1e-6 if sure else 1.0
-    rows = np.linspace(0.0, 0.01, 30).reshape(-1, 3)
-    turned = Turned(TURN, 0.02, np.zeros(3), np.eye(7) * wide, rows * 2, rows)
-    moved = Moved(MID360, np.zeros(3), np.array([0.0, 0.0, -9.81]), np.eye(6) * wide, rows * 2, rows)
-    return Calibration(recording, params or Params(), 30.0, turned, moved, np.array([0.0, 0.0, -1.0]), (0.02, 0.01))
 
 
 def test_what_was_found_is_kept_beside_the_recording_and_undone_by_deleting_it(tmp_path: Path) -> None:

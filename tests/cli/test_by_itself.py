@@ -1,0 +1,58 @@
+"""Tests app/calibration/by_itself.py: `run` and `info` where the mounting is not known."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from app.__main__ import cli
+from app.calibration.calibrate import Calibration
+from app.slam.params import Params
+from tests.calibration.rehearsal import known
+
+
+def rehearsed(monkeypatch: pytest.MonkeyPatch, *, sure: bool = True) -> None:
+    def found(path: Path, params: Params, *_: object) -> Calibration:
+        return known(path, sure=sure, params=params)
+
+    monkeypatch.setattr("app.calibration.by_itself.calibrate", found)
+
+
+def test_an_unknown_mounting_is_found_used_and_told(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rehearsed(monkeypatch)
+    done = CliRunner().invoke(cli, ["run", str(walk), "--out", str(tmp_path / "out")])
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert "The LiDAR seems to be turned by 70°, -50°, 104° on the IMU" in done.output
+    assert "turned by 70°, -50°, 104°" in report["calibration"] and "--write" in report["calibration"]
+    assert np.allclose(report["parameters"]["sensor"]["rotation"], [70, -50, 104], atol=0.01)
+
+
+def test_a_given_mounting_or_a_refusal_is_respected(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rehearsed(monkeypatch)
+    for number, option in enumerate(["--preset=h2lid-mount", "--no-calibrate"]):
+        folder = tmp_path / str(number)
+        CliRunner().invoke(cli, ["run", str(walk), option, "--out", str(folder)])
+        report = json.loads((folder / "report.json").read_text())
+        assert report["calibration"] is None and report["parameters"]["sensor"]["rotation"] == [0, 0, 0]
+
+
+def test_what_a_motion_does_not_tell_changes_nothing(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rehearsed(monkeypatch, sure=False)
+    done = CliRunner().invoke(cli, ["run", str(walk), "--out", str(tmp_path / "out")])
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["calibration"] is None and "seems to be" not in done.output
+
+
+def test_info_tells_how_the_lidar_is_turned(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rehearsed(monkeypatch)
+    told = CliRunner().invoke(cli, ["info", str(walk)]).output
+    assert "turned by 70°, -50°, 104° on the IMU, and the IMU's clock" in told
+    assert f"hemislam calibrate {walk} --write" in told
