@@ -22,6 +22,7 @@ from app.server.protocol import Snapshot
 from app.server.setup import POINT_BUDGET, Setup
 from app.server.worker import RunningEngine
 from app.ui.appearance import AppearancePanel, apply_theme
+from app.ui.calibration import CalibrationPanel
 from app.ui.camera import CameraPanel
 from app.ui.compare import ComparePanel, Sides
 from app.ui.files import FilesPanel, RecentPanel
@@ -108,6 +109,8 @@ class Workbench:
             files.add_buttons()
             self._live = LivePanel(gui)
             self._doctor = DoctorPanel(page)
+            with gui.add_folder("Calibration", expand_by_default=False):
+                self._calibration = CalibrationPanel(page)
             with gui.add_folder("Notes"):
                 self._notes = NotesPanel(page)
             self._notices = NoticePanel(server)
@@ -117,7 +120,7 @@ class Workbench:
 
         self._panels = (
             self._transport, self._breakpoints, self._notes, self._notices, self._header, self._recent, self._timeline,
-            self._readouts, self._doctor, self._live, self._files, self._camera,
+            self._readouts, self._doctor, self._calibration, self._live, self._files, self._camera,
         )  # fmt: skip
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
@@ -133,6 +136,7 @@ class Workbench:
     def close(self) -> None:
         """Stop drawing; the page stays as it is until its server stops."""
         self._stop.set()
+        self._calibration.close()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
 
