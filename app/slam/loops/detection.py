@@ -27,8 +27,8 @@ NEAR_M = 3.0
 """Added to the reach of drift: places this far apart still see each other."""
 WIDER = 2.0
 """Odometry that slipped is farther off than the model of drift allows, so it is searched this many times as far."""
-KEPT_PREPARED = 2
-"""Submaps that stay in memory, ready for registration: the newer one, and one older one at a time."""
+KEPT_PREPARED = 8
+"""Submaps that stay in memory, ready for registration: the newer one, and older ones, which are often met again."""
 KEPT_SUBMAPS = 1
 """Submaps that stay in memory otherwise: the one just described is needed again."""
 _NUMBERS = np.empty(0, np.float32)

@@ -11,7 +11,7 @@ import numpy as np
 
 from app.slam import lie
 from app.slam.loops.plan import Window, placements
-from app.slam.loops.verification import Fit, Prepared, assess, refine, register, slide
+from app.slam.loops.verification import Fit, Prepared, assess, refine, register, rough, slide
 from app.slam.types import F64
 
 APART_M, APART_RAD = 0.8, float(np.radians(10.0))
@@ -19,6 +19,8 @@ APART_M, APART_RAD = 0.8, float(np.radians(10.0))
 LEAST_OVERLAP, MOST_RESIDUAL, RESIDUAL_M = 0.6, 1.6, 0.002
 """An alignment fits as well with at least this share of the overlap, and at most this many times the residual plus so
 many metres. (In a place that does not repeat, wrong alignments share less.)"""
+HOPEFUL, SAME_ROUGHLY = 0.5 * LEAST_OVERLAP, 0.25
+"""A rough alignment goes on with at least this share of the points that fit in the best, and this far from others."""
 ALONG = 0.9
 """Least cosine between the way from one alignment to another and a direction that is open, for them to be the same."""
 
@@ -58,8 +60,8 @@ def place(
     """
     starts = [T_guess, *(placements(target, source, T_guess, window) if window.reach_m >= APART_M else ())]
     fits: list[Fit] = []
-    for start in starts:
-        T = register(target, source, start)
+    for rough_T in _worthwhile([rough(target, source, start) for start in starts]):
+        T = register(target, source, rough_T)
         if not any(_apart(T, fit.T_target_source) < 1.0 for fit in fits):
             fits.append(assess(target, source, T))
     best = max(fits, key=lambda fit: fit.overlap)
@@ -86,6 +88,16 @@ def place(
         loose=loose,
         alternative_m=min(lengths, default=float("inf")),
     )
+
+
+def _worthwhile(roughs: list[tuple[F64, float]]) -> list[F64]:
+    """Of rough alignments (4, 4) with the share of points that fit, those that may become the best, each once."""
+    most = max(share for _, share in roughs)
+    out: list[F64] = []
+    for T, share in roughs:
+        if share >= HOPEFUL * most and not any(_apart(T, other) < SAME_ROUGHLY for other in out):
+            out.append(T)
+    return out
 
 
 def _as_good(other: Fit, fit: Fit) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from app.slam import lie
+from app.slam.kernels import submaps
 from app.slam.loops.verification import Prepared
 from app.slam.types import F64, I64
 
@@ -44,11 +45,11 @@ def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window)
     yaws = np.arctan2(T_guess[1, 0], T_guess[0, 0]) + np.arange(-steps, steps + 1) * TURN
     reach = int(np.ceil(min(window.reach_m, FARTHEST_M) / CELL_M))
     shifts = np.arange(-reach, reach + 1)
-    spectrum = np.fft.rfft2(_plan(target, np.eye(4)))
+    spectrum = np.fft.rfft2(_plan(target, 0.0, np.zeros(3)))
     alike = np.empty((len(yaws), len(shifts), len(shifts)))
     for index, yaw in enumerate(yaws):
-        plan = _plan(source, _upright(yaw, T_guess[:3, 3]))
-        alike[index] = np.fft.irfft2(spectrum * np.fft.rfft2(plan).conj(), plan.shape)[np.ix_(shifts, shifts)]
+        turned = np.fft.rfft2(_plan(source, yaw, T_guess[:3, 3]))
+        alike[index] = np.fft.irfft2(spectrum * turned.conj(), (CELLS, CELLS))[np.ix_(shifts, shifts)]
     alike[:, np.hypot(shifts[:, None], shifts) > reach] = 0.0
     highest = ndimage.maximum_filter(alike, SAME, mode="constant")  # type: ignore[attr-defined]  # no types
     found = np.argwhere((alike >= highest) & (alike > LEAST * alike.max()))
@@ -59,17 +60,11 @@ def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window)
     ]
 
 
-def _plan(prepared: Prepared, T: F64) -> F64:
-    """(CELLS, CELLS) of a submap that lies at T (4, 4); the origin is in the first cell."""
-    ground, upright = (_moved(prepared.points[which], T) for which in (prepared.level, prepared.upright))
-    plan = np.zeros(CELLS * CELLS)
-    plan[_cells(ground)] = BARE
-    layer = np.floor(upright[:, 2] / CELL_M).astype(np.int64) % CELLS
-    boxes = np.unique(_cells(upright) * CELLS + layer)
-    tall = np.bincount(boxes // CELLS, minlength=CELLS * CELLS)
-    standing = tall > 0
-    plan[standing] = np.sqrt(np.minimum(tall[standing], TALLEST) / 2)
-    return plan.reshape(CELLS, CELLS)
+def _plan(prepared: Prepared, yaw: float, position: F64) -> F64:
+    """(CELLS, CELLS) of a submap turned about the vertical and moved; the origin is in the first cell."""
+    plan = np.empty((CELLS, CELLS))
+    submaps.columns(prepared.points, prepared.level, prepared.upright, yaw, position, CELL_M, BARE, TALLEST, plan)
+    return plan
 
 
 def _on_ground(target: Prepared, source: Prepared, T: F64) -> F64:

@@ -13,8 +13,7 @@ from app.slam.loops.edits import Add
 from app.slam.loops.placing import Placement, place
 from app.slam.loops.plan import Window
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
-from app.slam.loops.verification import Fit, assess, refine
-from app.slam.loops.verification import register as align
+from app.slam.loops.verification import Fit, assess, refine, register, rough
 from app.slam.sections import LoopsParams
 from app.slam.types import F64
 
@@ -87,7 +86,7 @@ def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
     if not edit.register:
         fit = assess(*both, guess)
     elif edit.guess:
-        fit = assess(*both, refine(*both, align(*both, guess)))
+        fit = assess(*both, refine(*both, register(*both, rough(*both, guess)[0])))
     else:
         fit = _place(older, newer, detector, expect(newer, poses, (), Drift.of(params)), params).fit
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)

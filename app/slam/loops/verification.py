@@ -12,7 +12,7 @@ import numpy.typing as npt
 import small_gicp
 
 from app.slam import lie
-from app.slam.kernels import patches
+from app.slam.kernels import patches, small, submaps
 from app.slam.loops.submap import Submap
 from app.slam.types import F64, I64
 
@@ -34,6 +34,8 @@ ENOUGH = 2e-4
 """Change (rad, m) that ends a pass."""
 MOST_POINTS, FEW_POINTS = 2500, 800
 """Points of the source that take part in a registration, and in a rough one; all flat points are judged."""
+FITS_M = 0.15
+"""A point this near to the plane of its partner fits, roughly."""
 PARTNER_M = 0.3
 """A point with another within this distance in the other submap has a partner."""
 COMMON_M = 15.0
@@ -120,32 +122,41 @@ def _thinned(which: Flags, most: int) -> I64:
     return indices[:: max(1, -(-len(indices) // most))]
 
 
-def register(target: Prepared, source: Prepared, T_guess: F64) -> F64:
-    """(4, 4) T_target_source of the level frames, to a centimetre or so, by Gauss-Newton with Cauchy weights."""
-    return _align(target, source, _align(target, source, T_guess, source.few, COARSE), source.few, FINE)
+def rough(target: Prepared, source: Prepared, T_guess: F64) -> tuple[F64, float]:
+    """(4, 4) T_target_source of the level frames, to a decimetre or so, and the share of points that fit there."""
+    return _align(target, source, T_guess, source.few, COARSE)
+
+
+def register(target: Prepared, source: Prepared, T_rough: F64) -> F64:
+    """The same from where `rough` ends, to a centimetre or so."""
+    return _align(target, source, T_rough, source.few, FINE)[0]
 
 
 def refine(target: Prepared, source: Prepared, T: F64) -> F64:
     """The same from where `register` ends, with more points."""
-    return _align(target, source, T, source.chosen, FINE)
+    return _align(target, source, T, source.chosen, FINE)[0]
 
 
-def _align(target: Prepared, source: Prepared, T_guess: F64, chosen: I64, one_pass: tuple[float, float, int]) -> F64:
-    T = T_guess.copy()
+def _align(
+    target: Prepared, source: Prepared, T_guess: F64, chosen: I64, one_pass: tuple[float, float, int]
+) -> tuple[F64, float]:
+    """By Gauss-Newton with Cauchy weights. Returns the pose, and the share of the chosen points that fit there."""
+    T, turn = T_guess.copy(), np.empty((3, 3))
+    points, normals = source.points[chosen], source.normals[chosen]
     reach, scale, iterations = one_pass
+    share = 0.0
     for _ in range(iterations):
-        moved, partner, residual = _correspond(target, source, chosen, T, reach)
-        if len(moved) < 6:
-            return T
-        weight = 1.0 / (1.0 + (residual / scale) ** 2)
-        J = _jacobian(moved, target.normals[partner], T)
-        H = (J * weight[:, None]).T @ J
-        step = -np.linalg.lstsq(H + 1e-6 * np.trace(H) * np.eye(6), J.T @ (weight * residual), rcond=None)[0]
-        T[:3, :3] = lie.exp(step[:3]) @ T[:3, :3]
+        H, b, residuals = _pull(target, points, normals, T, reach, scale)
+        if np.count_nonzero(~np.isnan(residuals)) < 6:
+            return T, 0.0
+        share = float(np.count_nonzero(np.abs(residuals) < FITS_M) / len(points))
+        step = -np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(6), b)
+        small.rotation(step[0], step[1], step[2], turn)
+        T[:3, :3] = turn @ T[:3, :3]
         T[:3, 3] += step[3:]
         if np.abs(step).max() < ENOUGH:
             break
-    return T
+    return T, share
 
 
 def assess(target: Prepared, source: Prepared, T: F64) -> Fit:
@@ -153,9 +164,8 @@ def assess(target: Prepared, source: Prepared, T: F64) -> Fit:
     back = lie.inverse(T)
     overlap = min(_overlap(target, source, T), _overlap(source, target, back))
     near = np.flatnonzero(_near(source.points @ T[:3, :3].T + T[:3, 3], T[:3, 3]) & source.flat)
-    moved, partner, residuals = _correspond(target, source, near, T, PARTNER_M)
-    J = _jacobian(moved, target.normals[partner], T)
-    return Fit(T, overlap, residuals, J.T @ J)
+    information, _, residuals = _pull(target, source.points[near], source.normals[near], T, PARTNER_M, np.inf)
+    return Fit(T, overlap, residuals[~np.isnan(residuals)], information)
 
 
 def slide(target: Prepared, source: Prepared, fit: Fit, direction: F64) -> float:
@@ -167,24 +177,23 @@ def slide(target: Prepared, source: Prepared, fit: Fit, direction: F64) -> float
     for sign in (-1.0, 1.0):
         pushed = fit.T_target_source.copy()
         pushed[:3, 3] += sign * DISTURBANCE_M * direction
-        ends.append(_align(target, source, pushed, source.few, FINE)[:3, 3])
+        ends.append(_align(target, source, pushed, source.few, FINE)[0][:3, 3])
     return float(max(abs(direction @ (end - fit.T_target_source[:3, 3])) for end in ends))
 
 
-def _correspond(target: Prepared, source: Prepared, chosen: I64, T: F64, reach: float) -> tuple[F64, I64, F64]:
-    """Of the chosen source points those with a counterpart: moved (k, 3), its index (k,), residual (k,) m."""
-    moved = source.points[chosen] @ T[:3, :3].T + T[:3, 3]
+def _pull(target: Prepared, points: F64, normals: F64, T: F64, reach: float, scale: float) -> tuple[F64, F64, F64]:
+    """Normal equations (6, 6), (6,) of source points laid at T (4, 4), and their residuals, nan without a partner.
+
+    Errors are a rotation about the source's origin and a translation, in the target's axes.
+    """
+    moved = points @ T[:3, :3].T + T[:3, 3]
     partner, squared = _nearest(target, moved)
-    normals = source.normals[chosen] @ T[:3, :3].T
-    facing = np.einsum("ni,ni->n", normals, target.normals[partner]) > FACING
-    good = np.flatnonzero((squared < reach**2) & target.flat[partner] & facing)
-    moved, partner = moved[good], partner[good]
-    return moved, partner, np.einsum("ni,ni->n", moved - target.points[partner], target.normals[partner])
-
-
-def _jacobian(moved: F64, normals: F64, T: F64) -> F64:
-    """(k, 6) of the residuals by a rotation about the source's origin and a translation, target's axes."""
-    return np.hstack([np.cross(moved - T[:3, 3], normals), normals])
+    H, b, residuals = np.empty((6, 6)), np.empty(6), np.empty(len(moved))
+    submaps.normal_equations(
+        moved, normals, T[:3, :3], T[:3, 3], partner, squared, target.points, target.normals, target.flat, reach,
+        FACING, scale, H, b, residuals,
+    )  # fmt: skip
+    return H, b, residuals
 
 
 def _overlap(target: Prepared, source: Prepared, T: F64) -> float:

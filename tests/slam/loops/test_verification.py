@@ -1,6 +1,6 @@
 """Submaps are registered to one another.
 
-Tests app/slam/kernels/patches.py.
+Tests app/slam/kernels/patches.py, app/slam/kernels/submaps.py.
 """
 
 import numpy as np
@@ -8,7 +8,7 @@ import pytest
 
 from app.slam import lie
 from app.slam.loops.submap import Submap
-from app.slam.loops.verification import Prepared, assess, prepare, refine, register, slide
+from app.slam.loops.verification import Prepared, assess, prepare, refine, register, rough, slide
 from app.slam.types import F64
 
 
@@ -50,7 +50,7 @@ def test_a_submap_is_found_where_it_is(guess: tuple[float, float, float, float])
     truth = pose(0.8, -0.2, 0.05, 2.0)
     target = seen(corridor(np.random.default_rng(0), FINS), np.eye(4))
     source = seen(corridor(np.random.default_rng(1), FINS), truth)
-    T = refine(target, source, register(target, source, pose(*guess) @ truth))
+    T = refine(target, source, register(target, source, rough(target, source, pose(*guess) @ truth)[0]))
     assert np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.01
     assert np.degrees(np.linalg.norm(lie.log(T[:3, :3] @ truth[:3, :3].T))) < 0.1
     fit = assess(target, source, T)
