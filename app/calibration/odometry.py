@@ -186,25 +186,28 @@ def _laid(scan: Scan, prior: _Motion, path: _Path, local_map: LocalMap, params: 
         world = points @ here.R.T + here.p
         good, poor = local_map.planes(np.ascontiguousarray(world), params)
         planes = good if np.count_nonzero(good.variances >= 0) > ENOUGH * len(points) else poor
-        off = np.sum(planes.normals * (world - planes.centers), axis=1)
-        normals = planes.normals @ here.R  # in the LiDAR frame
+        found = np.flatnonzero(planes.variances >= 0)  # nothing was written elsewhere
+        at, spread = planes.normals[found], np.sqrt(planes.variances[found])
+        off = np.sum(at * (world[found] - planes.centers[found]), axis=1)
+        points, normals = points[found], at @ here.R  # in the LiDAR frame
         reach = np.linalg.norm(points, axis=1)
-        fits = (planes.variances >= 0) & (np.abs(off) < gate * params.gate * np.sqrt(reach))
+        fits = np.abs(off) < gate * params.gate * np.sqrt(reach)
         fits &= np.abs(np.sum(normals * points, axis=1)) > EDGE_ON * reach
         if np.count_nonzero(fits) < LEAST_PLANES:
             return prior, float("nan")
         rotation = np.cross(points, normals)
-        rows = np.hstack([rotation, planes.normals, ago * rotation, ago * planes.normals])[fits]
+        then = ago[found]
+        rows = np.hstack([rotation, at, then * rotation, then * at])[fits]
         if path.turned is not None:
             rows[:, RATE] = 0.0
-        spread = np.sqrt(planes.variances[fits])
-        weight = np.minimum(1.0, RESIDUAL_HUBER * spread / np.maximum(np.abs(off[fits]), 1e-9)) / spread**2 / REPEATED
+        off, spread = off[fits], spread[fits]
+        weight = np.minimum(1.0, RESIDUAL_HUBER * spread / np.maximum(np.abs(off), 1e-9)) / spread**2 / REPEATED
         H = information + rows.T @ (weight[:, None] * rows)
-        b = rows.T @ (weight * off[fits]) + information @ here.minus(prior)
+        b = rows.T @ (weight * off) + information @ here.minus(prior)
         step = -np.linalg.solve(H, b)
         here = here.plus(step)
         here.P = np.linalg.inv(H)
-        residual = float(np.sqrt(np.mean(off[fits] ** 2)))
+        residual = float(np.sqrt(np.mean(off**2)))
         if gate == 1.0 and np.linalg.norm(step[ROT]) < 1e-4 and np.linalg.norm(step[POS]) < 1e-3:
             break
     return here, residual
