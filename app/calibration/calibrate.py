@@ -102,7 +102,7 @@ class Calibration:
         be told."""
         found, parts = self.found(), []
         if "sensor.rotation" in found and self.apart > APART_ROTATION:
-            angles = ", ".join(f"{angle:.0f}°" for angle in self.rotation)
+            angles = ", ".join(f"{round(angle)}°" for angle in self.rotation)
             parts.append(f"the LiDAR seems to be turned by {angles} on the IMU")
         off = self.moved.p_imu_lidar - self.params.sensor.translation
         if "sensor.translation" in found and np.linalg.norm(off) > APART_PLACE:
