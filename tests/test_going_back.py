@@ -20,7 +20,7 @@ STORES = {
     "slam/keyframes.py": "the file of keyframes",
 }
 """Containers with `truncate`, which others call."""
-LOOP_BACK_END = {f"slam/loops/{name}.py" for name in ("backend", "detection", "edits", "submap")}
+LOOP_BACK_END = {f"slam/loops/{name}.py" for name in ("backend", "detection", "search", "submap")}
 """What is derived from keyframes and edits. It is brought to another number of keyframes by `backend.py` alone."""
 
 

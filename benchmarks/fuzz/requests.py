@@ -53,7 +53,7 @@ class Document:
         paths = st.just(path)
         for parameter in operation.get("parameters", ()):
             hole, values = f"{{{parameter['name']}}}", self.values(parameter["schema"])
-            paths = st.tuples(paths, values).map(lambda pair, hole=hole: pair[0].replace(hole, pair[1]))  # type: ignore[misc]
+            paths = st.tuples(paths, values).map(lambda pair, hole=hole: pair[0].replace(hole, str(pair[1])))  # type: ignore[misc]
         if "requestBody" not in operation:
             return paths.map(lambda path: Sent(method, path))
         said = operation["requestBody"]["content"]["application/json"]["schema"]

@@ -96,6 +96,8 @@ def test_edits_are_downloaded_as_the_command_line_takes_them(bench: Bench) -> No
 def test_flying_to_a_loop_brings_its_submaps_before_the_camera(bench: Bench) -> None:
     page = bench.page
     (client,) = bench.workbench._server.get_clients().values()
+    page.keyboard.press("f")  # follow the sensor
+    bench.eventually(lambda: bench.workbench._appearance.view.follow)
     page.get_by_role("button", name="fly there").click()
     expect(page.get_by_text("Follow is off")).to_be_visible()
     poses = bench.engine.snapshot.keyframe_poses

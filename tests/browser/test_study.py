@@ -50,12 +50,12 @@ def click_goes_to(bench: Bench, frame: int) -> None:
 
 
 def drawn(bench: Bench) -> int:
-    """Pixels of the timeline's canvas that are painted."""
+    """Pixels of the timeline's canvas that are painted; while viser makes the panel twice, of the newest."""
     script = (
         "(c) => {const p = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0;"
         "for (let i = 3; i < p.length; i += 4) n += p[i] > 150; return n}"
     )
-    return int(timeline(bench).evaluate(script))
+    return int(timeline(bench).first.evaluate(script))
 
 
 def test_a_click_on_the_timeline_goes_there_and_what_is_passed_is_drawn(bench: Bench) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.sensors.live.decoder import Decoder
-from app.sensors.live.difop import NOMINAL, Calibration, Difop, read_difop
+from app.sensors.live.difop import NOMINAL, ChannelAngles, Difop, read_difop
 from app.sensors.live.feed import DEVICE, packets_of
 from app.sensors.live.firings import firings_of, fit_angles
 from app.sensors.live.frames import Assembler
@@ -60,7 +60,7 @@ def scan_of(
     )
 
 
-def as_packets(scan: Scan, calibration: Calibration = NOMINAL, model: Model = BPEARL, rate: int = 10) -> Scan:
+def as_packets(scan: Scan, calibration: ChannelAngles = NOMINAL, model: Model = BPEARL, rate: int = 10) -> Scan:
     """The same scan, had it come as packets. Its points must all be in one revolution, and of different times."""
     firings, writer = firings_of(scan, calibration, model, rate), PacketWriter(model)
     packets = writer.add(firings.times_ns, firings.azimuth, firings.counts, firings.intensity) + writer.flush()
