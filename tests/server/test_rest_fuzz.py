@@ -20,8 +20,8 @@ from benchmarks.fuzz.requests import Document, Sent
 
 JSON = {"Content-Type": "application/json"}
 EXPORT = "/api/export/{name}"
-MAY_BE_REFUSED = ("/api/recordings", "/api/truth", "/api/params", "/api/export/")
-"""Whether a request is accepted there depends on more than its form: on files, other values, and what is open."""
+MAY_BE_REFUSED = ("/api/recordings", "/api/truth", "/api/params", "/api/export/", "/api/notes/")
+"""Whether a request is accepted there depends on more than its form: on files, other values, and what there is."""
 
 
 def described() -> Document:
