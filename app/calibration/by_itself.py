@@ -18,7 +18,7 @@ def contradicted(path: Path, params: Params, progress: Progress = lambda step, f
     told."""
     try:
         found = calibrate(path, params, USED_S, progress)
-    except HemislamError:  # too short, say; whoever opens the recording hears of what matters
+    except HemislamError:  # such as too short a recording; opening it reports what is wrong with it
         return None
     return found if found.contradiction() else None
 

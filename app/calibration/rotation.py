@@ -77,7 +77,7 @@ def fit_rotation(track: Track, inertial: Inertial, R: F64, late: float, given: F
     """Refine a rotation and an offset by least squares over windows, each with an attitude of its own.
 
     Args:
-        given: (3, 3), the rotation taken so far; what is left of it without this fit is told.
+        given: (3, 3), the rotation in use; `before` holds its residuals.
     """
     windows = windows_of(track, WINDOW)
 

@@ -47,7 +47,7 @@ def fit_translation(track: Track, inertial: Inertial, turned: Turned, given: F64
     """Least squares over windows, robust against those in which the odometry slipped.
 
     Args:
-        given: (3,) m, the position taken so far; what is left of it without this fit is told.
+        given: (3,) m, the position in use; `before` holds its residuals.
     """
     windows = windows_of(track, WINDOW)
     tau, attitudes, fallen, lever = _integrated(track, inertial, turned, windows)
