@@ -8,6 +8,7 @@
 Compare maps of the same recording only. Between different trajectories or densities of points the numbers say little.
 """
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -107,7 +108,7 @@ def _crispness(points: F64) -> tuple[float, float]:
     if not values:
         return float("nan"), float("nan")
     eigenvalues = np.maximum(np.vstack(values), 1e-9)  # ascending; at least 0.03 mm, squared
-    entropy = 0.5 * (3 * np.log(2 * np.pi * np.e) + np.log(eigenvalues).sum(axis=1))
+    entropy = 0.5 * (3 * np.log(2 * np.pi * math.e) + np.log(eigenvalues).sum(axis=1))
     flat = (eigenvalues[:, 0] < 0.1 * eigenvalues[:, 1]) & (eigenvalues[:, 1] > (0.2 * BALL_M) ** 2)
     thickness = np.sqrt(eigenvalues[flat, 0])
     return float(entropy.mean()), float(np.median(thickness)) if len(thickness) else float("nan")

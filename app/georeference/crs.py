@@ -1,0 +1,75 @@
+"""Coordinate systems by pyproj: which fits a place, and the scale that its grid has there."""
+
+import math
+from functools import lru_cache
+
+import pyproj
+from pyproj.exceptions import CRSError, ProjError
+
+from app.slam.errors import HemislamError
+
+WGS84 = "EPSG:4979"
+"""Latitude, longitude and height above the ellipsoid, as GNSS gives them."""
+EARTH_M = 6_371_000.0
+"""Mean radius."""
+
+
+@lru_cache(maxsize=32)
+def projected(name: str) -> pyproj.CRS:
+    """A coordinate system by "EPSG:code" or WKT.
+
+    Raises:
+        HemislamError: there is none, or it is not a plane grid in metres.
+    """
+    try:
+        crs = pyproj.CRS.from_user_input(name)
+    except CRSError:
+        raise HemislamError(f"{name} names no coordinate system; give one as EPSG:32632.") from None
+    if not crs.is_projected:
+        raise HemislamError(f"{name} ({crs.name}) is not a plane grid; give a projected one such as EPSG:32632.")
+    if any(abs(axis.unit_conversion_factor - 1.0) > 1e-12 for axis in crs.axis_info):
+        raise HemislamError(f"{name} ({crs.name}) is not in metres; give one that is.")
+    return crs
+
+
+@lru_cache(maxsize=32)
+def transformer(source: str, target: str) -> pyproj.Transformer:
+    """From one system to another; longitude before latitude, easting before northing. It leaves heights alone."""
+    first, second = (pyproj.CRS.from_user_input(name).to_2d() for name in (source, target))
+    return pyproj.Transformer.from_crs(first, second, always_xy=True)
+
+
+def utm(latitude: float, longitude: float) -> str:
+    """The EPSG code of the UTM zone of a place in degrees; of the polar grids beyond 84° N and 80° S."""
+    if latitude > 84.0 or latitude < -80.0:
+        return "EPSG:32661" if latitude > 0 else "EPSG:32761"
+    zone = int((longitude + 180.0) // 6.0) % 60 + 1
+    if 56.0 <= latitude < 64.0 and 3.0 <= longitude < 12.0:
+        zone = 32  # south-west Norway
+    if latitude >= 72.0 and 0.0 <= longitude < 42.0:
+        zone = 31 + 2 * int((longitude + 3.0) // 12.0)  # Svalbard
+    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+
+
+def check_place(name: str, latitude: float, longitude: float) -> None:
+    """Raises HemislamError if a place in degrees is far outside the area that a coordinate system is made for."""
+    crs = projected(name)
+    area = crs.area_of_use
+    if area is None:
+        return
+    width = area.east - area.west + (360.0 if area.east < area.west else 0.0)
+    beside = (longitude - area.west + 1.0) % 360.0 > width + 2.0
+    if beside or not area.south - 1.0 <= latitude <= area.north + 1.0:
+        raise HemislamError(
+            f"{name} ({crs.name}) is not made for latitude {latitude:.4f}°, longitude {longitude:.4f}°;"
+            f" {utm(latitude, longitude)} is."
+        )
+
+
+def grid_scale(name: str, latitude: float, longitude: float, height: float) -> float:
+    """Metres of the grid per metre on the ground at a place in degrees and m, such as 0.9996 in the middle of UTM."""
+    try:
+        factors = pyproj.Proj(projected(name)).get_factors(longitude, latitude)
+    except ProjError:
+        return 1.0
+    return float(math.sqrt(factors.areal_scale) * EARTH_M / (EARTH_M + height))

@@ -1,0 +1,92 @@
+"""Where on Earth a map lies."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from app.georeference import crs
+from app.slam.arrays import F64
+from app.slam.errors import HemislamError
+
+FILE = "georeference.json"
+"""Its name beside the results."""
+ELLIPSOIDAL = "ellipsoidal"
+
+Row = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class GeoReference:
+    """Where on Earth a map lies: grid = origin + scale * (rotation @ map), with a height that has no scale.
+
+    Attributes:
+        crs: a projected system in metres: "EPSG:32632" or WKT2.
+        origin: easting, northing and height of the map's origin, m.
+        rotation: rows of the (3, 3) rotation from the map's axes to east, north and up of the grid.
+        scale: metres of the grid per metre on the ground there; a map keeps its true size, a grid does not.
+        height: "ellipsoidal" or, for example, "orthometric (EGM2008)": what heights are above.
+    """
+
+    crs: str
+    origin: Row
+    rotation: tuple[Row, Row, Row] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    scale: float = 1.0
+    height: str = ELLIPSOIDAL
+
+    def to_crs(self, points_map: F64) -> F64:
+        """(n, 3) m in the map to (n, 3) float64 easting, northing, height, m."""
+        points = np.asarray(points_map, np.float64).reshape(-1, 3)
+        return np.asarray(self.origin + (points @ np.array(self.rotation).T) * self._scales)
+
+    def from_crs(self, points_crs: F64) -> F64:
+        """The inverse of `to_crs`."""
+        points = np.asarray(points_crs, np.float64).reshape(-1, 3) - self.origin
+        return np.asarray((points / self._scales) @ np.array(self.rotation))
+
+    def to_geographic(self, points_map: F64) -> F64:
+        """(n, 3) m in the map to (n, 3) float64 latitude and longitude in degrees (WGS84) and height in m."""
+        east, north, height = self.to_crs(points_map).T
+        longitude, latitude = crs.transformer(self.crs, crs.WGS84).transform(east, north)
+        return np.column_stack([latitude, longitude, height])
+
+    def wkt(self, version: str = "WKT2_2019") -> str:
+        """The coordinate system as well-known text; `version` as pyproj names them, "WKT1_GDAL" for example."""
+        return str(crs.projected(self.crs).to_wkt(version))
+
+    @property
+    def _scales(self) -> F64:
+        return np.array([self.scale, self.scale, 1.0])
+
+    def to_json(self) -> str:
+        """Every digit, so that `from_json` gives an equal value."""
+        return json.dumps(asdict(self), indent=2, ensure_ascii=False) + "\n"
+
+    @staticmethod
+    def from_json(text: str | bytes) -> "GeoReference":
+        """Raises HemislamError: it is not a georeference, or its coordinate system cannot be used."""
+        try:
+            read = _ADAPTER.validate_json(text)
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise HemislamError(
+                f"This is no georeference ({'.'.join(map(str, first['loc']))}: {first['msg']}); write a new one with"
+                " hemislam georeference."
+            ) from None
+        crs.projected(read.crs)
+        return read
+
+
+_ADAPTER = TypeAdapter(GeoReference)
+
+
+def read(folder: Path) -> GeoReference | None:
+    """That of the results in a folder; None if they have none. Raises HemislamError: it cannot be used."""
+    try:
+        return GeoReference.from_json((folder / FILE).read_bytes())
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise HemislamError(f"{folder / FILE} cannot be read: {error.strerror}.") from None

@@ -1,0 +1,45 @@
+"""Coordinate systems: which fits a place. Oracle: the areas of use that EPSG states."""
+
+import pyproj
+import pytest
+
+from app.georeference import crs
+from app.slam.errors import HemislamError
+
+PLACES = [
+    (48.14, 11.58),
+    (60.39, 5.32),
+    (78.22, 15.65),
+    (-33.86, 151.21),
+    (30.54, 114.35),
+    (0.01, -179.9),
+    (85.0, 10.0),
+]
+
+
+@pytest.mark.parametrize(("latitude", "longitude"), PLACES)
+def test_the_proposed_grid_is_made_for_its_place(latitude: float, longitude: float) -> None:
+    name = crs.utm(latitude, longitude)
+    area = pyproj.CRS(name).area_of_use
+    assert area is not None and area.south <= latitude <= area.north
+    assert area.west <= longitude <= area.east or (latitude, longitude) in PLACES[1:3]  # the exceptions of Norway
+    crs.check_place(name, latitude, longitude)
+
+
+def test_a_grid_of_the_other_side_of_the_earth_is_refused_and_the_right_one_named() -> None:
+    with pytest.raises(HemislamError, match=r"is not made for latitude 48.1400°.* EPSG:32632 is"):
+        crs.check_place("EPSG:32756", 48.14, 11.58)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("EPSG:1", "names no"), ("Mars", "names no"), ("EPSG:4326", "not a plane"), ("EPSG:2263", "not in metres")],
+)
+def test_what_is_no_grid_in_metres_is_refused(name: str, words: str) -> None:
+    with pytest.raises(HemislamError, match=words):
+        crs.projected(name)
+
+
+def test_utm_is_narrower_than_the_ground_in_the_middle_of_a_zone_and_at_height() -> None:
+    assert crs.grid_scale("EPSG:32632", 48.0, 9.0, 0.0) == pytest.approx(0.9996, abs=1e-6)
+    assert crs.grid_scale("EPSG:32632", 48.0, 9.0, 1000.0) == pytest.approx(0.9996 * (1 - 1.57e-4), abs=1e-6)
