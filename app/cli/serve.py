@@ -1,10 +1,9 @@
 """`hemislam serve`: the workbench in the browser."""
 
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -106,9 +105,8 @@ def serve(
     from app.server.folders import Folders
     from app.server.protocol import LIVE
     from app.server.setup import Setup
-    from app.server.web import Tls, run_server
+    from app.server.web import ServedPage, Tls, run_server
     from app.slam.trajectory import truth_beside
-    from app.ui.workbench import Workbench
 
     if key is not None and certificate is None:
         raise HemislamError("--key needs --certificate; give both.")
@@ -128,11 +126,19 @@ def serve(
     if recording is not None:
         opened = session.opened.recording if session else recording
         say_calibrated(opened)
-        open_recording(opened, params).close()  # a mistake is reported here, not in the page
     if truth is not None:
         read_poses(truth)
     elif recording is not None:
         truth = truth_beside(recording)
+
+    def build_page(viser: Any, engine: Any, folders: Folders) -> ServedPage:
+        """While the engine opens the recording too. A mistake in it is reported here, not in the page."""
+        if recording is not None:
+            open_recording(opened, params).close()
+        from app.ui.workbench import Workbench
+
+        return Workbench(viser, engine, folders, point_budget=point_budget, results=Path("runs"))
+
     with (
         TemporaryDirectory(prefix="hemislam-") as folder_live,
         LiveProcess(live, params, imu, record) if live else nullcontext() as source,
@@ -153,7 +159,7 @@ def serve(
                 live_folder=Path(folder_live),
             ),
             folders=Folders(folder or [recording.resolve().parent if recording else Path.cwd()]),
-            build_page=partial(Workbench, point_budget=point_budget, results=Path("runs")),
+            build_page=build_page,
             host=host,
             port=port,
             open_browser=not no_browser,

@@ -8,13 +8,16 @@ import io
 import math
 import secrets
 import warnings
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import msgspec
 import viser
+import viser._icons
 import viser._messages
 import viser.infra
 import websockets.asyncio.server
@@ -62,10 +65,17 @@ def start_viser() -> Viser:
     viser itself accepts every Origin, so any web page that the user has open could drive it.
     """
     key = secrets.token_urlsafe(24)
+    _list_icons_once()
     with _require_key(key), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     server._websock_server.get_message_buffer().max_window_size = MOST_AT_ONCE
     return Viser(server, key)
+
+
+def _list_icons_once() -> None:
+    """viser reads the list of its 4,000 icons again for each icon: most of the time in which a page is built."""
+    icons = zipfile.ZipFile(viser._icons.ICONS_DIR / "tabler-icons.zip")
+    viser._icons.zipfile = SimpleNamespace(ZipFile=lambda path: contextlib.nullcontext(icons))  # type: ignore[assignment,attr-defined]
 
 
 @contextlib.contextmanager

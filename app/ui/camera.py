@@ -90,6 +90,7 @@ class Framing:
         self._put: deque[F64] = deque(maxlen=_PUT)
         self._wanted = self._shown = NOTHING
         self._at_once = False
+        self._pictures = self.pictures
         server.initial_camera.fov = FOV
         self._begin(np.zeros(3))
 
@@ -97,9 +98,15 @@ class Framing:
         """Take in some points of the map, (n, 3); at_once: it is another map."""
         self._wanted, self._at_once = extent(points), at_once
 
+    @property
+    def pictures(self) -> frozenset[tuple[int, float]]:
+        """Number and width over height of each browser's picture."""
+        return frozenset((number, _shape(client)) for number, client in self._server.get_clients().items())
+
     def draw(self, offset: F64) -> bool:
         """Move the cameras on; False while they are on their way. offset: (3,) m, of the map in the scene."""
-        if not self._at_once and self._shown.apart(self._wanted) < _ARRIVED:
+        before, self._pictures = self._pictures, self.pictures
+        if not self._at_once and self._shown.apart(self._wanted) < _ARRIVED and self._pictures == before:
             return True
         self._shown = self._wanted if self._at_once else self._shown.towards(self._wanted, _EASE)
         self._at_once = False
@@ -131,7 +138,9 @@ class Framing:
         self._put.append(camera.position)
 
     def _place(self, client: viser.ClientHandle, way: str, offset: F64) -> None:
-        stand = whole(self._shown, way, client.camera.fov)
+        camera = client.camera
+        narrow = 2 * np.arctan(np.tan(camera.fov / 2) * min(_shape(client), 1.0))
+        stand = whole(self._shown, way, float(narrow))
         move(client, Stand(stand.position + offset, stand.look_at + offset))
         self._put.append(stand.position + offset)
 
@@ -139,6 +148,12 @@ class Framing:
         """Whether the browser's camera is where it was put."""
         off = np.linalg.norm(np.array(self._put) - client.camera.position, axis=1)
         return bool(off.min() < 1e-3 * self._shown.radius)
+
+
+def _shape(client: viser.ClientHandle) -> float:
+    """Width over height of a browser's picture."""
+    camera = client.camera
+    return round(max(camera.image_width, 1) / max(camera.image_height, 1), 2) or 0.01
 
 
 def move(client: viser.ClientHandle, stand: Stand) -> None:

@@ -4,12 +4,14 @@ Tests app/server/viser_adapter.py.
 """
 
 import ast
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import get_type_hints
 
 import pytest
 import viser
+import viser._icons
 import viser._messages
 import websockets.asyncio.server
 from viser.infra import WebsockServer
@@ -130,3 +132,12 @@ def test_viser_has_the_messages_that_the_bridge_decides_about(name: str) -> None
     assert hasattr(viser._messages, name), (
         f"viser has no message {name}; look how `bridge.Gate` must treat its successor."
     )
+
+
+def test_a_server_lists_the_archive_of_icons_once(target: Viser, monkeypatch: pytest.MonkeyPatch) -> None:
+    """viser's own way lists 4,000 files for each icon; the pictures are the same."""
+    with zipfile.ZipFile(viser._icons.ICONS_DIR / "tabler-icons.zip") as archive:
+        wanted = archive.read("bug.svg").decode()
+    monkeypatch.setattr(zipfile.ZipFile, "_RealGetContents", lambda archive: pytest.fail("the list is read again"))
+    viser._icons.svg_from_icon.cache_clear()
+    assert viser._icons.svg_from_icon(viser.Icon.BUG) == wanted

@@ -89,7 +89,10 @@ class Browser:
     """A browser's camera, which is where it was put unless its user moves it."""
 
     def __init__(self, position: np.ndarray) -> None:
-        self.client_id, self.camera = 1, SimpleNamespace(position=position, look_at=np.zeros(3), fov=FOV)
+        self.client_id = 1
+        self.camera = SimpleNamespace(
+            position=position, look_at=np.zeros(3), fov=FOV, image_width=1600, image_height=1000
+        )
 
     atomic = staticmethod(nullcontext)
 
@@ -132,6 +135,17 @@ def test_the_map_stays_in_the_picture_as_it_grows(framed: Framed) -> None:
     assert settle(framing) > 5, "it glides"
     assert browser.distance() == pytest.approx(4 * near, rel=0.05)
     assert server.initial_camera.position == pytest.approx(browser.camera.position), "pages that open now"
+
+
+def test_in_a_picture_that_is_higher_than_wide_all_of_the_map_is_seen_too(framed: Framed) -> None:
+    framing, browser, _ = framed
+    wide = browser.distance()
+    browser.camera.image_width = 500
+    settle(framing)
+    assert browser.distance() == pytest.approx(2 * wide), "half as wide at the same distance"
+    browser.camera.image_width = 2000
+    settle(framing)
+    assert browser.distance() == pytest.approx(wide), "a phone that is turned"
 
 
 def test_who_moves_the_camera_keeps_it_until_he_asks_for_the_whole_map(framed: Framed) -> None:

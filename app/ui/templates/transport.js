@@ -202,8 +202,10 @@ const settle = () => {
     Object.assign(mover.style, {position: 'fixed', zIndex: 11, left: box.left + (phone ? 0 : 8) + 'px',
       width: box.width - (phone ? 0 : 16) + 'px', bottom: phone ? 0 : innerHeight - box.bottom + 8 + 'px'});
     dock.classList.toggle('narrow', box.width < 640);
-    const high = bar.offsetHeight + 'px', style = document.documentElement.style;
-    if (style.getPropertyValue('--hs-bar') !== high) style.setProperty('--hs-bar', high);
+    const sheet = phone && document.querySelector('[style*="max-height: 60%"]'), high = bar.offsetHeight;
+    const style = document.documentElement.style;
+    const put = (name, pixels) => { if (style.getPropertyValue(name) !== pixels + 'px') style.setProperty(name, pixels + 'px'); };
+    put('--hs-bar', high); put('--hs-under', high + (sheet ? sheet.offsetHeight : 0));
   }
   setTimeout(settle, 300);
 };
