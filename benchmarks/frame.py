@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
-from app.sensors.rsbpearl import BPEARL
+from app.sensors.robosense import BPEARL
 from app.slam.engine import Engine
 from app.slam.types import TIMINGS, FrameStatus, Measurement, Scan
 from app.slam.warmup import compile_kernels

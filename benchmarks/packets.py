@@ -1,14 +1,14 @@
-"""Time to put the sensor's packets in order and to decode a revolution of 57,632 firings."""
+"""Time to put the sensor's packets in order and to decode a revolution."""
 
 import time
 
 import numpy as np
 
 from app.sensors.live.decoder import Decoder
-from app.sensors.live.difop import NOMINAL, ChannelAngles, Difop
+from app.sensors.live.difop import ChannelAngles, Difop
 from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.msop import PacketWriter
-from app.sensors.rsbpearl import BPEARL, BPV4, CHANNELS, Model
+from app.sensors.robosense import AIRY, BPEARL, BPV4, Model
 from app.slam.types import Scan
 from benchmarks.record import Line
 
@@ -16,13 +16,13 @@ TURNS = 300
 
 
 def run() -> list[Line]:
-    return [line for model in (BPEARL, BPV4) for line in measure(model)]
+    return [line for model in (BPEARL, BPV4, AIRY) for line in measure(model)]
 
 
 def measure(model: Model) -> list[Line]:
     """ms to put the packets of a revolution in order, and to decode it, if every firing has a return."""
-    assembler, decoder = Assembler(), Decoder()
-    decoder.configure(Difop(calibration=ChannelAngles(NOMINAL.elevations_deg, np.linspace(-1.0, 0.0, CHANNELS))))
+    assembler, decoder = Assembler(), Decoder(model=model)
+    decoder.configure(Difop(calibration=ChannelAngles(model.elevations_deg, np.linspace(-1.0, 0.0, model.channels))))
     assembling: list[float] = []
     decoding: list[float] = []
     points = 0
@@ -48,8 +48,8 @@ def _turns(model: Model) -> list[list[bytes]]:
     writer = PacketWriter(model)
     rng = np.random.default_rng(0)
     azimuth = np.rint(np.arange(blocks) * 36_000 / blocks).astype(np.uint16)
-    counts = rng.integers(100, 10_000, (blocks, CHANNELS)).astype(np.uint16)
-    intensity = rng.integers(0, 256, (blocks, CHANNELS)).astype(np.uint8)
+    counts = rng.integers(100, 10_000, (blocks, model.channels)).astype(np.uint16)
+    intensity = rng.integers(0, 256, (blocks, model.channels)).astype(np.uint8)
     start = 1_700_000_000_000_000_000
     turns = []
     for turn in range(TURNS):

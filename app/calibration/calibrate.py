@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from app.calibration.guide import Guide
 from app.calibration.inertial import Inertial
@@ -54,8 +53,7 @@ class Calibration:
     @property
     def rotation(self) -> tuple[float, float, float]:
         """Roll, pitch, yaw in degrees, as `sensor.rotation`."""
-        yaw, pitch, roll = Rotation.from_matrix(self.turned.R_imu_lidar).as_euler("ZYX", degrees=True)
-        return float(roll), float(pitch), float(yaw)
+        return lie.rpy_degrees(self.turned.R_imu_lidar)
 
     @property
     def sigmas(self) -> dict[str, F64]:

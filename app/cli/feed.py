@@ -15,12 +15,16 @@ def feed(
     params_for: ParamsFor,
     to: Annotated[
         str,
-        typer.Option("--to", metavar="URL", help="rsbpearl://HOST:MSOP,DIFOP, or foxglove://HOST:PORT to serve at."),
+        typer.Option(
+            "--to",
+            metavar="URL",
+            help="rsbpearl://HOST:MSOP,DIFOP, airy://HOST, mid360://HOST, or foxglove://HOST:PORT to serve at.",
+        ),
     ],
     imu_to: Annotated[
         str | None,
         typer.Option(
-            "--imu-to", metavar="URL", help="imu-udp://HOST:PORT, beside packets; else port 6700 of their HOST."
+            "--imu-to", metavar="URL", help="imu-udp://HOST:PORT, beside an RS-Bpearl; else port 6700 of its HOST."
         ),
     ] = None,
     speed: Annotated[
@@ -30,11 +34,13 @@ def feed(
 ) -> None:
     """Send a recording as live data, to try `serve --live` without a sensor.
 
-    As RS-Bpearl packets with the IMU beside them, or as a Foxglove server like foxglove_bridge.
+    As packets of an RS-Bpearl with the IMU beside them, of an Airy or a Mid-360, or as a Foxglove server like
+    foxglove_bridge.
 
     \b
     Examples:
       hemislam feed walk.mcap --to rsbpearl://127.0.0.1:6699,7788 --imu-to imu-udp://127.0.0.1:6700
+      hemislam feed walk.mcap --to mid360://127.0.0.1
       hemislam feed walk.mcap --to foxglove://127.0.0.1:8765 --speed 2
     """
     from app.sensors.live.feed import Pace
@@ -58,4 +64,4 @@ def feed(
         count = play(
             recording, params, target, beside, pace=Pace(speed or math.inf, progress=show), duration_s=duration
         )
-    typer.echo(f"{count} {'packets' if target.scheme == 'rsbpearl' else 'messages'} sent.")
+    typer.echo(f"{count} {'messages' if target.scheme == 'foxglove' else 'packets'} sent.")

@@ -57,7 +57,7 @@ def serve(
         typer.Option(
             "--live",
             metavar="URL",
-            help="Map live from a sensor: rsbpearl://0.0.0.0:6699,7788 or foxglove://HOST:8765.",
+            help="Map live from a sensor: rsbpearl://0.0.0.0:6699,7788, airy://, mid360:// or foxglove://HOST:8765.",
         ),
     ] = None,
     imu: Annotated[

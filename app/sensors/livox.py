@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.slam.types import U8, Scan
+from app.slam.types import F32, I64, U8, Scan
 
 DRIVERS = ("livox_ros_driver2", "livox_ros_driver")
 CUSTOM_MSGS = tuple(f"{driver}/msg/CustomMsg" for driver in DRIVERS)
@@ -72,13 +72,27 @@ class CustomMsg:
         _, stated, _, held = struct.unpack_from(f"{order}Q3I", data, at)
         body = data[at + 20 :] + bytes(1)  # the last point is not padded
         points = np.frombuffer(body, _dtype(order, step), count=min(held, len(body) // step))
+        return cls._of(seconds, nanoseconds, stated, points)
+
+    @classmethod
+    def made(cls, times_ns: I64, points: F32, reflectivity: U8, tag: U8) -> "CustomMsg":
+        """Of points (n, 3) m at times (n,), stamped at the earliest."""
+        begin_ns = int(times_ns.min())
+        rows = np.zeros(len(points), _dtype("<", 20))
+        rows["x"], rows["y"], rows["z"] = points.T
+        rows["offset_time"] = np.minimum(times_ns - begin_ns, np.iinfo(np.uint32).max)
+        rows["reflectivity"], rows["tag"] = reflectivity, tag
+        return cls._of(*divmod(begin_ns, 1_000_000_000), len(rows), rows)
+
+    @classmethod
+    def _of(cls, seconds: int, nanoseconds: int, stated: int, points: npt.NDArray[Any]) -> "CustomMsg":
+        """Doubtful returns are put at zero."""
         doubtful = (points["tag"] & _DOUBTFUL) != 0
         if doubtful.any():
             points = points.copy()
             for axis in "xyz":
                 points[axis][doubtful] = 0.0
-        stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
-        return cls(SimpleNamespace(stamp=stamp), stated, points)
+        return cls(SimpleNamespace(stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds)), stated, points)
 
     @property
     def fields(self) -> dict[str, tuple[int, np.dtype[Any]]]:

@@ -12,7 +12,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from app.sensors.livox import CUSTOM_MSGS, CustomMsg
+from app.sensors.livox import CUSTOM_MSGS, DEFINITION, CustomMsg, encoded
 from app.slam.types import Scan
 
 LIDAR_TOPIC, IMU_TOPIC = "/rslidar_points", "/imu/data"
@@ -154,6 +154,10 @@ class Layout:
     kind: str = CLOUD
     text: str = ""
     encode: Callable[[Scan], bytes] = lambda scan: serialised(cloud_message(scan))
+
+
+AIRY_LAYOUT = Layout(imu_topic="/rslidar_imu_data")
+MID360_LAYOUT = Layout("/livox/lidar", "/livox/imu", CUSTOM_MSGS[0], DEFINITION, encoded)
 
 
 class RecordingWriter:

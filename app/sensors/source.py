@@ -28,7 +28,7 @@ _REPAIR = {
     **dict.fromkeys(CAPTURES, "`tcpdump -r {path} -w repaired.pcap` saves what is whole"),
     "": "`ros2 bag reindex {path}` may repair it",
 }
-_KINDS = "a ROS 1 .bag, a ROS 2 folder, an .mcap, a .db3, or a .pcap of an RS-Bpearl"
+_KINDS = "a ROS 1 .bag, a ROS 2 folder, an .mcap, a .db3, or a .pcap of an RS-Bpearl, an Airy or a Mid-360"
 _FOREVER = 2**63 - 1
 
 
@@ -216,8 +216,8 @@ def _open_capture(path: Path) -> CaptureStream:
         raise HemislamError(f"{path} is no capture of a network ({error}); {_KINDS} can be read.") from None
     if not stream.counts:
         raise HemislamError(
-            f"{path} holds no packets of an RS-Bpearl and no imu-udp datagrams; capture its UDP ports, usually "
-            "6699 and 7788."
+            f"{path} holds no packets of an RS-Bpearl, an Airy or a Mid-360 and no imu-udp datagrams; capture their "
+            "UDP ports, usually 6699 and 7788, or 56301 and 56401."
         )
     return stream
 

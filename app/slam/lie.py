@@ -95,6 +95,13 @@ def from_rpy_degrees(rpy: tuple[float, float, float]) -> F64:
     return exp(np.array([0.0, 0.0, y])) @ exp(np.array([0.0, p, 0.0])) @ exp(np.array([r, 0.0, 0.0]))
 
 
+def rpy_degrees(R: F64) -> tuple[float, float, float]:
+    """Roll, pitch, yaw in degrees of a rotation (3, 3); the inverse of `from_rpy_degrees`."""
+    pitch = np.arcsin(np.clip(-R[2, 0], -1.0, 1.0))
+    angles = np.degrees([np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
+    return float(angles[0]), float(angles[1]), float(angles[2])
+
+
 def transform(R: F64, p: F64) -> F64:
     """(3, 3) and (3,) to the (4, 4) homogeneous matrix."""
     T = np.eye(4)

@@ -36,7 +36,7 @@ class Fuzzer:
         self._rest = Rest(self._recordings.good)
         self._kinds: dict[str, Callable[[int], str]] = {
             "recordings": self._recordings.broken,
-            "packets": lambda seed: inputs.packets(seed, self._recordings.packets),
+            "packets": lambda seed: inputs.packets(seed, self._recordings.packets[seed % 3]),
             "rest": self._rest.broken,
             "session": lambda seed: inputs.session(seed, self._recordings.good),
             "text": inputs.text,

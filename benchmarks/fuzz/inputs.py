@@ -11,7 +11,9 @@ import numpy as np
 from viser.infra import Message
 
 from app.mapping.session_file import Opened, SavedSession, State, read_session, size_of, write_session
+from app.sensors.cloud_types import LIVOX_CUSTOM_MSGS, POINT_CLOUD_2
 from app.sensors.live.urls import parse_address
+from app.sensors.livox import CustomMsg
 from app.sensors.source import Source
 from app.server.bridge import Gate, Refused
 from app.slam.errors import HemislamError
@@ -46,8 +48,9 @@ def packets(seed: int, good: list[Packet]) -> str:
         try:
             with Source(path) as source:
                 for _, _, message in source.messages(tuple(topic.name for topic in source.topics)):
-                    if hasattr(message, "data") and message.width:
-                        points = np.ndarray((message.width, 3), "<f4", message.data, 0, (message.point_step, 4))
+                    if isinstance(message, CustomMsg) or (hasattr(message, "data") and message.width):
+                        kind = LIVOX_CUSTOM_MSGS[0] if isinstance(message, CustomMsg) else POINT_CLOUD_2
+                        points = kind.read(message).xyz()
                         if np.isinf(points).any() or np.nanmax(np.abs(points), initial=0) > 1e4:
                             return "points beyond all ranges"
         except HemislamError as error:

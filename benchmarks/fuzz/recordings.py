@@ -24,7 +24,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from app.sensors.cloud_types import read_point_cloud_2
 from app.sensors.live.feed import packets_of
+from app.sensors.live.livox_udp import MID360, Livox
 from app.sensors.recording import open_recording
+from app.sensors.robosense import AIRY, BPEARL, Model
 from app.sensors.ros import CLOUD, IMU, IMU_TOPIC, LIDAR_TOPIC, header, serialised
 from app.sensors.simulator import simulate
 from app.sensors.source import Source
@@ -63,7 +65,8 @@ class Recordings:
     """Makes cases of a simulated walk and judges how they end. Close it at the end.
 
     Attributes:
-        good: the undamaged walk. said: what a run of it says. packets: what the sensors would have sent.
+        good: the undamaged walk. said: what a run of it says. packets: what an RS-Bpearl, a Mid-360 and an
+            Airy would have sent.
     """
 
     def __init__(self) -> None:
@@ -74,10 +77,12 @@ class Recordings:
         self._params = (self._path / "good.params.yaml").read_text(encoding="utf-8")
         with Source(self.good) as source:
             self._entries = list(source.messages((LIDAR_TOPIC, IMU_TOPIC)))
-        with open_recording(self.good, Params().merged_yaml(self._params)) as recording:
-            self.packets = [
-                (sent.time_ns, (6699, 7788, 7799)[sent.stream], sent.data) for sent in packets_of(recording)
-            ]
+        simulate("room", self._path / "airy.mcap", duration_s=4.0, every_block=10, scanner="airy")
+        self.packets = [
+            self._sent(self.good, BPEARL),
+            self._sent(self.good, MID360),
+            self._sent(self._path / "airy.mcap", AIRY),
+        ]
         self._files = {kind: self._written(kind, self._entries).read_bytes() for kind in sorted({*FORMATS})}
         code, said, _, _ = self._run(self.good)
         assert code == 0, said
@@ -86,6 +91,11 @@ class Recordings:
 
     def close(self) -> None:
         self._folder.cleanup()
+
+    def _sent(self, path: Path, model: Model | Livox) -> list[Packet]:
+        with open_recording(path, Params()) as recording:
+            sending = packets_of(recording, model=model)
+            return [(sent.time_ns, (6699, 7788, 7799)[sent.stream], sent.data) for sent in sending]
 
     def broken(self, seed: int) -> str:
         """Which invariant the case breaks, and how; "" if none."""
@@ -150,7 +160,7 @@ class Recordings:
             case "db3":
                 _write_db3(path, entries)
             case "pcap":
-                path.write_bytes(pcap(self.packets))
+                path.write_bytes(pcap(self.packets[0]))
         return path
 
     def _run(self, path: Path) -> tuple[int, str, float, int]:

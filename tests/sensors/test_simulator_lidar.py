@@ -1,6 +1,6 @@
 """The simulated RS-Bpearl's firings, ranges, labels and moving bodies.
 
-Tests app/sensors/rsbpearl.py, app/sensors/simulator/lidar.py, app/sensors/simulator/mesh.py,
+Tests app/sensors/robosense.py, app/sensors/simulator/lidar.py, app/sensors/simulator/mesh.py,
 app/sensors/simulator/raycast.py, app/sensors/simulator/scenes/museum.py, app/sensors/simulator/scenes/offices.py,
 app/sensors/simulator/scenes/outdoors.py, app/sensors/simulator/scenes/props.py,
 app/sensors/simulator/scenes/rooms.py.
@@ -9,7 +9,7 @@ app/sensors/simulator/scenes/rooms.py.
 import numpy as np
 import pytest
 
-from app.sensors.rsbpearl import BPEARL, BPV4, RINGS
+from app.sensors.robosense import BPEARL, BPV4, RINGS
 from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
 from app.sensors.simulator.mesh import Mesh, MeshBuilder
 from app.sensors.simulator.raycast import Mover, Raycaster

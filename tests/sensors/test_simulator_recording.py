@@ -12,7 +12,7 @@ import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 
-from app.sensors.rsbpearl import BPEARL
+from app.sensors.robosense import BPEARL
 from app.sensors.simulator import SCENES, simulate
 from app.slam.errors import HemislamError
 

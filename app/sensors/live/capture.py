@@ -1,4 +1,4 @@
-"""A network capture as a recording: the RS-Bpearl's packets and `imu-udp` datagrams of a .pcap or .pcapng.
+"""A network capture as a recording: a sensor's packets and `imu-udp` datagrams of a .pcap or .pcapng.
 
 Opening reads the file once and notes where each revolution was complete, so that reading can begin near any time. The
 packets are recognised by their content, whatever their ports.
@@ -17,12 +17,14 @@ from app.sensors import ros
 from app.sensors.clocks import TOLERANCE_S
 from app.sensors.findings import Finding
 from app.sensors.live.clock import JUMP_NS, ClockMap
+from app.sensors.live.devices import DEVICES, device_of, mount_finding
 from app.sensors.live.difop import DIFOP_ID, Difop, read_angles, read_difop
-from app.sensors.live.frames import Assembler, Revolution
-from app.sensors.live.imu_udp import IMU_MAGIC, ImuOrder, ImuSample
-from app.sensors.live.msop import MSOP_ID
+from app.sensors.live.frames import Assembler, Revolution, sensor_of
+from app.sensors.live.imu_udp import ImuOrder, ImuSample, is_imu
+from app.sensors.live.livox_udp import read_points
 from app.sensors.live.pcap import Capture, CapturePlace
 from app.sensors.live.status import Counters
+from app.sensors.robosense import Model
 from app.slam.types import I64, Scan
 
 SUFFIXES = (".pcap", ".pcapng")
@@ -50,8 +52,12 @@ class CaptureStream:
 
         self._capture = Capture(path)
         sidecar = path.with_name(f"{path.stem}.angles.csv")
-        self._decoder = Decoder(read_angles(sidecar) if sidecar.is_file() else None)
-        self._angles = f"from {sidecar.name}" if sidecar.is_file() else ""
+        found = device_of(datagram.payload for datagram in self._capture.datagrams())
+        self._device = found or DEVICES["rsbpearl"]
+        self._lidar_topic, self._imu_topic = self._device.layout.lidar_topic, self._device.layout.imu_topic
+        model, own = self._device.model, sidecar.is_file() and self._device.has_angles
+        self._decoder = Decoder(read_angles(sidecar) if own else None, model) if isinstance(model, Model) else None
+        self._angles = f"from {sidecar.name}" if own else ""
         self._devices: list[tuple[int, Difop]] = []
         self._complete_at: list[tuple[int, CapturePlace]] = []
         self._counters = Counters()
@@ -69,19 +75,25 @@ class CaptureStream:
                 return
             if log_ns < start_ns:
                 continue
-            if isinstance(content, ImuSample) and ros.IMU_TOPIC in topics:
+            if isinstance(content, ImuSample) and self._imu_topic in topics:
                 stamp_ns = content.stamp_ns + _value_at(self._imu_shifts, log_ns)
-                yield ros.IMU_TOPIC, log_ns, ros.imu_message(stamp_ns, content.gyro, content.accel)
-            elif isinstance(content, Revolution) and ros.LIDAR_TOPIC in topics:
+                yield self._imu_topic, log_ns, ros.imu_message(stamp_ns, content.gyro, content.accel)
+            elif isinstance(content, Revolution) and self._lidar_topic in topics:
                 if self._devices and (said := _value_at(self._devices, log_ns)) is not device:
                     device = said
-                    self._decoder.configure(said)
-                scan = self._decoder.decode(content)
-                stamp_ns = scan.stamp_ns + _value_at(self._lidar_shifts, log_ns)
-                if isinstance(scan, Scan):
-                    yield ros.LIDAR_TOPIC, log_ns, ros.cloud_message(replace(scan, stamp_ns=stamp_ns), exact=True)
-                else:
-                    yield ros.LIDAR_TOPIC, log_ns, ros.empty_cloud(stamp_ns)
+                    if self._decoder is not None:
+                        self._decoder.configure(said)
+                yield self._lidar_topic, log_ns, self._cloud(content, _value_at(self._lidar_shifts, log_ns))
+
+    def _cloud(self, frame: Revolution, shift_ns: int) -> Any:
+        """The message of a revolution."""
+        if self._decoder is None:
+            return read_points(frame.packets, shift_ns)
+        scan = self._decoder.decode(frame)
+        stamp_ns = scan.stamp_ns + shift_ns
+        if isinstance(scan, Scan):
+            return ros.cloud_message(replace(scan, stamp_ns=stamp_ns), exact=True)
+        return ros.empty_cloud(stamp_ns)
 
     def close(self) -> None:
         """Nothing stays open between two readings."""
@@ -99,12 +111,16 @@ class CaptureStream:
         for datagram in self._capture.datagrams(place):
             at, running_ns, payload = datagram.place, max(running_ns, datagram.time_ns), datagram.payload
             found: list[Any] = []
-            if payload[:8] == MSOP_ID:
-                found = assembler.add(payload, running_ns)
-            elif payload[:4] == IMU_MAGIC:
+            if is_imu(payload):
                 found = order.add(payload)
-            elif payload[:8] == DIFOP_ID and (said := read_difop(payload)) is not None:
-                found = [said]
+            elif payload[:8] == DIFOP_ID:
+                model = self._device.model
+                said = read_difop(payload, model) if isinstance(model, Model) else None
+                found = [said] if said is not None else []
+            elif (sensor := sensor_of(payload)) is None or sensor in self._device.models:
+                found = assembler.add(payload, running_ns)
+            else:
+                counters.foreign += 1
             for content in found:
                 yield running_ns, at, content
         rest: list[Any] = [*assembler.flush(), *order.flush()]
@@ -130,7 +146,7 @@ class CaptureStream:
             self.start_ns = self.start_ns or log_ns
             self.end_ns = log_ns
         frames, samples = np.array(lidar, np.int64).reshape(-1, 2), np.array(imu, np.int64).reshape(-1, 2)
-        of_topics = ((ros.LIDAR_TOPIC, ros.CLOUD, frames), (ros.IMU_TOPIC, ros.IMU, samples))
+        of_topics = ((self._lidar_topic, self._device.layout.kind, frames), (self._imu_topic, ros.IMU, samples))
         self.counts = {topic: (kind, len(rows)) for topic, kind, rows in of_topics if len(rows)}
         self._settle_clocks(frames, samples)
 
@@ -162,14 +178,8 @@ class CaptureStream:
         wrong = counters.lost or counters.truncated or counters.late or counters.imu_lost or not self.complete
         text = counters.describe() + ("" if self.complete else "; the file is cut off there")
         found = [Finding("packets", "corrected" if wrong else "fine", text)]
-        if ros.LIDAR_TOPIC in self.counts:
-            device = self._devices[0][1] if self._devices else None
-            changed = f"; set to other values {len(self._devices) - 1} times" if len(self._devices) > 1 else ""
-            text = f"{self._model}, {device.describe() if device else 'without a DIFOP packet'}{changed}"
-            found.append(Finding("sensor", "fine" if device else "corrected", text))
-            angles = self._angles or ("from the device's DIFOP packet" if device and device.calibration else "")
-            missing = "nominal, since the unit did not send its own; put them beside the file as NAME.angles.csv"
-            found.append(Finding("angles", "fine" if angles else "needs you", angles or missing))
+        if self._lidar_topic in self.counts:
+            found += self._device_findings()
         if self._host:
             side = "behind" if self._apart_s > 0 else "ahead of"
             text = f"the IMU's stamps are {abs(self._apart_s):.3f} s {side} the LiDAR's: both were put on the capture's"
@@ -180,6 +190,21 @@ class CaptureStream:
                 Finding("sensor clocks", "corrected", f"set by {jumps} on the way; these steps were taken out")
             )
         return tuple(found)
+
+    def _device_findings(self) -> list[Finding]:
+        """What the sensor states of itself."""
+        if not self._device.has_angles:
+            return [Finding("sensor", "fine", self._model)]
+        device = self._devices[0][1] if self._devices else None
+        changed = f"; set to other values {len(self._devices) - 1} times" if len(self._devices) > 1 else ""
+        text = f"{self._model}, {device.describe() if device else 'without a DIFOP packet'}{changed}"
+        found = [Finding("sensor", "fine" if device else "corrected", text)]
+        angles = self._angles or ("from the device's DIFOP packet" if device and device.calibration else "")
+        missing = "nominal, since the unit did not send its own; put them beside the file as NAME.angles.csv"
+        found.append(Finding("angles", "fine" if angles else "needs you", angles or missing))
+        if device and device.T_imu_lidar is not None:
+            found.append(mount_finding(device.T_imu_lidar))
+        return found
 
 
 def _value_at(rows: list[tuple[int, V]], log_ns: int) -> V:

@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from app.sensors.live.difop import NOMINAL, ChannelAngles, Difop
+from app.sensors.live.difop import ChannelAngles, Difop
 from app.sensors.live.frames import Revolution
 from app.sensors.live.kernels import decode_blocks
-from app.sensors.live.msop import BLOCK_BYTES, BLOCKS, HEADER_BYTES, PACKET_BYTES, TURN
-from app.sensors.rsbpearl import BPEARL, CHANNELS
+from app.sensors.live.msop import HEADER_BYTES, PACKET_BYTES, TURN
+from app.sensors.robosense import BPEARL, Model
+from app.slam.errors import HemislamError
 from app.slam.types import F64, U16, DroppedScan, Scan
 
 MIN_RANGE_M, MAX_RANGE_M = 0.1, 150.0
@@ -21,17 +22,21 @@ class Decoder:
         difop: the device's settings. bad_blocks: without their mark or azimuth.
     """
 
-    def __init__(self, angles: ChannelAngles | None = None) -> None:
-        self._angles = angles
-        self.difop = Difop()
-        self.calibration = NOMINAL
+    def __init__(self, angles: ChannelAngles | None = None, model: Model = BPEARL) -> None:
+        """Raises HemislamError: the angles are those of another sensor."""
+        if angles is not None and len(angles.elevations_deg) != model.channels:
+            raise HemislamError(
+                f"These are angles of {len(angles.elevations_deg)} channels, but an {model.name} has {model.channels}; "
+                "use this unit's own."
+            )
+        self._angles, self._model = angles, model
         self.bad_blocks = 0
-        self.configure(self.difop)
+        self.configure(Difop())
 
     def configure(self, difop: Difop) -> None:
         """Decode by these settings from now on."""
         self.difop = difop
-        self.calibration = self._angles or difop.calibration or NOMINAL
+        self.calibration = self._angles or difop.calibration or ChannelAngles.nominal(self._model)
         elevation = np.radians(self.calibration.elevations_deg)
         horizontal = np.radians(self.calibration.horizontal_deg)
         angles = (np.cos(elevation), np.sin(elevation), np.cos(horizontal), np.sin(horizontal))
@@ -42,20 +47,24 @@ class Decoder:
         """Compile or load the kernel before the first packet arrives."""
         packets = np.zeros((1, PACKET_BYTES), np.uint8)
         packets.setflags(write=False)
-        self.decode(Revolution(BPEARL, packets, np.zeros(1, np.int64), 0, BLOCKS, 0))
+        self.decode(Revolution(self._model, packets, np.zeros(1, np.int64), 0, self._model.blocks, 0))
         self.bad_blocks = 0
 
     def decode(self, frame: Revolution) -> Scan | DroppedScan:
         """The scan in firing order: block by block, in each by channel."""
         model = frame.model
-        room = len(frame.packets) * BLOCKS * CHANNELS
+        assert isinstance(model, Model)
+        if model.channels != self._model.channels:
+            return DroppedScan(int(frame.stamps_ns[0]), f"it is of another sensor ({model.name})")
+        room = len(frame.packets) * model.blocks * model.channels
         points, times = np.empty((room, 3), np.float32), np.empty(room, np.int64)
         intensity, ring = np.empty(room, np.float32), np.empty(room, np.uint16)
         base_ns = int(frame.stamps_ns[0])
         n, bad = decode_blocks(
-            frame.packets, frame.stamps_ns - base_ns, frame.first, frame.stop, self.difop.reverse, self._step(frame),
-            60e9 / self.difop.rpm, *self._trigonometry, model.firing_offsets_ns / model.block_ns,
-            model.firing_offsets_ns, self._rings, model.block_ns, model.range_step,
+            frame.packets, frame.stamps_ns - base_ns, frame.first, frame.stop, self.difop.reverse,
+            self._step(frame, model), 60e9 / self.difop.rpm, *self._trigonometry,
+            model.firing_offsets_ns / model.block_ns, model.firing_offsets_ns, self._rings,
+            model.blocks, model.parts, model.part, model.counted, model.block_ns, model.range_step,
             round(MIN_RANGE_M / model.range_step), round(MAX_RANGE_M / model.range_step), model.rx, model.rz,
             points, times, intensity, ring,
         )  # fmt: skip
@@ -72,10 +81,10 @@ class Decoder:
             array.setflags(write=False)
         return scan
 
-    def _step(self, frame: Revolution) -> float:
+    def _step(self, frame: Revolution, model: Model) -> float:
         """0.01 deg from block to block: the median, or what follows from the stated speed."""
-        at = HEADER_BYTES + 2 + BLOCK_BYTES * np.arange(BLOCKS)
+        at = HEADER_BYTES + 2 + model.parts * model.part_bytes * np.arange(model.blocks)
         azimuth = (frame.packets[:, at].astype(np.int64) << 8) | frame.packets[:, at + 1]
         step = (np.diff(azimuth, axis=1) + TURN // 2) % TURN - TURN // 2
         step = step[(step != 0) & (np.abs(step) <= 100)]
-        return float(np.median(step)) if step.size else TURN * self.difop.rpm / 60.0 * frame.model.block_ns * 1e-9
+        return float(np.median(step)) if step.size else TURN * self.difop.rpm / 60.0 * model.block_ns * 1e-9

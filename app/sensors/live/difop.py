@@ -1,4 +1,4 @@
-"""DIFOP, the packet in which an RS-Bpearl states its settings and calibration; and calibrations from CSV."""
+"""DIFOP, the packet in which a RoboSense states its settings and calibration; and calibrations from CSV."""
 
 import csv
 import struct
@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from app.sensors.live.msop import PACKET_BYTES, date_bytes
-from app.sensors.rsbpearl import CHANNELS, ELEVATIONS_DEG
+from app.sensors.robosense import AIRY, BPEARL, Model
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.types import F64, U16
 
@@ -16,7 +17,9 @@ DIFOP_PORT = 7788
 DIFOP_ID = bytes.fromhex("a5ff005a11115555")
 RETURN_MODES = ("dual", "strongest", "last")
 _ANGLES = np.dtype([("sign", "u1"), ("value", ">u2")])
-_ELEVATION_AT, _HORIZONTAL_AT = 468, 564
+_ANGLES_AT, _REVERSE_AT, _POSE_AT = 468, 337, 1092
+_POSE = struct.Struct(">7f")
+"""Quaternion x, y, z, w and position in m of the IMU in the LiDAR's frame; an Airy's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +27,7 @@ class ChannelAngles:
     """The direction of each channel of one unit.
 
     Attributes:
-        elevations_deg, horizontal_deg: (32,) by channel, above the base plane and added to the azimuth.
+        elevations_deg, horizontal_deg: (c,) by channel, above the base plane and added to the azimuth.
     """
 
     elevations_deg: F64
@@ -32,7 +35,7 @@ class ChannelAngles:
 
     @property
     def rings(self) -> U16:
-        """(32,) ring by channel: the rank of its elevation."""
+        """(c,) ring by channel: the rank of its elevation."""
         return np.argsort(np.argsort(self.elevations_deg, kind="stable")).astype(np.uint16)
 
     def same(self, other: "ChannelAngles") -> bool:
@@ -41,8 +44,12 @@ class ChannelAngles:
             and np.array_equal(self.horizontal_deg, other.horizontal_deg)
         )
 
+    @classmethod
+    def nominal(cls, model: Model) -> "ChannelAngles":
+        return cls(model.elevations_deg, np.zeros(model.channels))
 
-NOMINAL = ChannelAngles(ELEVATIONS_DEG, np.zeros(CHANNELS))
+
+NOMINAL = ChannelAngles.nominal(BPEARL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +58,7 @@ class Difop:
     rpm: 600 or 1200. fov_deg: azimuths between which it measures; (0, 360) is the full turn.
     return_mode: of RETURN_MODES. reverse: whether it spins the other way.
     calibration: None if the unit has not been calibrated.
+    T_imu_lidar: (4, 4) of an IMU inside; None where there is none, or it is not stated.
     """
 
     rpm: int = 600
@@ -59,6 +67,7 @@ class Difop:
     return_mode: str = "strongest"
     reverse: bool = False
     calibration: ChannelAngles | None = None
+    T_imu_lidar: F64 | None = None
 
     def same(self, other: "Difop") -> bool:
         """Whether all that matters for decoding is equal."""
@@ -72,28 +81,29 @@ class Difop:
         return f"{self.rpm} rpm, {self.return_mode} return{view}{', reversed' if self.reverse else ''}"
 
 
-def read_difop(packet: bytes) -> Difop | None:
-    """What a packet states; None if it is no DIFOP packet."""
+def read_difop(packet: bytes, model: Model = BPEARL) -> Difop | None:
+    """What a packet of this model states; None if it is no DIFOP packet."""
     if len(packet) != PACKET_BYTES or packet[:8] != DIFOP_ID:
         return None
     rpm, begin, end = (int(struct.unpack_from(">H", packet, at)[0]) for at in (8, 32, 34))
-    elevations, horizontal = _read_angles(packet, _ELEVATION_AT), _read_angles(packet, _HORIZONTAL_AT)
+    elevations, horizontal = (_read_angles(packet, at, model.channels) for at in _angles_at(model))
     calibration = None
     # A unit without calibration sends invalid signs, or zeros, which cannot be elevations.
     if elevations is not None and elevations.any() and np.abs(elevations).max() <= 91.0:
-        calibration = ChannelAngles(elevations, np.zeros(CHANNELS) if horizontal is None else horizontal)
+        calibration = ChannelAngles(elevations, np.zeros(model.channels) if horizontal is None else horizontal)
     mode = packet[300]
     return Difop(
         rpm=rpm if 60 <= rpm <= 6000 else 600,
         fov_deg=(begin / 100.0, end / 100.0) if begin != end else (0.0, 360.0),
         serial=packet[292:298].hex(),
         return_mode=RETURN_MODES[mode] if mode < len(RETURN_MODES) else RETURN_MODES[1],
-        reverse=packet[337] != 0,
+        reverse=model is not AIRY and packet[_REVERSE_AT] != 0,
         calibration=calibration,
+        T_imu_lidar=_read_pose(packet) if model is AIRY else None,
     )
 
 
-def write_difop(difop: Difop, stamp_ns: int) -> bytes:
+def write_difop(difop: Difop, stamp_ns: int, model: Model = BPEARL) -> bytes:
     """The packet that states these settings."""
     packet = bytearray(PACKET_BYTES)
     packet[:8] = DIFOP_ID
@@ -102,17 +112,21 @@ def write_difop(difop: Difop, stamp_ns: int) -> bytes:
     packet[292:298] = bytes.fromhex(difop.serial or "000000000000")[:6]
     packet[300] = RETURN_MODES.index(difop.return_mode)
     packet[303:313] = date_bytes(stamp_ns)
-    packet[337] = difop.reverse
+    packet[_REVERSE_AT] = difop.reverse
+    elevations_at, horizontal_at = _angles_at(model)
     if difop.calibration is None:
-        packet[_ELEVATION_AT : _HORIZONTAL_AT + 3 * CHANNELS] = b"\xff" * (6 * CHANNELS)
+        packet[elevations_at : horizontal_at + 3 * model.channels] = b"\xff" * (6 * model.channels)
     else:
-        _write_angles(packet, _ELEVATION_AT, difop.calibration.elevations_deg)
-        _write_angles(packet, _HORIZONTAL_AT, difop.calibration.horizontal_deg)
+        _write_angles(packet, elevations_at, difop.calibration.elevations_deg)
+        _write_angles(packet, horizontal_at, difop.calibration.horizontal_deg)
+    if difop.T_imu_lidar is not None:
+        T_lidar_imu = lie.inverse(difop.T_imu_lidar)
+        _POSE.pack_into(packet, _POSE_AT, *lie.quaternion(T_lidar_imu[:3, :3]), *T_lidar_imu[:3, 3])
     return bytes(packet)
 
 
 def read_angles(path: Path) -> ChannelAngles:
-    """A calibration from CSV: 32 lines by channel, `elevation, horizontal correction` in degrees.
+    """A calibration from CSV: a line for each channel, `elevation, horizontal correction` in degrees.
 
     Raises:
         HemislamError: the file cannot be read, or is no calibration.
@@ -125,16 +139,22 @@ def read_angles(path: Path) -> ChannelAngles:
         raise HemislamError(f"The angles {path} cannot be read ({error.strerror}); check the path.") from None
     except (ValueError, UnicodeDecodeError):
         table = np.empty((0, 0))
-    if table.shape != (CHANNELS, 2) or not np.isfinite(table).all() or np.abs(table[:, 0]).max() > 91.0:
+    counts = (BPEARL.channels, AIRY.channels)
+    if table.shape not in [(count, 2) for count in counts] or not (np.abs(table) <= (91.0, np.finfo(float).max)).all():
         raise HemislamError(
-            f"{path} is no calibration of an RS-Bpearl; it must hold {CHANNELS} lines, one for each channel, of "
-            "elevation and horizontal correction in degrees."
+            f"{path} is no calibration of an RS-Bpearl or Airy; it must hold {counts[0]} or {counts[1]} lines, one for "
+            "each channel, of elevation and horizontal correction in degrees."
         )
     return ChannelAngles(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
 
 
-def _read_angles(packet: bytes, at: int) -> F64 | None:
-    table = np.frombuffer(packet, _ANGLES, CHANNELS, at)
+def _angles_at(model: Model) -> tuple[int, int]:
+    """Where elevations and horizontal corrections begin."""
+    return _ANGLES_AT, _ANGLES_AT + 3 * model.channels
+
+
+def _read_angles(packet: bytes, at: int, channels: int) -> F64 | None:
+    table = np.frombuffer(packet, _ANGLES, channels, at)
     if (table["sign"] > 1).any():
         return None
     angles: F64 = np.where(table["sign"] == 0, 1.0, -1.0) * table["value"] * 0.01
@@ -142,7 +162,15 @@ def _read_angles(packet: bytes, at: int) -> F64 | None:
 
 
 def _write_angles(packet: bytearray, at: int, angles_deg: F64) -> None:
-    table = np.zeros(CHANNELS, _ANGLES)
+    table = np.zeros(len(angles_deg), _ANGLES)
     table["sign"] = angles_deg < 0
     table["value"] = np.rint(np.abs(angles_deg) * 100)
-    packet[at : at + 3 * CHANNELS] = table.tobytes()
+    packet[at : at + table.nbytes] = table.tobytes()
+
+
+def _read_pose(packet: bytes) -> F64 | None:
+    """(4, 4) T_imu_lidar; None where the numbers are no pose within a sensor."""
+    *quaternion, x, y, z = _POSE.unpack_from(packet, _POSE_AT)
+    if not abs(np.linalg.norm(quaternion) - 1.0) < 0.01 or not np.abs([x, y, z]).max() < 1.0:
+        return None
+    return lie.inverse(lie.transform(lie.matrix(np.array(quaternion)), np.array([x, y, z])))

@@ -11,19 +11,25 @@ from itertools import count, islice
 from operator import attrgetter
 from pathlib import Path
 
+import numpy as np
+
 from app.sensors import ros
-from app.sensors.live.difop import NOMINAL, ChannelAngles, Difop, read_angles, write_difop
+from app.sensors.live import livox_udp
+from app.sensors.live.devices import DEVICES
+from app.sensors.live.difop import ChannelAngles, Difop, read_angles, write_difop
 from app.sensors.live.firings import firings_of, fit_angles, rate_of
 from app.sensors.live.foxglove_server import FoxgloveServer, Offer
-from app.sensors.live.imu_udp import ImuSample, write_imu
+from app.sensors.live.imu_udp import ImuSample, write_airy_imu, write_imu
+from app.sensors.live.livox_udp import Livox, LivoxWriter
 from app.sensors.live.msop import PacketWriter
 from app.sensors.live.urls import Address
 from app.sensors.recording import Recording, ScanEntry, open_recording
-from app.sensors.rsbpearl import BPEARL, Model
+from app.sensors.robosense import AIRY, BPEARL, Model
 from app.sensors.source import Source
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import Scan
+from app.slam.types import F64, Scan
 
 LIDAR, DEVICE, IMU = 0, 1, 2
 _DEVICE_PERIOD_NS = 1_000_000_000
@@ -52,26 +58,65 @@ class Pace:
     progress: Callable[[float], None] = lambda seconds: None
 
 
+class _Sensor:
+    """A LiDAR that sends what a recording holds.
+
+    Attributes:
+        add, flush: packets that a scan completes, and of the remaining points, each with its time.
+    """
+
+    def __init__(self, recording: Recording, model: Model | Livox, angles: ChannelAngles | None, pose: F64 | None):
+        """Raises HemislamError: it is a recording of another LiDAR."""
+        self._model = model
+        if isinstance(model, Livox):
+            writer = LivoxWriter()
+            self.add, self.flush = writer.add, writer.flush
+            return
+        first = _first_scans(recording)
+        rate = rate_of(first)
+        calibration = angles or fit_angles(first, model, rate)
+        # A packet's angles have two decimals, the nominal ones four: a receiver without angles uses the nominal ones.
+        own = None if calibration.same(ChannelAngles.nominal(model)) else calibration
+        self._difop = Difop(rpm=60 * rate, serial="68656d690001", calibration=own, T_imu_lidar=pose)
+        packets = PacketWriter(model)
+
+        def add(scan: Scan) -> list[tuple[int, bytes]]:
+            firings = firings_of(scan, calibration, model, rate)
+            return packets.add(firings.times_ns, firings.azimuth, firings.counts, firings.intensity)
+
+        self.add, self.flush = add, packets.flush
+
+    def settings(self, stamp_ns: int) -> bytes | None:
+        """The packet in which it states them, if it does."""
+        return None if isinstance(self._model, Livox) else write_difop(self._difop, stamp_ns, self._model)
+
+    def imu(self, sample: ImuSample) -> bytes:
+        """The sample as its own IMU sends it, or one beside it."""
+        if isinstance(self._model, Livox):
+            return livox_udp.write_imu(sample.stamp_ns, sample.gyro, sample.accel, sample.number or 0)
+        return write_airy_imu(sample) if self._model is AIRY else write_imu(sample)
+
+
 def packets_of(
-    recording: Recording, duration_s: float | None = None, model: Model = BPEARL, angles: ChannelAngles | None = None
+    recording: Recording,
+    duration_s: float | None = None,
+    model: Model | Livox = BPEARL,
+    angles: ChannelAngles | None = None,
+    pose: F64 | None = None,
 ) -> Iterator[Sent]:
     """Everything that the sensors would have sent, in order of time.
+
+    pose: (4, 4) T_imu_lidar that an Airy states.
 
     Raises:
         HemislamError: it is a recording of another LiDAR.
     """
     stop_ns = math.inf if duration_s is None else recording.start_ns + duration_s * 1e9
-    first = _first_scans(recording)
-    rate = rate_of(first)
-    calibration = angles or fit_angles(first, model, rate)
-    # A packet's angles have two decimals, the nominal ones four: a receiver without angles uses the nominal ones.
-    own = None if calibration.same(NOMINAL) else calibration
-    difop = Difop(rpm=60 * rate, serial="68656d690001", calibration=own)
-    writer = PacketWriter(model)
+    sensor = _Sensor(recording, model, angles, pose)
     waiting: list[Sent] = []
     by_time = attrgetter("time_ns")
     samples = count()
-    device_ns = 0
+    stated_ns = 0
     for entry in recording.entries():
         if isinstance(entry, ScanEntry):
             scan = entry.scan
@@ -79,20 +124,18 @@ def packets_of(
                 break
             if not isinstance(scan, Scan) or scan.stamp_ns >= stop_ns:
                 continue
-            firings = firings_of(scan, calibration, model, rate)
-            packets = writer.add(firings.times_ns, firings.azimuth, firings.counts, firings.intensity)
-            waiting += [Sent(time_ns, LIDAR, packet) for time_ns, packet in packets]
-            if scan.stamp_ns - device_ns > _DEVICE_PERIOD_NS:
-                device_ns = scan.stamp_ns
-                waiting.append(Sent(device_ns, DEVICE, write_difop(difop, device_ns)))
+            waiting += [Sent(time_ns, LIDAR, packet) for time_ns, packet in sensor.add(scan)]
+            if scan.stamp_ns - stated_ns > _DEVICE_PERIOD_NS and (said := sensor.settings(scan.stamp_ns)) is not None:
+                stated_ns = scan.stamp_ns
+                waiting.append(Sent(stated_ns, DEVICE, said))
             waiting.sort(key=by_time)
             due = bisect.bisect_right(waiting, scan.end_ns, key=by_time)
             yield from waiting[:due]
             del waiting[:due]
         elif entry.stamp_ns < stop_ns + 2e8:
             sample = ImuSample(next(samples), entry.stamp_ns, entry.gyro, entry.accel)
-            waiting.append(Sent(entry.stamp_ns, IMU, write_imu(sample)))
-    waiting += [Sent(time_ns, LIDAR, packet) for time_ns, packet in writer.flush()]
+            waiting.append(Sent(entry.stamp_ns, IMU, sensor.imu(sample)))
+    waiting += [Sent(time_ns, LIDAR, packet) for time_ns, packet in sensor.flush()]
     yield from sorted(waiting, key=by_time)
 
 
@@ -116,25 +159,31 @@ def feed(
     """
     params = params.with_values({"recording.imu_time_offset": 0.0})  # the receiver applies it
     pace = pace or Pace()
-    if to.scheme == "rsbpearl":
-        if imu_to is None or imu_to.scheme != "imu-udp":
+    if to.scheme in DEVICES:
+        if not DEVICES[to.scheme].has_imu and (imu_to is None or imu_to.scheme != "imu-udp"):
             raise HemislamError("Packets hold no IMU samples; add --imu-to imu-udp://127.0.0.1:6700.")
         with open_recording(path, params) as recording:
-            return _feed_packets(recording, to, imu_to, pace, duration_s)
+            pose = lie.transform(lie.from_rpy_degrees(params.sensor.rotation), np.array(params.sensor.translation))
+            return _feed_packets(recording, to, imu_to, pace, duration_s, pose)
     if to.scheme == "foxglove":
         with open_recording(path, params) as recording:
             topics = (recording.lidar_topic, recording.imu_topic)
         return _feed_foxglove(path, topics, to, pace, duration_s, wait_s)
-    raise HemislamError("Play it out to rsbpearl:// or foxglove://.")
+    raise HemislamError(f"Play it out to {'://, '.join(DEVICES)}:// or foxglove://.")
 
 
-def _feed_packets(recording: Recording, to: Address, imu_to: Address, pace: Pace, duration_s: float | None) -> int:
-    lidar, imu = to.host or "127.0.0.1", imu_to.host or "127.0.0.1"
-    peers = ((lidar, to.ports[0]), (lidar, to.ports[1]), (imu, imu_to.ports[0]))
+def _feed_packets(
+    recording: Recording, to: Address, imu_to: Address | None, pace: Pace, duration_s: float | None, pose: F64
+) -> int:
+    device, lidar = DEVICES[to.scheme], to.host or "127.0.0.1"
+    peers = {LIDAR: (lidar, to.ports[0]), DEVICE: (lidar, to.ports[1]), IMU: (lidar, to.ports[-1])}
+    if imu_to is not None:
+        peers[IMU] = (imu_to.host or "127.0.0.1", imu_to.ports[0])
     angles = read_angles(Path(to.options["angles"])) if "angles" in to.options else None
+    sending = packets_of(recording, duration_s, device.model, angles, pose)
     number = 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for sent in _paced(packets_of(recording, duration_s, angles=angles), pace):
+        for sent in _paced(sending, pace):
             try:
                 sender.sendto(sent.data, peers[sent.stream])
             except ConnectionRefusedError:  # nobody receives there yet

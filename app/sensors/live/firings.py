@@ -11,7 +11,7 @@ import numpy as np
 
 from app.sensors.live.difop import NOMINAL, ChannelAngles
 from app.sensors.live.msop import TURN
-from app.sensors.rsbpearl import BPEARL, CHANNELS, Model
+from app.sensors.robosense import BPEARL, Model
 from app.slam.errors import HemislamError
 from app.slam.types import F64, I64, U8, U16, Scan
 
@@ -31,8 +31,8 @@ class Firings:
     """The blocks of one revolution.
 
     Attributes:
-        times_ns: (b,) absolute. azimuth: (b,) 0.01 deg. counts: (b, 32) distance in steps of the
-            model, 0 = no return. intensity: (b, 32).
+        times_ns: (b,) absolute. azimuth: (b,) 0.01 deg. counts: (b, c) distance in steps of the
+            model, 0 = no return. intensity: (b, c).
     """
 
     times_ns: I64
@@ -69,15 +69,15 @@ def firings_of(scan: Scan, calibration: ChannelAngles = NOMINAL, model: Model = 
         np.percentile(np.linalg.norm(lever + (count * model.range_step)[:, None] * ray - points, axis=1), 95)
     )
 
-    counts = np.zeros((len(order), CHANNELS), np.uint16)
-    intensity = np.zeros((len(order), CHANNELS), np.uint8)
-    counts[block, channel] = np.clip(count, 0, 65535)
+    counts = np.zeros((len(order), model.channels), np.uint16)
+    intensity = np.zeros((len(order), model.channels), np.uint8)
+    counts[block, channel] = np.clip(count, 0, model.counted)
     intensity[block, channel] = np.clip(np.rint(scan.intensity), 0, 255)
     kept = np.count_nonzero(counts) / max(int(np.count_nonzero(count)), 1)
     if misfit > MISFIT_M or kept < 0.98:
         raise HemislamError(
-            f"The recording's points are not those of an RS-Bpearl ({misfit:.2f} m beside its rays, {1 - kept:.0%} of "
-            "them in a firing that has a point already): play it out as foxglove://127.0.0.1:8765 instead."
+            f"The recording's points are not those of an {model.name} ({misfit:.2f} m beside its rays, {1 - kept:.0%} "
+            "of them in a firing that has a point already): play it out as foxglove://127.0.0.1:8765 instead."
         )
     times = turn.base_ns + model.block_ns * order.astype(np.int64)
     return Firings(times, azimuth.astype(np.uint16), counts, intensity)
@@ -94,9 +94,10 @@ def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> C
 
     Its channels must be in the nominal order: points have a ring, but no channel.
     """
+    nominal = ChannelAngles.nominal(model)
     seen, starts = [], []
     for scan in scans:
-        turn = _turn(scan, NOMINAL, model, rate_hz)
+        turn = _turn(scan, nominal, model, rate_hz)
         head = np.radians(turn.start_deg + turn.step_deg * turn.block)
         starts.append(float(_wrapped(turn.start_deg)))
         x = scan.points[:, 0] - model.rx * np.cos(head)
@@ -107,13 +108,13 @@ def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> C
         far = np.linalg.norm(scan.points, axis=1) > 1.0
         seen.append(np.array([turn.channel, elevation, aside])[:, far])
     channel, elevation, aside = np.concatenate(seen, axis=1)
-    elevations, sideways = NOMINAL.elevations_deg.copy(), NOMINAL.horizontal_deg.copy()
+    elevations, sideways = nominal.elevations_deg.copy(), nominal.horizontal_deg.copy()
     for c in np.unique(channel).astype(int):
         elevations[c], sideways[c] = np.median(elevation[channel == c]), np.median(aside[channel == c])
     # Near the pole a coordinate's last digit changes the azimuth by degrees, so its effect is judged.
-    off = np.hypot(elevations - NOMINAL.elevations_deg, sideways * np.cos(np.radians(NOMINAL.elevations_deg)))
+    off = np.hypot(elevations - nominal.elevations_deg, sideways * np.cos(np.radians(nominal.elevations_deg)))
     if off.max() < 0.03:
-        return NOMINAL
+        return nominal
     # The head's azimuth and the corrections are only known up to a common constant. Where revolutions are cut at 0, it
     # is such that none begins before; a scan that begins later may have had no return until then.
     if -_CUT_DEG < (start := min(starts)) < 0.0:
@@ -140,7 +141,7 @@ class _Turn:
 
 def _turn(scan: Scan, calibration: ChannelAngles, model: Model, rate_hz: int) -> _Turn:
     """The turn that fits the points' times and azimuths."""
-    channel = np.argsort(calibration.rings)[np.minimum(scan.ring, CHANNELS - 1)]
+    channel = np.argsort(calibration.rings)[np.minimum(scan.ring, model.channels - 1)]
     block, base_ns = _blocks(scan, channel, model)
     share = model.firing_offsets_ns[channel] / model.block_ns
     step = 360.0 * rate_hz * model.block_ns * 1e-9

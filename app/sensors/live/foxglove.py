@@ -9,29 +9,24 @@ import struct
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
-from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudType, Probe, stamped
-from app.sensors.findings import Finding
-from app.sensors.layout import settle_cloud
+from app.sensors.cloud_types import CLOUD_TYPES
+from app.sensors.live.cloud_reader import CloudReader
 from app.sensors.live.intake import Intake
-from app.sensors.pointcloud import CloudLayout, read_scan
-from app.sensors.probe import PROBED_CLOUDS, usable_types
+from app.sensors.probe import usable_types
 from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type, stamp_ns
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import DroppedScan, Scan
 
 SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
 MAX_MESSAGE = 256 << 20
 RETRY_S = 1.0
-_GIVE_UP = 100
-"""So many clouds without a usable point are reported."""
 MESSAGE = struct.Struct("<BIQ")
 
 Sensor = Literal["lidar", "imu"]
@@ -186,61 +181,6 @@ class FoxgloveReceiver:
         if text != self._told:
             self._told = text
             intake.put_status(kind, "source", text)
-
-
-class CloudReader:
-    """Examines the first clouds of a topic before it decodes any, and again if their fields change.
-
-    Attributes:
-        findings: how the clouds are read; replaced each time that was settled.
-    """
-
-    def __init__(self, params: Params, topic: str, kind: CloudType) -> None:
-        self.findings: list[Finding] = []
-        self._params, self._topic, self._kind = params, topic, kind
-        self._layout: CloudLayout | None = None
-        self._fields: dict[str, Any] = {}
-        self._waiting: list[tuple[Any, Probe, int]] = []
-        self._unusable = 0
-
-    def add(self, message: Any, log_ns: int, arrival_ns: int) -> list[tuple[Scan | DroppedScan, int]]:
-        """The scans that this message completes, each with its arrival: none at first, then those that waited.
-
-        Args:
-            message: deserialised. log_ns: when its sender passed it on.
-
-        Raises:
-            HemislamError: such clouds cannot be read at all, and why.
-        """
-        if self._layout is not None:
-            cloud, scan = read_scan(message, log_ns, self._layout)
-            if cloud is None or cloud.fields == self._fields:
-                return [(scan, arrival_ns)]
-            self._layout = None
-        try:
-            probe = Probe(log_ns, self._kind.read(message))
-        except CloudError as error:
-            return [(DroppedScan(stamp_ns(message.header.stamp), str(error)), arrival_ns)]
-        cloud = probe.cloud
-        if cloud.fields != self._fields:
-            self._waiting.clear()
-            self._fields = cloud.fields
-        if not {"x", "y", "z"} <= cloud.fields.keys():
-            raise HemislamError(f"The clouds on {self._topic} have no x, y, z, but {', '.join(cloud.fields)}.")
-        if not len(probe.points):
-            self._unusable += 1
-            if self._unusable == _GIVE_UP:
-                raise HemislamError(f"None of the clouds on {self._topic} has a usable point; check the LiDAR.")
-            return [(DroppedScan(cloud.stamp_ns, "none of its points is a return"), arrival_ns)]
-        self._waiting.append((message, probe, arrival_ns))
-        return self._settle() if len(self._waiting) == PROBED_CLOUDS else []
-
-    def _settle(self) -> list[tuple[Scan | DroppedScan, int]]:
-        waiting, self._waiting = self._waiting, []
-        probes = stamped([probe for _, probe, _ in waiting])
-        layout, self.findings = settle_cloud(probes, self._params.recording, self._topic, self._kind)
-        self._layout = layout
-        return [(read_scan(message, probe.log_ns, layout)[1], at) for message, probe, at in waiting]
 
 
 def _brief(error: BaseException) -> str:

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.sensors.live.msop import BLOCKS, MSOP_ID, PACKET_BYTES, TURN, azimuths_of, index_of, model_of, stamp_of
+from app.sensors.live import msop
+from app.sensors.live.livox_udp import MID360, SCAN_NS, Livox, is_points, read_header
+from app.sensors.live.msop import TURN
 from app.sensors.live.status import Counters
-from app.sensors.rsbpearl import Model
+from app.sensors.robosense import Model
 from app.slam.types import I64, U8
 
 HOLD = 3
@@ -22,8 +24,43 @@ JUMP_NS = 500_000_000
 MAX_PACKETS = 1024
 """In a revolution; twice what two returns at 10 Hz need. A longer one is cut here."""
 
-Pending = tuple[int, int, bytes]
-"""Time of the first block, arrival, packet."""
+_LATE = 64
+"""A packet numbered this far back begins another count."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Said:
+    """What a packet of measurements states of itself: who sent it, when (None: without a date), and its number."""
+
+    sensor: Model | Livox
+    stamp_ns: int | None
+    index: int
+
+
+def _read(packet: bytes) -> _Said | None:
+    """None if it holds no measurements."""
+    model = msop.model_of(packet)
+    if model is not None:
+        return _Said(model, msop.stamp_of(packet), msop.index_of(packet, model))
+    header = read_header(packet)
+    return _Said(MID360, header.stamp_ns, header.number) if header is not None and is_points(header) else None
+
+
+Pending = tuple[int, int, bytes, _Said]
+"""Time of the first block, arrival, packet, and what it states."""
+
+
+def sensor_of(packet: bytes) -> Model | Livox | None:
+    """Who sent this packet of measurements; None if it holds none."""
+    said = _read(packet)
+    return None if said is None else said.sensor
+
+
+def _azimuths(packet: bytes, stamp_ns: int, sensor: Model | Livox) -> tuple[int, ...]:
+    """Of each block, 0.01 deg; of a sensor that does not turn, its place within the time of a scan as if it did."""
+    if isinstance(sensor, Livox):
+        return (stamp_ns % SCAN_NS * TURN // SCAN_NS,)
+    return msop.azimuths_of(packet, sensor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +68,12 @@ class Revolution:
     """The packets of one revolution, in order of time.
 
     Attributes:
-        packets: (n, 1248). stamps_ns: (n,) of each packet's first block.
+        packets: (n, bytes of the longest), padded. stamps_ns: (n,) of each packet's first block.
         first, stop: the revolution begins with this block of the first packet and ends before this
             block of the last. arrival_ns: when its last packet came, by the host's clock.
     """
 
-    model: Model
+    model: Model | Livox
     packets: U8
     stamps_ns: I64
     first: int
@@ -55,7 +92,7 @@ class Assembler:
         self.counters = counters if counters is not None else Counters()
         self.turn_ns = 100_000_000
         self._pending: list[Pending] = []
-        self._model: Model | None = None
+        self._model: Model | Livox | None = None
         self._first = 0
         self._checked = 0
         self._given_ns: int | None = None
@@ -65,19 +102,23 @@ class Assembler:
 
     def add(self, packet: bytes, arrival_ns: int) -> list[Revolution]:
         """Revolutions that this packet completes, mostly none. arrival_ns: by the host's clock."""
-        if not self._is_msop(packet):
+        said = _read(packet)
+        if said is None:
+            if msop.is_marked(packet):
+                self.counters.truncated += 1
+            else:
+                self.counters.foreign += 1
             return []
-        model = model_of(packet)
-        stamp = stamp_of(packet)
+        model, stamp = said.sensor, said.stamp_ns
         if stamp is None:
             self.counters.undated += 1
             stamp = arrival_ns
-        entry = (stamp, arrival_ns, packet)
+        entry = (stamp, arrival_ns, packet, said)
         newest = self._pending[-1][0] if self._pending else self._given_ns
         frames: list[Revolution] = []
         if newest is not None and (abs(stamp - newest) > JUMP_NS or model is not self._model):
             suspect, self._suspect = self._suspect, entry
-            if suspect is None or abs(stamp - suspect[0]) > JUMP_NS or model is not model_of(suspect[2]):
+            if suspect is None or abs(stamp - suspect[0]) > JUMP_NS or model is not suspect[3].sensor:
                 self.counters.strays += suspect is not None
                 return []
             frames = list(self.flush())  # it is another time now
@@ -98,24 +139,15 @@ class Assembler:
         while self._checked < len(self._pending):
             yield from self._check()
         if self._pending:
-            yield self._take(len(self._pending), BLOCKS)
+            yield self._take(len(self._pending), None)
             self._pending, self._first, self._checked = [], 0, 0
 
     def pending_since(self) -> int | None:
         """When the newest waiting packet arrived, by the host's clock; None if no packet waits."""
         return self._pending[-1][1] if self._pending else None
 
-    def _is_msop(self, packet: bytes) -> bool:
-        if len(packet) == PACKET_BYTES and packet[:8] == MSOP_ID:
-            return True
-        if packet[:8] == MSOP_ID:
-            self.counters.truncated += 1
-        else:
-            self.counters.foreign += 1
-        return False
-
     def _insert(self, entry: Pending) -> None:
-        stamp, _, packet = entry
+        stamp, _, _, said = entry
         pending = self._pending
         if self._given_ns is not None and stamp <= self._given_ns:
             self.counters.late += 1
@@ -134,57 +166,62 @@ class Assembler:
             pending.insert(at, entry)
             self._checked = min(self._checked, at)
         self.counters.packets += 1
-        self._count_lost(index_of(packet))
+        self._count_lost(said.index)
 
     def _count_lost(self, index: int) -> None:
         """Count by the packets' numbers; one that arrives late after all no longer counts."""
-        if self._index is None or not 0 < abs(index - self._index) < 100_000:
-            self._index = index
-        elif index > self._index:
-            self.counters.lost += index - self._index - 1
-            self._index = index
-        else:
+        ahead = 0 if self._index is None else (index - self._index + (1 << 15)) % (1 << 16) - (1 << 15)
+        if -_LATE < ahead < 0:
             self.counters.lost = max(self.counters.lost - 1, 0)
+            return
+        self.counters.lost += max(ahead - 1, 0)
+        self._index = index
 
     def _check(self) -> list[Revolution]:
         """Look for the end of a revolution in the next packet."""
         at = self._checked
         self._checked += 1
-        stamp, _, packet = self._pending[at]
+        stamp = self._pending[at][0]
         begin = self._first if at == 0 else 0
-        azimuth = azimuths_of(packet)
+        azimuth = self._azimuths_at(at)
         moved = (azimuth[-1] - azimuth[begin] + TURN // 2) % TURN - TURN // 2
         if moved:
             self._sense = max(-8, min(8, self._sense + (1 if moved > 0 else -1)))
         sense = 1 if self._sense >= 0 else -1
         if at and (stamp - self._pending[at - 1][0] > 0.97 * self.turn_ns or at >= MAX_PACKETS):
             return [self._split(at, 0)]
-        before = azimuths_of(self._pending[at - 1][2])[-1] if at else azimuth[begin]
-        for block in range(begin, BLOCKS):
+        before = self._azimuths_at(at - 1)[-1] if at else azimuth[begin]
+        for block in range(begin, len(azimuth)):
             if (azimuth[block] - before) * sense < 0:
                 return [self._split(at, block)]
             before = azimuth[block]
         return []
 
+    def _azimuths_at(self, at: int) -> tuple[int, ...]:
+        stamp, _, packet, said = self._pending[at]
+        return _azimuths(packet, stamp, said.sensor)
+
     def _split(self, at: int, block: int) -> Revolution:
         """End the revolution before this block of the packet `at`; the next one begins there."""
-        frame = self._take(at + 1, block) if block else self._take(at, BLOCKS)
+        frame = self._take(at + 1, block) if block else self._take(at, None)
         self._pending = self._pending[at:]
         self._first = block
         self._checked = 0
         return frame
 
-    def _take(self, packets: int, stop: int) -> Revolution:
+    def _take(self, packets: int, stop: int | None) -> Revolution:
+        """stop: block of the last packet at which the revolution ends; None: with that packet."""
         taken = self._pending[:packets]
         assert self._model is not None
         self.counters.frames += 1
-        self._given_ns = taken[-1][0] if stop == BLOCKS else taken[-2][0] if len(taken) > 1 else self._given_ns
-        data = np.frombuffer(b"".join(packet for _, _, packet in taken), np.uint8)
+        self._given_ns = taken[-1][0] if stop is None else taken[-2][0] if len(taken) > 1 else self._given_ns
+        longest = max(len(packet) for _, _, packet, _ in taken)
+        data = np.frombuffer(b"".join(packet.ljust(longest, b"\0") for _, _, packet, _ in taken), np.uint8)
         return Revolution(
             model=self._model,
-            packets=data.reshape(len(taken), PACKET_BYTES),
-            stamps_ns=np.array([stamp for stamp, _, _ in taken], np.int64),
+            packets=data.reshape(len(taken), longest),
+            stamps_ns=np.array([stamp for stamp, *_ in taken], np.int64),
             first=self._first,
-            stop=stop,
-            arrival_ns=max(arrival for _, arrival, _ in taken),
+            stop=self._model.blocks if stop is None else stop,
+            arrival_ns=max(arrival for _, arrival, _, _ in taken),
         )

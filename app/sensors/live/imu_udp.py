@@ -28,11 +28,17 @@ A sender, complete:
         time.sleep(0.005)
 
 Stamp each sample when it is measured, not when it is sent, and by the LiDAR's clock if you can.
+
+The samples of an Airy's own IMU (51 bytes, big-endian, counts of its full range) and of a Mid-360's are read as well.
 '''
 
+import math
 import struct
 from dataclasses import dataclass, field
 
+from app.sensors.imu_units import STANDARD_GRAVITY
+from app.sensors.live import livox_udp
+from app.sensors.live.msop import read_utc, utc_bytes
 from app.sensors.live.status import Counters
 from app.sensors.ros import Vector
 
@@ -42,27 +48,54 @@ _SAMPLE = struct.Struct("<4sIq6d")
 SAMPLE_BYTES = _SAMPLE.size
 _FAR_NS = 1 << 62
 """The year 2116; later times would overflow."""
+AIRY_IMU_PORT = 6688
+_AIRY_MAGIC = bytes.fromhex("aa555a05")
+_AIRY_SAMPLE = struct.Struct(">4s10s6i4xBBBI2s")
+"""Mark, time, counts of acceleration and turning, temperature, rate, their ranges, number, end."""
+_COUNTS = 32_768
 
 
 @dataclass(frozen=True, slots=True)
 class ImuSample:
     """Attributes:
-    number: of the datagram. stamp_ns: as sent. gyro: rad/s. accel: m/s^2, IMU frame.
+    number: of the datagram; None if it has none to go by. stamp_ns: as sent. gyro: rad/s. accel: m/s^2, IMU frame.
     """
 
-    number: int
+    number: int | None
     stamp_ns: int
     gyro: Vector
     accel: Vector
 
 
 def write_imu(sample: ImuSample) -> bytes:
-    return _SAMPLE.pack(IMU_MAGIC, sample.number & 0xFFFFFFFF, sample.stamp_ns, *sample.gyro, *sample.accel)
+    number = (sample.number or 0) & 0xFFFFFFFF
+    return _SAMPLE.pack(IMU_MAGIC, number, sample.stamp_ns, *sample.gyro, *sample.accel)
+
+
+def write_airy_imu(sample: ImuSample) -> bytes:
+    """As an Airy sends it: ranges of 4 g and 500 deg/s."""
+    accel, gyro = _airy_units(1, 1)
+    counts = [round(value / accel) for value in sample.accel] + [round(value / gyro) for value in sample.gyro]
+    number = ((sample.number or 0) + 1) & 0xFFFFFFFF
+    return _AIRY_SAMPLE.pack(_AIRY_MAGIC, utc_bytes(sample.stamp_ns), *counts, 3, 1, 1, number, b"\xf0\x0f")
+
+
+def is_imu(datagram: bytes) -> bool:
+    """Whether it is to be read as IMU samples."""
+    if datagram.startswith((IMU_MAGIC, _AIRY_MAGIC)):
+        return True
+    header = livox_udp.read_header(datagram)
+    return header is not None and not livox_udp.is_points(header)
 
 
 def read_imu(datagram: bytes) -> list[ImuSample]:
     """The samples of a datagram; none if it is of another kind."""
-    if not datagram or len(datagram) % SAMPLE_BYTES:
+    if datagram.startswith(_AIRY_MAGIC):
+        return _read_airy(datagram)
+    if not datagram.startswith(IMU_MAGIC):
+        read = livox_udp.read_imu(datagram)
+        return [ImuSample(None, *read)] if read and _finite(read[1] + read[2]) else []
+    if len(datagram) % SAMPLE_BYTES:
         return []
     samples = []
     for magic, number, stamp, gx, gy, gz, ax, ay, az in _SAMPLE.iter_unpack(datagram):
@@ -70,6 +103,27 @@ def read_imu(datagram: bytes) -> list[ImuSample]:
             return []
         samples.append(ImuSample(number, stamp, (gx, gy, gz), (ax, ay, az)))
     return samples
+
+
+def _read_airy(datagram: bytes) -> list[ImuSample]:
+    if len(datagram) != _AIRY_SAMPLE.size:
+        return []
+    _, time, ax, ay, az, gx, gy, gz, _, accel_range, gyro_range, number, _ = _AIRY_SAMPLE.unpack(datagram)
+    stamp_ns = read_utc(time)
+    if stamp_ns is None or stamp_ns >= _FAR_NS or max(accel_range, gyro_range) > 3:
+        return []
+    accel, gyro = _airy_units(accel_range, gyro_range)
+    return [ImuSample(number, stamp_ns, (gx * gyro, gy * gyro, gz * gyro), (ax * accel, ay * accel, az * accel))]
+
+
+def _airy_units(accel_range: int, gyro_range: int) -> tuple[float, float]:
+    """m/s^2 and rad/s of a count. The ranges: 2 g and 250 deg/s, doubled so many times."""
+    accel, gyro = 2 * STANDARD_GRAVITY * 2**accel_range, math.radians(250.0) * 2**gyro_range
+    return accel / _COUNTS, gyro / _COUNTS
+
+
+def _finite(values: tuple[float, ...]) -> bool:
+    return all(map(math.isfinite, values))
 
 
 _HOLD = 4
@@ -103,6 +157,9 @@ class ImuOrder:
 
     def _one(self, sample: ImuSample) -> list[ImuSample]:
         ready: list[ImuSample] = []
+        if sample.number is None:
+            self.counters.imu += 1
+            return [sample]
         ahead = 0 if self._next is None else (sample.number - self._next + (1 << 31)) % (1 << 32) - (1 << 31)
         if self._next is None or abs(ahead) > _FAR:
             ready, self._next, ahead = self.flush(), sample.number, 0

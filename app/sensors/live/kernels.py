@@ -5,8 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from app.sensors.live.msop import BLOCK_BYTES, BLOCKS, HEADER_BYTES, TURN
-from app.sensors.rsbpearl import CHANNELS
+from app.sensors.live.msop import HEADER_BYTES, TURN
 
 _GAP = 100
 """0.01 deg: a longer step between two blocks is the gap of a limited field of view."""
@@ -15,33 +14,36 @@ _GAP = 100
 @njit(cache=True, nogil=True, error_model="numpy")
 def decode_blocks(
     packets, stamps, first, stop, reverse, nominal, turn_ns,
-    cos_e, sin_e, cos_h, sin_h, share, firing_ns, rings, block_ns, step_m, least, most, rx, rz,
-    points, times, intensity, ring,
+    cos_e, sin_e, cos_h, sin_h, share, firing_ns, rings, blocks, parts, part, counted, block_ns, step_m,
+    least, most, rx, rz, points, times, intensity, ring,
 ):  # fmt: skip
     """Points of the blocks from `first` of the first packet up to `stop` of the last. Returns (points, bad blocks).
 
     Args:
         packets: (n, 1248) u8. stamps: (n,) i64 ns of each packet's first block, after the frame's base.
         nominal: 0.01 deg from block to block, signed. turn_ns: of a revolution.
-        cos_e ... sin_h: (32,) of elevation and horizontal correction. share: (32,) of the block's
-            duration at which a channel fires. rings: (32,) u16. step_m: m per count.
+        cos_e ... sin_h: (c,) of elevation and horizontal correction. share: (c,) of the block's
+            duration at which a channel fires. rings: (c,) u16. step_m: m per count.
+        blocks: of a packet, each of so many parts of so many channels. counted: bits of a distance.
         least, most: counts outside are no return.
         points (m, 3) f32, times (m,) i64 after the base, intensity (m,) f32, ring (m,) u16: filled.
     """
     n = 0
     bad = 0
     last = len(packets) - 1
-    azimuth = np.empty(BLOCKS, np.int64)
+    part_bytes = 4 + 3 * part
+    block_bytes = parts * part_bytes
+    azimuth = np.empty(blocks, np.int64)
     to_radians = math.pi / 18000.0
     for i in range(len(packets)):
         packet = packets[i]
-        for b in range(BLOCKS):
-            at = HEADER_BYTES + b * BLOCK_BYTES
+        for b in range(blocks):
+            at = HEADER_BYTES + b * block_bytes
             azimuth[b] = (packet[at + 2] << 8) | packet[at + 3]
         time = stamps[i]
         step = nominal
         begin = first if i == 0 else 0
-        end = stop if i == last else BLOCKS
+        end = stop if i == last else blocks
         for b in range(end):
             if b > 0 and azimuth[b] != azimuth[b - 1]:  # else it is another return of the same firing
                 moved = (azimuth[b] - azimuth[b - 1] + TURN // 2) % TURN - TURN // 2
@@ -51,14 +53,14 @@ def decode_blocks(
                     time += block_ns
             if b < begin:
                 continue
-            at = HEADER_BYTES + b * BLOCK_BYTES
+            at = HEADER_BYTES + b * block_bytes
             if packet[at] != 0xFF or packet[at + 1] != 0xEE or azimuth[b] >= TURN:
                 bad += 1
                 continue
             following = b + 1
-            while following < BLOCKS and azimuth[following] == azimuth[b]:
+            while following < blocks and azimuth[following] == azimuth[b]:
                 following += 1
-            if following < BLOCKS:
+            if following < blocks:
                 moved = (azimuth[following] - azimuth[b] + TURN // 2) % TURN - TURN // 2
                 step = moved if abs(moved) <= _GAP else nominal
             again = b > begin and azimuth[b] == azimuth[b - 1]
@@ -68,12 +70,12 @@ def decode_blocks(
                 turned, width = -turned, -width
             cb, sb = math.cos(turned), math.sin(turned)
             lx, ly = rx * cb, -rx * sb
-            for c in range(CHANNELS):
-                p = at + 4 + 3 * c
-                count = (packet[p] << 8) | packet[p + 1]
+            for c in range(parts * part):
+                p = at + (c // part) * part_bytes + 4 + 3 * (c % part)
+                count = ((packet[p] << 8) | packet[p + 1]) & counted
                 if count < least or count > most:
                     continue
-                if again and packet[p - BLOCK_BYTES] == packet[p] and packet[p + 1 - BLOCK_BYTES] == packet[p + 1]:
+                if again and packet[p - block_bytes] == packet[p] and packet[p + 1 - block_bytes] == packet[p + 1]:
                     continue  # strongest and last return are the same
                 # The head turns on by at most 1 deg within a block: the series is exact to 1e-13.
                 w = width * share[c]

@@ -1,7 +1,8 @@
-"""MSOP, the RS-Bpearl's measurement packets, read and written. Big-endian throughout.
+"""MSOP, RoboSense's measurement packets, read and written. Big-endian throughout.
 
-A packet has 1,248 bytes: a header of 42, twelve blocks of 100 (FF EE, azimuth in 0.01 deg, then 32
-times distance u16 and intensity u8 in channel order), packet index and tail.
+A packet has 1,248 bytes: a header of 42, then blocks (FF EE, azimuth in 0.01 deg, then for each channel distance u16
+and intensity u8) and a tail. An RS-Bpearl's has twelve blocks of 32 channels; an Airy's has four of 96 channels, each
+divided into two parts with a mark and azimuth of their own.
 """
 
 import calendar
@@ -11,38 +12,41 @@ from functools import lru_cache
 
 import numpy as np
 
-from app.sensors.rsbpearl import BPEARL, BPV4, CHANNELS, Model
+from app.sensors.robosense import AIRY, BPEARL, BPV4, Model
 from app.slam.types import I64, U8, U16
 
 MSOP_PORT = 6699
-MSOP_ID = bytes.fromhex("55aa050a5aa550a0")
 PACKET_BYTES = 1248
-BLOCKS = 12
-BLOCK_BYTES = 100
 HEADER_BYTES = 42
-INDEX_AT = 1242
 TURN = 36_000
 """A revolution in the packets' unit of azimuth, 0.01 deg."""
 
-_AZIMUTHS = struct.Struct(">" + "2xH96x" * BLOCKS)
 _LEGACY = struct.Struct(">6BHH")
-_INDEX = struct.Struct(">I")
+_AZIMUTHS = {
+    model.name: struct.Struct(">" + f"2xH{model.part_bytes * model.parts - 4}x" * model.blocks)
+    for model in (BPEARL, BPV4, AIRY)
+}
 _TYPE_BPV4 = b"\x03\x04"
 
 
-def model_of(packet: bytes) -> Model:
-    """The generation of the sensor that sent it."""
+def is_marked(packet: bytes) -> bool:
+    """Whether it begins like a measurement packet."""
+    return packet.startswith((BPEARL.mark, AIRY.mark))
+
+
+def model_of(packet: bytes) -> Model | None:
+    """The sensor that sent it; None if it is no whole measurement packet."""
+    if len(packet) != PACKET_BYTES or not is_marked(packet):
+        return None
+    if packet.startswith(AIRY.mark):
+        return AIRY
     return BPV4 if packet[31:33] == _TYPE_BPV4 else BPEARL
 
 
 def stamp_of(packet: bytes) -> int | None:
     """Time of the first block, ns since 1970 by the sensor's clock; None if it shows no date."""
-    if packet[31:33] == _TYPE_BPV4:
-        seconds = int.from_bytes(packet[20:26], "big")
-        microseconds = int.from_bytes(packet[26:30], "big")
-        if seconds >= 1 << 33 or microseconds >= 1_000_000:
-            return None
-        return seconds * 1_000_000_000 + microseconds * 1_000
+    if model_of(packet) is not BPEARL:
+        return read_utc(packet[20:30])
     base = _date_ns(packet[20:26])
     if base is None:
         return None
@@ -50,13 +54,13 @@ def stamp_of(packet: bytes) -> int | None:
     return base + int(milliseconds) * 1_000_000 + int(micros) * 1_000
 
 
-def azimuths_of(packet: bytes) -> tuple[int, ...]:
-    """Azimuth of each of the 12 blocks, 0.01 deg."""
-    return _AZIMUTHS.unpack_from(packet, HEADER_BYTES)
+def azimuths_of(packet: bytes, model: Model) -> tuple[int, ...]:
+    """Azimuth of each block, 0.01 deg."""
+    return _AZIMUTHS[model.name].unpack_from(packet, HEADER_BYTES)
 
 
-def index_of(packet: bytes) -> int:
-    return int(_INDEX.unpack_from(packet, INDEX_AT)[0])
+def index_of(packet: bytes, model: Model) -> int:
+    return int.from_bytes(packet[model.index_at : model.index_at + model.index_bytes], "big")
 
 
 def write_packet(
@@ -66,19 +70,21 @@ def write_packet(
 
     Args:
         stamp_ns: time of the first block; the packet keeps whole microseconds.
-        azimuth: (12,) 0.01 deg. counts: (12, 32) distance in steps of the model, 0 = no return.
-        intensity: (12, 32).
+        azimuth: (blocks,) 0.01 deg. counts: (blocks, channels) distance in steps of the model, 0 = no return.
+        intensity: (blocks, channels).
     """
     packet = np.zeros(PACKET_BYTES, np.uint8)
-    packet[:8] = np.frombuffer(MSOP_ID, np.uint8)
+    packet[: len(model.mark)] = np.frombuffer(model.mark, np.uint8)
     packet[20:33] = np.frombuffer(_stamp_bytes(stamp_ns, model), np.uint8)
-    blocks = packet[HEADER_BYTES : HEADER_BYTES + BLOCKS * BLOCK_BYTES].reshape(BLOCKS, BLOCK_BYTES)
-    blocks[:, 0], blocks[:, 1] = 0xFF, 0xEE
-    blocks[:, 2:4] = azimuth.astype(">u2").view(np.uint8).reshape(BLOCKS, 2)
-    channels = blocks[:, 4:].reshape(BLOCKS, CHANNELS, 3)
-    channels[:, :, :2] = counts.astype(">u2").view(np.uint8).reshape(BLOCKS, CHANNELS, 2)
-    channels[:, :, 2] = intensity
-    packet[INDEX_AT : INDEX_AT + 4] = np.frombuffer(_INDEX.pack(index & 0xFFFFFFFF), np.uint8)
+    rows, size = model.blocks * model.parts, model.part_bytes
+    parts = packet[HEADER_BYTES : HEADER_BYTES + rows * size].reshape(rows, size)
+    parts[:, 0], parts[:, 1] = 0xFF, 0xEE
+    parts[:, 2:4] = np.repeat(azimuth, model.parts).astype(">u2").view(np.uint8).reshape(rows, 2)
+    channels = parts[:, 4:].reshape(rows, model.part, 3)
+    channels[:, :, :2] = counts.astype(">u2").view(np.uint8).reshape(rows, model.part, 2)
+    channels[:, :, 2] = intensity.reshape(rows, model.part)
+    number = (index % (1 << 16 if model is AIRY else 1 << 32)).to_bytes(model.index_bytes, "big")
+    packet[model.index_at : model.index_at + model.index_bytes] = np.frombuffer(number, np.uint8)
     return packet.tobytes()
 
 
@@ -92,12 +98,23 @@ def date_bytes(stamp_ns: int) -> bytes:
     )
 
 
+def utc_bytes(stamp_ns: int) -> bytes:
+    """The ten bytes of a time in later packets: seconds and microseconds."""
+    seconds, rest = divmod(stamp_ns // 1_000, 1_000_000)
+    return seconds.to_bytes(6, "big") + rest.to_bytes(4, "big")
+
+
+def read_utc(data: bytes) -> int | None:
+    """ns since 1970 of such ten bytes; None if they show no date."""
+    seconds, microseconds = int.from_bytes(data[:6], "big"), int.from_bytes(data[6:], "big")
+    return None if seconds >= 1 << 33 or microseconds >= 1_000_000 else seconds * 1_000_000_000 + microseconds * 1_000
+
+
 def _stamp_bytes(stamp_ns: int, model: Model) -> bytes:
     """Bytes 20 to 33: time, and which sensor it is."""
-    if model is not BPV4:
+    if model is BPEARL:
         return date_bytes(stamp_ns) + b"\x00\x03\x01"
-    seconds, rest = divmod(stamp_ns // 1_000, 1_000_000)
-    return seconds.to_bytes(6, "big") + rest.to_bytes(4, "big") + b"\x00" + _TYPE_BPV4
+    return utc_bytes(stamp_ns) + b"\x00" + (_TYPE_BPV4 if model is BPV4 else b"\x31\x02")
 
 
 @lru_cache(maxsize=64)
@@ -111,7 +128,7 @@ def _date_ns(date: bytes) -> int | None:
 
 
 class PacketWriter:
-    """Packs blocks into packets of twelve, as the sensor does: a packet may span two revolutions."""
+    """Packs blocks into packets, as the sensor does: a packet may span two revolutions."""
 
     def __init__(self, model: Model = BPEARL) -> None:
         self._model = model
@@ -123,14 +140,14 @@ class PacketWriter:
 
         Args:
             times_ns: (b,) of each block; two returns of one firing are two blocks of one time.
-            azimuth: (b,) 0.01 deg. counts, intensity: (b, 32).
+            azimuth: (b,) 0.01 deg. counts, intensity: (b, channels).
         """
         made = []
         for block in zip(times_ns.tolist(), azimuth.tolist(), counts, intensity, strict=True):
             if self._blocks and block[0] - self._blocks[-1][0] > 1.5 * self._model.block_ns:
                 made += self.flush()
             self._blocks.append(block)
-            if len(self._blocks) == BLOCKS:
+            if len(self._blocks) == self._model.blocks:
                 made += self.flush()
         return made
 
@@ -139,8 +156,9 @@ class PacketWriter:
         if not self._blocks:
             return []
         time, angle, *_ = self._blocks[-1]
-        empty = (time, angle, np.zeros(CHANNELS, np.uint16), np.zeros(CHANNELS, np.uint8))
-        times, azimuth, counts, intensity = zip(*(self._blocks + [empty] * BLOCKS)[:BLOCKS], strict=True)
+        count, channels = self._model.blocks, self._model.channels
+        empty = (time, angle, np.zeros(channels, np.uint16), np.zeros(channels, np.uint8))
+        times, azimuth, counts, intensity = zip(*(self._blocks + [empty] * count)[:count], strict=True)
         packet = write_packet(
             times[0], np.array(azimuth, np.uint16), np.array(counts), np.array(intensity), self._model, self._index
         )

@@ -1,4 +1,4 @@
-"""Receiving threads for UDP: the RS-Bpearl's packets, and IMU samples."""
+"""Receiving threads for UDP: packets of LiDARs, and IMU samples."""
 
 import contextlib
 import select
@@ -9,14 +9,19 @@ import threading
 import time
 from collections import deque
 
+from app.sensors.cloud_types import CLOUD_TYPES
+from app.sensors.live.cloud_reader import CloudReader
 from app.sensors.live.decoder import Decoder
+from app.sensors.live.devices import Device, mount_finding
 from app.sensors.live.difop import DIFOP_ID, ChannelAngles, Difop, read_difop
-from app.sensors.live.frames import Assembler, Revolution
-from app.sensors.live.imu_udp import ImuOrder
+from app.sensors.live.frames import Assembler, Revolution, sensor_of
+from app.sensors.live.imu_udp import ImuOrder, is_imu
 from app.sensors.live.intake import Intake
-from app.sensors.live.msop import MSOP_ID
+from app.sensors.live.livox_udp import read_points
+from app.sensors.robosense import Model
 from app.slam.errors import HemislamError
-from app.slam.types import Scan
+from app.slam.params import Params
+from app.slam.types import DroppedScan, Scan
 
 BUFFER_BYTES = 16 << 20
 """Requested from the kernel, so that nothing is lost while this process is busy; it may grant less."""
@@ -79,36 +84,53 @@ def _drain(ready: socket.socket) -> list[tuple[bytes, int, Peer]]:
     return found
 
 
-class RsbpearlReceiver:
-    """Receives the sensor's own packets. Its sockets are open from the start, so that nothing is missed.
+class PacketReceiver:
+    """Receives a sensor's own packets. Its sockets are open from the start, so that nothing is missed.
+
+    Args:
+        own_imu: whether to take IMU samples from it, too.
 
     Raises:
-        HemislamError: a port cannot be opened.
+        HemislamError: a port cannot be opened, or the angles are those of another sensor.
     """
 
-    def __init__(self, host: str, msop_port: int, difop_port: int, angles: ChannelAngles | None = None) -> None:
-        self._sockets = [open_socket(host, msop_port)]
-        if difop_port != msop_port:
-            try:
-                self._sockets.append(open_socket(host, difop_port))
-            except HemislamError:
-                self._sockets[0].close()
-                raise
+    def __init__(
+        self,
+        device: Device,
+        host: str,
+        ports: tuple[int, ...],
+        params: Params,
+        angles: ChannelAngles | None = None,
+        own_imu: bool = False,
+    ) -> None:
+        model = device.model
+        self._decoder = Decoder(angles, model) if isinstance(model, Model) else None
+        self._clouds = CloudReader(params, device.layout.lidar_topic, CLOUD_TYPES[device.layout.kind])
+        self._sockets: list[socket.socket] = []
+        try:
+            for number, port in enumerate(ports):
+                if port not in ports[:number]:
+                    self._sockets.append(open_socket(host, port))
+        except HemislamError:
+            for opened in self._sockets:
+                opened.close()
+            raise
         self.ports = [int(made.getsockname()[1]) for made in self._sockets]
-        self._decoder = Decoder(angles)
-        self._decoder.warm_up()
-        self._assembler = Assembler()
+        if self._decoder is not None:
+            self._decoder.warm_up()
+        self._model, self._models = model, device.models
+        self._own_imu = own_imu and device.has_imu
+        self._assembler, self._order = Assembler(), ImuOrder()
         self._wait_until_ns: int | None = None
         self._device: Difop | None = None
         self._frames: deque[Revolution] = deque()
-        self._known_angles = angles is not None
+        self._known_angles = angles is not None or not device.has_angles
         self._sensor: Peer | None = None
         self._heard_s = 0.0
         self._told_another = False
 
     def __call__(self, intake: Intake, stop: threading.Event) -> None:
-        self._assembler.counters = intake.counters
-        self._decoder.bad_blocks = intake.counters.bad_blocks
+        self._assembler.counters = self._order.counters = intake.counters
         with contextlib.ExitStack() as stack:
             for opened in self._sockets:
                 stack.enter_context(opened)
@@ -124,52 +146,59 @@ class RsbpearlReceiver:
                 self._give(now, intake)
 
     def _take(self, packet: bytes, now: int, peer: Peer, intake: Intake) -> None:
-        device = packet[:8] == DIFOP_ID
-        if (device or packet[:8] == MSOP_ID) and self._is_another(peer, device, intake):
+        sensor, states, felt = sensor_of(packet), packet[:8] == DIFOP_ID, is_imu(packet)
+        if (states or felt or sensor is not None) and self._is_another(peer, states or felt, intake):
             intake.counters.foreign += 1
-            return
-        if device:
-            said = read_difop(packet)
+        elif felt and self._own_imu:
+            for sample in self._order.add(packet):
+                intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, now)
+        elif states and isinstance(self._model, Model):
+            said = read_difop(packet, self._model)
             if said is None:
                 intake.counters.truncated += 1
             else:
                 intake.counters.difop += 1
                 self._configure(said, now, intake)
-            return
-        self._frames += self._assembler.add(packet, now)
+        elif not felt and (sensor is None or sensor in self._models):
+            self._frames += self._assembler.add(packet, now)
+        elif not felt:
+            intake.counters.foreign += 1
 
-    def _is_another(self, peer: Peer, device: bool, intake: Intake) -> bool:
+    def _is_another(self, peer: Peer, beside: bool, intake: Intake) -> bool:
         """Whether this is another sensor than the one in use: the first one, until it falls silent.
 
         Args:
-            device: it is a packet of the device's settings, which a sensor sends from another port.
+            beside: it is a packet of settings or of the IMU, which a sensor sends from another port.
         """
         known, now = self._sensor, time.monotonic()
         if known is None or now - self._heard_s > _REST_NS * 1e-9:
-            known = None if device else peer
-        elif (peer[0] != known[0]) if device else (peer != known):
+            known = None if beside else peer
+        elif (peer[0] != known[0]) if beside else (peer != known):
             if not self._told_another:
                 self._told_another = True
                 text = f"{peer[0]} sends to the port of {known[0]} too; its packets are left out while both send"
                 intake.put_status("configuration", "LiDAR", text)
             return True
-        if not device:
+        if not beside:
             self._sensor, self._heard_s = known, now
         return False
 
     def _configure(self, said: Difop, now: int, intake: Intake) -> None:
         before, self._device = self._device, said
-        if before is not None and before.same(said):
+        if self._decoder is None or (before is not None and before.same(said)):
             return
         if before is not None:
             self._give(now, intake)  # what came before was measured with the old settings
         self._decoder.configure(said)
         self._assembler.turn_ns = round(60e9 / said.rpm)
-        intake.sensor = f"RS-Bpearl {said.serial}: {said.describe()}"
-        if before is None:
-            intake.put_status("connected", "LiDAR", intake.sensor)
-        else:
+        intake.sensor = f"{self._model.name} {said.serial}: {said.describe()}"
+        if before is not None:
             intake.put_status("configuration", "LiDAR", f"the LiDAR was set to {said.describe()}")
+            return
+        intake.put_status("connected", "LiDAR", intake.sensor)
+        if said.T_imu_lidar is not None:
+            mount = mount_finding(said.T_imu_lidar)
+            intake.put_status("configuration", "LiDAR", f"{mount.text}: {mount.option}")
 
     def _give(self, now: int, intake: Intake) -> None:
         """Decode and hand on; at the start, once the angles are known or their time is up."""
@@ -184,11 +213,23 @@ class RsbpearlReceiver:
             intake.put_status("configuration", "LiDAR", text)
         while self._frames:
             frame = self._frames.popleft()
-            scan = self._decoder.decode(frame)
-            intake.counters.bad_blocks = self._decoder.bad_blocks
-            intake.put_scan(scan, frame.arrival_ns)
-            if isinstance(scan, Scan) and not intake.sensor:
-                intake.sensor = f"{frame.model.name}, without device packets"
+            for scan, arrival_ns in self._scans(frame, intake):
+                intake.put_scan(scan, arrival_ns)
+                if isinstance(scan, Scan) and not intake.sensor:
+                    without = "" if self._decoder is None else ", without device packets"
+                    intake.sensor = f"{frame.model.name}{without}"
+
+    def _scans(self, frame: Revolution, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
+        """Those that can be given now, each with its arrival."""
+        if self._decoder is None:
+            try:
+                return self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns)
+            except HemislamError:
+                intake.counters.unreadable += 1
+                return []
+        scan = self._decoder.decode(frame)
+        intake.counters.bad_blocks = self._decoder.bad_blocks
+        return [(scan, frame.arrival_ns)]
 
 
 class ImuReceiver:

@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Literal, cast
 from urllib.parse import parse_qsl, urlsplit
 
-from app.sensors.live.difop import DIFOP_PORT, read_angles
+from app.sensors.live.devices import DEVICES
+from app.sensors.live.difop import read_angles
 from app.sensors.live.imu_udp import IMU_PORT
 from app.sensors.live.intake import Clock, Intake, Receive
-from app.sensors.live.msop import MSOP_PORT
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.source import Known, LiveSource
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 
-Scheme = Literal["rsbpearl", "imu-udp", "foxglove"]
+Scheme = Literal["rsbpearl", "airy", "mid360", "imu-udp", "foxglove"]
 FOXGLOVE_PORT = 8765
 
 
@@ -29,7 +29,14 @@ class _Kind:
 
 
 _KINDS: dict[str, _Kind] = {
-    "rsbpearl": _Kind((MSOP_PORT, DIFOP_PORT), ("clock", "angles"), "rsbpearl://0.0.0.0:6699,7788"),
+    **{
+        scheme: _Kind(
+            device.ports,
+            ("clock", "angles") if device.has_angles else ("clock",),
+            f"{scheme}://0.0.0.0:{','.join(map(str, device.ports))}",
+        )
+        for scheme, device in DEVICES.items()
+    },
     "imu-udp": _Kind((IMU_PORT,), (), "imu-udp://:6700"),
     "foxglove": _Kind((FOXGLOVE_PORT,), ("clock",), "foxglove://192.168.1.5:8765"),
 }
@@ -38,8 +45,8 @@ _KINDS: dict[str, _Kind] = {
 @dataclass(frozen=True, slots=True)
 class Address:
     """Attributes:
-    ports: of `rsbpearl` two, for measurements and for the device's own packets.
-    options: rsbpearl: `clock` (auto, sensor, host), `angles` (a CSV); foxglove: `clock`.
+    ports: of a sensor several: for measurements, then for its other packets.
+    options: `clock` (auto, sensor, host); of a RoboSense also `angles` (a CSV).
     """
 
     scheme: Scheme
@@ -99,8 +106,8 @@ def open_live(
     """Begin to receive.
 
     Args:
-        lidar: `rsbpearl://HOST:MSOP,DIFOP` or `foxglove://HOST:PORT`. imu: `imu-udp://HOST:PORT`, or another
-            `foxglove://`; None: from the LiDAR's Foxglove source.
+        lidar: a sensor's address, such as `rsbpearl://HOST:MSOP,DIFOP`, or `foxglove://HOST:PORT`.
+        imu: `imu-udp://HOST:PORT`, or another `foxglove://`; None: from the LiDAR's source.
         record: an .mcap into which everything is written.
         before: what is known from a source that this one replaces.
 
@@ -108,13 +115,16 @@ def open_live(
         HemislamError: an address has no known form, a port cannot be opened, or a file not be written.
     """
     from app.sensors.live.foxglove import FoxgloveReceiver
-    from app.sensors.live.udp import ImuReceiver, RsbpearlReceiver
+    from app.sensors.live.udp import ImuReceiver, PacketReceiver
 
     address = parse_address(lidar)
     beside = parse_address(imu) if imu else None
-    if address.scheme == "imu-udp" or (beside is not None and beside.scheme == "rsbpearl"):
-        raise HemislamError(f"`{lidar}` gives no point clouds; use rsbpearl:// or foxglove:// for them.")
-    if beside is None and address.scheme == "rsbpearl":
+    device = DEVICES.get(address.scheme)
+    if address.scheme == "imu-udp":
+        raise HemislamError(f"`{lidar}` gives no point clouds; use {', '.join(DEVICES)} or foxglove:// for them.")
+    if beside is not None and beside.scheme in DEVICES:
+        raise HemislamError(f"`{imu}` is no IMU of its own; write --imu imu-udp://:6700 or foxglove://HOST:8765.")
+    if beside is None and device is not None and not device.has_imu:
         raise HemislamError(
             "An RS-Bpearl's packets hold no IMU samples; say where those come from, e.g. --imu imu-udp://:6700."
         )
@@ -122,8 +132,10 @@ def open_live(
     receivers: list[Receive] = []
     if beside is not None and beside.scheme == "imu-udp":
         receivers.append(ImuReceiver(beside.host or "0.0.0.0", beside.ports[0]))
-    if address.scheme == "rsbpearl":
-        receivers.append(RsbpearlReceiver(address.host or "0.0.0.0", address.ports[0], address.ports[1], angles))
+    if device is not None:
+        receivers.append(
+            PacketReceiver(device, address.host or "0.0.0.0", address.ports, params, angles, own_imu=beside is None)
+        )
     # One connection to each Foxglove server, for all that is wanted of it.
     wanted: dict[tuple[str, int], frozenset[str]] = {}
     for source, sensors in ((address, {"lidar"} if beside else {"lidar", "imu"}), (beside, {"imu"})):

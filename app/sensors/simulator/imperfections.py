@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from app.sensors.rsbpearl import CHANNELS
+from app.sensors.robosense import CHANNELS
 from app.sensors.simulator.raycast import Hits, Mover, Raycaster
 from app.sensors.simulator.scenes.props import person_mesh
 from app.sensors.simulator.trajectory import SmoothTrajectory, Walker, seconds

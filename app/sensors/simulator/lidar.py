@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from app.sensors.rsbpearl import (
+from app.sensors.robosense import (
     BPEARL,
     CHANNELS,
     ELEVATIONS_DEG,

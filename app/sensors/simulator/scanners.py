@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from app.sensors import livox, ros, rsbpearl
+from app.sensors import robosense, ros
 from app.sensors.presets import PRESETS
+from app.sensors.robosense import AIRY
 from app.sensors.simulator.lidar import P_IMU_LIDAR, Pattern, firing_pattern
 from app.sensors.simulator.trajectory import GRAVITY, R_BODY_IMU
 from app.slam import lie
@@ -59,19 +60,16 @@ class Scanner:
 
 
 def _bpearl(rate_hz: int, every_block: int, _: Path | None) -> Turns:
-    pattern = firing_pattern(rsbpearl.BPEARL, rate_hz, every_block)
+    pattern = firing_pattern(robosense.BPEARL, rate_hz, every_block)
     return lambda turn: pattern
 
 
 def _airy(rate_hz: int, every_block: int, _: Path | None) -> Turns:
-    """A RoboSense Airy [rs_driver, decoder_RSAIRY.hpp]: 96 channels, eight at a time, over a hemisphere.
-
-    A unit's own elevations are in its DIFOP packet; these are evenly spaced.
-    """
-    us = np.repeat([0.0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104], 8)
-    elevation = np.radians((np.arange(96) + 0.5) * 90.0 / 96)
-    lever = (float(np.hypot(0.0108, 0.00375)), 0.06056)
-    pattern = _turning(elevation, np.zeros(96), us, 111.08, rate_hz, every_block, lever)
+    """A RoboSense Airy: 96 channels, eight at a time, over a hemisphere."""
+    elevation, us = np.radians(AIRY.elevations_deg), AIRY.firing_offsets_ns / 1000
+    pattern = _turning(
+        elevation, np.zeros(AIRY.channels), us, AIRY.block_ns / 1000, rate_hz, every_block, (AIRY.rx, AIRY.rz)
+    )
     return lambda turn: pattern
 
 
@@ -147,11 +145,11 @@ def _translation(preset: str) -> F64:
 
 
 SCANNERS: dict[str, Scanner] = {
-    "bpearl": Scanner(_bpearl, p_imu_lidar=P_IMU_LIDAR, rates_hz=rsbpearl.ROTATION_RATES_HZ),
+    "bpearl": Scanner(_bpearl, p_imu_lidar=P_IMU_LIDAR, rates_hz=robosense.ROTATION_RATES_HZ),
     "airy": Scanner(
         _airy,
         R_imu_lidar=_rotation("airy"),
-        layout=ros.Layout(imu_topic="/rslidar_imu_data"),
+        layout=ros.AIRY_LAYOUT,
         accel_unit=GRAVITY,
     ),
     "jt128": Scanner(_jt128, farthest=60.0, layout=ros.Layout("/lidar_points", "/lidar_imu", encode=_hesai)),
@@ -163,7 +161,7 @@ SCANNERS: dict[str, Scanner] = {
         rated=(40.0, 0.1),
         range_noise=0.01,
         coordinate_step=0.001,
-        layout=ros.Layout("/livox/lidar", "/livox/imu", livox.CUSTOM_MSGS[0], livox.DEFINITION, livox.encoded),
+        layout=ros.MID360_LAYOUT,
         accel_unit=GRAVITY,
     ),
 }

@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from app.sensors.robosense import BPEARL
 from app.sensors.ros import RecordingWriter
-from app.sensors.rsbpearl import BPEARL
 from app.sensors.simulator.imperfections import NONE, Imperfections, Unit, companions, livelier
 from app.sensors.simulator.lidar import Lidar
 from app.sensors.simulator.raycast import Raycaster, SimulatedScene
@@ -26,6 +26,7 @@ from app.sensors.simulator.trajectory import (
     seconds,
     walk,
 )
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.trajectory import Trajectory, write_tum
 from app.slam.types import F64, I64
@@ -199,7 +200,7 @@ def _settings(device: Scanner) -> dict[str, Any]:
     """The parameters that a recording of it is read with."""
     sensor = {"translation": device.p_imu_lidar.tolist()}
     if not np.array_equal(device.R_imu_lidar, np.eye(3)):
-        sensor["rotation"] = Rotation.from_matrix(device.R_imu_lidar).as_euler("xyz", degrees=True).tolist()
+        sensor["rotation"] = list(lie.rpy_degrees(device.R_imu_lidar))
     return {"sensor": sensor}
 
 

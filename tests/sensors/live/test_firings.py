@@ -13,7 +13,7 @@ from app.sensors.live.firings import firings_of, fit_angles
 from app.sensors.live.frames import Assembler
 from app.sensors.live.msop import PacketWriter
 from app.sensors.recording import open_recording
-from app.sensors.rsbpearl import BPEARL, BPV4, Model
+from app.sensors.robosense import BPEARL, BPV4, Model
 from app.slam.params import Params
 from app.slam.types import F64, Measurement, Scan
 from tests.sensors.live import sensor
@@ -150,7 +150,7 @@ def test_a_units_own_angles_are_read_from_its_points_in_any_scene(sight: str) ->
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_a_unit_with_the_nominal_angles_keeps_them_in_any_scene(sight: str) -> None:
     scans = [scan_of(speed, sees=SIGHTS[sight]) for speed in (0.999, 1.0, 1.001)]
-    assert fit_angles(scans) is NOMINAL
+    assert fit_angles(scans).same(NOMINAL)
 
 
 @pytest.mark.parametrize("name", ["museum", "hall_bpearl", "outdoor_bpearl"])

@@ -13,7 +13,7 @@ from app.sensors.live.decoder import Decoder
 from app.sensors.live.difop import NOMINAL, ChannelAngles, Difop, read_angles, read_difop, write_difop
 from app.sensors.live.frames import Assembler, Revolution
 from app.sensors.live.msop import PacketWriter, stamp_of, write_packet
-from app.sensors.rsbpearl import BPEARL, BPV4
+from app.sensors.robosense import BPEARL, BPV4
 from app.slam.errors import HemislamError
 from app.slam.types import Scan
 from tests.sensors.live import sensor

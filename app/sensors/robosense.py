@@ -1,14 +1,14 @@
-"""Facts about the RoboSense RS-Bpearl: its firing pattern, geometry and units.
+"""Facts about RoboSense's hemispherical scanners: their firing patterns, geometry, units and packets.
 
-Source: the vendor's open driver (rs_driver: decoder_RSBP.hpp, chan_angles.hpp) and data sheet. The simulator and the
-decoder of packets both use them.
+Source: the vendor's open driver (rs_driver: decoder_RSBP.hpp, decoder_RSAIRY.hpp, chan_angles.hpp), data sheets and the
+Airy's manual. The simulator and the decoder of packets both use them. Constants without a model are the RS-Bpearl's.
 
 Frame of the sensor: x, y in the base plane, +z the pole of the hemisphere; azimuth turns from +x towards -y. A block is
 one firing of all 32 channels, which fire one after the other while the head turns, so every firing has its own time and
 azimuth.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -35,15 +35,18 @@ RATED_RANGE_M, RATED_REFLECTIVITY = 30.0, 0.1
 ROTATION_RATES_HZ = (10, 20)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """What differs between the two generations of the sensor.
+    """What differs between the sensors.
 
     Attributes:
         range_step: m per count of a packet's distance. block_ns: duration of a block.
-        firing_offsets_ns: (32,) firing time of each channel inside its block.
+        firing_offsets_ns: (c,) firing time of each channel inside its block.
         rx, rz: m, lever of the laser: a point is d * direction + (rx cos a, -rx sin a, rz) with
             the BLOCK's azimuth a.
+        elevations_deg: (c,) nominal, by channel. mark: with which its packets begin. blocks: of a packet.
+        part: channels that follow one azimuth in a packet. counted: bits of a distance; others are a flag.
+        index_at, index_bytes: where a packet's number is.
     """
 
     name: str
@@ -52,6 +55,26 @@ class Model:
     firing_offsets_ns: I64
     rx: float
     rz: float
+    elevations_deg: F64 = field(default_factory=lambda: ELEVATIONS_DEG)
+    mark: bytes = bytes.fromhex("55aa050a5aa550a0")
+    blocks: int = 12
+    part: int = CHANNELS
+    counted: int = 0xFFFF
+    index_at: int = 1242
+    index_bytes: int = 4
+
+    @property
+    def channels(self) -> int:
+        return len(self.elevations_deg)
+
+    @property
+    def parts(self) -> int:
+        """Into which a packet divides a block."""
+        return self.channels // self.part
+
+    @property
+    def part_bytes(self) -> int:
+        return 4 + 3 * self.part
 
     def blocks_per_turn(self, rate_hz: int) -> int:
         """Whole blocks in one revolution: 1801 at 10 Hz, 900 at 20 Hz."""
@@ -82,3 +105,22 @@ BPV4 = Model(
     rx=0.01619,
     rz=0.09571,
 )
+
+AIRY = Model(
+    name="Airy",
+    range_step=0.005,
+    block_ns=111_080,
+    firing_offsets_ns=np.repeat(
+        _offsets_us(0.0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104), 8
+    ),
+    rx=float(np.hypot(0.0108, 0.00375)),
+    rz=0.06056,
+    elevations_deg=(np.arange(96) + 0.5) * 90.0 / 96,
+    mark=bytes.fromhex("55aa055a"),
+    blocks=4,
+    part=48,
+    counted=0x3FFF,
+    index_at=12,
+    index_bytes=4,
+)
+"""Its nominal elevations are evenly spaced; each unit states its own."""
