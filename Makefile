@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 INSTALL := $(PIP) install --require-hashes --only-binary :all:
 
 .DEFAULT_GOAL := help
-.PHONY: help run install test check docs pictures bench bench-peers image-test lock clean
+.PHONY: help run install test check docs pictures bench peers bench-peers image-test lock clean
 
 help: ## List these targets.
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 20
@@ -40,11 +40,13 @@ pictures: $(VENV)/.installed-dev ## Make every picture of docs/ and the README a
 bench: $(VENV)/.installed-dev ## Time the engine stage by stage and the page; adds to benchmarks/results.csv.
 	$(BIN)/python -m benchmarks
 
-bench-peers: $(VENV)/.installed-dev ## Time and error of other odometries from PyPI on the same recordings.
+peers: $(VENV)/.installed-dev ## Install other odometries from PyPI, for evaluate --baseline.
 	$(PIP) install --quiet --upgrade --no-warn-conflicts --only-binary :all: --target build/peers $(PEERS)
-	$(BIN)/python -m benchmarks.peers
 # In a folder of their own: some want other versions of what hemislam uses.
-PEERS := 'kiss-icp>=1.3' 'rko_lio>=0.4' 'pypatchworkpp>=1.4'
+PEERS := 'kiss-icp>=1.3' 'rko_lio>=0.4' 'genz-icp>=0.3' 'pypatchworkpp>=1.4'
+
+bench-peers: peers ## Time and score of another ground segmentation from PyPI on the same recordings.
+	$(BIN)/python -m benchmarks.peers
 
 image-test: ## Build the Docker image with buildah and run it; needs root, buildah and debootstrap.
 	tests/image/build_and_run.sh

@@ -12,7 +12,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from app.baselines.features import extract
-from app.baselines.matching import FeatureMap, Fit, moved, solve
+from app.baselines.matching import FeatureMap, PoseFit, moved, solve
 from app.baselines.mounting import mounting
 from app.slam import lie, start
 from app.slam.errors import HemislamError
@@ -112,7 +112,7 @@ class Liom:
                 summed.integrateMeasurement(force, rate, lasting)
         return summed
 
-    def _relative(self, edges: F64, planes: F64, T_odom_imu: F64) -> tuple[int, Fit] | None:
+    def _relative(self, edges: F64, planes: F64, T_odom_imu: F64) -> tuple[int, PoseFit] | None:
         """The pose relative to the window's first scan (their section III.C), and which scan that is."""
         if not self._window or self._smoother is None:
             return None
@@ -130,7 +130,7 @@ class Liom:
 
     def _smooth(
         self, summed: gtsam.PreintegratedCombinedMeasurements, predicted: gtsam.NavState, end_ns: int,
-        relative: tuple[int, Fit] | None,
+        relative: tuple[int, PoseFit] | None,
     ) -> None:  # fmt: skip
         """Add the scan's state and factors, and estimate the window anew."""
         assert self._smoother is not None
@@ -158,7 +158,7 @@ class Liom:
         self._map.insert(moved(T, edges), moved(T, planes), T[:3, 3])
 
 
-def _registered(local: FeatureMap, edges: F64, planes: F64, T: F64, free: F64 | None = None) -> Fit:
+def _registered(local: FeatureMap, edges: F64, planes: F64, T: F64, free: F64 | None = None) -> PoseFit:
     """The pose that fits the map best, from a good guess `T`."""
     for _ in range(ROUNDS):
         fit = solve(T, local.pairs(edges, planes, T), free=free)
@@ -169,7 +169,7 @@ def _registered(local: FeatureMap, edges: F64, planes: F64, T: F64, free: F64 | 
     return fit
 
 
-def _in_body(fit: Fit) -> F64:
+def _in_body(fit: PoseFit) -> F64:
     """The information (6, 6) of a fit for a perturbation in the moving frame, as gtsam's Pose3 has it."""
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = fit.T[:3, :3]

@@ -47,7 +47,7 @@ class Pairs:
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class PoseFit:
     """Attributes:
     T: (4, 4) T_fixed_moving. information: (6, 6) of it, rotation then translation in the fixed frame, 1/m^2.
     pairs: used. rms: of their distances, m. weak: directions that kept the prediction.
@@ -69,7 +69,7 @@ def moved(T: F64, points: F64) -> F64:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> Fit:
+def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> PoseFit:
     """Gauss-Newton steps from `T` with Huber's weights; directions that the pairs leave open stay as they are.
 
     A perturbation acts from the left, about the moving frame's origin: R <- exp(w) R, p <- p + v.
@@ -80,7 +80,7 @@ def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> Fit:
     free = np.eye(6) if free is None else free
     information, rms, weak = np.zeros((6, 6)), float("nan"), 6
     if len(pairs) < 12:
-        return Fit(T, information, len(pairs), rms, weak)
+        return PoseFit(T, information, len(pairs), rms, weak)
     for _ in range(steps):
         arms = pairs.points @ T[:3, :3].T
         distances = np.einsum("ni,ni->n", pairs.normals, arms + T[:3, 3] - pairs.anchors)
@@ -93,7 +93,7 @@ def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> Fit:
         rms = float(np.sqrt(np.mean(weights * distances**2)))
         if np.linalg.norm(step[:3]) < 1e-5 and np.linalg.norm(step[3:]) < 1e-4:
             break
-    return Fit(T, information, len(pairs), rms, weak)
+    return PoseFit(T, information, len(pairs), rms, weak)
 
 
 def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64, int]:

@@ -37,6 +37,14 @@ def evaluate(
         list[str] | None,
         typer.Option("--variant", metavar="NAME:PARAM=VALUE,...", help="One more column. Repeatable."),
     ] = None,
+    baselines: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--baseline",
+            metavar="SYSTEM",
+            help="Another system as one more column: loam, liom, kiss-icp, rko-lio or genz-icp. Repeatable.",
+        ),
+    ] = None,
     ablation: Annotated[
         bool, typer.Option("--ablation/--no-ablation", help="The paper's four variants, or only your own.")
     ] = True,
@@ -63,7 +71,7 @@ def evaluate(
     """Measure accuracy, time and map sharpness: the paper's ablation, and yours.
 
     Each recording is run with FAST-LIO (no ground downsampling, no loops), FAST-LIO-GD, FAST-LIO-L
-    and Ours, and with each --variant. Finished runs are reused, so an interrupted evaluation
+    and Ours, and with each --variant and --baseline. Finished runs are reused, so an interrupted evaluation
     continues where it was.
 
     \b
@@ -78,6 +86,7 @@ def evaluate(
       hemislam evaluate walk.mcap --truth walk.tum --out results
       hemislam evaluate outdoor3.bag --preset h2lid --truth outdoor3_gnss.txt --out results
       hemislam evaluate walk.mcap --variant fine:scan.voxel_size=0.2 --compare FAST-LIO2=theirs.tum
+      hemislam evaluate walk.mcap --baseline loam --baseline liom --out results
       hemislam evaluate --suite paper --short --out results
     """
     from app.cli.run import compile_behind_bar
@@ -92,7 +101,9 @@ def evaluate(
         raise HemislamError(
             "--short, --seed and --imperfect belong to --suite; with a RECORDING, --duration shortens it."
         )
-    chosen = choose_variants([parse_variant(text) for text in variants or []], ablation=ablation)
+    chosen = choose_variants(
+        [parse_variant(text) for text in variants or []], ablation=ablation, baselines=baselines or []
+    )
     paths = list(recordings or [])
     make_folder(out)
     if suite is not None:

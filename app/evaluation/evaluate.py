@@ -79,6 +79,7 @@ def evaluate(
                 threads=threads,
                 start_s=start_s,
                 duration_s=duration_s,
+                baseline=variant.baseline,
             )
     failures = run_jobs(list(jobs.values()), parallel, folder / "runs")
     evaluated = []

@@ -227,7 +227,8 @@ def _times(outcomes: list[Outcome], colour: dict[str, str]) -> list[Figure]:
     last = float(np.percentile(np.concatenate([times[:, -1] for times in timed.values()]), 99.5))
     edges = np.linspace(0, last, 61)
     lines = [histogram(name, colour[name], times[:, -1], edges) for name, times in timed.items()]
-    bars = [(name, times[:, : len(STAGES)].mean(axis=0).tolist()) for name, times in timed.items()]
+    staged = [outcome.name for outcome in outcomes if outcome.staged and outcome.name in timed]
+    bars = [(name, timed[name][:, : len(STAGES)].mean(axis=0).tolist()) for name in staged]
     return [
         Figure(chart(lines, "time per frame (ms)", "frames (%)", from_zero=True), "Time per frame", []),
         Figure(stacked(bars, STAGES, "ms"), "Mean time by stage", list(zip(STAGES, PALETTE, strict=False))),

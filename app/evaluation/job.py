@@ -1,4 +1,4 @@
-"""One recording run with one variant, in a process of its own, and the files that it leaves.
+"""One recording run with one variant or baseline, in a process of its own, and the files that it leaves.
 
 A run's folder holds trajectory.tum, timings.csv, crops.npz and, written last, run.json with the key
 of all that the results depend on: a folder with the right key is finished and never run again.
@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -18,15 +19,19 @@ from typing import Any
 import numpy as np
 
 from app import __version__
+from app.baselines.keyframes import keep_keyframe
+from app.baselines.systems import find_system
 from app.evaluation import crops, map_sharpness
+from app.mapping.feed import FileFeed
 from app.mapping.opening import open_session
 from app.mapping.session import Session
+from app.slam.keyframes import KeyframeStore
 from app.slam.metrics import GroundScore
 from app.slam.params import Params
 from app.slam.provenance import describe_machine, peak_memory_mb
 from app.slam.results import timings_csv
 from app.slam.trajectory import Trajectory, write_tum
-from app.slam.types import F64, FrameStatus, Measurement, StepResult
+from app.slam.types import F64, TIMINGS, FrameStatus, Measurement, StepResult
 
 FORMAT = 1
 GROUND_RANGES_M = (0.0, 5.0, 10.0, 20.0, 40.0, 100.0)
@@ -37,7 +42,7 @@ RUN_FILES = ("trajectory.tum", "timings.csv", "crops.npz", "run.json")
 def code_digest() -> str:
     """Hash of the code that results depend on, so that a change of it runs jobs again."""
     root = Path(__file__).parents[1]
-    files = [path for room in ("slam", "mapping") for path in (root / room).rglob("*.py")]
+    files = [path for room in ("slam", "mapping", "baselines") for path in (root / room).rglob("*.py")]
     files += (root / "sensors").glob("*.py")
     files += [root / "evaluation" / name for name in ("job.py", "map_sharpness.py", "crops.py")]
     digest = hashlib.sha256()
@@ -51,6 +56,7 @@ class Job:
     """Attributes:
     recording: its path, sha256: of its bytes. name: of the recording in tables. variant: its name.
     params: as run. folder: for the results. threads: for the kernels. code: `code_digest()`.
+    baseline: name of the system that is run in place of the engine; "" for the engine.
     """
 
     recording: Path
@@ -63,6 +69,7 @@ class Job:
     start_s: float = 0.0
     duration_s: float | None = None
     code: str = field(default_factory=code_digest)
+    baseline: str = ""
     key: str = field(init=False)
     """Hash of all that a result depends on, the machine and its load aside."""
 
@@ -74,6 +81,7 @@ class Job:
             "input": self.sha256,
             "parameters": self.params.model_dump(mode="json"),
             "part": [self.start_s, self.duration_s],
+            "baseline": [self.baseline, find_system(self.baseline).version()] if self.baseline else None,
         }
         key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
         object.__setattr__(self, "key", key)  # once, where the job is made, so that its process agrees
@@ -102,6 +110,9 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
 
     numba.set_num_threads(min(job.threads, numba.get_num_threads()))
     compile_kernels()
+    if job.baseline:
+        run_baseline(job, progress)
+        return
     ground, cpu_ms = [GroundScore() for _ in GROUND_RANGES_M[1:]], list[float]()
     session = open_session(job.recording, job.params, job.start_s, job.duration_s, loops=InlineLoops)
     try:
@@ -117,14 +128,60 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
             progress(session.frame + 1, total)
         if session.loops:
             session.loops.poll()  # those of the last keyframes
-        _write(job, session, _facts(job, session, ground, peak_memory_mb()), cpu_ms)
+        log, frame, keyframes = session.log, session.map_frame, session.engine.keyframes
+        poses = frame.poses(np.array([keyframe.T_odom_imu for keyframe in keyframes]).reshape(-1, 4, 4))
+        timings = timings_csv(log.stamps_ns, log.timings_ms, {"cpu_ms": cpu_ms})
+        _write(job, frame.trajectory(log.odometry), keyframes, poses, timings, _facts(job, session, ground))
     finally:
         session.close()
 
 
-def _facts(job: Job, session: Session, ground: list[GroundScore], memory_mb: float) -> dict[str, Any]:
-    """What run.json holds, except what needs the map."""
-    log = session.log
+def run_baseline(job: Job, progress: Callable[[int, int], None]) -> None:
+    """Another system on the same measurements. Its clouds are undistorted by its own poses, for the map.
+
+    Where it gives no finite pose, its last one stands, and the frame counts as lost.
+    """
+    system = find_system(job.baseline).start(job.params)
+    feed, keyframes = FileFeed(job.recording, job.params, job.start_s, job.duration_s), KeyframeStore()
+    stamps, poses, times, dropped = list[int](), list[F64](), list[tuple[float, float]](), Counter[str]()
+    lost = 0
+    try:
+        while (entry := feed.next()) is not None:
+            if not isinstance(entry, Measurement):
+                dropped[entry.reason] += 1
+                continue
+            begin, cpu_begin = time.perf_counter(), time.process_time()
+            stamp, pose = system.step(entry)
+            times.append(((time.perf_counter() - begin) * 1e3, (time.process_time() - cpu_begin) * 1e3))
+            if not np.isfinite(pose).all():
+                lost, pose = lost + 1, poses[-1] if poses else np.eye(4)
+            keep_keyframe(keyframes, entry.scan, (stamp, pose), (stamps[-1], poses[-1]) if poses else None, job.params)
+            stamps.append(stamp)
+            poses.append(pose)
+            progress(len(poses), feed.info.frames or 0)
+        trajectory = Trajectory.from_poses(stamps, np.array(poses))
+        wall_ms, cpu_ms = np.array(times).reshape(-1, 2).T
+        stages = np.zeros((len(stamps), len(TIMINGS)))
+        stages[:, -1] = wall_ms
+        timings = timings_csv(trajectory.stamps_ns, stages, {"cpu_ms": cpu_ms})
+        facts = _common(job) | {
+            "frames": len(stamps),
+            "lost": lost,
+            "dropped": dict(dropped.most_common()),
+            "distance_m": trajectory.distance,
+            "loops": None,
+            "ground_share": None,
+            "ground": None,
+        }
+        kept = np.array([keyframe.T_odom_imu for keyframe in keyframes]).reshape(-1, 4, 4)
+        _write(job, trajectory, keyframes, kept, timings, facts)
+    finally:
+        keyframes.close()
+        feed.close()
+
+
+def _common(job: Job) -> dict[str, Any]:
+    """What run.json holds of any run."""
     return {
         "key": job.key,
         "hemislam": __version__,
@@ -132,9 +189,21 @@ def _facts(job: Job, session: Session, ground: list[GroundScore], memory_mb: flo
         "recording": str(job.recording),
         "sha256": job.sha256,
         "variant": job.variant,
+        "baseline": job.baseline,
         "parameters": job.params.model_dump(mode="json"),
         "start_s": job.start_s,
         "duration_s": job.duration_s,
+        "peak_memory_mb": peak_memory_mb(),
+        "threads": job.threads,
+        "load": os.getloadavg()[0],
+        "machine": describe_machine(),
+    }
+
+
+def _facts(job: Job, session: Session, ground: list[GroundScore]) -> dict[str, Any]:
+    """What run.json holds of a run of the engine, except what needs the map."""
+    log = session.log
+    return _common(job) | {
         "frames": len(log),
         "lost": log.statuses[FrameStatus.LOST],
         "dropped": dict(log.dropped.most_common()),
@@ -142,18 +211,13 @@ def _facts(job: Job, session: Session, ground: list[GroundScore], memory_mb: flo
         "loops": None if session.loops is None else session.loops.accepted,
         "ground_share": log.ground_share,
         "ground": None if log.ground_score is None else [asdict(score) for score in ground],
-        "peak_memory_mb": memory_mb,
-        "threads": job.threads,
-        "load": os.getloadavg()[0],
-        "machine": describe_machine(),
     }
 
 
-def _write(job: Job, session: Session, facts: dict[str, Any], cpu_ms: list[float]) -> None:
+def _write(
+    job: Job, trajectory: Trajectory, keyframes: KeyframeStore, poses: F64, timings: str, facts: dict[str, Any]
+) -> None:
     """All files beside their places, then moved there, run.json last: a kill in between leaves no result."""
-    log, keyframes, frame = session.log, session.engine.keyframes, session.map_frame
-    trajectory = frame.trajectory(log.odometry)
-    poses = frame.poses(np.array([keyframe.T_odom_imu for keyframe in keyframes]).reshape(-1, 4, 4))
     measured = map_sharpness.measure(map_sharpness.collect(keyframes, poses))
     facts["map_sharpness"] = {name: value if np.isfinite(value) else None for name, value in asdict(measured).items()}
 
@@ -161,7 +225,7 @@ def _write(job: Job, session: Session, facts: dict[str, Any], cpu_ms: list[float
     part.mkdir(parents=True, exist_ok=True)
     try:
         write_tum(part / "trajectory.tum", trajectory)
-        (part / "timings.csv").write_text(timings_csv(log, {"cpu_ms": cpu_ms}), encoding="utf-8")
+        (part / "timings.csv").write_text(timings, encoding="utf-8")
         centres = {place: _position_at(trajectory, share) for place, share in crops.PLACES.items()}
         np.savez_compressed(
             part / "crops.npz",

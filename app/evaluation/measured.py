@@ -88,12 +88,18 @@ class Outcome:
         """Milliseconds per frame by stage, and shares of frames within BUDGETS_MS."""
         if self.timings_ms is None or self.cpu_ms is None or self.run is None or not len(self.timings_ms):
             return None
+        named = list(zip(TIMINGS, self.timings_ms.T, strict=True))
         return {
-            **{stage: spread(times) for stage, times in zip(TIMINGS, self.timings_ms.T, strict=True)},
+            **{stage: spread(times) for stage, times in (named if self.staged else named[-1:])},
             "cpu": spread(self.cpu_ms),
             **{f"under_{budget:g}_ms": float(np.mean(self.timings_ms[:, -1] < budget)) for budget in BUDGETS_MS},
             **{name: self.run[name] for name in ("peak_memory_mb", "threads", "load")},
         }
+
+    @property
+    def staged(self) -> bool:
+        """Whether the stages of a frame were timed: of this engine, not of a baseline."""
+        return self.run is not None and not self.run.get("baseline")
 
     @property
     def ground(self) -> list[GroundScore] | None:

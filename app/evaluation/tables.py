@@ -154,7 +154,7 @@ def stages(recordings: Sequence[Evaluated]) -> Table:
     rows = []
     for recording in recordings:
         for outcome in recording.outcomes:
-            if time := outcome.value("runtime_ms"):
+            if outcome.staged and (time := outcome.value("runtime_ms")):
                 cells = (
                     " / ".join(f"{time[stage][what]:.2f}" for what in ("median", "p95", "max")) for stage in TIMINGS
                 )
@@ -198,23 +198,22 @@ def ground(recordings: Sequence[Evaluated]) -> Table:
 
 def beside_paper(recordings: Sequence[Evaluated]) -> Table:
     """Ours and the paper's own, for the simulated twins of its sequences."""
-    names = ("FAST-LIO", "FAST-LIO-GD", "FAST-LIO-L", "Ours")
+    names = paper.SYSTEMS
     rows: list[TableRow] = []
     for recording in recordings:
         if (sequence := paper.SEQUENCES.get(recording.name.partition("-")[0])) is None:
             continue
         run = {outcome.name for outcome in recording.outcomes}
-        for label, path, form, theirs, their_label, their_form in (
-            ("ATE (m), here", "accuracy/ate_m/rmse", ".4f", sequence.ate_m, "ATE (m), paper", ".2f"),
-            (
-                "RPE (m), here, per frame", f"accuracy/rpe/{RPE_OVER[0]}/m/rmse", ".4f",
-                sequence.rpe_m, "RPE (m), paper", ".2f",
-            ),
-            ("ms per frame, here", "runtime_ms/total/median", ".1f", sequence.runtime_ms, "ms per frame, paper", ".1f"),
-        ):  # fmt: skip
-            rows += _rows([recording], names, [Indicator(label, path, form)])
+        for label, path, form, theirs, their_form in (
+            ("ATE (m)", "accuracy/ate_m/rmse", ".4f", sequence.ate_m, ".2f"),
+            ("ATE ratio error", "accuracy/ate_ratio", ".2e", sequence.ratios(sequence.ate_m), ".2e"),
+            ("RPE (m), per frame", f"accuracy/rpe/{RPE_OVER[0]}/m/rmse", ".4f", sequence.rpe_m, ".2f"),
+            ("RPE ratio error", f"accuracy/rpe_ratio/{RPE_OVER[0]}", ".2e", sequence.ratios(sequence.rpe_m), ".2e"),
+            ("ms per frame", "runtime_ms/total/median", ".1f", sequence.runtime_ms, ".1f"),
+        ):
+            rows += _rows([recording], names, [Indicator(f"{label}, here", path, form)])
             values = [theirs.get(name) if name in run else None for name in names]
-            rows += [_row(recording.name, their_label, values, their_form)] if any(values) else []
+            rows += [_row(recording.name, f"{label}, paper", values, their_form)] if any(values) else []
     return Table("Beside the paper", names, rows, paper.NOT_COMPARABLE)
 
 

@@ -1,10 +1,11 @@
-"""Variants: sets of parameters that are run on the same recording, such as the paper's ablation."""
+"""Variants: what is run on the same recording. Sets of parameters such as the paper's ablation, and other systems."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from app.baselines.systems import find_system
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.user_text import read_assignments
@@ -16,12 +17,13 @@ LOOPS = "loops.enabled"
 class Variant:
     """Attributes:
     name: column of the tables. values: parameters by dotted name that replace those of the recording.
-    meaning: in words.
+    meaning: in words. baseline: name of the system that is run in place of the engine; "" for the engine.
     """
 
     name: str
     values: Mapping[str, Any]
     meaning: str = ""
+    baseline: str = ""
 
     def applied(self, params: Params) -> Params:
         """`params` with this variant's values.
@@ -60,16 +62,26 @@ def parse_variant(text: str) -> Variant:
     return Variant(name, values, ", ".join(f"{path} = {value}" for path, value in values.items()))
 
 
-def choose_variants(own: list[Variant], *, ablation: bool) -> list[Variant]:
-    """The paper's, if wanted, and the user's.
+def baseline_variant(name: str) -> Variant:
+    """Another system as a variant.
+
+    Raises:
+        HemislamError: there is none of this name, or it is not installed.
+    """
+    system = find_system(name)
+    return Variant(system.title, {}, f"{system.meaning} {system.version()}".strip(), baseline=name)
+
+
+def choose_variants(own: list[Variant], *, ablation: bool, baselines: Sequence[str] = ()) -> list[Variant]:
+    """The other systems, the paper's ablation, if wanted, and the user's: columns as in the paper's Table 2.
 
     Raises:
         HemislamError: two have the same name, or there is none.
     """
-    chosen = [*(PAPER if ablation else ()), *own]
+    chosen = [*map(baseline_variant, baselines), *(PAPER if ablation else ()), *own]
     names = [variant.name for variant in chosen]
     if twice := next((name for name in names if names.count(name) > 1), None):
-        raise HemislamError(f"There are two variants named {twice}; give each --variant another name.")
+        raise HemislamError(f"There are two variants named {twice}; name each only once.")
     if not chosen:
-        raise HemislamError("There is no variant to run; leave out --no-ablation or add a --variant.")
+        raise HemislamError("There is no variant to run; leave out --no-ablation, or add a --variant or --baseline.")
     return chosen

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from app.slam import report
 from app.slam.errors import HemislamError
@@ -21,7 +22,7 @@ from app.slam.map_frame import MapFrame
 from app.slam.ply import Keyframes, write_map
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import Trajectory, stamp_text, write_tum
-from app.slam.types import TIMINGS
+from app.slam.types import F64, I64, TIMINGS
 
 
 @dataclass
@@ -106,7 +107,9 @@ EXPORTS = (
     Export(
         "timings.csv",
         "milliseconds of each stage in each frame, without reading the file",
-        lambda path, results: path.write_text(timings_csv(results.log), encoding="utf-8"),
+        lambda path, results: path.write_text(
+            timings_csv(results.log.stamps_ns, results.log.timings_ms), encoding="utf-8"
+        ),
     ),
     Export("map.ply", "the map: x y z intensity ground", _write_map),
     Export("report.json", "parameters, counts of frames, ground share, errors against truth", _write_report),
@@ -162,10 +165,10 @@ def save_results(
     return results.report
 
 
-def timings_csv(log: RunLog, more: dict[str, Sequence[float]] | None = None) -> str:
-    """One line per frame: milliseconds of each stage; `more` adds columns by name."""
-    columns = [log.timings_ms, *(np.asarray(values)[:, None] for values in (more or {}).values())]
+def timings_csv(stamps_ns: I64, timings_ms: F64, more: dict[str, npt.ArrayLike] | None = None) -> str:
+    """One line per frame: milliseconds (n, len(TIMINGS)) of each stage; `more` adds columns by name."""
+    columns = [timings_ms, *(np.asarray(values)[:, None] for values in (more or {}).values())]
     lines = [",".join(["frame", "stamp_s", *(f"{stage}_ms" for stage in TIMINGS), *(more or {})])]
-    for frame, (stamp, row) in enumerate(zip(log.stamps_ns, np.hstack(columns), strict=True)):
+    for frame, (stamp, row) in enumerate(zip(stamps_ns, np.hstack(columns), strict=True)):
         lines.append(f"{frame},{stamp_text(int(stamp))}," + ",".join(f"{value:.4f}" for value in row))
     return "\n".join(lines) + "\n"

@@ -1,0 +1,87 @@
+"""Odometries from PyPI as baselines, with their own defaults and the true mounting of the sensor.
+
+Each is imported only when it is made: `app.baselines.systems` puts its folder on the path first.
+"""
+
+import numpy as np
+
+from app.baselines.mounting import levelled, mounting
+from app.slam import lie
+from app.slam.params import Params
+from app.slam.types import F64, I64, Measurement
+
+
+class KissIcp:
+    """KISS-ICP: Vizzo et al., RA-L 2023. Its poses are those at scan ends."""
+
+    def __init__(self, params: Params) -> None:
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.kiss_icp import KissICP
+
+        config = KISSConfig()
+        config.data.max_range, config.data.min_range = params.sensor.max_range, params.sensor.min_range
+        config.mapping.voxel_size = config.data.max_range / 100.0  # its own rule
+        self._odometry = KissICP(config)
+        self._world = _World(params)
+
+    def step(self, measurement: Measurement) -> tuple[int, F64]:
+        scan = measurement.scan
+        self._odometry.register_frame(
+            scan.points.astype(np.float64), scan.offsets_ns / max(int(scan.offsets_ns.max()), 1)
+        )
+        return scan.end_ns, self._world.imu(measurement, np.asarray(self._odometry.last_pose))
+
+
+class GenzIcp:
+    """GenZ-ICP: Lee, Lim and Han, RA-L 2025. Its poses are those in the middle of scans."""
+
+    def __init__(self, params: Params) -> None:
+        from genz_icp.config import GenZConfig
+        from genz_icp.genz_icp import GenZICP
+
+        config = GenZConfig()
+        config.data.max_range, config.data.min_range = params.sensor.max_range, params.sensor.min_range
+        config.data.deskew = True
+        self._odometry = GenZICP(config)
+        self._world = _World(params)
+
+    def step(self, measurement: Measurement) -> tuple[int, F64]:
+        scan = measurement.scan
+        self._odometry.register_frame(
+            scan.points.astype(np.float64), scan.offsets_ns / max(int(scan.offsets_ns.max()), 1)
+        )
+        middle_ns = (scan.stamp_ns + scan.end_ns) // 2
+        return middle_ns, self._world.imu(measurement, np.asarray(self._odometry.last_pose))
+
+
+class RkoLio:
+    """RKO-LIO: Malladi et al., 2025. Its poses are the IMU's at scan ends."""
+
+    def __init__(self, params: Params) -> None:
+        from rko_lio.config import LIOConfig
+        from rko_lio.lio import LIO
+
+        self._odometry, self._T_imu_lidar, self._last_ns = LIO(LIOConfig()), mounting(params), -1
+
+    def step(self, measurement: Measurement) -> tuple[int, F64]:
+        scan, imu = measurement.scan, measurement.imu
+        for stamp, gyro, accel in zip(imu.stamps_ns, imu.gyro, imu.accel, strict=True):
+            if stamp > self._last_ns:
+                self._odometry.add_imu_measurement(accel, gyro, int(stamp), np.eye(4))
+                self._last_ns = int(stamp)
+        stamps: I64 = scan.stamp_ns + scan.offsets_ns.astype(np.int64)
+        self._odometry.register_scan(scan.points.astype(np.float64), stamps, self._T_imu_lidar)
+        return scan.end_ns, np.array(self._odometry.pose())
+
+
+class _World:
+    """Turns poses of the LiDAR in a world that begins with it into poses of the IMU in one whose z points up."""
+
+    def __init__(self, params: Params) -> None:
+        self._T_imu_lidar = mounting(params)
+        self._T_odom_start: F64 | None = None  # of the LiDAR
+
+    def imu(self, measurement: Measurement, T_start_lidar: F64) -> F64:
+        if self._T_odom_start is None:
+            self._T_odom_start = levelled(measurement.imu) @ self._T_imu_lidar
+        return np.asarray(self._T_odom_start @ T_start_lidar @ lie.inverse(self._T_imu_lidar))
