@@ -13,6 +13,7 @@ from app import TEMPORARY_KERNEL_CACHE, __version__
 from app.cli import options
 from app.cli.calibrate import calibrate as calibrate_command
 from app.cli.evaluate import evaluate
+from app.cli.export import export as export_command
 from app.cli.feed import feed
 from app.cli.replay import replay
 from app.cli.run import run
@@ -91,6 +92,7 @@ def hemislam(
 cli.command()(serve)
 cli.command()(run)
 cli.command()(replay)
+cli.command("export")(export_command)
 cli.command("calibrate")(calibrate_command)
 cli.command()(evaluate)
 cli.command()(feed)

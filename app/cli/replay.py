@@ -1,11 +1,16 @@
 """`hemislam replay`: a session of the workbench once more, without a browser."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from app.slam.errors import HemislamError
+
+if TYPE_CHECKING:
+    from app.mapping.session import Session
 
 
 def replay(
@@ -31,28 +36,39 @@ def replay(
       hemislam replay runs/sessions/walk-20261121-101500.hemislam
       hemislam replay session.hemislam --to-end --out results/walk
     """
-    from app.cli.run import free_folder, prepare, process, save
+    from app.cli.run import free_folder, save
+    from app.export.results import prepare_folder
+
+    folder = out or free_folder(session)
+    prepare_folder(folder, replace=force)
+    with repeat(session, to_end=to_end) as (work, stop):
+        save(work, folder, stop, replace=force)
+
+
+@contextmanager
+def repeat(path: Path, *, to_end: bool = False) -> "Iterator[tuple[Session, BaseException | None]]":
+    """The session of a file, repeated, and what stopped it early.
+
+    Raises:
+        HemislamError: it cannot be read or repeated, or ended before its first frame.
+    """
+    from app.cli.run import prepare, process
     from app.mapping.opening import open_session
     from app.mapping.session_file import read_session
-    from app.slam.results import prepare_folder
 
-    saved = read_session(session)
+    saved = read_session(path)
     opened, truth = saved.opened, saved.state.truth
     if truth is not None and not truth.exists():  # no result but its errors follows from it
         typer.echo(f"The session was compared with {truth}, which is gone.")
         truth = None
-    work = open_session(opened.recording, saved.first_params, opened.start_s, opened.duration_s, truth=truth)
-    folder = out or free_folder(session)
+    session = open_session(opened.recording, saved.first_params, opened.start_s, opened.duration_s, truth=truth)
     try:
-        prepare_folder(folder, replace=force)
-        prepare(work)
-        work.resume(saved)
-        work.go_to(saved.frame)
-        stop = process(work, until=None if to_end or saved.ended else saved.frame)
-        if work.frame < 0:
-            raise stop or HemislamError(
-                f"The session {session} ended before its first frame; there is nothing to repeat."
-            )
-        save(work, folder, stop, replace=force)
+        prepare(session)
+        session.resume(saved)
+        session.go_to(saved.frame)
+        stop = process(session, until=None if to_end or saved.ended else saved.frame)
+        if session.frame < 0:
+            raise stop or HemislamError(f"The session {path} ended before its first frame; there is nothing to repeat.")
+        yield session, stop
     finally:
-        work.close()
+        session.close()

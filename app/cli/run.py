@@ -51,7 +51,7 @@ def run(
       loops.csv                every loop candidate: verdict, measurements and reason
       graph.g2o                the pose graph of the keyframes
       timings.csv              milliseconds of each stage in each frame, without reading the file
-      map.ply                  the map: x y z intensity ground
+      map.ply                  the map: x y z intensity ground ring time; keyframes
       report.json              parameters, counts of frames, ground share, errors against truth
 
     \b
@@ -62,9 +62,9 @@ def run(
       hemislam run walk.mcap --loops edits.yaml
     """
     from app.evaluation.truth import read_poses
+    from app.export.results import prepare_folder
     from app.mapping.opening import open_session
     from app.slam.doubts import doubts
-    from app.slam.results import prepare_folder
     from app.slam.trajectory import truth_beside
 
     params = params_for(recording)

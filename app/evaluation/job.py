@@ -22,6 +22,7 @@ from app import __version__
 from app.baselines.keyframes import keep_keyframe
 from app.baselines.systems import find_system
 from app.evaluation import crops, map_sharpness
+from app.export.results import timings_csv
 from app.mapping.feed import FileFeed
 from app.mapping.opening import open_session
 from app.mapping.session import Session
@@ -29,7 +30,6 @@ from app.slam.keyframes import KeyframeStore
 from app.slam.metrics import GroundScore
 from app.slam.params import Params
 from app.slam.provenance import describe_machine, peak_memory_mb
-from app.slam.results import timings_csv
 from app.slam.trajectory import Trajectory, write_tum
 from app.slam.types import F64, TIMINGS, FrameStatus, Measurement, StepResult
 

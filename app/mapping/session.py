@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from app.export.results import BY_RUN, Results, save_results
 from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelledKeyframes
@@ -25,7 +26,6 @@ from app.slam.loops.messages import LoopClient
 from app.slam.loops.schedule import LoopSchedule
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params, leaves
-from app.slam.results import EXPORTS, Results, save_results
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import read_tum, time_apart
 from app.slam.types import F64, DroppedScan, Measurement, StepResult
@@ -309,6 +309,14 @@ class Session:
         ours = self.map_frame.trajectory(self.log.odometry)
         return compared(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns, ours.positions)[1]
 
+    def results(self, stopped: str = "", calibration: str = "") -> Results:
+        """What result files are written from: the frames so far, with all loops, in effect or not. As `save`."""
+        info = self.feed.info
+        made_from = RunInfo(
+            info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped, calibration
+        )
+        return Results(self.log, self.keyframes.now(), made_from, self.loops.results() if self.loops else None)
+
     def save(
         self,
         folder: Path,
@@ -329,14 +337,10 @@ class Session:
         Returns:
             The content of report.json, or HemislamError if the folder cannot be written to.
         """
-        info = self.feed.info
-        made_from = RunInfo(
-            info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped, calibration
-        )
-        results = Results(self.log, self.keyframes.now(), made_from, self.loops.results() if self.loops else None)
+        results = self.results(stopped, calibration)
 
         def write() -> dict[str, Any]:
-            report = save_results(folder, results, EXPORTS[:1] if trajectory_only else EXPORTS, replace=replace)
+            report = save_results(folder, results, BY_RUN[:1] if trajectory_only else BY_RUN, replace=replace)
             if session is not None:
                 write_session(folder / f"session{SUFFIX}", session)
             return report

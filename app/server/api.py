@@ -20,6 +20,7 @@ from fastapi import Path as PathParam
 from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
+from app.export.results import BY_RUN
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import SUFFIX, Speed
 from app.server import protocol
@@ -29,7 +30,6 @@ from app.server.views import LoopsState, StateView, loops_state, state_view
 from app.server.worker import RunningEngine
 from app.slam.loops.edits import Accept, Add, LoopEdit, Reject, SetWeight, Solve
 from app.slam.params import Params
-from app.slam.results import EXPORTS
 from app.slam.trajectory import truth_beside
 from app.slam.types import NON_GROUND, SEED
 
@@ -134,7 +134,7 @@ class CompareBody(BaseModel):
     path: str | None = Field(None, description="A TUM file in the folders given by --folder; null ends the comparison.")
 
 
-EXPORTED: Final = (*(export.name for export in EXPORTS), f"session{SUFFIX}")
+EXPORTED: Final = (*(export.name for export in BY_RUN), f"session{SUFFIX}")
 _ANY_OF_THESE: Final = "|".join(f"^{re.escape(name)}$" for name in EXPORTED)
 ExportName = Annotated[str, PathParam(pattern=_ANY_OF_THESE, json_schema_extra={"enum": [*EXPORTED]})]
 

@@ -9,11 +9,11 @@ from typing import Any, Final
 
 import viser
 
+from app.export.results import BY_RUN
 from app.mapping.session_file import SUFFIX, SavedSession
 from app.server.folders import RECORDINGS, TRAJECTORIES, FolderEntry, Folders
 from app.server.protocol import CompareWith, OpenRecording, Save, Snapshot
 from app.slam.errors import HemislamError
-from app.slam.results import EXPORTS
 from app.slam.trajectory import truth_beside
 from app.ui.html import panel
 from app.ui.widgets import Changes, Page, by_user, dialog
@@ -192,7 +192,7 @@ class FilesPanel:
             return
         gui = client.gui
         with dialog(client, "Save results") as close:
-            names = [export.name for export in EXPORTS]
+            names = [export.name for export in BY_RUN]
             gui.add_html(panel("save", names, f"session{SUFFIX}", str(self._results)))
             name = gui.add_text("folder", result_folder_name(recording.path, datetime.now()))
             everything = gui.add_checkbox("all files", True, hint="Off: only trajectory.tum, which takes no time.")

@@ -10,22 +10,22 @@ import pytest
 from typer.testing import CliRunner
 
 from app.__main__ import cli
+from app.export.results import BY_RUN
 from app.mapping.session import Session
 from app.mapping.session_file import Opened, SavedSession, State, size_of, write_session
 from app.sensors.presets import resolve_params
 from app.slam.errors import HemislamError
 from app.slam.metrics import ate
-from app.slam.results import EXPORTS
 from app.slam.trajectory import Trajectory, read_tum, write_tum
 
 Call = Callable[..., Any]
-RESULTS = sorted(export.name for export in EXPORTS)
+RESULTS = sorted(export.name for export in BY_RUN)
 
 
 def test_help_lists_every_result_file_with_its_meaning(hemislam: Call) -> None:
     lines = [" ".join(line.split()) for line in hemislam("run", "--help").out.splitlines()]
-    assert [line for line in lines if any(line.startswith(f"{export.name} ") for export in EXPORTS)] == [
-        f"{export.name} {export.meaning}" for export in EXPORTS
+    assert [line for line in lines if any(line.startswith(f"{export.name} ") for export in BY_RUN)] == [
+        f"{export.name} {export.meaning}" for export in BY_RUN
     ]
 
 

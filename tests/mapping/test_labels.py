@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from app.export.map_file import write
+from app.export.points import Choice, blocks
 from app.mapping.labels import LabelEdit, LabelledKeyframes
 from app.slam.errors import HemislamError
 from app.slam.map_frame import MapFrame
-from app.slam.ply import write_map
 from app.slam.types import GROUND, NON_GROUND, Cloud, Keyframe
 
 POINTS = 4
@@ -77,8 +78,9 @@ def test_labels_are_kept_as_they_were_given() -> None:
 
 def test_the_map_is_written_with_edited_labels(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
-    write_map(path, LabelledKeyframes(KEYFRAMES, (LabelEdit.of(KEYFRAMES[1], ALL_GROUND),)), MapFrame())
+    labelled = LabelledKeyframes(KEYFRAMES, (LabelEdit.of(KEYFRAMES[1], ALL_GROUND),))
+    write(path, blocks(labelled, MapFrame(), Choice()))
     edited = path.read_bytes()
     relabelled = [replace(one, cloud=replace(one.cloud, labels=ALL_GROUND)) for one in KEYFRAMES[1:2]]
-    write_map(path, [KEYFRAMES[0], *relabelled, KEYFRAMES[2]], MapFrame())
+    write(path, blocks([KEYFRAMES[0], *relabelled, KEYFRAMES[2]], MapFrame(), Choice()))
     assert edited == path.read_bytes()

@@ -14,6 +14,7 @@ from test_rewind import SAMPLE, Bench, open_whole
 from typer.testing import CliRunner
 
 from app.__main__ import cli
+from app.export.results import BY_RUN
 from app.mapping.loops import LoopProcess, RestartingLoops
 from app.sensors.presets import resolve_params
 from app.server.protocol import (
@@ -34,9 +35,8 @@ from app.server.protocol import (
 from app.slam.loops import edit_files
 from app.slam.loops.edits import Accept, Reject, SetWeight
 from app.slam.loops.types import LoopEdge, Verdict
-from app.slam.results import EXPORTS
 
-FILES = ("trajectory.tum", *(export.name for export in EXPORTS if export.of_loops))
+FILES = ("trajectory.tum", *(export.name for export in BY_RUN if export.of_loops))
 DRIFTING = (
     "filter.max_points=100", "filter.plane_tilt=20", "map.spacing=0.6", "map.points_per_voxel=10", "map.radius=12",
     "sensor.max_range=12",

@@ -8,10 +8,12 @@ import time
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 import server_fakes as fakes
 from server_site import TIMEOUT_S, Site, eventually
 
+from app.export.map_file import VERTEX
 from app.mapping.breakpoints import Breakpoints
 
 
@@ -75,7 +77,9 @@ def test_labels_by_rest(site: Site) -> None:
 
     def ground() -> int:
         cloud = httpx.get(site.url("/api/export/map.ply"), timeout=TIMEOUT_S).content
-        return sum(cloud.partition(b"end_header\n")[2][16::17])
+        head, _, body = cloud.partition(b"end_header\n")
+        count = int(head.partition(b"element vertex ")[2].split()[0])
+        return int(np.frombuffer(body, VERTEX, count)["ground"].sum())
 
     def post(**body: object) -> int:
         return httpx.post(site.url("/api/labels"), json=body).status_code

@@ -70,3 +70,21 @@ def centroids(points, chosen, voxel, table, stamp, generation, cells, sums, orde
         for i in range(3):
             out[k, i] = sums[k, i] * s
     return m
+
+
+@njit(cache=True)
+def first_in_voxels(keys, table, first):
+    """Put keys (n,) i64 >= 0 into the hash table (2^k,) i64, where -1 is free; it must have room.
+
+    Out: first (n,) bool, whether the key was not there yet. Returns how many were not.
+    """
+    mask, count = len(table) - 1, 0
+    for j in range(len(keys)):
+        key = keys[j]
+        slot = ((key * PRIME_X) ^ (key >> 20)) & mask
+        while table[slot] >= 0 and table[slot] != key:
+            slot = (slot + 1) & mask
+        first[j] = table[slot] < 0
+        table[slot] = key
+        count += first[j]
+    return count

@@ -1,6 +1,6 @@
 """What a run writes: complete, readable by others, and never over older results by accident.
 
-Tests app/slam/ply.py, app/slam/run_log.py.
+Tests app/export/folder.py, app/export/map_file.py, app/export/points.py, app/slam/ply.py, app/slam/run_log.py.
 """
 
 import csv
@@ -11,13 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.export.folder import read_results
+from app.export.map_file import KEYFRAME, VERTEX, MapFile, write
+from app.export.points import Choice, blocks
+from app.export.results import BY_RUN, Results, save_results
 from app.slam.errors import HemislamError
 from app.slam.frames import Frame
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
-from app.slam.ply import VERTEX, write_map
 from app.slam.report import summarise
-from app.slam.results import EXPORTS, Results, save_results
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import (
@@ -116,15 +118,16 @@ def read_ply(path: Path) -> np.ndarray:
     lines = head.decode().splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
     count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
-    assert len(body) == count * VERTEX.itemsize
-    return np.frombuffer(body, dtype=VERTEX)
+    keyframes = next(int(line.split()[2]) for line in lines if line.startswith("element keyframe"))
+    assert len(body) == count * VERTEX.itemsize + keyframes * KEYFRAME.itemsize
+    return np.frombuffer(body, dtype=VERTEX, count=count)
 
 
 def test_a_run_writes_its_four_files(tmp_path: Path, recording: Path) -> None:
     folder = tmp_path / "out"
     report = save_results(folder, Results(logged(), [keyframe(0, [[1, 0, 0]], [GROUND])], RunInfo(recording, Params())))
     assert sorted(path.name for path in folder.iterdir()) == sorted(
-        export.name for export in EXPORTS if not export.of_loops
+        export.name for export in BY_RUN if not export.of_loops
     )
     assert json.loads((folder / "report.json").read_text()) == report
 
@@ -211,7 +214,7 @@ def test_the_map_holds_every_keyframe_where_loops_lay_it(tmp_path: Path) -> None
     keyframes = [keyframe(0, [[1, 0, 0], [0, 2, 0]], [GROUND, NON_GROUND]), keyframe(1, [[1, 0, 0]], [SEED])]
     T_map_odom = np.tile(np.eye(4), (2, 1, 1))
     T_map_odom[:, 1, 3] = 100.0, 200.0
-    count = write_map(tmp_path / "map.ply", keyframes, MapFrame(np.array([0, 1]), T_map_odom))
+    count = write(tmp_path / "map.ply", blocks(keyframes, MapFrame(np.array([0, 1]), T_map_odom), Choice()))
     points = read_ply(tmp_path / "map.ply")
     assert count == len(points) == 3
     np.testing.assert_allclose(
@@ -254,3 +257,44 @@ def test_a_file_in_the_place_of_the_folder_is_named(tmp_path: Path, recording: P
     with pytest.raises(HemislamError, match="out cannot be made"):
         save_results(tmp_path / "out", Results(logged(), [], RunInfo(recording, Params())))
     assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_a_map_read_again_is_the_map_that_was_written(tmp_path: Path, recording: Path) -> None:
+    keyframes = [keyframe(0, [[1, 0, 0], [0, 2, 0]], [GROUND, NON_GROUND]), keyframe(1, [[1, 0, 0]], [NON_GROUND])]
+    keyframes[0].cloud.offsets_ns[:] = 0, 50_000_000
+    keyframes[0].cloud.ring[:] = 3, 7
+    save_results(tmp_path, Results(logged(), keyframes, RunInfo(recording, Params())))
+    before = list(blocks(keyframes, MapFrame(), Choice()))
+    results = read_results(tmp_path)
+    assert results.info.recording == recording and len(results.trajectory) == 6
+    for one, other in zip(before, results.blocks(), strict=True):
+        np.testing.assert_allclose(other.points, one.points, atol=1e-5)
+        np.testing.assert_allclose(other.T_map_lidar, one.T_map_lidar, atol=1e-12)
+        np.testing.assert_allclose(other.stamps_ns, one.stamps_ns, atol=300)
+        for name in ("keyframe", "stamp_ns", "ring", "intensity", "labels"):
+            assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+def test_only_the_first_point_in_a_voxel_and_in_the_box_is_taken() -> None:
+    rng = np.random.default_rng(3)
+    points = [rng.uniform(-2, 2, (3000, 3)).tolist() for _ in range(30)]
+    keyframes = [keyframe(0, one, [NON_GROUND] * 3000) for one in points]
+    everything = np.concatenate([block.points for block in blocks(keyframes, MapFrame(), Choice())])
+    box = (-1.0, -1.5, 0.0, 1.0, 1.5, 2.0)
+    taken = np.concatenate([block.points for block in blocks(keyframes, MapFrame(), Choice(0.05, box))])
+    inside = everything[((everything >= box[:3]) & (everything <= box[3:])).all(axis=1)]
+    _, first = np.unique(np.floor(inside / 0.05), axis=0, return_index=True)
+    np.testing.assert_array_equal(taken, inside[np.sort(first)])
+    assert 1000 < len(taken) < len(inside)
+
+
+@pytest.mark.parametrize(("thin", "box"), [(-1.0, None), (1e-6, None), (0.0, (0.0, 0, 0, 1, 1, 0))])
+def test_a_choice_without_sense_is_refused(thin: float, box: tuple[float, float, float, float, float, float]) -> None:
+    with pytest.raises(HemislamError, match=r"Voxels|empty"):
+        Choice(thin, box)
+
+
+def test_a_file_that_is_no_map_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "map.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nend_header\n")
+    with pytest.raises(HemislamError, match="not a map of this version"):
+        MapFile(tmp_path / "map.ply")

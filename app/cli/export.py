@@ -1,0 +1,110 @@
+"""`hemislam export`: the map and the trajectory in the formats of other programs."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from app.cli.options import progress_bar
+from app.slam.errors import HemislamError
+
+if TYPE_CHECKING:
+    from app.export.points import Box, Choice
+    from app.export.results import Export, Results
+
+
+def export(
+    source: Annotated[
+        Path, typer.Argument(metavar="RESULTS|SESSION", help="A folder of results, or a session file (.hemislam).")
+    ],
+    formats: Annotated[
+        str, typer.Option("--format", metavar="NAME,...", help="One or several of the names below, with commas.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Where to write; else RESULTS/export, or runs/NAME-1.")
+    ] = None,
+    thin: Annotated[
+        float, typer.Option("--thin", metavar="METRES", help="Only the first point in each voxel of this size.")
+    ] = 0.0,
+    box: Annotated[
+        str | None, typer.Option("--box", metavar="xmin,ymin,zmin,xmax,ymax,zmax", help="Only points inside, m.")
+    ] = None,
+) -> None:
+    """Write a map in the formats of other programs.
+
+    A session is repeated first. Coordinates are those of the map or, if the results hold a
+    georeference.json, of its coordinate system where the format has one.
+
+    \b
+    Formats:
+      tum         trajectory.tum           poses with stamps
+      g2o         graph.g2o                the pose graph of the keyframes
+      ply         map.ply                  points and keyframes
+      las, laz    map.las, map.laz         LAS 1.4: time, intensity, ring, ground
+      e57         map.e57                  one scan with its pose per keyframe
+      pcd         map.pcd                  intensity ring ground time
+      kitti       trajectory.kitti         poses as rows of 12 numbers
+      csv         trajectory.csv           poses with easting, northing, height if known
+      gpx         trajectory.gpx           the walk as a GPX track
+      occupancy   occupancy.pgm, .yaml     free, wall, unknown for nav2
+      floor, dxf  floor.png, floor.dxf     floor plan: a slice 1 to 1.5 m above the ground
+      terrain     terrain.tif              height of the ground as GeoTIFF
+      density     density.tif              points per square metre as GeoTIFF
+      kmz         map.kmz                  walk, picture and keyframes for Google Earth
+      html        share.html               the map in one page that needs no server
+
+    \b
+    Examples:
+      hemislam export runs/walk-1 --format laz,e57
+      hemislam export runs/walk-1 --format pcd --thin 0.05 --out to_client
+      hemislam export session.hemislam --format laz --box=-10,-10,-1,10,10,3
+    """
+    from app.export.folder import read_results
+    from app.export.points import Choice
+    from app.export.results import of_formats
+
+    exports = of_formats([name.strip() for name in formats.split(",") if name.strip()])
+    choice = Choice(thin, _box(box))
+    if source.is_dir():
+        results, folder = read_results(source), out or source / "export"
+        if folder.resolve() == source.resolve():
+            raise HemislamError(f"{source} is what is exported; choose another folder as --out.")
+        results.choice = choice
+        _save(results, folder, exports)
+    else:
+        _export_session(source, out, exports, choice)
+
+
+def _export_session(source: Path, out: Path | None, exports: "tuple[Export, ...]", choice: "Choice") -> None:
+    from app.cli.replay import repeat
+    from app.cli.run import free_folder
+
+    with repeat(source) as (session, stop):
+        if stop is not None:
+            raise stop
+        results = session.results()
+        results.choice = choice
+        _save(results, out or free_folder(source), exports)
+
+
+def _save(results: "Results", folder: Path, exports: "tuple[Export, ...]") -> None:
+    from app.export.results import save_results
+
+    with progress_bar("Exporting", total=1.0, bar_format="{desc}: {percentage:3.0f}% |{bar}| {elapsed}") as show:
+        results.progress = show
+        save_results(folder, results, exports, replace=True)
+    for one in exports:
+        if (folder / one.name).exists():
+            typer.echo(f"{folder / one.name}: {(folder / one.name).stat().st_size / 1e6:.1f} MB")
+        else:
+            typer.echo(f"There is no {one.name}, because loops were not searched.")
+
+
+def _box(text: str | None) -> "Box | None":
+    if text is None:
+        return None
+    try:
+        a, b, c, d, e, f = map(float, text.split(","))
+    except ValueError:
+        raise HemislamError(f"--box takes six numbers xmin,ymin,zmin,xmax,ymax,zmax, not {text}.") from None
+    return a, b, c, d, e, f

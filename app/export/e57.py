@@ -1,0 +1,79 @@
+"""The map as E57 (ASTM E2807): one scan per keyframe, in the LiDAR's frame, with its pose."""
+
+import uuid
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pye57
+from pye57 import libe57
+from scipy.spatial.transform import Rotation
+
+from app.export.points import Block
+from app.georeference.reference import GeoReference
+
+if TYPE_CHECKING:
+    from app.export.results import Results
+
+GPS_MINUS_UNIX_S = -315_964_800 + 18
+"""From Unix to GPS time, with the leap seconds since 2017."""
+
+
+def write(path: Path, results: "Results") -> None:
+    """Poses are in the map or, if it is known, in the coordinate system on Earth. Each file has new GUIDs."""
+    file = _Writer(str(path), results.where)
+    try:
+        for block in results.blocks():
+            if len(block):
+                _add(file, block, results.where)
+    finally:
+        file.close()
+
+
+class _Writer(pye57.E57):  # type: ignore[misc] # it has no types
+    """pye57 leaves the coordinate system empty, and no node can be set twice."""
+
+    def __init__(self, path: str, where: GeoReference | None) -> None:
+        self._wkt = "" if where is None else where.wkt("WKT1_GDAL")
+        super().__init__(path, "w")
+
+    def write_default_header(self) -> None:
+        file, root = self.image_file, self.root
+        file.extensionsAdd("", libe57.E57_V1_0_URI)
+        texts = {
+            "formatName": "ASTM E57 3D Imaging Data File",
+            "guid": f"{{{uuid.uuid4()}}}",
+            "e57LibraryVersion": libe57.E57_LIBRARY_ID,
+            "coordinateMetadata": self._wkt,
+        }
+        for name, text in texts.items():
+            root.set(name, libe57.StringNode(file, text))
+        for name, number in {"versionMajor": libe57.E57_FORMAT_MAJOR, "versionMinor": libe57.E57_FORMAT_MINOR}.items():
+            root.set(name, libe57.IntegerNode(file, number))
+        for name in ("data3D", "images2D"):
+            root.set(name, libe57.VectorNode(file, True))
+
+
+def _add(file: Any, block: Block, where: GeoReference | None) -> None:
+    rotation, translation, points = block.T_map_lidar[:3, :3], block.T_map_lidar[:3, 3], block.points
+    if where is not None:
+        rotation, translation = np.array(where.rotation) @ rotation, where.to_crs(translation[None])[0]
+        points = where.to_crs(points)
+    own = ((points - translation) @ rotation).astype(np.float32).astype(np.float64)
+    times = block.stamps_ns[[0, -1]] * 1e-9 + GPS_MINUS_UNIX_S
+    bounds = zip("xyz", own.min(axis=0), own.max(axis=0), strict=True)
+    head = {name: value for axis, low, high in bounds for name, value in _limits(axis, low, high)}
+    for name, seconds in zip(("Start", "End"), (times.min(), times.max()), strict=True):
+        head[f"acquisition{name}_dateTimeValue"] = float(seconds)
+    file.write_scan_raw(
+        {**{f"cartesian{axis}": own[:, k] for k, axis in enumerate("XYZ")}, "intensity": block.intensity.astype("f4")},
+        name=f"keyframe {block.keyframe}",
+        rotation=np.roll(Rotation.from_matrix(rotation).as_quat(), 1),
+        translation=translation,
+        scan_header=SimpleNamespace(**head),
+    )
+
+
+def _limits(axis: str, low: float, high: float) -> list[tuple[str, float]]:
+    return [(f"{axis}Minimum", float(low)), (f"{axis}Maximum", float(high))]

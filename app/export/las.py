@@ -1,0 +1,70 @@
+"""The map as LAS 1.4 (ASPRS, "LAS Specification 1.4 - R15"), compressed or not, written keyframe by keyframe."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import laspy
+import numpy as np
+from laspy.vlrs.known import WktCoordinateSystemVlr
+
+from app import __version__
+from app.export.points import Block
+from app.georeference.reference import GeoReference
+from app.slam.types import F64, NON_GROUND
+
+if TYPE_CHECKING:
+    from app.export.results import Results
+
+SCALE = 0.001
+"""m."""
+OTHER, GROUND_CLASS = 1, 2
+GPS_MINUS_UNIX_S = -315_964_800 + 18 - 1_000_000_000
+"""From Unix time to "adjusted standard GPS time", with the leap seconds since 2017."""
+
+
+def write_las(path: Path, results: "Results") -> None:
+    """Uncompressed."""
+    _write(path, results, compressed=False)
+
+
+def write_laz(path: Path, results: "Results") -> None:
+    """Compressed by lazrs on all cores."""
+    _write(path, results, compressed=True)
+
+
+def _write(path: Path, results: "Results", *, compressed: bool) -> None:
+    header, where = _header(results.where), results.where
+    if len(results.keyframes):
+        header.creation_date = datetime.fromtimestamp(results.keyframes[0].stamp_ns // 10**9, UTC).date()
+    backend = laspy.LazBackend.LazrsParallel if compressed else None
+    with laspy.open(path, mode="w", header=header, do_compress=compressed, laz_backend=backend) as file:
+        for block in results.blocks():
+            if len(block):
+                file.write_points(_record(block, header, where))
+
+
+def _header(where: GeoReference | None) -> laspy.LasHeader:
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, SCALE)
+    header.offsets = np.floor(where.origin) if where is not None else np.zeros(3)
+    header.generating_software = f"hemislam {__version__}"
+    header.global_encoding.wkt = True
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    if where is not None:
+        header.vlrs.append(WktCoordinateSystemVlr(where.wkt("WKT1_GDAL")))
+    return header
+
+
+def _record(block: Block, header: laspy.LasHeader, where: GeoReference | None) -> laspy.ScaleAwarePointRecord:
+    points: F64 = block.points if where is None else where.to_crs(block.points)
+    record = laspy.ScaleAwarePointRecord.zeros(len(block), header=header)
+    array = record.array
+    array["X"], array["Y"], array["Z"] = np.rint((points - header.offsets) / SCALE).T
+    array["intensity"] = np.clip(np.rint(block.intensity), 0, 65535)
+    array["bit_fields"] = 0x11  # the only return of its pulse
+    array["classification"] = np.where(block.labels == NON_GROUND, OTHER, GROUND_CLASS)
+    array["user_data"] = np.minimum(block.ring, 255)
+    array["point_source_id"] = block.keyframe % 65536
+    array["gps_time"] = block.stamps_ns * 1e-9 + GPS_MINUS_UNIX_S
+    return record

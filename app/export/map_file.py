@@ -1,0 +1,105 @@
+"""The map as PLY. After the points it holds the keyframes, so that other formats can be made of it later."""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from app.export.points import Block, as_cloud
+from app.slam.errors import HemislamError
+from app.slam.ply import header
+from app.slam.types import GROUND, NON_GROUND, Keyframe
+
+VERTEX = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ground", "u1"), ("ring", "<u2"), ("time", "<f8")]
+)
+"""m in the map; seconds as in the trajectory."""
+KEYFRAME = np.dtype(
+    [("points", "<i4"), ("seconds", "<i4"), ("nanoseconds", "<i4")]
+    + [(name, "<f8") for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+)
+"""How many of the points are its own, the end of its scan, and T_map_lidar."""
+_COMMENT = "hemislam map, metres, z up"
+
+
+def write(path: Path, blocks: Iterable[Block]) -> int:
+    """Write points and keyframes, and return the number of points; it enters the header at the end."""
+    keyframes, count = [], 0
+    with path.open("wb") as file:
+        file.write(header(VERTEX, 0, _COMMENT, keyframe=KEYFRAME))
+        for block in blocks:
+            file.write(_vertices(block).tobytes())
+            T = block.T_map_lidar
+            pose = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
+            keyframes.append((len(block), *divmod(block.stamp_ns, 1_000_000_000), *pose))
+            count += len(block)
+        file.write(np.array(keyframes, KEYFRAME).tobytes())
+        file.seek(0)
+        file.write(header(VERTEX, count, _COMMENT, keyframe=KEYFRAME, keyframes=len(keyframes)))
+    return count
+
+
+def _vertices(block: Block) -> np.ndarray:
+    vertices = np.empty(len(block), dtype=VERTEX)
+    vertices["x"], vertices["y"], vertices["z"] = block.points.T
+    vertices["intensity"], vertices["ring"] = block.intensity, block.ring
+    vertices["ground"] = block.labels != NON_GROUND
+    vertices["time"] = block.stamps_ns * 1e-9
+    return vertices
+
+
+class MapFile:
+    """The keyframes of a map that `write` has written. Their poses in odometry are those in the map.
+
+    Raises:
+        HemislamError: it cannot be read, or is not such a map.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self._file = path.open("rb")
+            self._read_ends(self._file.read(4096))
+        except OSError as error:
+            raise HemislamError(f"The map {path} cannot be read: {error.strerror}.") from None
+        except (ValueError, IndexError):
+            raise HemislamError(
+                f"{path} is not a map of this version of hemislam; run it on the recording once more."
+            ) from None
+
+    def _read_ends(self, head: bytes) -> None:
+        counts = [int(line.split()[2]) for line in head.split(b"\n") if line.startswith(b"element ")]
+        first, second = counts
+        if not head.startswith(begin := header(VERTEX, first, _COMMENT, keyframe=KEYFRAME, keyframes=second)):
+            raise ValueError
+        self._file.seek(len(begin) + first * VERTEX.itemsize)
+        self._keyframes = np.frombuffer(self._file.read(second * KEYFRAME.itemsize), KEYFRAME, count=second)
+        self._begins = len(begin) + np.cumsum([0, *self._keyframes["points"]], dtype=np.int64) * VERTEX.itemsize
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    def __getitem__(self, index: int, /) -> Keyframe:
+        if not 0 <= index < len(self):
+            raise IndexError(f"keyframe {index} of {len(self)}")
+        begin, end = self._begins[index : index + 2].tolist()
+        vertices = np.frombuffer(os.pread(self._file.fileno(), end - begin, begin), VERTEX)
+        row = self._keyframes[index]
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+        T[:3, 3] = row["x"], row["y"], row["z"]
+        stamp_ns = int(row["seconds"]) * 1_000_000_000 + int(row["nanoseconds"])
+        offsets_ns = np.rint((vertices["time"] - row["seconds"]) * 1e9 - row["nanoseconds"]).astype(np.int64)
+        block = Block(
+            index,
+            stamp_ns,
+            T,
+            np.stack([vertices["x"], vertices["y"], vertices["z"]], axis=1).astype(np.float64),
+            stamp_ns + offsets_ns,
+            np.where(vertices["ground"] > 0, GROUND, NON_GROUND).astype(np.uint8),
+            vertices["intensity"],
+            vertices["ring"],
+        )
+        return Keyframe(index, index, stamp_ns, T, np.eye(4), np.eye(6), as_cloud(block))

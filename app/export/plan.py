@@ -1,0 +1,102 @@
+"""Plans: an occupancy grid for robots, a floor plan, and the terrain. North or the map's y is up."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import ezdxf
+import numpy as np
+import numpy.typing as npt
+import rasterio
+import rasterio.features
+from PIL import Image
+from rasterio.transform import from_origin
+from scipy import ndimage
+
+from app.export.raster import COARSE_CELL, Raster
+
+if TYPE_CHECKING:
+    from app.export.results import Results
+
+FREE, WALL, UNKNOWN = 254, 0, 205
+"""Grey values that nav2's map_server expects."""
+LEAST_POINTS = 3
+"""In a cell, to be a wall; fewer may be a person who walked past."""
+
+
+def write_pgm(path: Path, results: "Results") -> None:
+    """Walls, what is free by ground labels, and the rest, in the map."""
+    raster = results.raster(on_earth=False)
+    seen = raster.ground > 0
+    free = seen | ndimage.binary_closing(seen, iterations=2)  # type: ignore[attr-defined]  # no types
+    grey = np.where(free, FREE, UNKNOWN).astype(np.uint8)
+    grey[raster.walls >= LEAST_POINTS] = WALL
+    rows, columns = grey.shape
+    path.write_bytes(f"P5\n{columns} {rows}\n255\n".encode("ascii") + np.flipud(grey).tobytes())
+
+
+def write_yaml(path: Path, results: "Results") -> None:
+    """What nav2's map_server needs beside the image."""
+    raster = results.raster(on_earth=False)
+    x, y = raster.origin[:2]
+    path.write_text(
+        f"image: occupancy.pgm\nmode: trinary\nresolution: {raster.cell:g}\norigin: [{x:.3f}, {y:.3f}, 0.0]\n"
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
+        encoding="ascii",
+    )
+
+
+def write_floor_png(path: Path, results: "Results") -> None:
+    """A horizontal slice, black on white; the darker, the more points."""
+    cut = results.raster(on_earth=True).cut
+    grey = 255 - np.minimum(cut * 32, 255)
+    Image.fromarray(np.flipud(grey).astype(np.uint8)).save(path, format="PNG")
+
+
+def write_dxf(path: Path, results: "Results") -> None:
+    """The outlines of what the slice cuts, in metres, on the layer `walls`."""
+    raster = results.raster(on_earth=True)
+    walls = (np.flipud(raster.cut) >= LEAST_POINTS).astype(np.uint8)
+    drawing: Any = ezdxf.new("R2010", units=6)
+    drawing.layers.add("walls")
+    space = drawing.modelspace()
+    for shape, _ in rasterio.features.shapes(walls, mask=walls > 0, connectivity=8, transform=_transform(raster)):
+        for ring in shape["coordinates"]:
+            space.add_lwpolyline(ring[:-1], close=True, dxfattribs={"layer": "walls"})
+    with path.open("w", encoding="utf-8") as file:
+        drawing.write(file)
+
+
+def write_terrain(path: Path, results: "Results") -> None:
+    """Mean height of the ground in each cell, m; nan where none was seen."""
+    raster = results.raster(on_earth=True, cell=COARSE_CELL)
+    _write_tiff(path, results, raster, raster.height)
+
+
+def write_density(path: Path, results: "Results") -> None:
+    """Points per square metre."""
+    raster = results.raster(on_earth=True, cell=COARSE_CELL)
+    _write_tiff(path, results, raster, (raster.points / raster.cell**2).astype(np.float32))
+
+
+def _write_tiff(path: Path, results: "Results", raster: Raster, values: npt.NDArray[np.float32]) -> None:
+    rows, columns = values.shape
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        height=rows,
+        width=columns,
+        count=1,
+        dtype="float32",
+        nodata=float("nan"),
+        compress="deflate",
+        transform=_transform(raster),
+        crs=None if results.where is None else results.where.wkt(),
+    ) as file:
+        file.write(np.flipud(values), 1)
+
+
+def _transform(raster: Raster) -> Any:
+    """From columns and rows, counted from the north, to coordinates."""
+    x, y = raster.origin[:2]
+    return from_origin(x, y + raster.points.shape[0] * raster.cell, raster.cell, raster.cell)

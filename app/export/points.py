@@ -1,0 +1,112 @@
+"""The points of a map as a stream, one keyframe at a time, so that memory does not grow with the map."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from app.slam.errors import HemislamError
+from app.slam.kernels.clouds import first_in_voxels
+from app.slam.map_frame import MapFrame
+from app.slam.ply import Keyframes
+from app.slam.types import F32, F64, I64, U8, U16, Cloud, Keyframe
+
+Box = tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Which points of a map are exported.
+
+    Attributes:
+        thin: m, edge of the voxels of which only the first point is taken; 0: all points.
+        box: least x, y, z and greatest x, y, z in the map, m; None: everywhere.
+    """
+
+    thin: float = 0.0
+    box: Box | None = None
+
+    def __post_init__(self) -> None:
+        if not (self.thin == 0 or 0.001 <= self.thin <= 100):
+            raise HemislamError(f"Voxels of {self.thin:g} m do not thin a map; choose 0.001 to 100 m.")
+        if self.box is not None and not all(low < high for low, high in zip(self.box[:3], self.box[3:], strict=True)):
+            raise HemislamError("The box is empty; give xmin,ymin,zmin,xmax,ymax,zmax with each minimum first.")
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Points of one keyframe in the map.
+
+    Attributes:
+        keyframe: its index. stamp_ns: its scan's end. T_map_lidar: (4, 4).
+        points: (n, 3) float64 m, map. stamps_ns: (n,) of each point.
+        labels, intensity, ring: (n,) as in `Cloud`.
+    """
+
+    keyframe: int
+    stamp_ns: int
+    T_map_lidar: F64
+    points: F64
+    stamps_ns: I64
+    labels: U8
+    intensity: F32
+    ring: U16
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def chosen(self, which: npt.NDArray[np.bool_]) -> "Block":
+        """Only the points where `which` (n,) is true."""
+        arrays = ("points", "stamps_ns", "labels", "intensity", "ring")
+        return replace(self, **{name: getattr(self, name)[which] for name in arrays})
+
+
+def blocks(keyframes: Keyframes, frame: MapFrame, choice: Choice) -> Iterator[Block]:
+    """The chosen points, where `frame` puts them in the map."""
+    voxels = _Voxels(choice.thin) if choice.thin else None
+    for index in range(len(keyframes)):
+        block = _block(keyframes[index], frame.at(index))
+        if choice.box is not None:
+            low, high = np.reshape(choice.box, (2, 3))
+            inside = (block.points >= low) & (block.points <= high)
+            block = block.chosen(np.all(inside, axis=1))
+        yield block if voxels is None else block.chosen(voxels.new(block.points))
+
+
+def _block(keyframe: Keyframe, T_map_odom: F64) -> Block:
+    cloud = keyframe.cloud
+    T = T_map_odom @ keyframe.T_odom_imu @ keyframe.T_imu_lidar
+    points = cloud.points.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+    begin_ns = keyframe.stamp_ns - int(cloud.offsets_ns.max(initial=0))
+    stamps_ns = begin_ns + cloud.offsets_ns.astype(np.int64)
+    return Block(keyframe.index, keyframe.stamp_ns, T, points, stamps_ns, cloud.labels, cloud.intensity, cloud.ring)
+
+
+def as_cloud(block: Block) -> Cloud:
+    """The points in the LiDAR frame again."""
+    T, stamps_ns = block.T_map_lidar, block.stamps_ns
+    points = ((block.points - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
+    offsets_ns = (stamps_ns - stamps_ns.min(initial=block.stamp_ns)).astype(np.int32)
+    return Cloud(points, block.labels, block.intensity, block.ring, offsets_ns)
+
+
+class _Voxels:
+    """Voxels that hold a point already: 8 bytes each, twice as many slots as voxels."""
+
+    def __init__(self, edge: float) -> None:
+        self._edge, self._used = edge, 0
+        self._table = np.full(1 << 16, -1, np.int64)
+
+    def new(self, points: F64) -> npt.NDArray[np.bool_]:
+        """(n,) whether each point is the first in its voxel; it is in it from now on."""
+        cells = np.floor(points / self._edge).astype(np.int64) & 0x1FFFFF
+        keys = cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2]
+        if 2 * (self._used + len(keys)) > len(self._table):
+            held = self._table[self._table >= 0]
+            self._table = np.full(1 << math.ceil(math.log2(4 * (self._used + len(keys)))), -1, np.int64)
+            first_in_voxels(held, self._table, np.empty(len(held), np.bool_))
+        first = np.empty(len(keys), np.bool_)
+        self._used += first_in_voxels(keys, self._table, first)
+        return first

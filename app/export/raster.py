@@ -1,0 +1,120 @@
+"""The map from above: what lies in each cell of a grid. The points are read three times, so that none is held."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from app.export.points import Block
+from app.georeference.reference import GeoReference
+from app.slam.errors import HemislamError
+from app.slam.types import F64, NON_GROUND, U8
+
+CELL = 0.05
+"""m, edge of a cell of all but huge maps."""
+COARSE_CELL = 0.25
+"""m, of terrain, density and the picture for Google Earth."""
+MOST_CELLS = 16_000_000
+COARSE = 10
+"""Cells along the edge of a square in which the ground has one height."""
+WALL_FROM, WALL_TO = 0.2, 1.8
+"""m above the ground: what a robot, or a person, would run into."""
+SLICE_FROM, SLICE_TO = 1.0, 1.5
+"""m above the ground: a floor plan shows what is cut there, above tables and below lamps."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Counts in cells, row 0 in the south.
+
+    Attributes:
+        origin: (3,) x, y of the outer corner of cell (0, 0), and what was subtracted from heights, m.
+        cell: m. points, ground, walls, cut: (rows, columns) int32, number of points: all, of the ground, and in the
+            two ranges of height above it. height_sum: (rows, columns) of ground points, m.
+    """
+
+    origin: F64
+    cell: float
+    points: npt.NDArray[np.int32]
+    ground: npt.NDArray[np.int32]
+    walls: npt.NDArray[np.int32]
+    cut: npt.NDArray[np.int32]
+    height_sum: npt.NDArray[np.float32]
+
+    @property
+    def height(self) -> npt.NDArray[np.float32]:
+        """(rows, columns) m, mean of the ground points; nan without one."""
+        with np.errstate(invalid="ignore"):
+            mean = self.height_sum / self.ground + np.float32(self.origin[2])
+        return np.where(self.ground > 0, mean, np.float32(np.nan))
+
+
+def rasterise(read: Callable[[], Iterable[Block]], where: GeoReference | None, cell: float) -> Raster:
+    """Count the chosen points of a map.
+
+    Args:
+        read: gives the points from the first on. where: on Earth the raster shall lie; None: in the map.
+        cell: m.
+
+    Raises:
+        HemislamError: there are no points, or none is ground.
+    """
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for points, _ in _points(read, where):
+        low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+    if not np.isfinite(low).all():
+        raise HemislamError("There are no points to draw a plan of; choose a larger --box.")
+    while np.prod((high - low)[:2] / cell + COARSE) > MOST_CELLS:
+        cell *= 2
+    origin = np.append(np.floor(low[:2] / (cell * COARSE)) * cell * COARSE, math.floor(low[2]))
+    size = np.ceil((high - origin)[:2] / (cell * COARSE) + 1e-9).astype(int) * COARSE
+    shape = (int(size[1]), int(size[0]))
+    floor = _floor(read, where, origin, cell, shape)
+    counts = {name: np.zeros(shape, np.int32) for name in ("points", "ground", "walls", "cut")}
+    height_sum = np.zeros(shape, np.float32)
+    for points, labels in _points(read, where):
+        rows, columns = _cells(points, origin, cell)
+        above = points[:, 2] - floor[rows // COARSE, columns // COARSE]
+        is_ground = labels != NON_GROUND
+        kinds = (
+            slice(None),
+            is_ground,
+            ~is_ground & (above > WALL_FROM) & (above < WALL_TO),
+            ~is_ground & (above > SLICE_FROM) & (above < SLICE_TO),
+        )
+        for count, which in zip(counts.values(), kinds, strict=True):
+            np.add.at(count, (rows[which], columns[which]), 1)
+        np.add.at(height_sum, (rows[is_ground], columns[is_ground]), points[is_ground, 2] - origin[2])
+    return Raster(origin, cell, height_sum=height_sum, **counts)
+
+
+def _floor(
+    read: Callable[[], Iterable[Block]], where: GeoReference | None, origin: F64, cell: float, shape: tuple[int, int]
+) -> F64:
+    """(rows, columns) of coarse squares: mean height of the ground, m; where none was seen, of the nearest one."""
+    total, count = np.zeros((2, shape[0] // COARSE, shape[1] // COARSE))
+    for points, labels in _points(read, where):
+        points = points[labels != NON_GROUND]
+        place = _cells(points, origin, cell * COARSE)
+        np.add.at(total, place, points[:, 2])
+        np.add.at(count, place, 1)
+    if not count.any():
+        raise HemislamError("No point of the map is ground, and a plan starts from the ground; tune the ground first.")
+    unseen = count == 0
+    nearest = ndimage.distance_transform_edt(unseen, return_distances=False, return_indices=True)  # type: ignore[attr-defined]  # no types
+    mean = total / np.maximum(count, 1)
+    return np.asarray(mean[tuple(nearest)])
+
+
+def _points(read: Callable[[], Iterable[Block]], where: GeoReference | None) -> Iterator[tuple[F64, U8]]:
+    for block in read():
+        if len(block):
+            yield (block.points if where is None else where.to_crs(block.points)), block.labels
+
+
+def _cells(points: F64, origin: F64, cell: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    columns, rows = ((points[:, :2] - origin[:2]) / cell).astype(np.int64).T
+    return rows, columns

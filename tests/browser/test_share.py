@@ -1,0 +1,59 @@
+"""The page to share: opened from the disk, it shows the map within seconds and complains of nothing.
+
+Tests app/export/share.py.
+"""
+
+import io
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from playwright.sync_api import Browser
+
+from app.export import share
+from app.export.results import Results
+from app.slam.params import Params
+from app.slam.run_log import RunInfo, RunLog
+from app.slam.types import Cloud, Keyframe
+
+
+def plaza(points: int) -> Results:
+    """Two keyframes over a square of 30 m with a wavy floor."""
+    rng, keyframes = np.random.default_rng(2), []
+    for index in range(2):
+        at = rng.uniform(-15, 15, (points // 2, 3)).astype(np.float32)
+        at[:, 2] = np.sin(at[:, 0] / 3)
+        nothing = np.zeros(len(at), np.int32)
+        cloud = Cloud(at, nothing.astype(np.uint8), nothing.astype(np.float32), nothing.astype(np.uint16), nothing)
+        keyframes.append(Keyframe(index, index, 10**18 + index, np.eye(4), np.eye(4), np.eye(6), cloud))
+    return Results(RunLog([]), keyframes, RunInfo(Path("plaza.mcap"), Params()))
+
+
+def test_a_shared_page_opens_from_the_disk_without_a_complaint(chromium: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "share.html"
+    share.write(file, plaza(200_000))
+    page, said = chromium.new_page(viewport={"width": 800, "height": 600}), list[str]()
+    page.on("console", lambda one: said.append(one.text) if one.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: said.append(str(error)))
+    begin = time.monotonic()
+    page.goto(file.as_uri())
+    deadline = time.monotonic() + 60
+    while True:
+        picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+        if (np.ptp(picture[100:500, 200:600], axis=2) > 40).mean() > 0.2:
+            break
+        assert time.monotonic() < deadline, "the map does not show"
+    print(f"shown after {time.monotonic() - begin:.1f} s")
+    if "SHARE_PICTURE" in os.environ:
+        page.screenshot(path=Path(os.environ["SHARE_PICTURE"]))
+    assert "plaza" in page.title() and page.get_by_text("200,000 points").is_visible()
+    of_the_renderer = ("THREE.Clock: ", "GL Driver Message", "Canvas2D: Multiple readback")
+    assert not [text for text in said if not text.startswith(of_the_renderer) and "GL Driver" not in text]
+    page.close()
+
+
+def test_a_million_points_take_less_than_15_megabytes(tmp_path: Path) -> None:
+    share.write(tmp_path / "share.html", plaza(1_500_000))
+    assert 3e6 < (tmp_path / "share.html").stat().st_size < 15e6

@@ -1,0 +1,62 @@
+"""`hemislam export` from the outside: from results and from a session to the same points."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pytest
+
+from app.export.results import FORMATS
+
+Call = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def results(hemislam: Call, walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export") / "results"
+    assert hemislam("run", walk, "--out", folder).code == 0
+    return folder
+
+
+def test_help_lists_every_format(hemislam: Call) -> None:
+    lines = [line.strip().split("  ")[0] for line in hemislam("export", "--help").out.splitlines()]
+    assert {name for line in lines for name in line.split(", ")} >= set(FORMATS)
+
+
+def test_a_map_is_exported_whole_and_thinned_in_a_box(results: Path, hemislam: Call, tmp_path: Path) -> None:
+    outcome = hemislam("export", results, "--format", "laz,pcd")
+    assert outcome.code == 0, outcome.err
+    assert str(results / "export" / "map.laz") in outcome.out and outcome.err == ""
+    whole = laspy.read(results / "export" / "map.laz")
+    assert len(whole) == json.loads((results / "report.json").read_text())["map"]["points"]
+    box = ("--thin", "0.1", "--box=-1,-1,-2,2,2,2", "--out", tmp_path)
+    assert hemislam("export", results, "--format", "laz", *box).code == 0
+    part = laspy.read(tmp_path / "map.laz").xyz
+    assert 100 < len(part) < len(whole) and (np.abs(part) <= 2.001).all() and part[:, :2].min() >= -1.001
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--format", "dwg"), "There is no format dwg"),
+        (("--format", "laz", "--box", "1,2,3"), "--box takes six numbers"),
+        (("--format", "gpx"), "run hemislam georeference first"),
+    ],
+)
+def test_what_cannot_be_exported_is_said_in_a_sentence(
+    results: Path, hemislam: Call, options: tuple[str, ...], sentence: str
+) -> None:
+    outcome = hemislam("export", results, *options)
+    assert outcome.code == 2 and sentence in outcome.err and "Traceback" not in outcome.err
+
+
+def test_results_are_not_exported_onto_themselves(results: Path, hemislam: Call, tmp_path: Path) -> None:
+    before = (results / "map.ply").read_bytes()
+    assert (
+        "choose another folder" in hemislam("export", results, "--format", "ply", "--thin", "1", "--out", results).err
+    )
+    assert (results / "map.ply").read_bytes() == before
+    assert "no map.ply" in hemislam("export", tmp_path, "--format", "ply").err
