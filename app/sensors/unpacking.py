@@ -35,7 +35,8 @@ def unpack_zstd(data: bytes, size: int = LIMIT) -> bytes:
 
 
 def unpack_lz4(data: bytes, size: int = LIMIT) -> bytes:
-    """At most `size` bytes. Raises TooLarge, or lz4's error."""
+    """At most `size` bytes, and never more than `LIMIT`. Raises TooLarge, or lz4's error."""
+    size = min(size, LIMIT)
     decompressor: Any = lz4.frame.LZ4FrameDecompressor
     return _checked(decompressor().decompress(data, max_length=size + 1), size)
 

@@ -48,6 +48,8 @@ def test_so_is_one_of_another_compression() -> None:
     with pytest.raises(TooLarge):
         unpack_lz4(lz4_bomb(300))
     with pytest.raises(TooLarge):
+        unpack_lz4(lz4_bomb(300), 300 << 20)  # as large as its chunk says, and still too large
+    with pytest.raises(TooLarge):
         unpack_bz2(bz2_bomb(260))
 
 
