@@ -149,6 +149,11 @@ class Controller:
                     raise HemislamError("Loops are not looked for; set loops.enabled and restart.")
                 self._loops.handle(command, loops)
 
+    def relabel(self) -> None:
+        """Label the frame anew if its parameters were changed: the page is then sent both at once, and draws once."""
+        if self._opening is None:
+            self._player.relabel()
+
     def _set_params(self, params: Params) -> None:
         changed = self._params.changed(params)
         self._params = params

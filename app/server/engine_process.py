@@ -101,6 +101,7 @@ def run_loop(
         while True:
             for command in commands:
                 controller.handle(command)
+            controller.relabel()
             commands = updates.exchange(0.0 if commands else controller.work())  # the page first hears what takes long
     except LinkClosed:
         controller.close()

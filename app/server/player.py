@@ -170,7 +170,7 @@ class Player:
         if session is None:
             return None
         if self.relabelling:
-            self._relabel(session)
+            self.relabel()
             return 0.0
         if target is None and not self._page.transport.playing:
             return None
@@ -286,11 +286,13 @@ class Player:
             fraction = (frame - target.origin) / (target.frame - target.origin)
             self._page.put(progress=Progress(f"Going to frame {target.frame}", fraction))
 
-    def _relabel(self, session: Session) -> None:
+    def relabel(self) -> None:
+        """Segment the ground of the frame shown again, if that is called for."""
+        session, result, due = self.session, self._page.result, self.relabelling
         self.relabelling = False
-        if self._page.result is None:
+        if not due or session is None or result is None:
             return
         try:
-            self._page.relabelled(session.engine.relabel(self._page.result))
+            self._page.relabelled(session.engine.relabel(result))
         except Exception as error:
             self.fail("The ground of this frame could not be segmented again", error)

@@ -156,9 +156,9 @@ class Workbench:
         view = self._study.seen(self._loops.seen(self._appearance.view))
         self._compare.draw(current, view)
         view = self._compare.seen(view)
+        self._draw_scene(current, view)
         self._parameters.draw(self._sides.tuned(current))
         self._loops.draw(current, view)
-        self._draw_scene(current, view)
         self._study.draw(current, view)
         for panel in self._panels:
             panel.draw(current)
