@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO, Final
 
 import numpy as np
+import numpy.typing as npt
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -23,7 +24,7 @@ ENCODINGS: Final = {"cdr": "ros2msg", "ros1": "ros1msg"}
 Vector = tuple[float, float, float]
 
 _ROS2 = get_typestore(Stores.ROS2_HUMBLE)
-_DATATYPES = {"<f4": 7, "<f8": 8, "<u2": 4, "|u1": 2, "<i8": 9}
+_DATATYPES = {"<u4": 6, "<f4": 7, "<f8": 8, "<u2": 4, "|u1": 2, "<i8": 9}
 
 
 class Deserialiser:
@@ -85,10 +86,15 @@ def cloud_message(scan: Scan, *, exact: bool = False, stamp_ns: int | None = Non
         points["ground"] = scan.truth_ground
     stamps = scan.stamp_ns + scan.offsets_ns.astype(np.int64)
     points["timestamp"] = stamps if exact else stamps * 1e-9
-    columns: dict[str, Any] = dict(point.fields or {})
+    return points_message(points, scan.end_ns if stamp_ns is None else stamp_ns, frame)
+
+
+def points_message(points: npt.NDArray[Any], stamp_ns: int, frame: str) -> Any:
+    """A PointCloud2 of a structured array (n,)."""
+    columns: dict[str, Any] = dict(points.dtype.fields or {})
     return new(
         CLOUD,
-        header=header(scan.end_ns if stamp_ns is None else stamp_ns, frame),
+        header=header(stamp_ns, frame),
         height=1,
         width=len(points),
         fields=[

@@ -15,6 +15,7 @@ from app.sensors.live.capture import SUFFIXES as CAPTURES
 from app.sensors.live.capture import CaptureStream
 from app.sensors.live.pcap import CaptureError
 from app.sensors.mcap_stream import McapStream
+from app.sensors.ouster import OusterStream, metadata_beside
 from app.sensors.ros import Deserialiser
 from app.sensors.unpacking import limit_rosbags
 from app.slam.errors import HemislamError, printable
@@ -28,7 +29,7 @@ _REPAIR = {
     **dict.fromkeys(CAPTURES, "`tcpdump -r {path} -w repaired.pcap` saves what is whole"),
     "": "`ros2 bag reindex {path}` may repair it",
 }
-_KINDS = "a ROS 1 .bag, a ROS 2 folder, an .mcap, a .db3, or a .pcap of an RS-Bpearl, an Airy or a Mid-360"
+_KINDS = "a ROS 1 .bag, a ROS 2 folder, an .mcap, a .db3, or a .pcap of an RS-Bpearl, an Airy, a Mid-360 or an Ouster"
 _FOREVER = 2**63 - 1
 
 
@@ -209,15 +210,17 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
     return reader, ()
 
 
-def _open_capture(path: Path) -> CaptureStream:
+def _open_capture(path: Path) -> CaptureStream | OusterStream:
+    metadata = metadata_beside(path)
     try:
-        stream = CaptureStream(path)
+        stream = CaptureStream(path) if metadata is None else OusterStream(path, metadata)
     except CaptureError as error:
         raise HemislamError(f"{path} is no capture of a network ({error}); {_KINDS} can be read.") from None
     if not stream.counts:
         raise HemislamError(
             f"{path} holds no packets of an RS-Bpearl, an Airy or a Mid-360 and no imu-udp datagrams; capture their "
-            "UDP ports, usually 6699 and 7788, or 56301 and 56401."
+            "UDP ports, usually 6699 and 7788, or 56301 and 56401. Those of an Ouster need its metadata beside them, "
+            f"as {path.stem}.json."
         )
     return stream
 
@@ -260,6 +263,9 @@ def _recording_files(path: Path) -> list[Path]:
             raise HemislamError(f"There is no recording {path}; check the path.")
         if path.is_dir():
             return _folder_files(path)
+        if path.suffix.lower() == ".osf":
+            pcap = path.with_suffix(".pcap")
+            raise HemislamError(f"{path} is read by Ouster's own tool only; `ouster-cli source {path} save {pcap}`.")
         if path.suffix.lower() not in SUFFIXES:
             raise HemislamError(f"{path} is no recording by its name; what can be read is {_KINDS}.")
         if path.stat().st_size == 0:

@@ -1,0 +1,273 @@
+"""A capture of an Ouster's packets, with its metadata (.json) beside it, as a recording. Little-endian throughout.
+
+Source: Ouster's sensor documentation, "Lidar data packet format" and "Coordinate frames". Points are in the LiDAR's own
+frame, as the ROS driver's `os_lidar`; topics and units are that driver's.
+"""
+
+import bisect
+import json
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app.sensors import ros
+from app.sensors.findings import Finding
+from app.sensors.imu_units import STANDARD_GRAVITY
+from app.sensors.live.pcap import Capture, CapturePlace
+from app.slam import lie
+from app.slam.errors import HemislamError
+from app.slam.types import F64, I64, U8
+
+LIDAR_TOPIC, IMU_TOPIC = "/ouster/points", "/ouster/imu"
+_IMU = np.dtype([("system", "<u8"), ("accel_ns", "<u8"), ("gyro_ns", "<u8"), ("accel", "<f4", 3), ("gyro", "<f4", 3)])
+"""The legacy IMU packet: g and deg/s."""
+_POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "t", "reflectivity", "ring"],
+        "formats": ["<f4", "<f4", "<f4", "<u4", "<u2", "<u2"],
+        "offsets": [0, 4, 8, 12, 16, 18],
+        "itemsize": 20,
+    }
+)
+_RUN_IN = 2
+"""Reading begins where this many scans earlier was complete."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Return:
+    """Where a pixel holds a return: layout, bits and unit (mm) of its range; place of its reflectivity."""
+
+    at: int
+    layout: str
+    bits: int
+    unit_mm: int
+    reflectivity_at: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Profile:
+    """A format of packets: bytes around its columns, of a column's header and end, and of a pixel; its returns."""
+
+    header: int
+    column_header: int
+    column_end: int
+    footer: int
+    pixel: int
+    returns: tuple[_Return, ...]
+
+
+_PROFILES = {
+    "LEGACY": _Profile(0, 16, 4, 0, 12, (_Return(0, "<u4", 0xFFFFF, 1, 4),)),
+    "RNG19_RFL8_SIG16_NIR16": _Profile(32, 12, 0, 32, 12, (_Return(0, "<u4", 0x7FFFF, 1, 4),)),
+    "RNG19_RFL8_SIG16_NIR16_DUAL": _Profile(
+        32, 12, 0, 32, 16, (_Return(0, "<u4", 0x7FFFF, 1, 3), _Return(4, "<u4", 0x7FFFF, 1, 7))
+    ),
+    "RNG15_RFL8_NIR8": _Profile(32, 12, 0, 32, 4, (_Return(0, "<u2", 0x7FFF, 8, 2),)),
+}
+"""By the name in the metadata."""
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What an Ouster states of itself.
+
+    Attributes:
+        name: of the product. profile: of its packets. columns: of a packet. width: columns of a turn.
+        elevations, azimuths: (rows,) rad of each beam. origin_mm: of the beams, from the axis.
+        T_imu_lidar: (4, 4), m.
+    """
+
+    name: str
+    profile: _Profile
+    columns: int
+    width: int
+    elevations: F64
+    azimuths: F64
+    origin_mm: float
+    T_imu_lidar: F64
+
+    @classmethod
+    def read(cls, path: Path) -> "Metadata | None":
+        """None if the file is no metadata of an Ouster. Raises HemislamError: its packets cannot be read."""
+        try:
+            said = json.loads(path.read_text(encoding="utf-8"))
+            flat = dict(said)
+            for part in said.values():  # later firmware puts them into groups
+                flat |= part if isinstance(part, dict) else {}
+            profile = str(flat.get("udp_profile_lidar", "LEGACY"))
+            T_lidar, T_imu = (
+                np.array(flat[f"{name}_to_sensor_transform"], np.float64).reshape(4, 4) for name in ("lidar", "imu")
+            )
+            T_imu_lidar = lie.inverse(T_imu) @ T_lidar
+            T_imu_lidar[:3, 3] /= 1000.0
+            elevations, azimuths = (
+                np.radians(np.array(flat[f"beam_{name}_angles"], np.float64)) for name in ("altitude", "azimuth")
+            )
+            found = cls(
+                str(flat.get("prod_line", "Ouster")), _PROFILES.get(profile, _PROFILES["LEGACY"]),
+                int(flat["columns_per_packet"]), int(flat["columns_per_frame"]), elevations, azimuths,
+                float(flat["lidar_origin_to_beam_origin_mm"]), T_imu_lidar,
+            )  # fmt: skip
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return None
+        if profile not in _PROFILES or found.elevations.shape != found.azimuths.shape or found.elevations.ndim != 1:
+            raise HemislamError(
+                f"The packets of {path.name} are of a kind that is not read ({profile}); set the sensor to one of "
+                f"{', '.join(_PROFILES)}, or record its ROS topics."
+            )
+        return found
+
+    @property
+    def column_bytes(self) -> int:
+        profile = self.profile
+        return profile.column_header + len(self.elevations) * profile.pixel + profile.column_end
+
+    @property
+    def packet_bytes(self) -> int:
+        return self.profile.header + self.columns * self.column_bytes + self.profile.footer
+
+    @cached_property
+    def rays(self) -> tuple[F64, F64]:
+        """(width, rows, 3) directions and (width, 1, 3) origins in mm: a point lies on its ray at range - origin."""
+        head = 2 * np.pi * (1.0 - np.arange(self.width) / self.width)[:, None]
+        along, level = head - self.azimuths, np.cos(self.elevations)
+        up = np.broadcast_to(np.sin(self.elevations), along.shape)
+        origins = np.stack([np.cos(head), np.sin(head), np.zeros_like(head)], axis=2) * self.origin_mm
+        return np.stack([level * np.cos(along), level * np.sin(along), up], axis=2), origins
+
+
+def metadata_beside(capture: Path) -> Metadata | None:
+    """That of the .json that has the capture's name, or NAME_0; or the longest name that the capture's begins with."""
+    named = (capture.stem, f"{capture.stem}_0")
+    beside = [
+        path for path in capture.parent.glob("*.json") if path.stem in named or capture.stem.startswith(path.stem)
+    ]
+    found = (Metadata.read(path) for path in sorted(beside, key=lambda path: -len(path.stem)))
+    return next((one for one in found if one is not None), None)
+
+
+class OusterStream:
+    """Topics and messages of such a capture; see `app.sensors.source.Stream`.
+
+    Attributes:
+        complete: whether the file has its end. findings: what the packets are, and what was lost of them.
+    """
+
+    by_log_time = True
+
+    def __init__(self, path: Path, metadata: Metadata) -> None:
+        """Raises CaptureError: the file is no capture."""
+        self._capture, self._metadata = Capture(path), metadata
+        self._complete_at: list[tuple[int, CapturePlace]] = []
+        logged, samples, missing = array("q"), 0, 0
+        for log_ns, place, content in self._read(None):
+            logged.append(log_ns)
+            if isinstance(content, list):
+                self._complete_at.append((log_ns, place))
+                missing += max(metadata.width // metadata.columns - len(content), 0)
+            else:
+                samples += 1
+        self.start_ns, self.end_ns = (logged[0], logged[-1]) if logged else (0, 0)
+        scans = len(self._complete_at)
+        topics = ((LIDAR_TOPIC, ros.CLOUD, scans), (IMU_TOPIC, ros.IMU, samples))
+        self.counts = {topic: (kind, count) for topic, kind, count in topics if count}
+        self.complete = self._capture.complete
+        end = "" if self.complete else "; the file is cut off there"
+        text = f"{scans} scans, {samples} IMU samples, {missing} packets missing{end}"
+        rows = f"{metadata.name}, {len(metadata.elevations)} x {metadata.width}, by the .json beside the file"
+        self.findings = (
+            Finding("packets", "corrected" if missing or not self.complete else "fine", text),
+            Finding("sensor", "fine", rows),
+        )
+
+    def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
+        """(topic, log time ns, message) of what was logged within [start, stop), by log time."""
+        number = bisect.bisect_left(self._complete_at, start_ns, key=lambda row: row[0]) - _RUN_IN
+        for log_ns, _, content in self._read(self._complete_at[number][1] if number >= 0 else None):
+            if log_ns >= stop_ns:
+                return
+            if log_ns < start_ns:
+                continue
+            if isinstance(content, list):
+                if LIDAR_TOPIC in topics:
+                    yield LIDAR_TOPIC, log_ns, self._cloud(content)
+            elif IMU_TOPIC in topics:
+                yield IMU_TOPIC, log_ns, _imu_message(content)
+
+    def close(self) -> None:
+        """Nothing stays open between two readings."""
+
+    def _read(self, place: CapturePlace | None) -> Iterator[tuple[int, CapturePlace, bytes | list[bytes]]]:
+        """Log time, place in the file, and an IMU packet or all packets of a scan."""
+        waiting: list[bytes] = []
+        frame, running_ns, at = None, 0, place or CapturePlace(0)
+        for datagram in self._capture.datagrams(place):
+            running_ns, at, payload = max(running_ns, datagram.time_ns), datagram.place, datagram.payload
+            if len(payload) == _IMU.itemsize:
+                yield running_ns, at, payload
+            elif len(payload) == self._metadata.packet_bytes:
+                number = self._frame_of(payload)
+                if waiting and number != frame:
+                    yield running_ns, at, waiting
+                    waiting = []
+                frame = number
+                waiting.append(payload)
+        if waiting:
+            yield running_ns, at, waiting
+
+    def _frame_of(self, packet: bytes) -> int:
+        at = 2 if self._metadata.profile.header else 10
+        return int.from_bytes(packet[at : at + 2], "little")
+
+    def _cloud(self, packets: list[bytes]) -> Any:
+        """The message of a scan, stamped at its first column."""
+        meta, profile = self._metadata, self._metadata.profile
+        whole = np.frombuffer(b"".join(packets), np.uint8).reshape(len(packets), meta.packet_bytes)
+        columns = whole[:, profile.header : profile.header + meta.columns * meta.column_bytes]
+        columns = np.ascontiguousarray(columns).reshape(-1, meta.column_bytes)
+        times = _column(columns, 0, "<u8").astype(np.int64)
+        place = _column(columns, 8, "<u2").astype(np.int64)
+        status = _column(columns, meta.column_bytes - 4, "<u4") if profile.column_end else _column(columns, 10, "<u2")
+        fits = ((status & 1) == 1) & (place < meta.width) & (times > 0)
+        columns, times, place = columns[fits], times[fits], place[fits]
+        if not len(times):
+            return ros.points_message(np.empty(0, _POINT), 0, "os_lidar")
+        parts = [self._points(columns, times, place, one) for one in profile.returns]
+        return ros.points_message(np.concatenate(parts), int(times.min()), "os_lidar")
+
+    def _points(self, columns: U8, times: I64, place: I64, of: _Return) -> Any:
+        """(n,) points of one return."""
+        meta, profile = self._metadata, self._metadata.profile
+        rows = len(meta.elevations)
+        pixels = columns[:, profile.column_header : profile.column_header + rows * profile.pixel]
+        pixels = np.ascontiguousarray(pixels).reshape(-1, profile.pixel)
+        ranges = (_column(pixels, of.at, of.layout) & of.bits).astype(np.float64).reshape(-1, rows) * of.unit_mm
+        column, row = np.nonzero(ranges)
+        directions, origins = meta.rays
+        where = place[column]
+        xyz = directions[where, row] * (ranges[column, row] - meta.origin_mm)[:, None] + origins[where, 0]
+        points = np.zeros(len(row), _POINT)
+        points["x"], points["y"], points["z"] = (xyz * 0.001).T
+        points["t"] = np.minimum(times[column] - times.min(), np.iinfo(np.uint32).max)
+        points["reflectivity"] = pixels[:, of.reflectivity_at].reshape(-1, rows)[column, row]
+        points["ring"] = row
+        return points
+
+
+def _column(rows: U8, at: int, layout: str) -> Any:
+    """(n,) numbers at an offset of rows (n, bytes)."""
+    size = np.dtype(layout).itemsize
+    return np.ascontiguousarray(rows[:, at : at + size]).view(layout)[:, 0]
+
+
+def _imu_message(packet: bytes) -> Any:
+    (sample,) = np.frombuffer(packet, _IMU)
+    with np.errstate(invalid="ignore"):
+        gyro, accel = np.radians(sample["gyro"].astype(np.float64)), sample["accel"].astype(np.float64)
+    stamp_ns = min(int(sample["gyro_ns"]), 1 << 62)
+    return ros.imu_message(stamp_ns, tuple(gyro.tolist()), tuple((accel * STANDARD_GRAVITY).tolist()))

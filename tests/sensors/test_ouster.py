@@ -1,0 +1,142 @@
+"""An Ouster's packets, decoded as Ouster's own library decodes them.
+
+`ouster_sdk.json` holds what ouster-sdk 1.0.1 gives for the captures in ../shared/data/sensors/ouster: of each scan and
+return the number of points, their sum and every fortieth of them (index, x, y, z in the sensor's frame, time,
+reflectivity, row), and all IMU samples (time, rad/s, m/s²).
+"""
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.sensors.cloud_types import read_point_cloud_2
+from app.sensors.doctor import examine
+from app.sensors.ouster import IMU_TOPIC, LIDAR_TOPIC, OusterStream, metadata_beside
+from app.sensors.presets import resolve_params
+from app.sensors.recording import open_recording
+from app.sensors.ros import stamp_ns
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import Measurement
+from tests.sensors.live import captures
+
+SDK: dict[str, Any] = json.loads(Path(__file__).with_name("ouster_sdk.json").read_text())
+
+
+@pytest.mark.parametrize("name", SDK)
+def test_every_point_and_sample_is_that_of_ousters_library(name: str, shared_data: Path) -> None:
+    path = shared_data / "sensors" / "ouster" / f"{name}.pcap"
+    metadata = metadata_beside(path)
+    assert metadata is not None
+    stream, wanted = OusterStream(path, metadata), SDK[name]
+    messages = list(stream.messages((LIDAR_TOPIC, IMU_TOPIC), 0, 2**62))
+    T = np.array(wanted["lidar_to_sensor"]).reshape(4, 4) * [[1, 1, 1, 0.001]] * 1.0
+    returns = iter(wanted["returns"])
+    for _, _, message in (one for one in messages if one[0] == LIDAR_TOPIC):
+        cloud, begin = read_point_cloud_2(message), stamp_ns(message.header.stamp)
+        points, at = cloud.xyz().astype(np.float64) @ T[:3, :3].T + T[:3, 3], 0
+        while at < len(points):
+            part = next(returns)
+            mine = points[at : at + part["points"]]
+            np.testing.assert_allclose(mine.sum(axis=0), part["sum"], atol=0.5)  # of 100,000 roundings to float32
+            for index, x, y, z, time_ns, reflectivity, row in part["picked"]:
+                np.testing.assert_allclose(mine[index], (x, y, z), atol=2e-5)
+                assert begin + int(cloud.column("t")[at + index]) == time_ns
+                assert cloud.column("reflectivity")[at + index] == reflectivity
+                assert cloud.column("ring")[at + index] == row
+            at += part["points"]
+        assert at == len(points)
+    assert next(returns, None) is None
+    samples = [message for topic, _, message in messages if topic == IMU_TOPIC]
+    assert len(samples) == len(wanted["imu"])
+    for sample, (time_ns, *values) in zip(samples, wanted["imu"], strict=True):
+        assert stamp_ns(sample.header.stamp) == time_ns
+        w, a = sample.angular_velocity, sample.linear_acceleration
+        np.testing.assert_allclose([w.x, w.y, w.z, a.x, a.y, a.z], values, atol=1e-5)
+
+
+def test_a_real_capture_is_recognised_and_gives_scans(shared_data: Path) -> None:
+    path = shared_data / "sensors" / "ouster" / "OS-1-128_v2.3.0_1024x10_lb_n3.pcap"
+    findings = examine(path, Params())
+    assert any("--preset ouster" in finding.option for finding in findings)
+    with open_recording(path, resolve_params(path, "ouster", None, [])) as recording:
+        found = [one for one in recording.measurements() if isinstance(one, Measurement)]
+    assert found and all(len(one.scan) > 100_000 for one in found)
+    assert 0.09e9 < found[0].scan.offsets_ns.max() < 0.11e9
+
+
+ANGLES = [20.0, 0.0, -15.0, -22.0]
+AZIMUTHS = [3.0, -1.0, 1.0, -3.0]
+PROFILES = {"LEGACY": (0, 16, 4, 0), "RNG19_RFL8_SIG16_NIR16": (32, 12, 0, 32)}
+
+
+def made(profile: str, folder: Path, **changed: object) -> Path:
+    """A capture of four turns of 32 columns by a sensor of four beams; every range is 5 m plus a cm a row."""
+    header, column_header, end, footer = PROFILES.get(profile, PROFILES["LEGACY"])
+    entries: list[captures.Entry] = []
+    for number in range(8):
+        packet = struct.pack("<HH", 1, number // 2).ljust(header, b"\0")[:header]
+        for column in range(16):
+            place = 16 * (number % 2) + column
+            time_ns = 10**12 + number * 50_000_000 + column * 3_125_000
+            if column_header == 16:
+                packet += struct.pack("<QHHI", time_ns, place, number // 2, 0)
+            else:
+                packet += struct.pack("<QHH", time_ns, place, 1)
+            for row in range(4):
+                packet += struct.pack("<IBxHHxx", 5000 + 10 * row, 40 + row, 7, 8)
+            packet += b"\xff\xff\xff\xff"[:end]
+        entries.append((time_ns, 7502, packet + bytes(footer)))
+    identity = np.eye(4).ravel().tolist()
+    said = {
+        "prod_line": "OS-X", "beam_altitude_angles": ANGLES, "beam_azimuth_angles": AZIMUTHS,
+        "lidar_origin_to_beam_origin_mm": 20.0, "lidar_to_sensor_transform": identity,
+        "imu_to_sensor_transform": identity,
+        "lidar_data_format": {"columns_per_packet": 16, "columns_per_frame": 32, "udp_profile_lidar": profile},
+    }  # fmt: skip
+    (folder / "walk.json").write_text(json.dumps(said | changed))
+    path = folder / "walk.pcap"
+    path.write_bytes(captures.pcap(entries))
+    return path
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_pixel_is_where_the_manual_puts_it(profile: str, tmp_path: Path) -> None:
+    path = made(profile, tmp_path)
+    metadata = metadata_beside(path)
+    assert metadata is not None
+    stream = OusterStream(path, metadata)
+    messages = [message for _, _, message in stream.messages((LIDAR_TOPIC,), 0, 2**62)]
+    assert len(messages) == 4
+    cloud = read_point_cloud_2(messages[1])
+    assert len(cloud) == 32 * 4
+    for index in range(0, len(cloud), 7):
+        column, row = divmod(index, 4)
+        head = 2 * math.pi * (1 - column / 32)
+        along, up, away = head - math.radians(AZIMUTHS[row]), math.radians(ANGLES[row]), 4.98 + 0.01 * row
+        truth = (
+            away * math.cos(up) * math.cos(along) + 0.02 * math.cos(head),
+            away * math.cos(up) * math.sin(along) + 0.02 * math.sin(head),
+            away * math.sin(up),
+        )
+        np.testing.assert_allclose(cloud.xyz()[index], truth, atol=1e-5)
+        assert cloud.column("reflectivity")[index] == 40 + row
+    rest = list(stream.messages((LIDAR_TOPIC,), stream.end_ns - 60_000_000, 2**62))
+    assert [message.header.stamp for _, _, message in rest] == [message.header.stamp for message in messages[2:]]
+
+
+def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path: Path) -> None:
+    path = made("FUSA_RNG15_RFL8_NIR8_DUAL", tmp_path)
+    with pytest.raises(HemislamError, match="of a kind that is not read"):
+        open_recording(path, Params())
+    (tmp_path / "walk.json").unlink()
+    with pytest.raises(HemislamError, match=r"need its metadata beside them, as walk\.json"):
+        open_recording(path, Params())
+    (tmp_path / "walk.osf").write_bytes(b"osf")
+    with pytest.raises(HemislamError, match="ouster-cli source"):
+        open_recording(tmp_path / "walk.osf", Params())
