@@ -77,7 +77,7 @@ def evaluate(
     \b
     Writes into DIR:
       report.html      tables, trajectories, errors, times and pieces of the maps, in one file
-      report.md, *.csv the same tables
+      report.md, *.csv the same tables; tables.tex for LaTeX
       results.json     everything, with parameters, input hashes and the machine
       runs/            trajectory and times of every run
 

@@ -116,7 +116,7 @@ def _described(truth: TruePoses) -> str:
 
 
 def _path(truth: Trajectory, outcomes: Sequence[Outcome]) -> F64:
-    """The truth from above, (n, 2) m, over the time that was compared."""
+    """The truth, (n, 3) m, over the time that was compared."""
     stamps = np.concatenate([o.trajectory.stamps_ns for o in outcomes if o.accuracy and o.trajectory is not None])
     inside = (truth.stamps_ns >= stamps.min()) & (truth.stamps_ns <= stamps.max())
-    return np.asarray(truth.positions[inside, :2])
+    return np.asarray(truth.positions[inside])

@@ -32,6 +32,16 @@ _TEMPLATES = Environment(
 )
 
 
+def _tex(text: str) -> str:
+    """Text as LaTeX shows it."""
+    signs = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--"}
+    signs |= {"°": r"\textdegree{}"} | {sign: f"\\{sign}" for sign in "&%$#_{}"}
+    return "".join(signs.get(sign, sign) for sign in text)
+
+
+_TEMPLATES.filters["tex"] = _tex
+
+
 def render(template: str, **values: Any) -> str:
     """A file of the folder `templates`, filled in."""
     return _TEMPLATES.get_template(template).render(**values)
@@ -101,16 +111,76 @@ def chart(
     )
 
 
-def histogram(name: str, colour: str, values: F64, edges: F64) -> Line:
-    """The outline of a histogram, as shares in per cent."""
-    counts = np.histogram(values, edges)[0] * (100 / max(len(values), 1))
-    return Line(name, colour, np.repeat(edges, 2), np.r_[0.0, np.repeat(counts, 2), 0.0])
+@dataclass(frozen=True, slots=True)
+class Body:
+    """How values are distributed: a shape of half widths (n,) 0-1 at `values` (n,), a line from `low` to `high`, and a
+    mark at the median."""
+
+    name: str
+    colour: str
+    values: F64
+    widths: F64
+    low: float
+    high: float
+    middle: float
+
+
+def box(name: str, colour: str, values: F64) -> Body:
+    """The quartiles as a box, and a line from 5 to 95 %."""
+    low, first, middle, third, high = np.percentile(values, [5, 25, 50, 75, 95])
+    return Body(name, colour, np.array([first, third]), np.ones(2), low, high, middle)
+
+
+def violin(name: str, colour: str, values: F64) -> Body:
+    """As wide as values are frequent, on a logarithmic scale, from 0.5 to 99.5 %."""
+    low, middle, high = np.percentile(values, [0.5, 50, 99.5])
+    edges = np.geomspace(0.9 * low, 1.1 * high, 65)
+    counts = np.histogram(values, edges)[0].astype(np.float64)
+    smooth = np.convolve(counts, np.exp(-0.5 * (np.arange(-6, 7) / 2.5) ** 2), mode="same")
+    return Body(name, colour, np.sqrt(edges[1:] * edges[:-1]), smooth / max(smooth.max(), 1.0), low, high, middle)
+
+
+def bodies(groups: Sequence[tuple[str, Sequence[Body]]], x_label: str, y_label: str) -> Markup:
+    """Groups of distributions side by side over a logarithmic axis; `groups`: their names and bodies."""
+    height, right = 300, _WIDTH - _RIGHT
+    bottom = height - _BOTTOM
+    every = [body for _, group in groups for body in group]
+    low = np.log10(max(min(min(body.low, body.values.min()) for body in every), 1e-6)) - 0.05
+    high = np.log10(max(max(body.high, body.values.max()) for body in every)) + 0.05
+
+    def at_y(y: F64 | float) -> F64:
+        level = (np.log10(np.maximum(y, 1e-6)) - low) / (high - low)
+        return np.asarray(bottom - level * (bottom - _TOP)).round(1)
+
+    slot = (right - _LEFT) / (len(every) + len(groups))
+    place, drawn, labels = _LEFT + slot, [], []
+    for label, group in groups:
+        labels.append((round(place + slot * (len(group) - 1) / 2, 1), label))
+        for body in group:
+            half = 0.4 * min(slot, 60.0) * body.widths
+            xs, ys = np.r_[place - half, (place + half)[::-1]], np.r_[body.values, body.values[::-1]]
+            outline = " ".join(f"{x:.1f},{y:g}" for x, y in zip(xs, at_y(ys), strict=True))
+            marks = (float(at_y(value)) for value in (body.low, body.high, body.middle))
+            drawn.append((body, outline, round(place, 1), round(0.4 * min(slot, 60.0), 1), *marks))
+            place += slot
+        place += slot
+    ticks = [m * 10.0**k for k in range(int(np.floor(low)), int(np.ceil(high)) + 1) for m in (1, 2, 5)]
+    steps = [tick for tick in ticks if low <= np.log10(tick) <= high]
+    if len(steps) > 9:
+        steps = [tick for tick in steps if f"{tick:e}".startswith("1")]
+    return Markup(
+        render(
+            "bodies.svg", width=_WIDTH, height=height, left=_LEFT, right=right, top=_TOP, bottom=bottom, bodies=drawn,
+            y_ticks=[(float(at_y(tick)), f"{tick:g}") for tick in steps], labels=labels, x_label=x_label,
+            y_label=y_label,
+        )
+    )  # fmt: skip
 
 
 def stacked(rows: Sequence[tuple[str, Sequence[float]]], parts: Sequence[str], unit: str) -> Markup:
     """Horizontal bars, one per row, of several parts each."""
     longest = max((sum(values) for _, values in rows), default=0.0) or 1.0
-    left, scale = 110.0, 390 / longest
+    left, scale = 110.0, 350 / longest
     drawn = []
     for name, values in rows:
         ends = left + scale * np.cumsum(values)
@@ -186,12 +256,23 @@ def pictures(recording: Evaluated, colour: dict[str, str]) -> Pictures:
     there = [outcome for outcome in recording.outcomes if outcome.trajectory is not None]
     legend = [(outcome.name, colour[outcome.name]) for outcome in there]
     legend += [("truth", TRUTH)] if recording.truth_path is not None else []
-    drawn = [_from_above(recording, colour), _errors(there, colour), *_times(there, colour)]
+    drawn = [_from_above(recording, colour), _from_the_side(recording, colour), *_errors(there, colour)]
+    drawn += _times(there, colour)
     return Pictures(legend, [figure for figure in drawn if figure is not None], _maps(recording))
 
 
 def _from_above(recording: Evaluated, colour: dict[str, str]) -> Figure | None:
-    """All trajectories, in the truth's world if there is one."""
+    lines = _paths(recording, colour, 1)
+    return Figure(chart(lines, "x (m)", "y (m)", equal=True, height=420), "From above", []) if lines else None
+
+
+def _from_the_side(recording: Evaluated, colour: dict[str, str]) -> Figure | None:
+    lines = _paths(recording, colour, 2)
+    return Figure(chart(lines, "x (m)", "z (m)", height=200), "From the side, heights enlarged", []) if lines else None
+
+
+def _paths(recording: Evaluated, colour: dict[str, str], axis: int) -> list[Line]:
+    """All trajectories along x and one more axis, in the truth's world if there is one."""
     lines, path = [], recording.truth_path
     for outcome in recording.outcomes:
         places = None
@@ -200,39 +281,49 @@ def _from_above(recording: Evaluated, colour: dict[str, str]) -> Figure | None:
         elif outcome.trajectory is not None and path is None:
             places = outcome.trajectory.positions
         if places is not None:
-            lines.append(Line(outcome.name, colour[outcome.name], places[:, 0], places[:, 1]))
+            lines.append(Line(outcome.name, colour[outcome.name], places[:, 0], places[:, axis]))
     if path is not None:
-        lines.append(Line("truth", TRUTH, path[:, 0], path[:, 1], dashed=True))
-    if not lines:
-        return None
-    return Figure(chart(lines, "x (m)", "y (m)", equal=True, height=420), "From above", [])
+        lines.append(Line("truth", TRUTH, path[:, 0], path[:, axis], dashed=True))
+    return lines
 
 
-def _errors(outcomes: list[Outcome], colour: dict[str, str]) -> Figure | None:
-    lines = [
-        Line(outcome.name, colour[outcome.name], outcome.accuracy.times_s, outcome.accuracy.errors_m)
-        for outcome in outcomes
-        if outcome.accuracy
+def _errors(outcomes: list[Outcome], colour: dict[str, str]) -> list[Figure]:
+    """Position error over time and over distance, and drift over pieces of the path."""
+    known = [(outcome.name, colour[outcome.name], outcome.accuracy) for outcome in outcomes if outcome.accuracy]
+    if not known:
+        return []
+    of_time = [Line(name, shade, accuracy.times_s, accuracy.errors_m) for name, shade, accuracy in known]
+    of_way = [Line(name, shade, accuracy.walked_m, accuracy.errors_m) for name, shade, accuracy in known]
+    figures = [
+        Figure(chart(lines, label, "position error (m)", from_zero=True), f"Position error over {what}", [])
+        for lines, label, what in (
+            (of_time, "time (s)", "time, after the alignment"),
+            (of_way, "true path (m)", "distance, after the alignment"),
+        )
     ]
-    if not lines:
-        return None
-    picture = chart(lines, "time (s)", "position error (m)", from_zero=True)
-    return Figure(picture, "Position error over time, after the alignment", [])
+    pieces = sorted({metres for _, _, accuracy in known for metres in accuracy.drift})
+    groups = [
+        (f"{metres:g} m", [box(name, shade, a.drift[metres]) for name, shade, a in known if metres in a.drift])
+        for metres in pieces
+    ]
+    if groups:
+        caption = "Drift over pieces of the path: quartiles, and a line from 5 to 95 %"
+        figures.append(Figure(bodies(groups, "length of the piece", "wrong by (% of it)"), caption, []))
+    return figures
 
 
 def _times(outcomes: list[Outcome], colour: dict[str, str]) -> list[Figure]:
     timed = {o.name: o.timings_ms for o in outcomes if o.timings_ms is not None and len(o.timings_ms)}
     if not timed:
         return []
-    last = float(np.percentile(np.concatenate([times[:, -1] for times in timed.values()]), 99.5))
-    edges = np.linspace(0, last, 61)
-    lines = [histogram(name, colour[name], times[:, -1], edges) for name, times in timed.items()]
+    groups = [("", [violin(name, colour[name], times[:, -1]) for name, times in timed.items()])]
+    figures = [Figure(bodies(groups, "", "time per frame (ms)"), "Time per frame", [])]
     staged = [outcome.name for outcome in outcomes if outcome.staged and outcome.name in timed]
-    bars = [(name, timed[name][:, : len(STAGES)].mean(axis=0).tolist()) for name in staged]
-    return [
-        Figure(chart(lines, "time per frame (ms)", "frames (%)", from_zero=True), "Time per frame", []),
-        Figure(stacked(bars, STAGES, "ms"), "Mean time by stage", list(zip(STAGES, PALETTE, strict=False))),
-    ]
+    if staged:
+        bars = [(name, timed[name][:, : len(STAGES)].mean(axis=0).tolist()) for name in staged]
+        legend = list(zip(STAGES, PALETTE, strict=False))
+        figures.append(Figure(stacked(bars, STAGES, "ms"), "Mean time by stage", legend))
+    return figures
 
 
 def _maps(recording: Evaluated) -> dict[str, list[tuple[str, str]]]:

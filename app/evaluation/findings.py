@@ -17,6 +17,9 @@ MOST_NAMED = 4
 CHANCE = 2.0
 """A mean difference of fewer standard errors than this, over the recordings, may be chance."""
 
+MANY = 10
+"""From so many times on, a difference is not told in per cent."""
+
 _SAME = "stays the same"
 _CLAIMS = (
     ("FAST-LIO-GD", "FAST-LIO", "downsampling the ground"),
@@ -192,5 +195,7 @@ def _compare(ours: float, theirs: float, like: float) -> tuple[str, bool]:
     """In words, and whether it got worse."""
     if abs(ours - theirs) <= like * max(abs(theirs), 1e-9):
         return _SAME, False
+    if ours > MANY * theirs > 0:
+        return f"is {ours / theirs:.0f} times as large", True
     change = 100 * abs(ours - theirs) / theirs
     return (f"falls by {change:.0f} %", False) if ours < theirs else (f"rises by {change:.0f} %", True)

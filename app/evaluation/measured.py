@@ -11,13 +11,15 @@ from app.evaluation.job import Job, finished
 from app.evaluation.truth import TruePoses
 from app.evaluation.truth_match import Matched, match
 from app.slam.errors import HemislamError
-from app.slam.metrics import GroundScore, ate, compare, paired
+from app.slam.metrics import GroundScore, ate, compare, drift, paired, walked_m
 from app.slam.report import spread
 from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import F64, TIMINGS, U16
 
 START_S = 5.0
 """The start: rest and the first steps. A slip there moves all later poses against the few of the start."""
+PIECES_M = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 400.0, 800.0)
+"""Lengths of path over which drift is measured; KITTI's begin at 100 m, since cars go farther."""
 BUDGETS_MS = (50.0, 100.0)
 """Time for a frame at 20 Hz and at 10 Hz."""
 
@@ -29,14 +31,17 @@ class Accuracy:
     Attributes:
         errors: what `compare` found, ratios of the RMSE to the length of the true path, and `ate_after_start_m`: the
             RMSE of the positions after START_S, aligned without those before; None if there are too few.
-        times_s, errors_m: (n,) position error of each pose after the alignment.
+        times_s, errors_m: (n,) position error of each pose after the alignment. walked_m: (n,) of true path until it.
         aligned: (n, 3) the estimate in the truth's world.
+        drift: by length of a piece of path, m: per cent of it by which each piece is wrong.
     """
 
     errors: dict[str, Any]
     times_s: F64
     errors_m: F64
+    walked_m: F64
     aligned: F64
+    drift: dict[float, F64] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,7 @@ class Evaluated:
 
     Attributes:
         truth: what it is, in words; "" without one. notes: what was assumed about it.
-        truth_path: (n, 2) m from above, of the poses that were compared.
+        truth_path: (n, 3) m, of the poses that were compared.
     """
 
     name: str
@@ -183,7 +188,9 @@ def _accuracy(estimate: Trajectory, matched: Matched) -> Accuracy:
         errors=errors | ratios(errors) | {"ate_after_start_m": _later(estimate, truth)},
         times_s=(ours.stamps_ns - estimate.stamps_ns[0]) * 1e-9,
         errors_m=np.linalg.norm(aligned - theirs.positions, axis=1),
+        walked_m=walked_m(theirs),
         aligned=aligned,
+        drift={metres: found for metres in PIECES_M if len(found := drift(estimate, truth, metres))},
     )
 
 

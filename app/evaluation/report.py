@@ -1,4 +1,4 @@
-"""Write what was measured: report.html, report.md, results.json and the CSV tables."""
+"""Write what was measured: report.html, report.md, results.json, and the tables as CSV and LaTeX."""
 
 import csv
 import io
@@ -43,6 +43,7 @@ def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
     texts = {
         "report.html": render("report.html", **shown),
         "report.md": render("report.md", **shown),
+        "tables.tex": render("tables.tex", **shown),
         "results.json": json.dumps(results, indent=2, ensure_ascii=False) + "\n",
         **{f"{name}.csv": _csv(rows) for name, rows in _flat(results).items()},
     }

@@ -69,7 +69,7 @@ def baseline_variant(name: str) -> Variant:
         HemislamError: there is none of this name, or it is not installed.
     """
     system = find_system(name)
-    return Variant(system.title, {}, f"{system.meaning} {system.version()}".strip(), baseline=name)
+    return Variant(system.title, {}, ", version ".join(filter(None, (system.meaning, system.version()))), baseline=name)
 
 
 def choose_variants(own: list[Variant], *, ablation: bool, baselines: Sequence[str] = ()) -> list[Variant]:

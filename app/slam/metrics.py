@@ -197,6 +197,31 @@ def rpe(estimate: Trajectory, truth: Trajectory, *, frames: int = 1, metres: flo
     )
 
 
+def drift(estimate: Trajectory, truth: Trajectory, metres: float, every: int = 10) -> F64:
+    """(n,) per cent of the true path by which the motion over `metres` of it is wrong, as KITTI's (Geiger et al. 2012).
+
+    Every `every`-th pose begins a piece, so pieces overlap. Empty if the path is too short.
+
+    Raises:
+        HemislamError: fewer than 3 stamps of the estimate have a truth.
+    """
+    ours, theirs = paired(estimate, truth)
+    walked = walked_m(theirs)
+    i = np.arange(0, len(theirs), every)
+    j = np.searchsorted(walked, walked[i] + metres)
+    i, j = i[j < len(theirs)], j[j < len(theirs)]
+    if not len(i):
+        return np.zeros(0)
+    wrong = _motion(ours, i, j)[1] - _motion(theirs, i, j)[1]
+    return np.asarray(100 * np.linalg.norm(wrong, axis=1) / metres)
+
+
+def walked_m(trajectory: Trajectory) -> F64:
+    """(n,) m of path up to each pose."""
+    steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
 def compare(estimate: Trajectory, truth: Trajectory, *, rotations: bool = True) -> dict[str, Any]:
     """ATE, and RPE over each of RPE_OVER, as a tree for JSON. Lengths in m, angles in degrees.
 

@@ -16,8 +16,8 @@ from app.slam import lie
 from app.slam.types import F64, ImuSamples, Measurement, Scan
 from tests.slam.scenes import Rig, Walk, furnished_room, measurements, mounted, params_for, pose_error, seconds_of
 
-RIG = Rig(columns=180, T_imu_lidar=mounted((0, 0, 0), (0.0175, 0.0276, -0.1083)), range_noise=0.005)
-FRAMES = 60
+RIG = Rig(columns=120, T_imu_lidar=mounted((0, 0, 0), (0.0175, 0.0276, -0.1083)), range_noise=0.005)
+FRAMES = 50
 
 
 @cache

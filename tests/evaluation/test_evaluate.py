@@ -30,6 +30,7 @@ REPORT_FILES = (
     "report.html",
     "report.md",
     "results.json",
+    "tables.tex",
     "accuracy.csv",
     "runtime.csv",
     "map_sharpness.csv",

@@ -13,7 +13,7 @@ from app.slam.types import TIMINGS
 
 def column(name: str, ate_m: float, cpu_ms: float) -> Outcome:
     none, error = np.zeros(0), {"rmse": ate_m, "mean": ate_m, "max": ate_m}
-    accuracy = Accuracy({"ate_m": error, "ate_after_start_m": ate_m}, none, none, np.zeros((0, 3)))
+    accuracy = Accuracy({"ate_m": error, "ate_after_start_m": ate_m}, none, none, none, np.zeros((0, 3)))
     run = {"peak_memory_mb": 100.0, "threads": 1, "load": 0.5, "ground": None}
     times = np.full((10, len(TIMINGS)), cpu_ms)
     return Outcome(name, run=run, timings_ms=times, cpu_ms=times[:, 0], accuracy=accuracy)
@@ -34,7 +34,7 @@ def said(where: str, ours: list[float], theirs: list[float], cpu: tuple[float, f
 
 
 def about(texts: list[str], what: str) -> str:
-    (text,) = [text for text in texts if re.search(rf"the mean {re.escape(what)} (falls|rises|stays)", text)]
+    (text,) = [text for text in texts if re.search(rf"the mean {re.escape(what)} (falls|rises|stays|is)", text)]
     return text
 
 
@@ -44,6 +44,7 @@ def about(texts: list[str], what: str) -> str:
         (1.0, 2.0, "falls by 50 %, 0.002 to 0.001 m", False),
         (3.0, 2.0, "rises by 50 %, 0.002 to 0.003 m", True),
         (2.01, 2.0, "stays the same", False),
+        (50.0, 2.0, "is 25 times as large, 0.002 to 0.05 m", True),
     ],
 )
 def test_an_error_that_falls_and_one_that_rises_are_told_apart(

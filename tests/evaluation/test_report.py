@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.evaluation.figures import Line, chart
+from app.evaluation.figures import Line, bodies, box, chart, violin
 from app.evaluation.measured import Accuracy, Evaluated, Outcome, ratios
 from app.evaluation.report import write_report
 from app.evaluation.tables import _row
+from app.slam.trajectory import Trajectory
 from app.slam.types import TIMINGS
 
 LENGTH_M = 200.0
@@ -41,12 +42,21 @@ def column(name: str, size: float, *, bent: bool = True) -> Outcome:
         "distance_m": LENGTH_M,
         "ate_after_start_m": size,
     }
-    accuracy = Accuracy(errors | ratios(errors), times_s=np.arange(2.0), errors_m=np.ones(2), aligned=np.zeros((2, 3)))
+    accuracy = Accuracy(
+        errors | ratios(errors),
+        times_s=np.arange(2.0),
+        errors_m=np.ones(2),
+        walked_m=np.arange(2.0),
+        aligned=np.zeros((2, 3)),
+        drift={5.0: np.array([0.5, 1.0, 2.0])},
+    )
     run = {
         "peak_memory_mb": 100.0, "threads": 1, "load": 0.5, "ground": None, "parameters": {},
         "map_sharpness": dict.fromkeys(("entropy", "thickness", "revisit_median", "revisit_p95")),
     }  # fmt: skip
-    return Outcome(name, run=run, timings_ms=np.ones((2, len(TIMINGS))), cpu_ms=np.ones(2), accuracy=accuracy)
+    there = Trajectory(np.arange(2), np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
+    times = np.ones((2, len(TIMINGS)))
+    return Outcome(name, run=run, trajectory=there, timings_ms=times, cpu_ms=np.ones(2), accuracy=accuracy)
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +120,47 @@ def test_the_same_ratios_are_in_the_files_for_machines(folder: Path) -> None:
         line = list(csv.DictReader(file))[1]
     assert float(line["rpe.10 m.deg.max"]) == pytest.approx(1.5)
     assert float(line["rpe_ratio_deg_per_m.10 m"]) == pytest.approx(0.5 / LENGTH_M)
+
+
+def test_the_tables_are_latex_too(folder: Path) -> None:
+    text = (folder / "tables.tex").read_text()
+    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") >= 4
+    assert r"walk & ATE, RMSE (m) & 0.2000 & \textbf{0.1000} & 0.4000 \\" in text
+    assert r"under 50 ms (\%)" in text and "°" not in text
+    (columns,) = {line.count("&") for line in text.splitlines() if line.startswith("walk & ATE")}
+    assert columns == 4
+
+
+def test_errors_stand_over_time_over_distance_and_over_pieces_of_the_path(folder: Path) -> None:
+    page = html.unescape((folder / "report.html").read_text())
+    for text in (
+        "From the side",
+        "over time",
+        "over distance",
+        "Drift over pieces",
+        "true path (m)",
+        "wrong by (% of it)",
+    ):
+        assert text in page
+    assert "<title>Ours: 1 in the median</title>" in page
+
+
+def heights(svg: str) -> list[float]:
+    """y of the corners of the only polygon."""
+    (points,) = re.findall(r'<polygon points="([^"]*)"', svg)
+    return [float(point.split(",")[1]) for point in points.split()]
+
+
+def test_a_box_reaches_from_quartile_to_quartile_and_a_violin_is_widest_where_most_values_are() -> None:
+    values = np.geomspace(1.0, 100.0, 1001)
+    corners = heights(bodies([("all", [box("a", "red", values)])], "", ""))
+    whole = heights(bodies([("all", [violin("a", "red", values)])], "", ""))
+    share = (max(corners) - min(corners)) / (max(whole) - min(whole))
+    assert share == pytest.approx(0.5, abs=0.06)  # the values spread evenly over the logarithmic axis
+    twice = np.r_[np.full(50, 10.0), np.geomspace(5.0, 50.0, 50)]
+    body = violin("a", "red", twice)
+    assert body.values[np.argmax(body.widths)] == pytest.approx(10.0, rel=0.1)
+    assert bodies([("all", [violin("a", "red", np.full(5, 3.0))])], "", "").count("<polygon") == 1
 
 
 def test_it_is_said_that_cpu_time_is_of_whole_frames(folder: Path) -> None:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from app.slam.errors import HemislamError
-from app.slam.metrics import GroundScore, ate, interpolate, rpe
+from app.slam.metrics import GroundScore, ate, drift, interpolate, rpe
 from app.slam.trajectory import Trajectory, read_tum, write_tum
 
 EXACT = 1e-9
@@ -291,6 +291,18 @@ def test_without_any_error_a_straight_line_does_not_fix_the_rotation_either() ->
 def test_a_short_path_has_no_error_over_many_metres() -> None:
     truth = walk(1, poses=5)
     assert rpe(truth, truth, metres=100.0) is None
+
+
+def test_a_walk_whose_scale_is_wrong_drifts_by_that_share() -> None:
+    stamps = np.arange(500, dtype=np.int64) * 100_000_000
+    along = np.arange(500) * 0.1
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (500, 1))
+    straight = Trajectory(stamps, np.column_stack([along, 0 * along, 0 * along]), still)
+    longer = Trajectory(stamps, 1.02 * straight.positions, still)
+    np.testing.assert_allclose(drift(longer, straight, 10.0), 2.0, rtol=0.02)
+    assert len(drift(longer, straight, 10.0)) == 40  # every tenth pose from which 10 m are left
+    np.testing.assert_allclose(drift(straight, straight, 10.0), 0.0, atol=1e-9)
+    assert not len(drift(longer, straight, 100.0))
 
 
 def test_ground_scores_count_seeds_as_ground_and_add_up() -> None:
