@@ -78,11 +78,13 @@ def export(
 def _export_session(source: Path, out: Path | None, exports: "tuple[Export, ...]", choice: "Choice") -> None:
     from app.cli.replay import repeat
     from app.cli.run import free_folder
+    from app.georeference import reference
 
     with repeat(source) as (session, stop):
         if stop is not None:
             raise stop
         results = session.results()
+        results.where = reference.read(source.parent)
         results.choice = choice
         _save(results, out or free_folder(source), exports)
 

@@ -2,7 +2,7 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import laspy
 import numpy as np
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 SCALE = 0.001
 """m."""
+BATCH = 1_000_000
+"""Points that are compressed at once: lazrs gives each core chunks of 50,000."""
 OTHER, GROUND_CLASS = 1, 2
 GPS_MINUS_UNIX_S = -315_964_800 + 18 - 1_000_000_000
 """From Unix time to "adjusted standard GPS time", with the leap seconds since 2017."""
@@ -39,9 +41,19 @@ def _write(path: Path, results: "Results", *, compressed: bool) -> None:
         header.creation_date = datetime.fromtimestamp(results.keyframes[0].stamp_ns // 10**9, UTC).date()
     backend = laspy.LazBackend.LazrsParallel if compressed else None
     with laspy.open(path, mode="w", header=header, do_compress=compressed, laz_backend=backend) as file:
+        batch: list[np.ndarray] = []
         for block in results.blocks():
-            if len(block):
-                file.write_points(_record(block, header, where))
+            batch.append(_record(block, header, where))
+            if sum(map(len, batch)) > BATCH:
+                _write_batch(file, header, batch)
+        _write_batch(file, header, batch)
+
+
+def _write_batch(file: Any, header: laspy.LasHeader, batch: list[np.ndarray]) -> None:
+    """Write points at once and forget them."""
+    if any(map(len, batch)):
+        file.write_points(laspy.PackedPointRecord(np.concatenate(batch), header.point_format))
+    batch.clear()
 
 
 def _header(where: GeoReference | None) -> laspy.LasHeader:
@@ -56,10 +68,9 @@ def _header(where: GeoReference | None) -> laspy.LasHeader:
     return header
 
 
-def _record(block: Block, header: laspy.LasHeader, where: GeoReference | None) -> laspy.ScaleAwarePointRecord:
+def _record(block: Block, header: laspy.LasHeader, where: GeoReference | None) -> np.ndarray:
     points: F64 = block.points if where is None else where.to_crs(block.points)
-    record = laspy.ScaleAwarePointRecord.zeros(len(block), header=header)
-    array = record.array
+    array: np.ndarray = laspy.PackedPointRecord.zeros(len(block), header.point_format).array
     array["X"], array["Y"], array["Z"] = np.rint((points - header.offsets) / SCALE).T
     array["intensity"] = np.clip(np.rint(block.intensity), 0, 65535)
     array["bit_fields"] = 0x11  # the only return of its pulse
@@ -67,4 +78,4 @@ def _record(block: Block, header: laspy.LasHeader, where: GeoReference | None) -
     array["user_data"] = np.minimum(block.ring, 255)
     array["point_source_id"] = block.keyframe % 65536
     array["gps_time"] = block.stamps_ns * 1e-9 + GPS_MINUS_UNIX_S
-    return record
+    return array

@@ -35,6 +35,9 @@ class Choice:
             raise HemislamError("The box is empty; give xmin,ymin,zmin,xmax,ymax,zmax with each minimum first.")
 
 
+EVERYTHING = Choice()
+
+
 @dataclass(frozen=True, slots=True)
 class Block:
     """Points of one keyframe in the map.

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.export import map_file
-from app.export.points import Block, Choice, blocks
+from app.export.points import EVERYTHING, Block, Choice, blocks
 from app.export.raster import CELL, Raster, rasterise
 from app.georeference.reference import GeoReference
 from app.slam import report
@@ -48,7 +48,7 @@ class Results:
     info: RunInfo
     loops: LoopResults | None = None
     report: dict[str, Any] = field(default_factory=dict)
-    choice: Choice = field(default_factory=Choice)
+    choice: Choice = EVERYTHING
     where: GeoReference | None = None
     progress: Callable[[float], None] = lambda share: None
     _rasters: dict[tuple[bool, float], Raster] = field(default_factory=dict, repr=False)

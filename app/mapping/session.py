@@ -1,6 +1,6 @@
 """A session: a feed of measurements, the engine at work on it, loops, and the log of what came of it so far."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from app.export.results import BY_RUN, Results, save_results
+from app.export.points import EVERYTHING, Choice
+from app.export.results import BY_RUN, Results, of_formats, save_results
 from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelledKeyframes
@@ -322,7 +323,9 @@ class Session:
         folder: Path,
         *,
         session: SavedSession | None = None,
-        trajectory_only: bool = False,
+        formats: Sequence[str] = (),
+        choice: Choice = EVERYTHING,
+        progress: Callable[[float], None] = lambda share: None,
         replace: bool = True,
         stopped: str = "",
         calibration: str = "",
@@ -330,7 +333,8 @@ class Session:
         """Write the results of the frames so far in a thread of its own, with all loops, in effect or not.
 
         Args:
-            session: to be written beside them. trajectory_only: nothing but trajectory.tum.
+            session: to be written beside them. formats: of `EXPORTS`, instead of the files of a run.
+            choice: of points. progress: called with the share that is written, 0-1, in that thread.
             replace: overwrite older results. stopped: why the session ended early, if it did.
             calibration: what the recording tells of its mounting, in a sentence.
 
@@ -338,9 +342,10 @@ class Session:
             The content of report.json, or HemislamError if the folder cannot be written to.
         """
         results = self.results(stopped, calibration)
+        results.choice, results.progress = choice, progress
 
         def write() -> dict[str, Any]:
-            report = save_results(folder, results, BY_RUN[:1] if trajectory_only else BY_RUN, replace=replace)
+            report = save_results(folder, results, of_formats(formats) if formats else BY_RUN, replace=replace)
             if session is not None:
                 write_session(folder / f"session{SUFFIX}", session)
             return report

@@ -20,7 +20,7 @@ from fastapi import Path as PathParam
 from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from app.export.results import BY_RUN
+from app.export.results import EXPORTS
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import SUFFIX, Speed
 from app.server import protocol
@@ -134,7 +134,7 @@ class CompareBody(BaseModel):
     path: str | None = Field(None, description="A TUM file in the folders given by --folder; null ends the comparison.")
 
 
-EXPORTED: Final = (*(export.name for export in BY_RUN), f"session{SUFFIX}")
+EXPORTED: Final = (*(export.name for export in EXPORTS), f"session{SUFFIX}")
 _ANY_OF_THESE: Final = "|".join(f"^{re.escape(name)}$" for name in EXPORTED)
 ExportName = Annotated[str, PathParam(pattern=_ANY_OF_THESE, json_schema_extra={"enum": [*EXPORTED]})]
 
@@ -234,7 +234,7 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
 
     @router.get("/export/{name}", response_class=FileResponse)
     def export(name: ExportName, background: BackgroundTasks) -> FileResponse:
-        """What was processed so far, as `hemislam run` writes it."""
+        """What was processed so far, as `hemislam run` or `hemislam export` writes it."""
         if not exporting.acquire(blocking=False):
             raise HTTPException(503, "Too many exports are running; ask again in a moment.")
         try:
@@ -263,7 +263,7 @@ def _exported(engine: RunningEngine, name: str, background: BackgroundTasks) -> 
     folder = Path(tempfile.mkdtemp(prefix="hemislam-export-"))
     background.add_task(shutil.rmtree, folder, ignore_errors=True)
     try:
-        _save(engine, folder, trajectory_only=name == "trajectory.tum")
+        _save(engine, folder, tuple(export.format for export in EXPORTS if export.name == name and export.format))
         if not (folder / name).exists():
             raise HTTPException(404, f"There is no {name}, because the loop search is off; set loops.enabled.")
     except BaseException:
@@ -272,12 +272,12 @@ def _exported(engine: RunningEngine, name: str, background: BackgroundTasks) -> 
     return FileResponse(folder / name, filename=name, background=background)
 
 
-def _save(engine: RunningEngine, folder: Path, *, trajectory_only: bool) -> None:
+def _save(engine: RunningEngine, folder: Path, formats: tuple[str, ...]) -> None:
     """Let the engine save into a folder, and wait until it has."""
     snapshot = engine.snapshot
     if snapshot.transport.frame < 0:
         raise HTTPException(409, "No frame has been processed yet; open a recording and play it first.")
-    _send(engine, protocol.Save(folder, trajectory_only))
+    _send(engine, protocol.Save(folder, formats))
     deadline = time.monotonic() + EXPORT_TIMEOUT_S
     while time.monotonic() < deadline:
         for saved in snapshot.saved:

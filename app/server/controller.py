@@ -1,6 +1,7 @@
 """What happens in the engine's process: commands in, one piece of work at a time, changes out."""
 
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -8,6 +9,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+from app.export.points import Choice
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session import EFFECT, Session
 from app.mapping.session_file import SUFFIX, KeptView, Note, SavedSession, SessionWriter, State, new_path, read_session
@@ -66,6 +68,8 @@ class Controller:
         self._page = page
         self._loops, self._player, self._writer = LoopCommands(page), Player(page, clock), SessionWriter()
         self._saves: deque[tuple[Path, Future[Any]]] = deque()
+        self._share = 0.0  # of a save that is written
+        self._shown_share: protocol.Progress | None = None
         self._open_session, self._resolve, self._session_folder = open_session, resolve, session_folder
         self._params = self._base = params  # with and without the user's changes
         self._notes: tuple[Note, ...] = ()
@@ -134,10 +138,11 @@ class Controller:
                 self._page.put(recording=opened_recording(self._need_session()), urgent=True)
             case protocol.Restart():
                 self._open_soon(self._need_session().feed.info.path, self._reopen)
-            case protocol.Save(folder, trajectory_only):
-                session = self._need_session()
-                saved = None if trajectory_only else session.saved(self._state(session))
-                self._saves.append((folder, session.save(folder, session=saved, trajectory_only=trajectory_only)))
+            case protocol.Save(folder, formats, thin):
+                session, choice = self._need_session(), Choice(thin)
+                saved = None if formats else session.saved(self._state(session))
+                save = session.save(folder, session=saved, formats=formats, choice=choice, progress=self._set_share)
+                self._saves.append((folder, save))
             case protocol.EditLabels(keyframe, labels):
                 self._need_session().keyframes.edit(keyframe, labels)
                 self._page.show_again(keyframe)
@@ -165,6 +170,17 @@ class Controller:
     def _set_breakpoints(self, breakpoints: Breakpoints) -> None:
         self._player.breakpoints = breakpoints
         self._page.put(breakpoints=breakpoints, urgent=True)
+
+    def _set_share(self, share: float) -> None:
+        """Called by the thread that saves; `work` shows it."""
+        self._share = share
+
+    def _show_share(self, share: float | None) -> None:
+        """How far a save is, in steps of a hundredth; None: it has ended."""
+        shown = None if share is None else protocol.Progress("Saving", math.floor(share * 100) / 100)
+        if shown != self._shown_share:
+            self._shown_share = shown
+            self._page.put(progress=shown, urgent=True)
 
     def _show_notes(self, notes: tuple[Note, ...]) -> None:
         self._notes = notes
@@ -200,7 +216,10 @@ class Controller:
             error = save.exception()
             if error is not None and not isinstance(error, HemislamError):
                 log.error("Saving to %s failed", folder, exc_info=error)
+            self._show_share(None)
             self._page.saved(protocol.Saved(folder, "" if error is None else str(error) or type(error).__name__))
+        if self._saves:
+            self._show_share(self._share)
         if self._opening is not None:
             self._do_opening(self._opening)
             return 0.0

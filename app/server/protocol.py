@@ -121,10 +121,15 @@ class Restart(Command, frozen=True):
 
 
 class Save(Command, frozen=True):
-    """Write the results of the frames so far, replacing older ones in the folder; `Snapshot.saved` tells when."""
+    """Write the results of the frames so far, replacing older ones in the folder; `Snapshot.saved` tells when.
+
+    Attributes:
+        formats: as `hemislam export` has them; none: all files of a run. thin: m, as there.
+    """
 
     folder: Path
-    trajectory_only: bool = False
+    formats: tuple[str, ...] = ()
+    thin: float = 0.0
 
 
 class EditLabels(Command, frozen=True):

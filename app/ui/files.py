@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import viser
 
-from app.export.results import BY_RUN
+from app.export.results import BY_RUN, EXPORTS
 from app.mapping.session_file import SUFFIX, SavedSession
 from app.server.folders import RECORDINGS, TRAJECTORIES, FolderEntry, Folders
 from app.server.protocol import CompareWith, OpenRecording, Save, Snapshot
@@ -20,6 +20,8 @@ from app.ui.widgets import Changes, Page, by_user, dialog
 
 _MOST_ENTRIES: Final = 60
 _RECENT: Final = 3
+_OF_A_RUN: Final = "all of a run"
+_FORMATS: Final = {f"{export.name}: {export.meaning}": (export.format,) for export in EXPORTS if export.format}
 _EARLY: Final = 100
 """Before this frame the last session is offered."""
 
@@ -195,7 +197,12 @@ class FilesPanel:
             names = [export.name for export in BY_RUN]
             gui.add_html(panel("save", names, f"session{SUFFIX}", str(self._results)))
             name = gui.add_text("folder", result_folder_name(recording.path, datetime.now()))
-            everything = gui.add_checkbox("all files", True, hint="Off: only trajectory.tum, which takes no time.")
+            files = gui.add_dropdown(
+                "files", (_OF_A_RUN, *_FORMATS), hint="Those of a run, or one in the format of other programs."
+            )
+            thin = gui.add_number(
+                "thin to (m)", 0.0, min=0.0, max=100.0, step=0.01, hint="One point in each voxel of this size; 0: all."
+            )
             problem = gui.add_html("", visible=False)
             save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
 
@@ -205,7 +212,7 @@ class FilesPanel:
                 problem.content = panel("text", "The folder needs a name without /.")
                 problem.visible = True
                 return
-            self._page.send(Save(self._results / chosen, trajectory_only=not everything.value))
+            self._page.send(Save(self._results / chosen, _FORMATS.get(files.value, ()), thin.value))
             close()
 
         save.on_click(confirmed)

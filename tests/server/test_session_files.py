@@ -134,7 +134,7 @@ def test_results_are_written_while_replay_goes_on(tmp_path: Path) -> None:
     recording.write_bytes(b"something to hash")
     bench = Bench(str(recording))
     bench.do(Seek(30))
-    snapshot = bench.do(Save(tmp_path / "out"), Save(tmp_path / "short", trajectory_only=True))
+    snapshot = bench.do(Save(tmp_path / "out"), Save(tmp_path / "short", formats=("tum",)))
     while len(snapshot.saved) < 2:
         snapshot = bench.do(StepFrame())
     assert [saved.error for saved in snapshot.saved] == ["", ""]
@@ -143,6 +143,21 @@ def test_results_are_written_while_replay_goes_on(tmp_path: Path) -> None:
     }  # fmt: skip
     assert {file.name for file in (tmp_path / "short").iterdir()} == {"trajectory.tum"}
     assert len((tmp_path / "out/trajectory.tum").read_text().splitlines()) == 31
+
+
+def test_formats_of_other_programs_are_written_and_what_they_lack_is_said(tmp_path: Path) -> None:
+    recording = tmp_path / "walk-60.mcap"
+    recording.write_bytes(b"something to hash")
+    bench = Bench(str(recording))
+    bench.do(Seek(30))
+    save, shares = Save(tmp_path / "laz", ("laz", "csv"), 0.1), set()
+    snapshot = bench.do(save, Save(tmp_path / "gpx", ("gpx",)))
+    while len(snapshot.saved) < 2:
+        shares.add(snapshot.progress.fraction if snapshot.progress else None)
+        snapshot = bench.do(StepFrame())
+    assert snapshot.progress is None and shares != {None}
+    assert {file.name for file in (tmp_path / "laz").iterdir()} == {"map.laz", "trajectory.csv"}
+    assert snapshot.saved[0].error == "" and "where on Earth" in snapshot.saved[1].error
 
 
 def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
