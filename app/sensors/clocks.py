@@ -11,6 +11,10 @@ TOLERANCE_S = 0.15
 """Drivers log a scan up to this late; a smaller difference is delay, not another clock."""
 
 
+OVERLAP, LEAST_OVERLAPS = 0.2, 0.4
+"""Scans that have more than such a part of their time in common overlap; more than so many do so with two LiDARs."""
+
+
 def clock_finding(scans: I64, imu: I64, applied_s: float) -> Finding:
     """Compare the stamps of LiDAR and IMU, and find out whether their difference changes, as when a clock is set.
 
@@ -39,6 +43,16 @@ def clock_finding(scans: I64, imu: I64, applied_s: float) -> Finding:
     else:
         text = f"LiDAR and IMU stamps agree within {abs(offset) * 1e3:.0f} ms, judged by when they were logged{applied}"
     return Finding("clocks", "fine", text)
+
+
+def overlap_finding(scans: I64, topic: str) -> list[Finding]:
+    """Whether the scans of a topic overlap in time, as those of a single LiDAR cannot. scans: as above."""
+    begin, end = scans[np.lexsort((scans[:, 2], scans[:, 1])), 1:].T
+    overlaps = end[:-1] - begin[1:] > OVERLAP * np.median(end - begin)
+    if not len(overlaps) or overlaps.mean() < LEAST_OVERLAPS:
+        return []
+    text = f"the scans on {topic} overlap in time, as if two LiDARs sent on it; record each on a topic of its own"
+    return [Finding("scans", "needs you", text)]
 
 
 def _offset_s(scans: I64, imu: I64) -> float:

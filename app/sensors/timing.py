@@ -71,6 +71,10 @@ def scan_period_ns(clouds: list[Probe], rotation_rate: float) -> tuple[int, bool
     return round(1e9 / (rotation_rate or 10.0)), False
 
 
+LONGEST = 5.0
+"""Intervals that a scan may last: more than one where several LiDARs send on one topic, which `clocks.py` tells."""
+
+
 def _candidates(probe: Probe, kind: CloudType, wanted: str) -> list[str]:
     if wanted == "none":
         return []
@@ -96,7 +100,7 @@ def _settle_unit(
     if wanted == "auto":
         unit = min(UNITS_NS, key=lambda u: abs(np.log(max(span, 1e-12) * UNITS_NS[u] / period_ns)))
     seconds = span * UNITS_NS[unit] / 1e9
-    fits = 0.05 < span * UNITS_NS[unit] / period_ns < 1.5
+    fits = 0.05 < span * UNITS_NS[unit] / period_ns < LONGEST
     misfit = f"`{name}` in {unit} makes a scan last {seconds:.3g} s, yet they come every {period_ns / 1e9:.3f} s"
     problem = ""
     if first.dtype == np.float32 and first.any() and float(np.spacing(np.abs(first).max())) > 0.02 * span:

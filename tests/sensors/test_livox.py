@@ -1,4 +1,7 @@
-"""CustomMsg of the Livox drivers: what rosbags writes of any message, we read point by point."""
+"""CustomMsg of the Livox drivers: what rosbags writes of any message, we read point by point, and what may be wrong.
+
+Tests app/sensors/livox.py, app/sensors/clocks.py.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -7,6 +10,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
+from app.sensors import ros
 from app.sensors.cloud_types import CloudError, read_custom_msg
 from app.sensors.doctor import examine
 from app.sensors.livox import DRIVERS
@@ -110,3 +114,84 @@ def test_a_message_that_lies_is_dropped_and_the_others_stay(tmp_path: Path) -> N
     dropped = [entry.reason for entry in found if isinstance(entry, DroppedScan)]
     assert len(dropped) == 7 and set(dropped) == {"the cloud states 7 points, but holds 480"}
     assert sum(isinstance(entry, Measurement) for entry in found) >= 5
+
+
+def findings(path: Path, subject: str, *settings: str) -> list[str]:
+    """What the doctor says of it, in sentences."""
+    found = examine(path, Params().with_assignments(list(settings)))
+    return [f"{one.verdict}: {one.text} {one.option}" for one in found if one.subject == subject]
+
+
+def test_a_recording_of_halves_says_that_points_are_missing(tmp_path: Path) -> None:
+    entries = list(rig.walk(turns=14, columns=60))
+    path = tmp_path / "halves.mcap"
+    with path.open("wb") as file:
+        writer = ros.RecordingWriter(file, ros.MID360_LAYOUT)
+        for topic, log_ns, made in entries:
+            if topic == "/imu":
+                writer.add_imu(ros.stamp_ns(made.header.stamp), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), log_ns)
+                continue
+            data = encoded(message(rig.turn((log_ns - rig.START_NS) // rig.PERIOD_NS - 1, 60)))[0]
+            writer._add(writer._lidar, data[: len(data) // 2], log_ns)
+        writer.finish()
+    (text,) = findings(path, "use")
+    assert "usable point" in text and "states 480 points, but holds 2" in text
+
+
+def test_a_recording_without_one_certain_return_says_so(tmp_path: Path) -> None:
+    entries = [
+        (topic, log_ns, message(rig.turn(0, 60), tags=np.full(480, 0x20)) if topic == "/points" else made)
+        for topic, log_ns, made in rig.walk(turns=14, columns=60)
+    ]
+    (text,) = findings(rig.write(tmp_path / "doubt", entries, "mcap"), "use")
+    assert "needs you" in text and "has a usable point" in text and "NaN or zero" in text
+
+
+def test_g_that_is_said_to_be_metres_per_second_squared_is_contradicted(tmp_path: Path) -> None:
+    entries = []
+    for topic, log_ns, made in rig.walk(turns=30, columns=60):
+        if topic == "/imu":
+            made.linear_acceleration.z /= 9.80665
+        entries.append((topic, log_ns, made))
+    path = rig.write(tmp_path / "g", entries, "mcap")
+    assert findings(path, "IMU units")[0].startswith("corrected: g")
+    (text,) = findings(path, "IMU units", "recording.acceleration_unit=m/s2")
+    assert text.startswith("needs you") and "not gravity in it" in text and "acceleration_unit=auto" in text
+
+
+def test_clocks_a_year_apart_are_told_with_the_offset_that_mends_it(tmp_path: Path) -> None:
+    year_ns = 365 * 86_400 * 10**9
+    entries = []
+    for topic, log_ns, made in rig.walk(turns=30, columns=60):
+        if topic == "/imu":
+            made.header = rig.header(ros.stamp_ns(made.header.stamp) - year_ns, 2)
+        entries.append((topic, log_ns, made))
+    path = rig.write(tmp_path / "year", entries, "mcap")
+    (text,) = findings(path, "clocks")
+    assert text.startswith("needs you") and "behind" in text and "recording.imu_time_offset=3153" in text
+    with open_recording(path, Params().with_assignments(["recording.imu_time_offset=31536000"])) as recording:
+        assert sum(isinstance(one, Measurement) for one in recording.measurements()) > 25
+
+
+@pytest.mark.parametrize("late_ns", [0, 40_000_000])
+def test_two_lidars_on_one_topic_are_noticed(late_ns: int, tmp_path: Path) -> None:
+    entries = list(rig.walk(turns=20, columns=60))
+    assert findings(rig.write(tmp_path / "one", entries, "mcap"), "scans") == []
+    second = []
+    for topic, log_ns, made in entries:
+        if topic == "/points":
+            stamp = ros.stamp_ns(made.header.stamp) + late_ns
+            times = made.data.reshape(made.width, made.point_step)
+            second.append((topic, log_ns + late_ns + 1_000_000, later(made, times.copy(), stamp, late_ns)))
+    both = sorted(entries + second, key=lambda entry: entry[1])
+    (text,) = findings(rig.write(tmp_path / "two", both, "mcap"), "scans")
+    assert text.startswith("needs you") and "two LiDARs" in text and "/points" in text
+
+
+def later(made: Any, points: Any, stamp_ns: int, by_ns: int) -> Any:
+    """The same cloud, measured later."""
+    field = next(one for one in made.fields if one.name == "timestamp")
+    seconds = points[:, field.offset : field.offset + 8].copy().view("<f8")
+    points[:, field.offset : field.offset + 8] = (seconds + by_ns * 1e-9).view(np.uint8)
+    values = {name: value for name, value in vars(made).items() if not name.startswith("__")}
+    return type(made)(**values | {"header": rig.header(stamp_ns, 2), "data": points.reshape(-1)})

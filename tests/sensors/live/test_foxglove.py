@@ -24,15 +24,17 @@ from app.sensors.live.status import Status
 from app.sensors.live.urls import open_live
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from tests.sensors import rig
+from tests.sensors import rig, test_livox
 from tests.sensors.live import ports
 
 
 class Bridge:
     """A bridge of ROS 1 or ROS 2, written after the protocol's description: sends a walk to whoever subscribes."""
 
-    def __init__(self, port: int, *, ros: int = 2, name: str = "foxglove.sdk.v1", noise: bool = False) -> None:
-        self.ros, self.noise = ros, noise
+    def __init__(
+        self, port: int, *, ros: int = 2, name: str = "foxglove.sdk.v1", noise: bool = False, livox: bool = False
+    ) -> None:
+        self.ros, self.noise, self.livox = ros, noise, livox
         self.entries = rig.walk(turns=20, ros=ros, columns=30)
         self.subscribed: list[str] = []
         self.connections: list[ServerConnection] = []
@@ -57,7 +59,8 @@ class Bridge:
     def _speak(self, connection: ServerConnection) -> None:
         middle = "msg/" if self.ros == 2 else ""
         encoding = "cdr" if self.ros == 2 else "ros1"
-        types = [("/other", "std_msgs/String"), ("/points", "sensor_msgs/PointCloud2"), ("/imu", "sensor_msgs/Imu")]
+        cloud = "livox_ros_driver2/CustomMsg" if self.livox else "sensor_msgs/PointCloud2"
+        types = [("/other", "std_msgs/String"), ("/points", cloud), ("/imu", "sensor_msgs/Imu")]
         channels = [
             {
                 "id": 7 + k,
@@ -92,6 +95,9 @@ class Bridge:
         typestore = rig.TYPESTORES[self.ros]
         serialise = typestore.serialize_ros1 if self.ros == 1 else typestore.serialize_cdr
         for topic, log_ns, message in self.entries:
+            if self.livox and topic == "/points":
+                turn = rig.turn((log_ns - rig.START_NS) // rig.PERIOD_NS - 1, columns=30)
+                message = test_livox.message(turn, ros=self.ros)
             channel = 8 if topic == "/points" else 9
             data = bytes(serialise(message, message.__msgtype__))
             if self.noise and channel == 9 and log_ns % 3 == 0:
@@ -120,6 +126,18 @@ def test_every_kind_of_bridge_is_understood(ros: int, name: str) -> None:
         np.testing.assert_array_equal(measurement.scan.points, truth.points)
         np.testing.assert_array_equal(measurement.scan.ring, truth.ring)
         assert measurement.imu.stamps_ns[0] <= measurement.scan.stamp_ns
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_livoxs_own_message_arrives_point_by_point(ros: int) -> None:
+    number = port()
+    with Bridge(number, ros=ros, livox=True), open_live(f"foxglove://127.0.0.1:{number}", Params()) as source:
+        events = ports.collect(source, enough(19))
+    for number, measurement in enumerate(ports.measurements(events)):
+        truth = rig.turn(number, columns=30)
+        assert measurement.scan.stamp_ns == truth.begin_ns
+        np.testing.assert_array_equal(measurement.scan.points, truth.points.astype(np.float32))
+        np.testing.assert_array_equal(measurement.scan.offsets_ns, truth.offsets_ns)
 
 
 def test_nonsense_from_a_server_is_passed_over() -> None:
