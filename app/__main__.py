@@ -15,6 +15,7 @@ from app.cli.calibrate import calibrate as calibrate_command
 from app.cli.evaluate import evaluate
 from app.cli.export import export as export_command
 from app.cli.feed import feed
+from app.cli.georeference import georeference
 from app.cli.replay import replay
 from app.cli.run import run
 from app.cli.serve import serve
@@ -95,6 +96,7 @@ cli.command()(replay)
 cli.command("export")(export_command)
 cli.command("calibrate")(calibrate_command)
 cli.command()(evaluate)
+cli.command()(georeference)
 cli.command()(feed)
 
 
@@ -181,6 +183,10 @@ def simulate(
         list[str] | None,
         typer.Option("--error", metavar="NAME=SIZE", help="Size of one imperfection; 0: none. Repeatable."),
     ] = None,
+    gnss: Annotated[
+        list[str] | None,
+        typer.Option("--gnss", metavar="NAME=VALUE", help="Add a satellite receiver, e.g. noise=0.02. Repeatable."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
 ) -> None:
     """Simulate a recording in a modelled scene.
@@ -195,18 +201,20 @@ def simulate(
       hemislam simulate outdoor --out outdoor.mcap --duration 120 --seed 7
       hemislam simulate room --out small.mcap --duration 20 --every-block 6
       hemislam simulate outdoor --out real.mcap --imperfect --error companions=0
+      hemislam simulate outdoor --out gnss.mcap --gnss noise=0.02 --gnss offset=0.08 --gnss z=0.5
       hemislam simulate corridor --out livox.mcap --scanner mid360 --tables tables/
       hemislam simulate --suite paper --out suite/
     """
     from app.cli.suite import make_suite
     from app.sensors.simulator import SCENES, simulate
+    from app.sensors.simulator.gnss import Gnss
     from app.sensors.simulator.imperfections import IMPERFECT, NONE
 
     imperfections = (IMPERFECT if imperfect else NONE).with_sizes(errors or [])
     if (scene is not None) if suite is not None else short:
         raise HemislamError("SCENE takes --duration, --suite takes --short; give either SCENE or --suite.")
     if suite is not None:
-        only = ("duration", "rate", "coordinate_step", "range_step", "scanner", "tables", "upright", "force")
+        only = ("duration", "rate", "coordinate_step", "range_step", "scanner", "tables", "upright", "gnss", "force")
         sources = {name: ctx.get_parameter_source(name) for name in only}
         if given := [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]:
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
@@ -231,6 +239,7 @@ def simulate(
             scanner=scanner,
             tables=tables,
             upright=upright,
+            gnss=Gnss().with_sizes(gnss) if gnss else None,
             progress=show,
         )
     typer.echo(

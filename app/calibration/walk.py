@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from app.sensors.recording import Recording, ScanEntry
+from app.sensors.recording import ImuEntry, Recording, ScanEntry
 from app.slam import rest
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -61,10 +61,10 @@ def read_walk(
     grid = VoxelGrid()
     stop_ns = recording.start_ns + round(duration_s * 1e9)
     for entry in recording.entries(None, stop_ns):
-        if not isinstance(entry, ScanEntry):
+        if isinstance(entry, ImuEntry):
             stamps.append(entry.stamp_ns)
             values.append((*entry.gyro, *entry.accel))
-        elif isinstance(entry.scan, Scan) and entry.scan.end_ns < stop_ns:
+        elif isinstance(entry, ScanEntry) and isinstance(entry.scan, Scan) and entry.scan.end_ns < stop_ns:
             scans.append(_thinned(entry.scan, params, grid))
             progress(min((entry.scan.end_ns - recording.start_ns) / min(duration_s, recording.duration_s) * 1e-9, 1.0))
     scans.sort(key=lambda scan: scan.end_ns)

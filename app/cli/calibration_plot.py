@@ -1,5 +1,7 @@
 """The residuals of a calibration before and after, as one SVG file."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from app.calibration.calibrate import Calibration
@@ -20,8 +22,13 @@ def residual_plot(calibration: Calibration) -> str:
         _chart(np.degrees(turned.before), np.degrees(turned.after), "turning (deg)"),
         _chart(moved.before * 1e3, moved.after * 1e3, "motion (mm)"),
     ]
+    return page(charts)
+
+
+def page(charts: Sequence[str]) -> str:
+    """Charts of the usual height below one another, as a file of their own."""
     placed = [
-        svg.replace("<svg ", f'<svg y="{_HEIGHT * k}" width="560" height="{_HEIGHT}" ', 1)
+        str(svg).replace("<svg ", f'<svg y="{_HEIGHT * k}" width="560" height="{_HEIGHT}" ', 1)
         for k, svg in enumerate(charts)
     ]
     height = _HEIGHT * len(charts)

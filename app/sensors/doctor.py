@@ -17,7 +17,7 @@ from app.sensors.findings import Finding as Finding
 from app.sensors.findings import Verdict
 from app.sensors.layout import settle_cloud
 from app.sensors.probe import choose_topic, probe_clouds
-from app.sensors.recording import ImuEntry, ScanEntry, open_recording
+from app.sensors.recording import ImuEntry, OtherEntry, ScanEntry, open_recording
 from app.sensors.sequencer import STUCK_SAMPLES, Counts, Sequencer
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
@@ -97,11 +97,11 @@ class _Census:
     returns: int = 0
     reasons: Counter[str] = field(default_factory=Counter)
 
-    def add(self, entry: ScanEntry | ImuEntry) -> None:
+    def add(self, entry: ScanEntry | ImuEntry | OtherEntry) -> None:
         if isinstance(entry, ImuEntry):
             self.imu_times.append((entry.log_ns, entry.stamp_ns))
             self.sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
-        else:
+        elif isinstance(entry, ScanEntry):
             if entry.cloud is not None:
                 self.places += len(entry.cloud)
                 self.nan += int(np.isnan(entry.cloud.xyz()).any(axis=1).sum())

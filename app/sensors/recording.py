@@ -13,6 +13,7 @@ from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
 from app.sensors.findings import Finding
 from app.sensors.imu_units import AS_RECORDED, gravity_findings, settle_imu
 from app.sensors.layout import settle_cloud
+from app.sensors.navsat import fix_of, navsat_topic
 from app.sensors.pointcloud import decode, read_scan
 from app.sensors.presets import preset_for
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu, usable_types
@@ -21,7 +22,7 @@ from app.sensors.sequencer import Sequencer
 from app.sensors.source import Mark, Source
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import I64, DroppedScan, Measurement, Scan
+from app.slam.types import I64, DroppedScan, Measurement, Samples, Scan
 
 LOG_MARGIN_NS = 2_000_000_000
 """How much later or earlier than usual a message may be logged and is still found by time."""
@@ -55,11 +56,20 @@ class ImuEntry:
     accel: Vector
 
 
+@dataclass(frozen=True, slots=True)
+class OtherEntry:
+    """A message of a sensor beside LiDAR and IMU."""
+
+    log_ns: int
+    samples: Samples
+
+
 class Recording:
     """An open recording, made by `open_recording`. A context manager.
 
     Attributes:
-        path, params: as given. topics: all there are. lidar_topic, imu_topic: the ones used; "" without an IMU.
+        path, params: as given. topics: all there are. lidar_topic, imu_topic, gnss_topic: the ones used; ""
+            where there is none.
         scan_count: messages on the LiDAR topic. findings: of the first messages.
         start_ns: first point of the first usable scan. duration_s: from there to the last message.
     """
@@ -76,6 +86,7 @@ class Recording:
             imu_topic, imu_finding = choose_topic(source, "imu", chosen.imu_topic)
             self.imu_topic = imu_topic.name
         self.scan_count = lidar.messages
+        self.gnss_topic = navsat_topic(source)
 
         probes, probe_findings = probe_clouds(source, lidar)
         self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic, CLOUD_TYPES[lidar.type])
@@ -124,8 +135,8 @@ class Recording:
 
     def entries(
         self, first_ns: int | None = None, stop_ns: int | None = None, after: Mark | None = None
-    ) -> Iterator[ScanEntry | ImuEntry]:
-        """Decoded scans and IMU samples in the order of the file; generously more than [first, stop).
+    ) -> Iterator[ScanEntry | ImuEntry | OtherEntry]:
+        """Decoded scans and samples in the order of the file; generously more than [first, stop).
 
         Args:
             after: only what comes after this message.
@@ -136,10 +147,12 @@ class Recording:
         offset = self._log_after_stamp_ns
         log_first = None if first_ns is None else first_ns + offset - LOG_MARGIN_NS
         log_stop = None if stop_ns is None else stop_ns + offset + LOG_MARGIN_NS
-        topics = tuple(filter(None, (self.lidar_topic, self.imu_topic)))
+        topics = tuple(filter(None, (self.lidar_topic, self.imu_topic, self.gnss_topic)))
         for topic, log_ns, message in self._source.messages(topics, log_first, log_stop, after):
             if topic == self.lidar_topic:
                 yield ScanEntry(log_ns, *read_scan(message, log_ns, self._layout))
+            elif topic == self.gnss_topic:
+                yield OtherEntry(log_ns, fix_of(message))
             else:
                 yield self._imu_entry(message, log_ns)
 
@@ -239,6 +252,8 @@ class Measurements(Iterator[Measurement | DroppedScan]):
                     if isinstance(entry, ScanEntry):
                         if entry.scan.stamp_ns >= first_ns and (stop_ns is None or entry.scan.stamp_ns < stop_ns):
                             sequencer.add_scan(entry.scan)
+                    elif isinstance(entry, OtherEntry):
+                        sequencer.add(entry.samples)
                     elif start_s <= 0 or entry.stamp_ns >= first_ns - IMU_BEFORE_NS:
                         sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
                     yield from sequencer.ready()

@@ -176,12 +176,19 @@ class RecordingWriter:
         self._mcap.start(profile="ros2")
         self._lidar = self._channel(layout.lidar_topic, layout.kind, layout.text)
         self._imu = self._channel(layout.imu_topic, IMU)
+        self._others: dict[str, int] = {}
 
     def add_scan(self, scan: Scan, log_ns: int) -> None:
         self._add(self._lidar, self._encode(scan), log_ns)
 
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, log_ns: int) -> None:
         self._add(self._imu, serialised(imu_message(stamp_ns, gyro, accel)), log_ns)
+
+    def add(self, topic: str, message: Any, log_ns: int) -> None:
+        """A message of a standard type on any other topic."""
+        if topic not in self._others:
+            self._others[topic] = self._channel(topic, message.__msgtype__)
+        self._add(self._others[topic], serialised(message), log_ns)
 
     def flush(self) -> None:
         """End a chunk, so that what was written can be read even if the end of the file never comes."""

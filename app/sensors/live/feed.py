@@ -23,7 +23,7 @@ from app.sensors.live.imu_udp import ImuSample, write_airy_imu, write_imu
 from app.sensors.live.livox_udp import Livox, LivoxWriter
 from app.sensors.live.msop import PacketWriter
 from app.sensors.live.urls import Address
-from app.sensors.recording import Recording, ScanEntry, open_recording
+from app.sensors.recording import ImuEntry, Recording, ScanEntry, open_recording
 from app.sensors.robosense import AIRY, BPEARL, Model
 from app.sensors.source import Source
 from app.slam import lie
@@ -132,7 +132,7 @@ def packets_of(
             due = bisect.bisect_right(waiting, scan.end_ns, key=by_time)
             yield from waiting[:due]
             del waiting[:due]
-        elif entry.stamp_ns < stop_ns + 2e8:
+        elif isinstance(entry, ImuEntry) and entry.stamp_ns < stop_ns + 2e8:
             sample = ImuSample(next(samples), entry.stamp_ns, entry.gyro, entry.accel)
             waiting.append(Sent(entry.stamp_ns, IMU, sensor.imu(sample)))
     waiting += [Sent(time_ns, LIDAR, packet) for time_ns, packet in sensor.flush()]

@@ -9,8 +9,10 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from app.sensors.navsat import TOPIC, navsat_message
 from app.sensors.robosense import BPEARL
 from app.sensors.ros import RecordingWriter
+from app.sensors.simulator.gnss import Gnss, received
 from app.sensors.simulator.imperfections import NONE, Imperfections, Unit, companions, livelier
 from app.sensors.simulator.lidar import Lidar
 from app.sensors.simulator.raycast import Raycaster, SimulatedScene
@@ -40,7 +42,7 @@ TRANSPORT_NS = 4_000_000
 _FIRST_TURN_S = 0.05
 _IMU_PERIOD_NS = 1_000_000_000 // IMU_RATE_HZ
 
-_TRAJECTORY, _IMU, _LIDAR, _UNIT, _PEOPLE = 1, 2, 3, 4, 5
+_TRAJECTORY, _IMU, _LIDAR, _UNIT, _PEOPLE, _GNSS = 1, 2, 3, 4, 5, 6
 """Streams of random numbers that do not disturb one another (0 is the scene's)."""
 
 
@@ -76,6 +78,7 @@ def simulate(
     scanner: str = "bpearl",
     tables: Path | None = None,
     upright: bool | None = None,
+    gnss: Gnss | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulationSummary:
     """Simulate a person who carries a LiDAR and an IMU, and write it as a ROS 2 recording.
@@ -98,6 +101,7 @@ def simulate(
         imperfections: errors of a real scanner and hand, and people beside the operator.
         scanner: a name in SCANNERS. tables: folder with its maker's tables, where it takes some.
         upright: held with the LiDAR's z up rather than looking forward; None: as usual for it.
+        gnss: a satellite receiver beside; where the world truly lies is then in `<stem>_georeference.json`.
         progress: called with (scans done, scans in all).
 
     Raises:
@@ -134,8 +138,10 @@ def simulate(
     if unit is not None:
         imu = unit.felt(imu, START_NS, _random(seed, _UNIT, _IMU))
 
+    fixes = received(gnss, trajectory, duration_s, START_NS, _random(seed, _GNSS)) if gnss else None
+
     total = int((duration_s - _FIRST_TURN_S) * rate_hz + 1e-6)
-    points = written = 0
+    points = written = fixed = 0
     truth, params = out.with_name(f"{out.stem}_truth.tum"), out.with_name(f"{out.stem}.params.yaml")
     unfinished = out.with_name(out.name + ".part")
     ends: list[int] = []
@@ -146,6 +152,12 @@ def simulate(
             stamp = int(imu.stamps_ns[k])
             recording.add_imu(stamp, imu.gyro[k], imu.accel[k] / device.accel_unit, stamp)
         written = max(written, stop)
+
+    def add_fixes(until_ns: int) -> None:
+        nonlocal fixed
+        while fixes is not None and fixed < len(fixes) and fixes.stamps_ns[fixed] <= until_ns:
+            recording.add(TOPIC, navsat_message(fixes, fixed), int(fixes.stamps_ns[fixed]))
+            fixed += 1
 
     try:
         with unfinished.open("wb") as file:
@@ -160,12 +172,16 @@ def simulate(
                 ends.append(scan.end_ns)
                 logged_ns = scan.end_ns + TRANSPORT_NS
                 add_imu(int(np.searchsorted(imu.stamps_ns, logged_ns, side="right")))
+                add_fixes(logged_ns)
                 recording.add_scan(scan, logged_ns)
                 progress(index + 1, total)
             add_imu(len(imu))
+            add_fixes(int(imu.stamps_ns[-1]))
             recording.finish()
         _write_truth(truth, trajectory, np.array(ends, np.int64))
         params.write_text(_SIDECAR + yaml.safe_dump(_settings(device)))
+        if gnss is not None:
+            out.with_name(f"{out.stem}_georeference.json").write_text(gnss.reference.to_json(), encoding="utf-8")
         unfinished.replace(out)
     except OSError as error:
         raise HemislamError(f"{out} cannot be written ({error.strerror}); choose another place.") from error

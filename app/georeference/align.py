@@ -1,0 +1,354 @@
+"""Lays a trajectory on satellite fixes: yaw, translation, the clocks' offset, and the antenna's lever arm.
+
+The model of a fix g, in metres east, north and up, stamped s:
+
+    g = Rz(yaw) (p(s - offset) + R(s - offset) lever) + shift
+
+where p, R is T_map_imu. The map's z is up already. Its shape does not change.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import optimize
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation, Slerp
+
+from app.georeference import crs
+from app.georeference.fixes import Fixes
+from app.georeference.reference import ELLIPSOIDAL, GeoReference
+from app.slam import lie
+from app.slam.arrays import F64
+from app.slam.errors import HemislamError
+from app.slam.trajectory import Trajectory
+
+SEARCH_S, COARSE_S = 10.0, 0.2
+"""The clocks' offset is looked for this far on either side, first in such steps."""
+GAP_S = 1.0
+"""Between poses further apart than this, the place of the antenna is not known."""
+MOST_SIGMAS = 4.03
+"""Of the distance of a sound fix: 99.9 % of a Gaussian in three directions are nearer."""
+MEDIAN_SIGMAS = 1.538
+"""Half of them are nearer than this."""
+WORST_YAW, WORST_OFFSET_S, WORST_LEVER_M = np.radians(10.0), 0.1, 0.1
+"""What is less certain than this (standard deviation) is not taken from the fixes."""
+FEWEST = 8
+COARSE_FIXES = 200
+
+_least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
+
+Vector = tuple[float, float, float]
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """How fixes or control points lie on a map.
+
+    Attributes:
+        reference: where the map lies. names: (n,) of the fixes.
+        grid: (n, 3) easting, northing, height of the fixes, m. residuals: (n, 3) m, measured minus map.
+        distances: (n,) lengths of the residuals in standard deviations. used: (n,) whether a fix counts.
+        offset_s: how much later the fixes are stamped than they were measured. lever_arm: m, IMU frame.
+        offset_sigma_s, yaw_sigma, lever_sigma: their standard deviations, s, rad and m; nan where a value was given.
+        notes: what a user should know, in sentences.
+    """
+
+    reference: GeoReference
+    names: tuple[str, ...]
+    grid: F64
+    residuals: F64
+    distances: F64
+    used: Mask
+    offset_s: float = 0.0
+    offset_sigma_s: float = float("nan")
+    yaw_sigma: float = float("nan")
+    lever_arm: Vector = (0.0, 0.0, 0.0)
+    lever_sigma: float = float("nan")
+    notes: tuple[str, ...] = ()
+
+    @property
+    def rms(self) -> F64:
+        """(3,) m to the east, north and up, of what counts."""
+        return np.asarray(np.sqrt((self.residuals[self.used] ** 2).mean(axis=0)))
+
+
+class WalkedPath:
+    """Where the IMU was between the poses of a trajectory; times in s since the first pose."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.start_ns = int(trajectory.stamps_ns[0])
+        self._times = (trajectory.stamps_ns - self.start_ns) * 1e-9
+        self._places = make_interp_spline(self._times, trajectory.positions, k=3)
+        self._turns = Slerp(self._times, trajectory.rotations)
+
+    def known(self, t: F64) -> Mask:
+        """(n,) whether there are poses near these times."""
+        after = np.clip(np.searchsorted(self._times, t), 1, len(self._times) - 1)
+        near = self._times[after] - self._times[after - 1] < GAP_S
+        return np.asarray(near & (t >= self._times[0]) & (t <= self._times[-1]))
+
+    def antenna(self, t: F64, lever: F64) -> F64:
+        """(n, 3) m in the map, of a point `lever` (3,) in the IMU frame."""
+        inside = np.clip(t, self._times[0], self._times[-1])
+        places = np.asarray(self._places(inside))
+        if not lever.any():
+            return places
+        turns: Rotation = self._turns(inside)
+        return np.asarray(places + turns.apply(lever))
+
+
+def align(
+    trajectory: Trajectory, fixes: Fixes, *, grid: str = "", height: str = ELLIPSOIDAL, lever: Vector | None = None
+) -> Alignment:
+    """Find where a trajectory lies by fixes that are in order of time.
+
+    Args:
+        trajectory: T_map_imu with z up. grid: a projected system; "": the UTM zone there. height: what the heights of
+            the fixes are above. lever: m from the IMU to the antenna, IMU frame; None: found, if the fixes tell it.
+
+    Raises:
+        HemislamError: the fixes do not fit the trajectory in time or place, or tell no heading.
+    """
+    if len(trajectory) < 3:
+        raise HemislamError("The trajectory has fewer than 3 poses; there is nothing to lay on the fixes.")
+    ground = Ground.of(fixes, grid)
+    path = WalkedPath(trajectory)
+    seconds: F64 = (fixes.stamps_ns - path.start_ns).astype(np.float64) * 1e-9
+    notes: list[str] = []
+    arm = np.array(lever or (0.0, 0.0, 0.0))
+    offset, median = _coarse(path, seconds, ground.places, arm)
+    _refuse_swapped(path, seconds, fixes, median)
+    known = path.known(seconds - offset)
+    problem = _Problem(path, seconds[known], ground.places[known], fixes.sigmas[known], arm, offset, lever is None)
+    if (blind := np.isnan(problem.sigmas.sum(axis=1))).any():
+        notes.append("Fixes come without a covariance; how far they scatter about the map stands for it.")
+        problem = replace(problem, sigmas=np.where(blind[:, None], median / MEDIAN_SIGMAS, problem.sigmas))
+        scatter = float(np.median(problem.solve().distances)) / MEDIAN_SIGMAS
+        problem = replace(problem, sigmas=np.where(blind[:, None], problem.sigmas * scatter, problem.sigmas))
+    solved = problem.solve()
+    if lever is None and not solved.lever_sigma < WORST_LEVER_M:
+        notes.append("The motion does not tell the antenna's lever arm; it is taken as zero, give it if it is not.")
+        problem = replace(problem, lever_free=False)
+        solved = problem.solve()
+    if not solved.offset_sigma < WORST_OFFSET_S:
+        notes.append("The motion does not tell the clocks' offset; it is taken as zero.")
+        solved = replace(problem, offset=None).solve()
+    if not solved.yaw_sigma < WORST_YAW:
+        raise HemislamError(
+            f"The fixes tell the map's heading only to {np.degrees(solved.yaw_sigma):.0f}°; walk farther under the sky."
+        )
+    reference = ground.reference(solved.yaw, solved.shift, height)
+    return Alignment(
+        reference,
+        tuple(str(number) for number in np.flatnonzero(known) + 1),
+        ground.grid[known],
+        solved.residuals,
+        solved.distances,
+        solved.used,
+        solved.offset,
+        solved.offset_sigma,
+        solved.yaw_sigma,
+        (float(solved.lever[0]), float(solved.lever[1]), float(solved.lever[2])),
+        solved.lever_sigma,
+        tuple(notes),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """Places in metres as they are on the ground, near one another, rather than in a grid far away.
+
+    Attributes:
+        name: of the grid. grid: (n, 3) easting, northing, height, m. centre: (3,) of the grid, whole metres.
+        scale: of the grid there. places: (n, 3) m east, north, up of the centre.
+    """
+
+    name: str
+    grid: F64
+    centre: F64
+    scale: float
+    places: F64
+
+    @classmethod
+    def of(cls, fixes: Fixes, name: str = "") -> "Ground":
+        """Raises HemislamError: the grid is not made for the place, or is none."""
+        middle = [float(np.median(column)) for column in (fixes.latitude, fixes.longitude, fixes.height)]
+        name = name or crs.utm(middle[0], middle[1])
+        crs.check_place(name, middle[0], middle[1])
+        flat = crs.transformer(crs.WGS84, name).transform(fixes.longitude, fixes.latitude)
+        return cls.in_grid(np.column_stack([*flat, fixes.height]), name)
+
+    @classmethod
+    def in_grid(cls, grid: F64, name: str) -> "Ground":
+        """Of (n, 3) easting, northing and height."""
+        centre = np.round(np.median(grid, axis=0))
+        longitude, latitude = crs.transformer(name, crs.WGS84).transform(*centre[:2])
+        if not np.isfinite(longitude + latitude):
+            raise HemislamError(f"{name} has no place at E {centre[0]:.0f}, N {centre[1]:.0f}; check the grid.")
+        crs.check_place(name, latitude, longitude)
+        scale = crs.grid_scale(name, latitude, longitude, float(centre[2]))
+        return cls(name, grid, centre, scale, (grid - centre) / [scale, scale, 1.0])
+
+    def reference(self, R_ground_map: F64, shift: F64, height: str) -> GeoReference:
+        """Where a map lies whose origin is at `shift` (3,) m from the centre."""
+        east, north, up = (self.centre + shift * [self.scale, self.scale, 1.0]).tolist()
+        first, second, third = (tuple(map(float, row)) for row in R_ground_map)
+        return GeoReference(self.name, (east, north, up), (first, second, third), self.scale, height)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    """As in `Alignment`, with yaw as the rotation (3, 3) and shift (3,) from the map to the ground."""
+
+    yaw: F64
+    shift: F64
+    offset: float
+    lever: F64
+    residuals: F64
+    distances: F64
+    used: Mask
+    offset_sigma: float
+    yaw_sigma: float
+    lever_sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """What is known: (n,) times, (n, 3) places on the ground and their sigmas.
+
+    Attributes:
+        lever: m, IMU frame, as given. offset: s, to start from; None: there is none.
+        lever_free: whether the lever arm is to be found instead.
+    """
+
+    path: WalkedPath
+    seconds: F64
+    places: F64
+    sigmas: F64
+    lever: F64
+    offset: float | None
+    lever_free: bool
+
+    def solve(self) -> _Solved:
+        """All unknowns at once, first robustly, then by the fixes that agree."""
+        late, free = self.offset is not None, self.lever_free
+        yaw, shift, _ = _laid(self.path.antenna(self.seconds - (self.offset or 0.0), self.lever), self.places)
+        start = np.r_[yaw, shift, [self.offset] * late, [0.0] * (3 * free)].astype(np.float64)
+        x, used = _robust(self._errors, start)
+        R, shift, offset, arm = self._model(x)
+        errors = self._errors(x)
+        J = _jacobian(lambda x: self._errors(x)[used].ravel(), x)
+        spread = max(1.0, float((errors[used] ** 2).sum()) / max(3 * int(used.sum()) - len(x), 1))
+        sigmas = _deviations(J) * spread**0.5
+        return _Solved(
+            R,
+            shift,
+            offset,
+            arm,
+            errors * self.sigmas,
+            np.linalg.norm(errors, axis=1),
+            used,
+            float(sigmas[4]) if late else 0.0,
+            float(sigmas[0]),
+            float(sigmas[-3:].max()) if free else float("nan"),
+        )
+
+    def _model(self, x: F64) -> tuple[F64, F64, float, F64]:
+        """Rotation, shift, offset and lever arm of the unknowns."""
+        late = float(x[4]) if self.offset is not None else 0.0
+        return lie.exp(np.array([0.0, 0.0, x[0]])), x[1:4], late, x[-3:] if self.lever_free else self.lever
+
+    def _errors(self, x: F64) -> F64:
+        """(n, 3) in standard deviations."""
+        R, shift, late, arm = self._model(x)
+        return np.asarray((self.places - self.path.antenna(self.seconds - late, arm) @ R.T - shift) / self.sigmas)
+
+
+def _deviations(J: F64) -> F64:
+    """(k,) standard deviations of the unknowns of whitened errors with this Jacobian (n, k); inf if one is open."""
+    lengths = np.linalg.norm(J, axis=0)
+    lengths = np.where(lengths > 0, lengths, 1.0)
+    values, vectors = np.linalg.eigh((J / lengths).T @ (J / lengths))
+    values = np.where(values > 1e-12, values, 1e-300)
+    return np.asarray(np.sqrt((vectors**2 / values).sum(axis=1)) / lengths)
+
+
+def _robust(errors: Callable[[F64], F64], start: F64) -> tuple[F64, Mask]:
+    """The optimum by what agrees, and which that is. errors: (n, 3) whitened."""
+    x = np.asarray(_least_squares(lambda x: errors(x).ravel(), start, loss="cauchy", f_scale=2.0, x_scale="jac").x)
+    used = np.ones(len(errors(x)), bool)
+    for _ in range(10):
+        distances = np.linalg.norm(errors(x), axis=1)
+        scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
+        agree = distances < MOST_SIGMAS * scale
+        if agree.sum() < 3:
+            break
+        x = np.asarray(_least_squares(lambda x, w=agree: errors(x)[w].ravel(), x, x_scale="jac").x)
+        if (agree == used).all():
+            break
+        used = agree
+    return x, used
+
+
+def _jacobian(function: Callable[[F64], F64], x: F64) -> F64:
+    step = 1e-5
+    columns = [(function(x + step * axis) - function(x - step * axis)) / (2 * step) for axis in np.eye(len(x))]
+    return np.stack(columns, axis=1)
+
+
+def _coarse(path: WalkedPath, seconds: F64, places: F64, lever: F64) -> tuple[float, float]:
+    """The offset (s) with which the fixes fit best, and how far off (m) they are then in the median."""
+    few = np.unique(np.linspace(0, len(seconds) - 1, COARSE_FIXES).astype(int))
+    best = (np.inf, 0.0, np.inf)
+    offsets = np.arange(-SEARCH_S, SEARCH_S + COARSE_S / 2, COARSE_S)
+    for offset in offsets[np.argsort(np.abs(offsets), kind="stable")].tolist():
+        t = seconds[few] - offset
+        inside = path.known(t)
+        if inside.sum() >= FEWEST and inside.sum() >= 0.5 * path.known(seconds[few]).sum():
+            _, _, off = _laid(path.antenna(t[inside], lever), places[few][inside])
+            best = min(best, (float(off.mean()), offset, float(np.median(off))))
+    if not np.isfinite(best[0]):
+        count = int(path.known(seconds).sum())
+        begin, end = seconds[0], seconds[-1]
+        raise HemislamError(
+            f"Only {count} fixes lie within the time of the trajectory, {FEWEST} are needed: they begin {begin:.0f} s"
+            f" and end {end:.0f} s after its start; both must be stamped in UTC."
+        )
+    return best[1], best[2]
+
+
+def _laid(points: F64, places: F64) -> tuple[float, F64, F64]:
+    """The yaw (rad) and shift (3,) that lay points (n, 3) on places with the smallest sum of distances.
+
+    Returns also how far each is off, m (n,). By reweighted least squares (Weiszfeld), so that a few wrong ones do not
+    matter.
+    """
+    weights = np.ones(len(points))
+    for _ in range(8):
+        share = weights / weights.sum()
+        middle, there = share @ points, share @ places
+        a, b = points - middle, places - there
+        sine = share @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        yaw = float(np.arctan2(sine, share @ (a[:, :2] * b[:, :2]).sum(axis=1)))
+        R = lie.exp(np.array([0.0, 0.0, yaw]))
+        shift = there - R @ middle
+        off = np.linalg.norm(places - points @ R.T - shift, axis=1)
+        weights = 1.0 / np.maximum(off, 1e-3)
+    return yaw, shift, off
+
+
+def _refuse_swapped(path: WalkedPath, seconds: F64, fixes: Fixes, median: float) -> None:
+    """Raises HemislamError if the fixes fit far better with latitude and longitude exchanged: a mirrored path."""
+    if (np.abs(fixes.longitude) > 84).any() or median < 0.5:
+        return
+    swapped = Fixes(fixes.stamps_ns, fixes.longitude, fixes.latitude, fixes.height, fixes.sigmas)
+    _, other = _coarse(path, seconds, Ground.of(swapped).places, np.zeros(3))
+    if other < 0.3 * median:
+        raise HemislamError(
+            f"Latitude and longitude seem to be swapped: the path fits to {other:.2f} m with them exchanged, and to"
+            f" {median:.2f} m as they are; exchange the columns."
+        )

@@ -1,0 +1,75 @@
+"""What became of each fix or control point: as a table, as CSV, and in sentences."""
+
+import csv
+import io
+
+import numpy as np
+
+from app.georeference import crs
+from app.georeference.align import Alignment
+
+COLUMNS = (
+    "name", "east_m", "north_m", "height_m", "d_east_m", "d_north_m", "d_height_m", "sigmas", "verdict",
+)  # fmt: skip
+
+
+def residuals_csv(alignment: Alignment) -> str:
+    """One line a fix: its place in the grid, measured minus map, and whether it counts."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for name, place, off, sigmas, used in _rows(alignment):
+        verdict = "accepted" if used else "rejected"
+        numbers = [f"{value:.4f}" for value in (*place, *off)]
+        writer.writerow([name, *numbers, f"{sigmas:.2f}" if np.isfinite(sigmas) else "", verdict])
+    return out.getvalue()
+
+
+def summary(alignment: Alignment, what: str) -> list[str]:
+    """The result in lines; `what` was measured: "fixes" or "control points"."""
+    where, used = alignment.reference, int(alignment.used.sum())
+    east, north, height = where.origin
+    turned = _plus(np.degrees(alignment.yaw_sigma), "°", 3)
+    lines = [
+        f"Coordinate system  {where.crs} ({crs.projected(where.crs).name}), heights {where.height}",
+        f"Map origin         E {east:.3f} m, N {north:.3f} m, H {height:.3f} m",
+        f"Map x axis         {_bearing(alignment):.3f}° from grid north{turned}",
+        f"Grid scale         {where.scale:.7f}",
+    ]
+    if np.isfinite(alignment.offset_sigma_s):
+        lines.append(
+            f"Clock offset       {alignment.offset_s * 1e3:.1f} ms{_plus(alignment.offset_sigma_s * 1e3, ' ms', 1)}"
+            f" (the fixes are stamped {'late' if alignment.offset_s >= 0 else 'early'})"
+        )
+        x, y, z = alignment.lever_arm
+        how = _plus(alignment.lever_sigma, " m", 3) if np.isfinite(alignment.lever_sigma) else ""
+        lines.append(f"Lever arm          {x:.3f} {y:.3f} {z:.3f} m{how}")
+    rms = " ".join(f"{axis} {value:.4f} m" for axis, value in zip("ENH", alignment.rms, strict=True))
+    lines.append(f"Residuals (RMS)    {rms}, of {used} of {len(alignment.used)} {what}")
+    return [*lines, *alignment.notes]
+
+
+def table(alignment: Alignment, *, only_rejected: bool = False) -> list[str]:
+    """The residuals in lines, m."""
+    lines = ["name          dE       dN       dH"]
+    for name, _, off, sigmas, used in _rows(alignment):
+        if used and only_rejected:
+            continue
+        far = f"  {sigmas:.0f} σ" if np.isfinite(sigmas) else ""
+        lines.append(f"{name:<8}" + "".join(f"{value:9.3f}" for value in off) + ("" if used else f"  rejected{far}"))
+    return lines
+
+
+def _rows(alignment: Alignment) -> list[tuple[str, list[float], list[float], float, bool]]:
+    columns = (alignment.grid, alignment.residuals, alignment.distances, alignment.used)
+    return list(zip(alignment.names, *(column.tolist() for column in columns), strict=True))
+
+
+def _bearing(alignment: Alignment) -> float:
+    """Of the map's x axis, degrees clockwise from grid north, 0 to 360."""
+    (east, *_), (north, *_), _ = alignment.reference.rotation
+    return float(np.degrees(np.arctan2(east, north)) % 360.0)
+
+
+def _plus(sigma: float, unit: str, digits: int) -> str:
+    return f" ± {sigma:.{digits}f}{unit}" if np.isfinite(sigma) else ""

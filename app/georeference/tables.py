@@ -1,0 +1,158 @@
+"""Tables of places with a heading: fixes (CSV, the GNSS/INS table of H2LID), control points, and points of the map."""
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from app.georeference import nmea
+from app.georeference.fixes import Fixes
+from app.georeference.reference import ELLIPSOIDAL
+from app.slam.arrays import F64
+from app.slam.errors import HemislamError
+
+GEOID = "orthometric (geoid of the receiver)"
+LEAP_S, WEEK_S, GPS_EPOCH_S = 18, 604_800, 315_964_800
+"""GPS time is ahead of UTC by so many leap seconds since 2017; a GPS week; when the first one began."""
+
+_NAMES = {
+    "time": ("time", "t", "stamp", "timestamp", "unix", "utc", "time_s", "stamp_s"),
+    "week_s": ("gpstime", "gps_time", "tow", "sow"),
+    "latitude": ("latitude", "lat"),
+    "longitude": ("longitude", "lon", "lng", "long"),
+    "height": ("height", "h", "alt", "altitude", "z", "h-ell", "h_m", "height_m"),
+    "east": ("e", "east", "easting", "e_m", "east_m"),
+    "north": ("n", "north", "northing", "n_m", "north_m"),
+    "sigma_e": ("sigma_e", "sigma_east", "sd_e", "sde"),
+    "sigma_n": ("sigma_n", "sigma_north", "sd_n", "sdn"),
+    "sigma_u": ("sigma_u", "sigma_h", "sigma_up", "sd_u", "sdu", "sd_h"),
+    "name": ("name", "id", "point", "label"),
+    "x": ("x", "x_m"),
+    "y": ("y", "y_m"),
+    "z": ("z", "z_m"),
+}
+"""What a column is, by its heading in small letters without units in brackets."""
+
+
+@dataclass(frozen=True, slots=True)
+class NamedColumns:
+    """A table that was read. columns: (n,) texts by what they are; only those that have a name above."""
+
+    path: Path
+    columns: Mapping[str, Sequence[str]]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def has(self, *wanted: str) -> bool:
+        return all(name in self.columns for name in wanted)
+
+    def numbers(self, *wanted: str) -> F64:
+        """(n, k) of these columns; an empty cell is nan. Raises HemislamError: there is a word that is no number."""
+        out = np.full((len(self), len(wanted)), np.nan)
+        for at, name in enumerate(wanted):
+            for row, word in enumerate(self.columns[name]):
+                try:
+                    out[row, at] = float(word) if word else np.nan
+                except ValueError:
+                    raise HemislamError(f"{self.path}, row {row + 1}: `{word[:40]}` is no number ({name}).") from None
+        return out
+
+
+def read_table(path: Path, *wanted: str) -> NamedColumns:
+    """A table with a heading, separated by commas, semicolons or spaces; `#` begins a comment.
+
+    Args:
+        wanted: what columns are asked for, where a heading may mean several things.
+
+    Raises:
+        HemislamError: it cannot be read, or has no heading, or a row is cut.
+    """
+    rows = [line for line in _lines(path) if line.strip() and not line.lstrip().startswith("#")]
+    if not rows:
+        raise HemislamError(f"{path} is empty.")
+    separator = next((one for one in ",;\t" if one in rows[0]), None)
+    if separator:
+        cells = [[cell.strip() for cell in row] for row in csv.reader(rows, delimiter=separator)]
+    else:
+        cells = [row.split() for row in rows]
+    titles = [_plain(title) for title in cells[0]]
+    known: dict[str, int] = {}
+    for what in dict.fromkeys([*wanted, *_NAMES]):
+        found = [at for at, title in enumerate(titles) if title in _NAMES[what] and at not in known.values()]
+        if found:
+            known[what] = found[0]
+    body = cells[1:]
+    if cut := next((row for row, one in enumerate(body, 1) if len(one) < len(titles)), 0):
+        raise HemislamError(f"{path}, row {cut} has {len(body[cut - 1])} columns, but its heading {len(titles)}.")
+    return NamedColumns(path, {what: [row[at] for row in body] for what, at in known.items()})
+
+
+def read_fixes(path: Path, near_ns: int) -> tuple[Fixes, str]:
+    """Fixes of a file: NMEA sentences, CSV of time, latitude, longitude, height, or the GNSS/INS table of H2LID.
+
+    Args:
+        near_ns: a time of the recording; tells the day of NMEA sentences and the week of GPS seconds.
+
+    Returns:
+        The fixes, and what their heights are above.
+
+    Raises:
+        HemislamError: it cannot be read, or is none of these.
+    """
+    lines = _lines(path)
+    if any(line.lstrip().startswith("$G") for line in lines[:50]):
+        fixes, ellipsoidal = nmea.read(lines, str(path), near_ns)
+        return fixes.sound(str(path)), ELLIPSOIDAL if ellipsoidal else GEOID
+    table = read_table(path, "time", "latitude", "longitude", "height")
+    if not table.has("latitude", "longitude", "height") or not (table.has("time") or table.has("week_s")):
+        raise HemislamError(
+            f"{path} holds no fixes; its first line must name the columns time, latitude, longitude, height"
+            " (and sigma_e, sigma_n, sigma_u, if known), or it must hold NMEA sentences."
+        )
+    stamps = [_stamp(table, word) for word in table.columns["time"]] if table.has("time") else _of_week(table, near_ns)
+    names = ("sigma_e", "sigma_n", "sigma_u")
+    sigmas = table.numbers(*names) if table.has(*names) else None
+    fixes = Fixes.of(stamps, table.numbers("latitude", "longitude", "height"), sigmas)
+    return fixes.sound(str(path)), ELLIPSOIDAL
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise HemislamError(f"{path} is not a text file.") from None
+    except OSError as error:
+        raise HemislamError(f"{path} cannot be read: {error.strerror}.") from None
+
+
+def _plain(title: str) -> str:
+    """A heading in small letters, without a unit in brackets."""
+    return re.sub(r"[\(\[].*", "", title).strip().lower()
+
+
+def _stamp(table: NamedColumns, word: str) -> int:
+    """Unix seconds with any number of digits, or ISO 8601 (UTC unless it says otherwise), as ns."""
+    try:
+        return int(Decimal(word).scaleb(9).to_integral_value())
+    except InvalidOperation:
+        pass
+    try:
+        return int(np.datetime64(word.strip().removesuffix("Z"), "ns").astype(np.int64))
+    except ValueError:
+        raise HemislamError(
+            f"{table.path}: the time `{word[:40]}` is neither Unix seconds nor a date such as 2026-05-01T10:00:00Z."
+        ) from None
+
+
+def _of_week(table: NamedColumns, near_ns: int) -> list[int]:
+    """Seconds of the GPS week, in the week that is nearest to a time."""
+    seconds = table.numbers("week_s")[:, 0]
+    now = near_ns * 1e-9 - GPS_EPOCH_S + LEAP_S
+    weeks = round((now - float(seconds[0])) / WEEK_S)
+    start = (weeks * WEEK_S + GPS_EPOCH_S - LEAP_S) * 1_000_000_000
+    return [start + round(value * 1e9) for value in seconds.tolist()]

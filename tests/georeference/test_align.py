@@ -1,0 +1,87 @@
+"""Lay a walk on satellite fixes. Oracle: the curve that both were made of."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.georeference.align import Alignment, align
+from app.georeference.fixes import Fixes
+from app.slam.errors import HemislamError
+from tests.georeference.walks import LEVER, LINE, TRUTH, Walked, off, walked
+
+
+def verdicts(found: Alignment, made: Walked) -> tuple[set[int], int]:
+    """The wild fixes that were taken, and how many sound ones were not."""
+    rejected = {int(name) for name, used in zip(found.names, found.used, strict=True) if not used}
+    wild = set(made.outliers.tolist()) & set(map(int, found.names))
+    return wild - rejected, len(rejected - wild)
+
+
+def test_a_walk_with_a_late_receiver_and_wild_fixes_is_placed_to_centimetres() -> None:
+    made = walked()
+    found = align(made.trajectory, made.fixes, grid="EPSG:32632", lever=LEVER)
+    assert found.offset_s == pytest.approx(0.08, abs=0.002) and found.offset_sigma_s < 0.002
+    assert np.sqrt((off(found.reference, made.trajectory) ** 2).mean()) < 0.02
+    missed, wronged = verdicts(found, made)
+    assert not missed and wronged <= 0.01 * len(found.names)  # 0.1 % of the sound ones are expected
+    assert found.reference.scale == pytest.approx(TRUTH.scale, abs=1e-6)
+
+
+def test_the_lever_arm_is_found_with_its_uncertainty_where_the_hand_turns_enough() -> None:
+    made = walked(outliers=0.0)
+    found = align(made.trajectory, made.fixes)
+    assert found.lever_sigma < 0.05
+    assert np.abs(np.subtract(found.lever_arm, LEVER)).max() < 4 * found.lever_sigma
+
+
+def test_a_lever_arm_left_out_shows_in_the_residuals() -> None:
+    made = walked(outliers=0.0)
+    with_it, without = (align(made.trajectory, made.fixes, lever=lever) for lever in (LEVER, (0.0, 0.0, 0.0)))
+    assert with_it.rms.max() < 0.03 < 0.1 < without.rms.max()
+
+
+def test_a_receiver_that_is_seconds_late_is_aligned_by_its_motion() -> None:
+    made = walked(offset_s=-7.3, lever=(0.0, 0.0, 0.0))
+    assert align(made.trajectory, made.fixes, lever=(0.0, 0.0, 0.0)).offset_s == pytest.approx(-7.3, abs=0.003)
+
+
+def test_fixes_without_a_covariance_are_judged_by_their_scatter() -> None:
+    made = walked()
+    blind = replace(made.fixes, sigmas=np.full((len(made.fixes), 3), np.nan))
+    found = align(made.trajectory, blind, lever=LEVER)
+    assert "without a covariance" in found.notes[0]
+    assert found.offset_s == pytest.approx(0.08, abs=0.002)
+    assert not verdicts(found, made)[0]
+
+
+def test_a_straight_walk_with_the_antenna_above_tells_no_lever_arm_and_says_so() -> None:
+    made = walked(path=LINE, noise=0.5, outliers=0.0, lever=(0.0, 0.0, 0.0), rate_hz=1.0, duration_s=40.0)
+    found = align(made.trajectory, made.fixes)
+    assert found.lever_arm == (0.0, 0.0, 0.0) and "lever arm" in " ".join(found.notes)
+
+
+def test_swapped_latitude_and_longitude_are_recognised_by_the_mirrored_path() -> None:
+    fixes = walked().fixes
+    swapped = Fixes(fixes.stamps_ns, fixes.longitude, fixes.latitude, fixes.height, fixes.sigmas)
+    with pytest.raises(HemislamError, match="seem to be swapped"):
+        align(walked().trajectory, swapped)
+
+
+def test_a_grid_that_does_not_fit_the_place_is_refused() -> None:
+    made = walked()
+    with pytest.raises(HemislamError, match="is not made for latitude 48"):
+        align(made.trajectory, made.fixes, grid="EPSG:32756")
+
+
+def test_fixes_of_another_day_are_refused() -> None:
+    made = walked()
+    other = replace(made.fixes, stamps_ns=made.fixes.stamps_ns + 86_400_000_000_000)
+    with pytest.raises(HemislamError, match="Only 0 fixes lie within the time"):
+        align(made.trajectory, other)
+
+
+def test_someone_who_stands_still_learns_that_no_heading_follows() -> None:
+    made = walked(duration_s=2.4, outliers=0.0, rate_hz=10.0)  # the walker rests at the start
+    with pytest.raises(HemislamError, match="heading only to"):
+        align(made.trajectory, made.fixes, lever=LEVER)

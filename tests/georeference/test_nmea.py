@@ -1,0 +1,44 @@
+"""Sentences of a receiver. Oracle: the example that every description of NMEA quotes."""
+
+import pytest
+
+from app.georeference import nmea
+from app.slam.errors import HemislamError
+
+GGA = "$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47"
+DAY_S = 86_400
+
+
+def test_the_usual_example_is_munich_at_592_metres_above_the_ellipsoid() -> None:
+    fixes, ellipsoidal = nmea.read([GGA], "log", 0)
+    place = float(fixes.latitude[0]), float(fixes.longitude[0]), float(fixes.height[0])
+    assert place == pytest.approx((48.1173, 11.516667, 592.3), abs=1e-6) and ellipsoidal
+
+
+def test_the_day_is_that_of_the_recording_also_across_midnight() -> None:
+    at = 12 * 3600 + 35 * 60 + 19
+    for day, near in ((19_000, 19_000 * DAY_S + 50_000), (19_001, 19_001 * DAY_S + 100), (18_999, 19_000 * DAY_S)):
+        fixes, _ = nmea.read([GGA], "log", near * 10**9)
+        assert abs(int(fixes.stamps_ns[0]) - near * 10**9) <= DAY_S // 2 * 10**9
+        assert (int(fixes.stamps_ns[0]) // 10**9 - at) % DAY_S == 0, day
+
+
+def test_a_sentence_with_the_date_overrules_the_recordings_day() -> None:
+    rmc = "$GPRMC,123520,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*60"
+    fixes, _ = nmea.read([GGA, rmc, GGA], "log", 1_700_000_000 * 10**9)
+    assert (fixes.stamps_ns == 764_426_119 * 10**9).all()  # 1994-03-23T12:35:19Z
+
+
+def test_sigmas_come_from_gst_and_belong_to_the_fix_of_the_same_time() -> None:
+    gst = "$GPGST,123519,0.006,0.023,0.020,273.6,0.023,0.020,0.031*"
+    value = 0
+    for character in gst[1:-1].encode():
+        value ^= character
+    fixes, _ = nmea.read([GGA, f"{gst}{value:02X}"], "log", 0)
+    assert fixes.sigmas[0].tolist() == [0.020, 0.023, 0.031]  # GST names north first
+
+
+@pytest.mark.parametrize("line", [GGA[:-1] + "8", GGA.replace(",1,08", ",0,08"), GGA[:30], "noise", ""])
+def test_a_wrong_checksum_a_cut_line_or_no_fix_give_nothing(line: str) -> None:
+    with pytest.raises(HemislamError, match="no NMEA sentence GGA"):
+        nmea.read([line], "log", 0)

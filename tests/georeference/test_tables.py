@@ -1,0 +1,84 @@
+"""Fixes from files. Tests app/georeference/tables.py and app/georeference/fixes.py."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.georeference.tables import GEOID, read_fixes
+from app.slam.errors import HemislamError
+
+NEAR_NS = 1_700_000_000_000_000_000  # 2023-11-14T22:13:20Z, a Tuesday
+H2LID = (
+    "GPSTime(sec) Easting(m) Northing(m) H-Ell(m) Heading(deg) Pitch(deg) Roll(deg) Latitude(deg) Longitude(deg)"
+    " VEast(m/s) VNorth(m/s) VUp(m/s) Q\n"
+)
+ROW = " 533843.632 3379901.251 17.899 -4.85 0.78 -0.08 30.5388466765 114.3526809197 0.0 -0.002 -0.001 1\n"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "fixes.csv"
+    path.write_text(text)
+    return path
+
+
+def test_a_table_with_sigmas_is_read_to_the_last_digit_of_its_times(tmp_path: Path) -> None:
+    text = "time,lat,lon,height,sigma_e,sigma_n,sigma_u\n" + "".join(
+        f"170000000{k}.123456789,48.1{k},11.5,520.{k},0.01,0.02,0.03\n" for k in range(3)
+    )
+    fixes, height = read_fixes(written(tmp_path, text), NEAR_NS)
+    assert fixes.stamps_ns.tolist() == [1_700_000_000_123_456_789 + k * 10**9 for k in range(3)]
+    np.testing.assert_array_equal(fixes.latitude, [48.10, 48.11, 48.12])
+    np.testing.assert_array_equal(fixes.sigmas[1], [0.01, 0.02, 0.03])
+    assert height == "ellipsoidal"
+
+
+def test_dates_are_read_and_rows_are_brought_in_order_of_time(tmp_path: Path) -> None:
+    text = "Time;Latitude [deg];Longitude [deg];Altitude (m)\n" + "".join(
+        f"2023-11-14T22:13:2{k}Z;48.1;11.{k};520\n" for k in (2, 0, 1)
+    )
+    fixes, _ = read_fixes(written(tmp_path, text), NEAR_NS)
+    assert fixes.stamps_ns.tolist() == [NEAR_NS + k * 10**9 for k in range(3)]
+    assert fixes.longitude.tolist() == [11.0, 11.1, 11.2] and np.isnan(fixes.sigmas).all()
+
+
+def test_seconds_of_the_gps_week_become_utc_by_the_recordings_week_and_leap_seconds(tmp_path: Path) -> None:
+    # Tuesday 22:13:20 UTC is 2 days and 80000 s into the week, and GPS is 18 s ahead.
+    text = H2LID + "".join(f"{2 * 86400 + 80000 + 18 + k}.5{ROW}" for k in range(3))
+    fixes, height = read_fixes(written(tmp_path, text), NEAR_NS + 3600 * 10**9)
+    assert fixes.stamps_ns.tolist() == [NEAR_NS + 500_000_000 + k * 10**9 for k in range(3)]
+    assert (fixes.height[0], fixes.longitude[0], height) == (17.899, 114.3526809197, "ellipsoidal")
+
+
+def test_a_log_of_a_receiver_is_recognised_by_its_sentences(tmp_path: Path) -> None:
+    line = "$GPGGA,2213{:05.2f},4807.038,N,01131.000,E,4,08,0.9,545.4,M,46.9,M,,"
+    lines = [line.format(20 + k) for k in range(3)]
+    path = written(tmp_path, "".join(f"{text}*{checksum(text)}\n" for text in lines))
+    fixes, height = read_fixes(path, NEAR_NS + 5 * 10**9)
+    assert fixes.stamps_ns[0] == NEAR_NS and height == "ellipsoidal"
+    path = written(tmp_path, "".join(f"{text}*{checksum(text)}\n" for text in (x.replace("46.9", "") for x in lines)))
+    assert read_fixes(path, NEAR_NS)[1] == GEOID
+
+
+def checksum(sentence: str) -> str:
+    value = 0
+    for character in sentence[1:].encode():
+        value ^= character
+    return f"{value:02X}"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time,lat,lon,height\n1,48,11,5\n", "holds 1 fixes"),
+        ("time,lat,lon,height\n" + "1,148,11,5\n" * 3, "swapped: exchange them"),
+        ("time,lat,lon,height\n" + "1,48,11\n" * 3, "row 1 has 3 columns"),
+        ("time,lat,lon,height\n" + "1,x,11,5\n" * 3, "`x` is no number"),
+        ("time,lat,lon,height\n" + "noon,48,11,5\n" * 3, "neither Unix seconds nor a date"),
+        ("1,2,3,4\n" * 3, "its first line must name the columns"),
+        ("", "is empty"),
+    ],
+)
+def test_what_is_no_table_of_fixes_is_refused_in_one_sentence(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(HemislamError, match=words):
+        read_fixes(written(tmp_path, text), NEAR_NS)
