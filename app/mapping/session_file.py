@@ -87,6 +87,24 @@ _Note = Annotated[
 ]
 _Place = tuple[float, float, float]
 KeptView = tuple[_Place, _Place]
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A place on what a keyframe saw, so that it moves with the map. at: (x, y, z), m, in the keyframe's IMU frame."""
+
+    keyframe: int
+    at: _Place
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """A named annotation: of one spot its coordinates, of two their distance, of three the angle at the second."""
+
+    name: str
+    spots: tuple[Spot, ...]
+
+
 Speed = Annotated[
     float,
     Field(ge=0.1),
@@ -104,6 +122,7 @@ class State:
     edits: of loops, in force. undone: those that can be redone, the next one last. labels: edits of labels.
     truth: trajectory to compare with. notes: in the order in which they were made. speed: to play at.
     views: where cameras stood that the user kept, and what they looked at, (x, y, z) each, m, in the map.
+    measures: what was measured in the map.
     """
 
     params: _Params
@@ -116,6 +135,7 @@ class State:
     speed: Speed = 1.0
     labels: tuple[_LabelEdit, ...] = ()
     views: tuple[KeptView, ...] = ()
+    measures: tuple[Measure, ...] = ()
 
 
 _OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)

@@ -12,7 +12,17 @@ from typing import Any
 from app.export.points import Choice
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session import EFFECT, Session
-from app.mapping.session_file import SUFFIX, KeptView, Note, SavedSession, SessionWriter, State, new_path, read_session
+from app.mapping.session_file import (
+    SUFFIX,
+    KeptView,
+    Measure,
+    Note,
+    SavedSession,
+    SessionWriter,
+    State,
+    new_path,
+    read_session,
+)
 from app.server import protocol
 from app.server.loop_commands import LoopCommands
 from app.server.player import Player
@@ -31,13 +41,20 @@ MOST_NOTES = 1000
 """Every page and every REST answer holds all of them."""
 
 MOST_VIEWS = 6
+MOST_MEASURES = 200
 """Older ones are left out."""
 
 _AT_ONCE = protocol.OpenRecording | protocol.Restart | protocol.SetSpeed | protocol.SetBreakpoints
 """Commands that do not wait for the session that is being opened."""
 _OF_LABELS = protocol.EditLabels | protocol.UndoLabels
 _FOR_THE_FRAME = (
-    protocol.LoopCommand | _OF_LABELS | protocol.AddNote | protocol.KeepView | protocol.CompareWith | protocol.Save
+    protocol.LoopCommand
+    | _OF_LABELS
+    | protocol.AddNote
+    | protocol.KeepView
+    | protocol.KeepMeasure
+    | protocol.CompareWith
+    | protocol.Save
 )
 """Commands that wait until a reopened session is at its frame."""
 
@@ -74,6 +91,7 @@ class Controller:
         self._params = self._base = params  # with and without the user's changes
         self._notes: tuple[Note, ...] = ()
         self._views: tuple[KeptView, ...] = ()
+        self._measures: tuple[Measure, ...] = ()
         self._resuming: SavedSession | None = None  # that is being repeated
         self._opening: Callable[[], None] | None = None  # opens the next session
         self._waiting: list[Command] = []  # until that session is at its frame
@@ -127,6 +145,10 @@ class Controller:
                 self._show_notes((*self._notes[:place], *changed, *self._notes[place + 1 :]))
             case protocol.KeepView(view):
                 self._show_views((*self._views, view)[-MOST_VIEWS:])
+            case protocol.KeepMeasure(measure):
+                self._show_measures((*self._measures, measure)[-MOST_MEASURES:])
+            case protocol.DropMeasure(measure):
+                self._show_measures(tuple(kept for kept in self._measures if kept != measure))
             case protocol.SetParams(values):
                 self._set_params(self._params.with_values(values))
             case protocol.LoadParams(text):
@@ -190,6 +212,10 @@ class Controller:
         self._views = views
         self._page.put(views=views, urgent=True)
 
+    def _show_measures(self, measures: tuple[Measure, ...]) -> None:
+        self._measures = measures
+        self._page.put(measures=measures, urgent=True)
+
     def _show_params(self) -> None:
         """Show the parameters, and which of them wait for a restart."""
         session = self._player.session
@@ -247,6 +273,7 @@ class Controller:
             truth=session.truth_path,
             notes=self._notes,
             views=self._views,
+            measures=self._measures,
             breakpoints=self._player.breakpoints,
             speed=self._page.transport.speed,
             labels=session.keyframes.edits,
@@ -287,13 +314,14 @@ class Controller:
         self._take(session)
 
     def _reopen(self) -> None:
-        """Begin again with the present parameters. Notes, kept views and loop edits stay."""
-        before, notes, views = self._need_session(), self._notes, self._views
+        """Begin again with the present parameters. Notes, kept views, measures and loop edits stay."""
+        before, notes, views, measures = self._need_session(), self._notes, self._views, self._measures
         info, edits = before.feed.info, Edits(*before.edits)
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
         self._take(session)
         self._show_notes(notes)
         self._show_views(views)
+        self._show_measures(measures)
         if session.loops is not None and edits != Edits():
             session.edit_loops(edits.done, edits.undone)
 
@@ -322,6 +350,7 @@ class Controller:
         self._player.take(session)
         self._show_notes(saved.state.notes if saved is not None else ())
         self._show_views(saved.state.views if saved is not None else ())
+        self._show_measures(saved.state.measures if saved is not None else ())
         self._resuming = None
         if saved is not None:
             self._writer.write(saved.frame, saved.state, ended=saved.ended)  # this process may die on the way there

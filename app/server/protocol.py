@@ -12,7 +12,7 @@ from typing import Any, Literal
 import msgspec
 
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.session_file import KeptView, Note, Speed
+from app.mapping.session_file import KeptView, Measure, Note, Speed
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
 from app.slam.frames import READOUTS, Frame
@@ -89,6 +89,18 @@ class KeepView(Command, frozen=True):
     """Keep in the session where a camera stands and what it looks at."""
 
     view: KeptView
+
+
+class KeepMeasure(Command, frozen=True):
+    """Keep in the session what was measured."""
+
+    measure: Measure
+
+
+class DropMeasure(Command, frozen=True):
+    """Delete a measure from the session."""
+
+    measure: Measure
 
 
 class SetParams(Command, frozen=True):
@@ -291,7 +303,7 @@ class Snapshot:
         trajectory: (n, 3) m, positions of the IMU in the map. corrections: of odometry, by loops.
         series: (n,) arrays by SERIES name.
         T_map_truth: (4, 4), aligns the truth with the trajectory; None until the trajectory determines it.
-        notes, views: in the order in which they were made. notices: the newest 50. saved: the newest 10.
+        notes, views, measures: in the order in which they were made. notices: the newest 50. saved: the newest 10.
         live: state of the live source; None for a recording.
         session_file: keeps this session; opening it continues the session.
     """
@@ -313,6 +325,7 @@ class Snapshot:
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     notes: tuple[Note, ...] = ()
     views: tuple[KeptView, ...] = ()
+    measures: tuple[Measure, ...] = ()
     progress: Progress | None = None
     notices: tuple[Notice, ...] = ()
     saved: tuple[Saved, ...] = ()

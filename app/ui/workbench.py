@@ -29,6 +29,7 @@ from app.ui.files import FilesPanel, RecentPanel
 from app.ui.html import render
 from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
+from app.ui.measure import MeasurePanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.readouts import ReadoutPanel
 from app.ui.scale import FromAbove, ScaleBars
@@ -97,14 +98,18 @@ class Workbench:
             with gui.add_folder("Pause when", expand_by_default=False):
                 self._breakpoints = BreakpointPanel(page)
         with tabs.add_tab("Loops", viser.Icon.INFINITY):
-            self._loops = LoopsPanel(page, lambda client: self._appearance.look_freely(client))
+            self._loops = LoopsPanel(
+                page, lambda client: self._appearance.look_freely(client), taken=lambda: self._measure.picking
+            )
         with tabs.add_tab("Study", viser.Icon.MICROSCOPE):
-            self._study = StudyPanel(page, taken=self._loops.points_at)
+            self._study = StudyPanel(page, taken=lambda *ray: self._measure.picking or self._loops.points_at(*ray))
         with tabs.add_tab("A/B", viser.Icon.GIT_COMPARE):
             self._compare = ComparePanel(page, forks, self._sides)
         with tabs.add_tab("View", viser.Icon.EYE):
             self._appearance = AppearancePanel(gui, legend, FromAbove(server))
             self._camera = CameraPanel(page, self._scene.framing, self._appearance.look_freely)
+            with gui.add_folder("Measure"):
+                self._measure = MeasurePanel(page)
         with tabs.add_tab("Recording", viser.Icon.STETHOSCOPE):
             files.add_buttons()
             self._live = LivePanel(gui)
@@ -160,6 +165,7 @@ class Workbench:
         self._parameters.draw(self._sides.tuned(current))
         self._loops.draw(current, view)
         self._study.draw(current, view)
+        self._measure.draw(current, view)
         for panel in self._panels:
             panel.draw(current)
         self._scale.draw()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
-from app.server.protocol import CompareWith, OpenRecording, Pause, Play, Seek, SetParams, StepFrame
+from app.server.protocol import CompareWith, KeepMeasure, OpenRecording, Pause, Play, Seek, SetParams, StepFrame
 from tests.browser.conftest import Bench, new_page
 
 
@@ -246,3 +246,27 @@ def test_the_first_visit_is_shown_around_once(bench: Bench, chromium: Browser) -
         expect(tour).to_have_count(0)
     finally:
         page.close()
+
+
+def test_a_click_on_the_map_measures_the_point_under_it(bench: Bench) -> None:
+    for _ in range(14):
+        bench.engine.send(StepFrame())
+    bench.page.get_by_role("tab", name="View").click()
+    bench.look((0.0, -1e-3, 14.0), (0.0, 0.0, -1.0))
+    bench.page.get_by_role("button", name="point", exact=True).click()
+    expect(bench.page.get_by_text("Click 1 point of the map")).to_be_visible()
+    scene = bench.page.locator("canvas[data-engine]").bounding_box()
+    assert scene is not None
+    bench.engine.sent.clear()
+
+    def kept() -> list[KeepMeasure]:
+        return [command for command in bench.engine.sent if isinstance(command, KeepMeasure)]
+
+    for share in (0.5, 0.55, 0.45, 0.6, 0.4):  # the map has gaps
+        if not kept():
+            bench.page.mouse.click(scene["x"] + share * scene["width"], scene["y"] + share * scene["height"])
+            bench.page.wait_for_timeout(1500)
+    (spot,) = kept()[0].measure.spots
+    assert np.linalg.norm(spot.at[:2]) < 12.0 and -3.0 < spot.at[2] < 5.0
+    bench.page.get_by_role("button", name="stop", exact=True).click()
+    bench.page.get_by_role("tab", name="Tune").click()

@@ -21,10 +21,12 @@ from app.mapping.breakpoints import Breakpoints
 from app.mapping.session import Session
 from app.mapping.session_file import (
     SUFFIX,
+    Measure,
     Note,
     Opened,
     SavedSession,
     SessionWriter,
+    Spot,
     State,
     new_path,
     read_session,
@@ -35,6 +37,8 @@ from app.sensors.presets import resolve_params
 from app.server.controller import MOST_NOTES, Controller
 from app.server.protocol import (
     AddNote,
+    DropMeasure,
+    KeepMeasure,
     KeepView,
     OpenRecording,
     Pause,
@@ -156,12 +160,15 @@ class Kept(Bench):
 
 
 VIEW = ((1.0, 2.0, 30.5), (0.0, 0.0, 0.0))
+DOOR = Measure("door", (Spot(1, (0.5, 0.25, -1.0)), Spot(2, (0.5, 0.25, 1.125))))
 
 
 def walk_about(bench: Kept) -> Snapshot:
     """On, back, other parameters, on, and one last wish that no frame has seen yet."""
     bench.do(Seek(30), SetParams({"ground.sigma": 0.02}), Seek(60), Seek(45), SetParams({"scan.voxel_size": 0.6}))
     bench.do(Seek(80), Seek(70), AddNote("a turn"), KeepView(VIEW))
+    wrong = Measure("wrong", DOOR.spots[:1])
+    bench.do(KeepMeasure(wrong), KeepMeasure(DOOR), DropMeasure(wrong))
     return bench.do(StepFrame(2), SetParams({"ground.alpha": 35.0}))
 
 
@@ -175,6 +182,7 @@ def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path)
     np.testing.assert_array_equal(again.trajectory, there.trajectory)
     assert again.notes == there.notes == (Note(70, "a turn"),)
     assert again.views == there.views == (VIEW,)
+    assert again.measures == there.measures == (DOOR,)
     assert again.result is not None and there.result is not None
     np.testing.assert_array_equal(again.result.cloud.labels, there.result.cloud.labels, "relabelled by the last wish")
     third = Kept(tmp_path, second.session_file)  # the one reopened is kept as well

@@ -40,10 +40,14 @@ class LoopsPanel:
 
     Args:
         look_freely: stops following the sensor, so that a camera can stay where it is put.
+        taken: whether clicks in the scene are meant for something else.
     """
 
-    def __init__(self, page: Page, look_freely: Callable[[viser.ClientHandle], None]) -> None:
+    def __init__(
+        self, page: Page, look_freely: Callable[[viser.ClientHandle], None], taken: Callable[[], bool] = lambda: False
+    ) -> None:
         gui = page.gui
+        self._taken = taken
         self._page, self._look_freely = page, look_freely
         self._send, self._snapshot = page.send, page.snapshot
         self._chosen: Pair | None = None
@@ -168,6 +172,8 @@ class LoopsPanel:
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         origin, direction = self._page.in_map(event)
+        if self._taken():
+            return
         if self._add_loop.picking:
             self._add_loop.pick(origin, direction)
         elif (pair := self._edges.pick(origin, direction)) is not None:

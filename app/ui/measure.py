@@ -1,0 +1,116 @@
+"""Measures by clicks in the scene: a point, a distance, an angle; each is named, kept in the session, and drawn."""
+
+from typing import Any, Final
+
+import numpy as np
+import viser
+
+from app.mapping.session_file import Measure, Spot
+from app.server.protocol import DropMeasure, KeepMeasure, Snapshot
+from app.slam.types import F64
+from app.ui.html import panel
+from app.ui.measure_maths import Numbers, as_csv, meet, numbers, places, words
+from app.ui.nodes import add_exact_points, add_lines, segments
+from app.ui.viser_adapter import Bridge
+from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of
+
+POINT, DISTANCE, ANGLE, STOP = "point", "distance", "angle", "stop"
+_SPOTS: Final = {POINT: 1, DISTANCE: 2, ANGLE: 3}
+_WIDTH: Final = 0.01
+"""So far beside a click, as a share of the picture's height, a point may be."""
+_COLOUR: Final = (255, 205, 80)
+_SIZE_M: Final = 0.08
+
+
+class MeasurePanel:
+    """Widgets in the caller's container, and the measures in the scene, below the map's node."""
+
+    def __init__(self, page: Page) -> None:
+        gui = page.gui
+        self._page = page
+        self._changes = Changes()
+        self._kind = STOP
+        self._click: tuple[F64, F64, float] | None = None  # of the newest click: its ray in the map, and its width
+        self._spots: tuple[Spot, ...] = ()  # of the measure that is begun
+        self._nodes: list[Any] = []
+        self._measured: list[tuple[Measure, F64, Numbers]] = []
+        self._name = gui.add_text("name", "", hint="Of the next measure; empty: a number.")
+        kinds = gui.add_button_group("measure", (*_SPOTS, STOP), hint="Then click points of the map.")
+        kinds.on_click(by_user(lambda kind, _: self.begin(kind)))
+        self._asked = gui.add_html("", visible=False)
+        self._bridge = Bridge(gui, "measures", self._act)
+        self._list = gui.add_html("", visible=False)
+        self._save = gui.add_button("Download as CSV", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
+        self._save.on_click(by_user(lambda _, client: self._download(client)))
+        page.scene.on_click()(self._clicked)
+
+    @property
+    def picking(self) -> bool:
+        """Whether clicks in the scene are for a measure."""
+        return self._kind != STOP
+
+    def begin(self, kind: str) -> None:
+        self._kind, self._spots = kind, ()
+
+    def draw(self, current: Snapshot, view: View) -> None:
+        """Take the newest click, and show what the session keeps."""
+        click, self._click = self._click, None
+        poses = poses_of(current)
+        if click is not None and self.picking:
+            spot = meet(current.chunks, poses, *click, ceilings=view.ceilings) if view.map else None
+            self._take(spot, current)
+        kept = [(measure, places(measure, poses)) for measure in current.measures]
+        begun = places(Measure("", self._spots), poses) if self._spots else None
+        where = [(measure, at) for measure, at in kept if at is not None]
+        drawn = str([at.round(3).tolist() for _, at in where])
+        if self._changes(current.measures, self._kind, str(self._spots), drawn, current.session):
+            self._measured = [(measure, at, numbers(at, current.chunks, poses)) for measure, at in where]
+            self._draw_scene(begun)
+            self._draw_list()
+
+    def _take(self, spot: Spot | None, current: Snapshot) -> None:
+        if spot is None:
+            return
+        self._spots = (*self._spots, spot)
+        if len(self._spots) == _SPOTS[self._kind]:
+            name = self._name.value.strip() or f"{self._kind} {len(current.measures) + 1}"
+            self._page.send(KeepMeasure(Measure(name, self._spots)))
+            self._spots, self._name.value = (), ""  # type: ignore[misc]  # mypy overlooks viser's setter
+
+    def _draw_scene(self, begun: F64 | None) -> None:
+        for node in self._nodes:
+            node.remove()
+        self._nodes.clear()
+        scene = self._page.scene
+        every = [(at, f"{measure.name}: {words(at, found)}") for measure, at, found in self._measured]
+        for number, (at, text) in enumerate([*every, *([(begun, "")] if begun is not None else [])]):
+            name, exact = f"{ROOT}/measures/{number}", at.astype(np.float32)
+            colours = np.tile(np.array(_COLOUR, np.uint8), (len(at), 1))
+            self._nodes.append(add_exact_points(scene, f"{name}/points", exact, colours, _SIZE_M))
+            if len(at) > 1:
+                self._nodes.append(add_lines(scene, f"{name}/lines", segments(exact), _COLOUR, 2.5))
+            if text:
+                self._nodes.append(scene.add_label(f"{name}/label", text, position=at.mean(axis=0)))
+
+    def _draw_list(self) -> None:
+        left = _SPOTS.get(self._kind, 0) - len(self._spots)
+        self._asked.content = panel("note", f"Click {left} point{'s' if left > 1 else ''} of the map.") if left else ""
+        self._asked.visible = bool(left)
+        rows = [(measure.name, words(at, found)) for measure, at, found in self._measured]
+        self._list.content = self._bridge.live(panel("measures", rows)) if rows else ""
+        self._list.visible = self._save.visible = bool(rows)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        if self.picking and event.client is not None:
+            self._click = (*self._page.in_map(event), _WIDTH * event.client.camera.fov)
+
+    def _act(self, word: str, client: viser.ClientHandle) -> None:
+        """What the list sends: "delete 3"."""
+        verb, _, place = word.partition(" ")
+        if verb == "delete" and place.isdecimal() and int(place) < len(self._measured):
+            self._page.send(DropMeasure(self._measured[int(place)][0]))
+
+    def _download(self, client: viser.ClientHandle) -> None:
+        recording = self._page.snapshot().recording
+        name = f"{recording.path.stem if recording else 'map'}-measures.csv"
+        client.send_file_download(name, as_csv(self._measured).encode(), save_immediately=True)

@@ -1,0 +1,140 @@
+"""Measures in the map: the point that a click meets, coordinates, distances, heights, angles; as words and as CSV."""
+
+import csv
+import io
+from dataclasses import astuple, dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from app.mapping.session_file import Measure, Spot
+from app.server.protocol import Chunk
+from app.slam.types import F32, F64, NON_GROUND
+from app.ui.chunks import Chosen, shown_points
+
+_DEEP_M: Final = 0.1
+"""So far behind the nearest point that a click meets, others may be the one that was meant."""
+_AROUND_M: Final = (0.3, 1.0)
+"""Where ground is looked for below a point: so far beside it, or else so far."""
+_FLOOR_M: Final = 0.3
+"""Ground points up to so far below the highest are of the same floor."""
+_KEYFRAMES: Final = 20
+"""Nearest ones, among whose points the ground is looked for."""
+COLUMNS: Final = (
+    "name", "x_m", "y_m", "z_m", "height_m", "distance_m", "horizontal_m", "vertical_m", "angle_deg",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Numbers:
+    """What a measure comes to; nan where it has no such number. height: over the ground below, m. angle: degrees."""
+
+    height: float = np.nan
+    distance: float = np.nan
+    horizontal: float = np.nan
+    vertical: float = np.nan
+    angle: float = np.nan
+
+
+def meet(
+    chunks: tuple[Chunk, ...], poses: F64, origin: F64, direction: F64, width: float, *, ceilings: bool
+) -> Spot | None:
+    """The visible point that a click means: of those at the front, the one nearest to its ray; None if it meets none.
+
+    Args:
+        poses: (k, 4, 4) T_map_imu of the chunks' keyframes. origin, direction: (3,) of the ray, in the map.
+        width: rad, how far beside the ray a point may be seen. ceilings: whether they are shown.
+    """
+    found: list[tuple[F32, F32, Chunk, F32]] = []
+    for chunk, T_map_imu in zip(chunks, poses, strict=False):
+        T = T_map_imu @ chunk.T_imu_lidar
+        along, aside = _from_ray(chunk.points, T[:3, :3].T @ (origin - T[:3, 3]), T[:3, :3].T @ direction)
+        hit = (along > 0) & (aside < width * along)
+        if hit.any():
+            hit &= _mask(shown_points(chunk, T, ceilings), len(hit))
+        if hit.any():
+            found.append((along[hit], aside[hit] / along[hit], chunk, chunk.points[hit]))
+    if not found:
+        return None
+    front = min(float(along.min()) for along, *_ in found) + _DEEP_M
+    best = [np.where(along <= front, off, np.inf) for along, off, *_ in found]
+    which = int(np.argmin([one.min() for one in best]))
+    chunk, points = found[which][2:]
+    x, y, z = (chunk.T_imu_lidar[:3, :3] @ points[np.argmin(best[which])] + chunk.T_imu_lidar[:3, 3]).tolist()
+    return Spot(chunk.index, (x, y, z))
+
+
+def _mask(chosen: Chosen, count: int) -> npt.NDArray[np.bool_]:
+    return np.ones(count, np.bool_) if isinstance(chosen, slice) else chosen
+
+
+def _from_ray(points: F32, origin: F64, direction: F64) -> tuple[F32, F32]:
+    """(n,) m along a ray and aside from it. By the cross product: squares of long ones would lose short ones."""
+    x, y, z = (points - origin.astype(np.float32)).T
+    u, v, w = (direction / np.linalg.norm(direction)).astype(np.float32)
+    aside = np.sqrt((y * w - z * v) ** 2 + (z * u - x * w) ** 2 + (x * v - y * u) ** 2)
+    return x * u + y * v + z * w, aside
+
+
+def places(measure: Measure, poses: F64) -> F64 | None:
+    """(1 to 3, 3) m, its spots in the map; None where a keyframe is not there, as after going back.
+
+    Args:
+        poses: (k, 4, 4) T_map_imu of the keyframes.
+    """
+    if any(not 0 <= spot.keyframe < len(poses) for spot in measure.spots):
+        return None
+    return np.array([poses[spot.keyframe][:3, :3] @ spot.at + poses[spot.keyframe][:3, 3] for spot in measure.spots])
+
+
+def numbers(at: F64, chunks: tuple[Chunk, ...], poses: F64) -> Numbers:
+    """Of one to three (n, 3) places in the map."""
+    if len(at) == 1:
+        return Numbers(height=height(at[0], chunks, poses))
+    a, b = at[0] - at[1], at[-1] - at[1]
+    if len(at) == 2:
+        up = float(at[1, 2] - at[0, 2])
+        return Numbers(distance=float(np.linalg.norm(a)), horizontal=float(np.hypot(a[0], a[1])), vertical=up)
+    cross = float(np.linalg.norm(np.cross(a, b)))
+    return Numbers(angle=float(np.degrees(np.arctan2(cross, a @ b))))
+
+
+def height(place: F64, chunks: tuple[Chunk, ...], poses: F64) -> float:
+    """m over the highest floor that is labelled ground below a (3,) place in the map; nan if there is none."""
+    near = poses[[chunk.index for chunk in chunks], :2, 3] - place[:2]
+    ground = [_ground(chunks[k], poses[chunks[k].index]) for k in np.argsort(np.linalg.norm(near, axis=1))[:_KEYFRAMES]]
+    points = np.concatenate([np.empty((0, 3)), *ground]) - place
+    points = points[points[:, 2] <= _FLOOR_M / 6]  # the place may be on the ground itself, which is rough
+    for around in _AROUND_M:
+        z = points[np.hypot(points[:, 0], points[:, 1]) < around, 2]
+        if len(z):
+            return -float(np.median(z[z > z.max() - _FLOOR_M]))
+    return np.nan
+
+
+def _ground(chunk: Chunk, T_map_imu: F64) -> npt.NDArray[np.floating]:
+    T = T_map_imu @ chunk.T_imu_lidar
+    return np.asarray(chunk.points[chunk.labels != NON_GROUND] @ T[:3, :3].T + T[:3, 3])
+
+
+def words(at: F64, found: Numbers) -> str:
+    """What a measure says, in metres and degrees."""
+    if len(at) == 1:
+        above = f", {found.height:.2f} m above the ground" if np.isfinite(found.height) else ""
+        return f"x {at[0, 0]:.3f}, y {at[0, 1]:.3f}, z {at[0, 2]:.3f} m{above}"
+    if len(at) == 2:
+        return f"{found.distance:.3f} m: {found.horizontal:.3f} m horizontal, {found.vertical:+.3f} m vertical"
+    return f"{found.angle:.1f}°"
+
+
+def as_csv(measured: list[tuple[Measure, F64, Numbers]]) -> str:
+    """A row for each spot, in the map's axes; the first of a measure has its numbers too."""
+    text = io.StringIO()
+    write = csv.writer(text, lineterminator="\n").writerow
+    write(COLUMNS)
+    for measure, at, found in measured:
+        cells = [f"{value:.4f}" if np.isfinite(value) else "" for value in astuple(found)]
+        for row, place in enumerate(at):
+            write((measure.name, *(f"{value:.4f}" for value in place), *(cells if row == 0 else [""] * len(cells))))
+    return text.getvalue()
