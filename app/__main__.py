@@ -19,6 +19,7 @@ from app.cli.georeference import georeference
 from app.cli.replay import replay
 from app.cli.run import run
 from app.cli.serve import serve
+from app.cli.tune import tune
 from app.slam.errors import HemislamError
 
 LEAST_MEMORY = 900 << 20
@@ -97,6 +98,7 @@ cli.command("export")(export_command)
 cli.command("calibrate")(calibrate_command)
 cli.command()(evaluate)
 cli.command()(georeference)
+cli.command()(tune)
 cli.command()(feed)
 
 

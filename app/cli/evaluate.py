@@ -112,25 +112,24 @@ def evaluate(
         )
     if not paths:
         raise HemislamError("Nothing to evaluate; name a RECORDING or use --suite paper.")
-    names = _names(paths)
+    names = name_recordings(paths)
     others = _compared(compare or [], names, [variant.name for variant in chosen])
     arm = _lever(lever)
     subjects = []
-    for path, name, text in zip(paths, names, _truth_texts(paths, truths or []), strict=True):
+    for path, name, text in zip(paths, names, truth_texts(paths, truths or []), strict=True):
         truth: TruePoses | None = read_truth(text, path, arm) if text else None
         params = params_for(path)
         subjects.append(Subject(name, path, params, truth, tuple(others[name])))
     for variant in chosen:
         variant.applied(subjects[0].params)  # raises for a misspelt parameter before anything runs
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    parallel = max(1, min(jobs or cores, len(chosen) * len(subjects)))
+    parallel = max(1, min(jobs or cores(), len(chosen) * len(subjects)))
     compile_behind_bar()
     findings, failures = run_evaluation(
         subjects,
         chosen,
         out,
         parallel=parallel,
-        threads=max(1, cores // parallel),
+        threads=max(1, cores() // parallel),
         start_s=start,
         duration_s=duration,
     )
@@ -142,7 +141,12 @@ def evaluate(
         raise HemislamError(f"{len(failures)} of {len(chosen) * len(subjects)} runs failed; {recording}, {name}: {why}")
 
 
-def _names(paths: list[Path]) -> list[str]:
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def name_recordings(paths: list[Path]) -> list[str]:
     """The recordings' names, numbered where two are the same."""
     names: list[str] = []
     for path in paths:
@@ -152,7 +156,7 @@ def _names(paths: list[Path]) -> list[str]:
     return names
 
 
-def _truth_texts(paths: list[Path], given: list[str]) -> list[str | None]:
+def truth_texts(paths: list[Path], given: list[str]) -> list[str | None]:
     from app.slam.trajectory import truth_beside
 
     if len(given) > len(paths):

@@ -27,13 +27,14 @@ from app.mapping.feed import FileFeed
 from app.mapping.opening import open_session
 from app.mapping.session import Session
 from app.slam.keyframes import KeyframeStore
+from app.slam.loops.types import Origin, Verdict
 from app.slam.metrics import GroundScore
 from app.slam.params import Params
 from app.slam.provenance import describe_machine, peak_memory_mb
 from app.slam.trajectory import Trajectory, write_tum
 from app.slam.types import F64, TIMINGS, FrameStatus, Measurement, StepResult
 
-FORMAT = 1
+FORMAT = 2
 GROUND_RANGES_M = (0.0, 5.0, 10.0, 20.0, 40.0, 100.0)
 RUN_FILES = ("trajectory.tum", "timings.csv", "crops.npz", "run.json")
 
@@ -209,9 +210,23 @@ def _facts(job: Job, session: Session, ground: list[GroundScore]) -> dict[str, A
         "dropped": dict(log.dropped.most_common()),
         "distance_m": session.map_frame.trajectory(log.odometry).distance,
         "loops": None if session.loops is None else session.loops.accepted,
+        "loop_drift_m": _loop_drift(session),
         "ground_share": log.ground_share,
         "ground": None if log.ground_score is None else [asdict(score) for score in ground],
     }
+
+
+def _loop_drift(session: Session) -> float | None:
+    """Median distance between where odometry and where accepted loops have their newer keyframes, m."""
+    if session.loops is None:
+        return None
+    poses = [keyframe.T_odom_imu for keyframe in session.engine.keyframes]
+    drifts = [
+        np.linalg.norm((np.linalg.inv(poses[edge.older]) @ poses[edge.newer] - edge.T_older_newer)[:3, 3])
+        for edge in session.loops.edges
+        if edge.verdict is Verdict.ACCEPTED and edge.origin is Origin.DETECTED
+    ]
+    return float(np.median(drifts)) if drifts else None
 
 
 def _write(

@@ -19,8 +19,8 @@ from app.slam.errors import HemislamError
 REPORT_EVERY_S = 0.2
 
 
-def run_jobs(jobs: list[Job], parallel: int, folder: Path) -> dict[tuple[str, str], str]:
-    """Run all jobs that are not finished yet, `parallel` at a time.
+def run_jobs(jobs: list[Job], parallel: int, folder: Path, *, quiet: bool = False) -> dict[tuple[str, str], str]:
+    """Run all jobs that are not finished yet, `parallel` at a time. quiet: say nothing of single jobs.
 
     Returns:
         Why jobs failed, by (recording, variant); those not named are finished.
@@ -29,7 +29,7 @@ def run_jobs(jobs: list[Job], parallel: int, folder: Path) -> dict[tuple[str, st
     stop = threading.Event()
     with ThreadPoolExecutor(parallel) as pool:
         try:
-            errors = list(pool.map(partial(_run, stop), jobs))
+            errors = list(pool.map(partial(_run, stop, quiet), jobs))
         except BaseException:  # Ctrl-C
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)
@@ -37,15 +37,16 @@ def run_jobs(jobs: list[Job], parallel: int, folder: Path) -> dict[tuple[str, st
     return {(job.name, job.variant): error for job, error in zip(jobs, errors, strict=True) if error}
 
 
-def _run(stop: threading.Event, job: Job) -> str:
+def _run(stop: threading.Event, quiet: bool, job: Job) -> str:
     """Run a job in a process until it ends or `stop` is set. Returns why it failed, "" if it did not."""
     title, error = f"{job.name}, {job.variant}", ""
     if finished(job) is not None:
-        tqdm.write(f"{title}: finished before")
+        if not quiet:
+            tqdm.write(f"{title}: finished before")
         return ""
     child = Child(_work, job, name="job", title="Its process", grace_s=0.0)
     bar: tqdm[NoReturn]
-    with tqdm(desc=title, unit=" frames", leave=False, disable=None) as bar:
+    with tqdm(desc=title, unit=" frames", leave=False, disable=quiet or None) as bar:
         try:
             while not stop.is_set():
                 message = child.receive(REPORT_EVERY_S)
@@ -59,7 +60,8 @@ def _run(stop: threading.Event, job: Job) -> str:
                 error = str(death)
         finally:
             child.close()
-    tqdm.write(f"{title}: {error or 'finished'}")
+    if not quiet:
+        tqdm.write(f"{title}: {error or 'finished'}")
     return error
 
 

@@ -1,0 +1,156 @@
+"""`hemislam tune`: which parameters fit a sensor and a place."""
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from app.cli.evaluate import cores, name_recordings, truth_texts
+from app.cli.options import Duration, ParamsFor, Start, make_folder, with_params
+from app.slam.errors import HemislamError
+
+if TYPE_CHECKING:
+    from app.evaluation.evaluate import Subject
+
+
+@with_params
+def tune(
+    params_for: ParamsFor,
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="One or more recordings.")],
+    parameters: Annotated[
+        str,
+        typer.Option(
+            "--parameters",
+            metavar="NAME,NAME=LEAST:GREATEST,...",
+            help="What varies: names of parameters, each over its whole range or a narrower one.",
+        ),
+    ] = "ground.alpha,ground.sigma",
+    objectives: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--objective",
+            metavar="NAME",
+            help="What is wanted: ate, rpe, loop-drift, ground-f1, entropy, thickness or frame-time. Repeatable."
+            " Default: ate with a truth, else entropy.",
+        ),
+    ] = None,
+    search: Annotated[
+        Literal["bayes", "random", "grid"], typer.Option("--search", help="How the next settings are chosen.")
+    ] = "bayes",
+    trials: Annotated[int, typer.Option("--trials", min=1, metavar="N", help="Settings to try, at most.")] = 100,
+    held_back: Annotated[
+        float | None,
+        typer.Option(
+            "--held-back",
+            min=0,
+            metavar="SECONDS",
+            help="Length of the part after --duration on which the best setting is checked. Default: as long; 0: none.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the search.")] = 0,
+    truths: Annotated[
+        list[str] | None, typer.Option("--truth", metavar="TRUTH", help="True poses, as for `hemislam evaluate`.")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Where to write. Finished runs found there are reused.")
+    ] = Path("runs/tuning"),
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", min=1, metavar="N", help="Parallel runs. Default: one per core.")
+    ] = None,
+    start: Start = 0.0,
+    duration: Duration = None,
+) -> None:
+    """Find the parameters that fit a sensor and a place.
+
+    Tries settings on the recordings, the parameters as given first, and then compares the best of them with these on a
+    part that the search has not seen. With several objectives, the settings that no other one beats in all of them are
+    reported. Started again with the same options, an interrupted search goes on where it was; runs that `evaluate` has
+    finished in a folder beside DIR are not run again.
+
+    \b
+    Writes into DIR:
+      best.params.yaml  the best setting; use it with --config
+      tuning.html       the best settings and the plots, in one file
+      trials.csv        every trial
+      tuning.json       the best settings with all parameters, input hashes and the machine
+
+    \b
+    Examples:
+      hemislam tune walk.mcap --parameters ground.alpha,ground.sigma --objective ground-f1 --duration 20
+      hemislam tune walk.mcap --parameters scan.voxel_size=0.1:0.6 --objective entropy --objective frame-time
+    """
+    if find_spec("optuna") is None:
+        raise HemislamError("`hemislam tune` needs Optuna; install it with `pip install 'hemislam[tune]'`.")
+    from tqdm import tqdm
+
+    from app.cli.run import compile_behind_bar
+    from app.evaluation.evaluate import Subject
+    from app.evaluation.truth import read_truth
+    from app.tuning.objectives import choose_objectives
+    from app.tuning.report import BEST, write_results
+    from app.tuning.space import parse_dimensions
+    from app.tuning.tune import Part, Runs, Trial, front, known_runs
+    from app.tuning.tune import search as find
+
+    dimensions = parse_dimensions(parameters)
+    subjects = [
+        Subject(name, path, params_for(path), read_truth(text, path, None) if text else None)
+        for path, name, text in zip(
+            recordings, name_recordings(recordings), truth_texts(recordings, truths or []), strict=True
+        )
+    ]
+    wanted = choose_objectives(objectives or [_usual(subjects)], subjects)
+    part, rest = Part(start, duration), None
+    if duration is not None and held_back != 0:
+        rest = Part(start + duration, held_back or duration)
+    make_folder(out)
+    parallel = jobs or cores()
+    runs = Runs(
+        subjects,
+        wanted,
+        out / "runs",
+        known=known_runs(out.resolve().parent),
+        parallel=parallel,
+        threads=max(1, cores() // parallel),
+    )
+    compile_behind_bar()
+    with tqdm(total=trials + 1, desc="Tuning", unit=" trials", disable=None) as bar:
+
+        def progress(so_far: Sequence[Trial]) -> None:
+            bar.update(len(so_far) - bar.n)
+            if best := front(so_far, wanted):
+                bar.set_postfix_str(f"best {wanted[0].told(best[0].scores[0])}")
+
+        done, study = find(runs, dimensions, wanted, part, how=search, trials=trials, seed=seed, progress=progress)
+    best = front(done, wanted)
+    if not best:
+        raise HemislamError(f"No trial gave a result: {done[0].error or 'no run has a value for the objective'}")
+    checked = []
+    if rest is not None:
+        settings = [done[0], *(trial for trial in best[:5] if trial.number)]
+        results = runs.score([trial.values for trial in settings], rest)
+        checked = [
+            Trial(t.number, t.values, scores, error) for t, (scores, error) in zip(settings, results, strict=True)
+        ]
+    asked = {
+        "recordings": [{"path": str(s.recording), "sha256": h} for s, h in zip(subjects, runs.hashes, strict=True)],
+        "search": search,
+        "trials": trials,
+        "seed": seed,
+        "part_s": [start, duration],
+    }
+    write_results(out, done, checked, wanted, subjects[0].params, study, asked)
+    for label, shown in (("as given", done[:1]), ("best", best[:5]), ("held back", checked)):
+        for trial in shown:
+            told = ", ".join(f"{one.title} {one.told(v)}" for one, v in zip(wanted, trial.scores, strict=True))
+            typer.echo(f"{label:<10} {told}  ({trial.name}){' ' + trial.error if trial.error else ''}")
+    failed = [trial for trial in done if trial.error]
+    if failed:
+        typer.echo(f"{len(failed)} of {len(done)} trials failed; the first: {failed[0].error}")
+    typer.echo(f"saved in   {out / BEST}, {out / 'tuning.html'}")
+
+
+def _usual(subjects: "list[Subject]") -> str:
+    return "ate" if all(subject.truth is not None for subject in subjects) else "entropy"

@@ -1,0 +1,134 @@
+"""What a search leaves: trials.csv, tuning.json, the best parameters as YAML, and tuning.html with its plots."""
+
+import csv
+import io
+import json
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import optuna
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from app import __version__
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.provenance import describe_machine
+from app.tuning.objectives import Objective
+from app.tuning.tune import Trial, front
+
+BEST = "best.params.yaml"
+
+
+def write_results(
+    folder: Path,
+    trials: Sequence[Trial],
+    held_back: Sequence[Trial],
+    objectives: Sequence[Objective],
+    params: Params,
+    study: optuna.Study,
+    inputs: dict[str, Any],
+) -> None:
+    """Write all files, each whole or not at all.
+
+    Args:
+        held_back: trials run again on the part held back; none if there is no such part.
+        params: as given, over which the settings are laid. inputs: what the search was asked for.
+
+    Raises:
+        HemislamError: the folder cannot be written to.
+    """
+    best = front(trials, objectives)
+    texts = {
+        "trials.csv": _csv(trials, objectives),
+        "tuning.json": json.dumps(
+            {
+                "hemislam": __version__,
+                "machine": describe_machine(),
+                **inputs,
+                "parameters": params.model_dump(mode="json"),
+                "best": [_entry(trial, objectives) for trial in best],
+                "held_back": [_entry(trial, objectives) for trial in held_back],
+            },
+            indent=2,
+            ensure_ascii=False,
+        )
+        + "\n",
+        "tuning.html": _html(trials, best, held_back, objectives, study),
+    }
+    if best:
+        texts[BEST] = params.with_values(best[0].values).to_yaml()
+    try:
+        for name, text in texts.items():
+            part = folder / f".{name}.part"
+            part.write_text(text, encoding="utf-8")
+            part.replace(folder / name)
+    except OSError as error:
+        raise HemislamError(f"The results cannot be written to {folder}: {error.strerror}.") from error
+
+
+def pictures(study: optuna.Study, objectives: Sequence[Objective]) -> dict[str, Any]:
+    """Plotly figures by title, those that the trials so far allow: history, importance, parallel coordinates, front."""
+    from optuna import visualization as draw
+    from optuna.importance import PedAnovaImportanceEvaluator
+
+    done = [trial for trial in study.trials if trial.state == optuna.trial.TrialState.COMPLETE]
+    if len(done) < 2:
+        return {}
+    figures: dict[str, Any] = {}
+    for index, objective in enumerate(objectives):
+        title = f"{objective.title} ({objective.unit})" if objective.unit else objective.title
+
+        def target(trial: optuna.trial.FrozenTrial, index: int = index) -> float:
+            return float(trial.values[index])
+
+        def cost(trial: optuna.trial.FrozenTrial, index: int = index, greatest: bool = objective.greatest) -> float:
+            return float(trial.values[index]) * (-1.0 if greatest else 1.0)  # importance is for low values
+
+        figures[f"{title} over trials"] = draw.plot_optimization_history(study, target=target, target_name=title)
+        figures[f"{title} by parameters"] = draw.plot_parallel_coordinate(study, target=target, target_name=title)
+        if len(done[0].params) > 1 and len({target(trial) for trial in done}) > 1:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # it reminds of what `cost` settles
+                figures[f"What {title} depends on"] = draw.plot_param_importances(
+                    study, evaluator=PedAnovaImportanceEvaluator(), target=cost, target_name=title
+                )
+    if len(objectives) in (2, 3):
+        figures["Pareto front"] = draw.plot_pareto_front(study, target_names=[one.title for one in objectives])
+    for title, figure in figures.items():
+        figure.update_layout(title=title)
+    return figures
+
+
+def _entry(trial: Trial, objectives: Sequence[Objective]) -> dict[str, Any]:
+    scores = {one.name: value for one, value in zip(objectives, trial.scores, strict=True)}
+    return {"trial": trial.number, "values": dict(trial.values), "scores": scores, "error": trial.error or None}
+
+
+def _csv(trials: Sequence[Trial], objectives: Sequence[Objective]) -> str:
+    paths = list(dict.fromkeys(path for trial in trials for path in trial.values))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["trial", *paths, *(f"{one.name}_{one.unit}".rstrip("_") for one in objectives), "error"])
+    for trial in trials:
+        scores = ["" if value is None else f"{value:.9g}" for value in trial.scores]
+        writer.writerow([trial.number, *(trial.values.get(path, "") for path in paths), *scores, trial.error])
+    return text.getvalue()
+
+
+def _html(
+    trials: Sequence[Trial],
+    best: Sequence[Trial],
+    held_back: Sequence[Trial],
+    objectives: Sequence[Objective],
+    study: optuna.Study,
+) -> str:
+    figures = [
+        figure.to_html(full_html=False, include_plotlyjs=index == 0)
+        for index, figure in enumerate(pictures(study, objectives).values())
+    ]
+    page = Environment(loader=PackageLoader("app.tuning"), autoescape=True, undefined=StrictUndefined)
+    return page.get_template("tuning.html").render(
+        version=__version__, trials=trials, best=best, held_back=held_back, objectives=objectives, figures=figures
+    )

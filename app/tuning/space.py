@@ -1,0 +1,119 @@
+"""What a search may vary: parameters with their ranges, from their declaration or narrower ones from the user."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+
+from app.slam.errors import HemislamError
+from app.slam.params import Leaf, Params, leaves
+
+WIDE = 50.0
+"""A range whose ends differ by more than this factor is searched by ratios, not by differences."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dimension:
+    """One parameter that varies. low, high: the ends of a number's range; unused for a switch or a choice."""
+
+    leaf: Leaf
+    low: float = 0.0
+    high: float = 0.0
+
+    @property
+    def path(self) -> str:
+        return self.leaf.path
+
+    @property
+    def distribution(self) -> BaseDistribution:
+        leaf = self.leaf
+        if leaf.choices:
+            return CategoricalDistribution(leaf.choices)
+        if isinstance(leaf.default, bool):
+            return CategoricalDistribution((False, True))
+        if isinstance(leaf.default, int):
+            return IntDistribution(int(self.low), int(self.high), step=int(leaf.step or 1))
+        if self.low > 0 and self.high / self.low > WIDE:
+            return FloatDistribution(self.low, self.high, log=True)
+        return FloatDistribution(self.low, self.high)
+
+    def rounded(self, value: Any) -> Any:
+        """The value on the parameter's own step, so that the same setting is never run twice."""
+        step = self.leaf.step
+        if not isinstance(value, float) or not step:
+            return value
+        return min(max(float(f"{round(value / step) * step:.9g}"), self.low), self.high)
+
+    def grid(self, points: int) -> list[Any]:
+        """At most `points` values, spread evenly over the range."""
+        distribution = self.distribution
+        if isinstance(distribution, CategoricalDistribution):
+            return list(distribution.choices)
+        spread = np.geomspace if getattr(distribution, "log", False) else np.linspace
+        values = spread(self.low, self.high, points).tolist()
+        if isinstance(distribution, IntDistribution):
+            values = [round(value) for value in values]
+        return sorted({self.rounded(value) for value in values})
+
+
+def parse_dimensions(text: str) -> tuple[Dimension, ...]:
+    """From `ground.alpha,ground.sigma=0.01:0.08`: names, each with a range of its own or the declared one.
+
+    Raises:
+        HemislamError: a name is unknown or twice there, a parameter is no number, switch or choice, or a range is none.
+    """
+    known = {leaf.path: leaf for leaf in leaves()}
+    found: dict[str, Dimension] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        path, equals, limits = part.partition("=")
+        if path not in known:
+            Params().with_values({path: 0})  # raises, and names the parameters that are meant
+        if path in found:
+            raise HemislamError(f"--parameters names {path} twice.")
+        found[path] = _dimension(known[path], limits if equals else None)
+    if not found:
+        raise HemislamError("--parameters names nothing that varies; write --parameters ground.alpha,ground.sigma.")
+    return tuple(found.values())
+
+
+def _dimension(leaf: Leaf, limits: str | None) -> Dimension:
+    if leaf.choices or isinstance(leaf.default, bool):
+        if limits is not None:
+            raise HemislamError(f"{leaf.path} is {leaf.requirement}, so it has no range; leave `={limits}` out.")
+        return Dimension(leaf)
+    if not isinstance(leaf.default, int | float) or leaf.minimum is None or leaf.maximum is None:
+        raise HemislamError(f"{leaf.path} cannot vary: it is {leaf.requirement}; choose a number, switch or choice.")
+    if limits is None:
+        return Dimension(leaf, leaf.minimum, leaf.maximum)
+    try:
+        low, high = (float(end) for end in limits.split(":"))
+    except ValueError:
+        raise HemislamError(f"`{leaf.path}={limits}` is no range; write it as {leaf.path}=LEAST:GREATEST.") from None
+    if not leaf.minimum <= low < high <= leaf.maximum:
+        raise HemislamError(f"`{leaf.path}={limits}` is not a range within {leaf.range} {leaf.unit}".rstrip() + ".")
+    return Dimension(leaf, low, high)
+
+
+def grid(dimensions: Sequence[Dimension], most: int) -> list[Mapping[str, Any]]:
+    """At most `most` settings on a grid, every number with the same count of values.
+
+    Raises:
+        HemislamError: there are more settings with two values each.
+    """
+    points, settings = 2, _grid(dimensions, 2)
+    if len(settings) > most:
+        raise HemislamError(
+            f"A grid over {len(dimensions)} parameters has at least {len(settings)} points, more than --trials {most};"
+            " use --search bayes or random, or fewer parameters."
+        )
+    while len(finer := _grid(dimensions, points + 1)) <= most and points < most:
+        points, settings = points + 1, finer
+    return settings
+
+
+def _grid(dimensions: Sequence[Dimension], points: int) -> list[Mapping[str, Any]]:
+    axes = [[(dimension.path, value) for value in dimension.grid(points)] for dimension in dimensions]
+    return [dict(setting) for setting in product(*axes)]

@@ -1,0 +1,219 @@
+"""What `hemislam tune` does: settings are tried on recordings, and the best of them once more on a part held back.
+
+Nothing but finished runs is kept. The same search asks for the same settings in the same order, whatever the number
+of processes, so one that was interrupted finds its finished runs and goes on where it was.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import optuna
+
+from app.evaluation.evaluate import Subject
+from app.evaluation.job import RUN_FILES, Job
+from app.evaluation.measured import Outcome, load, measure
+from app.evaluation.runner import run_jobs
+from app.slam.errors import HemislamError
+from app.slam.provenance import hash_input
+from app.tuning.objectives import Objective, score
+from app.tuning.space import Dimension, grid
+
+Search = Literal["bayes", "random", "grid"]
+BATCH = 8
+"""Trials between two looks at the results; the same for any number of processes, so that trials repeat."""
+DEFAULTS = "as given"
+"""Name of the first trial: the parameters that the user gave."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """Attributes:
+    values: by dotted name; none for the first one. scores: by objective, None if it has none. error: why it failed.
+    """
+
+    number: int
+    values: Mapping[str, Any]
+    scores: tuple[float | None, ...]
+    error: str = ""
+
+    @property
+    def name(self) -> str:
+        return ", ".join(f"{path} = {value}" for path, value in self.values.items()) or DEFAULTS
+
+    @property
+    def complete(self) -> bool:
+        return None not in self.scores
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Of each recording, in seconds after its first scan. duration_s: None for all the rest."""
+
+    start_s: float = 0.0
+    duration_s: float | None = None
+
+
+class Runs:
+    """Runs settings on all recordings and scores them.
+
+    Args:
+        folder: for runs. known: folders of runs that were finished before, by key. parallel, threads: as `evaluate`.
+    """
+
+    def __init__(
+        self,
+        subjects: Sequence[Subject],
+        objectives: Sequence[Objective],
+        folder: Path,
+        *,
+        known: Mapping[str, Path],
+        parallel: int,
+        threads: int,
+    ) -> None:
+        self._subjects, self._objectives, self._folder = subjects, objectives, folder
+        self._known, self._parallel, self._threads = known, parallel, threads
+        self.hashes = [_hash(subject.recording) for subject in subjects]
+
+    def score(self, settings: Sequence[Mapping[str, Any]], part: Part) -> list[tuple[tuple[float | None, ...], str]]:
+        """For each setting its scores by objective, and why it failed ("" if it did not)."""
+        jobs = [[self._job(index, setting, part) for index in range(len(self._subjects))] for setting in settings]
+        each = {job.key: job for of_setting in jobs for job in of_setting}
+        errors = run_jobs(list(each.values()), self._parallel, self._folder, quiet=True)
+        return [self._scored(of_setting, errors) for of_setting in jobs]
+
+    def _job(self, index: int, values: Mapping[str, Any], part: Part) -> Job:
+        subject = self._subjects[index]
+
+        def made(folder: Path, variant: str) -> Job:
+            return Job(
+                recording=subject.recording,
+                sha256=self.hashes[index],
+                name=subject.name,
+                variant=variant,
+                params=subject.params.with_values(values),
+                folder=folder,
+                threads=self._threads,
+                start_s=part.start_s,
+                duration_s=part.duration_s,
+            )
+
+        key = made(self._folder, "").key
+        return made(self._known.get(key, self._folder / subject.name / key[:16]), key[:16])
+
+    def _scored(
+        self, jobs: Sequence[Job], errors: Mapping[tuple[str, str], str]
+    ) -> tuple[tuple[float | None, ...], str]:
+        failed = [error for job in jobs if (error := errors.get((job.name, job.variant)))]
+        if failed:
+            return (None,) * len(self._objectives), failed[0]
+        outcomes = [self._outcome(job, subject) for job, subject in zip(jobs, self._subjects, strict=True)]
+        return tuple(score(objective, outcomes) for objective in self._objectives), ""
+
+    @staticmethod
+    def _outcome(job: Job, subject: Subject) -> Outcome:
+        (outcome,), _, _ = measure([load(job, "")], subject.truth)
+        return outcome
+
+
+def search(
+    runs: Runs,
+    dimensions: Sequence[Dimension],
+    objectives: Sequence[Objective],
+    part: Part,
+    *,
+    how: Search = "bayes",
+    trials: int = 100,
+    seed: int = 0,
+    progress: Callable[[Sequence[Trial]], None] = lambda so_far: None,
+) -> tuple[list[Trial], optuna.Study]:
+    """Try the parameters as given and then `trials` settings. `progress` is called with the trials after each batch.
+
+    Raises:
+        HemislamError: a grid has more points than trials.
+    """
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    study = optuna.create_study(directions=["maximize" if one.greatest else "minimize" for one in objectives])
+    ((scores, error),) = runs.score([{}], part)
+    done = [Trial(0, {}, scores, error)]
+    progress(done)
+    for batch in _batches(study, dimensions, how, trials, seed):
+        settings = [setting for _, setting in batch]
+        for (asked, setting), (scores, error) in zip(batch, runs.score(settings, part), strict=True):
+            trial = Trial(len(done), setting, scores, error)
+            done.append(trial)
+            if trial.complete:
+                study.tell(asked, [value for value in scores if value is not None])
+            else:
+                study.tell(asked, state=optuna.trial.TrialState.FAIL)
+        progress(done)
+    return done, study
+
+
+Batch = list[tuple[optuna.trial.Trial, Mapping[str, Any]]]
+
+
+def _batches(
+    study: optuna.Study, dimensions: Sequence[Dimension], how: Search, trials: int, seed: int
+) -> Iterator[Batch]:
+    distributions = {dimension.path: dimension.distribution for dimension in dimensions}
+    if how == "grid":
+        settings = grid(dimensions, trials)
+        for setting in settings:
+            study.enqueue_trial(dict(setting))
+        for first in range(0, len(settings), BATCH):
+            yield [(study.ask(distributions), setting) for setting in settings[first : first + BATCH]]
+        return
+    for first in range(0, trials, BATCH):
+        study.sampler = _sampler(how, seed * 10_000 + first)
+        asked = [study.ask(distributions) for _ in range(min(BATCH, trials - first))]
+        yield [(trial, {one.path: one.rounded(trial.params[one.path]) for one in dimensions}) for trial in asked]
+
+
+def _sampler(how: Search, seed: int) -> optuna.samplers.BaseSampler:
+    if how == "random":
+        return optuna.samplers.RandomSampler(seed=seed)
+    return optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
+
+
+def front(trials: Sequence[Trial], objectives: Sequence[Objective]) -> list[Trial]:
+    """The trials that no other one beats in every objective, the best of the first objective first."""
+    signs = [-1.0 if objective.greatest else 1.0 for objective in objectives]
+    costs = {
+        trial.number: [sign * (value or 0.0) for sign, value in zip(signs, trial.scores, strict=True)]
+        for trial in trials
+        if trial.complete
+    }
+
+    def beaten(number: int) -> bool:
+        mine = costs[number]
+        return any(
+            all(a <= b for a, b in zip(theirs, mine, strict=True)) and (theirs != mine or other < number)
+            for other, theirs in costs.items()
+            if other != number
+        )
+
+    best = [trial for trial in trials if trial.number in costs and not beaten(trial.number)]
+    return sorted(best, key=lambda trial: costs[trial.number])
+
+
+def known_runs(folder: Path) -> dict[str, Path]:
+    """Folders of finished runs below `folder`, by their key, so that `tune` runs nothing that `evaluate` ran."""
+    known = {}
+    for report in sorted(folder.glob("*/runs/*/*/run.json")):
+        try:
+            key = json.loads(report.read_text(encoding="utf-8"))["key"]
+        except (OSError, ValueError, KeyError):
+            continue
+        if all((report.parent / name).is_file() for name in RUN_FILES):
+            known[str(key)] = report.parent
+    return known
+
+
+def _hash(recording: Path) -> str:
+    digest = hash_input(recording)
+    if digest is None:
+        raise HemislamError(f"{recording} cannot be read; check its permissions.")
+    return digest

@@ -1,0 +1,169 @@
+"""A search tries settings, keeps the best, goes on after a stop, and refuses what cannot vary.
+
+Tests app/tuning/space.py, app/tuning/objectives.py, app/tuning/tune.py, app/tuning/report.py.
+"""
+
+import csv
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import Result
+from typer.testing import CliRunner
+
+from app.__main__ import cli
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.tuning.objectives import OBJECTIVES
+from app.tuning.space import grid, parse_dimensions
+from app.tuning.tune import Part, Trial, front, search
+from tests.cli.conftest import write_walk
+
+ATE, F1 = OBJECTIVES["ate"], OBJECTIVES["ground-f1"]
+
+
+class Bowl:
+    """Stands for runs: the error is least at α = 40°, σ = 0.05, and nothing comes of α below 5°."""
+
+    def __init__(self) -> None:
+        self.asked: list[Mapping[str, Any]] = []
+
+    def score(self, settings: Sequence[Mapping[str, Any]], part: Part) -> list[tuple[tuple[float | None, ...], str]]:
+        self.asked += settings
+        return [self._one(setting) for setting in settings]
+
+    def _one(self, setting: Mapping[str, Any]) -> tuple[tuple[float | None, ...], str]:
+        params = Params().with_values(setting)
+        if params.ground.alpha < 5:
+            return (None,), "lost"
+        off = (params.ground.alpha - 40) / 40, np.log(params.ground.sigma / 0.05)
+        return (float(off[0] ** 2 + off[1] ** 2),), ""
+
+
+def found(how: Any, trials: int = 60, seed: int = 0) -> tuple[list[Trial], Bowl]:
+    bowl = Bowl()
+    done, _ = search(
+        bowl,  # type: ignore[arg-type]
+        parse_dimensions("ground.alpha,ground.sigma"),
+        (ATE,),
+        Part(),
+        how=how,
+        trials=trials,
+        seed=seed,
+    )
+    return done, bowl
+
+
+@pytest.mark.parametrize("how", ["bayes", "random", "grid"])
+def test_every_search_comes_near_the_least_error(how: str) -> None:
+    done, _ = found(how)
+    (best,) = front(done, (ATE,))
+    assert done[0].values == {} and best.scores[0] < 0.25 * done[0].scores[0]
+    assert sum(trial.error == "lost" for trial in done) == sum(trial.scores == (None,) for trial in done)
+
+
+def test_a_bayesian_search_beats_a_random_one() -> None:
+    def least(how: str, seed: int) -> float:
+        (best,) = front(found(how, seed=seed)[0], (ATE,))
+        assert best.scores[0] is not None
+        return best.scores[0]
+
+    seeds = range(5)
+    assert np.median([least("bayes", seed) for seed in seeds]) < np.median([least("random", seed) for seed in seeds])
+
+
+def test_a_search_that_is_repeated_asks_for_the_same_settings() -> None:
+    (_, first), (_, again), (_, other) = found("bayes"), found("bayes"), found("bayes", seed=1)
+    assert first.asked == again.asked != other.asked
+
+
+def test_the_front_holds_what_no_other_trial_beats() -> None:
+    scores = [(1.0, 0.5), (2.0, 0.9), (1.0, 0.6), (3.0, 0.8), (0.5, None), (1.0, 0.6)]
+    trials = [Trial(number, {}, pair) for number, pair in enumerate(scores)]
+    assert [trial.number for trial in front(trials, (ATE, F1))] == [2, 1]
+
+
+def test_ranges_come_from_the_declaration_or_are_narrowed() -> None:
+    alpha, lines, loops = parse_dimensions("ground.alpha=10:40, ground.scan_lines ,loops.enabled")
+    assert (alpha.low, alpha.high, lines.low, lines.high) == (10, 40, 1, 128)
+    assert loops.grid(5) == [False, True]
+    assert all(isinstance(value, int) for value in lines.grid(6))
+    assert alpha.rounded(12.3456) == 12.0
+
+
+def test_a_grid_has_at_most_as_many_points_as_trials() -> None:
+    dimensions = parse_dimensions("ground.alpha,ground.sigma,loops.enabled")
+    assert len(grid(dimensions, 20)) == 3 * 3 * 2
+    with pytest.raises(HemislamError, match="more than --trials 7"):
+        grid(dimensions, 7)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("ground.alfa", "alpha"),
+        ("recording.lidar_topic", "cannot vary"),
+        ("sensor.translation", "cannot vary"),
+        ("ground.alpha=40:10", "not a range"),
+        ("ground.alpha=0:1000", "not a range"),
+        ("ground.alpha=fast", "LEAST:GREATEST"),
+        ("loops.enabled=0:1", "no range"),
+        ("ground.alpha,ground.alpha", "twice"),
+        (" , ", "nothing that varies"),
+    ],
+)
+def test_what_cannot_vary_is_refused_in_a_sentence(text: str, complaint: str) -> None:
+    with pytest.raises(HemislamError, match=complaint):
+        parse_dimensions(text)
+
+
+# --- the command ---------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "walk.mcap"
+    write_walk(path)
+    return path
+
+
+def tune(recording: Path, out: Path, *words: str) -> Result:
+    options = ["--parameters", "filter.max_iterations=1:5", "--search", "grid", "--trials", "3", "--duration", "1.5"]
+    return CliRunner().invoke(cli, ["tune", str(recording), *options, "--out", str(out), *words])
+
+
+def trials_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "trials.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_search_on_a_recording_leaves_its_results_and_is_not_run_twice(recording: Path, tmp_path: Path) -> None:
+    out, both = tmp_path / "first", ("--objective", "entropy", "--objective", "frame-time")
+    result = tune(recording, out, *both)
+    assert result.exit_code == 0, result.output
+    rows = trials_of(out)
+    assert [row["filter.max_iterations"] for row in rows] == ["", "1", "3", "5"]
+    assert all(float(row["frame-time_ms"]) > 0 for row in rows)
+    best = yaml.safe_load((out / "best.params.yaml").read_text())
+    told = json.loads((out / "tuning.json").read_text())
+    assert Params().merged(best).changed(Params().with_values(told["best"][0]["values"])) == {}
+    assert "Pareto front" in (out / "tuning.html").read_text()
+
+    stamps = {path: path.stat().st_mtime_ns for path in out.glob("runs/*/*/run.json")}
+    shutil.rmtree(min(stamps).parent)  # as if stopped in the middle
+    assert tune(recording, out, *both).exit_code == 0
+    again = {path: path.stat().st_mtime_ns for path in out.glob("runs/*/*/run.json")}
+    assert sum(stamps[path] != again[path] for path in stamps) == 1
+    other = tmp_path / "second"
+    assert tune(recording, other, *both).exit_code == 0
+    assert not list(other.glob("runs/*/*/run.json")), "what the first search ran is used"
+    assert [row["entropy_nats"] for row in trials_of(other)] == [row["entropy_nats"] for row in rows]
+
+
+def test_an_objective_without_truth_is_refused(recording: Path, tmp_path: Path) -> None:
+    result = tune(recording, tmp_path / "out", "--truth", "none", "--objective", "ate")
+    assert result.exit_code == 2
+    assert "needs true poses" in result.output
