@@ -22,13 +22,16 @@ GPS_MINUS_UNIX_S = -315_964_800 + 18
 
 def write(path: Path, results: "Results") -> None:
     """Poses are in the map or, if it is known, in the coordinate system on Earth. Each file has new GUIDs."""
-    file = _Writer(str(path), results.where)
     try:
-        for block in results.blocks():
-            if len(block):
-                _add(file, block, results.where)
-    finally:
-        file.close()
+        file = _Writer(str(path), results.where)
+        try:
+            for block in results.blocks():
+                if len(block):
+                    _add(file, block, results.where)
+        finally:
+            file.close()
+    except libe57.E57Exception as error:
+        raise OSError("the disk is full or fails") from error
 
 
 class _Writer(pye57.E57):  # type: ignore[misc] # it has no types

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import laspy
+import lazrs
 import numpy as np
 from laspy.vlrs.known import WktCoordinateSystemVlr
 
@@ -40,13 +41,16 @@ def _write(path: Path, results: "Results", *, compressed: bool) -> None:
     if len(results.keyframes):
         header.creation_date = datetime.fromtimestamp(results.keyframes[0].stamp_ns // 10**9, UTC).date()
     backend = laspy.LazBackend.LazrsParallel if compressed else None
-    with laspy.open(path, mode="w", header=header, do_compress=compressed, laz_backend=backend) as file:
-        batch: list[np.ndarray] = []
-        for block in results.blocks():
-            batch.append(_record(block, header, where))
-            if sum(map(len, batch)) > BATCH:
-                _write_batch(file, header, batch)
-        _write_batch(file, header, batch)
+    batch: list[np.ndarray] = []
+    try:
+        with laspy.open(path, mode="w", header=header, do_compress=compressed, laz_backend=backend) as file:
+            for block in results.blocks():
+                batch.append(_record(block, header, where))
+                if sum(map(len, batch)) > BATCH:
+                    _write_batch(file, header, batch)
+            _write_batch(file, header, batch)
+    except lazrs.LazrsError as error:
+        raise OSError("the disk is full or fails") from error
 
 
 def _write_batch(file: Any, header: laspy.LasHeader, batch: list[np.ndarray]) -> None:

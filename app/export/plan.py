@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 import ezdxf
 import numpy as np
 import numpy.typing as npt
-import rasterio
 import rasterio.features
 from PIL import Image
+from rasterio.io import MemoryFile
 from rasterio.transform import from_origin
 from scipy import ndimage
 
@@ -80,9 +80,8 @@ def write_density(path: Path, results: "Results") -> None:
 
 def _write_tiff(path: Path, results: "Results", raster: Raster, values: npt.NDArray[np.float32]) -> None:
     rows, columns = values.shape
-    with rasterio.open(
-        path,
-        "w",
+    memory = MemoryFile()  # a disk that fails is no error to GDAL
+    with memory.open(
         driver="GTiff",
         height=rows,
         width=columns,
@@ -94,6 +93,7 @@ def _write_tiff(path: Path, results: "Results", raster: Raster, values: npt.NDAr
         crs=None if results.where is None else results.where.wkt(),
     ) as file:
         file.write(np.flipud(values), 1)
+    path.write_bytes(memory.read())
 
 
 def _transform(raster: Raster) -> Any:

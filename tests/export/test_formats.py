@@ -86,3 +86,14 @@ def test_what_is_not_installed_is_named_with_the_command(monkeypatch: pytest.Mon
     monkeypatch.setitem(table.EXTRAS, "e57", ("no_such_module",))
     with pytest.raises(HemislamError, match=r"pip install 'hemislam\[e57\]'"):
         of_formats(["e57"])
+
+
+@pytest.mark.parametrize("kind", ["las", "laz", "e57", "pcd", "ply", "terrain", "html"])
+def test_a_full_disk_leaves_the_older_file_and_is_said_in_a_sentence(tmp_path: Path, kind: str) -> None:
+    (export,) = of_formats([kind])
+    older = tmp_path / export.name
+    older.write_bytes(b"older")
+    (tmp_path / f".{export.name}.part").symlink_to("/dev/full")
+    with pytest.raises(HemislamError, match="cannot be written to"):
+        save_results(tmp_path, room(UTM), [export], replace=True)
+    assert [path.name for path in tmp_path.iterdir()] == [export.name] and older.read_bytes() == b"older"
