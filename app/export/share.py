@@ -74,7 +74,7 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: "Resu
     low, high = seen.min(axis=0), seen.max(axis=0)
     _add_scale_and_arrow(server, low, high, results)
     center, size = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) + 1.0
-    server.initial_camera.position = tuple(center + size * np.array([-0.35, -0.55, 0.6]))
+    server.initial_camera.position = tuple(center + size * np.array([-0.26, -0.42, 0.45]))
     server.initial_camera.look_at = tuple(center)
 
 
