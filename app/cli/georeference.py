@@ -21,6 +21,13 @@ def georeference(
         Path | None,
         typer.Option("--gnss", metavar="FILE", help="NMEA log or CSV of fixes; else those in the recording."),
     ] = None,
+    control: Annotated[
+        Path | None,
+        typer.Option("--control", metavar="FILE", help="CSV of control points: name,E,N,H or name,lat,lon,height."),
+    ] = None,
+    picks: Annotated[
+        Path | None, typer.Option("--picks", metavar="FILE", help="CSV of where they are in the map: name,x,y,z.")
+    ] = None,
     crs: Annotated[
         str, typer.Option("--crs", metavar="EPSG:CODE", help="A plane grid in metres; else the UTM zone of the place.")
     ] = "",
@@ -28,17 +35,21 @@ def georeference(
         tuple[float, float, float] | None,
         typer.Option("--lever-arm", metavar="X Y Z", help="Metres from the IMU to the antenna, in the IMU's axes."),
     ] = None,
+    height: Annotated[
+        str,
+        typer.Option("--height", metavar="TEXT", help="What the file's heights are above, to be written beside them."),
+    ] = "",
 ) -> None:
-    """Find where on Earth a map lies, by satellite fixes.
+    """Find where on Earth a map lies, by satellite fixes or control points.
 
-    Only turns the map about the vertical and moves it: its shape stays. Finds how late the receiver's clock is by
-    comparing the motion, and the lever arm if it is not given and the motion tells it. Fixes that contradict the
-    others are rejected and named.
+    The map's shape stays. By fixes, it is only turned about the vertical and moved. That finds how late the receiver's
+    clock is by comparing the motion, and the lever arm if it is not given and the motion tells it. Fixes that
+    contradict the others are rejected and named.
 
     \b
     Writes into RESULTS:
       georeference.json     coordinate system, origin and rotation of the map
-      gnss_residuals.csv    every fix: place, residual, verdict
+      gnss_residuals.csv    every fix or control point: place, residual, verdict
       georeference.svg      path and fixes from above, residuals
 
     \b
@@ -46,24 +57,44 @@ def georeference(
       hemislam georeference runs/walk-1
       hemislam georeference runs/walk-1 --gnss rover.nmea --lever-arm 0.05 -0.1 0.4
       hemislam georeference runs/walk-1 --gnss fixes.csv --crs EPSG:25832
+      hemislam georeference runs/walk-1 --control points.csv --picks picked.csv --crs EPSG:25832
     """
     from app.georeference import ledger
+    from app.georeference.control import lay_on_control
+    from app.slam.trajectory import read_tum
+
+    if (control is None) != (picks is None) or (control is not None and (gnss is not None or lever_arm is not None)):
+        raise HemislamError("--control and --picks go together, without --gnss and --lever-arm.")
+    trajectory = read_tum(results / "trajectory.tum")
+    if control is not None and picks is not None:
+        found = lay_on_control(control, picks, grid=crs, height=height or "ellipsoidal")
+        lines = [*ledger.summary(found, "control points"), "", *ledger.table(found)]
+    else:
+        found = _by_fixes(results, trajectory, gnss, crs, lever_arm, height)
+        lines = ledger.summary(found, "fixes")
+        if not found.used.all():
+            lines += ["", *ledger.table(found, only_rejected=True)]
+    typer.echo("\n".join(lines))
+    _write(results, found, trajectory)
+
+
+def _by_fixes(
+    results: Path,
+    trajectory: "Trajectory",
+    gnss: Path | None,
+    crs: str,
+    lever_arm: tuple[float, float, float] | None,
+    height: str,
+) -> "Alignment":
     from app.georeference.align import align
     from app.georeference.tables import read_fixes
     from app.sensors.navsat import recorded_fixes
-    from app.slam.trajectory import read_tum
 
-    trajectory = read_tum(results / "trajectory.tum")
     if gnss is not None:
-        fixes, height = read_fixes(gnss, int(trajectory.stamps_ns[0]))
+        fixes, told = read_fixes(gnss, int(trajectory.stamps_ns[0]))
     else:
-        fixes, height = recorded_fixes(_recording_of(results)), "ellipsoidal"
-    found = align(trajectory, fixes, grid=crs, height=height, lever=lever_arm)
-    lines = ledger.summary(found, "fixes")
-    if not found.used.all():
-        lines += ["", *ledger.table(found, only_rejected=True)]
-    typer.echo("\n".join(lines))
-    _write(results, found, trajectory)
+        fixes, told = recorded_fixes(_recording_of(results)), "ellipsoidal"
+    return align(trajectory, fixes, grid=crs, height=height or told, lever=lever_arm)
 
 
 def _recording_of(results: Path) -> Path:

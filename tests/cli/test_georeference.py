@@ -10,7 +10,7 @@ import pytest
 
 from app.georeference import reference
 from app.slam.trajectory import stamp_text, write_tum
-from tests.georeference.walks import LEVER, Walked, off, walked
+from tests.georeference.walks import LEVER, TRUTH, Walked, off, walked
 
 Call = Callable[..., Any]
 
@@ -57,3 +57,16 @@ def test_without_fixes_it_says_where_to_take_them_from(hemislam: Call, results: 
 def test_a_folder_without_a_trajectory_is_refused(hemislam: Call, tmp_path: Path) -> None:
     outcome = hemislam("georeference", tmp_path)
     assert outcome.code == 2 and "trajectory.tum cannot be read" in outcome.err
+
+
+def test_control_points_are_listed_with_their_residuals(hemislam: Call, results: Path) -> None:
+    grid = TRUTH.to_crs(np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 1.0], [0.0, 20.0, 2.0]])).tolist()
+    (results / "c.csv").write_text("name,E,N,H\n" + "".join(f"P{k},{e},{n},{h}\n" for k, (e, n, h) in enumerate(grid)))
+    (results / "p.csv").write_text("name,x,y,z\nP0,0,0,0\nP1,30,0,1\nP2,0,20,2\n")
+    files = ("--control", results / "c.csv", "--picks", results / "p.csv")
+    outcome = hemislam("georeference", results, *files, "--crs", "EPSG:32632")
+    assert outcome.code == 0, outcome.err
+    assert [line.split()[0] for line in outcome.out.splitlines() if line.startswith("P")] == ["P0", "P1", "P2"]
+    assert "of 3 of 3 control points" in outcome.out
+    outcome = hemislam("georeference", results, *files[:2])
+    assert outcome.code == 2 and "go together" in outcome.err

@@ -1,0 +1,74 @@
+"""Control points. Oracle: SciPy's general least squares over a rotation vector and a shift."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from app.georeference.control import lay_on_control
+from app.slam.errors import HemislamError
+from tests.georeference.walks import TRUTH
+
+CORNERS = {"A": (0.0, 0.0, 0.0), "B": (40.0, 2.0, 1.0), "C": (38.0, 30.0, -0.5), "D": (-3.0, 28.0, 4.0)}
+
+
+def written(folder: Path, points: dict[str, tuple[float, ...]], *, noise: float = 0.01) -> tuple[Path, Path]:
+    """The files of control points and of where they were picked; each is off by `noise` m."""
+    rng = np.random.default_rng(4)
+    grid = TRUTH.to_crs(np.array([*points.values()])) + noise * rng.normal(size=(len(points), 3))
+    rows = [f"{name},{e!r},{n!r},{h!r}" for name, (e, n, h) in zip(points, grid.tolist(), strict=True)]
+    control, picks = folder / "control.csv", folder / "picks.csv"
+    control.write_text("Name,E,N,H\n" + "\n".join(rows) + "\n")
+    picks.write_text("name,x,y,z\n" + "".join(f"{name},{x},{y},{z}\n" for name, (x, y, z) in points.items()))
+    return control, picks
+
+
+def test_four_points_give_the_transform_of_an_independent_least_squares(tmp_path: Path) -> None:
+    control, picks = written(tmp_path, CORNERS)
+    found = lay_on_control(control, picks, grid="EPSG:32632")
+    points = np.array([*CORNERS.values()])
+    k = found.reference.scale
+    there = (found.grid - found.grid.mean(axis=0)) / [k, k, 1.0]
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        return (there - Rotation.from_rotvec(x[:3]).apply(points) - x[3:]).ravel()
+
+    best = least_squares(errors, np.r_[0.0, 0.0, np.radians(37.0), np.zeros(3)], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    np.testing.assert_allclose(found.residuals.ravel(), best.fun, atol=1e-7)
+    np.testing.assert_allclose(found.reference.rotation, Rotation.from_rotvec(best.x[:3]).as_matrix(), atol=1e-8)
+    assert np.abs(found.reference.to_crs(points) - TRUTH.to_crs(points)).max() < 0.03
+    assert found.rms.max() < 0.02
+
+
+def test_exact_points_in_degrees_give_the_map_its_exact_place(tmp_path: Path) -> None:
+    _, picks = written(tmp_path, CORNERS)
+    rows = zip(CORNERS, TRUTH.to_geographic(np.array([*CORNERS.values()])).tolist(), strict=True)
+    control = tmp_path / "degrees.csv"
+    control.write_text("id;lat;lon;height\n" + "".join(f"{n};{a!r};{o!r};{h!r}\n" for n, (a, o, h) in rows))
+    found = lay_on_control(control, picks, height="orthometric (EGM2008)")
+    np.testing.assert_allclose(found.reference.origin, TRUTH.origin, atol=1e-4)
+    assert found.reference.crs == "EPSG:32632" and found.reference.height == "orthometric (EGM2008)"
+
+
+def test_a_point_that_is_only_in_one_file_is_left_out(tmp_path: Path) -> None:
+    control, picks = written(tmp_path, CORNERS)
+    picks.write_text(picks.read_text().replace("D,", "Z,"))
+    assert lay_on_control(control, picks, grid="EPSG:32632").names == ("A", "B", "C")
+
+
+@pytest.mark.parametrize(
+    ("points", "grid", "words"),
+    [
+        (dict([*CORNERS.items()][:2]), "EPSG:32632", "with fewer, the map may still turn"),
+        ({name: (10.0 * k, 5.0 * k, 0.1 * k) for k, name in enumerate("ABCD")}, "EPSG:32632", "lie on one line"),
+        (CORNERS, "", "say of which grid with --crs"),
+        (CORNERS, "EPSG:2056", "is not made for|has no place"),
+    ],
+)
+def test_points_that_leave_the_place_open_are_refused_and_it_is_said_what(
+    tmp_path: Path, points: dict[str, tuple[float, ...]], grid: str, words: str
+) -> None:
+    with pytest.raises(HemislamError, match=words):
+        lay_on_control(*written(tmp_path, points), grid=grid)
