@@ -82,7 +82,7 @@ class MeasurePanel:
             node.remove()
         self._nodes.clear()
         scene = self._page.scene
-        every = [(at, f"{measure.name}: {words(at, found)}") for measure, at, found in self._measured]
+        every = [(at, f"{measure.name}: {words(at, found).split(': ')[0]}") for measure, at, found in self._measured]
         for number, (at, text) in enumerate([*every, *([(begun, "")] if begun is not None else [])]):
             name, exact = f"{ROOT}/measures/{number}", at.astype(np.float32)
             colours = np.tile(np.array(_COLOUR, np.uint8), (len(at), 1))

@@ -109,7 +109,7 @@ def height(place: F64, chunks: tuple[Chunk, ...], poses: F64) -> float:
     for around in _AROUND_M:
         z = points[np.hypot(points[:, 0], points[:, 1]) < around, 2]
         if len(z):
-            return -float(np.median(z[z > z.max() - _FLOOR_M]))
+            return round(-float(np.median(z[z > z.max() - _FLOOR_M])), 3) + 0.0  # never a negative zero
     return np.nan
 
 
