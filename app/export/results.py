@@ -33,6 +33,9 @@ EXTRAS = {"e57": ("pye57",), "plan": ("ezdxf", "rasterio")}
 """Modules that the extras of the package install."""
 
 
+Mark = tuple[str, tuple[tuple[int, tuple[float, float, float]], ...]]
+
+
 @dataclass
 class Results:
     """What the result files are written from.
@@ -40,6 +43,7 @@ class Results:
     Attributes:
         loops: None if loops were not searched. report: what report.json holds; complete once it is written.
         choice: of points. where: on Earth the map is, if that is known.
+        marks: what was measured, each a name and its spots: keyframe and (x, y, z) m in its IMU frame.
         progress: called with the share of the points that a file has got, 0-1, for each file.
     """
 
@@ -50,6 +54,7 @@ class Results:
     report: dict[str, Any] = field(default_factory=dict)
     choice: Choice = EVERYTHING
     where: GeoReference | None = None
+    marks: tuple[Mark, ...] = ()
     progress: Callable[[float], None] = lambda share: None
     _rasters: dict[tuple[bool, float], Raster] = field(default_factory=dict, repr=False)
 

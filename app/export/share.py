@@ -21,11 +21,11 @@ TILE = 16.0
 """m: float16 holds coordinates in a tile to 4 mm."""
 STOPS = np.array([[40, 60, 150], [30, 150, 160], [120, 195, 110], [240, 200, 70], [225, 90, 50]], np.float64)
 """Colours from low to high."""
-PATH, LOOP, ARROW = (255, 255, 255), (255, 120, 40), (255, 60, 60)
+PATH, LOOP, MARK, ARROW = (255, 255, 255), (255, 120, 40), (120, 255, 160), (255, 60, 60)
 
 
 def write(path: Path, results: "Results") -> None:
-    """Points to a budget, the trajectory, loops, a scale, an arrow to the north, title and credits."""
+    """Points to a budget, trajectory, loops, what was measured, a scale, an arrow to the north, title, credits."""
     points, keyframes = _sample(results)
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints when it starts and stops
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
@@ -70,12 +70,28 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: "Resu
         _lines(server, "/trajectory", np.stack([trajectory[:-1], trajectory[1:]], axis=1), PATH)
     if len(pairs := _loops(results.loops.g2o if results.loops else "", len(keyframes))):
         _lines(server, "/loops", keyframes[pairs], LOOP)
+    for number, (text, at) in enumerate(marked(results)):
+        server.scene.add_label(f"/marks/{number}", text, position=tuple(at.mean(axis=0)))
+        if len(at) > 1:
+            _lines(server, f"/marks/{number}/line", np.stack([at[:-1], at[1:]], axis=1), MARK)
     seen = points if len(points) else np.zeros((1, 3), np.float32)
     low, high = seen.min(axis=0), seen.max(axis=0)
     _add_scale_and_arrow(server, low, high, results)
     center, size = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) + 1.0
     server.initial_camera.position = tuple(center + size * np.array([-0.26, -0.42, 0.45]))
     server.initial_camera.look_at = tuple(center)
+
+
+def marked(results: "Results") -> list[tuple[str, F64]]:
+    """What was measured: name, with the distance of two points, and the (k, 3) m places in the map."""
+    found = []
+    for name, spots in results.marks:
+        if all(0 <= index < len(results.keyframes) for index, _ in spots):
+            poses = [results.frame.at(index) @ results.keyframes[index].T_odom_imu for index, _ in spots]
+            at = np.array([T[:3, :3] @ place + T[:3, 3] for T, (_, place) in zip(poses, spots, strict=True)])
+            length = f" {np.linalg.norm(at[1] - at[0]):.3f} m" if len(at) == 2 else ""
+            found.append((name + length, at))
+    return found
 
 
 def _lines(server: viser.ViserServer, name: str, ends: F64, colour: tuple[int, int, int]) -> None:

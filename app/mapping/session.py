@@ -14,7 +14,7 @@ from app.export.results import BY_RUN, Results, of_formats, save_results
 from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelledKeyframes
-from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
+from app.mapping.session_file import SUFFIX, Measure, Opened, SavedSession, State, size_of, write_session
 from app.mapping.truth import compared
 from app.sensors.findings import Finding
 from app.slam.engine import Engine
@@ -310,13 +310,15 @@ class Session:
         ours = self.map_frame.trajectory(self.log.odometry)
         return compared(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns, ours.positions)[1]
 
-    def results(self, stopped: str = "", calibration: str = "") -> Results:
+    def results(self, stopped: str = "", calibration: str = "", measures: tuple[Measure, ...] = ()) -> Results:
         """What result files are written from: the frames so far, with all loops, in effect or not. As `save`."""
         info = self.feed.info
         made_from = RunInfo(
             info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped, calibration
         )
-        return Results(self.log, self.keyframes.now(), made_from, self.loops.results() if self.loops else None)
+        results = Results(self.log, self.keyframes.now(), made_from, self.loops.results() if self.loops else None)
+        results.marks = tuple((one.name, tuple((spot.keyframe, spot.at) for spot in one.spots)) for one in measures)
+        return results
 
     def save(
         self,
@@ -333,7 +335,7 @@ class Session:
         """Write the results of the frames so far in a thread of its own, with all loops, in effect or not.
 
         Args:
-            session: to be written beside them. formats: of `EXPORTS`, instead of the files of a run.
+            session: to be written beside the files of a run. formats: of `EXPORTS`, instead of the files of a run.
             choice: of points. progress: called with the share that is written, 0-1, in that thread.
             replace: overwrite older results. stopped: why the session ended early, if it did.
             calibration: what the recording tells of its mounting, in a sentence.
@@ -341,12 +343,12 @@ class Session:
         Returns:
             The content of report.json, or HemislamError if the folder cannot be written to.
         """
-        results = self.results(stopped, calibration)
+        results = self.results(stopped, calibration, session.state.measures if session is not None else ())
         results.choice, results.progress = choice, progress
 
         def write() -> dict[str, Any]:
             report = save_results(folder, results, of_formats(formats) if formats else BY_RUN, replace=replace)
-            if session is not None:
+            if session is not None and not formats:
                 write_session(folder / f"session{SUFFIX}", session)
             return report
 

@@ -162,7 +162,7 @@ class Controller:
                 self._open_soon(self._need_session().feed.info.path, self._reopen)
             case protocol.Save(folder, formats, thin):
                 session, choice = self._need_session(), Choice(thin)
-                saved = None if formats else session.saved(self._state(session))
+                saved = session.saved(self._state(session))
                 save = session.save(folder, session=saved, formats=formats, choice=choice, progress=self._set_share)
                 self._saves.append((folder, save))
             case protocol.EditLabels(keyframe, labels):

@@ -54,6 +54,17 @@ def test_a_shared_page_opens_from_the_disk_without_a_complaint(chromium: Browser
     page.close()
 
 
+def test_what_was_measured_is_named_with_its_distance(tmp_path: Path) -> None:
+    results = plaza(20)
+    results.marks = (
+        ("door", ((0, (0.0, 0.0, 0.0)), (1, (3.0, 4.0, 0.0)))),
+        ("gone", ((7, (0.0, 0.0, 0.0)),)),
+    )
+    ((text, at),) = share.marked(results)
+    assert text == "door 5.000 m" and at.tolist() == [[0, 0, 0], [3, 4, 0]]
+    share.write(tmp_path / "share.html", results)
+
+
 def test_a_million_points_take_less_than_15_megabytes(tmp_path: Path) -> None:
     share.write(tmp_path / "share.html", plaza(1_500_000))
     assert 3e6 < (tmp_path / "share.html").stat().st_size < 15e6
