@@ -25,7 +25,7 @@ MORE_EDGES = 12
 SHARP, FLAT = 0.4, 0.2
 """Curvature, without unit, above which a point may be an edge, and below which it may be on a plane. A right angle
 seen from its bisector has 0.7."""
-NOISE_M = 0.02
+NOISE_M = 0.04
 """Distance between a point and the middle of its neighbours that noise alone may cause."""
 OCCLUSION = 0.1
 """Share of the range by which two neighbours' ranges differ where the nearer surface hides the farther one."""

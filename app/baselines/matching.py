@@ -22,12 +22,15 @@ REACH_M = 1.2
 """Neighbours farther away do not belong to a point."""
 LINE, PLANE = 5.0, 0.15
 """Variances of neighbours: along a line, at least so many times those across; across a plane, at most that share."""
+SPREAD = 0.02
+"""Least share of the variance along a plane's longer axis that the shorter one has: a scan line makes no plane."""
 THICK_M = 0.15
 """RMS distance of the neighbours from their line or plane, above which they form none."""
 HUBER_M = 0.1
-WEAK = 0.01
+WEAK = 0.1
 """A direction in which the scan tells less than this share of a well-seen one keeps the prediction (Zhang, Kaess and
-Singh, "On Degeneracy of Optimization-based State Estimation Problems", ICRA 2016)."""
+Singh, "On Degeneracy of Optimization-based State Estimation Problems", ICRA 2016). Normals that are wrong by 0.2 rad
+tell 0.04 of directions that nothing is seen of."""
 _LINE_APART_M = 1000.0
 
 
@@ -49,7 +52,8 @@ class Pairs:
 @dataclass(frozen=True, slots=True)
 class PoseFit:
     """Attributes:
-    T: (4, 4) T_fixed_moving. information: (6, 6) of it, rotation then translation in the fixed frame, 1/m^2.
+    T: (4, 4) T_fixed_moving. information: (6, 6) of it in units of one point's, rotation then translation in the
+        fixed frame; nothing of weak directions.
     pairs: used. rms: of their distances, m. weak: directions that kept the prediction.
     """
 
@@ -88,7 +92,8 @@ def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> Pose
         weights = HUBER_M / np.maximum(np.abs(distances), HUBER_M)
         information = np.einsum("ni,nj,n->ij", J, J, weights)
         lever = np.sqrt(np.mean(np.sum(arms**2, axis=1)))
-        step, weak = _step(information, -np.einsum("ni,n,n->i", J, distances, weights), lever, free)
+        gradient = -np.einsum("ni,n,n->i", J, distances, weights)
+        step, information, weak = _step(information, gradient, lever, free)
         T = lie.transform(lie.exp(step[:3]) @ T[:3, :3], T[:3, 3] + step[3:])
         rms = float(np.sqrt(np.mean(weights * distances**2)))
         if np.linalg.norm(step[:3]) < 1e-5 and np.linalg.norm(step[3:]) < 1e-4:
@@ -96,8 +101,9 @@ def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> Pose
     return PoseFit(T, information, len(pairs), rms, weak)
 
 
-def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64, int]:
-    """The step (6,) within `free`, without what the pairs do not determine, and how many directions that left out.
+def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64, F64, int]:
+    """The step (6,) within `free`, without what the pairs do not determine; the information (6, 6) without that; and
+    how many directions that were.
 
     lever: m, by which rotations are made lengths, so that all directions can be compared.
     """
@@ -105,7 +111,9 @@ def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64
     values, vectors = np.linalg.eigh(basis @ information @ basis.T)
     seen = values > WEAK * np.median(values)
     along = vectors.T @ (basis @ gradient)
-    return (vectors @ np.where(seen, along / np.where(seen, values, 1.0), 0.0)) @ basis, int(np.sum(~seen))
+    back = np.linalg.pinv(basis) @ vectors[:, seen]
+    step = (vectors @ np.where(seen, along / np.where(seen, values, 1.0), 0.0)) @ basis
+    return step, (back * values[seen]) @ back.T, int(np.sum(~seen))
 
 
 class LastScan:
@@ -209,7 +217,7 @@ class FeatureMap:
     def _on_planes(self, points: F64, T: F64) -> Pairs:
         points, means, values, vectors = self._patches(1, points, T)
         found = (values[:, 0] < PLANE * values[:, 1]) & (values[:, 0] < THICK_M**2)
-        found &= values[:, 1] > 0.02 * values[:, 2]  # points of one scan line make no plane
+        found &= values[:, 1] > SPREAD * values[:, 2]
         return Pairs(points[found], vectors[found, :, 0], means[found])
 
     def _patches(self, index: int, points: F64, T: F64) -> tuple[F64, F64, F64, F64]:
