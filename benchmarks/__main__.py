@@ -4,11 +4,27 @@ import os
 import sys
 from pathlib import Path
 
-from benchmarks import consistency, fed, frame, kill, latency, live, loops, packets, page, replay, rewind, seek, walk
+from benchmarks import (
+    consistency,
+    export,
+    fed,
+    frame,
+    kill,
+    latency,
+    live,
+    loops,
+    packets,
+    page,
+    replay,
+    rewind,
+    seek,
+    walk,
+)
 from benchmarks.record import show
 
 BENCHMARKS = {
     "consistency": consistency.run,
+    "export": export.run,
     "fed": fed.run,
     "frame": frame.run,
     "kill": kill.run,

@@ -1,6 +1,5 @@
-"""Points per second and memory of an export, on a made-up map: `python -m benchmarks.export [laz] [millions]`."""
+"""Points per second, size and memory of exports of a made-up map."""
 
-import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -13,9 +12,14 @@ from app.slam.params import Params
 from app.slam.provenance import peak_memory_mb
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.types import Cloud, Keyframe
+from benchmarks.record import Line
 
 POINTS = 57_632
 """Of a full revolution of an RS-Bpearl."""
+KEYFRAMES = 347
+"""20 million points."""
+FORMATS = ("laz", "las", "e57", "ply")
+RUNS = 3
 
 
 class Walk:
@@ -43,26 +47,29 @@ class Walk:
         return replace(self._first, index=index, T_odom_imu=T, stamp_ns=self._first.stamp_ns + index * 1_000_000_000)
 
 
+def run() -> list[Line]:
+    lines = []
+    for kind in FORMATS:
+        rate, size, more = zip(*(_measure(kind) for _ in range(RUNS)), strict=True)
+        on = f"{kind}: {KEYFRAMES * POINTS / 1e6:.0f} million points"
+        lines += [Line.of("export", on, "million points/s", rate), Line.of("size", on, "bytes a point", size)]
+        lines.append(Line.of("memory beyond what was there, at most", on, "MB", more))
+    return lines
+
+
+def _measure(kind: str) -> tuple[float, float, float]:
+    """Million points per second, bytes per point and MB."""
+    exports, info = of_formats([kind]), RunInfo(Path("walk.mcap"), Params())
+    with tempfile.TemporaryDirectory() as folder:
+        save_results(Path(folder), Results(RunLog([]), Walk(2), info), exports, replace=True)  # compiles and imports
+        before, begin = _resident_mb(), time.perf_counter()
+        save_results(Path(folder), Results(RunLog([]), Walk(KEYFRAMES), info), exports, replace=True)
+        seconds = time.perf_counter() - begin
+        size = sum(path.stat().st_size for path in Path(folder).iterdir())
+    points = KEYFRAMES * POINTS
+    return points / seconds / 1e6, size / points, peak_memory_mb() - before
+
+
 def _resident_mb() -> float:
     """Memory of this process now; Linux only."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
-
-
-def main(kind: str = "laz", millions: str = "20") -> None:
-    walk = Walk(round(float(millions) * 1e6 / POINTS))
-    points = len(walk) * POINTS
-    results = Results(RunLog([]), walk, RunInfo(Path("walk.mcap"), Params()))
-    exports = of_formats([kind])
-    with tempfile.TemporaryDirectory() as folder:
-        save_results(Path(folder), replace(results, keyframes=Walk(2)), exports, replace=True)  # compiles and imports
-        before, begin = _resident_mb(), time.perf_counter()
-        save_results(Path(folder), results, exports, replace=True)
-        seconds = time.perf_counter() - begin
-        more = peak_memory_mb() - before
-        size = sum(path.stat().st_size for path in Path(folder).iterdir()) / points
-    print(f"{kind}: {points / 1e6:.1f} million points, {points / seconds / 1e6:.2f} million/s, {size:.1f} bytes each,")
-    print(f"at most {more:.0f} MB beyond what was there")
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
