@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from app.calibration.guide import Guide
-from app.calibration.inertial import Inertial
+from app.calibration.inertial import Inertial, Noise
 from app.calibration.odometry import track
 from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation
 from app.calibration.translation import Moved, fit_translation
@@ -40,6 +40,7 @@ class Calibration:
         recording: the file. params: what was taken so far. lasted_s: the part that was used.
         turned, moved: the fits. down: (3,) unit direction of gravity in the LiDAR frame at the begin.
         residuals: m, RMS of the scans on the map without the IMU, and with it.
+        gyro_noise, accel_noise: of the IMU in most seconds, vibrations included.
     """
 
     recording: Path
@@ -49,6 +50,8 @@ class Calibration:
     moved: Moved
     down: F64
     residuals: tuple[float, float]
+    gyro_noise: Noise
+    accel_noise: Noise
 
     @property
     def rotation(self) -> tuple[float, float, float]:
@@ -155,4 +158,5 @@ def calibrate_walk(
             inertial, turned.R_imu_lidar, turned.late, turned.bias, moved.p_imu_lidar, moved.bias, moved.gravity
         )
     down = moved.gravity / np.linalg.norm(moved.gravity)
-    return Calibration(path, params, walk.duration_s, turned, moved, down, (alone, way.residual))
+    noises = (Noise.of(inertial.times, values) for values in (inertial.gyro, inertial.accel))
+    return Calibration(path, params, walk.duration_s, turned, moved, down, (alone, way.residual), *noises)

@@ -7,6 +7,7 @@ import numpy as np
 import yaml
 
 from app.calibration.calibrate import Calibration
+from app.calibration.inertial import Noise
 from app.sensors.presets import CALIBRATED, sidecar
 from app.slam.errors import HemislamError
 from app.slam.user_text import read_yaml
@@ -31,6 +32,8 @@ def table(calibration: Calibration) -> list[tuple[str, str]]:
         ("added to the IMU's clock", _if(observed["offset"], f"{c.turned.late * 1e3:+.1f} ± {offset:.1f} ms")),
         ("bias of the gyroscope", _vector(np.degrees(c.turned.bias), np.degrees(sigmas["gyro_bias"]), "deg/s")),
         ("bias of the accelerometer", _vector(c.moved.bias, sigmas["accel_bias"], "m/s²")),
+        ("noise of the gyroscope", _noise(c.gyro_noise, 1e3, "mrad/s/√Hz")),
+        ("noise of the accelerometer", _noise(c.accel_noise, 1e3, "mm/s²/√Hz")),
         ("down at the begin, LiDAR frame", ", ".join(f"{value:+.3f}" for value in c.down)),
         ("turning by scans against IMU", f"{_degrees(c.turned.before)} deg before, {_degrees(c.turned.after)} after"),
         ("motion by scans against IMU", f"{_mm(c.moved.before)} mm before, {_mm(c.moved.after)} after"),
@@ -39,7 +42,8 @@ def table(calibration: Calibration) -> list[tuple[str, str]]:
 
 
 def as_json(calibration: Calibration) -> dict[str, Any]:
-    """The same as numbers; units as in the parameters, standard deviations in rad, s, m, rad/s and m/s²."""
+    """The same as numbers; units as in the parameters, standard deviations in rad, s, m, rad/s and m/s²; of the noise
+    density and its standard deviation."""
     c = calibration
     return {
         "recording": str(c.recording),
@@ -49,6 +53,8 @@ def as_json(calibration: Calibration) -> dict[str, Any]:
         "imu_time_offset_s": c.params.recording.imu_time_offset + c.turned.late,
         "gyro_bias": c.turned.bias.tolist(),
         "accel_bias": c.moved.bias.tolist(),
+        "gyro_noise": [c.gyro_noise.density, c.gyro_noise.sigma],
+        "accel_noise": [c.accel_noise.density, c.accel_noise.sigma],
         "down_lidar": c.down.tolist(),
         "sigmas": {name: values.tolist() for name, values in c.sigmas.items()},
         "observed": c.observed,
@@ -106,6 +112,10 @@ def _if(observed: bool, text: str) -> str:
 
 def _vector(values: np.ndarray, sigmas: np.ndarray, unit: str) -> str:
     return ", ".join(f"{v:.3f} ± {s:.3f}" for v, s in zip(values, sigmas, strict=True)) + f" {unit}"
+
+
+def _noise(noise: Noise, scale: float, unit: str) -> str:
+    return f"{noise.density * scale:.2f} ± {noise.sigma * scale:.2f} {unit}"
 
 
 def _rms(values: np.ndarray) -> float:

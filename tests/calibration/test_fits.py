@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from app.calibration.guide import Guide
-from app.calibration.inertial import Inertial
+from app.calibration.inertial import Inertial, Noise
 from app.calibration.odometry import Track
 from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation
 from app.calibration.translation import fit_translation
@@ -134,3 +134,18 @@ def test_within_a_scan_the_lidar_is_where_its_motion_had_it() -> None:
     assert np.abs(true).max() > 1e-3
     assert np.abs(ways - true).max() < 2e-4
     assert np.abs(guide.turned(3.0, back) - R_end.T @ R_world_imu[:11] @ R).max() < 1e-4
+
+
+@pytest.mark.parametrize("rate", [100, 200, 400])
+def test_an_imus_noise_is_told_from_a_hands_motion(rate: int) -> None:
+    """White noise of a known density on a lively walk, with a stretch in which the hand knocks against something."""
+    rng = np.random.default_rng(1)
+    times = np.arange(0.0, 30.0, 1.0 / rate)
+    motion = np.column_stack([np.sin(2 * np.pi * f * times) for f in (0.7, 1.8, 3.0)])
+    knocks = ((times > 10) & (times < 15))[:, None] * np.sin(2 * np.pi * 30.0 * times)[:, None]
+    for density, swing in ((1.2e-3, 1.5), (1.3e-2, 4.0)):
+        noise = rng.normal(scale=density * np.sqrt(rate), size=(len(times), 3))
+        found = Noise.of(times, swing * (motion + knocks) + noise)
+        assert abs(found.density - density) < 0.1 * density
+        assert 0.0 < found.sigma < 0.1 * density
+    assert np.isnan(Noise.of(times[:100], np.zeros((100, 3))).density)
