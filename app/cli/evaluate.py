@@ -1,6 +1,8 @@
 """`hemislam evaluate`: the paper's tables, on any recordings."""
 
 import os
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,9 +12,24 @@ from app.cli.options import Duration, Imperfect, ParamsFor, Start, make_folder, 
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
+    from app.evaluation.runner import RunJobs
     from app.evaluation.truth import TruePoses
     from app.slam.trajectory import Trajectory
 
+ClusterAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster", metavar="ADDRESS", help="Run on the Dask cluster of this scheduler, e.g. tcp://host:8786."
+    ),
+]
+ClusterData = Annotated[
+    str,
+    typer.Option(
+        "--cluster-data",
+        metavar="URL",
+        help="Where its workers find the recordings, e.g. s3://bucket/walks. Default: the same path, else from here.",
+    ),
+]
 _TRUTH_HELP = (
     "True poses: a TUM or KITTI file, the GNSS/INS table of H2LID, or topic:/NAME in the recording; `none` for none."
     " Repeatable, in the order of the recordings. Default: RECORDING_truth.tum beside the recording."
@@ -65,6 +82,8 @@ def evaluate(
     jobs: Annotated[
         int | None, typer.Option("--jobs", min=1, metavar="N", help="Parallel runs. Default: one per core.")
     ] = None,
+    cluster: ClusterAddress = None,
+    cluster_data: ClusterData = "",
     start: Start = 0.0,
     duration: Duration = None,
 ) -> None:
@@ -122,14 +141,14 @@ def evaluate(
         subjects.append(Subject(name, path, params, truth, tuple(others[name])))
     for variant in chosen:
         variant.applied(subjects[0].params)  # raises for a misspelt parameter before anything runs
-    parallel = max(1, min(jobs or cores(), len(chosen) * len(subjects)))
+    run, threads = runner(max(1, min(jobs or cores(), len(chosen) * len(subjects))), cluster, cluster_data)
     compile_behind_bar()
     findings, failures = run_evaluation(
         subjects,
         chosen,
         out,
-        parallel=parallel,
-        threads=max(1, cores() // parallel),
+        run=run,
+        threads=threads,
         start_s=start,
         duration_s=duration,
     )
@@ -139,6 +158,24 @@ def evaluate(
     if failures:
         (recording, name), why = next(iter(failures.items()))
         raise HemislamError(f"{len(failures)} of {len(chosen) * len(subjects)} runs failed; {recording}, {name}: {why}")
+
+
+def runner(parallel: int, address: str | None, url: str, *, quiet: bool = False) -> tuple["RunJobs", int]:
+    """What runs jobs, on this machine or on a cluster, and how many threads each takes.
+
+    Raises:
+        HemislamError: Dask is not installed, or an option is there without the one it belongs to.
+    """
+    from app.evaluation.cluster import Cluster
+    from app.evaluation.runner import run_jobs
+
+    if address is None:
+        if url:
+            raise HemislamError("--cluster-data belongs to --cluster; give both.")
+        return partial(run_jobs, parallel=parallel, quiet=quiet), max(1, cores() // parallel)
+    if find_spec("distributed") is None:
+        raise HemislamError("--cluster needs Dask; install it with `pip install 'hemislam[cluster]'`.")
+    return Cluster(address, url).run_jobs, 1
 
 
 def cores() -> int:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from app.cli.evaluate import cores, name_recordings, truth_texts
+from app.cli.evaluate import ClusterAddress, ClusterData, cores, name_recordings, runner, truth_texts
 from app.cli.options import Duration, ParamsFor, Start, make_folder, with_params
 from app.slam.errors import HemislamError
 
@@ -59,6 +59,8 @@ def tune(
     jobs: Annotated[
         int | None, typer.Option("--jobs", min=1, metavar="N", help="Parallel runs. Default: one per core.")
     ] = None,
+    cluster: ClusterAddress = None,
+    cluster_data: ClusterData = "",
     start: Start = 0.0,
     duration: Duration = None,
 ) -> None:
@@ -106,14 +108,14 @@ def tune(
     if duration is not None and held_back != 0:
         rest = Part(start + duration, held_back or duration)
     make_folder(out)
-    parallel = jobs or cores()
+    run, threads = runner(jobs or cores(), cluster, cluster_data, quiet=True)
     runs = Runs(
         subjects,
         wanted,
         out / "runs",
         known=known_runs(out.resolve().parent),
-        parallel=parallel,
-        threads=max(1, cores() // parallel),
+        run=run,
+        threads=threads,
     )
     compile_behind_bar()
     with tqdm(total=trials + 1, desc="Tuning", unit=" trials", disable=None) as bar:

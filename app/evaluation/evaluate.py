@@ -9,7 +9,7 @@ import numpy as np
 from app.evaluation.job import Job
 from app.evaluation.measured import Evaluated, Outcome, load, measure
 from app.evaluation.report import write_report
-from app.evaluation.runner import run_jobs
+from app.evaluation.runner import RunJobs
 from app.evaluation.truth import TruePoses, check_overlap
 from app.evaluation.variants import Variant
 from app.sensors.recording import open_recording
@@ -41,7 +41,7 @@ def evaluate(
     variants: Sequence[Variant],
     folder: Path,
     *,
-    parallel: int,
+    run: RunJobs,
     threads: int,
     start_s: float = 0.0,
     duration_s: float | None = None,
@@ -49,7 +49,7 @@ def evaluate(
     """Run what is not finished and write the report.
 
     Args:
-        folder: for the report and the runs. parallel: runs at a time. threads: of each.
+        folder: for the report and the runs. run: runs the jobs. threads: of each.
         start_s, duration_s: the part of each recording to use.
 
     Returns:
@@ -81,7 +81,7 @@ def evaluate(
                 duration_s=duration_s,
                 baseline=variant.baseline,
             )
-    failures = run_jobs(list(jobs.values()), parallel, folder / "runs")
+    failures = run(list(jobs.values()), folder / "runs")
     evaluated = []
     for subject in subjects:
         outcomes = [

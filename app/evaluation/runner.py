@@ -4,6 +4,7 @@ With a process for each job, its peak memory is its own, and a crash costs one c
 """
 
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,11 @@ from app.slam.errors import HemislamError
 REPORT_EVERY_S = 0.2
 
 
-def run_jobs(jobs: list[Job], parallel: int, folder: Path, *, quiet: bool = False) -> dict[tuple[str, str], str]:
+RunJobs = Callable[[list[Job], Path], dict[tuple[str, str], str]]
+"""Runs jobs, given the folder of all runs; on this machine or on a cluster."""
+
+
+def run_jobs(jobs: list[Job], folder: Path, *, parallel: int, quiet: bool = False) -> dict[tuple[str, str], str]:
     """Run all jobs that are not finished yet, `parallel` at a time. quiet: say nothing of single jobs.
 
     Returns:

@@ -15,7 +15,7 @@ import optuna
 from app.evaluation.evaluate import Subject
 from app.evaluation.job import RUN_FILES, Job
 from app.evaluation.measured import Outcome, load, measure
-from app.evaluation.runner import run_jobs
+from app.evaluation.runner import RunJobs
 from app.slam.errors import HemislamError
 from app.slam.provenance import hash_input
 from app.tuning.objectives import Objective, score
@@ -60,7 +60,7 @@ class Runs:
     """Runs settings on all recordings and scores them.
 
     Args:
-        folder: for runs. known: folders of runs that were finished before, by key. parallel, threads: as `evaluate`.
+        folder: for runs. known: folders of runs that were finished before, by key. run, threads: as `evaluate`.
     """
 
     def __init__(
@@ -70,18 +70,18 @@ class Runs:
         folder: Path,
         *,
         known: Mapping[str, Path],
-        parallel: int,
+        run: RunJobs,
         threads: int,
     ) -> None:
         self._subjects, self._objectives, self._folder = subjects, objectives, folder
-        self._known, self._parallel, self._threads = known, parallel, threads
+        self._known, self._run, self._threads = known, run, threads
         self.hashes = [_hash(subject.recording) for subject in subjects]
 
     def score(self, settings: Sequence[Mapping[str, Any]], part: Part) -> list[tuple[tuple[float | None, ...], str]]:
         """For each setting its scores by objective, and why it failed ("" if it did not)."""
         jobs = [[self._job(index, setting, part) for index in range(len(self._subjects))] for setting in settings]
         each = {job.key: job for of_setting in jobs for job in of_setting}
-        errors = run_jobs(list(each.values()), self._parallel, self._folder, quiet=True)
+        errors = self._run(list(each.values()), self._folder)
         return [self._scored(of_setting, errors) for of_setting in jobs]
 
     def _job(self, index: int, values: Mapping[str, Any], part: Part) -> Job:

@@ -1,0 +1,146 @@
+"""A real Dask scheduler and its workers run what one machine runs, to the same tables, though processes are killed.
+
+Tests app/evaluation/cluster.py.
+"""
+
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from app.__main__ import cli
+from app.evaluation import cluster
+from app.evaluation.cluster import Cluster
+from app.evaluation.job import Job, finished
+from app.sensors.presets import resolve_params
+from app.slam.errors import HemislamError
+from app.slam.provenance import hash_input
+from tests.cli.conftest import ROOT, write_walk
+
+
+class Site:
+    """A scheduler and workers as processes. `path` keeps what they say."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port: int = free.getsockname()[1]
+        self.address = f"tcp://127.0.0.1:{self.port}"
+        self.scheduler = self.start("scheduler", "--port", str(self.port), "--no-dashboard")
+        self.workers = [self.worker() for _ in range(3)]
+
+    def worker(self) -> "subprocess.Popen[bytes]":
+        return self.start("worker", self.address, "--no-nanny", "--nthreads", "1", "--no-dashboard")
+
+    def start(self, what: str, *words: str) -> "subprocess.Popen[bytes]":
+        log = (self._folder / f"{what}.log").open("ab")
+        command = [sys.executable, "-m", f"distributed.cli.dask_{what}", *words]
+        return subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
+
+    def restart(self) -> None:
+        """As an orchestrator does: the workers go with their scheduler and come back with it."""
+        for process in (self.scheduler, *self.workers):
+            process.kill()
+            process.wait()
+        self.scheduler = self.start("scheduler", "--port", str(self.port), "--no-dashboard")
+        self.workers = [self.worker() for _ in range(3)]
+
+    def stop(self) -> None:
+        for process in (*self.workers, self.scheduler):
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    started = Site(tmp_path_factory.mktemp("site"))
+    yield started
+    started.stop()
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "walk.mcap"
+    write_walk(path)
+    return path
+
+
+def evaluate(recording: Path, out: Path, *words: str) -> Result:
+    return CliRunner().invoke(cli, ["evaluate", str(recording), "--out", str(out), "--duration", "1.5", *words])
+
+
+def job_of(recording: Path, folder: Path) -> Job:
+    sha256 = hash_input(recording)
+    assert sha256 is not None
+    params = resolve_params(recording, None, None, [])
+    return Job(recording, sha256, "walk", folder.name, params, folder, duration_s=1.0)
+
+
+def test_a_cluster_gives_the_tables_of_one_machine_though_processes_die(
+    site: Site, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker is killed when the first run has come, and everything is restarted when the second has."""
+    kept, keep = list[str](), cluster._keep
+
+    def keep_and_kill(job: Job, files: dict[str, bytes]) -> None:
+        keep(job, files)
+        kept.append(job.variant)
+        if len(kept) == 1:
+            site.workers[0].send_signal(signal.SIGKILL)
+        elif len(kept) == 2:
+            site.restart()
+
+    monkeypatch.setattr(cluster, "_keep", keep_and_kill)
+    result = evaluate(recording, tmp_path / "cluster", "--cluster", site.address)
+    assert result.exit_code == 0, result.output
+    assert len(kept) == len(set(kept)) == 4, "every run is done once"
+    assert evaluate(recording, tmp_path / "here").exit_code == 0
+    for name in ("accuracy.csv", "map_sharpness.csv"):
+        assert (tmp_path / "cluster" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+
+
+def test_a_worker_without_the_recording_fetches_it(
+    site: Site, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From here, or from a URL, and keeps it by its hash; a file with another content is refused."""
+    monkeypatch.setattr(cluster.tempfile, "gettempdir", lambda: str(tmp_path))
+    job = job_of(recording, tmp_path / "runs" / "walk")
+    gone = Job(tmp_path / "gone" / recording.name, job.sha256, "walk", "walk", job.params, job.folder, duration_s=1.0)
+    data = recording.read_bytes()
+    fetched = cluster._fetched(gone, "", [data[:1000], data[1000:]])
+    assert fetched.read_bytes() == data
+    fetched.unlink()
+    assert cluster._fetched(gone, recording.parent.as_uri(), []).read_bytes() == data
+    fetched.unlink()
+    with pytest.raises(HemislamError, match="another file"):
+        cluster._fetched(gone, "", [data[:1000]])
+
+
+def test_a_recording_that_cannot_be_used_costs_its_own_run_only(site: Site, recording: Path, tmp_path: Path) -> None:
+    empty = tmp_path / "empty.mcap"
+    empty.write_bytes(b"")
+    good, bad = job_of(recording, tmp_path / "good"), job_of(empty, tmp_path / "bad")
+    errors = Cluster(site.address).run_jobs([good, bad], tmp_path)
+    assert finished(good) is not None
+    assert list(errors) == [("walk", "bad")] and "empty.mcap" in errors["walk", "bad"]
+
+
+def test_no_scheduler_and_other_versions_are_told_in_a_sentence(
+    site: Site, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "CONNECT_S", 1.0)
+    result = evaluate(recording, tmp_path / "none", "--cluster", "tcp://127.0.0.1:9")
+    assert result.exit_code == 2 and "no Dask scheduler at tcp://127.0.0.1:9" in result.output
+    monkeypatch.setattr(cluster, "CONNECT_S", 15.0)
+    monkeypatch.setattr(cluster, "__version__", "99.0")
+    with pytest.raises(HemislamError, match=r"has version .*, and this is 99.0"):
+        Cluster(site.address).run_jobs([job_of(recording, tmp_path / "run")], tmp_path)
+    result = evaluate(recording, tmp_path / "data", "--cluster-data", "s3://bucket")
+    assert result.exit_code == 2 and "belongs to --cluster" in result.output
