@@ -14,10 +14,10 @@ from scipy.spatial import KDTree
 
 from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops import scan_context, verification
+from app.slam.loops import scan_context, slips, verification
 from app.slam.loops.drift import Expectation
 from app.slam.loops.scan_context import ScanContext
-from app.slam.loops.submap import Submap, Submaps
+from app.slam.loops.submap import Submaps
 from app.slam.loops.types import LoopDetail
 from app.slam.loops.verification import Prepared
 from app.slam.sections import LoopsParams
@@ -61,8 +61,9 @@ class Detector:
     def __init__(self, params: LoopsParams) -> None:
         self.half = params.submap_keyframes
         self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS)
-        self._around = lru_cache(KEPT_SUBMAPS)(self._make)
+        self._around = lru_cache(KEPT_SUBMAPS)(lambda *key: self._submaps.around(key[0], self._poses, *key[1:]))
         self._prepared = lru_cache(KEPT_PREPARED)(lambda *key: verification.prepare(self._around(*key)))
+        self._slips: dict[tuple[int, int], bool] = {}
         self._heads: list[Keyframe] = []
         self._poses = np.empty((0, 4, 4))
         self._stamps = np.empty(0, np.int64)
@@ -109,24 +110,32 @@ class Detector:
 
     def forget(self) -> None:
         """Forget the keyframes beyond the present one."""
+        if len(self._heads) == len(self):
+            return
         del self._heads[len(self) :]
         self._poses, self._stamps = self._poses[: len(self)], self._stamps[: len(self)]
         self._submaps.truncate(len(self))
         self._around.cache_clear()
         self._prepared.cache_clear()
+        self._slips.clear()
 
     def close(self) -> None:
         self._submaps.close()
 
     def describe(self, index: int) -> ScanContext:
         """The context of a keyframe, from the keyframes around it."""
-        return scan_context.describe(self._around(index, self.last(index)).points)
+        return scan_context.describe(self._around(index, self._first(index), self.last(index)).points)
 
     def context(self, index: int) -> ScanContext:
         return self._contexts[index] if index < self.described else self.describe(index)
 
     def submap(self, index: int) -> Prepared:
-        return self._prepared(index, self.last(index))
+        """From the keyframes around one that no slip of odometry parts from it."""
+        before, last = range(index, self._first(index), -1), self.last(index)
+        after = (k for k in range(index + 1, last) if k + slips.REACH <= last + 1 or k == last - 1)
+        first = next((k for k in before if self._slipped(k, last)), before.stop)
+        end = next((k - 1 for k in after if self._slipped(k, last)), last)
+        return self._prepared(index, first, end)
 
     def T_level_imu(self, index: int) -> F64:
         """(4, 4) from a keyframe's IMU frame to its level frame: a rotation."""
@@ -204,8 +213,18 @@ class Detector:
         """The last keyframe of the submap about one."""
         return min(len(self) - 1, index + self.half)
 
-    def _make(self, index: int, last: int) -> Submap:
-        return self._submaps.around(index, self.poses, max(0, index - self.half), last)
+    def _first(self, index: int) -> int:
+        """The first keyframe of the submap about one."""
+        return max(0, index - self.half)
+
+    def _slipped(self, index: int, last: int) -> bool:
+        """Whether odometry slipped on the step to a keyframe, by those around it up to `last`."""
+        key = index, min(index + slips.REACH - 1, last)
+        if key not in self._slips:
+            before = self._submaps.around(index, self._poses, max(0, index - slips.REACH), index - 1)
+            after = self._submaps.around(index, self._poses, *key)
+            self._slips[key] = slips.slipped(verification.prepare(before), verification.prepare(after))
+        return self._slips[key]
 
 
 def _wrapped(angle: npt.NDArray[np.float64]) -> F64:

@@ -61,11 +61,11 @@ def settle(
         if edge.verdict is not Verdict.CANDIDATE or edge.edited:
             continue
         others = [o for o in near if o.pair != edge.pair and max(ways(edge, o)) < NEIGHBOURHOOD_M]
-        # an ambiguous candidate supports nothing: all that was seen there may belong to a place that looks the same
         agree = _agree(edge, others, poses, np.array([sum(ways(edge, o)) for o in others]), drift) if others else ()
-        verdicts = [bool(yes) and not o.evidence.ambiguous for yes, o in zip(agree, others, strict=True)]
-        agreeing = [other.newer for other, yes in zip(others, verdicts, strict=True) if yes]
-        support, against = len({*agreeing} - {edge.newer}), verdicts.count(False)
+        # an ambiguous one that agrees supports nothing: all seen there may belong to a place that looks the same
+        agreeing = [o.newer for o, yes in zip(others, agree, strict=True) if yes and not o.evidence.ambiguous]
+        contradicting = [o.pair for o, yes in zip(others, agree, strict=True) if not yes]
+        support, against = len({*agreeing} - {edge.newer}), len(contradicting)
         alone = edge.evidence.mahalanobis > params.max_mahalanobis
         stretch = float(np.ptp(walked[[edge.newer, *agreeing]]))
         needed = params.support * (OUTVOTING if alone else 1)
@@ -82,7 +82,7 @@ def settle(
                 waits = f"{edge.evidence.against_odometry(params.max_mahalanobis)}; {support} of {needed} others agree"
                 waits += f" over {stretch:.0f} m (least {STRETCH_M:g} m)"
             contradicted = f", {against} contradict it" if against else ""
-            named = tuple(other.pair for other, yes in zip(others, verdicts, strict=True) if not yes)[:NAMED]
+            named = tuple(contradicting[:NAMED])
             out[edge.pair] = replace(
                 edge, reason=waits + contradicted, evidence=evidence, weight=1.0, contradicted_by=named
             )

@@ -168,6 +168,11 @@ def assess(target: Prepared, source: Prepared, T: F64) -> Fit:
     return Fit(T, overlap, residuals[~np.isnan(residuals)], information)
 
 
+def information(target: Prepared, source: Prepared, T: F64) -> F64:
+    """(6, 6) as of a `Fit`, of the points of a rough registration."""
+    return _pull(target, source.points[source.few], source.normals[source.few], T, PARTNER_M, np.inf)[0]
+
+
 def slide(target: Prepared, source: Prepared, fit: Fit, direction: F64) -> float:
     """m that registrations pushed off along a direction (3,), both ways, end from the result along it.
 

@@ -266,6 +266,25 @@ def test_a_loop_that_others_contradict_is_not_accepted() -> None:
     assert {edge.verdict for edge in edges.values()} == {Verdict.ACCEPTED}
 
 
+def test_an_ambiguous_loop_that_agrees_neither_supports_nor_contradicts() -> None:
+    """What was seen there may belong to a place that looks the same, but it lies where the others say."""
+    near = replace(SLIPPED, mahalanobis=1.0)
+    unsure = replace(near, alternative_m=4.0)
+    sure = [loop(older) for older in (40, 39, 38)]
+
+    def verdicts(ambiguous: list[LoopEdge]) -> set[Verdict]:
+        found = {edge.pair: replace(edge, verdict=Verdict.CANDIDATE, evidence=near) for edge in sure}
+        known = found | {edge.pair: replace(edge, verdict=Verdict.REJECTED, evidence=unsure) for edge in ambiguous}
+        settled = settle(found, known, POSES, Drift(0.01, np.radians(0.02)), LoopsParams(), 2 * TURN - 1)
+        return {edge.verdict for edge in settled}
+
+    assert verdicts([loop(older) for older in (37, 36, 35)]) == {Verdict.ACCEPTED}
+    elsewhere = np.array([0.0, 2.0, 0.0])
+    assert verdicts([loop(older, elsewhere) for older in (37, 36, 35)]) == {Verdict.CANDIDATE}
+    sure = sure[:2]
+    assert verdicts([loop(older) for older in (37, 36, 35)]) == {Verdict.CANDIDATE}
+
+
 def test_along_a_direction_that_both_leave_open_loops_need_not_agree() -> None:
     """In a corridor they say nothing of how far along it the walk is."""
     apart = [loop(older, np.array([0.8 * (older % 2), 0.0, 0.0])) for older in range(40, 34, -1)]

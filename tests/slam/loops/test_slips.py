@@ -1,0 +1,73 @@
+"""A slip of odometry is seen where it is, and no submap reaches across it.
+
+Tests app/slam/loops/slips.py.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.slam.loops.detection import Detector
+from app.slam.loops.slips import REACH, slipped
+from app.slam.sections import LoopsParams
+from app.slam.types import F64, Keyframe
+from tests.slam.loops.test_verification import FINS, corridor, pose, seen
+from tests.slam.loops.walks import Walk, take
+
+AT, HALF = 12, 5
+
+
+@pytest.mark.parametrize(
+    "slip", [pose(0.2, 0.0, 0.0, 0.0), pose(0.0, 0.2, 0.0, 0.0), pose(0.0, 0.0, 0.15, 0.0), pose(0.0, 0.0, 0.0, 1.5)]
+)
+def test_between_surfaces_that_hold_every_slip_shows(slip: F64) -> None:
+    before = seen(corridor(np.random.default_rng(0), FINS), np.eye(4))
+    assert slipped(before, seen(corridor(np.random.default_rng(1), FINS), slip))
+    assert not slipped(before, seen(corridor(np.random.default_rng(1), FINS), np.eye(4)))
+
+
+def test_along_a_bare_corridor_no_slip_can_be_told() -> None:
+    before = seen(corridor(np.random.default_rng(0)), np.eye(4))
+    assert not slipped(before, seen(corridor(np.random.default_rng(1)), pose(0.3, 0.0, 0.0, 0.0)))
+
+
+@pytest.fixture(scope="module")
+def straight() -> Walk:
+    return take("corridor", 24.0)
+
+
+def walked(keyframes: tuple[Keyframe, ...]) -> Detector:
+    detector = Detector(LoopsParams(submap_keyframes=HALF))
+    for keyframe in keyframes:
+        detector.take(keyframe)
+        detector.go_on()
+    return detector
+
+
+def seen_from(detector: Detector, index: int) -> set[int]:
+    """Keyframes from which the submap about one was seen."""
+    positions = detector.poses[:, :3, 3] - detector.poses[index, :3, 3]
+    eyes = np.unique(detector.submap(index).submap.eyes, axis=0)
+    return {int(np.linalg.norm(positions - eye, axis=1).argmin()) for eye in eyes}
+
+
+def test_a_submap_ends_where_odometry_slipped(straight: Walk) -> None:
+    """Across the slip it would hold every surface twice."""
+    slip = pose(0.3, -0.3, 0.0, 2.5)
+    torn = [replace(k, T_odom_imu=slip @ k.T_odom_imu if k.index >= AT else k.T_odom_imu) for k in straight.keyframes]
+    whole, parted = walked(straight.keyframes), walked(tuple(torn))
+    for index in (AT - HALF, AT - 1, AT, AT + HALF - 1):
+        around = set(range(index - HALF, index + HALF + 1))
+        assert seen_from(whole, index) == around
+        here = {k for k in around if (k < AT) == (index < AT)}
+        assert seen_from(parted, index) - here <= {index + HALF}, "that the last keyframe lies elsewhere cannot be told"
+    assert seen_from(parted, AT - HALF) >= set(range(AT - 2 * HALF, AT - REACH + 1)), "what lies before it stays whole"
+    whole.close(), parted.close()
+
+
+def test_a_submap_does_not_depend_on_how_far_the_walk_went_on(straight: Walk) -> None:
+    early, late = walked(straight.keyframes[: AT + HALF + 1]), walked(straight.keyframes)
+    ours, theirs = (detector.submap(AT).submap.points for detector in (early, late))
+    assert ours.tobytes() == theirs.tobytes()
+    early.close(), late.close()
