@@ -10,6 +10,7 @@ from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
     from app.georeference.align import Alignment
+    from app.georeference.fixes import Fixes
     from app.slam.trajectory import Trajectory
 
 RESIDUALS, PLOT = "gnss_residuals.csv", "georeference.svg"
@@ -35,6 +36,19 @@ def georeference(
         tuple[float, float, float] | None,
         typer.Option("--lever-arm", metavar="X Y Z", help="Metres from the IMU to the antenna, in the IMU's axes."),
     ] = None,
+    factors: Annotated[
+        bool, typer.Option("--factors", help="Let the fixes bend the map: write another one to --out.")
+    ] = False,
+    accept: Annotated[
+        list[int] | None, typer.Option("--accept", metavar="FIX", help="With --factors: keep this fix. Repeatable.")
+    ] = None,
+    reject: Annotated[
+        list[int] | None, typer.Option("--reject", metavar="FIX", help="With --factors: leave it out. Repeatable.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder for the bent map, with --factors.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace results that --out already holds.")] = False,
     height: Annotated[
         str,
         typer.Option("--height", metavar="TEXT", help="What the file's heights are above, to be written beside them."),
@@ -42,9 +56,9 @@ def georeference(
 ) -> None:
     """Find where on Earth a map lies, by satellite fixes or control points.
 
-    The map's shape stays. By fixes, it is only turned about the vertical and moved. That finds how late the receiver's
-    clock is by comparing the motion, and the lever arm if it is not given and the motion tells it. Fixes that
-    contradict the others are rejected and named.
+    By fixes, the map is only turned about the vertical and moved; with --factors they bend it, too. That finds how
+    late the receiver's clock is by comparing the motion, and the lever arm if it is not given and the motion tells it.
+    Fixes that contradict the others are rejected and named.
 
     \b
     Writes into RESULTS:
@@ -60,17 +74,26 @@ def georeference(
       hemislam georeference runs/walk-1 --control points.csv --picks picked.csv --crs EPSG:25832
     """
     from app.georeference import ledger
+    from app.georeference.align import align
     from app.georeference.control import lay_on_control
     from app.slam.trajectory import read_tum
 
     if (control is None) != (picks is None) or (control is not None and (gnss is not None or lever_arm is not None)):
         raise HemislamError("--control and --picks go together, without --gnss and --lever-arm.")
+    if factors != (out is not None) or (factors and control is not None):
+        raise HemislamError("--factors and --out go together, for fixes.")
+    if (accept or reject) and not factors:
+        raise HemislamError("--accept and --reject belong to --factors.")
     trajectory = read_tum(results / "trajectory.tum")
     if control is not None and picks is not None:
         found = lay_on_control(control, picks, grid=crs, height=height or "ellipsoidal")
         lines = [*ledger.summary(found, "control points"), "", *ledger.table(found)]
     else:
-        found = _by_fixes(results, trajectory, gnss, crs, lever_arm, height)
+        fixes, told = _fixes_of(results, trajectory, gnss)
+        found = align(trajectory, fixes, grid=crs, height=height or told, lever=lever_arm)
+        if out is not None:
+            found, trajectory = _bent(results, out, fixes, found, accept or [], reject or [], replace=force)
+            results = out
         lines = ledger.summary(found, "fixes")
         if not found.used.all():
             lines += ["", *ledger.table(found, only_rejected=True)]
@@ -78,23 +101,44 @@ def georeference(
     _write(results, found, trajectory)
 
 
-def _by_fixes(
-    results: Path,
-    trajectory: "Trajectory",
-    gnss: Path | None,
-    crs: str,
-    lever_arm: tuple[float, float, float] | None,
-    height: str,
-) -> "Alignment":
-    from app.georeference.align import align
+def _fixes_of(results: Path, trajectory: "Trajectory", gnss: Path | None) -> "tuple[Fixes, str]":
+    """Those of a file or of the recording, and what their heights are above."""
+    from app.georeference.reference import ELLIPSOIDAL
     from app.georeference.tables import read_fixes
     from app.sensors.navsat import recorded_fixes
 
     if gnss is not None:
-        fixes, told = read_fixes(gnss, int(trajectory.stamps_ns[0]))
-    else:
-        fixes, told = recorded_fixes(_recording_of(results)), "ellipsoidal"
-    return align(trajectory, fixes, grid=crs, height=height or told, lever=lever_arm)
+        return read_fixes(gnss, int(trajectory.stamps_ns[0]))
+    return recorded_fixes(_recording_of(results)), ELLIPSOIDAL
+
+
+def _bent(
+    results: Path, out: Path, fixes: "Fixes", found: "Alignment", accept: list[int], reject: list[int], *, replace: bool
+) -> "tuple[Alignment, Trajectory]":
+    """Write trajectory and map, bent by the fixes, to `out`."""
+    import dataclasses
+
+    import numpy as np
+
+    from app.export.folder import read_results
+    from app.export.results import BY_RUN, save_results
+    from app.georeference.bend import bend
+    from app.slam.loops.files import LoopResults
+    from app.slam.loops.solvers import read_g2o
+    from app.slam.map_frame import MapFrame
+
+    before = read_results(results)
+    stamps_ns = np.array([before.keyframes[index].stamp_ns for index in range(len(before.keyframes))], np.int64)
+    try:
+        graph = read_g2o(results / "graph.g2o")
+    except (OSError, RuntimeError):
+        raise HemislamError(f"{results} has no graph.g2o; run the recording with loops.enabled.") from None
+    names = [[str(number) for number in one] for one in (accept, reject)]
+    corrections, found = bend(before.trajectory, stamps_ns, graph, fixes, found, accept=names[0], reject=names[1])
+    loops = LoopResults(MapFrame(stamps_ns, corrections), stamps_ns, (), "")
+    after = dataclasses.replace(before, loops=loops, where=found.reference)
+    save_results(out, after, [one for one in BY_RUN if one.name in ("trajectory.tum", "map.ply")], replace=replace)
+    return found, after.trajectory
 
 
 def _recording_of(results: Path) -> Path:

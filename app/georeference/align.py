@@ -36,9 +36,11 @@ MEDIAN_SIGMAS = 1.538
 WORST_YAW, WORST_OFFSET_S, WORST_LEVER_M = np.radians(10.0), 0.1, 0.1
 """What is less certain than this (standard deviation) is not taken from the fixes."""
 FEWEST = 8
+PART_S = 20.0
 COARSE_FIXES = 200
 
 _least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
+_minimize: Any = optimize.minimize_scalar
 
 Vector = tuple[float, float, float]
 Mask = npt.NDArray[np.bool_]
@@ -90,6 +92,13 @@ class WalkedPath:
         after = np.clip(np.searchsorted(self._times, t), 1, len(self._times) - 1)
         near = self._times[after] - self._times[after - 1] < GAP_S
         return np.asarray(near & (t >= self._times[0]) & (t <= self._times[-1]))
+
+    def poses(self, t: F64) -> F64:
+        """(n, 4, 4) T_map_imu."""
+        inside = np.clip(t, self._times[0], self._times[-1])
+        T = np.tile(np.eye(4), (len(t), 1, 1))
+        T[:, :3, :3], T[:, :3, 3] = self._turns(inside).as_matrix(), self._places(inside)
+        return T
 
     def antenna(self, t: F64, lever: F64) -> F64:
         """(n, 3) m in the map, of a point `lever` (3,) in the IMU frame."""
@@ -319,6 +328,27 @@ def _coarse(path: WalkedPath, seconds: F64, places: F64, lever: F64) -> tuple[fl
             f" and end {end:.0f} s after its start; both must be stamped in UTC."
         )
     return best[1], best[2]
+
+
+def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> float:
+    """The clocks' offset (s) near that of an alignment, by stretches of PART_S that are each laid on their own.
+
+    Drift over the whole walk looks like an offset; within a stretch there is little of it.
+    """
+    path, rows = WalkedPath(trajectory), np.array([int(name) - 1 for name in found.names])
+    seconds: F64 = (fixes.stamps_ns[rows] - path.start_ns).astype(np.float64) * 1e-9
+    places = Ground.in_grid(found.grid, found.reference.crs).places
+    arm = np.array(found.lever_arm)
+    parts = np.array_split(np.arange(len(rows)), max(1, round(float(seconds[-1] - seconds[0]) / PART_S)))
+
+    def cost(offset: float) -> float:
+        laid = (_laid(path.antenna(seconds[part] - offset, arm), places[part]) for part in parts)
+        return sum(float(off.sum()) for _, _, off in laid)
+
+    around = found.offset_s + np.linspace(-1.0, 1.0, 41)
+    best = float(around[np.argmin([cost(offset) for offset in around.tolist()])])
+    exact = _minimize(cost, bounds=(best - 0.05, best + 0.05), method="bounded", options={"xatol": 1e-5})
+    return float(exact.x)
 
 
 def _laid(points: F64, places: F64) -> tuple[float, F64, F64]:

@@ -1,7 +1,7 @@
 """Factors of the pose graph: what was measured between two keyframes, or of one."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -41,11 +41,17 @@ class Factor:
 
 @dataclass(frozen=True, slots=True)
 class PositionPrior:
-    """A measured position p_map_imu (3,) m of one keyframe, from GNSS for example, with its covariance (3, 3)."""
+    """A measured position p_map_imu (3,) m of one keyframe, from GNSS for example, with its covariance (3, 3).
+
+    Attributes:
+        arm: (3,) m, the point that was measured, in the IMU frame. robust: as in `Factor`.
+    """
 
     keyframe: KeyframeId
     p_map_imu: F64
     covariance: F64
+    arm: F64 = field(default_factory=lambda: np.zeros(3))
+    robust: bool = False
 
     @property
     def keyframes(self) -> tuple[KeyframeId, ...]:

@@ -28,15 +28,21 @@ MOST_UPDATES = 5
 """After a loop the update is repeated while the newest pose moves more than that, at most this often."""
 _HELD = 1e-6
 """Standard deviation (rad, m) with which the first pose is held."""
+_FIRST = np.full(6, _HELD)
+_FREE = np.repeat((np.radians(1.0), 100.0), 3)
+"""If position priors say where it is."""
 
 
-def optimise(first: F64, factors: Sequence[Closing], start: Sequence[F64] | F64) -> F64:
+def optimise(first: F64, factors: Sequence[Closing], start: Sequence[F64] | F64, *, free: bool = False) -> F64:
     """(n, 4, 4) the optimum of all factors at once, by Levenberg-Marquardt from (n, 4, 4) `start`.
+
+    Args:
+        free: the first pose is not held but by a degree; position priors say where it is.
 
     Raises:
         ArithmeticError: the solver failed.
     """
-    graph, values = _start(first)
+    graph, values = _start(first, _FREE if free else _FIRST)
     for factor in factors:
         graph.add(_gtsam(factor))
     for key in range(1, len(start)):
@@ -48,6 +54,21 @@ def optimise(first: F64, factors: Sequence[Closing], start: Sequence[F64] | F64)
         return _matrices(gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize())
     except (RuntimeError, ValueError, IndexError) as error:
         raise ArithmeticError(str(error)) from error
+
+
+def read_g2o(path: Path) -> list[Factor]:
+    """The factors of a g2o file. Loops are robust again. Raises RuntimeError or OSError: it cannot be read."""
+    path.open().close()  # or gtsam would say nothing of a file that is not there
+    graph, _ = gtsam.readG2o(str(path), True)
+    factors = []
+    for index in range(graph.size()):
+        factor = graph.at(index)
+        if isinstance(factor, gtsam.BetweenFactorPose3):
+            first, second = (KeyframeId(0, int(key)) for key in factor.keys())  # noqa: SIM118  # no mapping
+            covariance = np.asarray(factor.noiseModel().covariance())  # type: ignore[attr-defined]  # a Gaussian
+            measured = np.asarray(factor.measured().matrix())
+            factors.append(Factor(first, second, measured, covariance, second - first != 1))
+    return factors
 
 
 def g2o_text(poses: F64, factors: Iterable[Closing]) -> str:
@@ -238,9 +259,9 @@ def _estimate(solver: Any, key: int) -> F64:
     return np.asarray(solver.calculateEstimatePose3(key).matrix())
 
 
-def _start(first: F64) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def _start(first: F64, sigmas: F64 = _FIRST) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(first), gtsam.noiseModel.Isotropic.Sigma(6, _HELD)))
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(first), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
     values.insert(0, gtsam.Pose3(first))
     return graph, values
 
@@ -255,7 +276,7 @@ def _params() -> gtsam.ISAM2Params:
     return params
 
 
-def _noise(factor: Factor, times: int = 1) -> gtsam.noiseModel.Base:
+def _noise(factor: Closing, times: int = 1) -> gtsam.noiseModel.Base:
     """times: how many loops it is the mean of. Huber's limit grows so that they pull as far as each would alone."""
     noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
     if not factor.robust:
@@ -266,8 +287,7 @@ def _noise(factor: Factor, times: int = 1) -> gtsam.noiseModel.Base:
 def _gtsam(factor: Closing, times: int = 1) -> gtsam.NonlinearFactor:
     """The factor as gtsam has it."""
     if isinstance(factor, PositionPrior):
-        noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
-        return gtsam.GPSFactor(factor.keyframe, factor.p_map_imu, noise)
+        return gtsam.GPSFactorArm(factor.keyframe, factor.p_map_imu, factor.arm, _noise(factor))
     T = gtsam.Pose3(factor.T_first_second)
     return gtsam.BetweenFactorPose3(factor.first, factor.second, T, _noise(factor, times))
 

@@ -1,0 +1,106 @@
+"""Bends a map by its fixes: each becomes a factor of the pose graph, on the keyframe nearest in time.
+
+    g = T_map_imu @ (T_keyframe_then @ lever)        the antenna, carried to the time of the fix by odometry
+
+Fixes that do not fit even a bent map are rejected; the user's word on a fix overrules that.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from app.georeference.align import MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, Mask, WalkedPath, offset_by_parts
+from app.georeference.fixes import Fixes
+from app.slam import lie
+from app.slam.arrays import F64, I64
+from app.slam.errors import HemislamError
+from app.slam.keyframe_id import KeyframeId
+from app.slam.loops.factors import Closing, PositionPrior
+from app.slam.loops.solvers import optimise
+from app.slam.trajectory import Trajectory
+
+MOST_ROUNDS = 5
+
+
+def bend(
+    trajectory: Trajectory,
+    keyframe_stamps_ns: I64,
+    graph: Sequence[Closing],
+    fixes: Fixes,
+    found: Alignment,
+    *,
+    accept: Collection[str] = (),
+    reject: Collection[str] = (),
+) -> tuple[F64, Alignment]:
+    """Solve the graph with the fixes.
+
+    Args:
+        trajectory: T_map_imu at all scans, keyframes among them. graph: odometry and loops of the keyframes.
+        found: how the fixes lie on the map as it is. accept, reject: names of fixes on which the user has decided.
+
+    Returns:
+        (k, 4, 4) T_bent_map at each keyframe, and how the fixes lie on the bent map.
+
+    Raises:
+        HemislamError: there are no such fixes, or the solver fails.
+    """
+    if unknown := sorted({*accept, *reject} - set(found.names)):
+        raise HemislamError(f"There is no fix {unknown[0]} within the walk; gnss_residuals.csv lists all.")
+    before = WalkedPath(trajectory).poses((keyframe_stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
+    found = replace(found, offset_s=offset_by_parts(trajectory, fixes, found), offset_sigma_s=float("nan"))
+    priors = _priors(trajectory, keyframe_stamps_ns, before, fixes, found)
+    held, barred = np.isin(found.names, [*accept]), np.isin(found.names, [*reject])
+    chosen = [replace(prior, robust=True) for prior, no in zip(priors, barred, strict=True) if not no]
+    try:
+        poses = optimise(before[0], [*graph, *chosen], before, free=True)
+        used: Mask = ~barred
+        for _ in range(MOST_ROUNDS):
+            off, distances = _off(priors, poses)
+            scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
+            agree = ((distances < MOST_SIGMAS * scale) | held) & ~barred
+            poses = optimise(before[0], [*graph, *(priors[i] for i in np.flatnonzero(agree))], poses, free=True)
+            if (agree == used).all():
+                break
+            used = agree
+    except ArithmeticError as error:
+        raise HemislamError(f"The graph cannot be solved with these fixes ({error}).") from error
+    off, distances = _off(priors, poses)
+    moved = float(np.linalg.norm(poses[:, :3, 3] - before[:, :3, 3], axis=1).max())
+    notes = (
+        *found.notes,
+        f"Clock offset by stretches of the walk: {found.offset_s * 1e3:.1f} ms.",
+        f"The fixes bend the map: keyframes move by up to {moved:.3f} m.",
+    )
+    turned = off @ np.array(found.reference.rotation).T
+    return poses @ lie.inverse(before), replace(
+        found, residuals=turned, distances=distances, used=used, notes=notes, yaw_sigma=float("nan")
+    )
+
+
+def _priors(
+    trajectory: Trajectory, keyframe_stamps_ns: I64, keyframes: F64, fixes: Fixes, found: Alignment
+) -> list[PositionPrior]:
+    """One for each fix of the alignment."""
+    rows = np.array([int(name) - 1 for name in found.names])
+    stamps_ns = fixes.stamps_ns[rows] - round(found.offset_s * 1e9)
+    nearest = np.abs(keyframe_stamps_ns[None] - stamps_ns[:, None]).argmin(axis=1)
+    then = WalkedPath(trajectory).poses((stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
+    arms = (lie.inverse(keyframes[nearest]) @ then @ np.array([*found.lever_arm, 1.0]))[:, :3]
+    places = found.reference.from_crs(found.grid)
+    scatter = np.linalg.norm(found.residuals, axis=1) / np.maximum(found.distances, 1e-9)
+    sigmas = np.where(np.isfinite(fixes.sigmas[rows]), fixes.sigmas[rows], scatter[:, None])
+    R = np.array(found.reference.rotation)
+    return [
+        PositionPrior(KeyframeId(0, int(keyframe)), place, R.T @ np.diag(sigma**2) @ R, arm)
+        for keyframe, place, sigma, arm in zip(nearest, places, sigmas, arms, strict=True)
+    ]
+
+
+def _off(priors: Sequence[PositionPrior], poses: F64) -> tuple[F64, F64]:
+    """(n, 3) m, measured minus map in the map's axes, and (n,) the same in standard deviations."""
+    T = poses[[prior.keyframe for prior in priors]]
+    arms = np.array([prior.arm for prior in priors])
+    off = np.array([prior.p_map_imu for prior in priors]) - T[:, :3, 3] - np.einsum("nij,nj->ni", T[:, :3, :3], arms)
+    whitened = np.linalg.solve(np.array([prior.covariance for prior in priors]), off[..., None])[..., 0]
+    return off, np.sqrt(np.einsum("ni,ni->n", off, whitened))

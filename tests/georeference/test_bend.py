@@ -1,0 +1,73 @@
+"""Bend a map that drifted by its fixes. Oracle: the walk as it truly was."""
+
+import numpy as np
+import pytest
+
+from app.georeference.align import Alignment, align
+from app.georeference.bend import bend
+from app.slam import lie
+from app.slam.errors import HemislamError
+from app.slam.keyframe_id import KeyframeId
+from app.slam.loops.factors import Factor
+from app.slam.map_frame import corrected
+from app.slam.trajectory import Trajectory
+from app.slam.types import F64
+from tests.georeference.walks import LEVER, TRUTH, Walked, walked
+
+STEP = 10
+"""Scans between keyframes."""
+
+
+@pytest.fixture(scope="module")
+def made() -> Walked:
+    return walked(rate_hz=4.0, duration_s=60.0)
+
+
+@pytest.fixture(scope="module")
+def drifted(made: Walked) -> Trajectory:
+    """The walk by an odometry that turns by 0.02° in each scan."""
+    steps = lie.inverse(made.trajectory.poses[:-1]) @ made.trajectory.poses[1:]
+    up = np.swapaxes(made.trajectory.poses[1:, :3, :3], 1, 2) @ np.array([0.0, 0.0, np.radians(0.02)])
+    poses = [made.trajectory.poses[0]]
+    for step, turn in zip(steps, up, strict=True):
+        poses.append(poses[-1] @ step @ lie.transform(lie.exp(turn), np.zeros(3)))
+    return Trajectory.from_poses(made.trajectory.stamps_ns, poses)
+
+
+def solved(made: Walked, drifted: Trajectory, **decided: list[str]) -> tuple[F64, Alignment, Alignment]:
+    """(k, 4, 4) corrections, and the alignments before and after."""
+    keyframes = drifted.poses[::STEP]
+    noise = np.diag([np.radians(0.3)] * 3 + [0.01] * 3) ** 2
+    graph = [
+        Factor(KeyframeId(0, k), KeyframeId(0, k + 1), lie.inverse(keyframes[k]) @ keyframes[k + 1], noise)
+        for k in range(len(keyframes) - 1)
+    ]
+    found = align(drifted, made.fixes, grid="EPSG:32632", lever=LEVER)
+    return *bend(drifted, drifted.stamps_ns[::STEP], graph, made.fixes, found, **decided), found
+
+
+def test_a_map_that_turned_by_12_degrees_is_bent_back_to_where_it_was(made: Walked, drifted: Trajectory) -> None:
+    corrections, after, before = solved(made, drifted)
+    poses = corrected(drifted.stamps_ns, drifted.poses, drifted.stamps_ns[::STEP], corrections)
+    bent = Trajectory.from_poses(drifted.stamps_ns, poses)
+    true = TRUTH.to_crs(made.trajectory.positions)
+    errors = [
+        np.linalg.norm(found.reference.to_crs(path.positions) - true, axis=1)
+        for found, path in ((before, drifted), (after, bent))
+    ]
+    assert errors[0].max() > 0.5 and np.sqrt((errors[1] ** 2).mean()) < 0.03
+    rejected = {int(name) for name, used in zip(after.names, after.used, strict=True) if not used}
+    assert {n for n in made.outliers.tolist() if str(n) in after.names} <= rejected
+    assert after.rms.max() < 0.03 < before.rms.max()
+
+
+def test_the_users_word_on_a_fix_overrules_the_verdict(made: Walked, drifted: Trajectory) -> None:
+    wild, sound = str(made.outliers[2]), next(str(n) for n in range(30, 99) if n not in made.outliers)
+    _, after, _ = solved(made, drifted, accept=[wild], reject=[sound])
+    verdict = dict(zip(after.names, after.used.tolist(), strict=True))
+    assert verdict[wild] and not verdict[sound]
+
+
+def test_a_fix_that_is_not_there_cannot_be_decided_on(made: Walked, drifted: Trajectory) -> None:
+    with pytest.raises(HemislamError, match="There is no fix 9999"):
+        solved(made, drifted, reject=["9999"])
