@@ -30,10 +30,19 @@ ClusterData = Annotated[
         help="Where its workers find the recordings, e.g. s3://bucket/walks. Default: the same path, else from here.",
     ),
 ]
-_TRUTH_HELP = (
-    "True poses: a TUM or KITTI file, the GNSS/INS table of H2LID, or topic:/NAME in the recording; `none` for none."
-    " Repeatable, in the order of the recordings. Default: RECORDING_truth.tum beside the recording."
-)
+Out = Annotated[
+    Path, typer.Option("--out", metavar="DIR", help="Where to write. Finished runs found there are reused.")
+]
+Truths = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--truth",
+        metavar="TRUTH",
+        help="True poses: a TUM or KITTI file, the GNSS/INS table of H2LID, or topic:/NAME in the recording; `none` for"
+        " none. Repeatable, in the order of the recordings. Default: RECORDING_truth.tum beside the recording.",
+    ),
+]
+Jobs = Annotated[int | None, typer.Option("--jobs", min=1, metavar="N", help="Parallel runs. Default: one per core.")]
 
 
 @with_params
@@ -42,10 +51,8 @@ def evaluate(
     recordings: Annotated[
         list[Path] | None, typer.Argument(metavar="RECORDING...", help="One or more recordings.")
     ] = None,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Where to write. Finished runs found there are reused.")
-    ] = Path("runs/evaluation"),
-    truths: Annotated[list[str] | None, typer.Option("--truth", metavar="TRUTH", help=_TRUTH_HELP)] = None,
+    out: Out = Path("runs/evaluation"),
+    truths: Truths = None,
     lever: Annotated[
         str | None,
         typer.Option("--lever", metavar="X,Y,Z", help="Metres from the IMU to the truth's point, in its body's axes."),
@@ -79,9 +86,7 @@ def evaluate(
     short: Annotated[bool, typer.Option("--short", help="Only the first 60 s of each sequence of the suite.")] = False,
     seeds: Annotated[list[int] | None, typer.Option("--seed", min=0, help="Seed of the suite. Repeatable.")] = None,
     imperfect: Imperfect = False,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", min=1, metavar="N", help="Parallel runs. Default: one per core.")
-    ] = None,
+    jobs: Jobs = None,
     cluster: ClusterAddress = None,
     cluster_data: ClusterData = "",
     start: Start = 0.0,

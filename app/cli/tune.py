@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from app.cli.evaluate import ClusterAddress, ClusterData, cores, name_recordings, runner, truth_texts
+from app.cli.evaluate import (
+    ClusterAddress,
+    ClusterData,
+    Jobs,
+    Out,
+    Truths,
+    cores,
+    name_recordings,
+    runner,
+    truth_texts,
+)
 from app.cli.options import Duration, ParamsFor, Start, make_folder, with_params
 from app.slam.errors import HemislamError
 
@@ -50,15 +60,9 @@ def tune(
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the search.")] = 0,
-    truths: Annotated[
-        list[str] | None, typer.Option("--truth", metavar="TRUTH", help="True poses, as for `hemislam evaluate`.")
-    ] = None,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Where to write. Finished runs found there are reused.")
-    ] = Path("runs/tuning"),
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", min=1, metavar="N", help="Parallel runs. Default: one per core.")
-    ] = None,
+    truths: Truths = None,
+    out: Out = Path("runs/tuning"),
+    jobs: Jobs = None,
     cluster: ClusterAddress = None,
     cluster_data: ClusterData = "",
     start: Start = 0.0,

@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,12 @@ def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
         "results.json": json.dumps(results, indent=2, ensure_ascii=False) + "\n",
         **{f"{name}.csv": _csv(rows) for name, rows in _flat(results).items()},
     }
+    write_texts(folder, texts)
+    return found
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write files by their names, each whole or not at all. Raises HemislamError: they cannot be written."""
     try:
         for name, text in texts.items():
             part = folder / f".{name}.part"
@@ -54,7 +60,6 @@ def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
             part.replace(folder / name)
     except OSError as error:
         raise HemislamError(f"The report cannot be written to {folder}: {error.strerror}.") from error
-    return found
 
 
 def _results(recordings: Sequence[Evaluated], machine: dict[str, Any], found: list[str]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import optuna
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from app import __version__
-from app.slam.errors import HemislamError
+from app.evaluation.report import write_texts
 from app.slam.params import Params
 from app.slam.provenance import describe_machine
 from app.tuning.objectives import Objective
@@ -59,13 +59,7 @@ def write_results(
     }
     if best:
         texts[BEST] = params.with_values(best[0].values).to_yaml()
-    try:
-        for name, text in texts.items():
-            part = folder / f".{name}.part"
-            part.write_text(text, encoding="utf-8")
-            part.replace(folder / name)
-    except OSError as error:
-        raise HemislamError(f"The results cannot be written to {folder}: {error.strerror}.") from error
+    write_texts(folder, texts)
 
 
 def pictures(study: optuna.Study, objectives: Sequence[Objective]) -> dict[str, Any]:
