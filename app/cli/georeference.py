@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from app.georeference.fixes import Fixes
     from app.slam.trajectory import Trajectory
 
-RESIDUALS, PLOT = "gnss_residuals.csv", "georeference.svg"
-
 
 def georeference(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="A folder that `run` or the workbench wrote.")],
@@ -157,8 +155,8 @@ def _write(results: Path, found: "Alignment", trajectory: "Trajectory") -> None:
 
     texts = {
         reference.FILE: found.reference.to_json(),
-        RESIDUALS: ledger.residuals_csv(found),
-        PLOT: georeference_plot(found, trajectory.positions),
+        reference.RESIDUALS: ledger.residuals_csv(found),
+        reference.PLOT: georeference_plot(found, trajectory.positions),
     }
     try:
         for name, text in texts.items():

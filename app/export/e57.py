@@ -64,11 +64,10 @@ def _add(file: Any, block: Block, where: GeoReference | None) -> None:
         rotation, translation = np.array(where.rotation) @ rotation, where.to_crs(translation[None])[0]
         points = where.to_crs(points)
     own = ((points - translation) @ rotation).astype(np.float32).astype(np.float64)
-    times = block.stamps_ns[[0, -1]] * 1e-9 + GPS_MINUS_UNIX_S
     bounds = zip("xyz", own.min(axis=0), own.max(axis=0), strict=True)
     head = {name: value for axis, low, high in bounds for name, value in _limits(axis, low, high)}
-    for name, seconds in zip(("Start", "End"), (times.min(), times.max()), strict=True):
-        head[f"acquisition{name}_dateTimeValue"] = float(seconds)
+    for name, stamp_ns in (("Start", block.stamps_ns.min()), ("End", block.stamps_ns.max())):
+        head[f"acquisition{name}_dateTimeValue"] = int(stamp_ns) * 1e-9 + GPS_MINUS_UNIX_S
     file.write_scan_raw(
         {**{f"cartesian{axis}": own[:, k] for k, axis in enumerate("XYZ")}, "intensity": block.intensity.astype("f4")},
         name=f"keyframe {block.keyframe}",

@@ -32,9 +32,12 @@ def read_results(folder: Path) -> Results:
     log = RunLog([Frame(stamp_ns, False, position, quaternion, nothing) for stamp_ns, position, quaternion in rows])
     try:
         recording = Path(json.loads((folder / "report.json").read_bytes())["recording"]["path"])
-        g2o = graph.read_text(encoding="utf-8") if graph.exists() else None
     except (OSError, ValueError, KeyError, TypeError):
-        recording, g2o = folder, None
+        recording = folder
+    try:
+        g2o = graph.read_text(encoding="utf-8") if graph.exists() else None
+    except (OSError, ValueError):
+        g2o = None
     loops = LoopResults(MapFrame(), np.empty(0, np.int64), (), g2o) if g2o is not None else None
     info = RunInfo(recording, Params())
     return Results(log, MapFile(folder / "map.ply"), info, loops, where=reference.read(folder))

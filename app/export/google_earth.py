@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 from PIL import Image
 
-from app.export.paths import utc_text
+from app.export.paths import name_of, utc_text
 from app.export.raster import COARSE_CELL, Raster
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def _document(results: "Results", raster: Raster) -> ElementTree.Element:
     assert results.where is not None
     root = ElementTree.Element(f"{{{KML}}}kml")
     document = _add(root, "Document")
-    _add(document, "name", results.info.recording.stem)
+    _add(document, "name", name_of(results.info.recording))
     style = _add(document, "Style", id="walk")
     line = _add(style, "LineStyle")
     _add(line, "color", "ff2828ff")  # alpha, blue, green, red

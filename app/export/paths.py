@@ -36,7 +36,7 @@ def write_gpx(path: Path, results: "Results") -> None:
     assert results.where is not None
     root = ElementTree.Element("gpx", version="1.1", creator="hemislam", xmlns="http://www.topografix.com/GPX/1/1")
     track = ElementTree.SubElement(root, "trk")
-    ElementTree.SubElement(track, "name").text = results.info.recording.stem
+    ElementTree.SubElement(track, "name").text = name_of(results.info.recording)
     segment = ElementTree.SubElement(track, "trkseg")
     places = results.where.to_geographic(results.trajectory.positions)
     for stamp_ns, (latitude, longitude, height) in zip(results.trajectory.stamps_ns.tolist(), places, strict=True):
@@ -44,6 +44,11 @@ def write_gpx(path: Path, results: "Results") -> None:
         ElementTree.SubElement(point, "ele").text = f"{height:.3f}"
         ElementTree.SubElement(point, "time").text = utc_text(stamp_ns)
     write_xml(path, root)
+
+
+def name_of(recording: Path) -> str:
+    """Without its suffix, as UTF-8 whatever the bytes of the name are."""
+    return recording.stem.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def utc_text(stamp_ns: int) -> str:

@@ -1,4 +1,7 @@
-"""The points of a map as a stream, one keyframe at a time, so that memory does not grow with the map."""
+"""The points of a map as a stream, one keyframe at a time, so that memory does not grow with the map.
+
+Only thinning remembers something of the whole map: its voxels.
+"""
 
 import math
 from collections.abc import Iterator
@@ -88,10 +91,10 @@ def _block(keyframe: Keyframe, T_map_odom: F64) -> Block:
 
 
 def as_cloud(block: Block) -> Cloud:
-    """The points in the LiDAR frame again."""
+    """The points in the LiDAR frame again; offsets count from the scan's end, for its begin may not be in the map."""
     T, stamps_ns = block.T_map_lidar, block.stamps_ns
     points = ((block.points - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
-    offsets_ns = (stamps_ns - stamps_ns.min(initial=block.stamp_ns)).astype(np.int32)
+    offsets_ns = np.minimum(stamps_ns - block.stamp_ns, 0).astype(np.int32)
     return Cloud(points, block.labels, block.intensity, block.ring, offsets_ns)
 
 

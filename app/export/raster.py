@@ -42,14 +42,14 @@ class Raster:
     ground: npt.NDArray[np.int32]
     walls: npt.NDArray[np.int32]
     cut: npt.NDArray[np.int32]
-    height_sum: npt.NDArray[np.float32]
+    height_sum: F64
 
     @property
     def height(self) -> npt.NDArray[np.float32]:
         """(rows, columns) m, mean of the ground points; nan without one."""
         with np.errstate(invalid="ignore"):
-            mean = self.height_sum / self.ground + np.float32(self.origin[2])
-        return np.where(self.ground > 0, mean, np.float32(np.nan))
+            mean = self.height_sum / self.ground + self.origin[2]
+        return np.where(self.ground > 0, mean, np.nan).astype(np.float32)
 
 
 def rasterise(read: Callable[[], Iterable[Block]], where: GeoReference | None, cell: float) -> Raster:
@@ -74,7 +74,7 @@ def rasterise(read: Callable[[], Iterable[Block]], where: GeoReference | None, c
     shape = (int(size[1]), int(size[0]))
     floor = _floor(read, where, origin, cell, shape)
     counts = {name: np.zeros(shape, np.int32) for name in ("points", "ground", "walls", "cut")}
-    height_sum = np.zeros(shape, np.float32)
+    height_sum = np.zeros(shape)
     for points, labels in _points(read, where):
         rows, columns = _cells(points, origin, cell)
         above = points[:, 2] - floor[rows // COARSE, columns // COARSE]

@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy.typing as npt
 from app.export import map_file
 from app.export.points import EVERYTHING, Block, Choice, blocks
 from app.export.raster import CELL, Raster, rasterise
+from app.georeference import reference
 from app.georeference.reference import GeoReference
 from app.slam import report
 from app.slam.errors import HemislamError
@@ -75,7 +76,7 @@ class Results:
 
     def raster(self, *, on_earth: bool, cell: float = CELL) -> Raster:
         """The map from above, counted once for all files that show it."""
-        key = on_earth, cell
+        key = on_earth and self.where is not None, cell
         if key not in self._rasters:
             self._rasters[key] = rasterise(self.blocks, self.where if on_earth else None, cell)
         return self._rasters[key]
@@ -232,12 +233,14 @@ def save_results(
     written = [export for export in exports if results.loops or not export.of_loops]
     if results.where is None and (lost := [export.name for export in written if export.on_earth]):
         raise HemislamError(f"{lost[0]} needs to know where on Earth the map is; run hemislam georeference first.")
-    parts = {export.name: folder / f".{export.name}.part" for export in written}
+    parts, show = {export.name: folder / f".{export.name}.part" for export in written}, results.progress
     try:
-        show = results.progress
         for number, export in enumerate(written):
-            results.progress = partial(lambda before, share: show((before + share) / len(written)), number)
+            results.progress = _progress_of(number, len(written), show)
             export.write(parts[export.name], results)
+        if results.where is None and {"map.ply", "trajectory.tum"} & parts.keys():
+            for name in (reference.FILE, reference.RESIDUALS, reference.PLOT):
+                (folder / name).unlink(missing_ok=True)  # of an older map
         for export in exports:
             if export in written:
                 parts[export.name].replace(folder / export.name)
@@ -246,9 +249,22 @@ def save_results(
     except OSError as error:
         raise HemislamError(f"Results cannot be written to {folder}: {error.strerror or error}.") from error
     finally:
+        results.progress = show
         for part in parts.values():
             part.unlink(missing_ok=True)
     return results.report
+
+
+def _progress_of(file: int, files: int, show: Callable[[float], None]) -> Callable[[float], None]:
+    """How far all files are. It never goes back, although some read the points several times."""
+    most = 0.0
+
+    def tell(share: float) -> None:
+        nonlocal most
+        most = max(most, share)
+        show((file + most) / files)
+
+    return tell
 
 
 def timings_csv(stamps_ns: I64, timings_ms: F64, more: dict[str, npt.ArrayLike] | None = None) -> str:

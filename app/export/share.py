@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import viser
 
-from app.export.paths import utc_text
+from app.export.paths import name_of, utc_text
 from app.slam.types import F32, F64, U8
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 MOST_POINTS = 1_000_000
 TILE = 16.0
-"""m: float16 holds coordinates in a tile to 4 mm."""
+"""m: float16 holds x and y in a tile to 4 mm; z less finely where it is far from the tile's median."""
 STOPS = np.array([[40, 60, 150], [30, 150, 160], [120, 195, 110], [240, 200, 70], [225, 90, 50]], np.float64)
 """Colours from low to high."""
 PATH, LOOP, MARK, ARROW = (255, 255, 255), (255, 120, 40), (120, 255, 160), (255, 60, 60)
@@ -35,7 +35,7 @@ def write(path: Path, results: "Results") -> None:
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
-    name = html.escape(results.info.recording.stem)
+    name = html.escape(name_of(results.info.recording))
     page = page.replace("<title>Viser</title>", f"<title>{name}</title>", 1)
     before, end, after = page.rpartition("</body>")
     path.write_text(before + _overlay(name, len(points), results) + end + after, encoding="utf-8")

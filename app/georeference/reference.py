@@ -11,8 +11,8 @@ from app.georeference import crs
 from app.slam.arrays import F64
 from app.slam.errors import HemislamError
 
-FILE = "georeference.json"
-"""Its name beside the results."""
+FILE, RESIDUALS, PLOT = "georeference.json", "gnss_residuals.csv", "georeference.svg"
+"""Beside the results: itself, the fixes that it is made from, and a drawing of both."""
 ELLIPSOIDAL = "ellipsoidal"
 
 Row = tuple[float, float, float]

@@ -14,16 +14,21 @@ import pytest
 from evo.tools import file_interface
 from pypcd4 import PointCloud
 from test_las import UTM, room
+from test_plan import room as plan_room
 
 from app.export import results as table
 from app.export.results import of_formats, save_results
 from app.georeference.reference import GeoReference
 from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.run_log import RunInfo
 
 
 @pytest.mark.parametrize("where", [None, UTM])
 def test_e57_has_a_scan_with_its_pose_for_each_keyframe(tmp_path: Path, where: GeoReference | None) -> None:
     results = room(where)
+    for one in results.keyframes:
+        one.cloud.offsets_ns[:] = np.roll(one.cloud.offsets_ns, 100)  # rows are not in the order of time
     save_results(tmp_path, results, of_formats(["e57"]))
     file = pye57.E57(str(tmp_path / "map.e57"))
     assert file.scan_count == len(results.keyframes)
@@ -37,6 +42,10 @@ def test_e57_has_a_scan_with_its_pose_for_each_keyframe(tmp_path: Path, where: G
         np.testing.assert_allclose(points, expected, atol=1e-3)
         np.testing.assert_allclose(file.get_header(index).translation, place[0], atol=1e-9)
         np.testing.assert_array_equal(read["intensity"], block.intensity)
+        times = [file.get_header(index)[f"acquisition{name}"]["dateTimeValue"].value() for name in ("Start", "End")]
+        assert np.array(times) + 315_964_800 - 18 == pytest.approx(
+            [block.stamps_ns.min() * 1e-9, block.stamps_ns.max() * 1e-9], abs=1e-5, rel=0
+        )
     wkt = file.root["coordinateMetadata"].value()
     assert not wkt if where is None else pyproj.CRS(wkt).equals(pyproj.CRS(where.crs))
     file.close()
@@ -80,6 +89,14 @@ def test_a_map_without_a_place_gives_no_gpx(tmp_path: Path) -> None:
         save_results(tmp_path, room(), of_formats(["gpx"]))
     save_results(tmp_path, room(), of_formats(["csv"]))
     assert (tmp_path / "trajectory.csv").read_text().startswith("stamp_s,x_m,y_m,z_m,qx,qy,qz,qw\n")
+
+
+def test_a_recording_whose_name_is_no_utf_8_is_delivered(tmp_path: Path) -> None:
+    results = plan_room(UTM)
+    results.info = RunInfo(Path("w\udce4lk.mcap"), Params())
+    save_results(tmp_path, results, of_formats(["gpx", "kmz", "html"]))
+    assert "<name>w\\udce4lk</name>" in (tmp_path / "trajectory.gpx").read_text()
+    assert "<title>w\\udce4lk</title>" in (tmp_path / "share.html").read_text()
 
 
 def test_what_is_not_installed_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,5 +70,8 @@ def test_progress_ends_at_one_and_a_name_that_is_no_format_is_refused(tmp_path: 
     results.progress = shares.append
     save_results(tmp_path, results, of_formats(["las", "laz"]))
     assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) == 8
+    shares.clear()
+    save_results(tmp_path, results, of_formats(["las", "html"]), replace=True)
+    assert shares == sorted(shares) and shares[-1] == 1.0, "a page reads the points twice"
     with pytest.raises(HemislamError, match="no format lax; choose from tum"):
         of_formats(["laz", "lax"])

@@ -14,7 +14,8 @@ import pytest
 from app.export.folder import read_results
 from app.export.map_file import KEYFRAME, VERTEX, MapFile, write
 from app.export.points import Choice, blocks
-from app.export.results import BY_RUN, Results, save_results
+from app.export.results import BY_RUN, EXPORTS, Results, save_results
+from app.georeference import reference
 from app.slam.errors import HemislamError
 from app.slam.frames import Frame
 from app.slam.map_frame import MapFrame
@@ -235,6 +236,19 @@ def test_results_are_not_overwritten_unless_asked(tmp_path: Path, recording: Pat
     assert len(read_tum(tmp_path / "out" / "trajectory.tum")) == 9
 
 
+def test_a_new_map_does_not_lie_where_the_older_one_lay(tmp_path: Path, recording: Path) -> None:
+    results = Results(logged(4), [], RunInfo(recording, Params()))
+    save_results(tmp_path, results)
+    of_older = [tmp_path / name for name in (reference.FILE, reference.RESIDUALS, reference.PLOT)]
+    for path in of_older:
+        path.write_text("of the older map")
+    csv_only = [export for export in EXPORTS if export.name == "trajectory.csv"]
+    save_results(tmp_path, results, csv_only, replace=True)
+    assert all(path.exists() for path in of_older), "the map is the same"
+    save_results(tmp_path, results, replace=True)
+    assert not any(path.exists() for path in of_older)
+
+
 def test_older_results_survive_a_write_that_fails(tmp_path: Path, recording: Path) -> None:
     class BrokenDisk:
         def __len__(self) -> int:
@@ -273,6 +287,26 @@ def test_a_map_read_again_is_the_map_that_was_written(tmp_path: Path, recording:
         np.testing.assert_allclose(other.stamps_ns, one.stamps_ns, atol=300)
         for name in ("keyframe", "stamp_ns", "ring", "intensity", "labels"):
             assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+def test_points_of_a_thinned_map_keep_their_times(tmp_path: Path, recording: Path) -> None:
+    points = [[0.01 * (k // 2), 0, 0] for k in range(10)]  # the last one is not the first in its voxel
+    one = keyframe(0, points, [NON_GROUND] * 10)
+    one.cloud.offsets_ns[:] = np.arange(10) * 10_000_000
+    written = list(blocks([one], MapFrame(), Choice(0.01)))
+    save_results(tmp_path, Results(logged(), [one], RunInfo(recording, Params()), choice=Choice(0.01)))
+    (read,) = read_results(tmp_path).blocks()
+    assert 0 < len(read) < 10 and written[0].stamps_ns[-1] < START_NS
+    np.testing.assert_allclose(read.stamps_ns - START_NS, written[0].stamps_ns - START_NS, atol=300)
+
+
+def test_a_report_that_cannot_be_read_costs_no_loops(tmp_path: Path, recording: Path) -> None:
+    save_results(tmp_path, Results(logged(), [], RunInfo(recording, Params())))
+    (tmp_path / "report.json").write_text("{")
+    (tmp_path / "graph.g2o").write_text("EDGE_SE3:QUAT 0 5")
+    results = read_results(tmp_path)
+    assert results.info.recording == tmp_path and results.loops is not None
+    assert results.loops.g2o == "EDGE_SE3:QUAT 0 5"
 
 
 def test_only_the_first_point_in_a_voxel_and_in_the_box_is_taken() -> None:
