@@ -36,7 +36,7 @@ MEDIAN_SIGMAS = 1.538
 WORST_YAW, WORST_OFFSET_S, WORST_LEVER_M = np.radians(10.0), 0.1, 0.1
 """What is less certain than this (standard deviation) is not taken from the fixes."""
 FEWEST = 8
-PART_S = 20.0
+PART_S, FEWEST_IN_PART = 20.0, 5
 COARSE_FIXES = 200
 
 _least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
@@ -79,7 +79,7 @@ class Alignment:
 
 
 class WalkedPath:
-    """Where the IMU was between the poses of a trajectory; times in s since the first pose."""
+    """Where the IMU was between the poses of a trajectory (4 or more); times in s since the first pose."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.start_ns = int(trajectory.stamps_ns[0])
@@ -92,6 +92,10 @@ class WalkedPath:
         after = np.clip(np.searchsorted(self._times, t), 1, len(self._times) - 1)
         near = self._times[after] - self._times[after - 1] < GAP_S
         return np.asarray(near & (t >= self._times[0]) & (t <= self._times[-1]))
+
+    def within_search(self, t: F64) -> Mask:
+        """(n,) whether the clocks' offset may bring these times into the walk."""
+        return np.asarray((t >= self._times[0] - SEARCH_S) & (t <= self._times[-1] + SEARCH_S))
 
     def poses(self, t: F64) -> F64:
         """(n, 4, 4) T_map_imu."""
@@ -113,7 +117,7 @@ class WalkedPath:
 def align(
     trajectory: Trajectory, fixes: Fixes, *, grid: str = "", height: str = ELLIPSOIDAL, lever: Vector | None = None
 ) -> Alignment:
-    """Find where a trajectory lies by fixes that are in order of time.
+    """Find where a trajectory lies by fixes that are in order of time; those before and after it do not matter.
 
     Args:
         trajectory: T_map_imu with z up. grid: a projected system; "": the UTM zone there. height: what the heights of
@@ -122,11 +126,15 @@ def align(
     Raises:
         HemislamError: the fixes do not fit the trajectory in time or place, or tell no heading.
     """
-    if len(trajectory) < 3:
-        raise HemislamError("The trajectory has fewer than 3 poses; there is nothing to lay on the fixes.")
-    ground = Ground.of(fixes, grid)
+    if len(trajectory) < 4:
+        raise HemislamError("The trajectory has fewer than 4 poses; there is nothing to lay on the fixes.")
     path = WalkedPath(trajectory)
     seconds: F64 = (fixes.stamps_ns - path.start_ns).astype(np.float64) * 1e-9
+    rows = np.flatnonzero(path.within_search(seconds))
+    if len(rows) < FEWEST:
+        raise _too_few(path, seconds)
+    fixes, seconds = Fixes.of(fixes.stamps_ns[rows], fixes.places[rows], fixes.sigmas[rows]), seconds[rows]
+    ground = Ground.of(fixes, grid)
     notes: list[str] = []
     arm = np.array(lever or (0.0, 0.0, 0.0))
     offset, median = _coarse(path, seconds, ground.places, arm)
@@ -153,7 +161,7 @@ def align(
     reference = ground.reference(solved.yaw, solved.shift, height)
     return Alignment(
         reference,
-        tuple(str(number) for number in np.flatnonzero(known) + 1),
+        tuple(str(number) for number in rows[known] + 1),
         ground.grid[known],
         solved.residuals,
         solved.distances,
@@ -261,7 +269,7 @@ class _Problem:
             errors * self.sigmas,
             np.linalg.norm(errors, axis=1),
             used,
-            float(sigmas[4]) if late else 0.0,
+            float(sigmas[4]) if late else float("nan"),
             float(sigmas[0]),
             float(sigmas[-3:].max()) if free else float("nan"),
         )
@@ -321,13 +329,15 @@ def _coarse(path: WalkedPath, seconds: F64, places: F64, lever: F64) -> tuple[fl
             _, _, off = _laid(path.antenna(t[inside], lever), places[few][inside])
             best = min(best, (float(off.mean()), offset, float(np.median(off))))
     if not np.isfinite(best[0]):
-        count = int(path.known(seconds).sum())
-        begin, end = seconds[0], seconds[-1]
-        raise HemislamError(
-            f"Only {count} fixes lie within the time of the trajectory, {FEWEST} are needed: they begin {begin:.0f} s"
-            f" and end {end:.0f} s after its start; both must be stamped in UTC."
-        )
+        raise _too_few(path, seconds)
     return best[1], best[2]
+
+
+def _too_few(path: WalkedPath, seconds: F64) -> HemislamError:
+    return HemislamError(
+        f"Only {path.known(seconds).sum()} fixes lie within the time of the trajectory, {FEWEST} are needed: they begin"
+        f" {seconds[0]:.0f} s and end {seconds[-1]:.0f} s after its start; both must be stamped in UTC."
+    )
 
 
 def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> float:
@@ -339,7 +349,11 @@ def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> f
     seconds: F64 = (fixes.stamps_ns[rows] - path.start_ns).astype(np.float64) * 1e-9
     places = Ground.in_grid(found.grid, found.reference.crs).places
     arm = np.array(found.lever_arm)
-    parts = np.array_split(np.arange(len(rows)), max(1, round(float(seconds[-1] - seconds[0]) / PART_S)))
+    count = max(1, round(float(seconds[-1] - seconds[0]) / PART_S))
+    ends = np.searchsorted(seconds, np.linspace(seconds[0], seconds[-1], count + 1)[1:-1])
+    parts = [part for part in np.split(np.arange(len(rows)), ends) if len(part) >= FEWEST_IN_PART]
+    if not parts:
+        return found.offset_s
 
     def cost(offset: float) -> float:
         laid = (_laid(path.antenna(seconds[part] - offset, arm), places[part]) for part in parts)

@@ -48,7 +48,10 @@ def bend(
     if unknown := sorted({*accept, *reject} - set(found.names)):
         raise HemislamError(f"There is no fix {unknown[0]} within the walk; gnss_residuals.csv lists all.")
     before = WalkedPath(trajectory).poses((keyframe_stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
-    found = replace(found, offset_s=offset_by_parts(trajectory, fixes, found), offset_sigma_s=float("nan"))
+    if np.isfinite(found.offset_sigma_s):
+        offset_s = offset_by_parts(trajectory, fixes, found)
+        told = f"Clock offset by stretches of the walk: {offset_s * 1e3:.1f} ms."
+        found = replace(found, offset_s=offset_s, offset_sigma_s=float("nan"), notes=(*found.notes, told))
     priors = _priors(trajectory, keyframe_stamps_ns, before, fixes, found)
     held, barred = np.isin(found.names, [*accept]), np.isin(found.names, [*reject])
     chosen = [replace(prior, robust=True) for prior, no in zip(priors, barred, strict=True) if not no]
@@ -67,11 +70,7 @@ def bend(
         raise HemislamError(f"The graph cannot be solved with these fixes ({error}).") from error
     off, distances = _off(priors, poses)
     moved = float(np.linalg.norm(poses[:, :3, 3] - before[:, :3, 3], axis=1).max())
-    notes = (
-        *found.notes,
-        f"Clock offset by stretches of the walk: {found.offset_s * 1e3:.1f} ms.",
-        f"The fixes bend the map: keyframes move by up to {moved:.3f} m.",
-    )
+    notes = (*found.notes, f"The fixes bend the map: keyframes move by up to {moved:.3f} m.")
     turned = off @ np.array(found.reference.rotation).T
     return poses @ lie.inverse(before), replace(
         found, residuals=turned, distances=distances, used=used, notes=notes, yaw_sigma=float("nan")
@@ -84,7 +83,10 @@ def _priors(
     """One for each fix of the alignment."""
     rows = np.array([int(name) - 1 for name in found.names])
     stamps_ns = fixes.stamps_ns[rows] - round(found.offset_s * 1e9)
-    nearest = np.abs(keyframe_stamps_ns[None] - stamps_ns[:, None]).argmin(axis=1)
+    after = np.searchsorted(keyframe_stamps_ns, stamps_ns).clip(max=len(keyframe_stamps_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(keyframe_stamps_ns[before] - stamps_ns) <= np.abs(keyframe_stamps_ns[after] - stamps_ns)
+    nearest = np.where(nearer, before, after)
     then = WalkedPath(trajectory).poses((stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
     arms = (lie.inverse(keyframes[nearest]) @ then @ np.array([*found.lever_arm, 1.0]))[:, :3]
     places = found.reference.from_crs(found.grid)

@@ -41,9 +41,9 @@ def summary(alignment: Alignment, what: str) -> list[str]:
             f"Clock offset       {alignment.offset_s * 1e3:.1f} ms{_plus(alignment.offset_sigma_s * 1e3, ' ms', 1)}"
             f" (the fixes are stamped {'late' if alignment.offset_s >= 0 else 'early'})"
         )
+    if any(alignment.lever_arm):
         x, y, z = alignment.lever_arm
-        how = _plus(alignment.lever_sigma, " m", 3) if np.isfinite(alignment.lever_sigma) else ""
-        lines.append(f"Lever arm          {x:.3f} {y:.3f} {z:.3f} m{how}")
+        lines.append(f"Lever arm          {x:.3f} {y:.3f} {z:.3f} m{_plus(alignment.lever_sigma, ' m', 3)}")
     rms = " ".join(f"{axis} {value:.4f} m" for axis, value in zip("ENH", alignment.rms, strict=True))
     lines.append(f"Residuals (RMS)    {rms}, of {used} of {len(alignment.used)} {what}")
     return [*lines, *alignment.notes]

@@ -7,7 +7,9 @@ import pytest
 
 from app.georeference.align import Alignment, align
 from app.georeference.fixes import Fixes
+from app.georeference.ledger import summary
 from app.slam.errors import HemislamError
+from app.slam.trajectory import Trajectory
 from tests.georeference.walks import LEVER, LINE, TRUTH, Walked, off, walked
 
 
@@ -79,6 +81,35 @@ def test_fixes_of_another_day_are_refused() -> None:
     other = replace(made.fixes, stamps_ns=made.fixes.stamps_ns + 86_400_000_000_000)
     with pytest.raises(HemislamError, match="Only 0 fixes lie within the time"):
         align(made.trajectory, other)
+
+
+def test_an_hour_of_fixes_from_the_drive_to_the_site_does_not_matter() -> None:
+    made = walked(rate_hz=2.0)
+    drive = np.arange(3600)
+    stamps_ns = made.trajectory.stamps_ns[0] - (3700 - drive) * 1_000_000_000
+    places = made.fixes.places[0] + np.outer(3600 - drive, [0.45 / 3600, -8.0 / 3600, 0.0])  # from the zone beside
+    long = Fixes.of(
+        np.r_[stamps_ns, made.fixes.stamps_ns],
+        np.vstack([places, made.fixes.places]),
+        np.vstack([np.full((3600, 3), 0.02), made.fixes.sigmas]),
+    )
+    alone, found = (align(made.trajectory, fixes, lever=LEVER) for fixes in (made.fixes, long))
+    assert found.reference == alone.reference and found.offset_s == alone.offset_s
+    assert [int(name) - 3600 for name in found.names] == [int(name) for name in alone.names]
+
+
+def test_a_line_at_even_pace_tells_no_offset_and_none_is_made_up() -> None:
+    made = walked(path=LINE, noise=3.0, outliers=0.0, lever=(0.0, 0.0, 0.0), rate_hz=1.0, duration_s=60.0)
+    found = align(made.trajectory, made.fixes, lever=(0.0, 0.0, 0.0))
+    assert found.offset_s == 0.0 and np.isnan(found.offset_sigma_s)
+    assert not any("Clock offset" in line for line in summary(found, "fixes"))
+
+
+def test_a_trajectory_of_three_poses_is_refused() -> None:
+    made = walked(duration_s=3.0)
+    short = Trajectory.from_poses(made.trajectory.stamps_ns[:3], made.trajectory.poses[:3])
+    with pytest.raises(HemislamError, match="fewer than 4 poses"):
+        align(short, made.fixes)
 
 
 def test_someone_who_stands_still_learns_that_no_heading_follows() -> None:

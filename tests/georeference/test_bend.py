@@ -1,5 +1,7 @@
 """Bend a map that drifted by its fixes. Oracle: the walk as it truly was."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -34,8 +36,10 @@ def drifted(made: Walked) -> Trajectory:
     return Trajectory.from_poses(made.trajectory.stamps_ns, poses)
 
 
-def solved(made: Walked, drifted: Trajectory, **decided: list[str]) -> tuple[F64, Alignment, Alignment]:
-    """(k, 4, 4) corrections, and the alignments before and after."""
+def solved(
+    made: Walked, drifted: Trajectory, *, offset_known: bool = True, **decided: list[str]
+) -> tuple[F64, Alignment, Alignment]:
+    """(k, 4, 4) corrections, and the alignments after and before."""
     keyframes = drifted.poses[::STEP]
     noise = np.diag([np.radians(0.3)] * 3 + [0.01] * 3) ** 2
     graph = [
@@ -43,6 +47,8 @@ def solved(made: Walked, drifted: Trajectory, **decided: list[str]) -> tuple[F64
         for k in range(len(keyframes) - 1)
     ]
     found = align(drifted, made.fixes, grid="EPSG:32632", lever=LEVER)
+    if not offset_known:
+        found = replace(found, offset_s=0.0, offset_sigma_s=float("nan"))
     return *bend(drifted, drifted.stamps_ns[::STEP], graph, made.fixes, found, **decided), found
 
 
@@ -66,6 +72,13 @@ def test_the_users_word_on_a_fix_overrules_the_verdict(made: Walked, drifted: Tr
     _, after, _ = solved(made, drifted, accept=[wild], reject=[sound])
     verdict = dict(zip(after.names, after.used.tolist(), strict=True))
     assert verdict[wild] and not verdict[sound]
+
+
+def test_a_clock_offset_that_the_motion_does_not_tell_is_not_looked_for_again(
+    made: Walked, drifted: Trajectory
+) -> None:
+    _, after, _ = solved(made, drifted, offset_known=False)
+    assert after.offset_s == 0.0 and not any("Clock offset" in note for note in after.notes)
 
 
 def test_a_fix_that_is_not_there_cannot_be_decided_on(made: Walked, drifted: Trajectory) -> None:
