@@ -20,7 +20,7 @@ from app.sensors.live.clock import JUMP_NS, ClockMap
 from app.sensors.live.devices import DEVICES, device_of, mount_finding
 from app.sensors.live.difop import DIFOP_ID, Difop, read_angles, read_difop
 from app.sensors.live.frames import Assembler, Revolution, sensor_of
-from app.sensors.live.imu_udp import ImuOrder, ImuSample, is_imu
+from app.sensors.live.imu_udp import IMU_MAGIC, ImuOrder, ImuSample, is_imu, read_imu
 from app.sensors.live.livox_udp import read_points
 from app.sensors.live.pcap import Capture, CapturePlace
 from app.sensors.live.status import Counters
@@ -61,6 +61,7 @@ class CaptureStream:
         self._devices: list[tuple[int, Difop]] = []
         self._complete_at: list[tuple[int, CapturePlace]] = []
         self._counters = Counters()
+        self._beside = self._own = False  # whether there are samples of `imu-udp`, and of the sensor's own IMU
         self._index()
         self.complete = self._capture.complete
         self.findings = self._findings()
@@ -112,7 +113,16 @@ class CaptureStream:
             at, running_ns, payload = datagram.place, max(running_ns, datagram.time_ns), datagram.payload
             found: list[Any] = []
             if is_imu(payload):
-                found = order.add(payload)
+                beside = payload.startswith(IMU_MAGIC)
+                if beside and not self._beside and read_imu(payload):
+                    self._beside, order = True, ImuOrder(counters)
+                    counters.imu_foreign += counters.imu
+                    counters.imu = counters.imu_lost = counters.imu_late = 0
+                self._own |= not beside
+                if beside is self._beside:
+                    found = order.add(payload)
+                else:
+                    counters.imu_foreign += 1
             elif payload[:8] == DIFOP_ID:
                 model = self._device.model
                 said = read_difop(payload, model) if isinstance(model, Model) else None
@@ -129,7 +139,7 @@ class CaptureStream:
 
     def _index(self) -> None:
         """The first reading: times of all messages, what the device says, what is lost."""
-        lidar, imu = array("q"), array("q")
+        lidar, of_imus = array("q"), {False: array("q"), True: array("q")}
         self.start_ns = self.end_ns = 0
         for log_ns, place, content in self._read(None, 0, self._counters):
             if isinstance(content, Difop):
@@ -142,9 +152,10 @@ class CaptureStream:
                 self._complete_at.append((log_ns, place))
                 self._model = content.model.name
             else:
-                imu.extend((content.stamp_ns, log_ns))
+                of_imus[self._beside].extend((content.stamp_ns, log_ns))
             self.start_ns = self.start_ns or log_ns
             self.end_ns = log_ns
+        imu = of_imus[self._beside]
         frames, samples = np.array(lidar, np.int64).reshape(-1, 2), np.array(imu, np.int64).reshape(-1, 2)
         of_topics = ((self._lidar_topic, self._device.layout.kind, frames), (self._imu_topic, ros.IMU, samples))
         self.counts = {topic: (kind, len(rows)) for topic, kind, rows in of_topics if len(rows)}
@@ -180,6 +191,9 @@ class CaptureStream:
         found = [Finding("packets", "corrected" if wrong else "fine", text)]
         if self._lidar_topic in self.counts:
             found += self._device_findings()
+        if self._beside and self._own:
+            text = "the samples of imu-udp are used; those of the sensor's own IMU are left out and counted as foreign"
+            found.append(Finding("IMU", "corrected", text))
         if self._host:
             side = "behind" if self._apart_s > 0 else "ahead of"
             text = f"the IMU's stamps are {abs(self._apart_s):.3f} s {side} the LiDAR's: both were put on the capture's"

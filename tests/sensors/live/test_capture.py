@@ -3,6 +3,7 @@
 import functools
 import random
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from app.sensors.doctor import examine
 from app.sensors.live.capture import CaptureStream
+from app.sensors.live.imu_udp import ImuSample, write_airy_imu
 from app.sensors.recording import open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -119,6 +121,26 @@ def test_sensors_whose_clocks_disagree_are_put_on_the_captures(tmp_path: Path) -
         assert m.scan.stamp_ns == pytest.approx(sensor.START_NS + 40 * 10**9 + turn * TURN_NS, abs=5e6)
     text = next(f.text for f in examine(path, Params()) if f.subject == "sensor clocks")
     assert "40.00" in text and "ahead of" in text
+
+
+def test_of_two_imus_only_the_one_beside_the_sensor_is_read(tmp_path: Path) -> None:
+    """An Airy sends samples of its own; merged with those of another IMU they would be the motion of neither."""
+    sample = ImuSample(0, sensor.START_NS, (9.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+    own = [
+        (time - 400_000, 6688, write_airy_imu(replace(sample, number=k, stamp_ns=time - 400_000)))
+        for k, (time, port, _) in enumerate(walk())
+        if port == 6700
+    ]
+    found = {}
+    for name, entries in (("one", walk()), ("two", sorted([*own, *walk()]))):
+        (tmp_path / f"{name}.pcap").write_bytes(captures.pcap(entries))
+        found[name] = measurements(tmp_path / f"{name}.pcap")
+    for one, two in zip(found["one"], found["two"], strict=True):
+        np.testing.assert_array_equal(one.imu.stamps_ns, two.imu.stamps_ns)
+        np.testing.assert_array_equal(one.imu.gyro, two.imu.gyro)
+    findings = {f.subject: f.text for f in CaptureStream(tmp_path / "two.pcap").findings}
+    assert "own IMU are left out" in findings["IMU"] and f"{len(own)} imu foreign" in findings["packets"]
+    assert "IMU" not in {f.subject for f in CaptureStream(tmp_path / "one.pcap").findings}
 
 
 def test_a_clock_set_on_the_way_does_not_end_the_recording(tmp_path: Path) -> None:
