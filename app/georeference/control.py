@@ -38,12 +38,11 @@ def lay_on_control(control: Path, picks: Path, *, grid: str = "", height: str = 
             f"At least 3 control points must be picked in the map, but of {control} {found} is in {picks};"
             " with fewer, the map may still turn."
         )
-    ground = Ground.in_grid(np.array([places[one] for one in names]), name)
-    at = np.array([picked[one] for one in names])
-    if not np.isfinite(at).all() or not np.isfinite(ground.grid).all():
+    there, at = np.array([places[one] for one in names]), np.array([picked[one] for one in names])
+    if not np.isfinite([there, at]).all():
         raise HemislamError(f"A control point of {control} or {picks} lacks a coordinate; fill it in or remove it.")
     _refuse_line(at, names)
-    return _fitted(at, ground, tuple(names), height)
+    return _fitted(at, Ground.in_grid(there, name), tuple(names), height)
 
 
 def read_places(path: Path, grid: str = "") -> tuple[str, dict[str, F64]]:

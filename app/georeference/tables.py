@@ -18,6 +18,8 @@ from app.slam.errors import HemislamError
 GEOID = "orthometric (geoid of the receiver)"
 LEAP_S, WEEK_S, GPS_EPOCH_S = 18, 604_800, 315_964_800
 """GPS time is ahead of UTC by so many leap seconds since 2017; a GPS week; when the first one began."""
+MOST_S = 4e9
+"""More seconds are milliseconds."""
 
 _NAMES = {
     "time": ("time", "t", "stamp", "timestamp", "unix", "utc", "time_s", "stamp_s"),
@@ -104,7 +106,7 @@ def read_fixes(path: Path, near_ns: int) -> tuple[Fixes, str]:
     Raises:
         HemislamError: it cannot be read, or is none of these.
     """
-    lines = _lines(path)
+    lines = _lines(path, errors="replace")  # a log may hold binary messages beside the sentences
     if any(line.lstrip().startswith("$G") for line in lines[:50]):
         fixes, ellipsoidal = nmea.read(lines, str(path), near_ns)
         return fixes.sound(str(path)), ELLIPSOIDAL if ellipsoidal else GEOID
@@ -121,9 +123,9 @@ def read_fixes(path: Path, near_ns: int) -> tuple[Fixes, str]:
     return fixes.sound(str(path)), ELLIPSOIDAL
 
 
-def _lines(path: Path) -> list[str]:
+def _lines(path: Path, *, errors: str = "strict") -> list[str]:
     try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
+        return path.read_text(encoding="utf-8-sig", errors=errors).splitlines()
     except UnicodeDecodeError:
         raise HemislamError(f"{path} is not a text file.") from None
     except OSError as error:
@@ -138,20 +140,33 @@ def _plain(title: str) -> str:
 def _stamp(table: NamedColumns, word: str) -> int:
     """Unix seconds with any number of digits, or ISO 8601 (UTC unless it says otherwise), as ns."""
     try:
-        return int(Decimal(word).scaleb(9).to_integral_value())
-    except InvalidOperation:
-        pass
-    try:
-        return int(np.datetime64(word.strip().removesuffix("Z"), "ns").astype(np.int64))
-    except ValueError:
+        return _nanoseconds(word)
+    except (ValueError, OverflowError):
         raise HemislamError(
             f"{table.path}: the time `{word[:40]}` is neither Unix seconds nor a date such as 2026-05-01T10:00:00Z."
         ) from None
 
 
+def _nanoseconds(word: str) -> int:
+    """Raises ValueError or OverflowError: it is no time, or none within 292 years of 1970."""
+    try:
+        return int(np.int64(int(Decimal(word).scaleb(9).to_integral_value())))
+    except InvalidOperation:
+        date = np.datetime64(word.removesuffix("Z"), "ns")
+        if np.isnat(date):
+            raise ValueError from None
+        return int(date.astype(np.int64))
+
+
 def _of_week(table: NamedColumns, near_ns: int) -> list[int]:
     """Seconds of the GPS week, in the week that is nearest to a time."""
     seconds = table.numbers("week_s")[:, 0]
+    if not len(seconds):
+        return []
+    if (wrong := ~(np.abs(seconds) < MOST_S)).any():
+        row = int(np.argmax(wrong))
+        word = table.columns["week_s"][row][:40]
+        raise HemislamError(f"{table.path}, row {row + 1}: the time `{word}` is not in GPS seconds.")
     now = near_ns * 1e-9 - GPS_EPOCH_S + LEAP_S
     weeks = round((now - float(seconds[0])) / WEEK_S)
     start = (weeks * WEEK_S + GPS_EPOCH_S - LEAP_S) * 1_000_000_000

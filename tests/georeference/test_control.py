@@ -58,6 +58,15 @@ def test_a_point_that_is_only_in_one_file_is_left_out(tmp_path: Path) -> None:
     assert lay_on_control(control, picks, grid="EPSG:32632").names == ("A", "B", "C")
 
 
+def test_a_point_without_its_easting_is_told_as_such(tmp_path: Path) -> None:
+    control, picks = written(tmp_path, CORNERS)
+    head, first, *others = control.read_text().splitlines()
+    name, _, north, height = first.split(",")
+    control.write_text("\n".join([head, f"{name},,{north},{height}", *others]))
+    with pytest.raises(HemislamError, match="lacks a coordinate"):
+        lay_on_control(control, picks, grid="EPSG:32632")
+
+
 @pytest.mark.parametrize(
     ("points", "grid", "words"),
     [

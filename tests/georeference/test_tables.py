@@ -56,6 +56,8 @@ def test_a_log_of_a_receiver_is_recognised_by_its_sentences(tmp_path: Path) -> N
     path = written(tmp_path, "".join(f"{text}*{checksum(text)}\n" for text in lines))
     fixes, height = read_fixes(path, NEAR_NS + 5 * 10**9)
     assert fixes.stamps_ns[0] == NEAR_NS and height == "ellipsoidal"
+    path.write_bytes(b"\xb5\x62\x01\xff\n" + path.read_bytes())  # a binary message of the same receiver
+    assert len(read_fixes(path, NEAR_NS)[0]) == 3
     path = written(tmp_path, "".join(f"{text}*{checksum(text)}\n" for text in (x.replace("46.9", "") for x in lines)))
     assert read_fixes(path, NEAR_NS)[1] == GEOID
 
@@ -75,6 +77,13 @@ def checksum(sentence: str) -> str:
         ("time,lat,lon,height\n" + "1,48,11\n" * 3, "row 1 has 3 columns"),
         ("time,lat,lon,height\n" + "1,x,11,5\n" * 3, "`x` is no number"),
         ("time,lat,lon,height\n" + "noon,48,11,5\n" * 3, "neither Unix seconds nor a date"),
+        ("time,lat,lon,height\n" + "1700000000000,48,11,5\n" * 3, "neither Unix seconds nor a date"),
+        ("time,lat,lon,height\n" + "nan,48,11,5\n" * 3, "neither Unix seconds nor a date"),
+        ("time,lat,lon,height\n" + "inf,48,11,5\n" * 3, "neither Unix seconds nor a date"),
+        ("time,lat,lon,height\n" + ",48,11,5\n" * 3, "the time `` is neither Unix seconds nor a date"),
+        ("tow,lat,lon,height\n", "holds 0 fixes"),
+        ("tow,lat,lon,height\n1,48,11,5\n,48,11,5\n", "row 2: the time `` is not in GPS seconds"),
+        ("tow,lat,lon,height\n" + "1700000000000,48,11,5\n" * 3, "is not in GPS seconds"),
         ("1,2,3,4\n" * 3, "its first line must name the columns"),
         ("", "is empty"),
     ],
