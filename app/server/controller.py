@@ -239,6 +239,7 @@ class Controller:
     def _work(self) -> float | None:
         while self._saves and self._saves[0][1].done():
             folder, save = self._saves.popleft()
+            self._share = 0.0
             error = save.exception()
             if error is not None and not isinstance(error, HemislamError):
                 log.error("Saving to %s failed", folder, exc_info=error)

@@ -1,5 +1,6 @@
 """Measures by clicks in the scene: a point, a distance, an angle; each is named, kept in the session, and drawn."""
 
+import itertools
 from typing import Any, Final
 
 import numpy as np
@@ -56,9 +57,11 @@ class MeasurePanel:
         """Take the newest click, and show what the session keeps."""
         click, self._click = self._click, None
         poses = poses_of(current)
-        if click is not None and self.picking:
-            spot = meet(current.chunks, poses, *click, ceilings=view.ceilings) if view.map else None
-            self._take(spot, current)
+        kind = self._kind
+        if click is not None and kind != STOP and view.map:
+            spot = meet(current.chunks, poses, *click, ceilings=view.ceilings)
+            if spot is not None and self._kind == kind:  # meanwhile the user may have chosen another
+                self._take(kind, spot, current)
         kept = [(measure, places(measure, poses)) for measure in current.measures]
         begun = places(Measure("", self._spots), poses) if self._spots else None
         where = [(measure, at) for measure, at in kept if at is not None]
@@ -68,12 +71,12 @@ class MeasurePanel:
             self._draw_scene(begun)
             self._draw_list()
 
-    def _take(self, spot: Spot | None, current: Snapshot) -> None:
-        if spot is None:
-            return
+    def _take(self, kind: str, spot: Spot, current: Snapshot) -> None:
         self._spots = (*self._spots, spot)
-        if len(self._spots) == _SPOTS[self._kind]:
-            name = self._name.value.strip() or f"{self._kind} {len(current.measures) + 1}"
+        if len(self._spots) == _SPOTS[kind]:
+            taken = {measure.name for measure in current.measures}
+            numbered = (f"{kind} {number}" for number in itertools.count(1))
+            name = self._name.value.strip() or next(name for name in numbered if name not in taken)
             self._page.send(KeepMeasure(Measure(name, self._spots)))
             self._spots, self._name.value = (), ""  # type: ignore[misc]  # mypy overlooks viser's setter
 
@@ -105,10 +108,10 @@ class MeasurePanel:
             self._click = (*self._page.in_map(event), _WIDTH * event.client.camera.fov)
 
     def _act(self, word: str, client: viser.ClientHandle) -> None:
-        """What the list sends: "delete 3"."""
-        verb, _, place = word.partition(" ")
-        if verb == "delete" and place.isdecimal() and int(place) < len(self._measured):
-            self._page.send(DropMeasure(self._measured[int(place)][0]))
+        """What the list sends: "delete 3 door", the place and the name in the list as that browser shows it."""
+        for place, (measure, *_) in enumerate(self._measured):
+            if word == f"delete {place} {measure.name}":
+                self._page.send(DropMeasure(measure))
 
     def _download(self, client: viser.ClientHandle) -> None:
         recording = self._page.snapshot().recording

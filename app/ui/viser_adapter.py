@@ -42,7 +42,7 @@ class Bridge:
         self._name = name
         self._field = gui.add_text(name, "")
         gui.add_html(panel("bridge", name))
-        self._field.on_update(by_user(lambda text, client: act(text.split(" #")[0], client)))
+        self._field.on_update(by_user(lambda text, client: act(text.rsplit(" #", 1)[0], client)))
 
     def live(self, html: str) -> str:
         """HTML whose elements with `data-hs` can be clicked."""

@@ -67,6 +67,9 @@ def test_exports_by_rest(site: Site) -> None:
     cloud = httpx.get(site.url("/api/export/map.ply"), timeout=TIMEOUT_S).content
     assert f"element vertex {5 * fakes.POINTS:012d}".encode() in cloud
     assert httpx.get(site.url("/api/export/passwd")).status_code == 422
+    for name in ("trajectory.gpx", "map.kmz"):
+        refused = httpx.get(site.url(f"/api/export/{name}"))
+        assert refused.status_code == 409 and "where on Earth the map is" in refused.json()["detail"]
     without_loops = httpx.get(site.url("/api/export/graph.g2o"), timeout=TIMEOUT_S)
     assert without_loops.status_code == 404 and "loop search is off" in without_loops.json()["detail"]
 

@@ -1,6 +1,7 @@
 """What a session reads and writes: recordings, truth, results; and what happens if they cannot be used."""
 
 import math
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -158,6 +159,19 @@ def test_formats_of_other_programs_are_written_and_what_they_lack_is_said(tmp_pa
     assert snapshot.progress is None and shares != {None}
     assert {file.name for file in (tmp_path / "laz").iterdir()} == {"map.laz", "trajectory.csv"}
     assert snapshot.saved[0].error == "" and "where on Earth" in snapshot.saved[1].error
+
+
+def test_a_save_that_waits_does_not_show_how_far_the_last_one_was(tmp_path: Path) -> None:
+    recording = tmp_path / "walk-60.mcap"
+    recording.write_bytes(b"something to hash")
+    bench, may_go_on = Bench(str(recording)), threading.Event()
+    bench.do(Seek(30), Save(tmp_path / "first", ("csv", "ply")))
+    while not bench.see().saved:
+        bench.do()
+    bench.sessions[-1]._saves.submit(may_go_on.wait)
+    snapshot = bench.do(Save(tmp_path / "second", ("ply",)))
+    assert snapshot.progress is not None and snapshot.progress.fraction == 0.0
+    may_go_on.set()
 
 
 def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:

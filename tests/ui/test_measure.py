@@ -154,6 +154,33 @@ def test_a_click_beside_the_map_is_not_taken_and_stop_ends_it(server: viser.Vise
     assert not bench.sent and not bench.panel._asked.visible
 
 
+def test_a_click_that_is_met_while_stop_is_pressed_is_dropped(
+    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(server)
+
+    def meet_slowly(*_: Any, **__: Any) -> Spot:
+        bench.panel.begin(STOP)
+        return spot_at((0.0, 0.0, 0.8))
+
+    monkeypatch.setattr("app.ui.measure.meet", meet_slowly)
+    bench.panel.begin(POINT)
+    bench.click(0.0, 0.0)
+    assert not bench.sent and not bench.panel._spots
+
+
+def test_a_number_that_a_deleted_measure_had_is_free_again_and_no_other(server: viser.ViserServer) -> None:
+    bench, names = Bench(server), []
+    bench.panel.begin(POINT)
+    for deleted in (None, None, 0, None):
+        if deleted is not None:
+            bench.now = replace(bench.now, measures=bench.now.measures[1:])
+        bench.click(0.0, 0.0)
+        bench.keep()
+        names.append(bench.now.measures[-1].name)
+    assert names == ["point 1", "point 2", "point 1", "point 3"]
+
+
 def test_the_list_deletes_a_measure_and_an_empty_list_is_not_there(server: viser.ViserServer, wire: Wire) -> None:
     bench = Bench(server)
     bench.panel.begin(POINT)
@@ -161,8 +188,15 @@ def test_the_list_deletes_a_measure_and_an_empty_list_is_not_there(server: viser
     bench.keep()
     (kept,) = bench.now.measures
     assert any("/measures/0" in name for name in wire.nodes("PointCloudMessage"))
-    bench.panel._act("delete 0", None)  # type: ignore[arg-type]
-    bench.panel._act("delete 7", None)  # type: ignore[arg-type]
+    for word in (
+        "delete 0 another, which a slow browser still shows",
+        "delete 7 point 1",
+        "delete",
+        "delete 0 point 1",
+    ):
+        assert not bench.sent
+        bench.panel._act(word, None)  # type: ignore[arg-type]
+    assert 'data-hs="delete 0 point 1"' in bench.panel._list.content
     assert bench.sent == [DropMeasure(kept)]
     bench.now = replace(bench.now, measures=())
     bench.panel.draw(bench.now, View())

@@ -86,7 +86,8 @@ def test_a_bridge_is_a_text_field_followed_by_its_mark(server: viser.ViserServer
     assert (field, mark) == ("GuiTextMessage", "GuiHtmlMessage") and page < first < second
     assert 'class="hs-bridge" data-name="test"' in wire.messages[-1].props.content
     user_sets(bridge._field, "choose 3 5 #17ab")
-    assert words == ["choose 3 5"]
+    user_sets(bridge._field, "delete 0 door #2 #27cd")
+    assert words == ["choose 3 5", "delete 0 door #2"]
     assert 'data-hs-to="test"' in bridge.live("<b>x</b>")
 
 

@@ -23,7 +23,7 @@ from app.server.protocol import (
 from app.slam.params import Params
 from app.ui import hints
 from app.ui.colours import LABEL, Limits, legend
-from app.ui.files import result_folder_name, size_text
+from app.ui.files import _FORMATS, result_folder_name, size_text
 from app.ui.hints import HINTS
 from app.ui.html import BAD, GOOD, Tile, panel
 from app.ui.readouts import HISTORY, plotted, stacked_stages
@@ -119,3 +119,8 @@ def test_stages_are_stacked_to_the_total(engine: FakeEngine) -> None:
     _, highest, *lower = stacked_stages(engine.snapshot.series)
     assert np.allclose(highest, engine.snapshot.series["total_ms"])
     assert all((a >= b).all() for a, b in zip([highest, *lower], lower, strict=False))
+
+
+def test_the_workbench_offers_no_file_that_needs_a_place_on_earth() -> None:
+    offered = " ".join(_FORMATS)
+    assert "trajectory.csv" in offered and "trajectory.gpx" not in offered and "map.kmz" not in offered
