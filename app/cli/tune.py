@@ -108,11 +108,14 @@ def tune(
         )
     ]
     wanted = choose_objectives(objectives or [_usual(subjects)], subjects)
+    if held_back and duration is None:
+        raise HemislamError("--held-back needs --duration: without it the search sees the whole recording.")
+    timed = any(one.name == "frame-time" for one in wanted)  # runs beside each other would spoil it
     part, rest = Part(start, duration), None
     if duration is not None and held_back != 0:
         rest = Part(start + duration, held_back or duration)
     make_folder(out)
-    run, threads = runner(jobs or cores(), cluster, cluster_data, quiet=True)
+    run, threads = runner(jobs or (1 if timed else cores()), cluster, cluster_data, quiet=True)
     runs = Runs(
         subjects,
         wanted,
@@ -141,13 +144,16 @@ def tune(
             Trial(t.number, t.values, scores, error) for t, (scores, error) in zip(settings, results, strict=True)
         ]
     asked = {
-        "recordings": [{"path": str(s.recording), "sha256": h} for s, h in zip(subjects, runs.hashes, strict=True)],
+        "recordings": [
+            {"path": str(one.recording), "sha256": sha256, "parameters": one.params.model_dump(mode="json")}
+            for one, sha256 in zip(subjects, runs.hashes, strict=True)
+        ],
         "search": search,
         "trials": trials,
         "seed": seed,
         "part_s": [start, duration],
     }
-    write_results(out, done, checked, wanted, subjects[0].params, study, asked)
+    write_results(out, done, checked, wanted, study, asked)
     for label, shown in (("as given", done[:1]), ("best", best[:5]), ("held back", checked)):
         for trial in shown:
             told = ", ".join(f"{one.title} {one.told(v)}" for one, v in zip(wanted, trial.scores, strict=True))

@@ -1,16 +1,17 @@
 """Runs jobs on an existing Dask cluster (https://distributed.dask.org). Its scheduler and workers are the user's.
 
 A worker runs a job in a folder of its own and sends the files back; they are written here, as if run here. Recordings
-are read from their own path where workers have it, else from an fsspec URL, else each worker fetches them from here.
+are read from their own path where workers have it, else from an fsspec URL, else they are copied to the workers.
 """
 
 import contextlib
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
 from tqdm import tqdm
@@ -21,10 +22,14 @@ from app.slam.errors import HemislamError
 from app.slam.provenance import hash_input
 
 CONNECT_S = 15.0
-RETRIES = 3
-"""How often a job is tried again after its worker died."""
-PIECE = 64 << 20
-"""Bytes of a recording that travel as one message."""
+LOOK_S = 0.5
+"""How often it is looked what has ended, and whether the workers are still there."""
+PIECE = 16 << 20
+"""Bytes of a recording that are sent at a time."""
+
+
+class _Gone(Exception):
+    """The scheduler or all workers are gone, or not there yet. `str` says it in a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +37,7 @@ class Cluster:
     """Attributes:
     address: of the scheduler, such as tcp://scheduler:8786.
     url: folder of the recordings for workers that do not have their path, such as s3://bucket/walks; "" for none.
-    wait_s: how long a scheduler that is gone may take to come back.
+    wait_s: how long a scheduler or workers that are gone may take to come back.
     """
 
     address: str
@@ -43,123 +48,172 @@ class Cluster:
         """Run all jobs that are not finished yet, as `app.evaluation.runner.run_jobs` does.
 
         Raises:
-            HemislamError: the cluster is not there, or a worker has another version of hemislam.
+            HemislamError: the cluster is not there, a worker has another version of hemislam, or lacks a recording.
         """
         clear_remains(folder)
         errors: dict[tuple[str, str], str] = {}
-        waiting = {job.key: job for job in jobs if finished(job) is None}
-        gone_since: float | None = None
+        waiting = {job.folder: job for job in jobs if finished(job) is None}
+        patient_until = time.monotonic()  # at first the cluster must be there
         with tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit=" runs", disable=None) as bar:
             while waiting:
                 try:
                     for job, error in self._results(list(waiting.values())):
-                        gone_since = None
-                        del waiting[job.key]
+                        del waiting[job.folder]
                         bar.update()
                         if error:
                             errors[job.name, job.variant] = error
-                except ConnectionError as error:
-                    gone_since = gone_since or monotonic()
-                    if monotonic() - gone_since > self.wait_s:
-                        raise HemislamError(
-                            f"The Dask scheduler at {self.address} is gone; start it and the workers again. What is"
-                            " finished is kept, and the same command goes on from there."
-                        ) from error
+                        patient_until = time.monotonic() + self.wait_s
+                except _Gone as gone:
+                    if time.monotonic() > patient_until:
+                        kept = (
+                            " What is finished is kept: the same command goes on." if len(waiting) < len(jobs) else ""
+                        )
+                        raise HemislamError(f"{gone}{kept}") from None
+                    time.sleep(LOOK_S)
         return errors
 
     def _results(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str]]:
-        """Jobs as they end, and why they failed. Raises ConnectionError if the scheduler goes meanwhile."""
-        from distributed import as_completed
-        from distributed.client import FutureCancelledError
-
+        """Jobs as they end, and why they failed. Raises _Gone."""
         with self._client() as client:
-            _check_workers(client)
-            sent = {recording: self._sent(client, jobs, recording) for recording in {job.recording for job in jobs}}
-            futures = {
+            workers = _checked_workers(client)
+            for job in {job.recording: job for job in jobs}.values():
+                self._bring(client, workers, job)
+            running = {
                 client.submit(
-                    _work, job, self.url, sent[job.recording], key=f"hemislam-{job.key}", retries=RETRIES, pure=True
+                    _work, job, self.url, key=f"hemislam-{job.key}-{job.name}-{job.variant}", workers=workers
                 ): job
                 for job in jobs
             }
-            for future in as_completed(futures, loop=client.loop):
-                job = futures[future]
-                try:
-                    files = future.result()
-                except FutureCancelledError as error:
-                    raise ConnectionError from error
-                except Exception as error:  # whatever went wrong there; Dask raises what the worker raised
-                    yield job, f"The worker failed: {str(error) or type(error).__name__}"
-                    continue
-                if isinstance(files, str):
-                    yield job, files
-                else:
-                    _keep(job, files)
-                    yield job, ""
+            while running:
+                for future in [future for future in running if future.done()]:
+                    job = running.pop(future)
+                    yield job, _taken(job, future)
+                if not set(workers) & set(_workers(client)):
+                    raise _Gone("All workers of the Dask cluster are gone; start them again.")
+                time.sleep(LOOK_S)
 
     @contextlib.contextmanager
     def _client(self) -> Iterator[Any]:
+        """Raises _Gone: it cannot be reached, or not any more."""
         from distributed import Client
+        from distributed.comm import CommClosedError
 
+        gone = f"There is no Dask scheduler at {self.address}; start one with `dask scheduler`."
         try:
             client = Client(self.address, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise HemislamError(
-                f"There is no Dask scheduler at {self.address}; start one with `dask scheduler`."
-            ) from error
+        except (OSError, ValueError):
+            raise _Gone(gone) from None
         try:
             yield client
+        except (CommClosedError, TimeoutError):
+            raise _Gone(gone) from None
         finally:
             client.close(timeout=5)
 
-    def _sent(self, client: Any, jobs: Sequence[Job], recording: Path) -> list[Any]:
-        """The recording's bytes as futures, if a worker can have it from nowhere else; none if all can."""
-        sha256 = next(job.sha256 for job in jobs if job.recording == recording)
-        have = client.run(_has, recording, sha256)
-        if self.url or all(have.values()):
-            return []
-        if recording.is_dir():
-            lacks = next(worker for worker, has in have.items() if not has)
+    def _bring(self, client: Any, workers: Sequence[str], job: Job) -> None:
+        """Copy a recording to the workers that can have it from nowhere else, piece by piece."""
+        lack = [worker for worker, has in client.run(_has, job, workers=workers).items() if not has]
+        if self.url or not lack:
+            return
+        if job.recording.is_dir():
             raise HemislamError(
-                f"Worker {lacks} cannot read {recording}, and folders are not sent; put it where workers share it."
+                f"Worker {lack[0]} cannot read {job.recording}, and folders are not copied; put it where it can."
             )
-        with recording.open("rb") as file:
-            pieces = list(iter(lambda: file.read(PIECE), b""))
-        return list(client.scatter(pieces, hash=True))
+        with job.recording.open("rb") as file:
+            while piece := file.read(PIECE):
+                client.run(_append, job, file.tell() - len(piece), piece, workers=lack)
 
 
-def _check_workers(client: Any) -> None:
-    """Raises HemislamError: there is no worker, or one has another version or no hemislam."""
-    deadline = monotonic() + CONNECT_S
-    while not client.scheduler_info()["workers"]:
-        if monotonic() > deadline:
-            raise HemislamError("The Dask cluster has no workers; start some with `dask worker ADDRESS`.")
-        with contextlib.suppress(TimeoutError):
-            client.wait_for_workers(1, timeout=1)
-    try:
-        versions = client.run(_version, on_error="return")
-    except OSError as error:
-        raise ConnectionError from error
-    for worker, version in versions.items():
+def _workers(client: Any) -> dict[str, Any]:
+    """What the scheduler knows of its workers, by address; nothing if it is gone."""
+    return dict(client.scheduler_info(n_workers=-1).get("workers", {}))
+
+
+def _checked_workers(client: Any) -> list[str]:
+    """Addresses of the workers.
+
+    Raises:
+        _Gone: there is none. HemislamError: one has another version or no hemislam, or runs jobs beside each other.
+    """
+    with contextlib.suppress(TimeoutError):
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    workers = _workers(client)
+    if not workers:
+        raise _Gone("The Dask cluster has no workers; start some with `dask worker ADDRESS --nthreads 1`.")
+    for worker, facts in workers.items():
+        if facts["nthreads"] > 1:
+            raise HemislamError(
+                f"Worker {worker} runs {facts['nthreads']} jobs at a time in one process, which spoils their times;"
+                " start it with --nthreads 1."
+            )
+    for worker, version in client.run(_version, workers=list(workers), on_error="return").items():
         if isinstance(version, ModuleNotFoundError):
             raise HemislamError(f"Worker {worker} has no hemislam ({version}); install version {__version__} there.")
+        if isinstance(version, OSError):
+            raise _Gone(f"Worker {worker} is gone.")
         if version != (__version__, code_digest()):
             told = f"version {version[0]}" if isinstance(version, tuple) and version[0] != __version__ else "other code"
             raise HemislamError(f"Worker {worker} has {told}, and this is {__version__}; install the same on all.")
+    return list(workers)
+
+
+def _taken(job: Job, future: Any) -> str:
+    """Write what a worker gave. Returns why there is nothing, "" if there is. Raises _Gone."""
+    if future.status == "cancelled":
+        raise _Gone("The Dask scheduler is gone; start it and its workers again.")
+    try:
+        files = future.result()
+    except Exception as error:  # whatever went wrong there; Dask raises what the worker raised
+        return f"The worker failed: {str(error) or type(error).__name__}"
+    if isinstance(files, str):
+        return files
+    _keep(job, files)
+    return ""
 
 
 def _version() -> tuple[str, str]:
     return __version__, code_digest()
 
 
-def _has(recording: Path, sha256: str) -> bool:
-    return recording.exists() and hash_input(recording) == sha256
+def _has(job: Job) -> bool:
+    """Whether this worker has the recording, at its own path or as a copy."""
+    return any(_is_it(path, job.sha256) for path in (job.recording, _copy_of(job)))
 
 
-def _work(job: Job, url: str, pieces: Sequence[bytes]) -> dict[str, bytes] | str:
+def _is_it(path: Path, sha256: str) -> bool:
+    if not path.exists():
+        return False
+    facts = path.stat()
+    return _hash(path, facts.st_size, facts.st_mtime_ns) == sha256
+
+
+@cache
+def _hash(path: Path, size: int, changed_ns: int) -> str | None:
+    """Hash of a recording, computed anew only if it has changed."""
+    return hash_input(path)
+
+
+def _copy_of(job: Job) -> Path:
+    """Where a worker keeps its copy of a recording."""
+    return Path(tempfile.gettempdir()) / "hemislam-recordings" / f"{job.sha256[:16]}-{job.recording.name}"
+
+
+def _append(job: Job, offset: int, piece: bytes) -> None:
+    """Write a piece of a recording into this worker's copy, the first one into a new file."""
+    copy = _copy_of(job)
+    copy.parent.mkdir(exist_ok=True)
+    with copy.open("r+b" if offset else "wb") as file:
+        file.seek(offset)
+        file.write(piece)
+
+
+def _work(job: Job, url: str) -> dict[str, bytes] | str:
     """On a worker: the files of a finished run, or why there are none."""
     with tempfile.TemporaryDirectory(prefix="hemislam-job-") as folder:
         try:
-            there = replace(job, recording=_fetched(job, url, pieces), folder=Path(folder) / "run")
+            there = replace(job, recording=_found(job, url), folder=Path(folder) / "run")
+            if there.key != job.key:
+                return f"The worker has another version of {job.baseline}; install the same on all."
             run_job(there, lambda done, total: None)
         except HemislamError as error:
             return str(error)
@@ -168,33 +222,30 @@ def _work(job: Job, url: str, pieces: Sequence[bytes]) -> dict[str, bytes] | str
         return {name: (there.folder / name).read_bytes() for name in RUN_FILES}
 
 
-def _fetched(job: Job, url: str, pieces: Sequence[bytes]) -> Path:
-    """Where this worker has the recording: its own path, or a copy that is kept by its hash."""
-    if _has(job.recording, job.sha256):
-        return job.recording
-    cache = Path(tempfile.gettempdir()) / "hemislam-recordings"
-    path = cache / f"{job.sha256[:16]}-{job.recording.name}"
-    if _has(path, job.sha256):
-        return path
-    cache.mkdir(exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=cache, delete=False) as part:
-        if url:
-            import fsspec
+def _found(job: Job, url: str) -> Path:
+    """Where this worker has the recording; fetched from the URL if need be.
 
-            with fsspec.open(f"{url.rstrip('/')}/{job.recording.name}") as source:
-                shutil.copyfileobj(source, part, PIECE)
-        else:
-            part.writelines(pieces)
-    Path(part.name).replace(path)
-    if not _has(path, job.sha256):
-        path.unlink()
-        raise HemislamError(f"{job.recording.name} is another file at {url or 'the worker'} than here.")
-    return path
+    Raises:
+        HemislamError: there is none with the right content. OSError: it cannot be fetched.
+    """
+    if _is_it(job.recording, job.sha256):
+        return job.recording
+    copy = _copy_of(job)
+    if url and not _is_it(copy, job.sha256):
+        import fsspec
+
+        copy.parent.mkdir(exist_ok=True)
+        with fsspec.open(f"{url.rstrip('/')}/{job.recording.name}") as source, copy.open("wb") as file:
+            shutil.copyfileobj(source, file, PIECE)
+    if not _is_it(copy, job.sha256):
+        raise HemislamError(f"The worker has no {job.recording.name} with the same content as here.")
+    return copy
 
 
 def _keep(job: Job, files: dict[str, bytes]) -> None:
     """Write a run's files, run.json last: a kill in between leaves no result."""
     job.folder.mkdir(parents=True, exist_ok=True)
+    (job.folder / "run.json").unlink(missing_ok=True)
     for name in RUN_FILES:
         part = job.folder / f".{name}.part"
         part.write_bytes(files[name])

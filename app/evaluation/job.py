@@ -44,7 +44,8 @@ def code_digest() -> str:
     """Hash of the code that results depend on, so that a change of it runs jobs again."""
     root = Path(__file__).parents[1]
     files = [path for room in ("slam", "mapping", "baselines") for path in (root / room).rglob("*.py")]
-    files += (root / "sensors").glob("*.py")
+    files += [path for path in (root / "sensors").rglob("*.py") if "simulator" not in path.parts]
+    files += [root / "export" / "results.py"]
     files += [root / "evaluation" / name for name in ("job.py", "map_sharpness.py", "crops.py")]
     digest = hashlib.sha256()
     for path in sorted(files):

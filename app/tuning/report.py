@@ -4,16 +4,16 @@ import csv
 import io
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import optuna
+import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from app import __version__
 from app.evaluation.report import write_texts
-from app.slam.params import Params
 from app.slam.provenance import describe_machine
 from app.tuning.objectives import Objective
 from app.tuning.tune import Trial, front
@@ -26,7 +26,6 @@ def write_results(
     trials: Sequence[Trial],
     held_back: Sequence[Trial],
     objectives: Sequence[Objective],
-    params: Params,
     study: optuna.Study,
     inputs: dict[str, Any],
 ) -> None:
@@ -34,7 +33,7 @@ def write_results(
 
     Args:
         held_back: trials run again on the part held back; none if there is no such part.
-        params: as given, over which the settings are laid. inputs: what the search was asked for.
+        inputs: what the search was asked for.
 
     Raises:
         HemislamError: the folder cannot be written to.
@@ -47,7 +46,6 @@ def write_results(
                 "hemislam": __version__,
                 "machine": describe_machine(),
                 **inputs,
-                "parameters": params.model_dump(mode="json"),
                 "best": [_entry(trial, objectives) for trial in best],
                 "held_back": [_entry(trial, objectives) for trial in held_back],
             },
@@ -58,7 +56,7 @@ def write_results(
         "tuning.html": _html(trials, best, held_back, objectives, study),
     }
     if best:
-        texts[BEST] = params.with_values(best[0].values).to_yaml()
+        texts[BEST] = _yaml(best[0].values)
     write_texts(folder, texts)
 
 
@@ -98,6 +96,15 @@ def pictures(study: optuna.Study, objectives: Sequence[Objective]) -> dict[str, 
 def _entry(trial: Trial, objectives: Sequence[Objective]) -> dict[str, Any]:
     scores = {one.name: value for one, value in zip(objectives, trial.scores, strict=True)}
     return {"trial": trial.number, "values": dict(trial.values), "scores": scores, "error": trial.error or None}
+
+
+def _yaml(values: Mapping[str, Any]) -> str:
+    """A setting for `--config`: only what was searched for, so that it fits every recording."""
+    tree: dict[str, dict[str, Any]] = {}
+    for path, value in values.items():
+        section, _, name = path.partition(".")
+        tree.setdefault(section, {})[name] = value
+    return yaml.safe_dump(tree, sort_keys=False)
 
 
 def _csv(trials: Sequence[Trial], objectives: Sequence[Objective]) -> str:

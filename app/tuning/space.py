@@ -1,5 +1,6 @@
 """What a search may vary: parameters with their ranges, from their declaration or narrower ones from the user."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -103,12 +104,13 @@ def grid(dimensions: Sequence[Dimension], most: int) -> list[Mapping[str, Any]]:
     Raises:
         HemislamError: there are more settings with two values each.
     """
-    points, settings = 2, _grid(dimensions, 2)
-    if len(settings) > most:
+    least = math.prod(len(dimension.grid(2)) for dimension in dimensions)
+    if least > most:
         raise HemislamError(
-            f"A grid over {len(dimensions)} parameters has at least {len(settings)} points, more than --trials {most};"
+            f"A grid over {len(dimensions)} parameters has at least {least} points, more than --trials {most};"
             " use --search bayes or random, or fewer parameters."
         )
+    points, settings = 2, _grid(dimensions, 2)
     while len(finer := _grid(dimensions, points + 1)) <= most and points < most:
         points, settings = points + 1, finer
     return settings

@@ -80,7 +80,7 @@ class Runs:
     def score(self, settings: Sequence[Mapping[str, Any]], part: Part) -> list[tuple[tuple[float | None, ...], str]]:
         """For each setting its scores by objective, and why it failed ("" if it did not)."""
         jobs = [[self._job(index, setting, part) for index in range(len(self._subjects))] for setting in settings]
-        each = {job.key: job for of_setting in jobs for job in of_setting}
+        each = {job.folder: job for of_setting in jobs for job in of_setting}
         errors = self._run(list(each.values()), self._folder)
         return [self._scored(of_setting, errors) for of_setting in jobs]
 
@@ -205,7 +205,7 @@ def known_runs(folder: Path) -> dict[str, Path]:
     for report in sorted(folder.glob("*/runs/*/*/run.json")):
         try:
             key = json.loads(report.read_text(encoding="utf-8"))["key"]
-        except (OSError, ValueError, KeyError):
+        except (OSError, ValueError, KeyError, TypeError):
             continue
         if all((report.parent / name).is_file() for name in RUN_FILES):
             known[str(key)] = report.parent

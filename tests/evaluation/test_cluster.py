@@ -7,8 +7,10 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import Result
@@ -33,8 +35,7 @@ class Site:
             free.bind(("127.0.0.1", 0))
             self.port: int = free.getsockname()[1]
         self.address = f"tcp://127.0.0.1:{self.port}"
-        self.scheduler = self.start("scheduler", "--port", str(self.port), "--no-dashboard")
-        self.workers = [self.worker() for _ in range(3)]
+        self.begin()
 
     def worker(self) -> "subprocess.Popen[bytes]":
         return self.start("worker", self.address, "--no-nanny", "--nthreads", "1", "--no-dashboard")
@@ -44,11 +45,14 @@ class Site:
         command = [sys.executable, "-m", f"distributed.cli.dask_{what}", *words]
         return subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
 
-    def restart(self) -> None:
-        """As an orchestrator does: the workers go with their scheduler and come back with it."""
+    def restart(self, after_s: float) -> None:
+        """As an orchestrator does: the workers go with their scheduler and come back with it, a while later."""
         for process in (self.scheduler, *self.workers):
             process.kill()
             process.wait()
+        threading.Timer(after_s, self.begin).start()
+
+    def begin(self) -> None:
         self.scheduler = self.start("scheduler", "--port", str(self.port), "--no-dashboard")
         self.workers = [self.worker() for _ in range(3)]
 
@@ -88,6 +92,7 @@ def test_a_cluster_gives_the_tables_of_one_machine_though_processes_die(
 ) -> None:
     """A worker is killed when the first run has come, and everything is restarted when the second has."""
     kept, keep = list[str](), cluster._keep
+    monkeypatch.setattr(cluster, "CONNECT_S", 3.0)
 
     def keep_and_kill(job: Job, files: dict[str, bytes]) -> None:
         keep(job, files)
@@ -95,7 +100,7 @@ def test_a_cluster_gives_the_tables_of_one_machine_though_processes_die(
         if len(kept) == 1:
             site.workers[0].send_signal(signal.SIGKILL)
         elif len(kept) == 2:
-            site.restart()
+            site.restart(after_s=8.0)
 
     monkeypatch.setattr(cluster, "_keep", keep_and_kill)
     result = evaluate(recording, tmp_path / "cluster", "--cluster", site.address)
@@ -106,21 +111,38 @@ def test_a_cluster_gives_the_tables_of_one_machine_though_processes_die(
         assert (tmp_path / "cluster" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
-def test_a_worker_without_the_recording_fetches_it(
+def test_a_worker_without_the_recording_is_sent_it(
     site: Site, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From here, or from a URL, and keeps it by its hash; a file with another content is refused."""
+    """And a column that repeats another one is run, too."""
+    away = tmp_path / "walk.mcap"
+    away.write_bytes(recording.read_bytes())
+    bring = Cluster._bring
+
+    def bring_and_leave(self: Cluster, client: Any, workers: Sequence[str], job: Job) -> None:
+        bring(self, client, workers, job)
+        away.unlink()
+
+    monkeypatch.setattr(Cluster, "_bring", bring_and_leave)
+    monkeypatch.setattr(cluster, "_has", lambda job: False)
+    monkeypatch.setattr(cluster, "PIECE", 100_000)
+    jobs = [job_of(away, tmp_path / name) for name in ("first", "again")]
+    assert Cluster(site.address).run_jobs(jobs, tmp_path) == {}
+    assert [finished(job) is not None for job in jobs] == [True, True]
+
+
+def test_a_worker_fetches_a_recording_from_a_url(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And keeps it by its hash; a file with another content is refused."""
     monkeypatch.setattr(cluster.tempfile, "gettempdir", lambda: str(tmp_path))
     job = job_of(recording, tmp_path / "runs" / "walk")
     gone = Job(tmp_path / "gone" / recording.name, job.sha256, "walk", "walk", job.params, job.folder, duration_s=1.0)
     data = recording.read_bytes()
-    fetched = cluster._fetched(gone, "", [data[:1000], data[1000:]])
-    assert fetched.read_bytes() == data
-    fetched.unlink()
-    assert cluster._fetched(gone, recording.parent.as_uri(), []).read_bytes() == data
-    fetched.unlink()
-    with pytest.raises(HemislamError, match="another file"):
-        cluster._fetched(gone, "", [data[:1000]])
+    assert cluster._found(gone, recording.parent.as_uri()).read_bytes() == data
+    cluster._copy_of(gone).write_bytes(data[:1000])
+    with pytest.raises(HemislamError, match="same content"):
+        cluster._found(gone, "")
 
 
 def test_a_recording_that_cannot_be_used_costs_its_own_run_only(site: Site, recording: Path, tmp_path: Path) -> None:
