@@ -54,12 +54,13 @@ def georeference(
 ) -> None:
     """Find where on Earth a map lies, by satellite fixes or control points.
 
-    By fixes, the map is only turned about the vertical and moved; with --factors they bend it, too. That finds how
-    late the receiver's clock is by comparing the motion, and the lever arm if it is not given and the motion tells it.
+    By fixes, the map is only turned about the vertical and moved; with --factors they bend it, too. The command
+    finds how late the receiver's clock is by comparing the motion, and the lever arm if it is not given and the motion
+    tells it.
     Fixes that contradict the others are rejected and named.
 
     \b
-    Writes into RESULTS:
+    Writes into RESULTS, or with --factors into --out, beside the bent trajectory.tum and map.ply:
       georeference.json     coordinate system, origin and rotation of the map
       gnss_residuals.csv    every fix or control point: place, residual, verdict
       georeference.svg      path and fixes from above, residuals
@@ -69,6 +70,7 @@ def georeference(
       hemislam georeference runs/walk-1
       hemislam georeference runs/walk-1 --gnss rover.nmea --lever-arm 0.05 -0.1 0.4
       hemislam georeference runs/walk-1 --gnss fixes.csv --crs EPSG:25832
+      hemislam georeference runs/walk-1 --factors --out runs/walk-1-bent
       hemislam georeference runs/walk-1 --control points.csv --picks picked.csv --crs EPSG:25832
     """
     from app.georeference import ledger
@@ -80,6 +82,8 @@ def georeference(
         raise HemislamError("--control and --picks go together, without --gnss and --lever-arm.")
     if factors != (out is not None) or (factors and control is not None):
         raise HemislamError("--factors and --out go together, for fixes.")
+    if out is not None and out.resolve() == results.resolve():
+        raise HemislamError("The bent map would replace the one that it is made from; give --out another folder.")
     if (accept or reject) and not factors:
         raise HemislamError("--accept and --reject belong to --factors.")
     trajectory = read_tum(results / "trajectory.tum")
@@ -113,7 +117,7 @@ def _fixes_of(results: Path, trajectory: "Trajectory", gnss: Path | None) -> "tu
 def _bent(
     results: Path, out: Path, fixes: "Fixes", found: "Alignment", accept: list[int], reject: list[int], *, replace: bool
 ) -> "tuple[Alignment, Trajectory]":
-    """Write trajectory and map, bent by the fixes, to `out`."""
+    """Write trajectory and map, bent by the fixes, to `out`, and remove what another run has left there."""
     import dataclasses
 
     import numpy as np
@@ -135,7 +139,10 @@ def _bent(
     corrections, found = bend(before.trajectory, stamps_ns, graph, fixes, found, accept=names[0], reject=names[1])
     loops = LoopResults(MapFrame(stamps_ns, corrections), stamps_ns, (), "")
     after = dataclasses.replace(before, loops=loops, where=found.reference)
-    save_results(out, after, [one for one in BY_RUN if one.name in ("trajectory.tum", "map.ply")], replace=replace)
+    bent = [one for one in BY_RUN if one.name in ("trajectory.tum", "map.ply")]
+    save_results(out, after, bent, replace=replace)
+    for other in set(BY_RUN) - set(bent):
+        (out / other.name).unlink(missing_ok=True)
     return found, after.trajectory
 
 
@@ -151,6 +158,7 @@ def _recording_of(results: Path) -> Path:
 
 def _write(results: Path, found: "Alignment", trajectory: "Trajectory") -> None:
     from app.cli.georeference_plot import georeference_plot
+    from app.evaluation.report import write_texts
     from app.georeference import ledger, reference
 
     texts = {
@@ -158,9 +166,5 @@ def _write(results: Path, found: "Alignment", trajectory: "Trajectory") -> None:
         reference.RESIDUALS: ledger.residuals_csv(found),
         reference.PLOT: georeference_plot(found, trajectory.positions),
     }
-    try:
-        for name, text in texts.items():
-            (results / name).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise HemislamError(f"{results} cannot be written to: {error.strerror}.") from None
+    write_texts(results, texts)
     typer.echo(f"Written to {results}: {', '.join(texts)}")

@@ -52,14 +52,15 @@ def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write files by their names, each whole or not at all. Raises HemislamError: they cannot be written."""
+    """Write files by their names; older ones stay until all are whole. Raises HemislamError: they cannot be written."""
+    parts = {name: folder / f".{name}.part" for name in texts}
     try:
-        for name, text in texts.items():
-            part = folder / f".{name}.part"
-            part.write_text(text, encoding="utf-8")
+        for name, part in parts.items():
+            part.write_text(texts[name], encoding="utf-8")
+        for name, part in parts.items():
             part.replace(folder / name)
     except OSError as error:
-        raise HemislamError(f"The report cannot be written to {folder}: {error.strerror}.") from error
+        raise HemislamError(f"{', '.join(texts)} cannot be written to {folder}: {error.strerror}.") from error
 
 
 def _results(recordings: Sequence[Evaluated], machine: dict[str, Any], found: list[str]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """`hemislam georeference` on a walk whose truth is known. Tests app/cli/georeference.py."""
 
+import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -8,8 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app.export import map_file
+from app.export.points import Block
 from app.georeference import reference
-from app.slam.trajectory import stamp_text, write_tum
+from app.slam import lie
+from app.slam.keyframe_id import KeyframeId
+from app.slam.loops.factors import Factor
+from app.slam.loops.solvers import g2o_text
+from app.slam.trajectory import read_tum, stamp_text, write_tum
 from tests.georeference.walks import LEVER, TRUTH, Walked, off, walked
 
 Call = Callable[..., Any]
@@ -70,3 +77,49 @@ def test_control_points_are_listed_with_their_residuals(hemislam: Call, results:
     assert "of 3 of 3 control points" in outcome.out
     outcome = hemislam("georeference", results, *files[:2])
     assert outcome.code == 2 and "go together" in outcome.err
+
+
+def write_map(results: Path, made: Walked) -> None:
+    """A map of one point in each tenth scan, and the graph of its odometry."""
+    stamps_ns, poses = made.trajectory.stamps_ns[::10].tolist(), made.trajectory.poses[::10]
+    none = np.zeros(1, np.uint8)
+    map_file.write(
+        results / "map.ply",
+        [
+            Block(k, stamp, pose, pose[None, :3, 3], np.array([stamp]), none, none.astype("f4"), none.astype("u2"))
+            for k, (stamp, pose) in enumerate(zip(stamps_ns, poses, strict=True))
+        ],
+    )
+    noise = np.diag([np.radians(0.3)] * 3 + [0.01] * 3) ** 2
+    steps = enumerate(lie.inverse(poses[:-1]) @ poses[1:])
+    factors = [Factor(KeyframeId(0, k), KeyframeId(0, k + 1), step, noise) for k, step in steps]
+    (results / "graph.g2o").write_text(g2o_text(poses, factors))
+
+
+def test_a_wild_fix_that_the_user_insists_on_pulls_walk_and_map_alike(
+    hemislam: Call, made: Walked, results: Path
+) -> None:
+    write_map(results, made)
+    bent, (wild, sound) = results / "bent", (int(made.outliers[3]), 101)
+    assert sound not in made.outliers
+    bent.mkdir()
+    (bent / "report.json").write_text("{}")  # of another run
+    call = ["georeference", results, "--gnss", results / "fixes.csv", "--lever-arm", *LEVER, "--factors", "--out"]
+    assert "already holds results (report.json)" in hemislam(*call, bent).err
+    outcome = hemislam(*call, bent, "--force", "--accept", wild, "--reject", sound)
+    assert outcome.code == 0, outcome.err
+    rows = csv.DictReader((bent / "gnss_residuals.csv").read_text().splitlines())
+    verdicts = {int(row["name"]): row["verdict"] for row in rows}
+    assert (verdicts[wild], verdicts[sound]) == ("accepted", "rejected")
+    left = {"trajectory.tum", "map.ply", "georeference.json", "gnss_residuals.csv", "georeference.svg"}
+    assert {path.name for path in bent.iterdir()} == left and reference.read(results) is None
+    walk, keyframes = read_tum(bent / "trajectory.tum").positions, map_file.MapFile(bent / "map.ply")
+    assert np.linalg.norm(walk - made.trajectory.positions, axis=1).max() > 0.05
+    for k in (0, 30, 60):
+        np.testing.assert_allclose(keyframes[k].T_odom_imu[:3, 3], walk[10 * k], atol=1e-6)
+
+
+def test_a_map_is_not_bent_onto_itself(hemislam: Call, results: Path) -> None:
+    files = ("--gnss", results / "fixes.csv", "--factors", "--force")
+    outcome = hemislam("georeference", results, *files, "--out", results / "." / "")
+    assert outcome.code == 2 and "give --out another folder" in outcome.err
