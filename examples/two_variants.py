@@ -4,9 +4,11 @@ python examples/two_variants.py sample_data/museum.mcap FOLDER
 """
 
 import sys
+from functools import partial
 from pathlib import Path
 
 from app.evaluation.evaluate import Subject, evaluate
+from app.evaluation.runner import run_jobs
 from app.evaluation.truth import read_truth
 from app.evaluation.variants import Variant
 from app.slam.params import Params
@@ -20,6 +22,7 @@ if __name__ == "__main__":  # the runs have processes of their own, which import
         Variant("fine", {"scan.voxel_size": 0.2}, "finer voxels for the filter"),
     )
     subject = Subject(recording.stem, recording, params, truth)
-    findings, failed = evaluate([subject], variants, folder, parallel=2, threads=1, duration_s=10.0)
+    run = partial(run_jobs, parallel=2)
+    findings, failed = evaluate([subject], variants, folder, run=run, threads=1, duration_s=10.0)
     print(*findings, *failed.values(), sep="\n")
     print((folder / "report.md").read_text())
