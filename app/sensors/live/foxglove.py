@@ -171,10 +171,7 @@ class FoxgloveReceiver:
             intake.counters.unreadable += 1
             self._tell("configuration", str(error), intake)
         if self._reader.findings is not known:
-            for finding in self._reader.findings:
-                if finding.verdict != "fine":
-                    text = f"{finding.subject}: {finding.text} {finding.option}".rstrip()
-                    intake.put_status("configuration", "LiDAR", text)
+            intake.put_findings(self._reader.findings)
 
     def _tell(self, kind: Literal["disconnected", "configuration"], text: str, intake: Intake) -> None:
         """Report it once, however often it happens."""

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from app.sensors.clocks import TOLERANCE_S
+from app.sensors.findings import Finding
 from app.sensors.imu_units import ABSURD, AS_RECORDED, ImuProbe, ImuUnits, settle_imu
 from app.sensors.live.clock import JUMP_NS, ClockMap, OffsetEstimate
 from app.sensors.live.recorder import Recorder
@@ -129,6 +130,13 @@ class Intake:
         with self._changed:
             self._tell(kind, sensor, text)
             self._changed.notify()
+
+    def put_findings(self, findings: list[Finding]) -> None:
+        """How clouds are read, where that is not as expected."""
+        for finding in findings:
+            if finding.verdict != "fine":
+                text = f"{finding.subject}: {finding.text} {finding.option}".rstrip()
+                self.put_status("configuration", "LiDAR", text)
 
     # --- the reader ------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ from app.sensors.live.decoder import Decoder
 from app.sensors.live.devices import Device, mount_finding
 from app.sensors.live.difop import DIFOP_ID, ChannelAngles, Difop, read_difop
 from app.sensors.live.frames import Assembler, Revolution, sensor_of
-from app.sensors.live.imu_udp import ImuOrder, is_imu
+from app.sensors.live.imu_udp import ImuOrder, ImuSample, is_imu
 from app.sensors.live.intake import Intake
 from app.sensors.live.livox_udp import read_points
 from app.sensors.robosense import Model
@@ -127,10 +127,12 @@ class PacketReceiver:
         self._known_angles = angles is not None or not device.has_angles
         self._sensor: Peer | None = None
         self._heard_s = 0.0
-        self._told_another = False
+        self._told_another, self._told = False, ""
 
     def __call__(self, intake: Intake, stop: threading.Event) -> None:
         self._assembler.counters = self._order.counters = intake.counters
+        if self._decoder is not None:
+            self._decoder.bad_blocks = intake.counters.bad_blocks
         with contextlib.ExitStack() as stack:
             for opened in self._sockets:
                 stack.enter_context(opened)
@@ -140,6 +142,8 @@ class PacketReceiver:
                 for readable in ready:
                     for packet, arrival_ns, peer in _drain(readable):
                         self._take(packet, arrival_ns, peer, intake)
+                if not ready:
+                    self._put_imu(self._order.flush(), now, intake)
                 since = self._assembler.pending_since()
                 if not ready and since is not None and now - since > _REST_NS:
                     self._frames += self._assembler.flush()
@@ -150,8 +154,7 @@ class PacketReceiver:
         if (states or felt or sensor is not None) and self._is_another(peer, states or felt, intake):
             intake.counters.foreign += 1
         elif felt and self._own_imu:
-            for sample in self._order.add(packet):
-                intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, now)
+            self._put_imu(self._order.add(packet), now, intake)
         elif states and isinstance(self._model, Model):
             said = read_difop(packet, self._model)
             if said is None:
@@ -163,6 +166,10 @@ class PacketReceiver:
             self._frames += self._assembler.add(packet, now)
         elif not felt:
             intake.counters.foreign += 1
+
+    def _put_imu(self, samples: list[ImuSample], arrival_ns: int, intake: Intake) -> None:
+        for sample in samples:
+            intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, arrival_ns)
 
     def _is_another(self, peer: Peer, beside: bool, intake: Intake) -> bool:
         """Whether this is another sensor than the one in use: the first one, until it falls silent.
@@ -222,11 +229,18 @@ class PacketReceiver:
     def _scans(self, frame: Revolution, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
         """Those that can be given now, each with its arrival."""
         if self._decoder is None:
+            known = self._clouds.findings
             try:
-                return self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns)
-            except HemislamError:
+                found = self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns)
+            except HemislamError as error:
                 intake.counters.unreadable += 1
+                if str(error) != self._told:
+                    self._told = str(error)
+                    intake.put_status("configuration", "LiDAR", self._told)
                 return []
+            if self._clouds.findings is not known:
+                intake.put_findings(self._clouds.findings)
+            return found
         scan = self._decoder.decode(frame)
         intake.counters.bad_blocks = self._decoder.bad_blocks
         return [(scan, frame.arrival_ns)]

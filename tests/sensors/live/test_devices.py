@@ -4,9 +4,12 @@ Tests app/sensors/live/devices.py, app/sensors/live/livox_udp.py, app/sensors/li
 """
 
 import math
+import socket
 import struct
 import threading
+import time
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +23,10 @@ from app.sensors.live.devices import DEVICES, device_of
 from app.sensors.live.difop import read_angles, read_difop
 from app.sensors.live.feed import Pace, feed, packets_of
 from app.sensors.live.frames import Assembler
-from app.sensors.live.imu_udp import read_imu
+from app.sensors.live.imu_udp import ImuSample, read_imu, write_airy_imu
+from app.sensors.live.intake import Intake
+from app.sensors.live.status import Status
+from app.sensors.live.udp import PacketReceiver
 from app.sensors.live.urls import open_live, parse_address
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
@@ -164,6 +170,38 @@ def test_a_scan_of_a_mid360_ends_with_each_tenth_of_a_second() -> None:
     assert [start // 100_000_000 for start in starts] == [0, 1, 2]
     assert all(start % 100_000_000 < 480_000 for start in starts[1:])
     assert assembler.counters.lost == assembler.counters.late == 0
+
+
+def received(scheme: str, packets: list[bytes], wanted: Callable[[Intake], bool]) -> Intake:
+    """What a receiver makes of packets that come by UDP, once it has what is wanted, or after ten seconds."""
+    (port,), intake, stop = ports.free(1), Intake(Params()), threading.Event()
+    receiver = PacketReceiver(DEVICES[scheme], "127.0.0.1", (port,), Params(), own_imu=True)
+    thread = threading.Thread(target=receiver, args=(intake, stop))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for packet in packets:
+            sender.sendto(packet, ("127.0.0.1", port))
+    thread.start()
+    until = time.monotonic() + 10.0
+    while time.monotonic() < until and not wanted(intake):
+        time.sleep(0.02)
+    stop.set()
+    thread.join()
+    return intake
+
+
+def test_a_mid360_that_sees_nothing_is_reported() -> None:
+    packets = [livox(1, 96, bytes(96 * 14), START_NS + k * 100_000_000) for k in range(103)]
+    intake = received("mid360", packets, lambda intake: intake.counters.unreadable > 0)
+    told = [entry.text for entry in intake.take(0.0, scan=False)[0] if isinstance(entry, Status)]
+    assert any("has a usable point; check the LiDAR" in text for text in told)
+
+
+def test_imu_samples_behind_a_lost_one_do_not_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[int] = []
+    monkeypatch.setattr(Intake, "put_imu", lambda self, stamp_ns, *rest: heard.append(stamp_ns))
+    packets = [write_airy_imu(ImuSample(k, START_NS + k * 5_000_000, (0, 0, 0), (0, 0, 9.8))) for k in (0, 1, 3, 4)]
+    received("airy", packets, lambda intake: len(heard) == 4)
+    assert heard == [START_NS + k * 5_000_000 for k in (0, 1, 3, 4)]
 
 
 def test_angles_of_another_sensor_are_refused(tmp_path: Path) -> None:
