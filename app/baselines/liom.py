@@ -77,13 +77,14 @@ class Liom:
         return scan.end_ns, self._T_map_odom @ T_odom_imu
 
     def _begin(self, state: NavState) -> None:
-        """A new window whose first state is `state`; also where the smoother has failed."""
+        """The first window, from where the start has left off."""
         self._bias = gtsam.imuBias.ConstantBias(state.b_accel, state.b_gyro)
         pose = gtsam.Pose3(state.T_odom_imu)
         self._state, self._stamp_ns = gtsam.NavState(pose, state.v_odom_imu), state.stamp_ns
         self._restart(1e-3, 0.1)
 
     def _restart(self, pose_sigma: float, speed_sigma: float) -> None:
+        """A new window from the present state; also where the smoother has failed. The sigmas: m and rad; m/s."""
         graph, values, k = gtsam.NonlinearFactorGraph(), gtsam.Values(), self._index
         of = gtsam.noiseModel.Isotropic.Sigma
         bias = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.05] * 3 + [0.01] * 3))
@@ -92,7 +93,6 @@ class Liom:
         graph.addPriorConstantBias(B(k), self._bias, bias)
         _insert(values, k, self._state, self._bias)
         self._window.clear()
-        self._first = k + 1  # index of the first scan in the window
         self._smoother = gtsam.BatchFixedLagSmoother(float(WINDOW))
         self._smoother.update(graph, values, {key: float(k) for key in (X(k), V(k), B(k))})
 

@@ -54,13 +54,12 @@ class PoseFit:
     """Attributes:
     T: (4, 4) T_fixed_moving. information: (6, 6) of it in units of one point's, rotation then translation in the
         fixed frame; nothing of weak directions.
-    pairs: used. rms: of their distances, m. weak: directions that kept the prediction.
+    pairs: used. weak: directions that kept the prediction.
     """
 
     T: F64
     information: F64
     pairs: int
-    rms: float
     weak: int
 
 
@@ -82,9 +81,9 @@ def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> Pose
         free: (m, 6) orthonormal, the perturbations that are allowed; None: all.
     """
     free = np.eye(6) if free is None else free
-    information, rms, weak = np.zeros((6, 6)), float("nan"), 6
+    information, weak = np.zeros((6, 6)), 6
     if len(pairs) < 12:
-        return PoseFit(T, information, len(pairs), rms, weak)
+        return PoseFit(T, information, len(pairs), weak)
     for _ in range(steps):
         arms = pairs.points @ T[:3, :3].T
         distances = np.einsum("ni,ni->n", pairs.normals, arms + T[:3, 3] - pairs.anchors)
@@ -95,10 +94,9 @@ def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> Pose
         gradient = -np.einsum("ni,n,n->i", J, distances, weights)
         step, information, weak = _step(information, gradient, lever, free)
         T = lie.transform(lie.exp(step[:3]) @ T[:3, :3], T[:3, 3] + step[3:])
-        rms = float(np.sqrt(np.mean(weights * distances**2)))
         if np.linalg.norm(step[:3]) < 1e-5 and np.linalg.norm(step[3:]) < 1e-4:
             break
-    return PoseFit(T, information, len(pairs), rms, weak)
+    return PoseFit(T, information, len(pairs), weak)
 
 
 def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64, F64, int]:

@@ -15,7 +15,7 @@ DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """White noise of a sensor. density: of all axes together, unit/√Hz. sigma: its standard deviation."""
+    """White noise of a sensor. density: RMS over the axes, unit/√Hz. sigma: its standard deviation."""
 
     density: float
     sigma: float

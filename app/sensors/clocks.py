@@ -9,10 +9,9 @@ from app.slam.types import I64
 
 TOLERANCE_S = 0.15
 """Drivers log a scan up to this late; a smaller difference is delay, not another clock."""
-
-
 OVERLAP, LEAST_OVERLAPS = 0.2, 0.4
-"""Scans that have more than such a part of their time in common overlap; more than so many do so with two LiDARs."""
+"""Two scans overlap if they share more than 20 % of their duration; if over 40 % of neighbouring scans do, two LiDARs
+send on the topic."""
 
 
 def clock_finding(scans: I64, imu: I64, applied_s: float) -> Finding:

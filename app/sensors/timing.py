@@ -16,8 +16,9 @@ from app.sensors.findings import Finding, Verdict
 from app.slam.sections import RecordingParams
 from app.slam.types import I64
 
+LONGEST = 5.0
+"""Intervals that a scan may last: more than one where several LiDARs send on one topic, which `clocks.py` reports."""
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-
 MOST_NS = 2**61
 """Later times, 73 years after others, are cut to this, so that integers hold them."""
 
@@ -69,10 +70,6 @@ def scan_period_ns(clouds: list[Probe], rotation_rate: float) -> tuple[int, bool
         if len(steps):
             return int(np.median(steps)), True
     return round(1e9 / (rotation_rate or 10.0)), False
-
-
-LONGEST = 5.0
-"""Intervals that a scan may last: more than one where several LiDARs send on one topic, which `clocks.py` tells."""
 
 
 def _candidates(probe: Probe, kind: CloudType, wanted: str) -> list[str]:

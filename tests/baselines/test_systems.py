@@ -1,6 +1,7 @@
 """Baselines as `evaluate` runs them, and what it says of those that are not there.
 
-Tests app/baselines/systems.py, app/baselines/peers.py, app/baselines/keyframes.py.
+Tests app/baselines/systems.py, app/baselines/keyframes.py, and of app/baselines/peers.py the use of KISS-ICP and
+GenZ-ICP, by stand-ins for both. RKO-LIO is not run.
 """
 
 import json

@@ -63,6 +63,7 @@ def test_a_submap_ends_where_odometry_slipped(straight: Walk) -> None:
         here = {k for k in around if (k < AT) == (index < AT)}
         assert seen_from(parted, index) - here <= {index + HALF}, "that the last keyframe lies elsewhere cannot be told"
     assert seen_from(parted, AT - HALF) >= set(range(AT - 2 * HALF, AT - REACH + 1)), "what lies before it stays whole"
+    assert seen_from(parted, AT + HALF - 1) >= set(range(AT + REACH - 1, AT + 2 * HALF)), "and what lies behind it"
     whole.close(), parted.close()
 
 
