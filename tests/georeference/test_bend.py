@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.georeference.align import Alignment, align
+from app.georeference.align import Alignment, align, offset_by_parts
 from app.georeference.bend import bend
+from app.georeference.ledger import summary
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
@@ -78,7 +79,15 @@ def test_a_clock_offset_that_the_motion_does_not_tell_is_not_looked_for_again(
     made: Walked, drifted: Trajectory
 ) -> None:
     _, after, _ = solved(made, drifted, offset_known=False)
-    assert after.offset_s == 0.0 and not any("Clock offset" in note for note in after.notes)
+    lines = "\n".join(summary(after, "fixes"))
+    assert after.offset_s == 0.0 and "Clock offset" not in lines
+    assert "Lever arm          0.100 -0.200 0.450 m\n" in lines  # as given
+
+
+def test_stretches_with_too_few_fixes_leave_the_clock_offset_as_it_was() -> None:
+    sparse = walked(rate_hz=0.15, outliers=0.0)  # three in 20 s
+    found = replace(align(sparse.trajectory, sparse.fixes, lever=LEVER), offset_s=0.3)
+    assert offset_by_parts(sparse.trajectory, sparse.fixes, found) == 0.3
 
 
 def test_a_fix_that_is_not_there_cannot_be_decided_on(made: Walked, drifted: Trajectory) -> None:
