@@ -47,7 +47,8 @@ def export(
       csv         trajectory.csv           poses with easting, northing, height if known
       gpx         trajectory.gpx           the walk as a GPX track
       occupancy   occupancy.pgm, .yaml     free, wall, unknown for nav2
-      floor, dxf  floor.png, floor.dxf     floor plan: a slice 1 to 1.5 m above the ground
+      floor       floor.png, .pgw          floor plan: a slice 1 to 1.5 m above the ground
+      dxf         floor.dxf                the same as outlines
       terrain     terrain.tif              height of the ground as GeoTIFF
       density     density.tif              points per square metre as GeoTIFF
       kmz         map.kmz                  walk, picture and keyframes for Google Earth

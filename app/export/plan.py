@@ -52,6 +52,13 @@ def write_floor_png(path: Path, results: "Results") -> None:
     Image.fromarray(np.flipud(grey).astype(np.uint8)).save(path, format="PNG")
 
 
+def write_world_file(path: Path, results: "Results") -> None:
+    """Where floor.png lies, as GIS programs read it: size and turn of a pixel, middle of the upper left one."""
+    at = _transform(results.raster(on_earth=True))
+    numbers = (at.a, at.d, at.b, at.e, at.c + at.a / 2, at.f + at.e / 2)
+    path.write_text("".join(f"{number:.4f}\n" for number in numbers), encoding="ascii")
+
+
 def write_dxf(path: Path, results: "Results") -> None:
     """The outlines of what the slice cuts, in metres, on the layer `walls`."""
     raster = results.raster(on_earth=True)

@@ -174,6 +174,7 @@ EXPORTS = (
     _wanted("occupancy", "occupancy.pgm", "free, wall, unknown for nav2", "plan.write_pgm", "plan"),
     _wanted("occupancy", "occupancy.yaml", "where that lies in the map", "plan.write_yaml", "plan"),
     _wanted("floor", "floor.png", "floor plan: a slice 1 to 1.5 m above the ground", "plan.write_floor_png", "plan"),
+    _wanted("floor", "floor.pgw", "where that lies, as a world file", "plan.write_world_file", "plan"),
     _wanted("dxf", "floor.dxf", "the same as outlines", "plan.write_dxf", "plan"),
     _wanted("terrain", "terrain.tif", "height of the ground as GeoTIFF", "plan.write_terrain", "plan"),
     _wanted("density", "density.tif", "points per square metre as GeoTIFF", "plan.write_density", "plan"),

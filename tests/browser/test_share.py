@@ -3,12 +3,14 @@
 Tests app/export/share.py.
 """
 
+import base64
 import io
 import os
 import time
 from pathlib import Path
 
 import numpy as np
+import zstandard
 from PIL import Image
 from playwright.sync_api import Browser
 
@@ -63,6 +65,10 @@ def test_what_was_measured_is_named_with_its_distance(tmp_path: Path) -> None:
     ((text, at),) = share.marked(results)
     assert text == "door 5.000 m" and at.tolist() == [[0, 0, 0], [3, 4, 0]]
     share.write(tmp_path / "share.html", results)
+    _, begin, rest = (tmp_path / "share.html").read_text().partition('window.__VISER_EMBED_DATA__="')
+    assert begin, "viser's page holds its scene otherwise"
+    scene = base64.b64decode(rest.partition('"')[0])
+    assert b"door 5.000 m" in zstandard.ZstdDecompressor().decompressobj().decompress(scene[8:])
 
 
 def test_a_million_points_take_less_than_15_megabytes(tmp_path: Path) -> None:

@@ -8,8 +8,11 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
+from pypcd4 import PointCloud
 
 from app.export.results import FORMATS
+from app.mapping.session_file import Opened, SavedSession, State, size_of, write_session
+from app.sensors.presets import resolve_params
 
 Call = Callable[..., Any]
 
@@ -36,6 +39,18 @@ def test_a_map_is_exported_whole_and_thinned_in_a_box(results: Path, hemislam: C
     assert hemislam("export", results, "--format", "laz", *box).code == 0
     part = laspy.read(tmp_path / "map.laz").xyz
     assert 100 < len(part) < len(whole) and (np.abs(part) <= 2.001).all() and part[:, :2].min() >= -1.001
+
+
+def test_a_session_gives_the_points_of_a_run_to_its_frame(hemislam: Call, walk: Path, tmp_path: Path) -> None:
+    session, params = tmp_path / "walk.hemislam", resolve_params(walk, None, None, [])
+    write_session(session, SavedSession(Opened(walk, nbytes=size_of(walk)), State(params), 9))
+    assert hemislam("run", walk, "--duration", "1.0", "--out", tmp_path / "run").code == 0
+    for source, out in ((session, "of_session"), (tmp_path / "run", "of_run")):
+        outcome = hemislam("export", source, "--format", "pcd", "--out", tmp_path / out)
+        assert outcome.code == 0, outcome.err
+    of_session, of_run = (PointCloud.from_path(tmp_path / out / "map.pcd").numpy() for out in ("of_session", "of_run"))
+    np.testing.assert_allclose(of_session, of_run, atol=1e-3)
+    assert len(of_run) > 1000
 
 
 @pytest.mark.parametrize(

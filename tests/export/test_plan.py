@@ -27,12 +27,13 @@ LOW, HIGH, FLOOR = (-3.0, -2.0), (3.0, 2.0), -1.2
 
 
 def room(where: GeoReference | None = None) -> Results:
-    """A floor, four walls 2.5 m high and a table of 0.7 m, a point every 2 cm."""
+    """A floor, four walls and a short one 2.5 m high, and a table of 0.7 m, a point every 2 cm."""
     x, y = np.meshgrid(np.arange(-2.99, 3, 0.02), np.arange(-1.99, 2, 0.02))
     floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, FLOOR)])
     up = FLOOR + np.arange(0.02, 2.5, 0.02)
     walls = [np.array([(side, b, z) for b in np.arange(-1.99, 2, 0.02) for z in up]) for side in (LOW[0], HIGH[0])]
     walls += [np.array([(b, side, z) for b in np.arange(-2.99, 3, 0.02) for z in up]) for side in (LOW[1], HIGH[1])]
+    walls += [np.array([(b, 1.02, z) for b in np.arange(-2.99, -1.5, 0.02) for z in up])]
     table = np.array([(a, b, FLOOR + 0.7) for a in np.arange(0, 1, 0.02) for b in np.arange(0, 0.5, 0.02)])
     points = np.vstack([floor, *walls, table])
     labels = [GROUND] * len(floor) + [NON_GROUND] * (len(points) - len(floor))
@@ -69,7 +70,18 @@ def test_the_floor_plan_shows_walls_but_no_table(tmp_path: Path, where: GeoRefer
     np.testing.assert_allclose(points.min(axis=0), LOW, atol=cell)
     np.testing.assert_allclose(points.max(axis=0), HIGH, atol=cell)
     assert not ((np.abs(points - [0.5, 0.25]) < 0.6).all(axis=1)).any()
-    assert (np.asarray(Image.open(tmp_path / "floor.png")) < 100).sum() > 200
+    width, _, _, height, *first = map(float, (tmp_path / "floor.pgw").read_text().split())
+    assert width == -height == 0.05
+    picture = np.asarray(Image.open(tmp_path / "floor.png"))
+
+    def darkest(x: float, y: float) -> int:
+        """Of the pixels within 5 cm of a place in the map."""
+        place = np.array([x, y]) if where is None else where.to_crs(np.array([[x, y, FLOOR]]))[0, :2]
+        column, row = np.rint((place - first) / [width, height]).astype(int)
+        return int(picture[row - 1 : row + 2, column - 1 : column + 2].min())
+
+    assert darkest(-2.2, 1.02) < 100, "the short wall"
+    assert darkest(2.2, 1.02) == darkest(-2.2, -1.02) == darkest(2.2, -1.02) == 255, "and not its mirror images"
 
 
 def test_geotiffs_give_height_and_density_in_the_coordinate_system(tmp_path: Path) -> None:
@@ -79,7 +91,8 @@ def test_geotiffs_give_height_and_density_in_the_coordinate_system(tmp_path: Pat
         assert terrain.crs.to_epsg() == density.crs.to_epsg() == 32632
         assert next(terrain.sample([place[:2]]))[0] == pytest.approx(place[2], abs=1e-3)
         assert next(density.sample([place[:2]]))[0] == pytest.approx(1 / 0.02**2, rel=0.15)
-        assert np.isnan(next(terrain.sample([place[:2] + 50]))[0]) or terrain.bounds.right < place[0] + 50
+        corner = (terrain.bounds.left + 0.1, terrain.bounds.bottom + 0.1)  # of the raster; the room stands aslant in it
+        assert np.isnan(next(terrain.sample([corner]))[0]) and next(density.sample([corner]))[0] == 0
 
 
 def test_a_plan_needs_ground_and_points(tmp_path: Path) -> None:
