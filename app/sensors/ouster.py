@@ -18,6 +18,7 @@ import numpy as np
 from app.sensors import ros
 from app.sensors.findings import Finding
 from app.sensors.imu_units import STANDARD_GRAVITY
+from app.sensors.live.devices import mount_finding
 from app.sensors.live.pcap import Capture, CapturePlace
 from app.slam import lie
 from app.slam.errors import HemislamError
@@ -113,8 +114,13 @@ class Metadata:
                 int(flat["columns_per_packet"]), int(flat["columns_per_frame"]), elevations, azimuths,
                 float(flat["lidar_origin_to_beam_origin_mm"]), T_imu_lidar,
             )  # fmt: skip
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             return None
+        if not 0 < found.columns <= found.width:
+            raise HemislamError(
+                f"{path.name} states {found.columns} columns a packet and {found.width} a turn, which no sensor sends; "
+                "copy the metadata from the sensor again."
+            )
         if profile not in _PROFILES or found.elevations.shape != found.azimuths.shape or found.elevations.ndim != 1:
             raise HemislamError(
                 f"The packets of {path.name} are of a kind that is not read ({profile}); set the sensor to one of "
@@ -180,10 +186,17 @@ class OusterStream:
         end = "" if self.complete else "; the file is cut off there"
         text = f"{scans} scans, {samples} IMU samples, {missing} packets missing{end}"
         rows = f"{metadata.name}, {len(metadata.elevations)} x {metadata.width}, by the .json beside the file"
-        self.findings = (
+        found = [
             Finding("packets", "corrected" if missing or not self.complete else "fine", text),
             Finding("sensor", "fine", rows),
-        )
+        ]
+        R = metadata.T_imu_lidar[:3, :3]
+        if np.isfinite(metadata.T_imu_lidar).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-3):
+            found.append(mount_finding(metadata.T_imu_lidar))
+        if not samples:
+            missed = f"no IMU packet of {_IMU.itemsize} bytes is in the file; set the sensor's IMU profile to LEGACY"
+            found.append(Finding("IMU", "needs you", missed))
+        self.findings = tuple(found)
 
     def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
         """(topic, log time ns, message) of what was logged within [start, stop), by log time."""

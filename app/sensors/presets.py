@@ -42,7 +42,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 their pose of the LiDAR on the IMU, for recordings under other topics. `mid360`: Livox's ROS drivers, with the IMU
 inside the Mid-360 at the place that its manual states. `airy`: RoboSense's ROS driver and the IMU inside, whose axes
 are those of the vendor's examples; each unit states its own pose in DIFOP packets. `jt128`: Hesai's ROS driver; the
-axes agree. `ouster`: Ouster's ROS driver with clouds in `os_lidar`, the IMU's place from the metadata. `hesai-xt`,
+axes agree. `ouster`: Ouster's ROS driver with clouds in `os_lidar`, the IMU's place from one unit's
+metadata; the doctor shows that of a capture's unit. `hesai-xt`,
 `velodyne`: their ROS drivers; the IMU is your own. `close`: most things are at arm's length (a desk, a cabin,
 a shaft)."""
 

@@ -130,7 +130,25 @@ def test_a_pixel_is_where_the_manual_puts_it(profile: str, tmp_path: Path) -> No
     assert [message.header.stamp for _, _, message in rest] == [message.header.stamp for message in messages[2:]]
 
 
+def test_the_imu_is_where_the_metadata_puts_it_and_missed_if_it_is_silent(tmp_path: Path) -> None:
+    T_sensor_imu = np.eye(4)
+    T_sensor_imu[:3, 3] = 6.0, -11.0, 7.0  # mm
+    path = made("LEGACY", tmp_path, imu_to_sensor_transform=T_sensor_imu.ravel().tolist())
+    metadata = metadata_beside(path)
+    assert metadata is not None
+    findings = {finding.subject: finding for finding in OusterStream(path, metadata).findings}
+    assert "sensor.translation=[-0.00600, 0.01100, -0.00700]" in findings["unit's mount"].option
+    assert findings["IMU"].verdict == "needs you"
+
+
 def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path: Path) -> None:
+    for columns in (0, -16):
+        path = made("LEGACY", tmp_path, columns_per_packet=columns, lidar_data_format={}, columns_per_frame=32)
+        with pytest.raises(HemislamError, match="columns a packet"):
+            open_recording(path, Params())
+    path = made("LEGACY", tmp_path, columns_per_packet=math.inf, lidar_data_format={}, columns_per_frame=32)
+    with pytest.raises(HemislamError, match="need its metadata"):
+        open_recording(path, Params())
     path = made("FUSA_RNG15_RFL8_NIR8_DUAL", tmp_path)
     with pytest.raises(HemislamError, match="of a kind that is not read"):
         open_recording(path, Params())

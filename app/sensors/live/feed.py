@@ -132,7 +132,11 @@ def packets_of(
             due = bisect.bisect_right(waiting, scan.end_ns, key=by_time)
             yield from waiting[:due]
             del waiting[:due]
-        elif isinstance(entry, ImuEntry) and entry.stamp_ns < stop_ns + 2e8:
+        elif (
+            isinstance(entry, ImuEntry)
+            and entry.stamp_ns < stop_ns + 2e8
+            and np.isfinite(entry.gyro + entry.accel).all()
+        ):
             sample = ImuSample(next(samples), entry.stamp_ns, entry.gyro, entry.accel)
             waiting.append(Sent(entry.stamp_ns, IMU, sensor.imu(sample)))
     waiting += [Sent(time_ns, LIDAR, packet) for time_ns, packet in sensor.flush()]

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from app.sensors.imu_units import STANDARD_GRAVITY
 from app.sensors.livox import CustomMsg
 from app.sensors.ros import Vector
+from app.slam.errors import HemislamError
 from app.slam.types import I64, U8, Scan
 
 POINTS_PORT, IMU_PORT = 56301, 56401
@@ -22,6 +23,8 @@ SCAN_NS = 100_000_000
 """A scan is what came in such a part of a second, counted from whole seconds."""
 SLOT_NS, SLOTS = 5_000, 96
 """The sensor fires 200,000 times a second, and sends so many firings at once."""
+_MOST_LOST = 0.1
+"""Share of points that may fall into the firing of another: stamps are rounded."""
 FARTHEST_M = 100.0
 """A point farther out on any axis is no return."""
 _HEADER = struct.Struct("<B4H3B12xIQ")
@@ -127,12 +130,22 @@ class LivoxWriter:
         self._rows: npt.NDArray[Any] = np.empty(0, _MEASURED[1][0])
 
     def add(self, scan: Scan) -> list[tuple[int, bytes]]:
-        """Packets that this scan completes, each with the time at which the sensor would send it."""
+        """Packets that this scan completes, each with the time at which the sensor would send it.
+
+        Raises:
+            HemislamError: it is denser than such a sensor measures, so that points would be lost.
+        """
         self._base_ns = scan.stamp_ns if self._base_ns is None else self._base_ns
         rows = np.zeros(len(scan), self._rows.dtype)
         rows["at"] = np.rint(scan.points.astype(np.float64) * 1000.0)
         rows["reflectivity"], rows["tag"] = np.clip(np.rint(scan.intensity), 0, 255), 0x10
         slots = (scan.stamp_ns - self._base_ns + scan.offsets_ns.astype(np.int64) + SLOT_NS // 2) // SLOT_NS
+        lost = len(slots) - len(np.unique(slots))
+        if lost > _MOST_LOST * len(slots):
+            raise HemislamError(
+                f"{lost} of a scan's {len(slots)} points were measured at once with others: "
+                "they are not those of a Mid-360; play the recording out to foxglove://."
+            )
         self._slots, self._rows = np.append(self._slots, slots), np.append(self._rows, rows)
         return self._sent(int(slots.max()) // SLOTS)
 

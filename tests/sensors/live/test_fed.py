@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from app.sensors.live.feed import Pace, feed, packets_of
+from app.sensors.live.livox_udp import LivoxWriter
 from app.sensors.live.source import Event
 from app.sensors.live.urls import open_live, parse_address
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import Measurement
+from app.slam.types import Measurement, Scan
 from tests.sensors.live import ports
 
 MUSEUM = Path(__file__).resolve().parents[3] / "sample_data" / "museum.mcap"
@@ -115,6 +116,16 @@ def test_another_lidars_recording_is_no_rsbpearls(shared_data: Path) -> None:
     path = shared_data / "garage_hdl32e.mcap"
     with open_recording(path, Params()) as recording, pytest.raises(HemislamError, match="not those of an RS-Bpearl"):
         list(packets_of(recording))
+
+
+def test_a_denser_lidars_scan_is_no_mid360s() -> None:
+    points, rings = np.ones((32_000, 3), np.float32), np.zeros(32_000, np.uint16)
+    offsets = np.repeat(np.arange(1_000, dtype=np.int32) * 100_000, 32)
+    scan = Scan(10**18, points, offsets, points[:, 0], rings)
+    with pytest.raises(HemislamError, match="not those of a Mid-360"):
+        LivoxWriter().add(scan)
+    alone = LivoxWriter().add(Scan(10**18, points[::32], offsets[::32], points[::32, 0], rings[::32]))
+    assert alone, "each point is a firing of its own"
 
 
 def test_no_client_or_no_address_for_the_imu_is_refused(params: Params) -> None:
