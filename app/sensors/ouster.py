@@ -201,7 +201,8 @@ class OusterStream:
     def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
         """(topic, log time ns, message) of what was logged within [start, stop), by log time."""
         number = bisect.bisect_left(self._complete_at, start_ns, key=lambda row: row[0]) - _RUN_IN
-        for log_ns, _, content in self._read(self._complete_at[number][1] if number >= 0 else None):
+        running_ns, place = self._complete_at[number] if number >= 0 else (0, None)
+        for log_ns, _, content in self._read(place, running_ns):
             if log_ns >= stop_ns:
                 return
             if log_ns < start_ns:
@@ -215,17 +216,22 @@ class OusterStream:
     def close(self) -> None:
         """Nothing stays open between two readings."""
 
-    def _read(self, place: CapturePlace | None) -> Iterator[tuple[int, CapturePlace, bytes | list[bytes]]]:
+    def _read(
+        self, place: CapturePlace | None, running_ns: int = 0
+    ) -> Iterator[tuple[int, CapturePlace, bytes | list[bytes]]]:
         """Log time, place in the file, and an IMU packet or all packets of a scan."""
         waiting: list[bytes] = []
-        frame, running_ns, at = None, 0, place or CapturePlace(0)
+        frame, at = None, place or CapturePlace(0)
+        whole = self._metadata.width // self._metadata.columns
         for datagram in self._capture.datagrams(place):
             running_ns, at, payload = max(running_ns, datagram.time_ns), datagram.place, datagram.payload
             if len(payload) == _IMU.itemsize:
                 yield running_ns, at, payload
             elif len(payload) == self._metadata.packet_bytes:
                 number = self._frame_of(payload)
-                if waiting and number != frame:
+                if payload in waiting:
+                    continue  # it came twice
+                if waiting and (number != frame or len(waiting) == whole):
                     yield running_ns, at, waiting
                     waiting = []
                 frame = number

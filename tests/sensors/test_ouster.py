@@ -130,6 +130,28 @@ def test_a_pixel_is_where_the_manual_puts_it(profile: str, tmp_path: Path) -> No
     assert [message.header.stamp for _, _, message in rest] == [message.header.stamp for message in messages[2:]]
 
 
+def test_packets_that_come_twice_give_no_more_points(tmp_path: Path) -> None:
+    path = made("LEGACY", tmp_path)
+    metadata = metadata_beside(path)
+    assert metadata is not None
+    data = path.read_bytes()
+    size = (len(data) - 24) // 8
+    twice = b"".join(2 * data[at : at + size] for at in range(24, len(data), size))
+    path.write_bytes(data[:24] + twice)
+    messages = [message for _, _, message in OusterStream(path, metadata).messages((LIDAR_TOPIC,), 0, 2**62)]
+    assert [len(read_point_cloud_2(message)) for message in messages] == [32 * 4] * 4
+
+
+def test_a_turn_ends_with_its_last_packet_even_if_the_frame_number_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = made("LEGACY", tmp_path)
+    metadata = metadata_beside(path)
+    assert metadata is not None
+    monkeypatch.setattr(OusterStream, "_frame_of", lambda self, packet: 7)
+    assert OusterStream(path, metadata).counts[LIDAR_TOPIC][1] == 4
+
+
 def test_the_imu_is_where_the_metadata_puts_it_and_missed_if_it_is_silent(tmp_path: Path) -> None:
     T_sensor_imu = np.eye(4)
     T_sensor_imu[:3, 3] = 6.0, -11.0, 7.0  # mm
