@@ -11,6 +11,7 @@ import struct
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from app.sensors.cloud_types import read_point_cloud_2
 from app.sensors.live.feed import packets_of
-from app.sensors.live.livox_udp import MID360, Livox
-from app.sensors.recording import open_recording
+from app.sensors.live.livox_udp import SLOT_NS, LivoxWriter, write_imu
+from app.sensors.recording import ImuEntry, ScanEntry, open_recording
 from app.sensors.robosense import AIRY, BPEARL, Model
 from app.sensors.ros import CLOUD, IMU, IMU_TOPIC, LIDAR_TOPIC, header, serialised
 from app.sensors.simulator import simulate
@@ -34,6 +35,7 @@ from app.slam.errors import HemislamError
 from app.slam.metrics import compare
 from app.slam.params import Params
 from app.slam.trajectory import read_tum
+from app.slam.types import Scan
 from benchmarks.fuzz.damage import MESSAGES, Entry, bytes_damaged
 
 FORMATS = ("mcap-livox", "mcap", "mcap-lz4", "mcap-plain", "bag", "bag-bz2", "bag-lz4", "db3", "pcap")
@@ -43,6 +45,8 @@ MOST_S, MOST_BYTES = 60, 2 << 30
 """What one run may take."""
 TOLERANCE = 0.01
 """Of the way: a trajectory that is off by more must be said to be in doubt."""
+PORTS = (6699, 7788, 7799)
+"""Of the LiDAR, its settings and the IMU."""
 Packet = tuple[int, int, bytes]
 """Time in ns, UDP port, payload."""
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
@@ -80,7 +84,7 @@ class Recordings:
         simulate("room", self._path / "airy.mcap", duration_s=4.0, every_block=10, scanner="airy")
         self.packets = [
             self._sent(self.good, BPEARL),
-            self._sent(self.good, MID360),
+            self._mid360(),
             self._sent(self._path / "airy.mcap", AIRY),
         ]
         self._files = {kind: self._written(kind, self._entries).read_bytes() for kind in sorted({*FORMATS})}
@@ -92,10 +96,23 @@ class Recordings:
     def close(self) -> None:
         self._folder.cleanup()
 
-    def _sent(self, path: Path, model: Model | Livox) -> list[Packet]:
+    def _sent(self, path: Path, model: Model) -> list[Packet]:
         with open_recording(path, Params()) as recording:
             sending = packets_of(recording, model=model)
-            return [(sent.time_ns, (6699, 7788, 7799)[sent.stream], sent.data) for sent in sending]
+            return [(sent.time_ns, PORTS[sent.stream], sent.data) for sent in sending]
+
+    def _mid360(self) -> list[Packet]:
+        """Of the same recording, as though a Mid-360 had measured one point after the other."""
+        writer, sent = LivoxWriter(), []
+        with open_recording(self.good, Params()) as recording:
+            for entry in recording.entries():
+                if isinstance(entry, ScanEntry) and isinstance(entry.scan, Scan):
+                    offsets = np.arange(len(entry.scan), dtype=np.int32) * SLOT_NS
+                    packets = writer.add(replace(entry.scan, offsets_ns=offsets))
+                    sent += [(time_ns, PORTS[0], packet) for time_ns, packet in packets]
+                elif isinstance(entry, ImuEntry):
+                    sent.append((entry.stamp_ns, PORTS[2], write_imu(entry.stamp_ns, entry.gyro, entry.accel, 0)))
+        return sorted(sent)
 
     def broken(self, seed: int) -> str:
         """Which invariant the case breaks, and how; "" if none."""
