@@ -2,7 +2,8 @@
 
 The client looks for loops beside the frames, at its own speed. What it finds with a keyframe takes effect
 `loops.latency` frames after it, no sooner and no later, so the poses shown never depend on the speed of the machine.
-A frame waits only if an answer is late. What the user asks takes effect as soon as it is answered.
+A frame waits only if an answer is late, and never before the session is long enough for a loop: a client takes seconds
+to start. What the user asks takes effect as soon as it is answered.
 """
 
 from collections import deque
@@ -153,10 +154,8 @@ class LoopSchedule:
         self._reported = None
         if self._editing:
             self._forget_states()
-        elif self._wanted.count == 0:
-            self._states.setdefault(self._wanted, self._empty())
-        self._ask_next()
         self._take_wanted()
+        self._ask_next()
 
     def forget_after(self, frame: int) -> None:
         """Keyframes after this frame will be different ones."""
@@ -325,8 +324,19 @@ class LoopSchedule:
             del self._states[moment]
 
     def _take_wanted(self) -> None:
-        if self._shown != self._wanted and (state := self._states.get(self._wanted)) is not None:
+        if self._shown == self._wanted:
+            return
+        if (state := self._states.get(self._wanted)) is not None:
             self._put(state)
+        elif not self._editing and self._too_early(self._wanted.count):
+            self._put(self._without_loops(self._wanted))
+
+    def _too_early(self, count: int) -> bool:
+        """Whether no two of the first `count` keyframes are far enough apart in time for a loop, nor tied by hand."""
+        entries = self._log[:count]
+        return not self._edits.done and all(
+            entry.stamp_ns - entries[0].stamp_ns < entry.params.min_time * 1e9 for entry in entries
+        )
 
     def _put(self, state: LoopState) -> None:
         """Put a state into effect."""
@@ -341,9 +351,10 @@ class LoopSchedule:
     def _forget_states(self) -> None:
         self._states, self._shown = {}, None
 
-    def _empty(self) -> LoopState:
-        """The answer for no keyframes, so that nobody waits for it."""
-        return LoopState(0, False, np.empty((0, 4, 4)), (), self._edits.done, self._edits.undone)
+    def _without_loops(self, moment: Moment) -> LoopState:
+        """The answer where there cannot be any, so that nobody waits for it."""
+        odometry = np.tile(np.eye(4), (moment.count, 1, 1))
+        return LoopState(moment.count, moment.finished, odometry, (), (), self._edits.undone)
 
     def _lay(self, state: LoopState) -> MapFrame:
         if (state.corrections == np.eye(4)).all():

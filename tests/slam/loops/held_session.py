@@ -21,7 +21,7 @@ EVERY = 3  # frames between keyframes
 
 
 class Worker:
-    """Finds with every keyframe a loop that shifts the map by as many metres as there are keyframes.
+    """Finds with every keyframe but the first a loop that shifts the map by as many metres as there are before it.
 
     Answers once `answered` is raised, or at once when somebody waits for it.
     """
@@ -78,8 +78,8 @@ class Worker:
 
 def state(count: int, edits: Edits, *, finished: bool) -> LoopState:
     shifted = np.tile(np.eye(4), (count, 1, 1))
-    shifted[:, 0, 3] = count
-    return LoopState(count, finished, shifted, (edge(count - 1),) if count else (), edits.done, edits.undone)
+    shifted[:, 0, 3] = count - 1
+    return LoopState(count, finished, shifted, (edge(count - 1),) if count > 1 else (), edits.done, edits.undone)
 
 
 def edge(newer: int) -> LoopEdge:
@@ -87,7 +87,7 @@ def edge(newer: int) -> LoopEdge:
 
 
 class HeldSession:
-    """Every third frame is a keyframe; the first is frame 0."""
+    """Every third frame is a keyframe, 30 s after the one before; the first is frame 0."""
 
     def __init__(self, store: KeyframeStore | None = None) -> None:
         self.store = KeyframeStore() if store is None else store
@@ -135,12 +135,12 @@ class HeldSession:
 
 def a_keyframe(index: int, frame: int) -> Keyframe:
     none = Cloud(*(np.zeros(shape, dtype) for shape, dtype in CLOUD))
-    return Keyframe(index, frame, 100 * frame, np.eye(4), np.eye(4), np.eye(6), none)
+    return Keyframe(index, frame, 10**10 * frame, np.eye(4), np.eye(4), np.eye(6), none)
 
 
 CLOUD = (((0, 3), np.float32), (0, np.uint8), (0, np.float32), (0, np.uint16), (0, np.int32))
 
 
 def shift_at(frame: int) -> int:
-    """Keyframes that are `LATENCY` frames past at a frame."""
-    return 0 if frame < LATENCY else (frame - LATENCY) // EVERY + 1
+    """Keyframes after the first that are `LATENCY` frames past at a frame."""
+    return max(0, (frame - LATENCY) // EVERY)

@@ -6,6 +6,7 @@ import pytest
 
 from app.slam.loops.edits import Accept, Edits
 from app.slam.loops.messages import ApplyEdit, Failure
+from app.slam.sections import LoopsParams
 from tests.slam.loops.held_session import LATENCY, HeldSession, shift_at
 
 
@@ -22,7 +23,7 @@ def test_a_loop_takes_effect_at_its_frame_however_fast_the_work_is(session: Held
         session.worker.answered = speed
         news, shift = session.step()
         assert shift == shift_at(frame)
-        assert [e.newer for e in news] == ([shift - 1] if shift != shift_at(frame - 1) else [])
+        assert [e.newer for e in news] == ([shift] if shift != shift_at(frame - 1) else [])
     assert bool(session.worker.waits) == (speed == 0)
 
 
@@ -63,6 +64,16 @@ def test_before_the_first_loop_counts_the_worker_is_not_asked(session: HeldSessi
     assert (session.worker.waits, len(session.worker.requests)) == (waits, asked)
 
 
+def test_no_frame_waits_while_the_session_is_too_short_for_a_loop(session: HeldSession) -> None:
+    """Keyframes are 30 s apart here: between two of them there can be a loop after 15 s, but not after 100 s."""
+    patient = LoopsParams(latency=LATENCY, min_time=100.0)
+    while session.worker.waits == 0:
+        session.step(patient)
+    assert len(session.store) > 4, "the worker is first waited for when the fifth keyframe is due"
+    assert session.worker.added[:5] == [0, 1, 2, 3, 4], "but it was sent them all, so that it is not late then"
+    assert session.shift == 4
+
+
 def test_an_edit_made_just_before_going_back_is_not_lost(session: HeldSession) -> None:
     for _ in range(30):
         session.step()
@@ -92,7 +103,7 @@ def test_an_edit_takes_effect_when_it_is_answered_and_holds(session: HeldSession
     session.until_idle()
     assert session.loops.state is not None
     assert session.loops.state.undo == (Accept(0, 2),)
-    assert session.shift == len(session.store), "an edit acts on all there is"
+    assert session.shift == len(session.store) - 1, "an edit acts on all there is"
     for _ in range(20):
         session.step()
     assert session.loops.state.undo == (Accept(0, 2),)
@@ -114,14 +125,14 @@ def test_edits_given_without_waiting_are_applied_in_their_order(session: HeldSes
 def test_results_hold_all_keyframes_whether_in_effect_or_not(session: HeldSession) -> None:
     for _ in range(20):
         session.step()
-    assert session.shift < 7
+    assert session.shift < 6
     results = session.loops.results()
-    assert results.frame.newest[0, 3] == len(results.stamps_ns) == 7
+    assert results.frame.newest[0, 3] == len(results.stamps_ns) - 1 == 6
     assert results.g2o == "graph of 7"
     session.loops.finish()
     session.loops.results()
     assert session.loops.state is not None and session.loops.state.finished
-    assert session.shift == 7, "at its end all takes effect"
+    assert session.shift == 6, "at its end all takes effect"
 
 
 def test_a_session_that_never_goes_back_keeps_no_past_states(session: HeldSession) -> None:
