@@ -20,6 +20,7 @@ from app.sensors.findings import Finding
 from app.sensors.imu_units import STANDARD_GRAVITY
 from app.sensors.live.devices import mount_finding
 from app.sensors.live.pcap import Capture, CapturePlace
+from app.sensors.turns import Turns
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.types import F64, I64, U8
@@ -220,24 +221,18 @@ class OusterStream:
         self, place: CapturePlace | None, running_ns: int = 0
     ) -> Iterator[tuple[int, CapturePlace, bytes | list[bytes]]]:
         """Log time, place in the file, and an IMU packet or all packets of a scan."""
-        waiting: list[bytes] = []
-        frame, at = None, place or CapturePlace(0)
-        whole = self._metadata.width // self._metadata.columns
+        meta, at = self._metadata, place or CapturePlace(0)
+        turns = Turns(meta.width // meta.columns)
         for datagram in self._capture.datagrams(place):
             running_ns, at, payload = max(running_ns, datagram.time_ns), datagram.place, datagram.payload
             if len(payload) == _IMU.itemsize:
                 yield running_ns, at, payload
-            elif len(payload) == self._metadata.packet_bytes:
-                number = self._frame_of(payload)
-                if payload in waiting:
-                    continue  # it came twice
-                if waiting and (number != frame or len(waiting) == whole):
-                    yield running_ns, at, waiting
-                    waiting = []
-                frame = number
-                waiting.append(payload)
-        if waiting:
-            yield running_ns, at, waiting
+            elif len(payload) == meta.packet_bytes:
+                column = int.from_bytes(payload[(first := meta.profile.header + 8) : first + 2], "little")
+                for packets in turns.add(self._frame_of(payload), column, payload):
+                    yield running_ns, at, packets
+        for packets in turns.rest():
+            yield running_ns, at, packets
 
     def _frame_of(self, packet: bytes) -> int:
         at = 2 if self._metadata.profile.header else 10

@@ -1,4 +1,4 @@
-"""An Ouster's packets, decoded as Ouster's own library decodes them.
+"""Tests app/sensors/ouster.py and app/sensors/turns.py: packets of an Ouster, decoded as its own library decodes them.
 
 `ouster_sdk.json` holds what ouster-sdk 1.0.1 gives for the captures in ../shared/data/sensors/ouster: of each scan and
 return the number of points, their sum and every fortieth of them (index, x, y, z in the sensor's frame, time,
@@ -8,6 +8,7 @@ reflectivity, row), and all IMU samples (time, rad/s, m/s²).
 import json
 import math
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,12 @@ import pytest
 
 from app.sensors.cloud_types import read_point_cloud_2
 from app.sensors.doctor import examine
+from app.sensors.live.pcap import Capture
 from app.sensors.ouster import IMU_TOPIC, LIDAR_TOPIC, OusterStream, metadata_beside
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.sensors.ros import stamp_ns
+from app.sensors.turns import LATE, Turns
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import Measurement
@@ -130,16 +133,82 @@ def test_a_pixel_is_where_the_manual_puts_it(profile: str, tmp_path: Path) -> No
     assert [message.header.stamp for _, _, message in rest] == [message.header.stamp for message in messages[2:]]
 
 
-def test_packets_that_come_twice_give_no_more_points(tmp_path: Path) -> None:
+Changed = Callable[[list[bytes]], list[bytes]]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda packets: [packet for packet in packets for _ in range(2)],
+        lambda packets: [packets[i] for i in (1, 0, 2, 4, 3, 6, 5, 7)],
+        lambda packets: [packets[i] for i in (0, 2, 1, 2, 3, 5, 4, 7, 6, 6)],
+    ],
+    ids=["twice", "swapped", "both"],
+)
+def test_packets_that_the_network_swaps_or_repeats_change_nothing(changed: Changed, tmp_path: Path) -> None:
+    """Every turn has two packets, so each swap here but the first is across the end of one."""
     path = made("LEGACY", tmp_path)
     metadata = metadata_beside(path)
     assert metadata is not None
+    before = [bytes(message.data) for *_, message in OusterStream(path, metadata).messages((LIDAR_TOPIC,), 0, 2**62)]
     data = path.read_bytes()
     size = (len(data) - 24) // 8
-    twice = b"".join(2 * data[at : at + size] for at in range(24, len(data), size))
-    path.write_bytes(data[:24] + twice)
-    messages = [message for _, _, message in OusterStream(path, metadata).messages((LIDAR_TOPIC,), 0, 2**62)]
-    assert [len(read_point_cloud_2(message)) for message in messages] == [32 * 4] * 4
+    packets = [data[at : at + size] for at in range(24, len(data), size)]
+    path.write_bytes(data[:24] + b"".join(changed(packets)))
+    after = [bytes(message.data) for *_, message in OusterStream(path, metadata).messages((LIDAR_TOPIC,), 0, 2**62)]
+    assert len(before) == 4 and after == before
+
+
+def test_a_hundredth_of_the_packets_lost_costs_a_hundredth_of_the_points_and_moves_none(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    whole = shared_data / "sensors" / "ouster" / "OS-1-128_v2.3.0_1024x10_lb_n3.pcap"
+    metadata = metadata_beside(whole)
+    assert metadata is not None
+    sent = [(one.time_ns, 7502, one.payload) for one in Capture(whole).datagrams()]
+    kept = np.random.default_rng(1).random(len(sent)) > 0.01
+    lossy = tmp_path / "lossy.pcap"
+    lossy.write_bytes(captures.pcap([one for one, keep in zip(sent, kept, strict=True) if keep]))
+    clouds = [
+        [
+            read_point_cloud_2(message).xyz()
+            for *_, message in OusterStream(path, metadata).messages((LIDAR_TOPIC,), 0, 2**62)
+        ]
+        for path in (whole, lossy)
+    ]
+    assert 0 < len(sent) - np.count_nonzero(kept) < 0.02 * len(sent)
+    assert len(clouds[0]) == len(clouds[1]) > 1
+    for before, after in zip(*clouds, strict=True):
+        assert 0.96 * len(before) < len(after) <= len(before)
+        assert {row.tobytes() for row in after} <= {row.tobytes() for row in before}
+    assert sum(map(len, clouds[1])) < sum(map(len, clouds[0]))
+
+
+def numbered(turn: int, column: int) -> bytes:
+    return b"%d/%d" % (turn, column)
+
+
+def gathered(order: list[tuple[int, int]], whole: int = 8) -> list[list[bytes]]:
+    turns = Turns(whole)
+    over = [one for turn, column in order for one in turns.add(turn % 65536, column, numbered(turn, column))]
+    return over + list(turns.rest())
+
+
+def test_turns_are_whole_around_the_end_of_their_counter_and_after_a_restart() -> None:
+    order = [(turn, column) for turn in (65534, 65535, 65536, 65537, 20, 21) for column in range(8)]
+    for swapped in (7, 15, 23):
+        order[swapped], order[swapped + 1] = order[swapped + 1], order[swapped]
+    wanted = [[numbered(turn, column) for column in range(8)] for turn in (65534, 65535, 65536, 65537, 20, 21)]
+    assert gathered(order) == wanted
+
+
+def test_a_packet_that_comes_a_scan_late_is_left_out_and_one_that_is_lost_delays_nothing_for_long() -> None:
+    order = [(0, column) for column in range(7)] + [(1, column) for column in range(8)] + [(0, 7), (2, 0)]
+    turns = gathered(order)
+    assert [len(turn) for turn in turns] == [7, 8, 1]
+    first = Turns(8)
+    waited = [len(list(first.add(turn, column, numbered(turn, column)))) for turn, column in order]
+    assert waited.index(1) == 7 + LATE
 
 
 def test_a_turn_ends_with_its_last_packet_even_if_the_frame_number_stands(
