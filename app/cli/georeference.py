@@ -38,10 +38,10 @@ def georeference(
         bool, typer.Option("--factors", help="Let the fixes bend the map: write another one to --out.")
     ] = False,
     accept: Annotated[
-        list[int] | None, typer.Option("--accept", metavar="FIX", help="With --factors: keep this fix. Repeatable.")
+        list[int] | None, typer.Option("--accept", metavar="FIX", help="Keep this fix. Repeatable.")
     ] = None,
     reject: Annotated[
-        list[int] | None, typer.Option("--reject", metavar="FIX", help="With --factors: leave it out. Repeatable.")
+        list[int] | None, typer.Option("--reject", metavar="FIX", help="Leave it out. Repeatable.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder for the bent map, with --factors.")
@@ -75,7 +75,9 @@ def georeference(
     """
     from app.georeference import ledger
     from app.georeference.align import align
-    from app.georeference.control import lay_on_control
+    from app.georeference.control import CONTROL, PICKS, lay_on_control, read_picks
+    from app.georeference.tables import read_table
+    from app.mapping.earth import fixes_of
     from app.slam.trajectory import read_tum
 
     if (control is None) != (picks is None) or (control is not None and (gnss is not None or lever_arm is not None)):
@@ -84,17 +86,22 @@ def georeference(
         raise HemislamError("--factors and --out go together, for fixes.")
     if out is not None and out.resolve() == results.resolve():
         raise HemislamError("The bent map would replace the one that it is made from; give --out another folder.")
-    if (accept or reject) and not factors:
-        raise HemislamError("--accept and --reject belong to --factors.")
+    if (accept or reject) and control is not None:
+        raise HemislamError("--accept and --reject are for fixes.")
     trajectory = read_tum(results / "trajectory.tum")
     if control is not None and picks is not None:
-        found = lay_on_control(control, picks, grid=crs, height=height or "ellipsoidal")
+        picked = read_picks(read_table(picks, *PICKS))
+        found = lay_on_control(read_table(control, *CONTROL), picked, grid=crs, height=height or "ellipsoidal")
         lines = [*ledger.summary(found, "control points"), "", *ledger.table(found)]
     else:
-        fixes, told = _fixes_of(results, trajectory, gnss)
-        found = align(trajectory, fixes, grid=crs, height=height or told, lever=lever_arm)
+        recording = results if gnss is not None else _recording_of(results)
+        fixes, told = fixes_of(recording, gnss, int(trajectory.stamps_ns[0]))
+        overruled = {str(fix): fix in (accept or []) for fix in (*(accept or []), *(reject or []))}
+        found = align(trajectory, fixes, grid=crs, height=height or told, lever=lever_arm, overruled=overruled)
+        if unknown := sorted(set(overruled) - set(found.names)):
+            raise HemislamError(f"There is no fix {unknown[0]} within the walk; gnss_residuals.csv lists all.")
         if out is not None:
-            found, trajectory = _bent(results, out, fixes, found, accept or [], reject or [], replace=force)
+            found, trajectory = _bent(results, out, fixes, found, overruled, replace=force)
             results = out
         lines = ledger.summary(found, "fixes")
         if not found.used.all():
@@ -103,47 +110,21 @@ def georeference(
     _write(results, found, trajectory)
 
 
-def _fixes_of(results: Path, trajectory: "Trajectory", gnss: Path | None) -> "tuple[Fixes, str]":
-    """Those of a file or of the recording, and what their heights are above."""
-    from app.georeference.reference import ELLIPSOIDAL
-    from app.georeference.tables import read_fixes
-    from app.sensors.navsat import recorded_fixes
-
-    if gnss is not None:
-        return read_fixes(gnss, int(trajectory.stamps_ns[0]))
-    return recorded_fixes(_recording_of(results)), ELLIPSOIDAL
-
-
 def _bent(
-    results: Path, out: Path, fixes: "Fixes", found: "Alignment", accept: list[int], reject: list[int], *, replace: bool
+    results: Path, out: Path, fixes: "Fixes", found: "Alignment", overruled: dict[str, bool], *, replace: bool
 ) -> "tuple[Alignment, Trajectory]":
     """Write trajectory and map, bent by the fixes, to `out`, and remove what another run has left there."""
-    import dataclasses
-
-    import numpy as np
-
     from app.export.folder import read_results
     from app.export.results import BY_RUN, save_results
-    from app.georeference.bend import bend
-    from app.slam.loops.files import LoopResults
-    from app.slam.loops.solvers import read_g2o
-    from app.slam.map_frame import MapFrame
+    from app.mapping.earth import bent
 
-    before = read_results(results)
-    stamps_ns = np.array([before.keyframes[index].stamp_ns for index in range(len(before.keyframes))], np.int64)
-    try:
-        graph = read_g2o(results / "graph.g2o")
-    except (OSError, RuntimeError):
-        raise HemislamError(f"{results} has no graph.g2o; run the recording with loops.enabled.") from None
-    names = [[str(number) for number in one] for one in (accept, reject)]
-    corrections, found = bend(before.trajectory, stamps_ns, graph, fixes, found, accept=names[0], reject=names[1])
-    loops = LoopResults(MapFrame(stamps_ns, corrections), stamps_ns, (), "")
-    after = dataclasses.replace(before, loops=loops, where=found.reference)
-    bent = [one for one in BY_RUN if one.name in ("trajectory.tum", "map.ply")]
-    save_results(out, after, bent, replace=replace)
-    for other in set(BY_RUN) - set(bent):
+    after, _ = bent(read_results(results), fixes, found, overruled)
+    assert after.found is not None
+    files = [one for one in BY_RUN if one.name in ("trajectory.tum", "map.ply")]
+    save_results(out, after, files, replace=replace)
+    for other in set(BY_RUN) - set(files):
         (out / other.name).unlink(missing_ok=True)
-    return found, after.trajectory
+    return after.found, after.trajectory
 
 
 def _recording_of(results: Path) -> Path:
@@ -161,10 +142,6 @@ def _write(results: Path, found: "Alignment", trajectory: "Trajectory") -> None:
     from app.evaluation.report import write_texts
     from app.georeference import ledger, reference
 
-    texts = {
-        reference.FILE: found.reference.to_json(),
-        reference.RESIDUALS: ledger.residuals_csv(found),
-        reference.PLOT: georeference_plot(found, trajectory.positions),
-    }
+    texts = ledger.files(found) | {reference.PLOT: georeference_plot(found, trajectory.positions)}
     write_texts(results, texts)
     typer.echo(f"Written to {results}: {', '.join(texts)}")

@@ -148,6 +148,8 @@ def save(session: "Session", folder: Path, stop: BaseException | None, *, replac
     stopped = "" if stop is None else str(stop) or type(stop).__name__
     report = session.save(folder, replace=replace, stopped=stopped, calibration=calibration).result()
     typer.echo(summarise(report, folder))
+    if problem := report.get("georeference", {}).get("problem"):
+        typer.echo(problem)
     if session.loops:
         for notice in (*session.loops.take_notices(), *session.loops.take_alarms()):
             typer.echo(notice)

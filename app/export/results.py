@@ -18,7 +18,8 @@ import numpy.typing as npt
 from app.export import map_file
 from app.export.points import EVERYTHING, Block, Choice, blocks
 from app.export.raster import CELL, Raster, rasterise
-from app.georeference import reference
+from app.georeference import ledger, reference
+from app.georeference.align import Alignment
 from app.georeference.reference import GeoReference
 from app.slam import report
 from app.slam.errors import HemislamError
@@ -43,7 +44,8 @@ class Results:
 
     Attributes:
         loops: None if loops were not searched. report: what report.json holds; complete once it is written.
-        choice: of points. where: on Earth the map is, if that is known.
+        choice: of points. where: on Earth the map is, if that is known. found: how fixes or points lie on it, if it is
+            these results that they were laid on. problem: why they could not be, in a sentence.
         marks: what was measured, each a name and its spots: keyframe and (x, y, z) m in its IMU frame.
         progress: called with the share of the points that a file has got, 0-1, for each file.
     """
@@ -55,6 +57,8 @@ class Results:
     report: dict[str, Any] = field(default_factory=dict)
     choice: Choice = EVERYTHING
     where: GeoReference | None = None
+    found: Alignment | None = None
+    problem: str = ""
     marks: tuple[Mark, ...] = ()
     progress: Callable[[float], None] = lambda share: None
     _rasters: dict[tuple[bool, float], Raster] = field(default_factory=dict, repr=False)
@@ -132,6 +136,8 @@ def _write_graph(path: Path, results: Results) -> None:
 def _write_report(path: Path, results: Results) -> None:
     loops, info = results.loops, results.info
     made = report.make_report(results.log, results.trajectory, info) | {"map": results.report.get("map")}
+    if results.found is not None or results.problem:
+        made["georeference"] = ledger.report(results.found) if results.found else {"problem": results.problem}
     made["loops"] = {verdict.value: loops.count(verdict) for verdict in Verdict} if loops else None
     if loops and info.truth is not None:
         made["accuracy_odometry"] = report.accuracy(results.log.odometry, info)
@@ -233,15 +239,18 @@ def save_results(
     prepare_folder(folder, replace=replace)
     written = [export for export in exports if results.loops or not export.of_loops]
     if results.where is None and (lost := [export.name for export in written if export.on_earth]):
-        raise HemislamError(f"{lost[0]} needs to know where on Earth the map is; run hemislam georeference first.")
+        unknown = f"{lost[0]} needs to know where on Earth the map is; see Georeference in the page, or the command."
+        raise HemislamError(results.problem or unknown)
     parts, show = {export.name: folder / f".{export.name}.part" for export in written}, results.progress
     try:
         for number, export in enumerate(written):
             results.progress = _progress_of(number, len(written), show)
             export.write(parts[export.name], results)
-        if results.where is None and {"map.ply", "trajectory.tum"} & parts.keys():
+        if {"map.ply", "trajectory.tum"} & parts.keys() and (results.where is None or results.found is not None):
             for name in (reference.FILE, reference.RESIDUALS, reference.PLOT):
                 (folder / name).unlink(missing_ok=True)  # of an older map
+            for name, text in ledger.files(results.found).items() if results.found is not None else ():
+                (folder / name).write_text(text, encoding="utf-8")
         for export in exports:
             if export in written:
                 parts[export.name].replace(folder / export.name)

@@ -7,8 +7,9 @@ The model of a fix g, in metres east, north and up, stamped s:
 where p, R is T_map_imu. The map's z is up already. Its shape does not change.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -115,13 +116,22 @@ class WalkedPath:
 
 
 def align(
-    trajectory: Trajectory, fixes: Fixes, *, grid: str = "", height: str = ELLIPSOIDAL, lever: Vector | None = None
+    trajectory: Trajectory,
+    fixes: Fixes,
+    *,
+    grid: str = "",
+    height: str = ELLIPSOIDAL,
+    lever: Vector | None = None,
+    offset_s: float | None = None,
+    overruled: Mapping[str, bool] = MappingProxyType({}),
 ) -> Alignment:
     """Find where a trajectory lies by fixes that are in order of time; those before and after it do not matter.
 
     Args:
         trajectory: T_map_imu with z up. grid: a projected system; "": the UTM zone there. height: what the heights of
             the fixes are above. lever: m from the IMU to the antenna, IMU frame; None: found, if the fixes tell it.
+        offset_s: how much later the fixes are stamped than measured; None: found. overruled: whether fixes of these
+            names count, whatever their residuals.
 
     Raises:
         HemislamError: the fixes do not fit the trajectory in time or place, or tell no heading.
@@ -137,10 +147,21 @@ def align(
     ground = Ground.of(fixes, grid)
     notes: list[str] = []
     arm = np.array(lever or (0.0, 0.0, 0.0))
-    offset, median = _coarse(path, seconds, ground.places, arm)
+    seconds = seconds - (offset_s or 0.0)
+    offset, median = _coarse(path, seconds, ground.places, arm, search=offset_s is None)
     _refuse_swapped(path, seconds, fixes, median)
     known = path.known(seconds - offset)
-    problem = _Problem(path, seconds[known], ground.places[known], fixes.sigmas[known], arm, offset, lever is None)
+    names = tuple(str(number) for number in rows[known] + 1)
+    problem = _Problem(
+        path,
+        seconds[known],
+        ground.places[known],
+        fixes.sigmas[known],
+        as_told(overruled, names),
+        arm,
+        offset if offset_s is None else None,
+        lever is None,
+    )
     if (blind := np.isnan(problem.sigmas.sum(axis=1))).any():
         notes.append("Fixes come without a covariance; how far they scatter about the map stands for it.")
         problem = replace(problem, sigmas=np.where(blind[:, None], median / MEDIAN_SIGMAS, problem.sigmas))
@@ -151,7 +172,7 @@ def align(
         notes.append("The motion does not tell the antenna's lever arm; it is taken as zero, give it if it is not.")
         problem = replace(problem, lever_free=False)
         solved = problem.solve()
-    if not solved.offset_sigma < WORST_OFFSET_S:
+    if offset_s is None and not solved.offset_sigma < WORST_OFFSET_S:
         notes.append("The motion does not tell the clocks' offset; it is taken as zero.")
         solved = replace(problem, offset=None).solve()
     if not solved.yaw_sigma < WORST_YAW:
@@ -161,18 +182,23 @@ def align(
     reference = ground.reference(solved.yaw, solved.shift, height)
     return Alignment(
         reference,
-        tuple(str(number) for number in rows[known] + 1),
+        names,
         ground.grid[known],
         solved.residuals,
         solved.distances,
         solved.used,
-        solved.offset,
+        solved.offset + (offset_s or 0.0),
         solved.offset_sigma,
         solved.yaw_sigma,
         (float(solved.lever[0]), float(solved.lever[1]), float(solved.lever[2])),
         solved.lever_sigma,
         tuple(notes),
     )
+
+
+def as_told(overruled: Mapping[str, bool], names: Sequence[str]) -> F64:
+    """(n,) 1 or 0 where the user says that what has this name counts or does not, nan elsewhere."""
+    return np.array([float(overruled.get(name, np.nan)) for name in names], np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +264,7 @@ class _Problem:
     """What is known: (n,) times, (n, 3) places on the ground and their sigmas.
 
     Attributes:
+        told: (n,) 1 or 0 where the user says that a fix counts or does not, nan elsewhere.
         lever: m, IMU frame, as given. offset: s, to start from; None: there is none.
         lever_free: whether the lever arm is to be found instead.
     """
@@ -246,6 +273,7 @@ class _Problem:
     seconds: F64
     places: F64
     sigmas: F64
+    told: F64
     lever: F64
     offset: float | None
     lever_free: bool
@@ -253,9 +281,11 @@ class _Problem:
     def solve(self) -> _Solved:
         """All unknowns at once, first robustly, then by the fixes that agree."""
         late, free = self.offset is not None, self.lever_free
-        yaw, shift, _ = _laid(self.path.antenna(self.seconds - (self.offset or 0.0), self.lever), self.places)
+        some = self.told != 0
+        antenna = self.path.antenna(self.seconds[some] - (self.offset or 0.0), self.lever)
+        yaw, shift, _ = _laid(antenna, self.places[some])
         start = np.r_[yaw, shift, [self.offset] * late, [0.0] * (3 * free)].astype(np.float64)
-        x, used = _robust(self._errors, start)
+        x, used = _robust(self._errors, start, self.told)
         R, shift, offset, arm = self._model(x)
         errors = self._errors(x)
         J = _jacobian(lambda x: self._errors(x)[used].ravel(), x)
@@ -294,14 +324,17 @@ def _deviations(J: F64) -> F64:
     return np.asarray(np.sqrt((vectors**2 / values).sum(axis=1)) / lengths)
 
 
-def _robust(errors: Callable[[F64], F64], start: F64) -> tuple[F64, Mask]:
-    """The optimum by what agrees, and which that is. errors: (n, 3) whitened."""
-    x = np.asarray(_least_squares(lambda x: errors(x).ravel(), start, loss="cauchy", f_scale=2.0, x_scale="jac").x)
-    used = np.ones(len(errors(x)), bool)
+def _robust(errors: Callable[[F64], F64], start: F64, told: F64) -> tuple[F64, Mask]:
+    """The optimum by what agrees or the user insists on, and which that is. errors: (n, 3) whitened. told: (n,)."""
+    used = np.asarray(told != 0)
+    if used.sum() < FEWEST:
+        raise HemislamError(f"Only {used.sum()} fixes are left, {FEWEST} are needed; accept some of them again.")
+    first = _least_squares(lambda x: errors(x)[used].ravel(), start, loss="cauchy", f_scale=2.0, x_scale="jac")
+    x = np.asarray(first.x)
     for _ in range(10):
         distances = np.linalg.norm(errors(x), axis=1)
         scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
-        agree = distances < MOST_SIGMAS * scale
+        agree = ((distances < MOST_SIGMAS * scale) | (told == 1)) & (told != 0)
         if agree.sum() < 3:
             break
         x = np.asarray(_least_squares(lambda x, w=agree: errors(x)[w].ravel(), x, x_scale="jac").x)
@@ -317,11 +350,11 @@ def _jacobian(function: Callable[[F64], F64], x: F64) -> F64:
     return np.stack(columns, axis=1)
 
 
-def _coarse(path: WalkedPath, seconds: F64, places: F64, lever: F64) -> tuple[float, float]:
-    """The offset (s) with which the fixes fit best, and how far off (m) they are then in the median."""
+def _coarse(path: WalkedPath, seconds: F64, places: F64, lever: F64, *, search: bool = True) -> tuple[float, float]:
+    """The offset (s; 0 without a search) with which the fixes fit best, and how far off (m) they are in the median."""
     few = np.unique(np.linspace(0, len(seconds) - 1, COARSE_FIXES).astype(int))
     best = (np.inf, 0.0, np.inf)
-    offsets = np.arange(-SEARCH_S, SEARCH_S + COARSE_S / 2, COARSE_S)
+    offsets = np.arange(-SEARCH_S, SEARCH_S + COARSE_S / 2, COARSE_S) if search else np.zeros(1)
     for offset in offsets[np.argsort(np.abs(offsets), kind="stable")].tolist():
         t = seconds[few] - offset
         inside = path.known(t)

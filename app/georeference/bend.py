@@ -5,12 +5,12 @@
 Fixes that do not fit even a bent map are rejected; the user's word on a fix overrules that.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from app.georeference.align import MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, Mask, WalkedPath, offset_by_parts
+from app.georeference.align import MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, Mask, WalkedPath, as_told, offset_by_parts
 from app.georeference.fixes import Fixes
 from app.slam import lie
 from app.slam.arrays import F64, I64
@@ -29,31 +29,29 @@ def bend(
     graph: Sequence[Closing],
     fixes: Fixes,
     found: Alignment,
-    *,
-    accept: Collection[str] = (),
-    reject: Collection[str] = (),
+    overruled: Mapping[str, bool],
 ) -> tuple[F64, Alignment]:
     """Solve the graph with the fixes.
 
     Args:
         trajectory: T_map_imu at all scans, keyframes among them. graph: odometry and loops of the keyframes.
-        found: how the fixes lie on the map as it is. accept, reject: names of fixes on which the user has decided.
+        found: how the fixes lie on the map as it is. overruled: whether fixes of these names count, whatever their
+            residuals.
 
     Returns:
         (k, 4, 4) T_bent_map at each keyframe, and how the fixes lie on the bent map.
 
     Raises:
-        HemislamError: there are no such fixes, or the solver fails.
+        HemislamError: the solver fails.
     """
-    if unknown := sorted({*accept, *reject} - set(found.names)):
-        raise HemislamError(f"There is no fix {unknown[0]} within the walk; gnss_residuals.csv lists all.")
     before = WalkedPath(trajectory).poses((keyframe_stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
     if np.isfinite(found.offset_sigma_s):
         offset_s = offset_by_parts(trajectory, fixes, found)
         told = f"Clock offset by stretches of the walk: {offset_s * 1e3:.1f} ms."
         found = replace(found, offset_s=offset_s, offset_sigma_s=float("nan"), notes=(*found.notes, told))
     priors = _priors(trajectory, keyframe_stamps_ns, before, fixes, found)
-    held, barred = np.isin(found.names, [*accept]), np.isin(found.names, [*reject])
+    word = as_told(overruled, found.names)
+    held, barred = np.asarray(word == 1.0), np.asarray(word == 0.0)
     chosen = [replace(prior, robust=True) for prior, no in zip(priors, barred, strict=True) if not no]
     try:
         poses = optimise(before[0], [*graph, *chosen], before, free=True)

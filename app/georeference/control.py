@@ -1,73 +1,93 @@
 """Lays a map on control points: known places, each picked in the map."""
 
-from pathlib import Path
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 
 from app.georeference import crs
-from app.georeference.align import Alignment, Ground
+from app.georeference.align import Alignment, Ground, Mask
 from app.georeference.fixes import Fixes
 from app.georeference.reference import ELLIPSOIDAL
-from app.georeference.tables import read_table
+from app.georeference.tables import NamedColumns
 from app.slam.arrays import F64
 from app.slam.errors import HemislamError
 
+CONTROL = ("name", "east", "north", "height", "latitude", "longitude")
+PICKS = ("name", "x", "y", "z")
+"""Columns of the two tables."""
 LEAST_WIDTH = 0.02
 """Of control points beside the line through them, as a share of their length along it."""
 
 
-def lay_on_control(control: Path, picks: Path, *, grid: str = "", height: str = ELLIPSOIDAL) -> Alignment:
+def lay_on_control(
+    control: NamedColumns,
+    picked: Mapping[str, F64],
+    *,
+    grid: str = "",
+    height: str = ELLIPSOIDAL,
+    overruled: Mapping[str, bool] = MappingProxyType({}),
+) -> Alignment:
     """Where a map lies by the least squares of control points, turned about all axes. Its shape does not change.
 
     Args:
-        control: table of name, E, N, H in `grid`, or name, latitude, longitude, height.
-        picks: table of name, x, y, z, m in the map. height: what heights are above.
+        control: name, E, N, H in `grid`, or name, latitude, longitude, height. picked: (3,) m in the map, by name.
+        height: what heights are above. overruled: False for points that do not count.
 
     Raises:
-        HemislamError: a table cannot be read, or the points leave the map's place open.
+        HemislamError: a table cannot be used, or the points leave the map's place open.
     """
     name, places = read_places(control, grid)
-    table = read_table(picks, "name", "x", "y", "z")
-    if not table.has("name", "x", "y", "z"):
-        raise HemislamError(f"{picks} holds no picked points; its first line must name the columns name, x, y, z.")
-    picked = dict(zip(table.columns["name"], table.numbers("x", "y", "z"), strict=True))
     names = [one for one in places if one in picked]
-    if len(names) < 3:
-        found = f"only {', '.join(names)}" if names else "none"
-        raise HemislamError(
-            f"At least 3 control points must be picked in the map, but of {control} {found} is in {picks};"
-            " with fewer, the map may still turn."
-        )
+    used = np.array([overruled.get(one, True) for one in names], bool)
+    count = [one for one, uses in zip(names, used, strict=True) if uses]
+    if len(count) < 3:
+        raise HemislamError(_left_open(count))
     there, at = np.array([places[one] for one in names]), np.array([picked[one] for one in names])
     if not np.isfinite([there, at]).all():
-        raise HemislamError(f"A control point of {control} or {picks} lacks a coordinate; fill it in or remove it.")
-    _refuse_line(at, names)
-    return _fitted(at, Ground.in_grid(there, name), tuple(names), height)
+        raise HemislamError(f"A control point of {control.source} lacks a coordinate; fill it in or remove it.")
+    _refuse_line(at[used], count)
+    return _fitted(at, Ground.in_grid(there, name), tuple(names), used, height)
 
 
-def read_places(path: Path, grid: str = "") -> tuple[str, dict[str, F64]]:
+def read_picks(table: NamedColumns) -> dict[str, F64]:
+    """(3,) m in the map by name. Raises HemislamError: it lacks columns."""
+    if not table.has(*PICKS):
+        raise HemislamError(
+            f"{table.source} holds no picked points; its first line must name the columns name, x, y, z."
+        )
+    return dict(zip(table.columns["name"], table.numbers("x", "y", "z"), strict=True))
+
+
+def _left_open(names: list[str]) -> str:
+    """What fewer than three points leave open, in a sentence."""
+    found = f"only {' and '.join(names)} {'is' if len(names) == 1 else 'are'}" if names else "none is"
+    rest = ("where the map lies", "how the map is turned", "how the map is turned about the line through both")
+    return f"At least 3 control points must be picked in the map, but {found}: it stays open {rest[len(names)]}."
+
+
+def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64]]:
     """The grid and (3,) easting, northing, height of each control point by name.
 
     Raises:
-        HemislamError: it cannot be read, or lacks columns or the grid.
+        HemislamError: it lacks columns or the grid.
     """
-    table = read_table(path, "name", "east", "north", "height", "latitude", "longitude")
     if table.has("name", "east", "north", "height"):
         if not grid:
-            raise HemislamError(f"{path} holds eastings and northings; say of which grid with --crs EPSG:CODE.")
+            raise HemislamError(f"{table.source} holds eastings and northings; say of which grid: EPSG:CODE.")
         crs.projected(grid)
         numbers = table.numbers("east", "north", "height")
     elif table.has("name", "latitude", "longitude", "height"):
         degrees = table.numbers("latitude", "longitude", "height")
-        every = Fixes.of(np.arange(len(degrees)), degrees).sound(str(path))
+        every = Fixes.of(np.arange(len(degrees)), degrees).sound(table.source)
         ground = Ground.of(every, grid)
         grid = ground.name
         numbers = np.full(degrees.shape, np.nan)
         numbers[every.stamps_ns] = ground.grid
     else:
         raise HemislamError(
-            f"{path} holds no control points; its first line must name the columns name, E, N, H, or name, latitude,"
-            " longitude, height."
+            f"{table.source} holds no control points; its first line must name the columns name, E, N, H, or name,"
+            " latitude, longitude, height."
         )
     return grid, dict(zip(table.columns["name"], numbers, strict=True))
 
@@ -82,10 +102,10 @@ def _refuse_line(points: F64, names: list[str]) -> None:
         )
 
 
-def _fitted(points: F64, ground: Ground, names: tuple[str, ...], height: str) -> Alignment:
+def _fitted(points: F64, ground: Ground, names: tuple[str, ...], used: Mask, height: str) -> Alignment:
     """The rigid transform with the least squares of distances (Arun et al. 1987, Umeyama 1991)."""
-    middle, there = points.mean(axis=0), ground.places.mean(axis=0)
-    u, _, vt = np.linalg.svd((ground.places - there).T @ (points - middle))
+    middle, there = points[used].mean(axis=0), ground.places[used].mean(axis=0)
+    u, _, vt = np.linalg.svd((ground.places - there)[used].T @ (points - middle)[used])
     R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     shift = there - R @ middle
     residuals = ground.places - points @ R.T - shift
@@ -93,13 +113,13 @@ def _fitted(points: F64, ground: Ground, names: tuple[str, ...], height: str) ->
     notes = [f"The control points tilt the map by {tilt:.3f}° against gravity."]
     if tilt > 2.0:
         notes.append("Gravity knows better: check the heights, the names, and whether x, y, z are of this map.")
-    rms = float(np.sqrt((residuals**2).sum() / max(3 * len(points) - 6, 1)))
+    rms = float(np.sqrt((residuals[used] ** 2).sum() / max(3 * used.sum() - 6, 1)))
     return Alignment(
         ground.reference(R, shift, height),
         names,
         ground.grid,
         residuals,
         np.linalg.norm(residuals, axis=1) / max(rms, 1e-9),
-        np.ones(len(points), bool),
+        used,
         notes=tuple(notes),
     )

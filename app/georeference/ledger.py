@@ -2,10 +2,11 @@
 
 import csv
 import io
+from typing import Any
 
 import numpy as np
 
-from app.georeference import crs
+from app.georeference import crs, reference
 from app.georeference.align import Alignment
 
 COLUMNS = (
@@ -23,6 +24,18 @@ def residuals_csv(alignment: Alignment) -> str:
         numbers = [f"{value:.4f}" for value in (*place, *off)]
         writer.writerow([name, *numbers, f"{sigmas:.2f}" if np.isfinite(sigmas) else "", verdict])
     return out.getvalue()
+
+
+def files(alignment: Alignment) -> dict[str, str]:
+    """What is written beside the results: texts by name of the file."""
+    return {reference.FILE: alignment.reference.to_json(), reference.RESIDUALS: residuals_csv(alignment)}
+
+
+def report(alignment: Alignment) -> dict[str, Any]:
+    """What report.json says of it."""
+    rms = dict(zip(("east_m", "north_m", "height_m"), alignment.rms.tolist(), strict=True))
+    counts = {"used": int(alignment.used.sum()), "of": len(alignment.used)}
+    return {"crs": alignment.reference.crs, "height": alignment.reference.height, "rms": rms, **counts}
 
 
 def summary(alignment: Alignment, what: str) -> list[str]:

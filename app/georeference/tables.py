@@ -44,7 +44,7 @@ _NAMES = {
 class NamedColumns:
     """A table that was read. columns: (n,) texts by what they are; only those that have a name above."""
 
-    path: Path
+    source: str
     columns: Mapping[str, Sequence[str]]
 
     def __len__(self) -> int:
@@ -61,22 +61,27 @@ class NamedColumns:
                 try:
                     out[row, at] = float(word) if word else np.nan
                 except ValueError:
-                    raise HemislamError(f"{self.path}, row {row + 1}: `{word[:40]}` is no number ({name}).") from None
+                    raise HemislamError(f"{self.source}, row {row + 1}: `{word[:40]}` is no number ({name}).") from None
         return out
 
 
 def read_table(path: Path, *wanted: str) -> NamedColumns:
+    """As `table_of`, of a file. Raises HemislamError as well if it cannot be read."""
+    return table_of(_lines(path), str(path), *wanted)
+
+
+def table_of(lines: Sequence[str], source: str, *wanted: str) -> NamedColumns:
     """A table with a heading, separated by commas, semicolons or spaces; `#` begins a comment.
 
     Args:
-        wanted: what columns are asked for, where a heading may mean several things.
+        source: as errors name it. wanted: what columns are asked for, where a heading may mean several things.
 
     Raises:
-        HemislamError: it cannot be read, or has no heading, or a row is cut.
+        HemislamError: it has no heading, or a row is cut.
     """
-    rows = [line for line in _lines(path) if line.strip() and not line.lstrip().startswith("#")]
+    rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not rows:
-        raise HemislamError(f"{path} is empty.")
+        raise HemislamError(f"{source} is empty.")
     separator = next((one for one in ",;\t" if one in rows[0]), None)
     if separator:
         cells = [[cell.strip() for cell in row] for row in csv.reader(rows, delimiter=separator)]
@@ -90,8 +95,8 @@ def read_table(path: Path, *wanted: str) -> NamedColumns:
             known[what] = found[0]
     body = cells[1:]
     if cut := next((row for row, one in enumerate(body, 1) if len(one) < len(titles)), 0):
-        raise HemislamError(f"{path}, row {cut} has {len(body[cut - 1])} columns, but its heading {len(titles)}.")
-    return NamedColumns(path, {what: [row[at] for row in body] for what, at in known.items()})
+        raise HemislamError(f"{source}, row {cut} has {len(body[cut - 1])} columns, but its heading {len(titles)}.")
+    return NamedColumns(source, {what: [row[at] for row in body] for what, at in known.items()})
 
 
 def read_fixes(path: Path, near_ns: int) -> tuple[Fixes, str]:
@@ -143,7 +148,7 @@ def _stamp(table: NamedColumns, word: str) -> int:
         return _nanoseconds(word)
     except (ValueError, OverflowError):
         raise HemislamError(
-            f"{table.path}: the time `{word[:40]}` is neither Unix seconds nor a date such as 2026-05-01T10:00:00Z."
+            f"{table.source}: the time `{word[:40]}` is neither Unix seconds nor a date such as 2026-05-01T10:00:00Z."
         ) from None
 
 
@@ -166,7 +171,7 @@ def _of_week(table: NamedColumns, near_ns: int) -> list[int]:
     if (wrong := ~(np.abs(seconds) < MOST_S)).any():
         row = int(np.argmax(wrong))
         word = table.columns["week_s"][row][:40]
-        raise HemislamError(f"{table.path}, row {row + 1}: the time `{word}` is not in GPS seconds.")
+        raise HemislamError(f"{table.source}, row {row + 1}: the time `{word}` is not in GPS seconds.")
     now = near_ns * 1e-9 - GPS_EPOCH_S + LEAP_S
     weeks = round((now - float(seconds[0])) / WEEK_S)
     start = (weeks * WEEK_S + GPS_EPOCH_S - LEAP_S) * 1_000_000_000

@@ -11,7 +11,9 @@ import numpy as np
 
 from app.export.points import EVERYTHING, Choice
 from app.export.results import BY_RUN, Results, of_formats, save_results
+from app.georeference.survey import Survey
 from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
+from app.mapping.earth import lay, lay_if_possible
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelledKeyframes
 from app.mapping.session_file import SUFFIX, Measure, Opened, SavedSession, State, size_of, write_session
@@ -54,6 +56,7 @@ class Session:
         params: for frames not yet processed; set them with `choose`.
         history: parameters by the frame from which they apply, ascending.
         ended: the feed has no more to give. keyframes: with the labels that the user gave them.
+        survey: what lays the results on Earth; None: nothing does. by_fixes: what bent the map when it was last laid.
 
     Raises:
         HemislamError: the truth cannot be read.
@@ -79,6 +82,9 @@ class Session:
         self.ended = False
         self.frames: Log[Frame] = Log()
         self.keyframes = LabelledKeyframes(engine.keyframes)
+        self.survey: Survey | None = None
+        self.by_fixes = _NO_LOOPS
+        self._shown = _NO_LOOPS, _NO_LOOPS, _NO_LOOPS
         self.checkpoints = checkpoints
         self._waiting: Measurement | None = None
         self._dropped: tuple[str, ...] = ()  # why scans since the newest frame were
@@ -176,6 +182,13 @@ class Session:
         """Where loops lay odometry in the map, at the newest frame."""
         return self.loops.frame if self.loops else _NO_LOOPS
 
+    @property
+    def shown_frame(self) -> MapFrame:
+        """The same, bent by fixes as far as is known."""
+        if self._shown[0] is not self.map_frame or self._shown[1] is not self.by_fixes:
+            self._shown = self.map_frame, self.by_fixes, self.by_fixes.over(self.map_frame)
+        return self._shown[2]
+
     # --- parameters and edits --------------------------------------------------------------------
     def choose(self, params: Params) -> None:
         """Use these for all frames not yet processed, except those that take effect on restart."""
@@ -202,6 +215,7 @@ class Session:
         if state.edits or state.undone:
             self.edit_loops(state.edits, state.undone)
         self.history, self.planned, self.keyframes.edits = state.history, saved.frame, state.labels
+        self.survey = state.survey
 
     @property
     def edits(self) -> tuple[tuple[LoopEdit, ...], tuple[LoopEdit, ...]]:
@@ -345,14 +359,21 @@ class Session:
         """
         results = self.results(stopped, calibration, session.state.measures if session is not None else ())
         results.choice, results.progress = choice, progress
+        survey, edits = self.survey, self.edits[0]
 
         def write() -> dict[str, Any]:
-            report = save_results(folder, results, of_formats(formats) if formats else BY_RUN, replace=replace)
+            laid = lay_if_possible(results, survey, edits)
+            report = save_results(folder, laid, of_formats(formats) if formats else BY_RUN, replace=replace)
             if session is not None and not formats:
                 write_session(folder / f"session{SUFFIX}", session)
             return report
 
         return self._saves.submit(write)
+
+    def lay_on_earth(self) -> "Future[tuple[Results, MapFrame]]":
+        """Find where the map as it is now lies by the survey, in a thread of its own; as `lay`."""
+        assert self.survey is not None
+        return self._saves.submit(lay, self.results(), self.survey, self.edits[0])
 
     def finish_saves(self) -> None:
         """Wait until no save is under way."""

@@ -32,6 +32,7 @@ from pydantic import (
 )
 
 from app import __version__
+from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.labels import LabelEdit
 from app.slam.errors import HemislamError
@@ -122,7 +123,7 @@ class State:
     edits: of loops, in force. undone: those that can be redone, the next one last. labels: edits of labels.
     truth: trajectory to compare with. notes: in the order in which they were made. speed: to play at.
     views: where cameras stood that the user kept, and what they looked at, (x, y, z) each, m, in the map.
-    measures: what was measured in the map.
+    measures: what was measured in the map. survey: what lays it on Earth.
     """
 
     params: _Params
@@ -136,6 +137,7 @@ class State:
     labels: tuple[_LabelEdit, ...] = ()
     views: tuple[KeptView, ...] = ()
     measures: tuple[Measure, ...] = ()
+    survey: Survey | None = None
 
 
 _OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)

@@ -24,6 +24,7 @@ from app.mapping.session_file import (
     read_session,
 )
 from app.server import protocol
+from app.server.laying import Laying
 from app.server.loop_commands import LoopCommands
 from app.server.player import Player
 from app.server.protocol import Command
@@ -53,6 +54,7 @@ _FOR_THE_FRAME = (
     | protocol.AddNote
     | protocol.KeepView
     | protocol.KeepMeasure
+    | protocol.LayOnEarth
     | protocol.CompareWith
     | protocol.Save
 )
@@ -84,6 +86,7 @@ class Controller:
     ) -> None:
         self._page = page
         self._loops, self._player, self._writer = LoopCommands(page), Player(page, clock), SessionWriter()
+        self._laying = Laying(page)
         self._saves: deque[tuple[Path, Future[Any]]] = deque()
         self._share = 0.0  # of a save that is written
         self._shown_share: protocol.Progress | None = None
@@ -149,6 +152,8 @@ class Controller:
                 self._show_measures((*self._measures, measure)[-MOST_MEASURES:])
             case protocol.DropMeasure(measure):
                 self._show_measures(tuple(kept for kept in self._measures if kept != measure))
+            case protocol.LayOnEarth(survey):
+                self._need_session().survey = survey
             case protocol.SetParams(values):
                 self._set_params(self._params.with_values(values))
             case protocol.LoadParams(text):
@@ -261,7 +266,8 @@ class Controller:
                 self._handle_waiting()
         saving = POLL_S if self._saves else None
         loops = self._loops.update(session, show=not self._player.page_behind)
-        waits = [wait, saving, POLL_S if loops else None, self._player.look_at_source(session)]
+        laying = self._resuming is None and self._laying.update(session, still=self._player.still)
+        waits = [wait, saving, POLL_S if loops or laying else None, self._player.look_at_source(session)]
         return min((seconds for seconds in waits if seconds is not None), default=None)
 
     def _state(self, session: Session) -> State:
@@ -275,6 +281,7 @@ class Controller:
             notes=self._notes,
             views=self._views,
             measures=self._measures,
+            survey=session.survey,
             breakpoints=self._player.breakpoints,
             speed=self._page.transport.speed,
             labels=session.keyframes.edits,
@@ -319,6 +326,7 @@ class Controller:
         before, notes, views, measures = self._need_session(), self._notes, self._views, self._measures
         info, edits = before.feed.info, Edits(*before.edits)
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
+        session.survey = before.survey
         self._take(session)
         self._show_notes(notes)
         self._show_views(views)

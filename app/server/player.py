@@ -102,6 +102,11 @@ class Player:
         self._pacer.release()
         self._target = SeekTarget(0, -1) if session.frame < 0 else None
 
+    @property
+    def still(self) -> bool:
+        """Whether the session stays at its frame."""
+        return self._target is None and not self._page.transport.playing and not self.page_behind
+
     def play(self) -> None:
         self._pacer.release()
         self._page.show(playing=True)

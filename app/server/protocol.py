@@ -11,6 +11,8 @@ from typing import Any, Literal
 
 import msgspec
 
+from app.georeference.align import Alignment
+from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import KeptView, Measure, Note, Speed
 from app.sensors.findings import Finding
@@ -101,6 +103,12 @@ class DropMeasure(Command, frozen=True):
     """Delete a measure from the session."""
 
     measure: Measure
+
+
+class LayOnEarth(Command, frozen=True):
+    """Lay the map on Earth by these fixes or control points, from now on; None: no longer."""
+
+    survey: Survey | None
 
 
 class SetParams(Command, frozen=True):
@@ -292,6 +300,21 @@ error_m: to the truth (m), aligned to all frames shown."""
 
 
 @dataclass(frozen=True, slots=True)
+class Earth:
+    """Where on Earth the map is.
+
+    Attributes:
+        survey: what lays it there; None: nothing.
+        found: how its fixes or points lie on the map; None until that is known.
+        problem: why they cannot lie there, in a sentence.
+    """
+
+    survey: Survey | None = None
+    found: Alignment | None = None
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Snapshot:
     """All that the page draws, as one immutable value.
 
@@ -305,6 +328,7 @@ class Snapshot:
         T_map_truth: (4, 4), aligns the truth with the trajectory; None until the trajectory determines it.
         notes, views, measures: in the order in which they were made. notices: the newest 50. saved: the newest 10.
         live: state of the live source; None for a recording.
+        earth: as the map was when the session last stood still.
         session_file: keeps this session; opening it continues the session.
     """
 
@@ -332,6 +356,7 @@ class Snapshot:
     engine_alive: bool = True
     session_file: Path | None = None
     live: LiveState | None = None
+    earth: Earth = Earth()
 
 
 @dataclass(frozen=True, slots=True)

@@ -177,9 +177,9 @@ class Publisher:
         self.map_moved(session)
 
     def map_moved(self, session: Session) -> None:
-        """Show the corrections by loops, if they have changed."""
-        if session.map_frame is not self._corrections:
-            self._corrections = session.map_frame
+        """Show the corrections by loops and fixes, if they have changed."""
+        if session.shown_frame is not self._corrections:
+            self._corrections = session.shown_frame
             self.put(corrections=self._corrections)
 
     def relabelled(self, result: StepResult) -> None:

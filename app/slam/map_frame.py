@@ -31,6 +31,14 @@ class MapFrame:
         """(4, 4) T_map_odom at the last keyframe."""
         return self.at(len(self.T_map_odom))
 
+    def over(self, frame: "MapFrame") -> "MapFrame":
+        """These corrections of the map that another one's lead to."""
+        if not len(self.T_map_odom):
+            return frame
+        count = max(len(self.T_map_odom), len(frame.T_map_odom))
+        stamps_ns = max(self.stamps_ns, frame.stamps_ns, key=len)
+        return MapFrame(stamps_ns, np.array([self.at(k) @ frame.at(k) for k in range(count)]))
+
     def poses(self, T_odom_imu: F64) -> F64:
         """(k, 4, 4) T_map_imu of the first k keyframes from their (k, 4, 4) T_odom_imu."""
         count = min(len(T_odom_imu), len(self.T_map_odom))

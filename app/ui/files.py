@@ -21,11 +21,7 @@ from app.ui.widgets import Changes, Page, by_user, dialog
 _MOST_ENTRIES: Final = 60
 _RECENT: Final = 3
 _OF_A_RUN: Final = "all of a run"
-_FORMATS: Final = {
-    f"{export.name}: {export.meaning}": (export.format,)
-    for export in EXPORTS
-    if export.format and not export.on_earth  # a session does not know where on Earth it is
-}
+_FORMATS: Final = {f"{export.name}: {export.meaning}": (export.format,) for export in EXPORTS if export.format}
 _EARLY: Final = 100
 """Before this frame the last session is offered."""
 

@@ -116,3 +116,21 @@ def test_someone_who_stands_still_learns_that_no_heading_follows() -> None:
     made = walked(duration_s=2.4, outliers=0.0, rate_hz=10.0)  # the walker rests at the start
     with pytest.raises(HemislamError, match="heading only to"):
         align(made.trajectory, made.fixes, lever=LEVER)
+
+
+def test_the_users_word_on_a_fix_overrules_the_residuals() -> None:
+    made = walked()
+    wild, sound = str(made.outliers[2]), next(str(n) for n in range(30, 99) if n not in made.outliers)
+    found = align(made.trajectory, made.fixes, lever=LEVER, overruled={wild: True, sound: False})
+    verdict = dict(zip(found.names, found.used.tolist(), strict=True))
+    assert verdict[wild] and not verdict[sound]
+    few = dict.fromkeys(found.names[7:], False)
+    with pytest.raises(HemislamError, match="Only 7 fixes are left"):
+        align(made.trajectory, made.fixes, lever=LEVER, overruled=few)
+
+
+def test_a_clock_offset_that_is_given_is_used_and_not_looked_for() -> None:
+    made = walked(offset_s=0.08)
+    right, wrong = (align(made.trajectory, made.fixes, lever=LEVER, offset_s=offset) for offset in (0.08, -0.4))
+    assert (right.offset_s, wrong.offset_s) == (0.08, -0.4) and np.isnan(right.offset_sigma_s)
+    assert right.rms.max() < 0.03 < wrong.rms[:2].max()

@@ -9,7 +9,6 @@ from app.georeference.align import Alignment, align, offset_by_parts
 from app.georeference.bend import bend
 from app.georeference.ledger import summary
 from app.slam import lie
-from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.factors import Factor
 from app.slam.map_frame import corrected
@@ -38,7 +37,7 @@ def drifted(made: Walked) -> Trajectory:
 
 
 def solved(
-    made: Walked, drifted: Trajectory, *, offset_known: bool = True, **decided: list[str]
+    made: Walked, drifted: Trajectory, *, offset_known: bool = True, overruled: dict[str, bool] | None = None
 ) -> tuple[F64, Alignment, Alignment]:
     """(k, 4, 4) corrections, and the alignments after and before."""
     keyframes = drifted.poses[::STEP]
@@ -50,7 +49,7 @@ def solved(
     found = align(drifted, made.fixes, grid="EPSG:32632", lever=LEVER)
     if not offset_known:
         found = replace(found, offset_s=0.0, offset_sigma_s=float("nan"))
-    return *bend(drifted, drifted.stamps_ns[::STEP], graph, made.fixes, found, **decided), found
+    return *bend(drifted, drifted.stamps_ns[::STEP], graph, made.fixes, found, overruled or {}), found
 
 
 def test_a_map_that_turned_by_12_degrees_is_bent_back_to_where_it_was(made: Walked, drifted: Trajectory) -> None:
@@ -70,7 +69,7 @@ def test_a_map_that_turned_by_12_degrees_is_bent_back_to_where_it_was(made: Walk
 
 def test_the_users_word_on_a_fix_overrules_the_verdict(made: Walked, drifted: Trajectory) -> None:
     wild, sound = str(made.outliers[2]), next(str(n) for n in range(30, 99) if n not in made.outliers)
-    _, after, _ = solved(made, drifted, accept=[wild], reject=[sound])
+    _, after, _ = solved(made, drifted, overruled={wild: True, sound: False})
     verdict = dict(zip(after.names, after.used.tolist(), strict=True))
     assert verdict[wild] and not verdict[sound]
 
@@ -88,8 +87,3 @@ def test_stretches_with_too_few_fixes_leave_the_clock_offset_as_it_was() -> None
     sparse = walked(rate_hz=0.15, outliers=0.0)  # three in 20 s
     found = replace(align(sparse.trajectory, sparse.fixes, lever=LEVER), offset_s=0.3)
     assert offset_by_parts(sparse.trajectory, sparse.fixes, found) == 0.3
-
-
-def test_a_fix_that_is_not_there_cannot_be_decided_on(made: Walked, drifted: Trajectory) -> None:
-    with pytest.raises(HemislamError, match="There is no fix 9999"):
-        solved(made, drifted, reject=["9999"])

@@ -1,13 +1,16 @@
 """Control points. Oracle: SciPy's general least squares over a rotation vector and a shift."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from app.georeference.control import lay_on_control
+from app.georeference.align import Alignment
+from app.georeference.control import CONTROL, PICKS, lay_on_control, read_picks
+from app.georeference.tables import read_table
 from app.slam.errors import HemislamError
 from tests.georeference.walks import TRUTH
 
@@ -25,9 +28,13 @@ def written(folder: Path, points: dict[str, tuple[float, ...]], *, noise: float 
     return control, picks
 
 
+def laid(control: Path, picks: Path, **options: Any) -> Alignment:
+    return lay_on_control(read_table(control, *CONTROL), read_picks(read_table(picks, *PICKS)), **options)
+
+
 def test_four_points_give_the_transform_of_an_independent_least_squares(tmp_path: Path) -> None:
     control, picks = written(tmp_path, CORNERS)
-    found = lay_on_control(control, picks, grid="EPSG:32632")
+    found = laid(control, picks, grid="EPSG:32632")
     points = np.array([*CORNERS.values()])
     k = found.reference.scale
     there = (found.grid - found.grid.mean(axis=0)) / [k, k, 1.0]
@@ -47,7 +54,7 @@ def test_exact_points_in_degrees_give_the_map_its_exact_place(tmp_path: Path) ->
     rows = zip(CORNERS, TRUTH.to_geographic(np.array([*CORNERS.values()])).tolist(), strict=True)
     control = tmp_path / "degrees.csv"
     control.write_text("id;lat;lon;height\n" + "".join(f"{n};{a!r};{o!r};{h!r}\n" for n, (a, o, h) in rows))
-    found = lay_on_control(control, picks, height="orthometric (EGM2008)")
+    found = laid(control, picks, height="orthometric (EGM2008)")
     np.testing.assert_allclose(found.reference.origin, TRUTH.origin, atol=1e-4)
     assert found.reference.crs == "EPSG:32632" and found.reference.height == "orthometric (EGM2008)"
 
@@ -55,7 +62,7 @@ def test_exact_points_in_degrees_give_the_map_its_exact_place(tmp_path: Path) ->
 def test_a_point_that_is_only_in_one_file_is_left_out(tmp_path: Path) -> None:
     control, picks = written(tmp_path, CORNERS)
     picks.write_text(picks.read_text().replace("D,", "Z,"))
-    assert lay_on_control(control, picks, grid="EPSG:32632").names == ("A", "B", "C")
+    assert laid(control, picks, grid="EPSG:32632").names == ("A", "B", "C")
 
 
 def test_a_point_without_its_easting_is_told_as_such(tmp_path: Path) -> None:
@@ -64,15 +71,19 @@ def test_a_point_without_its_easting_is_told_as_such(tmp_path: Path) -> None:
     name, _, north, height = first.split(",")
     control.write_text("\n".join([head, f"{name},,{north},{height}", *others]))
     with pytest.raises(HemislamError, match="lacks a coordinate"):
-        lay_on_control(control, picks, grid="EPSG:32632")
+        laid(control, picks, grid="EPSG:32632")
 
 
 @pytest.mark.parametrize(
     ("points", "grid", "words"),
     [
-        (dict([*CORNERS.items()][:2]), "EPSG:32632", "with fewer, the map may still turn"),
+        (
+            dict([*CORNERS.items()][:2]),
+            "EPSG:32632",
+            "only A and B are: it stays open how the map is turned about the line",
+        ),
         ({name: (10.0 * k, 5.0 * k, 0.1 * k) for k, name in enumerate("ABCD")}, "EPSG:32632", "lie on one line"),
-        (CORNERS, "", "say of which grid with --crs"),
+        (CORNERS, "", "say of which grid: EPSG:CODE"),
         (CORNERS, "EPSG:2056", "is not made for|has no place"),
     ],
 )
@@ -80,4 +91,12 @@ def test_points_that_leave_the_place_open_are_refused_and_it_is_said_what(
     tmp_path: Path, points: dict[str, tuple[float, ...]], grid: str, words: str
 ) -> None:
     with pytest.raises(HemislamError, match=words):
-        lay_on_control(*written(tmp_path, points), grid=grid)
+        laid(*written(tmp_path, points), grid=grid)
+
+
+def test_a_point_that_the_user_leaves_out_pulls_nothing_and_still_shows_how_far_it_is_off(tmp_path: Path) -> None:
+    control, picks = written(tmp_path, CORNERS, noise=0.0)
+    picks.write_text(picks.read_text().replace("D,-3.0", "D,-2.0"))  # picked a metre beside
+    found = laid(control, picks, grid="EPSG:32632", overruled={"D": False})
+    assert found.used.tolist() == [True, True, True, False] and found.rms.max() < 1e-5
+    assert np.linalg.norm(found.residuals[3]) == pytest.approx(1.0, abs=1e-3)

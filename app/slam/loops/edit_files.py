@@ -8,11 +8,14 @@
       register: false
       guess: [[1.0, 0.0, 0.0, 0.2], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
     - solve: at once
+    - overrule: fix 12
+      accepted: false
 
 A loop is named by its older and its newer keyframe: an index, or `session/index` in another session than the first.
 `guess` is T_older_newer of the IMU frames; without it, the place is searched from where odometry has it. `register` is
 true by default. `solve: at once` takes the poses from all factors at once
-(Levenberg-Marquardt) instead of one after the other.
+(Levenberg-Marquardt) instead of one after the other. `overrule` counts or leaves out a satellite fix,
+by its number, or a control point: `point P1`.
 """
 
 import re
@@ -25,12 +28,12 @@ from pydantic import Strict, TypeAdapter, ValidationError
 
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.edits import Accept, Add, LoopEdit, Reject, SetWeight, Solve, check
+from app.slam.loops.edits import Accept, Add, LoopEdit, Overrule, Reject, SetWeight, Solve, check
 from app.slam.loops.types import Pair
 from app.slam.user_text import read_yaml
 
 _VERBS: Final[dict[str, Any]] = {
-    "accept": Accept, "reject": Reject, "weigh": SetWeight, "add": Add, "solve": Solve
+    "accept": Accept, "reject": Reject, "weigh": SetWeight, "add": Add, "solve": Solve, "overrule": Overrule
 }  # fmt: skip
 _AT_ONCE: Final = "at once"
 
@@ -40,13 +43,16 @@ class _Values:
     weight: Annotated[float, Strict()] = 1.0
     register: Annotated[bool, Strict()] = True
     guess: tuple[tuple[float, ...], ...] | None = None
+    accepted: Annotated[bool, Strict()] = True
 
 
 _VALUES: Final = TypeAdapter(_Values)
+_NEEDED: Final[dict[str, dict[str, Any]]] = {"weigh": {"weight": None}, "overrule": {"accepted": None}}
 _MUST_BE: Final = {
     "weight": "a number greater than 0",
     "register": "true or false",
     "guess": "a 4x4 matrix of numbers",
+    "accepted": "true or false",
 }
 _EXAMPLE: Final = "write entries such as `- accept: [12, 340]`"
 _HEAD: Final = "# Edits of loops, in their order: hemislam run RECORDING --loops THIS_FILE\n"
@@ -88,6 +94,8 @@ def edits_of(entries: object, source: str = "the list of edits") -> tuple[LoopEd
 
 def _entry(edit: LoopEdit) -> dict[str, Any]:
     verb = next(verb for verb, kind in _VERBS.items() if isinstance(edit, kind))
+    if isinstance(edit, Overrule):
+        return {verb: edit.what, "accepted": edit.accepted}
     pair = [int(one) if one < KeyframeId(1, 0) else str(one) for one in edit.pair or ()]
     values = {name: getattr(edit, name) for name in _names(type(edit))}
     if guess := values.pop("guess", None):
@@ -100,7 +108,7 @@ def _edit(entry: object) -> LoopEdit:
     if not isinstance(entry, dict) or len(verbs) != 1:
         raise HemislamError(
             "it must hold one of accept, reject, weigh or add, with two keyframes: accept: [12, 340]; or `solve:"
-            f" {_AT_ONCE}`."
+            f" {_AT_ONCE}`; or `overrule: fix 12`."
         )
     (verb,) = verbs
     entry = {
@@ -109,7 +117,7 @@ def _edit(entry: object) -> LoopEdit:
     known = _names(_VERBS[verb])
     if unknown := sorted(str(name) for name in entry.keys() - {verb, *known}):
         raise HemislamError(f"{verb} has no {unknown[0]}; it takes {' and '.join(known) or 'nothing else'}.")
-    given = ({"weight": None} if verb == "weigh" else {}) | {name: entry[name] for name in entry if name != verb}
+    given = _NEEDED.get(verb, {}) | {name: entry[name] for name in entry if name != verb}
     try:
         read = _VALUES.validate_python(given)
     except ValidationError as error:
@@ -117,16 +125,25 @@ def _edit(entry: object) -> LoopEdit:
         raise HemislamError(f"{name} is {given[name]!r}; it must be {_MUST_BE[name]}.") from None
     if verb == "solve" and entry[verb] != _AT_ONCE:
         raise HemislamError(f"solve is {entry[verb]!r}; it can only be `{_AT_ONCE}`.")
-    edit: LoopEdit = _VERBS[verb](
-        *(() if verb == "solve" else _pair(verb, entry[verb])), **{name: getattr(read, name) for name in given}
-    )
+    edit: LoopEdit = _VERBS[verb](*_subject(verb, entry[verb]), **{name: getattr(read, name) for name in given})
     check(edit)
     return edit
 
 
 def _names(kind: type[LoopEdit]) -> list[str]:
     """What an entry may hold beside its verb."""
-    return [field.name for field in fields(kind) if field.name not in ("older", "newer")]
+    return [field.name for field in fields(kind) if field.name not in ("older", "newer", "what")]
+
+
+def _subject(verb: str, value: object) -> tuple[Any, ...]:
+    """What an edit is for, as its first arguments."""
+    if verb == "solve":
+        return ()
+    if verb != "overrule":
+        return _pair(verb, value)
+    if not isinstance(value, str) or not re.fullmatch(r"(fix \d{1,9}|point .{1,100})", value):
+        raise HemislamError(f"overrule is {value!r}; it takes `fix 12` or `point NAME`.")
+    return (value,)
 
 
 def _pair(verb: str, value: object) -> Pair:

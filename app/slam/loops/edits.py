@@ -20,7 +20,7 @@ from app.slam.loops.types import LoopEdge, Origin, Pair, Verdict
 class _Edit:
     @property
     def pair(self) -> Pair | None:
-        """The loop that it edits; None: the graph as a whole."""
+        """The loop that it edits; None: none, but the graph or a fix."""
         return None
 
 
@@ -73,7 +73,19 @@ class Solve(_Edit):
     """
 
 
-LoopEdit = Accept | Reject | SetWeight | Add | Solve
+@dataclass(frozen=True, slots=True)
+class Overrule(_Edit):
+    """Count or leave out what lays the map on Earth, whatever its residual. It changes nothing of the loops.
+
+    Attributes:
+        what: "fix 12" or "point P1", as the table of residuals names them.
+    """
+
+    what: str
+    accepted: bool
+
+
+LoopEdit = Accept | Reject | SetWeight | Add | Solve | Overrule
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +132,7 @@ def lay_over(
 
 def check(edit: LoopEdit) -> None:
     """Raises HemislamError if the edit can never make sense, whatever is found."""
-    if isinstance(edit, Solve):
+    if isinstance(edit, Solve | Overrule):
         return
     older, newer = edit.older, edit.newer
     if not 0 <= older < newer:
@@ -157,7 +169,7 @@ def _edited(edge: LoopEdge, edit: LoopEdit) -> LoopEdge:
     edge = replace(edge, represented_by=None, repeats=None)  # what the user has a word on is in the graph itself
     if isinstance(edit, SetWeight):
         return replace(edge, weight=edit.weight)
-    if isinstance(edit, Add | Solve):  # one that waits; one that is for no loop
+    if isinstance(edit, Add | Solve | Overrule):  # one that waits; those that are for no loop
         return edge
     verdict = Verdict.ACCEPTED if isinstance(edit, Accept) else Verdict.REJECTED
     if verdict is edge.verdict:

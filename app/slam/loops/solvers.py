@@ -56,10 +56,12 @@ def optimise(first: F64, factors: Sequence[Closing], start: Sequence[F64] | F64,
         raise ArithmeticError(str(error)) from error
 
 
-def read_g2o(path: Path) -> list[Factor]:
-    """The factors of a g2o file. Loops are robust again. Raises RuntimeError or OSError: it cannot be read."""
-    path.open().close()  # or gtsam would say nothing of a file that is not there
-    graph, _ = gtsam.readG2o(str(path), True)
+def read_g2o(text: str) -> list[Factor]:
+    """The factors of the text of a g2o file. Loops are robust again. Raises RuntimeError: it cannot be read."""
+    with tempfile.TemporaryDirectory(prefix="hemislam-") as folder:  # gtsam reads files only
+        path = Path(folder) / "graph.g2o"
+        path.write_text(text, encoding="utf-8")
+        graph, _ = gtsam.readG2o(str(path), True)
     factors = []
     for index in range(graph.size()):
         factor = graph.at(index)

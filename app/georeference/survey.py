@@ -1,0 +1,37 @@
+"""What a map is to be laid on Earth by, as a session keeps it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from app.georeference.reference import Row
+
+
+@dataclass(frozen=True, slots=True)
+class Pick:
+    """Where a control point is on what a keyframe saw, so that it moves with the map. at: m, in its IMU frame."""
+
+    name: str
+    keyframe: int
+    at: Row
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """Satellite fixes, or control points if there is a table of them.
+
+    Attributes:
+        gnss: file of fixes; None: those of the recording. control: text of a table of control points.
+        picks: where these are in the map. crs: "EPSG:code" of a projected system; "": the UTM zone there.
+        height: what heights are above; "": as the fixes tell. lever: m from the IMU to the antenna, IMU frame; None:
+            found, if the motion tells it. offset_s: how much later fixes are stamped than measured; None: found.
+        factors: the fixes bend the map.
+    """
+
+    gnss: Path | None = None
+    control: str = ""
+    picks: tuple[Pick, ...] = ()
+    crs: str = ""
+    height: str = ""
+    lever: Row | None = None
+    offset_s: float | None = None
+    factors: bool = False

@@ -1,0 +1,110 @@
+"""Lays results on Earth as the user of a session asked for it: by satellite fixes, or by control points."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from app.export.results import Results
+from app.georeference.align import Alignment, align
+from app.georeference.bend import bend
+from app.georeference.control import CONTROL, lay_on_control
+from app.georeference.fixes import Fixes
+from app.georeference.reference import ELLIPSOIDAL
+from app.georeference.survey import Survey
+from app.georeference.tables import read_fixes, table_of
+from app.sensors.navsat import recorded_fixes
+from app.slam.errors import HemislamError
+from app.slam.loops.edits import LoopEdit, Overrule
+from app.slam.loops.solvers import read_g2o
+from app.slam.map_frame import MapFrame
+
+FIX, POINT = "fix ", "point "
+"""What an edit names begins with one of them."""
+
+
+def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> tuple[Results, MapFrame]:
+    """The results where they are on Earth, with how fixes or points lie on them.
+
+    Returns:
+        Also what bends the map, T_bent_map at its keyframes; nothing unless that was asked for.
+
+    Raises:
+        HemislamError: the survey cannot be read, or leaves open where the map lies.
+    """
+    if not len(results.trajectory):
+        raise HemislamError("Nothing is mapped yet that could be laid on Earth.")
+    overruled = {edit.what: edit.accepted for edit in edits if isinstance(edit, Overrule)}
+    if survey.control:
+        found = _by_points(results, survey, _named(overruled, POINT))
+        return replace(results, where=found.reference, found=found, _rasters={}), MapFrame()
+    fixes, told = fixes_of(results.info.recording, survey.gnss, int(results.trajectory.stamps_ns[0]))
+    of_fixes = _named(overruled, FIX)
+    found = align(
+        results.trajectory,
+        fixes,
+        grid=survey.crs,
+        height=survey.height or told,
+        lever=survey.lever,
+        offset_s=survey.offset_s,
+        overruled=of_fixes,
+    )
+    if survey.factors:
+        return bent(results, fixes, found, of_fixes)
+    return replace(results, where=found.reference, found=found, _rasters={}), MapFrame()
+
+
+def lay_if_possible(results: Results, survey: Survey | None, edits: Sequence[LoopEdit] = ()) -> Results:
+    """As `lay`; where that fails, the results as they are, with the reason."""
+    try:
+        return results if survey is None else lay(results, survey, edits)[0]
+    except HemislamError as error:
+        return replace(results, problem=str(error))
+
+
+def bent(results: Results, fixes: Fixes, found: Alignment, overruled: Mapping[str, bool]) -> tuple[Results, MapFrame]:
+    """As `lay`, with fixes that lie on the results as `found`."""
+    loops = results.loops
+    if loops is None or not loops.g2o:
+        raise HemislamError(
+            f"{results.info.recording} has no graph.g2o that fixes could bend; run the recording with loops.enabled."
+        )
+    try:
+        graph = read_g2o(loops.g2o)
+    except RuntimeError:
+        raise HemislamError(f"The graph of {results.info.recording} cannot be read.") from None
+    every = range(len(results.keyframes))
+    stamps_ns = loops.stamps_ns if len(loops.stamps_ns) else np.array([results.keyframes[k].stamp_ns for k in every])
+    corrections, found = bend(results.trajectory, stamps_ns, graph, fixes, found, overruled)
+    by_fixes = MapFrame(stamps_ns, corrections)
+    again = replace(loops, frame=by_fixes.over(loops.frame))
+    return replace(results, loops=again, where=found.reference, found=found, _rasters={}), by_fixes
+
+
+def fixes_of(recording: Path, gnss: Path | None, near_ns: int) -> tuple[Fixes, str]:
+    """Those of a file, or of the recording, and what their heights are above. near_ns: as `read_fixes`."""
+    path = gnss or recording
+    return _read(recording, gnss, near_ns, path.stat().st_mtime_ns if path.exists() else 0)
+
+
+@lru_cache(maxsize=2)
+def _read(recording: Path, gnss: Path | None, near_ns: int, changed_ns: int) -> tuple[Fixes, str]:
+    """A recording of an hour takes seconds to read, and every click asks for its fixes. changed_ns: of the file."""
+    return read_fixes(gnss, near_ns) if gnss is not None else (recorded_fixes(recording), ELLIPSOIDAL)
+
+
+def _by_points(results: Results, survey: Survey, overruled: Mapping[str, bool]) -> Alignment:
+    """By the control points that were picked on keyframes so far."""
+    table = table_of(survey.control.splitlines(), "The table of control points", *CONTROL)
+    picked = {}
+    for pick in survey.picks:
+        if pick.keyframe < len(results.keyframes):
+            T = results.frame.at(pick.keyframe) @ results.keyframes[pick.keyframe].T_odom_imu
+            picked[pick.name] = T[:3, :3] @ pick.at + T[:3, 3]
+    return lay_on_control(table, picked, grid=survey.crs, height=survey.height or ELLIPSOIDAL, overruled=overruled)
+
+
+def _named(overruled: Mapping[str, bool], kind: str) -> dict[str, bool]:
+    return {what.removeprefix(kind): accepted for what, accepted in overruled.items() if what.startswith(kind)}

@@ -1,0 +1,67 @@
+"""Lays the map of the open session on Earth whenever it has changed and stands still, and shows how it lies."""
+
+import logging
+from concurrent.futures import Future
+
+from app.export.results import Results
+from app.mapping.session import Session
+from app.server.protocol import Earth
+from app.server.publisher import Publisher
+from app.slam.errors import HemislamError
+from app.slam.loops.edits import Overrule
+from app.slam.map_frame import MapFrame
+
+log = logging.getLogger(__name__)
+
+
+class Laying:
+    """Begins the work in a thread of the session and takes in what comes of it; one thread calls `update`."""
+
+    def __init__(self, page: Publisher) -> None:
+        self._page = page
+        self._laid: tuple[object, ...] = (None, None, (), -1, None)  # what the newest was begun with
+        self._under_way: Future[tuple[Results, MapFrame]] | None = None
+
+    def update(self, session: Session, *, still: bool) -> bool:
+        """Show what has come, and begin anew where that is called for. Returns whether work is under way.
+
+        Args:
+            still: the session stays at its frame. While it goes on, only the user's choices are followed at once.
+        """
+        if self._under_way is not None:
+            if not self._under_way.done():
+                return True
+            self._take(session, self._under_way)
+            self._under_way = None
+        if session.loops is not None and not session.loops.idle:
+            return False
+        words = tuple(edit for edit in session.edits[0] if isinstance(edit, Overrule))
+        now = session, session.survey, words, session.frame, session.map_frame
+        chosen = self._laid[0] is not session or self._laid[1:3] != now[1:3]
+        moved = self._laid[3] != session.frame or self._laid[4] is not session.map_frame
+        if session.frame < 0 or not (chosen or (moved and still and session.survey is not None)):
+            return False
+        self._laid = now
+        if session.survey is None:
+            self._show(session, Earth(), MapFrame())
+            return False
+        self._under_way = session.lay_on_earth()
+        return True
+
+    def _take(self, session: Session, laid: Future[tuple[Results, MapFrame]]) -> None:
+        if self._laid[0] is not session:
+            return
+        error = laid.exception()
+        if error is None:
+            results, by_fixes = laid.result()
+            self._show(session, Earth(session.survey, results.found), by_fixes)
+            return
+        if not isinstance(error, HemislamError):
+            log.error("The map could not be laid on Earth", exc_info=error)
+        self._show(session, Earth(session.survey, problem=str(error) or type(error).__name__), MapFrame())
+
+    def _show(self, session: Session, earth: Earth, by_fixes: MapFrame) -> None:
+        if len(by_fixes.T_map_odom) or len(session.by_fixes.T_map_odom):
+            session.by_fixes = by_fixes
+            self._page.map_moved(session)
+        self._page.put(earth=earth, urgent=True)
