@@ -1,5 +1,6 @@
-"""A small recording with exact truth, and a way to call the command line as a user does."""
+"""A small recording with exact truth, and two ways to call the command line."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -10,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from app.__main__ import cli
 from app.sensors.ros import RecordingWriter
 from app.slam.trajectory import Trajectory, write_tum
 from app.slam.types import Scan
@@ -130,9 +133,23 @@ Call = Callable[..., Outcome]
 
 @pytest.fixture(scope="session")
 def hemislam() -> Call:
-    """Calls the command line in a process of its own."""
+    """Calls the command line in this process, where libraries and kernels are loaded already."""
 
-    def call(*arguments: str | Path, folder: Path = ROOT) -> Outcome:
+    def call(*arguments: object, folder: Path = ROOT) -> Outcome:
+        with contextlib.chdir(folder):
+            done = CliRunner().invoke(cli, [str(argument) for argument in arguments], prog_name="hemislam")
+        if done.exception is not None and not isinstance(done.exception, SystemExit):
+            raise done.exception
+        return Outcome(done.exit_code, done.stdout, done.stderr)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def hemislam_alone() -> Call:
+    """Calls it in a process of its own, as a user does."""
+
+    def call(*arguments: object, folder: Path = ROOT) -> Outcome:
         command = [sys.executable, "-m", "app", *map(str, arguments)]
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         done = subprocess.run(

@@ -30,9 +30,9 @@ def test_help_lists_every_result_file_with_its_meaning(hemislam: Call) -> None:
 
 
 @pytest.fixture(scope="module")
-def first(hemislam: Call, walk: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
+def first(hemislam_alone: Call, walk: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
     folder = tmp_path_factory.mktemp("results") / "first"
-    return hemislam("run", walk, "--out", folder), folder
+    return hemislam_alone("run", walk, "--out", folder), folder
 
 
 def test_a_walk_in_a_room_is_followed_to_a_centimetre(first: tuple[Any, Path], walk: Path) -> None:
@@ -182,9 +182,9 @@ def test_a_truth_of_another_day_or_none_at_all_or_whose_frame_jumps_is_refused(
     assert not (tmp_path / "runs").exists()
 
 
-def test_results_are_kept_unless_told_otherwise(first: tuple[Any, Path], hemislam: Call, walk: Path) -> None:
+def test_results_are_kept_unless_told_otherwise(first: tuple[Any, Path], hemislam_alone: Call, walk: Path) -> None:
     before = {path.name: path.read_bytes() for path in first[1].iterdir()}
-    assert "--force" in hemislam("run", walk, "--out", first[1]).refused()
+    assert "--force" in hemislam_alone("run", walk, "--out", first[1]).refused()
     assert {path.name: path.read_bytes() for path in first[1].iterdir()} == before
 
 
