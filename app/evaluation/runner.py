@@ -49,7 +49,7 @@ def _run(stop: threading.Event, quiet: bool, job: Job) -> str:
         if not quiet:
             tqdm.write(f"{title}: finished before")
         return ""
-    child = Child(_work, job, name="job", title="Its process", grace_s=0.0)
+    child = Child(_work, job, name="job", title="Its process", fork=True, grace_s=0.0)
     bar: tqdm[NoReturn]
     with tqdm(desc=title, unit=" frames", leave=False, disable=quiet or None) as bar:
         try:
