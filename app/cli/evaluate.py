@@ -1,6 +1,5 @@
 """`hemislam evaluate`: the paper's tables, on any recordings."""
 
-import os
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,6 +9,7 @@ import typer
 
 from app.cli.options import Duration, Imperfect, ParamsFor, Start, make_folder, with_params
 from app.slam.errors import HemislamError
+from app.slam.provenance import cores
 
 if TYPE_CHECKING:
     from app.evaluation.runner import RunJobs
@@ -181,11 +181,6 @@ def runner(parallel: int, address: str | None, url: str, *, quiet: bool = False)
     if find_spec("distributed") is None:
         raise HemislamError("--cluster needs Dask; install it with `pip install 'hemislam[cluster]'`.")
     return Cluster(address, url).run_jobs, 1
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def name_recordings(paths: list[Path]) -> list[str]:

@@ -13,13 +13,13 @@ from app.cli.evaluate import (
     Jobs,
     Out,
     Truths,
-    cores,
     name_recordings,
     runner,
     truth_texts,
 )
 from app.cli.options import Duration, ParamsFor, Start, make_folder, with_params
 from app.slam.errors import HemislamError
+from app.slam.provenance import cores
 
 if TYPE_CHECKING:
     from app.evaluation.evaluate import Subject
@@ -61,6 +61,14 @@ def tune(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the search.")] = 0,
     truths: Truths = None,
+    labels: Annotated[
+        Path | None,
+        typer.Option(
+            "--labels",
+            metavar="FILE",
+            help="Frames labelled in the page, for ground-f1: a session file or NAME.labels.json. For one recording.",
+        ),
+    ] = None,
     out: Out = Path("runs/tuning"),
     jobs: Jobs = None,
     cluster: ClusterAddress = None,
@@ -85,6 +93,7 @@ def tune(
     \b
     Examples:
       hemislam tune walk.mcap --parameters ground.alpha,ground.sigma --objective ground-f1 --duration 20
+      hemislam tune walk.mcap --objective ground-f1 --labels runs/sessions/walk-20261121-101500.hemislam
       hemislam tune walk.mcap --parameters scan.voxel_size=0.1:0.6 --objective entropy --objective frame-time
     """
     if find_spec("optuna") is None:
@@ -94,15 +103,20 @@ def tune(
     from app.cli.run import compile_behind_bar
     from app.evaluation.evaluate import Subject
     from app.evaluation.truth import read_truth
+    from app.mapping.session_file import read_marks
     from app.tuning.objectives import choose_objectives
     from app.tuning.report import BEST, write_results
     from app.tuning.space import parse_dimensions
-    from app.tuning.tune import Part, Runs, Trial, front, known_runs
+    from app.tuning.trial import Trial, front
+    from app.tuning.tune import Part, Runs, check, known_runs
     from app.tuning.tune import search as find
 
     dimensions = parse_dimensions(parameters)
+    if labels is not None and len(recordings) > 1:
+        raise HemislamError("--labels belong to one recording; give only that one.")
+    marks = read_marks(labels) if labels else ()
     subjects = [
-        Subject(name, path, params_for(path), read_truth(text, path, None) if text else None)
+        Subject(name, path, params_for(path), read_truth(text, path, None) if text else None, marks=marks)
         for path, name, text in zip(
             recordings, name_recordings(recordings), truth_texts(recordings, truths or []), strict=True
         )
@@ -112,7 +126,7 @@ def tune(
         raise HemislamError("--held-back needs --duration: without it the search sees the whole recording.")
     timed = any(one.name == "frame-time" for one in wanted)  # runs beside each other would spoil it
     part, rest = Part(start, duration), None
-    if duration is not None and held_back != 0:
+    if duration is not None and held_back != 0 and not marks:
         rest = Part(start + duration, held_back or duration)
     make_folder(out)
     run, threads = runner(jobs or (1 if timed else cores()), cluster, cluster_data, quiet=True)
@@ -127,7 +141,7 @@ def tune(
     compile_behind_bar()
     with tqdm(total=trials + 1, desc="Tuning", unit=" trials", disable=None) as bar:
 
-        def progress(so_far: Sequence[Trial]) -> None:
+        def progress(so_far: Sequence[Trial], _: object) -> None:
             bar.update(len(so_far) - bar.n)
             if best := front(so_far, wanted):
                 bar.set_postfix_str(f"best {wanted[0].told(best[0].scores[0])}")
@@ -136,24 +150,8 @@ def tune(
     best = front(done, wanted)
     if not best:
         raise HemislamError(f"No trial gave a result: {done[0].error or 'no run has a value for the objective'}")
-    checked = []
-    if rest is not None:
-        settings = [done[0], *(trial for trial in best[:5] if trial.number)]
-        results = runs.score([trial.values for trial in settings], rest)
-        checked = [
-            Trial(t.number, t.values, scores, error) for t, (scores, error) in zip(settings, results, strict=True)
-        ]
-    asked = {
-        "recordings": [
-            {"path": str(one.recording), "sha256": sha256, "parameters": one.params.model_dump(mode="json")}
-            for one, sha256 in zip(subjects, runs.hashes, strict=True)
-        ],
-        "search": search,
-        "trials": trials,
-        "seed": seed,
-        "part_s": [start, duration],
-    }
-    write_results(out, done, checked, wanted, study, asked)
+    checked = check(runs, done, wanted, rest)
+    write_results(out, done, checked, wanted, study, runs.asked(search, trials, seed, part))
     for label, shown in (("as given", done[:1]), ("best", best[:5]), ("held back", checked)):
         for trial in shown:
             told = ", ".join(f"{one.title} {one.told(v)}" for one, v in zip(wanted, trial.scores, strict=True))

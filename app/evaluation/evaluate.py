@@ -26,7 +26,7 @@ class Subject:
 
     Attributes:
         name: in tables, without `/`. params: before the variants. truth: to measure against.
-        compared: other systems' trajectories by name, in the recording's clock.
+        compared: other systems' trajectories by name, in the recording's clock. marks: as `Job` has them.
     """
 
     name: str
@@ -34,6 +34,7 @@ class Subject:
     params: Params
     truth: TruePoses | None = None
     compared: tuple[tuple[str, Trajectory], ...] = ()
+    marks: tuple[tuple[int, bytes], ...] = ()
 
 
 def evaluate(
@@ -80,6 +81,7 @@ def evaluate(
                 start_s=start_s,
                 duration_s=duration_s,
                 baseline=variant.baseline,
+                marks=subject.marks,
             )
     failures = run(list(jobs.values()), folder / "runs")
     evaluated = []

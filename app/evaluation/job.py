@@ -25,6 +25,7 @@ from app.evaluation import crops, map_sharpness
 from app.export.results import timings_csv
 from app.mapping.feed import FileFeed
 from app.mapping.opening import open_session
+from app.mapping.painted import UNMARKED
 from app.mapping.session import Session
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.types import Origin, Verdict
@@ -59,6 +60,8 @@ class Job:
     recording: its path, sha256: of its bytes. name: of the recording in tables. variant: its name.
     params: as run. folder: for the results. threads: for the kernels. code: `code_digest()`.
     baseline: name of the system that is run in place of the engine; "" for the engine.
+    marks: (stamp of a frame, a byte for each point of its cloud as in `app.mapping.painted`), in place of the
+        recording's labels of ground.
     """
 
     recording: Path
@@ -72,6 +75,7 @@ class Job:
     duration_s: float | None = None
     code: str = field(default_factory=code_digest)
     baseline: str = ""
+    marks: tuple[tuple[int, bytes], ...] = ()
     key: str = field(init=False)
     """Hash of all that a result depends on, the machine and its load aside."""
 
@@ -84,6 +88,7 @@ class Job:
             "parameters": self.params.model_dump(mode="json"),
             "part": [self.start_s, self.duration_s],
             "baseline": [self.baseline, find_system(self.baseline).version()] if self.baseline else None,
+            "marks": [[stamp, hashlib.sha256(labels).hexdigest()] for stamp, labels in self.marks],
         }
         key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
         object.__setattr__(self, "key", key)  # once, where the job is made, so that its process agrees
@@ -115,6 +120,7 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
     if job.baseline:
         run_baseline(job, progress)
         return
+    marks = dict(job.marks)
     ground, cpu_ms = [GroundScore() for _ in GROUND_RANGES_M[1:]], list[float]()
     session = open_session(job.recording, job.params, job.start_s, job.duration_s, loops=InlineLoops)
     try:
@@ -126,7 +132,7 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
             result = session.advance()
             cpu_ms.append((time.process_time() - begin) * 1e3)
             assert isinstance(result, StepResult)
-            _score_ground(ground, result)
+            _score_ground(ground, result, marks)
             progress(session.frame + 1, total)
         if session.loops:
             session.loops.poll()  # those of the last keyframes
@@ -213,7 +219,7 @@ def _facts(job: Job, session: Session, ground: list[GroundScore]) -> dict[str, A
         "loops": None if session.loops is None else session.loops.accepted,
         "loop_drift_m": _loop_drift(session),
         "ground_share": log.ground_share,
-        "ground": None if log.ground_score is None else [asdict(score) for score in ground],
+        "ground": [asdict(score) for score in ground] if job.marks or log.ground_score is not None else None,
     }
 
 
@@ -263,14 +269,17 @@ def clear_remains(folder: Path) -> None:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _score_ground(scores: list[GroundScore], result: StepResult) -> None:
-    if result.truth_ground is None:
+def _score_ground(scores: list[GroundScore], result: StepResult, marks: dict[int, bytes]) -> None:
+    """Add a frame's score, over all its points or, if there are marks, over those that are marked."""
+    cloud, truth = result.cloud, result.truth_ground
+    if marks:
+        truth = np.frombuffer(marks.get(result.stamp_ns, b""), np.uint8)
+    if truth is None or len(truth) != len(cloud):
         return
-    distance = np.linalg.norm(result.cloud.points, axis=1)
-    ranges = np.digitize(distance, GROUND_RANGES_M[1:-1])
+    ranges = np.digitize(np.linalg.norm(cloud.points, axis=1), GROUND_RANGES_M[1:-1])
     for index in range(len(scores)):
-        chosen = ranges == index
-        scores[index] += GroundScore.of(result.cloud.labels[chosen], result.truth_ground[chosen])
+        chosen = (ranges == index) & (truth != UNMARKED)
+        scores[index] += GroundScore.of(cloud.labels[chosen], truth[chosen])
 
 
 def _position_at(trajectory: Trajectory, share: float) -> F64:

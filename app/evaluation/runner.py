@@ -24,8 +24,18 @@ RunJobs = Callable[[list[Job], Path], dict[tuple[str, str], str]]
 """Runs jobs, given the folder of all runs; on this machine or on a cluster."""
 
 
-def run_jobs(jobs: list[Job], folder: Path, *, parallel: int, quiet: bool = False) -> dict[tuple[str, str], str]:
-    """Run all jobs that are not finished yet, `parallel` at a time. quiet: say nothing of single jobs.
+def run_jobs(
+    jobs: list[Job],
+    folder: Path,
+    *,
+    parallel: int,
+    quiet: bool = False,
+    ended: Callable[[], None] = lambda: None,
+) -> dict[tuple[str, str], str]:
+    """Run all jobs that are not finished yet, `parallel` at a time.
+
+    Args:
+        quiet: say nothing of single jobs. ended: called whenever one has ended, in whatever thread.
 
     Returns:
         Why jobs failed, by (recording, variant); those not named are finished.
@@ -34,7 +44,7 @@ def run_jobs(jobs: list[Job], folder: Path, *, parallel: int, quiet: bool = Fals
     stop = threading.Event()
     with ThreadPoolExecutor(parallel) as pool:
         try:
-            errors = list(pool.map(partial(_run, stop, quiet), jobs))
+            errors = list(pool.map(partial(_run, stop, quiet, ended), jobs))
         except BaseException:  # Ctrl-C
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)
@@ -42,12 +52,13 @@ def run_jobs(jobs: list[Job], folder: Path, *, parallel: int, quiet: bool = Fals
     return {(job.name, job.variant): error for job, error in zip(jobs, errors, strict=True) if error}
 
 
-def _run(stop: threading.Event, quiet: bool, job: Job) -> str:
+def _run(stop: threading.Event, quiet: bool, ended: Callable[[], None], job: Job) -> str:
     """Run a job in a process until it ends or `stop` is set. Returns why it failed, "" if it did not."""
     title, error = f"{job.name}, {job.variant}", ""
     if finished(job) is not None:
         if not quiet:
             tqdm.write(f"{title}: finished before")
+        ended()
         return ""
     child = Child(_work, job, name="job", title="Its process", fork=True, grace_s=0.0)
     bar: tqdm[NoReturn]
@@ -67,6 +78,7 @@ def _run(stop: threading.Event, quiet: bool, job: Job) -> str:
             child.close()
     if not quiet:
         tqdm.write(f"{title}: {error or 'finished'}")
+    ended()
     return error
 
 

@@ -35,6 +35,7 @@ from app import __version__
 from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.labels import LabelEdit
+from app.mapping.painted import Stroke, entry_of, marks, read_json, stroke_of
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import edit_files
@@ -82,6 +83,7 @@ _LabelEdit = Annotated[
         lambda edit: (edit.keyframe.session, edit.keyframe.index, b64encode(zlib.compress(edit.labels)).decode())
     ),
 ]
+_Stroke = Annotated[Stroke, PlainValidator(stroke_of), PlainSerializer(entry_of)]
 _Path = Annotated[Path, PlainSerializer(lambda path: str(path.resolve()))]
 _Note = Annotated[
     Note, PlainValidator(lambda entry: Note(*entry)), PlainSerializer(lambda note: (note.frame, note.text))
@@ -124,6 +126,7 @@ class State:
     truth: trajectory to compare with. notes: in the order in which they were made. speed: to play at.
     views: where cameras stood that the user kept, and what they looked at, (x, y, z) each, m, in the map.
     measures: what was measured in the map. survey: what lays it on Earth.
+    painted: points marked as ground or not.
     """
 
     params: _Params
@@ -138,6 +141,7 @@ class State:
     views: tuple[KeptView, ...] = ()
     measures: tuple[Measure, ...] = ()
     survey: Survey | None = None
+    painted: tuple[_Stroke, ...] = ()
 
 
 _OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)
@@ -287,6 +291,25 @@ def read_session(path: Path) -> SavedSession:
         gone = "is a different file now" if opened.recording.exists() else "is gone"
         raise HemislamError(f"The recording {opened.recording} of the session {path} {gone}; put it back there.")
     return SavedSession(opened, state, frame, ended)
+
+
+def read_marks(path: Path) -> tuple[tuple[int, bytes], ...]:
+    """Marks of frames, by their stamps, from a session file or NAME.labels.json.
+
+    Raises:
+        HemislamError: it cannot be read, or holds none.
+    """
+    try:
+        strokes = (
+            read_session(path).state.painted
+            if path.suffix == SUFFIX
+            else read_json(path.read_text(encoding="utf-8"), path.name)
+        )
+    except (OSError, UnicodeDecodeError) as error:
+        raise HemislamError(f"The labels {path} cannot be read: {error}.") from None
+    if not (found := marks(strokes)):
+        raise HemislamError(f"{path} holds no labelled points; label some frames under Study first.")
+    return tuple((stamp, labels.tobytes()) for stamp, labels in found.items())
 
 
 def recording_of(path: Path) -> Path | None:

@@ -11,6 +11,7 @@ from typing import Any
 
 from app.export.points import Choice
 from app.mapping.breakpoints import Breakpoints
+from app.mapping.painted import Stroke
 from app.mapping.session import EFFECT, Session
 from app.mapping.session_file import (
     SUFFIX,
@@ -55,6 +56,8 @@ _FOR_THE_FRAME = (
     | protocol.KeepView
     | protocol.KeepMeasure
     | protocol.LayOnEarth
+    | protocol.Paint
+    | protocol.UndoPaint
     | protocol.CompareWith
     | protocol.Save
 )
@@ -95,6 +98,7 @@ class Controller:
         self._notes: tuple[Note, ...] = ()
         self._views: tuple[KeptView, ...] = ()
         self._measures: tuple[Measure, ...] = ()
+        self._painted: tuple[Stroke, ...] = ()
         self._resuming: SavedSession | None = None  # that is being repeated
         self._opening: Callable[[], None] | None = None  # opens the next session
         self._waiting: list[Command] = []  # until that session is at its frame
@@ -154,6 +158,10 @@ class Controller:
                 self._show_measures(tuple(kept for kept in self._measures if kept != measure))
             case protocol.LayOnEarth(survey):
                 self._need_session().survey = survey
+            case protocol.Paint(stroke):
+                self._show_painted((*self._painted, stroke))
+            case protocol.UndoPaint():
+                self._show_painted(self._painted[:-1])
             case protocol.SetParams(values):
                 self._set_params(self._params.with_values(values))
             case protocol.LoadParams(text):
@@ -221,6 +229,10 @@ class Controller:
         self._measures = measures
         self._page.put(measures=measures, urgent=True)
 
+    def _show_painted(self, painted: tuple[Stroke, ...]) -> None:
+        self._painted = painted
+        self._page.put(painted=painted, urgent=True)
+
     def _show_params(self) -> None:
         """Show the parameters, and which of them wait for a restart."""
         session = self._player.session
@@ -282,6 +294,7 @@ class Controller:
             views=self._views,
             measures=self._measures,
             survey=session.survey,
+            painted=self._painted,
             breakpoints=self._player.breakpoints,
             speed=self._page.transport.speed,
             labels=session.keyframes.edits,
@@ -322,8 +335,9 @@ class Controller:
         self._take(session)
 
     def _reopen(self) -> None:
-        """Begin again with the present parameters. Notes, kept views, measures and loop edits stay."""
+        """Begin again with the present parameters. Notes, kept views, measures, painted labels and loop edits stay."""
         before, notes, views, measures = self._need_session(), self._notes, self._views, self._measures
+        painted = self._painted
         info, edits = before.feed.info, Edits(*before.edits)
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
         session.survey = before.survey
@@ -331,6 +345,7 @@ class Controller:
         self._show_notes(notes)
         self._show_views(views)
         self._show_measures(measures)
+        self._show_painted(painted)
         if session.loops is not None and edits != Edits():
             session.edit_loops(edits.done, edits.undone)
 
@@ -360,6 +375,7 @@ class Controller:
         self._show_notes(saved.state.notes if saved is not None else ())
         self._show_views(saved.state.views if saved is not None else ())
         self._show_measures(saved.state.measures if saved is not None else ())
+        self._show_painted(saved.state.painted if saved is not None else ())
         self._resuming = None
         if saved is not None:
             self._writer.write(saved.frame, saved.state, ended=saved.ended)  # this process may die on the way there

@@ -14,6 +14,7 @@ import msgspec
 from app.georeference.align import Alignment
 from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
+from app.mapping.painted import Stroke
 from app.mapping.session_file import KeptView, Measure, Note, Speed
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
@@ -161,6 +162,16 @@ class EditLabels(Command, frozen=True):
 
 class UndoLabels(Command, frozen=True):
     """Take the last `EditLabels` back."""
+
+
+class Paint(Command, frozen=True):
+    """Mark points of a frame as ground or not, over what was marked before."""
+
+    stroke: Stroke
+
+
+class UndoPaint(Command, frozen=True):
+    """Take the last `Paint` back."""
 
 
 class LoopCommand(Command, frozen=True):
@@ -326,7 +337,8 @@ class Snapshot:
         trajectory: (n, 3) m, positions of the IMU in the map. corrections: of odometry, by loops.
         series: (n,) arrays by SERIES name.
         T_map_truth: (4, 4), aligns the truth with the trajectory; None until the trajectory determines it.
-        notes, views, measures: in the order in which they were made. notices: the newest 50. saved: the newest 10.
+        notes, views, measures, painted: in the order in which they were made.
+        notices: the newest 50. saved: the newest 10.
         live: state of the live source; None for a recording.
         earth: as the map was when the session last stood still.
         session_file: keeps this session; opening it continues the session.
@@ -350,6 +362,7 @@ class Snapshot:
     notes: tuple[Note, ...] = ()
     views: tuple[KeptView, ...] = ()
     measures: tuple[Measure, ...] = ()
+    painted: tuple[Stroke, ...] = ()
     progress: Progress | None = None
     notices: tuple[Notice, ...] = ()
     saved: tuple[Saved, ...] = ()

@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.evaluation.evaluate import Subject
-from app.evaluation.measured import Outcome
 from app.slam.errors import HemislamError
 from app.slam.metrics import RPE_OVER, GroundScore
+
+if TYPE_CHECKING:  # the page names objectives and needs nothing of evaluation
+    from app.evaluation.evaluate import Subject
+    from app.evaluation.measured import Outcome
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +24,7 @@ class Objective:
     name: str
     title: str
     unit: str
-    of: Callable[[Outcome], Any]
+    of: "Callable[[Outcome], Any]"
     greatest: bool = False
     needs_truth: bool = False
 
@@ -31,11 +33,11 @@ class Objective:
         return "none" if value is None else f"{value:.4g} {self.unit}".rstrip()
 
 
-def _at(path: str) -> Callable[[Outcome], Any]:
+def _at(path: str) -> "Callable[[Outcome], Any]":
     return lambda outcome: outcome.value(path)
 
 
-def _ground_f1(outcome: Outcome) -> float | None:
+def _ground_f1(outcome: "Outcome") -> float | None:
     return sum(outcome.ground, GroundScore()).f1 if outcome.ground else None
 
 
@@ -55,7 +57,7 @@ OBJECTIVES: dict[str, Objective] = {
 }
 
 
-def choose_objectives(names: Sequence[str], subjects: Sequence[Subject]) -> tuple[Objective, ...]:
+def choose_objectives(names: Sequence[str], subjects: "Sequence[Subject]") -> tuple[Objective, ...]:
     """Raises HemislamError: a name is unknown or twice there, or a recording has no truth for it."""
     chosen = []
     for name in names:
@@ -74,7 +76,7 @@ def choose_objectives(names: Sequence[str], subjects: Sequence[Subject]) -> tupl
     return tuple(chosen)
 
 
-def score(objective: Objective, outcomes: Sequence[Outcome]) -> float | None:
+def score(objective: Objective, outcomes: "Sequence[Outcome]") -> float | None:
     """The mean over recordings; None if one of them has no value."""
     values = [objective.of(outcome) for outcome in outcomes]
     if any(value is None or not np.isfinite(value) for value in values):

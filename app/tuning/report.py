@@ -16,7 +16,7 @@ from app import __version__
 from app.evaluation.report import write_texts
 from app.slam.provenance import describe_machine
 from app.tuning.objectives import Objective
-from app.tuning.tune import Trial, front
+from app.tuning.trial import Trial, front
 
 BEST = "best.params.yaml"
 
@@ -63,7 +63,7 @@ def write_results(
 def pictures(study: optuna.Study, objectives: Sequence[Objective]) -> dict[str, Any]:
     """Plotly figures by title, those that the trials so far allow: history, importance, parallel coordinates, front."""
     from optuna import visualization as draw
-    from optuna.importance import PedAnovaImportanceEvaluator
+    from plotly.graph_objects import Bar, Figure  # type: ignore[import-untyped]
 
     done = [trial for trial in study.trials if trial.state == optuna.trial.TrialState.COMPLETE]
     if len(done) < 2:
@@ -75,22 +75,31 @@ def pictures(study: optuna.Study, objectives: Sequence[Objective]) -> dict[str, 
         def target(trial: optuna.trial.FrozenTrial, index: int = index) -> float:
             return float(trial.values[index])
 
-        def cost(trial: optuna.trial.FrozenTrial, index: int = index, greatest: bool = objective.greatest) -> float:
-            return float(trial.values[index]) * (-1.0 if greatest else 1.0)  # importance is for low values
-
         figures[f"{title} over trials"] = draw.plot_optimization_history(study, target=target, target_name=title)
         figures[f"{title} by parameters"] = draw.plot_parallel_coordinate(study, target=target, target_name=title)
-        if len(done[0].params) > 1 and len({target(trial) for trial in done}) > 1:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # it reminds of what `cost` settles
-                figures[f"What {title} depends on"] = draw.plot_param_importances(
-                    study, evaluator=PedAnovaImportanceEvaluator(), target=cost, target_name=title
-                )
+        if shares := importances(study, index, objective):
+            bar = Bar(x=list(shares.values()), y=list(shares), orientation="h")
+            figures[f"What {title} depends on"] = Figure(bar)
     if len(objectives) in (2, 3):
         figures["Pareto front"] = draw.plot_pareto_front(study, target_names=[one.title for one in objectives])
     for title, figure in figures.items():
         figure.update_layout(title=title)
     return figures
+
+
+def importances(study: optuna.Study, index: int, objective: Objective) -> dict[str, float]:
+    """Share of each parameter in what moves the objective with this index, the greatest first; none while unknown."""
+    from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+
+    sign = -1.0 if objective.greatest else 1.0  # importance is for low values
+    done = [trial for trial in study.trials if trial.state == optuna.trial.TrialState.COMPLETE]
+    if len({trial.values[index] for trial in done}) < 2 or len(done[0].params) < 2:
+        return {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it reminds of what `sign` settles
+        return get_param_importances(
+            study, evaluator=PedAnovaImportanceEvaluator(), target=lambda trial: sign * float(trial.values[index])
+        )
 
 
 def _entry(trial: Trial, objectives: Sequence[Objective]) -> dict[str, Any]:

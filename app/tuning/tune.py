@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import optuna
 
@@ -20,32 +20,12 @@ from app.slam.errors import HemislamError
 from app.slam.provenance import hash_input
 from app.tuning.objectives import Objective, score
 from app.tuning.space import Dimension, grid
+from app.tuning.trial import Search, Trial, front
 
-Search = Literal["bayes", "random", "grid"]
 BATCH = 8
 """Trials between two looks at the results; the same for any number of processes, so that trials repeat."""
-DEFAULTS = "as given"
-"""Name of the first trial: the parameters that the user gave."""
-
-
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """Attributes:
-    values: by dotted name; none for the first one. scores: by objective, None if it has none. error: why it failed.
-    """
-
-    number: int
-    values: Mapping[str, Any]
-    scores: tuple[float | None, ...]
-    error: str = ""
-
-    @property
-    def name(self) -> str:
-        return ", ".join(f"{path} = {value}" for path, value in self.values.items()) or DEFAULTS
-
-    @property
-    def complete(self) -> bool:
-        return None not in self.scores
+MOST_CHECKED = 5
+"""Settings that are run again on the part held back, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +57,19 @@ class Runs:
         self._known, self._run, self._threads = known, run, threads
         self.hashes = [_hash(subject.recording) for subject in subjects]
 
+    def asked(self, how: Search, trials: int, seed: int, part: Part) -> dict[str, Any]:
+        """What a search was asked for, as its report keeps it."""
+        return {
+            "recordings": [
+                {"path": str(one.recording), "sha256": sha256, "parameters": one.params.model_dump(mode="json")}
+                for one, sha256 in zip(self._subjects, self.hashes, strict=True)
+            ],
+            "search": how,
+            "trials": trials,
+            "seed": seed,
+            "part_s": [part.start_s, part.duration_s],
+        }
+
     def score(self, settings: Sequence[Mapping[str, Any]], part: Part) -> list[tuple[tuple[float | None, ...], str]]:
         """For each setting its scores by objective, and why it failed ("" if it did not)."""
         jobs = [[self._job(index, setting, part) for index in range(len(self._subjects))] for setting in settings]
@@ -98,6 +91,7 @@ class Runs:
                 threads=self._threads,
                 start_s=part.start_s,
                 duration_s=part.duration_s,
+                marks=subject.marks,
             )
 
         key = made(self._folder, "").key
@@ -127,7 +121,7 @@ def search(
     how: Search = "bayes",
     trials: int = 100,
     seed: int = 0,
-    progress: Callable[[Sequence[Trial]], None] = lambda so_far: None,
+    progress: Callable[[Sequence[Trial], optuna.Study], None] = lambda so_far, study: None,
 ) -> tuple[list[Trial], optuna.Study]:
     """Try the parameters as given and then `trials` settings. `progress` is called with the trials after each batch.
 
@@ -138,7 +132,7 @@ def search(
     study = optuna.create_study(directions=["maximize" if one.greatest else "minimize" for one in objectives])
     ((scores, error),) = runs.score([{}], part)
     done = [Trial(0, {}, scores, error)]
-    progress(done)
+    progress(done, study)
     for batch in _batches(study, dimensions, how, trials, seed):
         settings = [setting for _, setting in batch]
         for (asked, setting), (scores, error) in zip(batch, runs.score(settings, part), strict=True):
@@ -148,8 +142,19 @@ def search(
                 study.tell(asked, [value for value in scores if value is not None])
             else:
                 study.tell(asked, state=optuna.trial.TrialState.FAIL)
-        progress(done)
+        progress(done, study)
     return done, study
+
+
+def check(runs: Runs, trials: Sequence[Trial], objectives: Sequence[Objective], rest: Part | None) -> tuple[Trial, ...]:
+    """The parameters as given and the best settings, on a part that the search has not seen; nothing without one."""
+    if rest is None:
+        return ()
+    chosen = [trials[0], *(trial for trial in front(trials, objectives)[:MOST_CHECKED] if trial.number)]
+    results = runs.score([trial.values for trial in chosen], rest)
+    return tuple(
+        Trial(one.number, one.values, scores, error) for one, (scores, error) in zip(chosen, results, strict=True)
+    )
 
 
 Batch = list[tuple[optuna.trial.Trial, Mapping[str, Any]]]
@@ -176,27 +181,6 @@ def _sampler(how: Search, seed: int) -> optuna.samplers.BaseSampler:
     if how == "random":
         return optuna.samplers.RandomSampler(seed=seed)
     return optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
-
-
-def front(trials: Sequence[Trial], objectives: Sequence[Objective]) -> list[Trial]:
-    """The trials that no other one beats in every objective, the best of the first objective first."""
-    signs = [-1.0 if objective.greatest else 1.0 for objective in objectives]
-    costs = {
-        trial.number: [sign * (value or 0.0) for sign, value in zip(signs, trial.scores, strict=True)]
-        for trial in trials
-        if trial.complete
-    }
-
-    def beaten(number: int) -> bool:
-        mine = costs[number]
-        return any(
-            all(a <= b for a, b in zip(theirs, mine, strict=True)) and (theirs != mine or other < number)
-            for other, theirs in costs.items()
-            if other != number
-        )
-
-    best = [trial for trial in trials if trial.number in costs and not beaten(trial.number)]
-    return sorted(best, key=lambda trial: costs[trial.number])
 
 
 def known_runs(folder: Path) -> dict[str, Path]:

@@ -22,6 +22,7 @@ from app.server.protocol import Snapshot
 from app.server.setup import POINT_BUDGET, Setup
 from app.server.worker import RunningEngine
 from app.ui.appearance import AppearancePanel, apply_theme
+from app.ui.brush import BrushPanel
 from app.ui.calibration import CalibrationPanel
 from app.ui.camera import CameraPanel
 from app.ui.compare import ComparePanel, Sides
@@ -38,6 +39,7 @@ from app.ui.status import DoctorPanel, HeaderPanel, NoticePanel
 from app.ui.study import StudyPanel
 from app.ui.timeline import TimelinePanel
 from app.ui.transport import BreakpointPanel, NotesPanel, TransportPanel
+from app.ui.tune import TunePanel
 from app.ui.viser_adapter import prepare_page
 from app.ui.widgets import PANEL_PERIOD_S, SCENE_PERIOD_S, Changes, Page, View
 
@@ -88,7 +90,7 @@ class Workbench:
         files = FilesPanel(page, folders, results)
         self._recent = RecentPanel(page, folders, results / "sessions", files.browse)
         tabs = gui.add_tab_group()
-        with tabs.add_tab("Tune", viser.Icon.ADJUSTMENTS_HORIZONTAL):
+        with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS_HORIZONTAL):
             self._sides = Sides(gui, forks)
             tuned = replace(page, send=self._sides.send)
             self._parameters = ParameterPanel(tuned, engine.snapshot.params)
@@ -102,9 +104,16 @@ class Workbench:
                 page, lambda client: self._appearance.look_freely(client), taken=lambda: self._measure.picking
             )
         with tabs.add_tab("Study", viser.Icon.MICROSCOPE):
-            self._study = StudyPanel(page, taken=lambda *ray: self._measure.picking or self._loops.points_at(*ray))
+            self._study = StudyPanel(
+                page,
+                taken=lambda *ray: self._measure.picking or self._brush.painting or self._loops.points_at(*ray),
+            )
+            with gui.add_folder("Label by hand", expand_by_default=False):
+                self._brush = BrushPanel(page, taken=lambda *_: self._measure.picking)
         with tabs.add_tab("A/B", viser.Icon.GIT_COMPARE):
             self._compare = ComparePanel(page, forks, self._sides)
+        with tabs.add_tab("Tune", viser.Icon.TARGET_ARROW):
+            self._tune = TunePanel(page, forks, self._sides, results / "tuning")
         with tabs.add_tab("View", viser.Icon.EYE):
             self._appearance = AppearancePanel(gui, legend, FromAbove(server))
             self._camera = CameraPanel(page, self._scene.framing, self._appearance.look_freely)
@@ -126,6 +135,7 @@ class Workbench:
         self._panels = (
             self._transport, self._breakpoints, self._notes, self._notices, self._header, self._recent, self._timeline,
             self._readouts, self._doctor, self._calibration, self._live, self._files, self._camera,
+            self._tune,
         )  # fmt: skip
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
@@ -142,6 +152,7 @@ class Workbench:
         """Stop drawing; the page stays as it is until its server stops."""
         self._stop.set()
         self._calibration.close()
+        self._tune.close()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
 
@@ -166,6 +177,7 @@ class Workbench:
         self._loops.draw(current, view)
         self._study.draw(current, view)
         self._measure.draw(current, view)
+        self._brush.draw(current, view)
         for panel in self._panels:
             panel.draw(current)
         self._scale.draw()

@@ -10,7 +10,7 @@ from app.server.chunks import MOST_SHOWN
 from app.server.protocol import StepFrame
 from tests.browser.conftest import Bench
 
-TABS = ("Tune", "Readouts", "Loops", "Study", "A/B", "View", "Recording", "Help")
+TABS = ("Parameters", "Readouts", "Loops", "Study", "A/B", "Tune", "View", "Recording", "Help")
 
 CONTROLS = """() => [...document.querySelectorAll(
   'button,input,select,textarea,[role=slider],[role=tab],[data-hs][tabindex],summary,a[href]')].filter((one) => {

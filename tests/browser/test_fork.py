@@ -43,7 +43,7 @@ def test_a_fork_is_tuned_seen_swapped_and_kept(bench: Bench, forks: Workspace, t
     page.get_by_role("button", name="Fork here").click()
     bench.eventually(lambda: forks.names[1] == "wide band")
     expect(page.get_by_text("B · wide band")).to_be_visible()
-    page.get_by_role("tab", name="Tune").click()
+    page.get_by_role("tab", name="Parameters").click()
     expect(page.get_by_text("act on")).to_be_visible()
     page.get_by_role("tab", name="A/B").click()
     before = blue(bench)

@@ -117,7 +117,7 @@ def test_the_recording_s_findings_are_in_their_panel(bench: Bench) -> None:
     expect(bench.page.get_by_text("--set imu.max_gap=0.4")).to_be_visible()
     bench.page.get_by_role("button", name="Settle it").click()
     bench.eventually(lambda: SetParams({"imu.max_gap": 0.4}) in bench.engine.sent)
-    bench.page.get_by_role("tab", name="Tune").click()
+    bench.page.get_by_role("tab", name="Parameters").click()
 
 
 def test_parameters_can_be_had_as_yaml_and_given(bench: Bench) -> None:
@@ -168,7 +168,7 @@ def test_a_recording_is_chosen_from_the_allowed_folder(bench: Bench) -> None:
     dialog.get_by_role("button", name="garage.mcap").click()
     bench.eventually(lambda: any(isinstance(command, OpenRecording) for command in bench.engine.sent))
     expect(bench.page.get_by_text("garage.mcap").first).to_be_visible()
-    bench.page.get_by_role("tab", name="Tune").click()
+    bench.page.get_by_role("tab", name="Parameters").click()
 
 
 def test_a_trajectory_to_compare_with_is_chosen_from_the_allowed_folders(bench: Bench) -> None:
@@ -182,7 +182,7 @@ def test_a_trajectory_to_compare_with_is_chosen_from_the_allowed_folders(bench: 
     (command,) = (command for command in bench.engine.sent if isinstance(command, CompareWith))
     assert command.path is not None and command.path.name == "other_slam.tum"
     expect(dialog).to_have_count(0)
-    bench.page.get_by_role("tab", name="Tune").click()
+    bench.page.get_by_role("tab", name="Parameters").click()
 
 
 def test_a_reload_finds_everything_again(bench: Bench) -> None:
@@ -269,4 +269,4 @@ def test_a_click_on_the_map_measures_the_point_under_it(bench: Bench) -> None:
     (spot,) = kept()[0].measure.spots
     assert np.linalg.norm(spot.at[:2]) < 12.0 and -3.0 < spot.at[2] < 5.0
     bench.page.get_by_role("button", name="stop", exact=True).click()
-    bench.page.get_by_role("tab", name="Tune").click()
+    bench.page.get_by_role("tab", name="Parameters").click()

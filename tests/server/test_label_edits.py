@@ -7,8 +7,9 @@ import numpy as np
 from pydantic import TypeAdapter
 from session_bench import Bench, last_notice
 
+from app.mapping.painted import Stroke
 from app.mapping.session_file import State
-from app.server.protocol import EditLabels, Seek, SetParams, UndoLabels
+from app.server.protocol import EditLabels, Paint, Restart, Seek, SetParams, UndoLabels, UndoPaint
 from app.slam.types import GROUND, NON_GROUND
 
 
@@ -48,3 +49,13 @@ def test_a_state_with_label_edits_is_written_and_read() -> None:
     state = State(session.params, labels=session.keyframes.edits)
     assert adapter.validate_json(adapter.dump_json(state)) == state
     assert len(state.labels) == 2
+
+
+def test_marks_of_the_brush_are_kept_undone_and_survive_a_restart() -> None:
+    bench = Bench()
+    bench.do(Seek(20))
+    first, second = (Stroke.of(5, np.arange(4) < count, GROUND) for count in (1, 3))
+    assert bench.do(Paint(first), Paint(second)).painted == (first, second)
+    assert bench.do(UndoPaint()).painted == (first,)
+    assert bench.do(Restart()).painted == (first,)
+    assert bench.do(UndoPaint(), UndoPaint()).painted == ()

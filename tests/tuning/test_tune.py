@@ -1,6 +1,7 @@
 """A search tries settings, keeps the best, goes on after a stop, and refuses what cannot vary.
 
-Tests app/tuning/space.py, app/tuning/objectives.py, app/tuning/tune.py, app/tuning/report.py.
+Tests app/tuning/space.py, app/tuning/objectives.py, app/tuning/trial.py, app/tuning/tune.py, app/tuning/report.py,
+app/tuning/process.py.
 """
 
 import csv
@@ -20,8 +21,10 @@ from app.__main__ import cli
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.tuning.objectives import OBJECTIVES
+from app.tuning.process import Tried, Wanted, find
 from app.tuning.space import grid, parse_dimensions
-from app.tuning.tune import Part, Trial, front, search
+from app.tuning.trial import Trial, front
+from app.tuning.tune import Part, search
 from tests.cli.conftest import write_walk
 
 ATE, F1 = OBJECTIVES["ate"], OBJECTIVES["ground-f1"]
@@ -162,6 +165,40 @@ def test_a_search_on_a_recording_leaves_its_results_and_is_not_run_twice(recordi
     assert tune(recording, other, *both).exit_code == 0
     assert not list(other.glob("runs/*/*/run.json")), "what the first search ran is used"
     assert [row["entropy_nats"] for row in trials_of(other)] == [row["entropy_nats"] for row in rows]
+
+
+class Owner:
+    """Stands for the page."""
+
+    def __init__(self) -> None:
+        self.told: list[Any] = []
+
+    def send(self, message: object) -> None:
+        self.told.append(message)
+
+
+def wanted(recording: Path, out: Path, objective: str) -> Wanted:
+    varied = "filter.max_iterations=1:5"
+    return Wanted(recording, Params(), None, varied, (objective,), "grid", 3, 0.0, 1.5, out)
+
+
+def test_a_search_for_the_page_tells_each_run_and_its_trials_and_leaves_the_same_files(
+    recording: Path, tmp_path: Path
+) -> None:
+    owner = Owner()
+    find(owner, wanted(recording, tmp_path / "tuning", "entropy"))  # type: ignore[arg-type]
+    runs = [message for message in owner.told if isinstance(message, int)]
+    found = [message for message in owner.told if isinstance(message, Tried)]
+    assert runs[:4] == [1, 2, 3, 4] and [len(one.trials) for one in found] == [1, 4, 4]
+    assert found[-1].finished and found[-1].held_back[0].number == 0
+    assert {file.name for file in (tmp_path / "tuning").iterdir()} >= {"best.params.yaml", "tuning.html", "trials.csv"}
+
+
+def test_a_search_for_the_page_that_cannot_be_says_why(recording: Path, tmp_path: Path) -> None:
+    owner = Owner()
+    find(owner, wanted(recording, tmp_path, "ate"))  # type: ignore[arg-type]
+    (sentence,) = owner.told
+    assert "needs true poses" in sentence
 
 
 def test_an_objective_without_truth_is_refused(recording: Path, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@ if (!window.hemislamTour) {
   const STEPS = [
     ['.hs-steps', '', 'Play, or step', 'Space plays and pauses. ← and → go one frame; going back loses nothing.'],
     ['.hs-track', '', 'Go anywhere', 'Drag the track. Marks show loops, notes and trouble; Diagnostics says what it was.'],
-    ['[role=slider][aria-valuenow]:not(input)', 'Tune', 'Tune the ground', 'Move M, α or σ: the present frame is labelled again '
+    ['[role=slider][aria-valuenow]:not(input)', 'Parameters', 'Tune the ground', 'Move M, α or σ: the present frame is labelled again '
       + 'at once. Teal is ground, amber are the seeds it was found from.'],
     ['', 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click a row to see both sides and '
       + 'why it was accepted or refused; change that, and undo it.'],
@@ -27,7 +27,7 @@ if (!window.hemislamTour) {
       const [skip, next] = box.querySelectorAll('button');
       next.textContent = at + 1 < STEPS.length ? 'Next' : 'Done';
       skip.onclick = end;
-      next.onclick = () => { at += 1; if (at < STEPS.length) show(); else { end(); window.hemislamOpenTab('Tune'); } };
+      next.onclick = () => { at += 1; if (at < STEPS.length) show(); else { end(); window.hemislamOpenTab('Parameters'); } };
       next.focus();
     };
     box.className = 'hs-tour hs';

@@ -1,0 +1,108 @@
+"""A search in a process of its own, for the page: it tells its trials as they come and leaves what `tune` leaves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from app.child import Link
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.provenance import cores
+from app.tuning.trial import Search, Trial, front
+
+if TYPE_CHECKING:
+    import optuna
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is searched for.
+
+    Attributes:
+        parameters: what varies, as `--parameters` has it. objectives: names. how: as `--search`.
+        start_s, duration_s: the part of the recording; None: to its end.
+        folder: for the files that `hemislam tune` writes. marks: as `Job` has them.
+    """
+
+    recording: Path
+    params: Params
+    truth: Path | None
+    parameters: str
+    objectives: tuple[str, ...]
+    how: Search
+    trials: int
+    start_s: float
+    duration_s: float | None
+    folder: Path
+    marks: tuple[tuple[int, bytes], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """What is known so far.
+
+    Attributes:
+        best: numbers of the trials that no other one beats.
+        importance: share of each parameter in what moves the first objective.
+        held_back: trials run again on a part that the search has not seen. finished: no more will come.
+    """
+
+    trials: tuple[Trial, ...] = ()
+    best: tuple[int, ...] = ()
+    importance: dict[str, float] = field(default_factory=dict)
+    held_back: tuple[Trial, ...] = ()
+    finished: bool = False
+
+
+def find(owner: Link, wanted: Wanted) -> None:
+    """Send the number of runs that have ended, and a `Tried` whenever there is more; or why there is none, in words."""
+    try:
+        _find(owner, wanted)
+    except HemislamError as error:
+        owner.send(str(error))
+
+
+def _find(owner: Link, wanted: Wanted) -> None:
+    from app.evaluation.evaluate import Subject
+    from app.evaluation.runner import run_jobs
+    from app.evaluation.truth import read_truth
+    from app.tuning.objectives import choose_objectives
+    from app.tuning.report import importances, write_results
+    from app.tuning.space import parse_dimensions
+    from app.tuning.tune import Part, Runs, check, known_runs, search
+
+    truth = read_truth(str(wanted.truth)) if wanted.truth is not None else None
+    subject = Subject(wanted.recording.stem, wanted.recording, wanted.params, truth, marks=wanted.marks)
+    dimensions, objectives = parse_dimensions(wanted.parameters), choose_objectives(wanted.objectives, [subject])
+    part, rest = Part(wanted.start_s, wanted.duration_s), None
+    if wanted.duration_s is not None and not wanted.marks:  # marks are on the part itself
+        rest = Part(wanted.start_s + wanted.duration_s, wanted.duration_s)
+    count, latest = 0, Tried()
+
+    def ended() -> None:
+        nonlocal count
+        count += 1
+        owner.send(count)
+
+    def progress(so_far: Sequence[Trial], study: "optuna.Study") -> None:
+        nonlocal latest
+        best = tuple(trial.number for trial in front(so_far, objectives))
+        latest = Tried(tuple(so_far), best, importances(study, 0, objectives[0]))
+        owner.send(latest)
+
+    parallel = 1 if "frame-time" in wanted.objectives else cores()  # runs beside each other would spoil their times
+    runs = Runs(
+        [subject],
+        objectives,
+        wanted.folder / "runs",
+        known=known_runs(wanted.folder.resolve().parent),
+        run=partial(run_jobs, parallel=parallel, quiet=True, ended=ended),
+        threads=1,
+    )
+    done, study = search(runs, dimensions, objectives, part, how=wanted.how, trials=wanted.trials, progress=progress)
+    checked = check(runs, done, objectives, rest) if latest.best else ()
+    asked = runs.asked(wanted.how, wanted.trials, 0, part)
+    write_results(wanted.folder, done, checked, objectives, study, asked)
+    owner.send(replace(latest, held_back=checked, finished=True))

@@ -1,0 +1,53 @@
+"""A setting that was tried, and which of many no other one beats."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from app.tuning.objectives import Objective
+
+Search = Literal["bayes", "random", "grid"]
+"""How the next settings are chosen."""
+DEFAULTS = "as given"
+"""Name of the first trial: the parameters that the user gave."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """Attributes:
+    values: by dotted name; none for the first one. scores: by objective, None if it has none. error: why it failed.
+    """
+
+    number: int
+    values: Mapping[str, Any]
+    scores: tuple[float | None, ...]
+    error: str = ""
+
+    @property
+    def name(self) -> str:
+        return ", ".join(f"{path} = {value}" for path, value in self.values.items()) or DEFAULTS
+
+    @property
+    def complete(self) -> bool:
+        return None not in self.scores
+
+
+def front(trials: Sequence[Trial], objectives: Sequence[Objective]) -> list[Trial]:
+    """The trials that no other one beats in every objective, the best of the first objective first."""
+    signs = [-1.0 if objective.greatest else 1.0 for objective in objectives]
+    costs = {
+        trial.number: [sign * (value or 0.0) for sign, value in zip(signs, trial.scores, strict=True)]
+        for trial in trials
+        if trial.complete
+    }
+
+    def beaten(number: int) -> bool:
+        mine = costs[number]
+        return any(
+            all(a <= b for a, b in zip(theirs, mine, strict=True)) and (theirs != mine or other < number)
+            for other, theirs in costs.items()
+            if other != number
+        )
+
+    best = [trial for trial in trials if trial.number in costs and not beaten(trial.number)]
+    return sorted(best, key=lambda trial: costs[trial.number])

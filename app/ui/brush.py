@@ -1,0 +1,193 @@
+"""The brush: marks points of the present frame as ground or not, which `ground-f1` then measures labels against."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import viser
+
+from app.mapping.painted import SUFFIX, UNMARKED, Stroke, marks, read_json, to_json
+from app.server.protocol import Paint, Seek, Snapshot, UndoPaint
+from app.slam import lie
+from app.slam.errors import HemislamError
+from app.slam.types import F64, GROUND, NON_GROUND, U8, StepResult
+from app.ui.colours import LABEL_COLOURS
+from app.ui.html import panel
+from app.ui.nodes import add_points, place
+from app.ui.sensor import SCAN_POINT_SCALE
+from app.ui.study_maths import nearest_to_ray
+from app.ui.viser_adapter import Bridge
+from app.ui.widgets import ROOT, Changes, Page, View, by_user, notify_error
+
+_OFF: Final = "off"
+_MARKS: Final = {"ground": GROUND, "not ground": NON_GROUND, "erase": UNMARKED}
+_COLOURS: Final = np.array([(255, 92, 141), LABEL_COLOURS[GROUND]], np.uint8)
+"""Of marks: not ground in pink, ground in teal."""
+_SCALE: Final = 2.0
+"""Marked points are larger than the others of the scan."""
+
+
+class BrushPanel:
+    """Widgets in the caller's container, and the marked points of the present frame in the scene.
+
+    Args:
+        taken: whether a click's ray in the map, its origin and direction, was meant for something else.
+    """
+
+    def __init__(self, page: Page, taken: Callable[[F64, F64], bool] = lambda origin, direction: False) -> None:
+        gui = page.gui
+        self._page, self._taken = page, taken
+        self._changes = Changes()
+        self._mark: int | None = None
+        self._node: viser.SceneNodeHandle | None = None
+        self._why = gui.add_html("")
+        brush = gui.add_button_group(
+            "brush", (*_MARKS, _OFF), hint="Pause, then click points of the scan; Shift and drag marks a rectangle."
+        )
+        self._radius = gui.add_slider("radius (m)", 0.05, 3.0, 0.05, 0.4)
+        self._rest = gui.add_button(
+            "Mark the rest as labelled",
+            color="gray",
+            hint="Points of this frame without a mark take the label that the engine gave them; then correct these.",
+        )
+        self._undo = gui.add_button("Undo mark", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False)
+        self._bridge = Bridge(gui, "labelled", self._go)
+        self._list = gui.add_html("", visible=False)
+        self._save = gui.add_button("Download labels", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
+        self._load = gui.add_upload_button("Load labels", icon=viser.Icon.UPLOAD, color="gray", mime_type=".json")
+        brush.on_click(by_user(lambda name, _: self.choose(name)))
+        self._rest.on_click(by_user(lambda _, __: self._mark_rest()))
+        self._undo.on_click(by_user(lambda _, __: page.send(UndoPaint())))
+        self._save.on_click(by_user(lambda _, client: self._download(client)))
+        self._load.on_upload(by_user(self._read))
+        page.scene.on_click()(self._click)
+        page.scene.on_rect_select(modifier="shift")(self._drag)
+
+    @property
+    def painting(self) -> bool:
+        """Whether clicks in the scene are for the brush."""
+        return self._mark is not None
+
+    def choose(self, name: str) -> None:
+        self._mark = _MARKS.get(name)
+
+    def draw(self, snapshot: Snapshot, view: View) -> None:
+        result = snapshot.result
+        if not self._changes(snapshot.painted, result, self._mark, view.point_size):
+            return
+        found = marks(snapshot.painted)
+        self._undo.visible = bool(snapshot.painted)
+        self._rest.visible = self._radius.visible = self.painting
+        self._save.visible = self._list.visible = bool(found)
+        self._why.content = panel("quiet", self._words(snapshot, bool(found)))
+        rows = [(stamp, self._second(snapshot, stamp), *map(int, _counts(labels))) for stamp, labels in found.items()]
+        self._list.content = self._bridge.live(panel("labelled", rows)) if rows else ""
+        self._draw_scene(result, found.get(result.stamp_ns) if result is not None else None, view.point_size)
+
+    def _words(self, snapshot: Snapshot, any_marks: bool) -> str:
+        if self.painting:
+            return "Click points of the scan, or hold Shift and drag a rectangle. Marks lie on this frame alone."
+        if any_marks:
+            return "Tune uses these marks for Ground F1."
+        return "Mark ground in a few frames, and Tune finds the parameters that label them best."
+
+    def _draw_scene(self, result: StepResult | None, found: U8 | None, size: float) -> None:
+        if self._node is not None:
+            self._node.remove()
+            self._node = None
+        if result is None or found is None or len(found) != len(result.cloud):
+            return
+        shown = np.flatnonzero(found != UNMARKED)
+        points, colours = result.cloud.points[shown], _COLOURS[found[shown]]
+        node = add_points(self._page.scene, f"{ROOT}/painted", points, colours, _SCALE * SCAN_POINT_SCALE * size)
+        place(node, result.T_map_imu @ result.state.T_imu_lidar)
+        self._node = node
+
+    # --- what is marked --------------------------------------------------------------------------
+    def _frame(self) -> StepResult | None:
+        """The present one; None while it plays, or while the brush is off."""
+        snapshot = self._page.snapshot()
+        return None if snapshot.transport.playing or not self.painting else snapshot.result
+
+    def _click(self, event: viser.SceneClickEvent) -> None:
+        result, ray = self._frame(), self._page.in_map(event)
+        if result is None or self._taken(*ray):
+            return
+        T = lie.inverse(result.T_map_imu @ result.state.T_imu_lidar)
+        points = result.cloud.points
+        index = nearest_to_ray(points, T[:3, :3] @ ray[0] + T[:3, 3], T[:3, :3] @ ray[1])
+        if index is not None:
+            self._paint(result, np.linalg.norm(points - points[index], axis=1) <= self._radius.value)
+
+    def _drag(self, event: viser.SceneRectSelectEvent) -> None:
+        if (result := self._frame()) is not None:
+            camera = event.client.camera
+            T_camera_map = lie.inverse(_pose(camera.wxyz, np.asarray(camera.position) - self._page.offset()))
+            T = T_camera_map @ result.T_map_imu @ result.state.T_imu_lidar
+            seen = on_screen(result.cloud.points @ T[:3, :3].T + T[:3, 3], camera.fov, camera.aspect)
+            low, high = np.array(event.screen_min), np.array(event.screen_max)
+            self._paint(result, np.asarray(((seen >= low) & (seen <= high)).all(axis=1)))
+
+    def _paint(self, result: StepResult, touched: npt.NDArray[np.bool_]) -> None:
+        if self._mark is not None and touched.any():
+            self._page.send(Paint(Stroke.of(result.stamp_ns, touched, self._mark)))
+
+    def _mark_rest(self) -> None:
+        """The engine's labels for all points without a mark."""
+        if (result := self._frame()) is None:
+            return
+        found = marks(self._page.snapshot().painted).get(result.stamp_ns)
+        free = np.ones(len(result.cloud), np.bool_) if found is None else found == UNMARKED
+        for mark, ground in ((GROUND, True), (NON_GROUND, False)):
+            touched = free & ((result.cloud.labels != NON_GROUND) == ground)
+            if touched.any():
+                self._page.send(Paint(Stroke.of(result.stamp_ns, touched, mark)))
+
+    # --- the frames that have marks --------------------------------------------------------------
+    @staticmethod
+    def _second(snapshot: Snapshot, stamp_ns: int) -> str:
+        return f"{(stamp_ns - snapshot.recording.start_ns) * 1e-9:.1f} s" if snapshot.recording else ""
+
+    def _go(self, word: str, _: viser.ClientHandle) -> None:
+        """What the list sends: "frame 1700000000000000000", a stamp."""
+        snapshot = self._page.snapshot()
+        if snapshot.recording is not None and "stamp_s" in snapshot.series:
+            seconds = (int(word.removeprefix("frame ")) - snapshot.recording.start_ns) * 1e-9
+            frames = np.flatnonzero(np.abs(snapshot.series["stamp_s"] - seconds) < 1e-3)
+            if len(frames):
+                self._page.send(Seek(int(frames[0])))
+
+    def _download(self, client: viser.ClientHandle) -> None:
+        snapshot = self._page.snapshot()
+        name = f"{snapshot.recording.path.stem if snapshot.recording else 'frames'}{SUFFIX}"
+        client.send_file_download(name, to_json(snapshot.painted).encode(), save_immediately=True)
+
+    def _read(self, file: Any, client: viser.ClientHandle) -> None:
+        try:
+            strokes = read_json(file.content.decode("utf-8", errors="replace"), Path(file.name).name)
+        except HemislamError as error:
+            notify_error(client, error)
+            return
+        for stroke in strokes:
+            self._page.send(Paint(stroke))
+
+
+def _counts(labels: U8) -> tuple[int, int]:
+    return int(np.count_nonzero(labels == GROUND)), int(np.count_nonzero(labels == NON_GROUND))
+
+
+def _pose(wxyz: Any, position: Any) -> F64:
+    w, x, y, z = (float(value) for value in wxyz)
+    return lie.transform(lie.matrix(np.array([x, y, z, w])), np.asarray(position, np.float64))
+
+
+def on_screen(points: F64, fov: float, aspect: float) -> F64:
+    """Where (n, 3) points in the camera's frame (z forward, y down) are in the picture, (n, 2), 0-1 from its top left.
+
+    Points behind the camera are nowhere: nan. fov: vertical, rad. aspect: width over height.
+    """
+    depth = np.where(points[:, 2] > 0, points[:, 2], np.nan)
+    half = np.tan(fov / 2)
+    return np.stack((points[:, 0] / (depth * half * aspect), points[:, 1] / (depth * half)), axis=1) / 2 + 0.5

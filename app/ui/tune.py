@@ -1,0 +1,220 @@
+"""Tune: a search for better parameters on the open recording, in a process of its own; a click opens a trial as B."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final, get_args
+
+import viser
+
+from app.child import Child, ChildDied
+from app.mapping.painted import marks
+from app.server.fork import Workspace
+from app.server.protocol import LIVE, Snapshot
+from app.slam.errors import HemislamError
+from app.tuning.objectives import OBJECTIVES
+from app.tuning.process import Tried, Wanted, find
+from app.tuning.trial import Search
+from app.ui import tune_maths as maths
+from app.ui.compare import Sides
+from app.ui.html import panel
+from app.ui.viser_adapter import Bridge
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, by_user, notify_error
+
+_PARTS: Final = {"5 s from here": 5.0, "20 s from here": 20.0, "60 s from here": 60.0, "the whole recording": None}
+_LABELLED: Final = "the labelled frames"
+_LEAD_S: Final = 2.0
+"""The engine starts so long before the first labelled frame."""
+_NONE: Final = "–"
+_TITLES: Final = {one.title: one.name for one in OBJECTIVES.values()}
+_FORK: Final = "trial "
+"""How forks that were opened here are named."""
+_EMPTY: Final = (
+    "Choose what varies and what is wanted, go to a part of the recording that shows the trouble, and press Start. "
+    "Each trial runs that part with other parameters, beside this session."
+)
+_NO_OPTUNA: Final = "Tuning needs Optuna; install it with `pip install 'hemislam[tune]'` and start again."
+
+
+class TunePanel:
+    """What is asked for, the progress, and plots of the trials.
+
+    Args:
+        folder: for the files that a search leaves. sides: told to show the parameters of the trial that is opened.
+    """
+
+    def __init__(self, page: Page, forks: Workspace, sides: Sides, folder: Path) -> None:
+        gui = page.gui
+        self._page, self._forks, self._sides, self._folder = page, forks, sides, folder
+        self._child: Child | None = None
+        self._wanted: Wanted | None = None  # by the search that was started last
+        self._found, self._chosen = Tried(), -1
+        self._runs: list[tuple[float, int]] = []  # when how many runs had ended
+        self._changes = Changes(page.now, PANEL_PERIOD_S)
+        self._why = gui.add_html("")
+        self._parameters = gui.add_text(
+            "what varies",
+            "ground.alpha, ground.sigma",
+            hint="Names as in YAML, each over its range or a narrower one: ground.alpha=10:40.",
+        )
+        self._first = gui.add_dropdown("wanted", tuple(_TITLES), initial_value=OBJECTIVES["entropy"].title)
+        self._second = gui.add_dropdown("and", (_NONE, *_TITLES), hint="With two, no trial is best: a front is shown.")
+        self._part = gui.add_dropdown(
+            "on",
+            (*_PARTS, _LABELLED),
+            initial_value="20 s from here",
+            hint="The best are then checked on as much behind it.",
+        )
+        self._search = gui.add_dropdown("search", get_args(Search), hint="How the next trials are chosen.")
+        self._trials = gui.add_slider("trials", 8, 400, 8, 48)
+        self._start = gui.add_button("Start", icon=viser.Icon.PLAYER_PLAY)
+        self._stop = gui.add_button(
+            "Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False, hint="Finished runs stay."
+        )
+        self._go_on = gui.add_button("Go on", icon=viser.Icon.PLAYER_TRACK_NEXT, visible=False)
+        self._progress = gui.add_progress_bar(0.0, visible=False)
+        self._bridge = Bridge(gui, "trials", self._clicked)
+        self._plots = gui.add_html("", visible=False)
+        self._start.on_click(by_user(lambda _, client: self._begin(client)))
+        self._stop.on_click(by_user(lambda _, __: self.close()))
+        self._go_on.on_click(by_user(lambda _, __: self._run()))
+
+    def draw(self, snapshot: Snapshot) -> None:
+        recording = snapshot.recording.path if snapshot.recording else None
+        if self._wanted is not None and recording is not None and recording != self._wanted.recording:
+            self.close()
+            self._wanted, self._found, self._chosen = None, Tried(), -1
+        problem = self._problem(snapshot)
+        self._receive()
+        running = self._child is not None
+        self._start.visible, self._start.disabled = not running, bool(problem)
+        self._stop.visible = self._progress.visible = running
+        self._go_on.visible = not running and self._wanted is not None and not self._found.finished
+        done = self._runs[-1][1] if self._runs else 0
+        if self._changes(self._found, self._chosen, running, done, problem):
+            self._why.content = panel("quiet", problem or self._words())
+            objectives = self._objectives()
+            html = maths.plots(self._found, objectives, self._chosen) if objectives else ""
+            self._plots.content, self._plots.visible = self._bridge.live(html), bool(html)
+            if self._wanted is not None:
+                share = 100 * done / (self._wanted.trials + 1)
+                self._progress.value = min(share, 100.0)  # type: ignore[misc]  # mypy overlooks viser's setter
+
+    def close(self) -> None:
+        """End what is under way; its finished runs stay."""
+        child, self._child = self._child, None
+        if child is not None:
+            child.close(0.0)
+
+    @staticmethod
+    def _problem(snapshot: Snapshot) -> str:
+        if find_spec("optuna") is None:
+            return _NO_OPTUNA
+        if snapshot.recording is None:
+            return "Open a recording first, under Recording."
+        return "A live source cannot be repeated; record it, and open the recording." if snapshot.live else ""
+
+    def _words(self) -> str:
+        wanted, found = self._wanted, self._found
+        if wanted is None:
+            return _EMPTY
+        told = f"{len(found.trials)} of {wanted.trials + 1} trials"
+        if self._child is not None:
+            return (
+                f"{told} · {self._left(wanted)}" if self._runs else "The first trial runs with the parameters as given."
+            )
+        return f"{told} · saved in {wanted.folder}" if found.finished else f"{told} · stopped"
+
+    def _left(self, wanted: Wanted) -> str:
+        """By the pace of the newest runs: those that were finished before take no time."""
+        if len(self._runs) < 2:
+            return "the first runs tell how long it takes"
+        (begin, first), (end, last) = self._runs[-9:][0], self._runs[-1]
+        if last > wanted.trials:
+            return "checking the best on the part held back"
+        return maths.left((end - begin) / (last - first) * (wanted.trials + 1 - last))
+
+    def _objectives(self) -> "list[Any]":
+        return [OBJECTIVES[name] for name in self._wanted.objectives] if self._wanted else []
+
+    def _receive(self) -> None:
+        while (child := self._child) is not None:
+            try:
+                message = child.receive(0.0)
+            except ChildDied as death:
+                message = str(death)
+            if child is not self._child:
+                return  # stopped meanwhile
+            match message:
+                case None:
+                    return
+                case int():
+                    self._runs.append((self._page.now(), message))
+                case Tried():
+                    self._found = message
+                    if message.finished:
+                        self.close()
+                case sentence:
+                    self.close()
+                    for client in self._page.server.get_clients().values():
+                        notify_error(client, sentence)
+
+    def _begin(self, client: viser.ClientHandle) -> None:
+        snapshot = self._page.snapshot()
+        if self._child is not None or snapshot.recording is None or snapshot.recording.path == LIVE:
+            return
+        marked = marks(snapshot.painted)
+        names = dict.fromkeys(_TITLES[title] for title in (self._first.value, self._second.value) if title != _NONE)
+        if snapshot.recording.truth is None and (blind := [one for one in names if OBJECTIVES[one].needs_truth]):
+            title = OBJECTIVES[blind[0]].title
+            notify_error(client, f"{title} needs true poses; compare with a truth under Recording, or choose another.")
+            return
+        if self._part.value == _LABELLED and not marked:
+            notify_error(client, "No frame is labelled yet; mark ground in a few frames with the brush under Study.")
+            return
+        begin, length = self._chosen_part(snapshot, list(marked))
+        self._wanted = Wanted(
+            snapshot.recording.path,
+            snapshot.params,
+            snapshot.recording.truth,
+            self._parameters.value,
+            tuple(names),
+            self._search.value,
+            int(self._trials.value),
+            begin,
+            length,
+            self._folder,
+            tuple((stamp, labels.tobytes()) for stamp, labels in marked.items()) if "ground-f1" in names else (),
+        )
+        self._run()
+
+    def _chosen_part(self, snapshot: Snapshot, stamps: list[int]) -> tuple[float, float | None]:
+        """Its start and length, s. stamps: of labelled frames, ascending."""
+        assert snapshot.recording is not None
+        start_ns = snapshot.recording.start_ns
+        if self._part.value == _LABELLED:
+            first, last = ((stamp - start_ns) * 1e-9 for stamp in (stamps[0], stamps[-1]))
+            begin = round(max(first - _LEAD_S, 0.0), 1)
+            return begin, round(last - begin + 0.2, 1)
+        length, here = _PARTS[self._part.value], snapshot.transport.stamp_ns or start_ns
+        return (round(max((here - start_ns) * 1e-9, 0.0), 1) if length is not None else 0.0), length
+
+    def _run(self) -> None:
+        """Begin, or go on: a search finds the runs that were finished before."""
+        if self._wanted is not None and self._child is None:
+            self._found, self._runs, self._chosen = Tried(), [], -1
+            self._child = Child(find, self._wanted, name="tune", title="The search", fork=True, grace_s=0.0)
+
+    def _clicked(self, word: str, client: viser.ClientHandle) -> None:
+        """What the plots send: "trial 12". Opens it beside the present parameters; B's are then on the sliders."""
+        number = int(word.removeprefix("trial "))
+        if not 0 <= number < len(self._found.trials):
+            return
+        self._chosen = number
+        try:
+            if self._forks.names[1].startswith(_FORK):
+                self._forks.discard()
+            if number:
+                self._forks.fork(f"{_FORK}{number}", self._found.trials[number].values)
+                self._sides.choose("B")
+        except HemislamError as error:
+            notify_error(client, error)

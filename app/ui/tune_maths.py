@@ -1,0 +1,205 @@
+"""Where trials lie in the plots of the Tune tab, and what is said of them: pure functions."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from app.tuning.objectives import Objective
+from app.tuning.process import Tried
+from app.tuning.trial import Trial
+from app.ui.colours import TABLES
+from app.ui.html import css, panel
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 44.0, 334.0, 8.0, 108.0
+"""Of a scatter plot, in units of its picture."""
+_AXES: Final = (24.0, 316.0, 16.0, 120.0)
+"""Left, right, top and bottom of the parallel coordinates."""
+_OUTLIERS: Final = 5.0
+"""Per cent of trials whose bad scores may lie on the edge of a plot."""
+_WIDE: Final = 50.0
+"""A range is drawn by ratios where its ends differ by more than this factor."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """Attributes:
+    low, high: values at its two ends. share: of a value, 0-1 along the axis.
+    """
+
+    name: str
+    low: str
+    high: str
+    share: Callable[[Any], float]
+
+
+class Dot(NamedTuple):
+    number: int
+    x: float
+    y: float
+    words: str
+    best: bool
+    chosen: bool
+
+
+def words(trial: Trial, objectives: Sequence[Objective]) -> str:
+    """A trial in a line, as the page shows it on hover."""
+    told = ", ".join(f"{one.title} {one.told(value)}" for one, value in zip(objectives, trial.scores, strict=True))
+    return f"trial {trial.number}: {told} · {trial.name}"
+
+
+def number_axis(name: str, values: Sequence[float]) -> Axis:
+    """An axis over these numbers, by ratios where they span much."""
+    low, high = min(values), max(values)
+    by = math.log if low > 0 and high > _WIDE * low else float
+    begin, span = by(low), by(high) - by(low)
+
+    def share(value: float) -> float:
+        return (by(min(max(value, low), high)) - begin) / span if span else 0.5
+
+    return Axis(name, f"{low:.3g}", f"{high:.3g}", share)
+
+
+def score_axis(trials: Sequence[Trial], index: int, objective: Objective) -> Axis:
+    """An axis over the scores of an objective, without its worst outliers."""
+    values = np.array([_score(trial, index) for trial in trials])
+    name = f"{objective.title}, {objective.unit}" if objective.unit else objective.title
+    worst = np.percentile(values, _OUTLIERS if objective.greatest else 100 - _OUTLIERS)
+    return number_axis(name, np.clip(values, worst, None) if objective.greatest else np.clip(values, None, worst))
+
+
+def _score(trial: Trial, index: int) -> float:
+    value = trial.scores[index]
+    return math.nan if value is None else value
+
+
+def _parameter_axis(path: str, trials: Sequence[Trial]) -> Axis:
+    name = path.partition(".")[2].replace("_", " ")
+    values = [trial.values[path] for trial in trials if path in trial.values]
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        return number_axis(name, values)
+    kinds = sorted(set(map(str, values)))
+    most = max(len(kinds) - 1, 1)
+    return Axis(name, kinds[0], kinds[-1], lambda value: kinds.index(str(value)) / most)
+
+
+def dots(
+    found: Tried, objectives: Sequence[Objective], x: tuple[Axis, Callable[[Trial], float]], y: int, chosen: int
+) -> tuple[list[Dot], Axis]:
+    """Trials that have scores, in a scatter plot over `x`, and the axis of objective `y`."""
+    done = [trial for trial in found.trials if trial.complete]
+    axis, (across, value) = score_axis(done, y, objectives[y]), x
+    return [
+        Dot(
+            trial.number,
+            round(_LEFT + (_RIGHT - _LEFT) * across.share(value(trial)), 1),
+            round(_BOTTOM - (_BOTTOM - _TOP) * axis.share(_score(trial, y)), 1),
+            words(trial, objectives),
+            trial.number in found.best,
+            trial.number == chosen,
+        )
+        for trial in done
+    ], axis
+
+
+def best_so_far(drawn: Sequence[Dot], greatest: bool) -> str:
+    """The line of the best score until each trial."""
+    heights = np.array([dot.y for dot in drawn])  # downwards
+    best = np.minimum.accumulate(heights) if greatest else np.maximum.accumulate(heights)
+    return " ".join(f"{dot.x:g},{height:g}" for dot, height in zip(drawn, best, strict=True))
+
+
+def parallel(found: Tried, objectives: Sequence[Objective], chosen: int) -> str:
+    """Each trial as a line through its parameters and scores; the better by the first objective, the lighter."""
+    done = [trial for trial in found.trials if trial.complete and trial.values]
+    if len(done) < 2:
+        return ""
+    paths = list(done[0].values)
+    axes = [_parameter_axis(path, done) for path in paths]
+    axes += [score_axis(done, index, objective) for index, objective in enumerate(objectives)]
+    left, right, top, bottom = _AXES
+    across = np.linspace(left, right, len(axes))
+    lines = []
+    for trial in sorted(done, key=lambda one: (one.number == chosen, one.number in found.best, one.number)):
+        values = [*(trial.values[path] for path in paths), *trial.scores]
+        shares = [axis.share(value) for axis, value in zip(axes, values, strict=True)]
+        good = shares[len(paths)] if objectives[0].greatest else 1 - shares[len(paths)]
+        colour = TABLES["viridis"][round(255 * good)]
+        points = " ".join(f"{x:.0f},{bottom - (bottom - top) * y:.1f}" for x, y in zip(across, shares, strict=True))
+        lines.append(
+            {
+                "number": trial.number,
+                "points": points,
+                "colour": css((int(colour[0]), int(colour[1]), int(colour[2]))),
+                "words": words(trial, objectives),
+                "chosen": trial.number == chosen,
+            }
+        )
+    ends = {0: "start", len(axes) - 1: "end"}
+    drawn = [
+        {
+            "x": round(float(x), 1),
+            "name": axis.name,
+            "low": axis.low,
+            "high": axis.high,
+            "anchor": ends.get(place, "middle"),
+        }
+        for place, (x, axis) in enumerate(zip(across, axes, strict=True))
+    ]
+    return panel("tune.parallel", drawn, lines)
+
+
+def plots(found: Tried, objectives: Sequence[Objective], chosen: int) -> str:
+    """All that is known of the trials, as HTML; "" before the first score."""
+    done = [trial for trial in found.trials if trial.complete]
+    if not done:
+        return ""
+    numbers = number_axis("trial", [0, max(found.trials[-1].number, 1)])
+    parts = [_best(found, objectives, chosen)]
+    for index, objective in enumerate(objectives):
+        drawn, axis = dots(found, objectives, (numbers, lambda trial: trial.number), index, chosen)
+        line = best_so_far(drawn, objective.greatest)
+        parts.append(panel("tune.scatter", f"{axis.name}, over trials", drawn, line, numbers, axis))
+    if len(objectives) == 2:
+        across = score_axis(done, 0, objectives[0])
+        drawn, axis = dots(found, objectives, (across, lambda trial: _score(trial, 0)), 1, chosen)
+        parts.append(panel("tune.scatter", f"Pareto front: {axis.name}, over the first", drawn, "", across, axis))
+    parts.append(parallel(found, objectives, chosen))
+    if found.importance:
+        rows = [(name.partition(".")[2].replace("_", " "), round(100 * s)) for name, s in found.importance.items()]
+        parts.append(panel("tune.importance", f"What {objectives[0].title} depends on", rows))
+    return "".join(parts)
+
+
+def _best(found: Tried, objectives: Sequence[Objective], chosen: int) -> str:
+    held = {trial.number: trial.scores for trial in found.held_back}
+    numbers = list(dict.fromkeys([0, *found.best[:5], *([chosen] if chosen >= 0 else [])]))
+    shown = [found.trials[number] for number in numbers if number < len(found.trials)]
+    heads = [one.title.partition(",")[0] for one in objectives]
+    if held:
+        heads += [f"{head}, held back" for head in heads]
+    rows = []
+    for trial in shown:
+        scores = [one.told(value) for one, value in zip(objectives, trial.scores, strict=True)]
+        if held:
+            again = held.get(trial.number, (None,) * len(objectives))
+            scores += ["" if value is None else one.told(value) for one, value in zip(objectives, again, strict=True)]
+        rows.append(
+            {
+                "number": trial.number,
+                "cells": scores,
+                "words": words(trial, objectives),
+                "chosen": trial.number == chosen,
+            }
+        )
+    picked = next((trial for trial in shown if trial.number == chosen), None)
+    return panel("tune.best", heads, rows, words(picked, objectives) if picked else "")
+
+
+def left(seconds: float) -> str:
+    """A time to go, in words."""
+    if seconds < 90:
+        return f"{max(round(seconds), 1)} s left"
+    return f"{round(seconds / 60)} min left" if seconds < 5400 else f"{seconds / 3600:.1f} h left"
