@@ -9,6 +9,7 @@ is deterministic: the recording, the parameters by frame, the loop edits and the
     {"frame": 512, "ended": true}                                              that the recording has ended
 """
 
+import contextlib
 import itertools
 import json
 import logging
@@ -310,6 +311,15 @@ def read_marks(path: Path) -> tuple[tuple[int, bytes], ...]:
     if not (found := marks(strokes)):
         raise HemislamError(f"{path} holds no labelled points; label some frames under Study first.")
     return tuple((stamp, labels.tobytes()) for stamp, labels in found.items())
+
+
+def session_files(folder: Path) -> list[Path]:
+    """Those in a folder, the newest first."""
+    found = []
+    for path in folder.glob(f"*{SUFFIX}"):
+        with contextlib.suppress(OSError):  # it has gone meanwhile
+            found.append((path.stat().st_mtime_ns, path))
+    return [path for _, path in sorted(found, reverse=True)]
 
 
 def recording_of(path: Path) -> Path | None:

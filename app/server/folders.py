@@ -1,10 +1,11 @@
 """The part of the disk that the page may see."""
 
+import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from app.mapping.session_file import SUFFIX, SavedSession, read_session
+from app.mapping.session_file import SUFFIX, SavedSession, read_session, session_files
 from app.sensors.source import SUFFIXES
 from app.slam.errors import HemislamError
 
@@ -66,6 +67,8 @@ class Folders:
     def listing(self, folder: Path | str, suffixes: tuple[str, ...] = RECORDINGS) -> list[FolderEntry]:
         """The contents of a folder inside: first its folders, then the files that may be chosen, each sorted by name.
 
+        What may not be read, and a link that leads nowhere, is left out.
+
         Raises:
             HemislamError: as `inside`, or the folder cannot be read.
         """
@@ -80,7 +83,7 @@ class Folders:
     def sessions(self, kept: Path) -> list[tuple[Path, SavedSession]]:
         """The newest session files in a folder whose recordings are inside, newest first, without those never begun."""
         found = []
-        for path in sorted(kept.glob(f"*{SUFFIX}"), key=lambda path: path.stat().st_mtime_ns, reverse=True)[:_RECENT]:
+        for path in session_files(kept)[:_RECENT]:
             try:
                 saved = read_session(path)
                 self.inside(saved.opened.recording)
@@ -91,25 +94,29 @@ class Folders:
         return found
 
     def recordings(self) -> list[Path]:
-        """All recordings below all folders, sorted by path."""
+        """All recordings below all folders that can be read, sorted by path."""
         found: list[Path] = []
         waiting = list(self.roots)
         seen = set(waiting)
         while waiting:
-            for entry in self.listing(waiting.pop()):
-                if entry.is_choice:
-                    found.append(entry.path)
-                elif not entry.outside and (real := entry.path.resolve()) not in seen:
-                    seen.add(real)
-                    waiting.append(real)
+            with contextlib.suppress(HemislamError):
+                for entry in self.listing(waiting.pop()):
+                    if entry.is_choice:
+                        found.append(entry.path)
+                    elif not entry.outside and (real := entry.path.resolve()) not in seen:
+                        seen.add(real)
+                        waiting.append(real)
         return sorted(set(found))
 
     def _holds(self, real: Path) -> bool:
         return any(real.is_relative_to(root) for root in self.roots)
 
     def _entry(self, path: Path, suffixes: tuple[str, ...]) -> FolderEntry | None:
-        if self._holds(path.resolve()):
-            return _entry(path, suffixes)
+        try:
+            if self._holds(path.resolve()):
+                return _entry(path, suffixes)
+        except (OSError, RuntimeError):  # a folder of another user; a link to itself
+            return None
         return FolderEntry(path, False, outside=True) if path.suffix in suffixes else None
 
 

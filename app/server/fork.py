@@ -15,7 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.session_file import SUFFIX, SavedSession, free_path, read_session, recording_of, write_session
+from app.mapping.session_file import (
+    SUFFIX,
+    SavedSession,
+    free_path,
+    read_session,
+    recording_of,
+    session_files,
+    write_session,
+)
 from app.server.protocol import AddNote, Command, CompareWith, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
 from app.server.setup import Setup
 from app.server.worker import RunningEngine
@@ -171,11 +179,9 @@ class Workspace:
         a, folder = self._sides[0].engine.snapshot, self._setup.session_folder
         if folder is None or a.recording is None:
             return []
-        files = [
-            file for file in folder.glob(f"*{SUFFIX}") if a.session_file is None or file.name != a.session_file.name
-        ]
-        newest = sorted(files, key=lambda file: file.stat().st_mtime, reverse=True)[:_MOST_KEPT]
-        return [file for file in newest if recording_of(file) == a.recording.path.resolve()]
+        ours = a.session_file.name if a.session_file is not None else ""
+        others = [file for file in session_files(folder) if file.name != ours][:_MOST_KEPT]
+        return [file for file in others if recording_of(file) == a.recording.path.resolve()]
 
     def swap(self) -> None:
         """B becomes A: it goes on where A is, as A did, and A follows. Raises HemislamError without a fork."""

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from app.mapping.session_file import Opened, SavedSession, State, write_session
 from app.server.folders import Folders
 from app.slam.errors import HemislamError
+from app.slam.params import Params
 
 
 @pytest.fixture
@@ -80,3 +82,39 @@ def test_a_root_given_through_a_link_works(disk: Path) -> None:
 def test_a_root_that_is_no_folder_is_refused(disk: Path) -> None:
     with pytest.raises(HemislamError, match=r"a\.mcap is not a folder"):
         Folders([disk / "open/a.mcap"])
+
+
+def test_what_may_not_be_read_hides_nothing_but_itself(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk has a lost+found that only root may enter; a link may lead to itself."""
+    (disk / "open/self.mcap").symlink_to(disk / "open/self.mcap")
+    for name in ("closed", "half"):
+        (disk / "open" / name).mkdir()
+        (disk / "open" / name / "d.mcap").write_bytes(b"1")
+    stat, iterdir = Path.stat, Path.iterdir
+
+    def refusing_stat(path: Path, **how: bool) -> object:
+        if path.parent.name == "closed":
+            raise PermissionError(13, "Permission denied", str(path))
+        return stat(path, **how)
+
+    def refusing_iterdir(path: Path) -> object:
+        if path.name in ("closed", "half"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return iterdir(path)
+
+    monkeypatch.setattr(Path, "stat", refusing_stat)
+    monkeypatch.setattr(Path, "iterdir", refusing_iterdir)
+    folders = Folders([disk / "open"])
+    names = [entry.path.name for entry in folders.listing("")]
+    assert names == ["half", "loop", "out.mcap", "walks", "a.mcap", "ros2"]
+    assert len(folders.recordings()) == 4
+    with pytest.raises(HemislamError, match=r"half cannot be read: Permission denied"):
+        folders.listing("half")
+
+
+def test_a_session_file_that_leads_nowhere_hides_no_other(disk: Path) -> None:
+    (disk / "open/gone.hemislam").symlink_to(disk / "nowhere")
+    recording = disk / "open/a.mcap"
+    write_session(disk / "open/b.hemislam", SavedSession(Opened(recording, nbytes=4), State(Params()), 7))
+    folders = Folders([disk / "open"])
+    assert [(path.name, saved.frame) for path, saved in folders.sessions(disk / "open")] == [("b.hemislam", 7)]
