@@ -87,7 +87,7 @@ def _export_session(source: Path, out: Path | None, exports: "tuple[Export, ...]
         if stop is not None:
             raise stop
         results = session.results(measures=read_session(source).state.measures)
-        results = lay_if_possible(results, session.survey, session.edits[0])
+        results = lay_if_possible(results, session.survey, session.edits.done)
         results.where = results.where or reference.read(source.parent)
         results.choice = choice
         _save(results, out or free_folder(source), exports)

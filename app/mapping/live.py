@@ -17,6 +17,7 @@ from app.sensors.live.status import LiveState
 from app.slam.engine import Engine
 from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
+from app.slam.loops.edits import Edits
 from app.slam.loops.keyframe_log import KeyframeLog
 from app.slam.loops.messages import LoopClient
 from app.slam.params import Params
@@ -91,7 +92,7 @@ class LiveSession(Session):
         """Write what another process needs to go on from here. What is written must not grow with the session."""
         if self.frame < 0 or self.frame % EVERY:
             return
-        kept = (self.checkpoint(), self.params, self.history, self.edits, self.keyframes.edits)
+        kept = (self.checkpoint(), self.params, self.history, self.edits, self.keyframes.edits, self.survey)
         try:
             with self._file:
                 self._file.execute("BEGIN")
@@ -108,7 +109,7 @@ class LiveSession(Session):
         """Go on where a process that died was. False if it left nothing to go on from."""
         try:
             ((pickled,),) = self._file.execute("SELECT pickled FROM kept")
-            checkpoint, params, history, edits, labels = pickle.loads(pickled)
+            checkpoint, params, history, edits, labels, survey = pickle.loads(pickled)
             frames = [pickle.loads(row) for (row,) in self._file.execute("SELECT pickled FROM frames ORDER BY rowid")]
         except (sqlite3.Error, ValueError, pickle.UnpicklingError):
             return False
@@ -118,9 +119,9 @@ class LiveSession(Session):
         self._written = len(frames)
         self.return_to(checkpoint)
         self.choose(params)
-        self.history, self.keyframes.edits = history, labels
-        if any(edits):
-            self.edit_loops(*edits)
+        self.history, self.keyframes.edits, self.survey = history, labels, survey
+        if edits != Edits():
+            self.edit_loops(edits.done, edits.undone)
         return True
 
     def close(self) -> None:

@@ -168,6 +168,11 @@ class Session:
         return len(self.frames) - 1
 
     @property
+    def furthest(self) -> int:
+        """The last frame that is known or planned, so that `go_to` repeats it as it was."""
+        return max(self.known, self.planned)
+
+    @property
     def log(self) -> RunLog:
         """The frames up to the newest, for results."""
         return RunLog(self.frames[: self.frame + 1], self._dropped)
@@ -214,14 +219,13 @@ class Session:
         self.choose(state.params)
         if state.edits or state.undone:
             self.edit_loops(state.edits, state.undone)
-        self.history, self.planned, self.keyframes.edits = state.history, saved.frame, state.labels
+        self.history, self.planned, self.keyframes.edits = state.history, saved.known, state.labels
         self.survey = state.survey
 
     @property
-    def edits(self) -> tuple[tuple[LoopEdit, ...], tuple[LoopEdit, ...]]:
-        """Those in force, and those that can be redone."""
-        state = self.loops.state if self.loops else None
-        return (state.undo, state.redo) if state is not None else ((), ())
+    def edits(self) -> Edits:
+        """Of loops, also those that are asked for and not in effect yet."""
+        return self.loops.edits if self.loops else Edits()
 
     @property
     def opened(self) -> Opened:
@@ -231,7 +235,7 @@ class Session:
 
     def saved(self, state: State) -> SavedSession:
         """The session as a file holds it, with this state."""
-        return SavedSession(self.opened, state, self.frame, self.ended)
+        return SavedSession(self.opened, state, self.frame, self.ended, self.furthest)
 
     # --- going back ------------------------------------------------------------------------------
     def go_to(self, frame: int) -> None:
@@ -243,7 +247,7 @@ class Session:
         Raises:
             HemislamError: the feed cannot go back, or a checkpoint cannot be read; nothing has changed.
         """
-        heading = min(frame, max(self.known, self.planned))
+        heading = min(frame, self.furthest)
         nearest = self.checkpoints.before(min(heading, self.known)) if self.checkpoints else None
         behind = heading < self.frame or (heading == self.frame >= 0 and self.result is None)
         if behind or (nearest is not None and nearest > self.frame):
@@ -359,7 +363,7 @@ class Session:
         """
         results = self.results(stopped, calibration, session.state.measures if session is not None else ())
         results.choice, results.progress = choice, progress
-        survey, edits = self.survey, self.edits[0]
+        survey, edits = self.survey, self.edits.done
 
         def write() -> dict[str, Any]:
             laid = lay_if_possible(results, survey, edits)
@@ -373,7 +377,7 @@ class Session:
     def lay_on_earth(self) -> "Future[tuple[Results, MapFrame]]":
         """Find where the map as it is now lies by the survey, in a thread of its own; as `lay`."""
         assert self.survey is not None
-        return self._saves.submit(lay, self.results(), self.survey, self.edits[0])
+        return self._saves.submit(lay, self.results(), self.survey, self.edits.done)
 
     def finish_saves(self) -> None:
         """Wait until no save is under way."""

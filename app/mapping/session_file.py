@@ -5,7 +5,8 @@ is deterministic: the recording, the parameters by frame, the loop edits and the
 
     {"hemislam": "0.3.0", "format": 2, "recording": "/data/walk.mcap", ...}    what was opened
     {"frame": 120, "state": {...}}                                             all of the state, where it changed
-    {"frame": 131}                                                             how far the session has come
+    {"frame": 131}                                                             where the session is
+    {"frame": 90, "known": 131}                                                after going back, and how far it had come
     {"frame": 512, "ended": true}                                              that the recording has ended
 """
 
@@ -150,14 +151,18 @@ _OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)
 
 @dataclass(frozen=True, slots=True)
 class SavedSession:
-    """What a session file holds. frame: the newest, -1 before the first. ended: the recording had ended, so that loops
-    were searched at the last keyframes too.
+    """What a session file holds. frame: where it is, -1 before the first. ended: the recording had ended, so that loops
+    were searched at the last keyframes too. known: the last frame that holds, `frame` or one that it went back from.
     """
 
     opened: Opened
     state: State
     frame: int
     ended: bool = False
+    known: int = -1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "known", max(self.frame, self.known))
 
     @property
     def first_params(self) -> Params:
@@ -186,7 +191,7 @@ class SessionWriter:
         self.path = path
         self.error = ""
         self._state: State | None = None
-        self._at: tuple[int, bool] | None = None
+        self._at: tuple[int, bool, int] | None = None
         self._file: IO[str] | None = None
         if path is None or opened is None:
             return
@@ -197,13 +202,14 @@ class SessionWriter:
             self._failed(error)
         self._line(_head(opened))
 
-    def write(self, frame: int, state: State, *, ended: bool = False) -> None:
-        """Write where the session is, and its state, if they have changed."""
+    def write(self, frame: int, state: State, *, ended: bool = False, known: int = -1) -> None:
+        """Write where the session is, and its state, if they have changed. As in `SavedSession`."""
+        at = frame, ended, max(frame, known)
         if state != self._state:
-            self._line(_entry(frame, ended, state))
-        elif (frame, ended) != self._at:
-            self._line(_entry(frame, ended))
-        self._state, self._at = state, (frame, ended)
+            self._line(_entry(*at, state))
+        elif at != self._at:
+            self._line(_entry(*at))
+        self._state, self._at = state, at
 
     def close(self) -> None:
         if self._file is not None:
@@ -222,6 +228,8 @@ class SessionWriter:
     def _failed(self, error: OSError) -> None:
         self.error = f"The session cannot be kept in {self.path} ({error.strerror}); what is done now is not recorded."
         log.warning(self.error)
+        with contextlib.suppress(OSError):  # the rest of the line is given up
+            self.close()
         self._file = None
 
 
@@ -238,12 +246,16 @@ def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) ->
 
 def write_session(path: Path, session: SavedSession) -> None:
     """Write a session file as a whole; its folder need not exist yet. Raises HemislamError: that is not possible."""
-    entries = (_head(session.opened), _entry(session.frame, session.ended, session.state))
+    entries = (_head(session.opened), _entry(session.frame, session.ended, session.known, session.state))
     lines = [json.dumps(entry, ensure_ascii=False) + "\n" for entry in entries]
+    part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("".join(lines), encoding="utf-8", errors="backslashreplace")
+        part.write_text("".join(lines), encoding="utf-8", errors="backslashreplace")
+        part.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
         raise HemislamError(f"The session cannot be written to {path}: {error.strerror}.") from error
 
 
@@ -261,7 +273,7 @@ def read_session(path: Path) -> SavedSession:
     for line in lines:
         try:
             entries.append(json.loads(line))
-        except ValueError:
+        except (ValueError, RecursionError):
             break  # cut by a crash; what comes after it cannot be trusted
     if not entries or not isinstance(entries[0], dict) or "hemislam" not in entries[0]:
         raise HemislamError(f"{path} is not a session of hemislam; open one that the workbench has written.")
@@ -274,8 +286,8 @@ def read_session(path: Path) -> SavedSession:
         opened = _OPENED.validate_python(head)
         states = [entry for entry in entries if "state" in entry]
         state = _STATE.validate_python(states[-1]["state"]) if states else State(Params())
-        places = [entry for entry in entries if "frame" in entry and "did" not in entry]
-        frame, ended = (int(places[-1]["frame"]), bool(places[-1].get("ended"))) if places else (-1, False)
+        place: dict[str, Any] = next((entry for entry in reversed(entries) if "frame" in entry), {})
+        frame, ended, known = int(place.get("frame", -1)), bool(place.get("ended")), int(place.get("known", -1))
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError, zlib.error) as error:
         why = repr(error)
         if isinstance(error, ValidationError):
@@ -291,7 +303,7 @@ def read_session(path: Path) -> SavedSession:
     if not same:
         gone = "is a different file now" if opened.recording.exists() else "is gone"
         raise HemislamError(f"The recording {opened.recording} of the session {path} {gone}; put it back there.")
-    return SavedSession(opened, state, frame, ended)
+    return SavedSession(opened, state, frame, ended, known)
 
 
 def read_marks(path: Path) -> tuple[tuple[int, bytes], ...]:
@@ -327,7 +339,7 @@ def recording_of(path: Path) -> Path | None:
     try:
         with path.open(encoding="utf-8") as lines:
             return Path(json.loads(lines.readline())["recording"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, RecursionError, KeyError, TypeError):
         return None
 
 
@@ -341,7 +353,8 @@ def _head(opened: Opened) -> dict[str, Any]:
     return {"hemislam": __version__, "format": FORMAT, **_OPENED.dump_python(opened, mode="json")}
 
 
-def _entry(frame: int, ended: bool, state: State | None = None) -> dict[str, Any]:
+def _entry(frame: int, ended: bool, known: int, state: State | None = None) -> dict[str, Any]:
     """Where the session is, and its state if that has changed."""
-    entry: dict[str, Any] = {"frame": frame} | ({"ended": True} if ended else {})
+    entry: dict[str, Any] = {"frame": frame} | ({"known": known} if known > frame else {})
+    entry |= {"ended": True} if ended else {}
     return entry if state is None else entry | {"state": _STATE.dump_python(state, mode="json")}

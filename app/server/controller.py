@@ -30,6 +30,7 @@ from app.server.loop_commands import LoopCommands
 from app.server.player import Player
 from app.server.protocol import Command
 from app.server.publisher import Publisher, opened_recording
+from app.server.setup import Kept
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Edits
 from app.slam.params import Params
@@ -74,7 +75,8 @@ class Controller:
     Args:
         page: is told of all changes. params: to begin with.
         resolve: gives the parameters of a recording, before the user's changes; None: the present ones.
-        session_folder: for session files; None: none are kept. clock: monotonic seconds.
+        session_folder: for session files; None: none are kept. kept: notes, views, measures and painted labels of a
+            live session that another process began. clock: monotonic seconds.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class Controller:
         *,
         resolve: Callable[[Path], Params] | None = None,
         session_folder: Path | None = None,
+        kept: Kept = ((), (), (), ()),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._page = page
@@ -95,13 +98,11 @@ class Controller:
         self._shown_share: protocol.Progress | None = None
         self._open_session, self._resolve, self._session_folder = open_session, resolve, session_folder
         self._params = self._base = params  # with and without the user's changes
-        self._notes: tuple[Note, ...] = ()
-        self._views: tuple[KeptView, ...] = ()
-        self._measures: tuple[Measure, ...] = ()
-        self._painted: tuple[Stroke, ...] = ()
+        self._notes, self._views, self._measures, self._painted = kept
         self._resuming: SavedSession | None = None  # that is being repeated
         self._opening: Callable[[], None] | None = None  # opens the next session
         self._waiting: list[Command] = []  # until that session is at its frame
+        self._of_before = 0  # how many of these, the first ones, waited when another one was asked for
 
     def open(self, path: Path, truth: Path | None, *, play: bool = False) -> None:
         """Open a recording with exactly the present parameters, or a session file with its own."""
@@ -233,6 +234,10 @@ class Controller:
         self._painted = painted
         self._page.put(painted=painted, urgent=True)
 
+    def _show_kept(self, kept: Kept) -> None:
+        self._notes, self._views, self._measures, self._painted = kept
+        self._page.put(**dict(zip(("notes", "views", "measures", "painted"), kept, strict=True)), urgent=True)
+
     def _show_params(self) -> None:
         """Show the parameters, and which of them wait for a restart."""
         session = self._player.session
@@ -250,8 +255,15 @@ class Controller:
         wait = self._work()
         session = self._player.session
         if session is not None and self._resuming is None:
-            self._writer.write(session.frame, self._state(session), ended=session.ended)
+            self._keep(session)
         return wait
+
+    def _keep(self, session: Session) -> None:
+        """Write the session file; say it if that fails for the first time."""
+        kept = not self._writer.error
+        self._writer.write(session.frame, self._state(session), ended=session.ended, known=session.furthest)
+        if kept and self._writer.error:
+            self._page.notice("warning", self._writer.error)
 
     def _work(self) -> float | None:
         while self._saves and self._saves[0][1].done():
@@ -272,7 +284,7 @@ class Controller:
             return wait
         if (saved := self._resuming) is not None:
             arrived = session.frame >= saved.frame and not saved.ended
-            if arrived or session.ended or session.planned < saved.frame:  # repeated, or the user went on differently
+            if arrived or session.ended or session.heading < saved.frame:  # repeated, or the user went elsewhere
                 self._resuming = None
                 self._player.settle_labels(session)
                 self._handle_waiting()
@@ -287,8 +299,8 @@ class Controller:
         return State(
             params=self._params,
             history=session.history,
-            edits=session.edits[0],
-            undone=session.edits[1],
+            edits=session.edits.done,
+            undone=session.edits.undone,
             truth=session.truth_path,
             notes=self._notes,
             views=self._views,
@@ -303,7 +315,7 @@ class Controller:
     # --- opening ---------------------------------------------------------------------------------
     def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
         """Let `work` open it, so that the page first says that this takes a moment."""
-        self._opening, self._waiting = opening, []
+        self._opening, self._of_before = opening, len(self._waiting)
         self._page.put(progress=protocol.Progress.opening(path), urgent=True)
 
     def _do_opening(self, opening: Callable[[], None]) -> None:
@@ -336,16 +348,13 @@ class Controller:
 
     def _reopen(self) -> None:
         """Begin again with the present parameters. Notes, kept views, measures, painted labels and loop edits stay."""
-        before, notes, views, measures = self._need_session(), self._notes, self._views, self._measures
-        painted = self._painted
-        info, edits = before.feed.info, Edits(*before.edits)
+        before, kept = self._need_session(), (self._notes, self._views, self._measures, self._painted)
+        self._of_before = 0
+        info, edits = before.feed.info, before.edits
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
         session.survey = before.survey
         self._take(session)
-        self._show_notes(notes)
-        self._show_views(views)
-        self._show_measures(measures)
-        self._show_painted(painted)
+        self._show_kept(kept)
         if session.loops is not None and edits != Edits():
             session.edit_loops(edits.done, edits.undone)
 
@@ -369,16 +378,17 @@ class Controller:
         """Replace the present session by this one, at its first frame or at that of `saved`."""
         if self._player.session is not None:
             self._player.session.close()
+        self._leave_waiting()
         self._begin_file(session)
         self._loops.clear()
         self._player.take(session)
-        self._show_notes(saved.state.notes if saved is not None else ())
-        self._show_views(saved.state.views if saved is not None else ())
-        self._show_measures(saved.state.measures if saved is not None else ())
-        self._show_painted(saved.state.painted if saved is not None else ())
+        if session.frame < 0:  # else it goes on where a process that died was
+            state = saved.state if saved is not None else State(self._params)
+            self._show_kept((state.notes, state.views, state.measures, state.painted))
         self._resuming = None
         if saved is not None:
-            self._writer.write(saved.frame, saved.state, ended=saved.ended)  # this process may die on the way there
+            # This process may die on the way there.
+            self._writer.write(saved.frame, saved.state, ended=saved.ended, known=saved.known)
             session.resume(saved)
             self._player.resume(session, saved.frame, to_end=saved.ended)
             self._resuming = saved
@@ -394,6 +404,13 @@ class Controller:
         if self._writer.error:
             self._page.notice("warning", self._writer.error)
 
+    def _leave_waiting(self) -> None:
+        """Another session begins: what waited for the one before is not done."""
+        for command in self._waiting[: self._of_before]:
+            if isinstance(command, protocol.Save):
+                self._page.saved(protocol.Saved(command.folder, "Another recording was opened before it was saved."))
+        del self._waiting[: self._of_before]
+
     def _handle_waiting(self) -> None:
         waiting, self._waiting = self._waiting, []
         for command in waiting:
@@ -404,6 +421,7 @@ class Controller:
         session = self._player.session
         if session is not None:
             session.finish_saves()
-            self._writer.write(session.frame, self._state(session), ended=session.ended)
+            if self._resuming is None:  # else it is written where the session is going to
+                self._keep(session)
             session.close()
         self._writer.close()

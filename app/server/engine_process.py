@@ -82,7 +82,9 @@ def run_loop(
     seen = {name: getattr(setup, name) for name in ("session", "notices", "frames", "chunks")}
     page = Publisher(setup.params, **seen)
     updates = Updates(owner, page)
-    controller = Controller(page, setup.params, opener, resolve=setup.resolve, session_folder=setup.session_folder)
+    controller = Controller(
+        page, setup.params, opener, resolve=setup.resolve, session_folder=setup.session_folder, kept=setup.kept
+    )
     controller.handle(SetSpeed(setup.speed))
     controller.handle(SetBreakpoints(setup.breakpoints))
     early: list[Command] = []

@@ -89,7 +89,7 @@ class Folders:
                 self.inside(saved.opened.recording)
             except HemislamError:
                 continue
-            if saved.frame > 0:
+            if saved.known > 0:
                 found.append((path, saved))
         return found
 

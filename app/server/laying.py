@@ -35,7 +35,7 @@ class Laying:
             self._under_way = None
         if session.loops is not None and not session.loops.idle:
             return False
-        words = tuple(edit for edit in session.edits[0] if isinstance(edit, Overrule))
+        words = tuple(edit for edit in session.edits.done if isinstance(edit, Overrule))
         now = session, session.survey, words, session.frame, session.map_frame
         chosen = self._laid[0] is not session or self._laid[1:3] != now[1:3]
         moved = self._laid[3] != session.frame or self._laid[4] is not session.map_frame

@@ -6,12 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.mapping.breakpoints import Breakpoints
+from app.mapping.painted import Stroke
+from app.mapping.session_file import KeptView, Measure, Note
 from app.slam.params import Params
 
 if TYPE_CHECKING:
     from app.sensors.live.address import LiveAddress
 
 POINT_BUDGET = 3_000_000
+Kept = tuple[tuple[Note, ...], tuple[KeptView, ...], tuple[Measure, ...], tuple[Stroke, ...]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +28,7 @@ class Setup:
         live: source of scans if `recording` is `app.server.protocol.LIVE`. live_folder: keeps what a process that takes
             over needs. revive: this process takes over.
         session, notices, frames, chunks: how many there were before, if this process takes over.
+        kept: as of `Controller`.
     """
 
     recording: Path | None = None
@@ -46,3 +50,4 @@ class Setup:
     notices: int = 0
     frames: int = 0
     chunks: int = 0
+    kept: Kept = ((), (), (), ())

@@ -143,6 +143,7 @@ class EngineProcess:
             breakpoints=last.breakpoints,
             session=last.session,
             notices=_number(last),
+            kept=(last.notes, last.views, last.measures, last.painted),
         )
 
     def _edit(self, **values: Any) -> None:

@@ -329,6 +329,7 @@ def test_whatever_happens_the_end_is_that_of_the_session_and_no_edit_is_lost(act
             case "edit":
                 edits.append(Accept(0, number + 1))
                 session.loops.command(ApplyEdit(edits[-1]))
+        assert session.loops.edits.done == tuple(edits), "answered or not"
     session.loops.finish()
     results = session.loops.results()
     assert results.g2o == f"graph of {len(session.store)}"

@@ -20,7 +20,7 @@ from app.sensors.live.feed import Pace, feed
 from app.sensors.live.process import LiveClient, LiveProcess
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
-from app.server.protocol import LIVE, Pause, Seek, Snapshot, StepFrame
+from app.server.protocol import LIVE, AddNote, Pause, Seek, Snapshot, StepFrame
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.params import Params
@@ -184,15 +184,19 @@ def test_an_engine_that_is_killed_is_followed_by_one_that_goes_on_in_the_same_ma
     live: Live, from_file: dict[int, np.ndarray]
 ) -> None:
     thread = live.play(1.0)
-    before = live.until(lambda s: s.transport.frame >= 35)
+    live.until(lambda s: s.transport.frame >= 35)
+    live.engine.send(AddNote("a door"))
+    before = live.until(lambda s: bool(s.notes))
     assert live.engine.pid is not None
     os.kill(live.engine.pid, signal.SIGKILL)
     after = live.until(lambda s: s.transport.frame > before.transport.frame + 15 and s.engine_alive)
     assert after.session == before.session, "the page keeps its map"
     assert len(after.chunks) >= len(before.chunks)
     assert [chunk.index for chunk in after.chunks] == list(range(len(after.chunks)))
+    live.engine.send(AddNote("another"))
     thread.join(PATIENCE_S)
     end = live.until_all_is_mapped()
+    assert [note.text for note in end.notes] == ["a door", "another"]
     assert end.transport.dropped == 0
     assert apart(end, from_file) < 0.001
     assert any("returns to where it was" in notice.text for notice in end.notices)

@@ -3,12 +3,14 @@
 Tests app/server/controller.py, app/server/loop_commands.py, app/server/player.py.
 """
 
+import errno
 import json
 import math
 import os
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +110,7 @@ def test_a_session_file_cut_anywhere_holds_the_session_up_to_there(saved: SavedS
         (b"PNG\x00\n", "not a session"),
         (b'{"hemislam": "9.0", "format": 99}\n', "written by hemislam 9.0"),
         (b'{"hemislam": "0.1", "format": 2}\n', "damaged"),
+        (b"[" * 100_000 + b"\n", "not a session"),
     ],
 )
 def test_a_file_that_is_no_session_is_refused_in_a_sentence(tmp_path: Path, content: bytes, says: str) -> None:
@@ -133,6 +136,22 @@ def test_a_folder_that_cannot_be_written_ends_the_file_not_the_session(saved: Sa
     assert "not recorded" in writer.error
     writer.write(0, saved.state)
     writer.close()
+
+
+def test_a_disk_that_fills_up_leaves_the_session_that_was_saved_before(
+    saved: SavedSession, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.hemislam"
+    write_session(path, saved)
+
+    def full(path: Path, text: str, **how: str) -> None:
+        path.write_bytes(text.encode()[:40])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(HemislamError, match="No space left on device"):
+        write_session(path, replace(saved, frame=42))
+    assert read_session(path) == saved and [file.name for file in tmp_path.glob("*a.hem*")] == ["a.hemislam"]
 
 
 def test_two_sessions_at_one_time_have_two_names(tmp_path: Path) -> None:

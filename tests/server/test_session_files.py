@@ -1,5 +1,7 @@
 """What a session reads and writes: recordings, truth, results; and what happens if they cannot be used."""
 
+import errno
+import io
 import math
 import threading
 from pathlib import Path
@@ -10,10 +12,13 @@ import server_fakes as fakes
 from session_bench import Bench, last_notice
 
 from app.mapping.breakpoints import Breakpoints
+from app.mapping.session_file import Note, read_session
 from app.server.protocol import (
+    AddNote,
     Command,
     CompareWith,
     OpenRecording,
+    Pause,
     Play,
     Restart,
     Save,
@@ -228,3 +233,88 @@ def test_a_session_remembers_what_it_was_compared_with_and_opens_without_it_if_t
     without = Bench(str(snapshot.session_file)).see()
     assert without.transport.frame == 30 and np.isnan(without.series["error_m"]).all()
     assert "truth.tum, which is gone" in last_notice(without)
+
+
+# --- on the way back to where a session was -------------------------------------------------------
+@pytest.fixture
+def kept(tmp_path: Path) -> Path:
+    """A session file at frame 50, with a note there."""
+    bench = Bench(session_folder=tmp_path)
+    bench.do(Seek(50))
+    file = bench.do(AddNote("there")).session_file
+    bench.controller.close()
+    assert file is not None
+    return file
+
+
+def reopened(file: Path, at: int) -> Bench:
+    """The session, opened again and on its way, at this frame."""
+    bench = Bench(None, session_folder=file.parent)
+    bench.controller.open(file, None)
+    while bench.see().transport.frame < at:
+        bench.controller.work()
+    return bench
+
+
+def test_a_session_closed_on_its_way_is_kept_as_it_was(kept: Path) -> None:
+    bench = reopened(kept, 20)
+    bench.controller.close()
+    file = bench.see().session_file
+    assert file is not None and file != kept
+    assert read_session(file) == read_session(kept)
+
+
+def test_a_note_made_where_one_stopped_on_the_way_is_of_that_frame(kept: Path) -> None:
+    bench = reopened(kept, 20)
+    bench.do(Pause())
+    stopped = bench.do(AddNote("here"))
+    assert 20 <= stopped.transport.frame < 50
+    assert stopped.notes == (Note(50, "there"), Note(stopped.transport.frame, "here"))
+    bench.do(Seek(10))
+    assert bench.do(AddNote("back")).notes[-1] == Note(10, "back")
+
+
+def test_a_file_that_cannot_be_opened_loses_nothing_that_waits_for_the_way_to_end(kept: Path) -> None:
+    bench = reopened(kept, 20)
+    bench.controller.handle(AddNote("once there"))
+    bench.controller.handle(OpenRecording(Path("notes.txt")))
+    assert bench.settle().notes == (Note(50, "there"), Note(50, "once there"))
+
+
+def test_what_waited_for_a_session_that_was_left_is_not_done_in_the_next(kept: Path, tmp_path: Path) -> None:
+    bench = reopened(kept, 20)
+    bench.controller.handle(Save(tmp_path / "results"))
+    bench.controller.handle(AddNote("once there"))
+    bench.controller.handle(OpenRecording(Path("walk-30.mcap")))
+    bench.controller.handle(AddNote("in the next"))
+    left = bench.settle()
+    assert [note.text for note in left.notes] == ["in the next"]
+    assert [(saved.folder, saved.error) for saved in left.saved] == [
+        (tmp_path / "results", "Another recording was opened before it was saved.")
+    ]
+
+
+def test_a_session_that_had_gone_back_still_knows_the_frames_ahead(tmp_path: Path) -> None:
+    first = Bench(session_folder=tmp_path)
+    for sigma, frame in ((0.1, 30), (0.2, 50), (0.05, 10)):
+        first.do(SetParams({"ground.sigma": sigma}))
+        file = first.do(Seek(frame)).session_file
+    assert file is not None
+    again = reopened(file, 10)
+    ahead, as_it_was = again.do(Seek(50)), first.do(Seek(50))
+    assert ahead.transport.frame == as_it_was.transport.frame == 50
+    np.testing.assert_array_equal(ahead.series["speed"], as_it_was.series["speed"])
+
+
+def test_a_disk_that_fills_up_is_told_once_and_playing_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            if '"frame": 20' in text:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return super().write(text)
+
+    monkeypatch.setattr(Path, "open", lambda *_, **__: Full())
+    bench = Bench(session_folder=tmp_path)
+    told = [notice.text for notice in bench.do(Seek(40)).notices if "not recorded" in notice.text]
+    assert len(told) == 1 and "No space left on device" in told[0]
+    assert bench.see().transport.frame == 40

@@ -6,6 +6,7 @@ A frame waits only if an answer is late, and never before the session is long en
 to start. What the user asks takes effect as soon as it is answered.
 """
 
+import contextlib
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -60,13 +61,13 @@ class _Asked:
     """A question without an answer yet.
 
     Attributes:
-        user: the user waits for it. edits: it changes the edits.
+        user: the user waits for it. edits: what it makes of them; None: it leaves them as they are.
         version: of the keyframe log. visit: counts how often the session had gone to another frame.
     """
 
     moment: Moment
     user: bool
-    edits: bool
+    edits: Edits | None
     version: int
     visit: int
 
@@ -199,6 +200,15 @@ class LoopSchedule:
             return False
         return self._shown == self._wanted or not self._asked
 
+    @property
+    def edits(self) -> Edits:
+        """The user's, also those that are asked for and not in effect yet."""
+        edits = next((asked.edits for asked in self._asked if asked.edits is not None), self._edits)
+        for request in self._requests:
+            with contextlib.suppress(HemislamError):
+                edits = _after(edits, request)
+        return edits
+
     # --- results --------------------------------------------------------------------------------
     @property
     def edges(self) -> tuple[LoopEdge, ...]:
@@ -243,7 +253,7 @@ class LoopSchedule:
     @property
     def _editing(self) -> bool:
         """Whether the edits that hold are not known until an answer comes."""
-        return any(asked.edits for asked in self._asked)
+        return any(asked.edits is not None for asked in self._asked)
 
     def _ask_next(self) -> None:
         """Send what can be asked with the edits that are known: the user's requests, then states that are lacking."""
@@ -261,17 +271,16 @@ class LoopSchedule:
                 self._ask(Ask(Target(moment.count, self._edits, moment.finished)))
 
     def _ask_for_user(self, request: Request) -> None:
-        edits, question = self._edits, request if isinstance(request, Question) else AskState()
+        question = request if isinstance(request, Question) else AskState()
         try:
-            if not isinstance(request, Question):
-                edits = request(edits)
+            edits = _after(self._edits, request)
         except HemislamError as error:
             self._answers.append(Failure(str(error)))
-        else:
-            changes = edits is not self._edits or isinstance(question, ApplyEdit)
-            self._ask(Ask(Target(self._log.count, edits, self._finished), question), user=True, edits=changes)
+            return
+        target = Target(self._log.count, self._edits if question is request else edits, self._finished)
+        self._ask(Ask(target, question), user=True, edits=None if edits is self._edits else edits)
 
-    def _ask(self, ask: Ask, *, user: bool = False, edits: bool = False) -> None:
+    def _ask(self, ask: Ask, *, user: bool = False, edits: Edits | None = None) -> None:
         moment = Moment(ask.target.count, ask.target.finished)
         self._asked.append(_Asked(moment, user, edits, self._log.cursor.version, self._visit))
         self._client.send(ask)
@@ -307,7 +316,7 @@ class LoopSchedule:
 
     def _learn(self, asked: _Asked, state: LoopState) -> None:
         self._notices += state.notices
-        if asked.edits:
+        if asked.edits is not None:
             self._edits = Edits(state.undo, state.redo)
             self._forget_states()
         if self._log.keep(Cursor(asked.version, state.count)) < state.count:
@@ -360,3 +369,10 @@ class LoopSchedule:
         if (state.corrections == np.eye(4)).all():
             return self.frame if not len(self.frame.T_map_odom) else MapFrame()
         return MapFrame(self._log.stamps_ns(state.count), state.corrections)
+
+
+def _after(edits: Edits, request: Request) -> Edits:
+    """What a request of the user makes of the edits. Raises HemislamError: it cannot be done."""
+    if isinstance(request, ApplyEdit):
+        return Edits((*edits.done, request.edit))
+    return edits if isinstance(request, Question) else request(edits)
