@@ -59,7 +59,7 @@ def number_axis(name: str, values: Sequence[float]) -> Axis:
     def share(value: float) -> float:
         return (by(min(max(value, low), high)) - begin) / span if span else 0.5
 
-    return Axis(name, f"{low:.3g}", f"{high:.3g}", share)
+    return Axis(name, f"{low:.4g}", f"{high:.4g}", share)
 
 
 def score_axis(trials: Sequence[Trial], index: int, objective: Objective) -> Axis:
