@@ -176,6 +176,7 @@ class Child(Link):
         self._exit_code()
 
     def _exit_code(self) -> int:
+        super().close()  # whoever sends to it has nothing to do any more
         wait([self._process.sentinel])
         with self._reaping:  # the exit code can be read only once
             self._process.join()
@@ -251,15 +252,19 @@ def _signals_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+_hiding = threading.Lock()
+
+
 @contextlib.contextmanager
 def _main_hidden() -> Iterator[None]:
     """A process started meanwhile does not run the owner's script, which so needs no `if __name__ == "__main__"`."""
-    script = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = script
+    with _hiding:
+        script = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = script
 
 
 def show_as(name: str) -> None:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from app.child import Child, ChildDied, Link, LinkClosed, RestartLimit
+from app.child import Child, ChildDied, Link, LinkClosed, RestartLimit, _main_hidden
 
 ROOT = Path(__file__).resolve().parents[1]
 TIMEOUT_S = 30.0
@@ -207,6 +208,33 @@ def test_how_it_died_is_said_in_a_sentence(deed: Callable[[Child], None], how: s
         assert died.value.how == how
     child.send("nobody takes it")
     child.close()
+
+
+def test_a_dead_child_leaves_no_thread_behind() -> None:
+    before = threading.active_count()
+    child = Child(hang, name="hang", title="The child")
+    child.receive(TIMEOUT_S)
+    os.kill(child.pid, signal.SIGKILL)
+    with pytest.raises(ChildDied):
+        child.receive(TIMEOUT_S)
+    child.flush()
+    assert threading.active_count() == before
+
+
+def test_children_started_at_the_same_time_leave_the_script_in_its_place() -> None:
+    script = sys.modules["__main__"]
+
+    def start() -> None:
+        with _main_hidden():
+            time.sleep(0.02)
+
+    threads = [threading.Thread(target=start) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+        time.sleep(0.01)
+    for thread in threads:
+        thread.join()
+    assert sys.modules["__main__"] is script
 
 
 def test_one_that_does_not_end_when_asked_is_killed_after_the_time() -> None:

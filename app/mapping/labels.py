@@ -48,8 +48,8 @@ class LabelledKeyframes:
         if not 0 <= index < len(self):
             raise IndexError(f"keyframe {index} of {len(self)}")
         keyframe = self._keyframes[index]
-        labels = next((edit.labels for edit in reversed(self.edits) if edit.keyframe == index), None)
-        if labels is None:
+        labels = next((edit.labels for edit in reversed(self.edits) if edit.keyframe == index), b"")
+        if len(labels) != len(keyframe.cloud):  # there are none, or another version of the engine kept other points
             return keyframe
         return replace(keyframe, cloud=replace(keyframe.cloud, labels=np.frombuffer(labels, np.uint8)))
 

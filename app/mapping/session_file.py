@@ -48,6 +48,8 @@ log = logging.getLogger(__name__)
 
 SUFFIX = ".hemislam"
 FORMAT = 2
+MOST_POINTS = 1 << 24
+"""Of a keyframe: far more than any scan has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +80,20 @@ _Edits = Annotated[
     PlainValidator(edit_files.edits_of),
     PlainSerializer(edit_files.entries_of),
 ]
+
+
+def _unpacked(labels: str) -> bytes:
+    """Labels of a keyframe, of which there are not more than points."""
+    packed = zlib.decompressobj()
+    unpacked = packed.decompress(b64decode(labels), MOST_POINTS)
+    if packed.unconsumed_tail:
+        raise ValueError(f"more than {MOST_POINTS:,} labels of one keyframe")
+    return unpacked
+
+
 _LabelEdit = Annotated[
     LabelEdit,
-    PlainValidator(lambda entry: LabelEdit(KeyframeId(*entry[:2]), zlib.decompress(b64decode(entry[2])))),
+    PlainValidator(lambda entry: LabelEdit(KeyframeId(*entry[:2]), _unpacked(entry[2]))),
     PlainSerializer(
         lambda edit: (edit.keyframe.session, edit.keyframe.index, b64encode(zlib.compress(edit.labels)).decode())
     ),

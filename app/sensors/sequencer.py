@@ -24,6 +24,9 @@ OUTAGE_NS = 1_000_000_000
 MAX_WAITING = 64
 """Scans that may wait for IMU samples; bounds the memory when the IMU falls silent."""
 
+MAX_SAMPLES = 100_000
+"""IMU samples that may wait for a scan, eight minutes at 200 Hz: nobody dead-reckons longer than that."""
+
 MAX_HELD = 10_000
 """Samples of another sensor that may wait for a scan; the oldest go first."""
 
@@ -143,6 +146,9 @@ class Sequencer:
         self._note_stuck_axes(values)
         self._stamps.append(stamp_ns)
         self._values.append(values)
+        if len(self._stamps) > MAX_SAMPLES:  # the LiDAR is silent: a gap begins where its last scan ended
+            given_up = slice(int(self._last_end_ns is not None), MAX_SAMPLES // 2)
+            del self._stamps[given_up], self._values[given_up]
         if len(self._values) > 2:
             self._check(-3, -2, -1)
             if not self._begun and len(self._values) > 2:  # the very first has neighbours on one side only

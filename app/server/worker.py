@@ -50,7 +50,7 @@ class EngineProcess:
         self._main = main
         self._fold = Fold(Snapshot(params=setup.params, progress=Progress.opening(setup.recording)), setup.point_budget)
         self._changed = threading.Condition()
-        self._restarts = RestartLimit(MOST_RESTARTS)
+        self._restarts, self._restarting = RestartLimit(MOST_RESTARTS), threading.Lock()
         self._child: Child | None = None
         self._start(setup)
 
@@ -71,9 +71,12 @@ class EngineProcess:
 
     def send(self, command: Command) -> None:
         """Enqueue a command. Restart and OpenRecording start a dead engine again; other commands to it are lost."""
-        if not self.snapshot.engine_alive and isinstance(command, Restart | OpenRecording):
-            self.restart(command)
-        elif (child := self._child) is not None:
+        if isinstance(command, Restart | OpenRecording):
+            with self._restarting:  # the second one finds it alive
+                if not self.snapshot.engine_alive:
+                    self.restart(command)
+                    return
+        if (child := self._child) is not None:
             child.send(command)
 
     def restart(self, command: Restart | OpenRecording | None = None) -> None:

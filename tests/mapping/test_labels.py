@@ -12,6 +12,7 @@ from app.export.map_file import write
 from app.export.points import Choice, blocks
 from app.mapping.labels import LabelEdit, LabelledKeyframes
 from app.slam.errors import HemislamError
+from app.slam.keyframe_id import KeyframeId
 from app.slam.map_frame import MapFrame
 from app.slam.types import GROUND, NON_GROUND, Cloud, Keyframe
 
@@ -67,6 +68,12 @@ def test_labels_for_another_number_of_points_are_refused() -> None:
         LabelledKeyframes(KEYFRAMES).edit(0, ALL_GROUND[:3])
     with pytest.raises(HemislamError, match="no keyframe 3 to label; there are 3"):
         LabelledKeyframes(KEYFRAMES).edit(3, GROUND)
+
+
+def test_labels_that_fit_no_more_are_left_out() -> None:
+    """Another version of the engine may keep other points of the same scan than the session's file was made with."""
+    others = LabelEdit(KeyframeId(0, 1), bytes([GROUND] * (POINTS + 1)))
+    assert (LabelledKeyframes(KEYFRAMES, (others,))[1].cloud.labels == NON_GROUND).all()
 
 
 def test_labels_are_kept_as_they_were_given() -> None:

@@ -143,6 +143,19 @@ def test_a_silent_imu_does_not_fill_the_memory() -> None:
     assert isinstance(out[0], Measurement) and all(isinstance(entry, DroppedScan) for entry in out[1:])
 
 
+def test_a_silent_lidar_does_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.sensors.sequencer.MAX_SAMPLES", 1000)
+    sequencer = Sequencer(ImuParams())
+    for arrived in (*samples(0, 110), scan(0), *samples(120, 50_000)):
+        push(sequencer, arrived)
+        list(sequencer.ready())
+    push(sequencer, scan(49_800))
+    (after,) = sequencer.ready()
+    assert isinstance(after, Measurement) and len(after.imu.stamps_ns) <= 1000
+    assert stamps(after)[0] == 100 and stamps(after)[-1] == 49_900
+    assert any("no IMU sample for" in notice for notice in after.notices), "what was given up is told as a gap"
+
+
 def test_an_imu_outage_drops_the_scans_inside_and_is_reported_with_the_next() -> None:
     out, sequencer = feed([*samples(0, 210), *samples(480, 800)], [scan(100 * n) for n in range(7)])
     assert dropped(out) == [(200, "it lies in a gap of the IMU"), (300, "it lies in a gap of the IMU"),

@@ -3,8 +3,12 @@
 Tests app/server/controller.py and app/server/publisher.py.
 """
 
+import zlib
+from base64 import b64encode
+
 import numpy as np
-from pydantic import TypeAdapter
+import pytest
+from pydantic import TypeAdapter, ValidationError
 from session_bench import Bench, last_notice
 
 from app.mapping.painted import Stroke
@@ -49,6 +53,14 @@ def test_a_state_with_label_edits_is_written_and_read() -> None:
     state = State(session.params, labels=session.keyframes.edits)
     assert adapter.validate_json(adapter.dump_json(state)) == state
     assert len(state.labels) == 2
+
+
+def test_labels_that_unpack_to_a_gigabyte_are_refused_before_they_do() -> None:
+    packing = zlib.compressobj()
+    packed = b"".join(packing.compress(bytes(1 << 20)) for _ in range(32)) + packing.flush()
+    entry = (0, 1, b64encode(packed).decode())
+    with pytest.raises(ValidationError, match="more than 16,777,216 labels"):
+        TypeAdapter(State).validate_python({"params": {}, "labels": (entry,)})
 
 
 def test_marks_of_the_brush_are_kept_undone_and_survive_a_restart() -> None:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -117,6 +118,21 @@ def test_a_killed_engine_is_reported_and_can_be_started_again(engine: EngineProc
     assert [n.number for n in alive.notices] == list(range(1, len(alive.notices) + 1))
     engine.send(StepFrame())
     until(engine, lambda s: s.transport.frame == 1)
+
+
+def test_two_pages_that_restart_a_dead_engine_start_one(engine: EngineProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert engine.pid is not None
+    os.kill(engine.pid, signal.SIGKILL)
+    dead = until(engine, lambda s: not s.engine_alive)
+    started, start = [], engine._start
+    monkeypatch.setattr(engine, "_start", lambda setup: (started.append(setup), time.sleep(0.1), start(setup)))
+    pages = [threading.Thread(target=engine.send, args=(Restart(),)) for _ in range(2)]
+    for page in pages:
+        page.start()
+    for page in pages:
+        page.join()
+    until(engine, lambda s: s.session > dead.session and s.transport.frame == 0)
+    assert len(started) == 1
 
 
 def test_opening_another_recording_revives_a_dead_engine(engine: EngineProcess) -> None:

@@ -59,11 +59,10 @@ class Recorder:
         self._thread.start()
 
     def add_scan(self, scan: Scan, arrival_ns: int) -> None:
-        if self._scans_waiting < MAX_SCANS:
-            self._scans_waiting += 1
-            self._add((scan, arrival_ns))
-        else:
+        if self._scans_waiting >= MAX_SCANS:
             self.left_out += 1
+        elif self._add((scan, arrival_ns)):
+            self._scans_waiting += 1
 
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, arrival_ns: int) -> None:
         self._add((stamp_ns, gyro, accel, arrival_ns))
@@ -74,11 +73,13 @@ class Recorder:
         self._wake.set()
         self._thread.join(30.0)
 
-    def _add(self, message: _Scan | _Imu) -> None:
+    def _add(self, message: _Scan | _Imu) -> bool:
+        """Whether it will be written."""
         if len(self._waiting) >= MAX_SAMPLES or self.failure:
             self.left_out += 1
-            return
+            return False
         self._waiting.append(message)
+        return True
 
     def _run(self) -> None:
         try:

@@ -145,7 +145,7 @@ class PacketReceiver:
                 if not ready:
                     self._put_imu(self._order.flush(), now, intake)
                 since = self._assembler.pending_since()
-                if not ready and since is not None and now - since > _REST_NS:
+                if self._sockets[0] not in ready and since is not None and now - since > _REST_NS:
                     self._frames += self._assembler.flush()
                 self._give(now, intake)
 

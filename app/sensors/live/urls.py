@@ -68,7 +68,7 @@ def parse_address(text: str) -> Address:
     except ValueError:  # a bracket that is not closed
         raise HemislamError(f"`{text}` has no valid host; write it as {kind.example}.") from None
     host, colon, numbers = parts.netloc.rpartition(":")
-    if not colon:
+    if not colon or numbers.endswith("]"):  # an IPv6 address without a port
         host, numbers = parts.netloc, ""
     try:
         ports = tuple(map(int, numbers.split(","))) if numbers else ()

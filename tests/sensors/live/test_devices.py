@@ -4,6 +4,7 @@ Tests app/sensors/live/devices.py, app/sensors/live/livox_udp.py, app/sensors/li
 """
 
 import math
+import select
 import socket
 import struct
 import threading
@@ -202,6 +203,26 @@ def test_imu_samples_behind_a_lost_one_do_not_wait_for_ever(monkeypatch: pytest.
     packets = [write_airy_imu(ImuSample(k, START_NS + k * 5_000_000, (0, 0, 0), (0, 0, 9.8))) for k in (0, 1, 3, 4)]
     received("airy", packets, lambda intake: len(heard) == 4)
     assert heard == [START_NS + k * 5_000_000 for k in (0, 1, 3, 4)]
+
+
+def test_the_last_points_before_a_silence_are_given_while_the_imu_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.sensors.live.udp._REST_NS", 100_000_000)
+    really = select.select
+    monkeypatch.setattr(select, "select", lambda of, *_: (really(of, [], [], 0.01)[0] or [of[1]], [], []))  # the IMU
+    numbers, intake, stop = ports.free(2), Intake(Params()), threading.Event()
+    receiver = PacketReceiver(DEVICES["mid360"], "127.0.0.1", tuple(numbers), Params(), own_imu=True)
+    thread = threading.Thread(target=receiver, args=(intake, stop))
+    thread.start()
+    body = struct.pack("<3iBB", 1000, 0, 0, 1, 16) * 96
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for k in range(5):
+            sender.sendto(livox(1, 96, body, START_NS + k * 480_000), ("127.0.0.1", numbers[0]))
+    until = time.monotonic() + 2.0
+    while time.monotonic() < until and not intake.counters.frames:
+        time.sleep(0.02)
+    stop.set()
+    thread.join()
+    assert intake.counters.packets == 5 and intake.counters.frames == 1
 
 
 def test_angles_of_another_sensor_are_refused(tmp_path: Path) -> None:

@@ -303,6 +303,7 @@ def test_addresses_have_the_sensors_own_ports_by_default() -> None:
     assert parse_address("rsbpearl://:1700").ports == (1700, 7788)
     assert parse_address("foxglove://robot").host == "robot"
     assert parse_address("foxglove://[::1]:9").host == "::1"
+    assert (parse_address("foxglove://[::1]").host, parse_address("foxglove://[::1]").ports) == ("::1", (8765,))
     assert parse_address("rsbpearl://10.0.0.1:1,2?clock=host&angles=a.csv").options == {
         "clock": "host",
         "angles": "a.csv",

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from pathlib import Path
 
@@ -188,3 +189,22 @@ def test_a_disk_that_is_too_slow_costs_scans_of_the_recording_and_no_memory(tmp_
     assert len(recorder._waiting) <= MAX_SCANS
     recorder._write = lambda message: None  # type: ignore[method-assign]
     recorder.close()
+
+
+def test_scans_left_out_of_a_full_queue_do_not_count_as_waiting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.sensors.live.recorder.MAX_SAMPLES", 50)
+    recorder, stalled = Recorder(tmp_path / "session.mcap"), threading.Event()
+    recorder._write = lambda message: stalled.wait(20.0)  # type: ignore[assignment,method-assign]
+    for number in range(60):
+        recorder.add_imu(number, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), number)
+    for number in range(MAX_SCANS + 50):
+        recorder.add_scan(scan(0), sensor.START_NS + number)
+    stalled.set()
+    while recorder._waiting:
+        time.sleep(0.01)
+    before = recorder.left_out
+    recorder.add_scan(scan(0), sensor.START_NS)
+    recorder.close()
+    assert recorder.left_out == before, "the disk keeps up again"
