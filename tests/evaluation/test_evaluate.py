@@ -135,7 +135,8 @@ def deterministic(folder: Path) -> Any:
 def test_killed_at_any_moment_and_started_again_it_gives_the_same_tables(
     recording: Path, evaluated: Path, tmp_path: Path
 ) -> None:
-    arguments = (recording, "--out", tmp_path, "--no-ablation", "--variant", VARIANT, "--variant", "fine:map.radius=90")
+    systems = ("--variant", VARIANT, "--baseline", "loam")
+    arguments = (recording, "--out", tmp_path, "--no-ablation", *systems)
     whole = evaluated.parent / "whole"
     assert call(*arguments[:2], whole, *arguments[3:]).exit_code == 0
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
