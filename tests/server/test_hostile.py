@@ -53,6 +53,7 @@ def test_a_refused_path_cannot_forge_a_line_of_the_log(site: Site, caplog: Any) 
         ("POST", "/api/transport", b'{"action": "speed", "factor": NaN}'),
         ("POST", "/api/transport", b'{"action": "\\ud800"}'),
         ("POST", "/api/loops", b'{"action": "weigh", "older": 0, "newer": 1, "weight": NaN}'),
+        ("POST", "/api/loops", b'{"action": "accept", "older": 0, "newer": 1000000000000}'),
         ("POST", "/api/recordings", b'{"path": "\\ud800"}'),
         ("POST", "/api/recordings", b'{"path": "\\u0000"}'),
         ("POST", "/api/truth", b'{"path": "\\ud800"}'),

@@ -1,7 +1,7 @@
 """A bounded buffer between the receiving threads and the engine's side. It never blocks the receiving threads.
 
 When the engine falls behind, the oldest waiting scans are dropped, each reported as a `DroppedScan`. IMU samples are
-never dropped.
+not, unless nobody reads them for minutes.
 """
 
 import threading

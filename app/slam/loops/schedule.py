@@ -17,7 +17,7 @@ import numpy as np
 from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
 from app.slam.log import Cursor
-from app.slam.loops.edits import Edits
+from app.slam.loops.edits import Edits, check
 from app.slam.loops.files import LoopResults
 from app.slam.loops.keyframe_log import KeyframeEntry, KeyframeLog
 from app.slam.loops.messages import (
@@ -374,5 +374,6 @@ class LoopSchedule:
 def _after(edits: Edits, request: Request) -> Edits:
     """What a request of the user makes of the edits. Raises HemislamError: it cannot be done."""
     if isinstance(request, ApplyEdit):
+        check(request.edit)
         return Edits((*edits.done, request.edit))
     return edits if isinstance(request, Question) else request(edits)
