@@ -80,10 +80,10 @@ class CaptureStream:
                 stamp_ns = content.stamp_ns + _value_at(self._imu_shifts, log_ns)
                 yield self._imu_topic, log_ns, ros.imu_message(stamp_ns, content.gyro, content.accel)
             elif isinstance(content, Revolution) and self._lidar_topic in topics:
-                if self._devices and (said := _value_at(self._devices, log_ns)) is not device:
-                    device = said
+                if self._devices and (difop := _value_at(self._devices, log_ns)) is not device:
+                    device = difop
                     if self._decoder is not None:
-                        self._decoder.configure(said)
+                        self._decoder.configure(difop)
                 yield self._lidar_topic, log_ns, self._cloud(content, _value_at(self._lidar_shifts, log_ns))
 
     def _cloud(self, frame: Revolution, shift_ns: int) -> Any:
@@ -125,8 +125,8 @@ class CaptureStream:
                     counters.imu_foreign += 1
             elif payload[:8] == DIFOP_ID:
                 model = self._device.model
-                said = read_difop(payload, model) if isinstance(model, Model) else None
-                found = [said] if said is not None else []
+                difop = read_difop(payload, model) if isinstance(model, Model) else None
+                found = [difop] if difop is not None else []
             elif (sensor := sensor_of(payload)) is None or sensor in self._device.models:
                 found = assembler.add(payload, running_ns)
             else:

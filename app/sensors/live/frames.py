@@ -29,7 +29,7 @@ _LATE = 64
 
 
 @dataclass(frozen=True, slots=True)
-class _Said:
+class _Head:
     """What a packet of measurements states of itself: who sent it, when (None: without a date), and its number."""
 
     sensor: Model | Livox
@@ -37,23 +37,23 @@ class _Said:
     index: int
 
 
-def _read(packet: bytes) -> _Said | None:
+def _read(packet: bytes) -> _Head | None:
     """None if it holds no measurements."""
     model = msop.model_of(packet)
     if model is not None:
-        return _Said(model, msop.stamp_of(packet), msop.index_of(packet, model))
+        return _Head(model, msop.stamp_of(packet), msop.index_of(packet, model))
     header = read_header(packet)
-    return _Said(MID360, header.stamp_ns, header.number) if header is not None and is_points(header) else None
+    return _Head(MID360, header.stamp_ns, header.number) if header is not None and is_points(header) else None
 
 
-Pending = tuple[int, int, bytes, _Said]
+Pending = tuple[int, int, bytes, _Head]
 """Time of the first block, arrival, packet, and what it states."""
 
 
 def sensor_of(packet: bytes) -> Model | Livox | None:
     """Who sent this packet of measurements; None if it holds none."""
-    said = _read(packet)
-    return None if said is None else said.sensor
+    head = _read(packet)
+    return None if head is None else head.sensor
 
 
 def _azimuths(packet: bytes, stamp_ns: int, sensor: Model | Livox) -> tuple[int, ...]:
@@ -102,18 +102,18 @@ class Assembler:
 
     def add(self, packet: bytes, arrival_ns: int) -> list[Revolution]:
         """Revolutions that this packet completes, mostly none. arrival_ns: by the host's clock."""
-        said = _read(packet)
-        if said is None:
+        head = _read(packet)
+        if head is None:
             if msop.is_marked(packet):
                 self.counters.truncated += 1
             else:
                 self.counters.foreign += 1
             return []
-        model, stamp = said.sensor, said.stamp_ns
+        model, stamp = head.sensor, head.stamp_ns
         if stamp is None:
             self.counters.undated += 1
             stamp = arrival_ns
-        entry = (stamp, arrival_ns, packet, said)
+        entry = (stamp, arrival_ns, packet, head)
         newest = self._pending[-1][0] if self._pending else self._given_ns
         frames: list[Revolution] = []
         if newest is not None and (abs(stamp - newest) > JUMP_NS or model is not self._model):
@@ -147,7 +147,7 @@ class Assembler:
         return self._pending[-1][1] if self._pending else None
 
     def _insert(self, entry: Pending) -> None:
-        stamp, _, _, said = entry
+        stamp, _, _, head = entry
         pending = self._pending
         if self._given_ns is not None and stamp <= self._given_ns:
             self.counters.late += 1
@@ -166,7 +166,7 @@ class Assembler:
             pending.insert(at, entry)
             self._checked = min(self._checked, at)
         self.counters.packets += 1
-        self._count_lost(said.index)
+        self._count_lost(head.index)
 
     def _count_lost(self, index: int) -> None:
         """Count by the packets' numbers; one that arrives late after all no longer counts."""
@@ -198,8 +198,8 @@ class Assembler:
         return []
 
     def _azimuths_at(self, at: int) -> tuple[int, ...]:
-        stamp, _, packet, said = self._pending[at]
-        return _azimuths(packet, stamp, said.sensor)
+        stamp, _, packet, head = self._pending[at]
+        return _azimuths(packet, stamp, head.sensor)
 
     def _split(self, at: int, block: int) -> Revolution:
         """End the revolution before this block of the packet `at`; the next one begins there."""

@@ -150,21 +150,22 @@ class PacketReceiver:
                 self._give(now, intake)
 
     def _take(self, packet: bytes, now: int, peer: Peer, intake: Intake) -> None:
-        sensor, states, felt = sensor_of(packet), packet[:8] == DIFOP_ID, is_imu(packet)
-        if (states or felt or sensor is not None) and self._is_another(peer, states or felt, intake):
+        sensor, is_difop, of_imu = sensor_of(packet), packet[:8] == DIFOP_ID, is_imu(packet)
+        if (is_difop or of_imu or sensor is not None) and self._is_another(peer, is_difop or of_imu, intake):
             intake.counters.foreign += 1
-        elif felt and self._own_imu:
-            self._put_imu(self._order.add(packet), now, intake)
-        elif states and isinstance(self._model, Model):
-            said = read_difop(packet, self._model)
-            if said is None:
+        elif of_imu:
+            if self._own_imu:
+                self._put_imu(self._order.add(packet), now, intake)
+        elif is_difop and isinstance(self._model, Model):
+            difop = read_difop(packet, self._model)
+            if difop is None:
                 intake.counters.truncated += 1
             else:
                 intake.counters.difop += 1
-                self._configure(said, now, intake)
-        elif not felt and (sensor is None or sensor in self._models):
+                self._configure(difop, now, intake)
+        elif sensor is None or sensor in self._models:
             self._frames += self._assembler.add(packet, now)
-        elif not felt:
+        else:
             intake.counters.foreign += 1
 
     def _put_imu(self, samples: list[ImuSample], arrival_ns: int, intake: Intake) -> None:
@@ -190,21 +191,21 @@ class PacketReceiver:
             self._sensor, self._heard_s = known, now
         return False
 
-    def _configure(self, said: Difop, now: int, intake: Intake) -> None:
-        before, self._device = self._device, said
-        if self._decoder is None or (before is not None and before.same(said)):
+    def _configure(self, difop: Difop, now: int, intake: Intake) -> None:
+        before, self._device = self._device, difop
+        if self._decoder is None or (before is not None and before.same(difop)):
             return
         if before is not None:
             self._give(now, intake)  # what came before was measured with the old settings
-        self._decoder.configure(said)
-        self._assembler.turn_ns = round(60e9 / said.rpm)
-        intake.sensor = f"{self._model.name} {said.serial}: {said.describe()}"
+        self._decoder.configure(difop)
+        self._assembler.turn_ns = round(60e9 / difop.rpm)
+        intake.sensor = f"{self._model.name} {difop.serial}: {difop.describe()}"
         if before is not None:
-            intake.put_status("configuration", "LiDAR", f"the LiDAR was set to {said.describe()}")
+            intake.put_status("configuration", "LiDAR", f"the LiDAR was set to {difop.describe()}")
             return
         intake.put_status("connected", "LiDAR", intake.sensor)
-        if said.T_imu_lidar is not None:
-            mount = mount_finding(said.T_imu_lidar)
+        if difop.T_imu_lidar is not None:
+            mount = mount_finding(difop.T_imu_lidar)
             intake.put_status("configuration", "LiDAR", f"{mount.text}: {mount.option}")
 
     def _give(self, now: int, intake: Intake) -> None:
