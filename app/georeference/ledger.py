@@ -40,26 +40,30 @@ def report(alignment: Alignment) -> dict[str, Any]:
 
 def summary(alignment: Alignment, what: str) -> list[str]:
     """The result in lines; `what` was measured: "fixes" or "control points"."""
+    return [f"{name:<19}{text}" if name else text for name, text in in_rows(alignment, what)]
+
+
+def in_rows(alignment: Alignment, what: str) -> list[tuple[str, str]]:
+    """As `summary`, names and texts apart."""
     where, used = alignment.reference, int(alignment.used.sum())
     east, north, height = where.origin
     turned = _plus(np.degrees(alignment.yaw_sigma), "°", 3)
-    lines = [
-        f"Coordinate system  {where.crs} ({crs.projected(where.crs).name}), heights {where.height}",
-        f"Map origin         E {east:.3f} m, N {north:.3f} m, H {height:.3f} m",
-        f"Map x axis         {_bearing(alignment):.3f}° from grid north{turned}",
-        f"Grid scale         {where.scale:.7f}",
+    rows = [
+        ("Coordinate system", f"{where.crs} ({crs.projected(where.crs).name}), heights {where.height}"),
+        ("Map origin", f"E {east:.3f} m, N {north:.3f} m, H {height:.3f} m"),
+        ("Map x axis", f"{_bearing(alignment):.3f}° from grid north{turned}"),
+        ("Grid scale", f"{where.scale:.7f}"),
     ]
     if np.isfinite(alignment.offset_sigma_s):
-        lines.append(
-            f"Clock offset       {alignment.offset_s * 1e3:.1f} ms{_plus(alignment.offset_sigma_s * 1e3, ' ms', 1)}"
-            f" (the fixes are stamped {'late' if alignment.offset_s >= 0 else 'early'})"
-        )
+        side = "late" if alignment.offset_s >= 0 else "early"
+        plus = _plus(alignment.offset_sigma_s * 1e3, " ms", 1)
+        rows.append(("Clock offset", f"{alignment.offset_s * 1e3:.1f} ms{plus} (the fixes are stamped {side})"))
     if any(alignment.lever_arm):
         x, y, z = alignment.lever_arm
-        lines.append(f"Lever arm          {x:.3f} {y:.3f} {z:.3f} m{_plus(alignment.lever_sigma, ' m', 3)}")
+        rows.append(("Lever arm", f"{x:.3f} {y:.3f} {z:.3f} m{_plus(alignment.lever_sigma, ' m', 3)}"))
     rms = " ".join(f"{axis} {value:.4f} m" for axis, value in zip("ENH", alignment.rms, strict=True))
-    lines.append(f"Residuals (RMS)    {rms}, of {used} of {len(alignment.used)} {what}")
-    return [*lines, *alignment.notes]
+    rows.append(("Residuals (RMS)", f"{rms}, of {used} of {len(alignment.used)} {what}"))
+    return [*rows, *(("", note) for note in alignment.notes)]
 
 
 def table(alignment: Alignment, *, only_rejected: bool = False) -> list[str]:

@@ -58,10 +58,13 @@ class Folders:
         return real
 
     def openable(self, path: Path | str) -> Path:
-        """As `inside`; the recording of a session file must be inside too. Raises as `inside`."""
+        """As `inside`; what a session file reads must be inside too. Raises as `inside`."""
         real = self.inside(path)
         if real.suffix == SUFFIX:
-            self.inside(read_session(real).opened.recording)
+            session = read_session(real)
+            self.inside(session.opened.recording)
+            if session.state.survey is not None and session.state.survey.gnss is not None:
+                self.inside(session.state.survey.gnss)
         return real
 
     def listing(self, folder: Path | str, suffixes: tuple[str, ...] = RECORDINGS) -> list[FolderEntry]:

@@ -4,6 +4,7 @@ import logging
 from concurrent.futures import Future
 
 from app.export.results import Results
+from app.georeference.survey import Survey
 from app.mapping.session import Session
 from app.server.protocol import Earth
 from app.server.publisher import Publisher
@@ -20,6 +21,7 @@ class Laying:
     def __init__(self, page: Publisher) -> None:
         self._page = page
         self._laid: tuple[object, ...] = (None, None, (), -1, None)  # what the newest was begun with
+        self._begun_with: Survey | None = None
         self._under_way: Future[tuple[Results, MapFrame]] | None = None
 
     def update(self, session: Session, *, still: bool) -> bool:
@@ -31,7 +33,7 @@ class Laying:
         if self._under_way is not None:
             if not self._under_way.done():
                 return True
-            self._take(session, self._under_way)
+            self._take(session, self._under_way, self._begun_with)
             self._under_way = None
         if session.loops is not None and not session.loops.idle:
             return False
@@ -45,20 +47,20 @@ class Laying:
         if session.survey is None:
             self._show(session, Earth(), MapFrame())
             return False
-        self._under_way = session.lay_on_earth()
+        self._under_way, self._begun_with = session.lay_on_earth(), session.survey
         return True
 
-    def _take(self, session: Session, laid: Future[tuple[Results, MapFrame]]) -> None:
+    def _take(self, session: Session, laid: Future[tuple[Results, MapFrame]], survey: Survey | None) -> None:
         if self._laid[0] is not session:
             return
         error = laid.exception()
         if error is None:
             results, by_fixes = laid.result()
-            self._show(session, Earth(session.survey, results.found), by_fixes)
+            self._show(session, Earth(survey, results.found), by_fixes)
             return
         if not isinstance(error, HemislamError):
             log.error("The map could not be laid on Earth", exc_info=error)
-        self._show(session, Earth(session.survey, problem=str(error) or type(error).__name__), MapFrame())
+        self._show(session, Earth(survey, problem=str(error) or type(error).__name__), MapFrame())
 
     def _show(self, session: Session, earth: Earth, by_fixes: MapFrame) -> None:
         if len(by_fixes.T_map_odom) or len(session.by_fixes.T_map_odom):

@@ -1,11 +1,13 @@
 """Measures by clicks in the scene: a point, a distance, an angle; each is named, kept in the session, and drawn."""
 
 import itertools
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 import viser
 
+from app.georeference.reference import GeoReference
 from app.mapping.session_file import Measure, Spot
 from app.server.protocol import DropMeasure, KeepMeasure, Snapshot
 from app.slam.types import F64
@@ -15,7 +17,7 @@ from app.ui.nodes import add_exact_points, add_lines, segments
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of
 
-POINT, DISTANCE, ANGLE, STOP = "point", "distance", "angle", "stop"
+POINT, DISTANCE, ANGLE, STOP, PICK = "point", "distance", "angle", "stop", "pick"
 _SPOTS: Final = {POINT: 1, DISTANCE: 2, ANGLE: 3}
 _WIDTH: Final = 0.01
 """So far beside a click, as a share of the picture's height, a point may be."""
@@ -31,6 +33,8 @@ class MeasurePanel:
         self._page = page
         self._changes = Changes()
         self._kind = STOP
+        self._taker: Callable[[Spot, Snapshot], None] | None = None  # of a spot that is picked, not measured
+        self._where: GeoReference | None = None
         self._click: tuple[F64, F64, float] | None = None  # of the newest click: its ray in the map, and its width
         self._spots: tuple[Spot, ...] = ()  # of the measure that is begun
         self._nodes: list[Any] = []
@@ -53,6 +57,11 @@ class MeasurePanel:
     def begin(self, kind: str) -> None:
         self._kind, self._spots = kind, ()
 
+    def pick(self, taker: Callable[[Spot, Snapshot], None]) -> None:
+        """Give `taker` the spot that the next click meets, instead of measuring it."""
+        self.begin(PICK)
+        self._taker = taker
+
     def draw(self, current: Snapshot, view: View) -> None:
         """Take the newest click, and show what the session keeps."""
         click, self._click = self._click, None
@@ -66,12 +75,17 @@ class MeasurePanel:
         begun = places(Measure("", self._spots), poses) if self._spots else None
         where = [(measure, at) for measure, at in kept if at is not None]
         drawn = str([at.round(3).tolist() for _, at in where])
-        if self._changes(current.measures, self._kind, str(self._spots), drawn, current.session):
+        self._where = current.earth.found.reference if current.earth.found is not None else None
+        if self._changes(current.measures, self._kind, str(self._spots), drawn, current.session, self._where):
             self._measured = [(measure, at, numbers(at, current.chunks, poses)) for measure, at in where]
             self._draw_scene(begun)
             self._draw_list()
 
     def _take(self, kind: str, spot: Spot, current: Snapshot) -> None:
+        if kind == PICK and self._taker is not None:
+            self.begin(STOP)
+            self._taker(spot, current)
+            return
         self._spots = (*self._spots, spot)
         if len(self._spots) == _SPOTS[kind]:
             taken = {measure.name for measure in current.measures}
@@ -99,7 +113,7 @@ class MeasurePanel:
         left = _SPOTS.get(self._kind, 0) - len(self._spots)
         self._asked.content = panel("note", f"Click {left} point{'s' if left > 1 else ''} of the map.") if left else ""
         self._asked.visible = bool(left)
-        rows = [(measure.name, words(at, found)) for measure, at, found in self._measured]
+        rows = [(measure.name, words(at, found, self._where)) for measure, at, found in self._measured]
         self._list.content = self._bridge.live(panel("measures", rows)) if rows else ""
         self._list.visible = self._save.visible = bool(rows)
 
@@ -116,4 +130,4 @@ class MeasurePanel:
     def _download(self, client: viser.ClientHandle) -> None:
         recording = self._page.snapshot().recording
         name = f"{recording.path.stem if recording else 'map'}-measures.csv"
-        client.send_file_download(name, as_csv(self._measured).encode(), save_immediately=True)
+        client.send_file_download(name, as_csv(self._measured, self._where).encode(), save_immediately=True)

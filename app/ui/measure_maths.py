@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from app.georeference.reference import GeoReference
 from app.mapping.session_file import Measure, Spot
 from app.server.protocol import Chunk
 from app.slam.types import F32, F64, NON_GROUND
@@ -24,6 +25,8 @@ _KEYFRAMES: Final = 20
 COLUMNS: Final = (
     "name", "x_m", "y_m", "z_m", "height_m", "distance_m", "horizontal_m", "vertical_m", "angle_deg",
 )  # fmt: skip
+ON_EARTH: Final = ("east_m", "north_m", "grid_height_m")
+"""Beside them where the map has coordinates of others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,23 +121,29 @@ def _ground(chunk: Chunk, T_map_imu: F64) -> npt.NDArray[np.floating]:
     return np.asarray(chunk.points[chunk.labels != NON_GROUND] @ T[:3, :3].T + T[:3, 3])
 
 
-def words(at: F64, found: Numbers) -> str:
-    """What a measure says, in metres and degrees."""
+def words(at: F64, found: Numbers, where: GeoReference | None = None) -> str:
+    """What a measure says, in metres and degrees. where: on Earth the map is, if that is known."""
     if len(at) == 1:
         above = f", {found.height:.2f} m above the ground" if np.isfinite(found.height) else ""
-        return f"x {at[0, 0]:.3f}, y {at[0, 1]:.3f}, z {at[0, 2]:.3f} m{above}"
+        own = f"x {at[0, 0]:.3f}, y {at[0, 1]:.3f}, z {at[0, 2]:.3f} m{above}"
+        if where is None:
+            return own
+        ((east, north, up),) = where.to_crs(at).tolist()
+        return f"{own}; E {east:.3f}, N {north:.3f}, H {up:.3f} m ({where.crs}, {where.height})"
     if len(at) == 2:
         return f"{found.distance:.3f} m: {found.horizontal:.3f} m horizontal, {found.vertical:+.3f} m vertical"
     return f"{found.angle:.1f}°"
 
 
-def as_csv(measured: list[tuple[Measure, F64, Numbers]]) -> str:
-    """A row for each spot, in the map's axes; the first of a measure has its numbers too."""
+def as_csv(measured: list[tuple[Measure, F64, Numbers]], where: GeoReference | None = None) -> str:
+    """A row for each spot, in the map's axes and where it is on Earth; the first of a measure has its numbers too."""
     text = io.StringIO()
     write = csv.writer(text, lineterminator="\n").writerow
-    write(COLUMNS)
+    write((*COLUMNS, *(ON_EARTH if where is not None else ())))
     for measure, at, found in measured:
         cells = [f"{value:.4f}" if np.isfinite(value) else "" for value in astuple(found)]
         for row, place in enumerate(at):
-            write((measure.name, *(f"{value:.4f}" for value in place), *(cells if row == 0 else [""] * len(cells))))
+            there = where.to_crs(place)[0].tolist() if where is not None else []
+            own, grid = ([f"{value:.4f}" for value in values] for values in (place, there))
+            write((measure.name, *own, *(cells if row == 0 else [""] * len(cells)), *grid))
     return text.getvalue()

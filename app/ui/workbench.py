@@ -27,6 +27,7 @@ from app.ui.calibration import CalibrationPanel
 from app.ui.camera import CameraPanel
 from app.ui.compare import ComparePanel, Sides
 from app.ui.files import FilesPanel, RecentPanel
+from app.ui.georeference import GeoreferencePanel
 from app.ui.html import render
 from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
@@ -125,6 +126,8 @@ class Workbench:
             self._doctor = DoctorPanel(page)
             with gui.add_folder("Calibration", expand_by_default=False):
                 self._calibration = CalibrationPanel(page)
+            with gui.add_folder("Georeference", expand_by_default=False):
+                self._georeference = GeoreferencePanel(page, folders, self._measure)
             with gui.add_folder("Notes"):
                 self._notes = NotesPanel(page)
             self._notices = NoticePanel(server)
@@ -135,7 +138,7 @@ class Workbench:
         self._panels = (
             self._transport, self._breakpoints, self._notes, self._notices, self._header, self._recent, self._timeline,
             self._readouts, self._doctor, self._calibration, self._live, self._files, self._camera,
-            self._tune,
+            self._tune, self._georeference,
         )  # fmt: skip
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)

@@ -1,0 +1,115 @@
+"""What the georeference panel shows: rows of the table, lines in the scene, and the centre of a target."""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from scipy import optimize
+
+from app.georeference.align import Alignment
+from app.georeference.control import CONTROL
+from app.georeference.tables import table_of
+from app.mapping.earth import FIX, POINT
+from app.mapping.session_file import Spot
+from app.server.protocol import Chunk, Snapshot
+from app.slam.errors import HemislamError
+from app.slam.loops.edits import Overrule
+from app.slam.types import F32, F64
+
+_least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
+MOST_ROWS: Final = 100
+_NEAR_M, _FEWEST, _WORST_M = 0.03, 12, 0.01
+"""Points so near a sphere are its own; so many are needed, and they must fit so well (RMS)."""
+
+
+class Row(NamedTuple):
+    """A fix or control point in the table. word: what a click on it sends. texts: residuals in m, distance in σ."""
+
+    name: str
+    word: str
+    used: bool
+    edited: bool
+    texts: tuple[str, ...]
+
+
+def rows_of(found: Alignment, current: Snapshot) -> list[Row]:
+    """Those that are left out or overruled first, then by their residuals."""
+    survey = current.earth.survey
+    kind = POINT if survey is not None and survey.control else FIX
+    edited = {edit.what for edit in current.loops.undo if isinstance(edit, Overrule)}
+    told = np.array([kind + name in edited for name in found.names])
+    length = np.linalg.norm(found.residuals, axis=1)
+    order = np.lexsort((-length, found.used & ~told))
+    return [
+        Row(
+            found.names[k],
+            f"overrule {kind}{found.names[k]}",
+            bool(found.used[k]),
+            bool(told[k]),
+            (*(f"{value:+.3f}" for value in found.residuals[k]), f"{found.distances[k]:.1f}"),
+        )
+        for k in order[:MOST_ROWS].tolist()
+    ]
+
+
+def lines_of(found: Alignment) -> tuple[F32, F32]:
+    """(n, 3) where fixes or points were measured, and (n, 2, 3) lines from there to where the map has them, m."""
+    measured = found.reference.from_crs(found.grid)
+    at = measured - found.residuals @ np.array(found.reference.rotation)
+    return measured.astype(np.float32), np.stack((measured, at), axis=1).astype(np.float32)
+
+
+def names_of(text: str) -> tuple[str, ...]:
+    """Of the control points in a table. Raises HemislamError: it has no heading, or a row is cut."""
+    return tuple(table_of(text.splitlines(), "The table of control points", *CONTROL).columns.get("name", ()))
+
+
+def numbers_in(text: str, what: str, count: int) -> list[float]:
+    """As many numbers as there must be, or none. Raises HemislamError, naming `what`."""
+    try:
+        found = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        found = [np.nan]
+    if len(found) not in (0, count) or not np.isfinite(found).all():
+        raise HemislamError(f"The {what} is {text}; it takes {count} number{'s' if count > 1 else ''}, or nothing.")
+    return found
+
+
+def centre_of_sphere(chunks: tuple[Chunk, ...], poses: F64, spot: Spot, radius: float) -> tuple[float, float, float]:
+    """Of a sphere of known radius (m), by the points around a spot on it; m, in the IMU frame of the spot's keyframe.
+
+    Args:
+        poses: (k, 4, 4) T_map_imu of the chunks' keyframes.
+
+    Raises:
+        HemislamError: what is there is no such sphere.
+    """
+    T = poses[spot.keyframe]
+    at = T[:3, :3] @ spot.at + T[:3, 3]
+    points = _around(chunks, poses, at, 2.5 * radius)
+    behind = at + radius * (at - T[:3, 3]) / np.linalg.norm(at - T[:3, 3])
+
+    def off(centre: F64) -> F64:
+        return np.asarray(np.linalg.norm(points - centre, axis=1) - radius)
+
+    if len(points) >= _FEWEST:
+        behind = _least_squares(off, behind, loss="cauchy", f_scale=_NEAR_M / 3).x
+        near = np.abs(off(behind)) < _NEAR_M
+        if near.sum() >= _FEWEST:
+            behind = _least_squares(lambda centre: off(centre)[near], behind).x
+            if np.sqrt((off(behind)[near] ** 2).mean()) < _WORST_M and near.mean() > 0.5:
+                x, y, z = (T[:3, :3].T @ (behind - T[:3, 3])).tolist()
+                return x, y, z
+    raise HemislamError(
+        f"The points there do not form a sphere of {radius:g} m radius; click its middle, or pick a point instead."
+    )
+
+
+def _around(chunks: tuple[Chunk, ...], poses: F64, place: F64, radius: float) -> F64:
+    """(n, 3) points of the map within a radius (m) of a place."""
+    found = [np.empty((0, 3))]
+    for chunk in chunks:
+        T = poses[chunk.index] @ chunk.T_imu_lidar
+        own = (place - T[:3, 3]) @ T[:3, :3]
+        near = np.linalg.norm(chunk.points - own, axis=1) < radius
+        found.append(chunk.points[near] @ T[:3, :3].T + T[:3, 3])
+    return np.concatenate(found)
