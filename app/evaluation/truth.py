@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from app.sensors.navsat import NAVSAT, fix_of
 from app.sensors.source import Source
 from app.slam.errors import HemislamError
 from app.slam.trajectory import Trajectory, read_tum, time_apart
@@ -31,8 +32,7 @@ _POSES: dict[str, Callable[[Any], Any]] = {
     "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
 }
-_FIX = "sensor_msgs/msg/NavSatFix"
-TYPES = (*_POSES, _FIX)
+TYPES = (*_POSES, NAVSAT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,8 +210,8 @@ def _read_topic(recording: Path, topic: str) -> TruePoses:
             )
         stamps, rows = [], []
         for _, _, message in source.messages((topic,)):
-            row = _fix(message) if kind == _FIX else _pose(_POSES[kind](message))
-            if row is not None:
+            row = fix_of(message).places[0] if kind == NAVSAT else _pose(_POSES[kind](message))
+            if kind != NAVSAT or np.isfinite(row).all():
                 stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
                 rows.append(row)
     table = np.array(rows, dtype=np.float64)
@@ -219,7 +219,7 @@ def _read_topic(recording: Path, topic: str) -> TruePoses:
     name = f"Topic {topic}"
     if not len(table):
         raise HemislamError(f"Topic {topic} of {recording} holds no usable pose.")
-    if kind == _FIX:
+    if kind == NAVSAT:
         return TruePoses(name, "satellite fixes", stamps_ns, _east_north_up(table), None)
     lengths = np.linalg.norm(table[:, 3:], axis=1)
     if not (np.abs(lengths - 1) <= 0.01).all():  # also refuses nan
@@ -232,12 +232,6 @@ def _read_topic(recording: Path, topic: str) -> TruePoses:
 def _pose(pose: Any) -> list[float]:
     p, q = pose.position, pose.orientation
     return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
-
-
-def _fix(message: Any) -> list[float] | None:
-    """Latitude and longitude in degrees, height in m; None if there was no fix."""
-    row = [message.latitude, message.longitude, message.altitude]
-    return row if message.status.status >= 0 and np.isfinite(row).all() else None
 
 
 def _east_north_up(fixes: F64) -> F64:
