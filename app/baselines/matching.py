@@ -24,8 +24,9 @@ LINE, PLANE = 5.0, 0.15
 """Variances of neighbours: along a line, at least so many times those across; across a plane, at most that share."""
 SPREAD = 0.02
 """Least share of the variance along a plane's longer axis that the shorter one has: a scan line makes no plane."""
-THICK_M = 0.15
-"""RMS distance of the neighbours from their line or plane, above which they form none."""
+THICK_M = 0.06
+"""RMS distance of the neighbours from their line or plane, above which they form none: three times a scanner's noise,
+so that hedges have no planes."""
 HUBER_M = 0.1
 WEAK = 0.1
 """A direction in which the scan tells less than this share of a well-seen one keeps the prediction (Zhang, Kaess and
