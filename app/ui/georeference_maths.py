@@ -60,6 +60,8 @@ def lines_of(found: Alignment) -> tuple[F32, F32]:
 
 def names_of(text: str) -> tuple[str, ...]:
     """Of the control points in a table. Raises HemislamError: it has no heading, or a row is cut."""
+    if not text.strip():
+        return ()
     return tuple(table_of(text.splitlines(), "The table of control points", *CONTROL).columns.get("name", ()))
 
 

@@ -22,7 +22,7 @@ from app.ui.georeference_maths import centre_of_sphere, lines_of, names_of, numb
 from app.ui.measure import MeasurePanel
 from app.ui.measure_maths import as_csv, numbers, words
 from app.ui.widgets import View
-from tests.ui.conftest import Wire, page_of, user_clicks
+from tests.ui.conftest import Wire, page_of, user_clicks, user_sets
 from tests.ui.test_measure import FLOOR, POSES, SEEN_AT, UP_AT_10, chunk_of
 
 WHERE = GeoReference(
@@ -73,7 +73,7 @@ def paging(server: viser.ViserServer, tmp_path: Path) -> Paging:
 
 
 def choose(control: Any, value: Any) -> None:
-    control.value = value
+    user_sets(control, value)
 
 
 def test_the_widgets_say_what_the_map_is_to_be_laid_by(paging: Paging, tmp_path: Path) -> None:
@@ -90,8 +90,10 @@ def test_the_widgets_say_what_the_map_is_to_be_laid_by(paging: Paging, tmp_path:
     panel._file = tmp_path / "rover.nmea"
     choose(panel._by, FILE)
     assert paging.lay() == replace(given, gnss=tmp_path / "rover.nmea")
-    panel._uploaded(TABLE.encode(), None)
     choose(panel._by, CONTROL)
+    assert panel._table.visible and not panel._pick.visible
+    panel._uploaded(TABLE.encode(), None)
+    assert panel._pick.visible
     assert paging.lay() == Survey(control=TABLE, crs="EPSG:25832")
 
 
