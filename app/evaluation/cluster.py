@@ -53,7 +53,12 @@ class Cluster:
         clear_remains(folder)
         errors: dict[tuple[str, str], str] = {}
         waiting = {job.folder: job for job in jobs if finished(job) is None}
-        patient_until = time.monotonic()  # at first the cluster must be there
+        try:
+            with self._client() as client:
+                _checked_workers(client)
+        except _Gone as gone:  # at first the cluster must be there
+            raise HemislamError(str(gone)) from None
+        patient_until = time.monotonic() + self.wait_s
         with tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit=" runs", disable=None) as bar:
             while waiting:
                 try:

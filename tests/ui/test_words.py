@@ -121,6 +121,6 @@ def test_stages_are_stacked_to_the_total(engine: FakeEngine) -> None:
     assert all((a >= b).all() for a, b in zip([highest, *lower], lower, strict=False))
 
 
-def test_the_workbench_offers_no_file_that_needs_a_place_on_earth() -> None:
+def test_the_workbench_offers_each_file_of_the_table_of_formats() -> None:
     offered = " ".join(_FORMATS)
-    assert "trajectory.csv" in offered and "trajectory.gpx" not in offered and "map.kmz" not in offered
+    assert all(name in offered for name in ("trajectory.csv", "trajectory.gpx", "map.kmz", "map.laz"))
