@@ -17,6 +17,7 @@ _LAYERS: Final = (
     ("wedge", "seed wedge", "Where seeds are looked for: within α of straight down, on the M outermost lines."),
     ("plane", "ground plane", "The plane through the seeds."),
     ("path", "path, truth", "The sensor's trajectory, and the truth when it is loaded."),
+    ("notes", "notes", "Pinned where the sensor was when they were taken. A click goes to that frame."),
     ("grid", "grid", "1 m cells on the ground below the sensor."),
 )
 

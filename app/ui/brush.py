@@ -12,7 +12,7 @@ from app.mapping.painted import SUFFIX, UNMARKED, Stroke, marks, read_json, to_j
 from app.server.protocol import Paint, Seek, Snapshot, UndoPaint
 from app.slam import lie
 from app.slam.errors import HemislamError
-from app.slam.types import F64, GROUND, NON_GROUND, U8, StepResult
+from app.slam.types import GROUND, NON_GROUND, U8, StepResult
 from app.ui.colours import LABEL_COLOURS
 from app.ui.html import panel
 from app.ui.nodes import add_points, place
@@ -33,10 +33,10 @@ class BrushPanel:
     """Widgets in the caller's container, and the marked points of the present frame in the scene.
 
     Args:
-        taken: whether a click's ray in the map, its origin and direction, was meant for something else.
+        taken: whether a click in the scene was meant for something else.
     """
 
-    def __init__(self, page: Page, taken: Callable[[F64, F64], bool] = lambda origin, direction: False) -> None:
+    def __init__(self, page: Page, taken: Callable[[], bool] = lambda: False) -> None:
         gui = page.gui
         self._page, self._taken = page, taken
         self._changes = Changes()
@@ -113,7 +113,7 @@ class BrushPanel:
 
     def _click(self, event: viser.SceneClickEvent) -> None:
         result, ray = self._frame(), self._page.in_map(event)
-        if result is None or self._taken(*ray):
+        if result is None or self._taken():
             return
         T = lie.inverse(result.T_map_imu @ result.state.T_imu_lidar)
         points = result.cloud.points
@@ -123,10 +123,8 @@ class BrushPanel:
 
     def _drag(self, event: viser.SceneRectSelectEvent) -> None:
         if (result := self._frame()) is not None:
-            camera = event.client.camera
-            T_camera_map = lie.inverse(_pose(camera.wxyz, np.asarray(camera.position) - self._page.offset()))
-            T = T_camera_map @ result.T_map_imu @ result.state.T_imu_lidar
-            seen = on_screen(result.cloud.points @ T[:3, :3].T + T[:3, 3], camera.fov, camera.aspect)
+            T = result.T_map_imu @ result.state.T_imu_lidar
+            seen = self._page.in_picture(event.client, result.cloud.points @ T[:3, :3].T + T[:3, 3])
             low, high = np.array(event.screen_min), np.array(event.screen_max)
             self._paint(result, np.asarray(((seen >= low) & (seen <= high)).all(axis=1)))
 
@@ -176,18 +174,3 @@ class BrushPanel:
 
 def _counts(labels: U8) -> tuple[int, int]:
     return int(np.count_nonzero(labels == GROUND)), int(np.count_nonzero(labels == NON_GROUND))
-
-
-def _pose(wxyz: Any, position: Any) -> F64:
-    w, x, y, z = (float(value) for value in wxyz)
-    return lie.transform(lie.matrix(np.array([x, y, z, w])), np.asarray(position, np.float64))
-
-
-def on_screen(points: F64, fov: float, aspect: float) -> F64:
-    """Where (n, 3) points in the camera's frame (z forward, y down) are in the picture, (n, 2), 0-1 from its top left.
-
-    Points behind the camera are nowhere: nan. fov: vertical, rad. aspect: width over height.
-    """
-    depth = np.where(points[:, 2] > 0, points[:, 2], np.nan)
-    half = np.tan(fov / 2)
-    return np.stack((points[:, 0] / (depth * half * aspect), points[:, 1] / (depth * half)), axis=1) / 2 + 0.5

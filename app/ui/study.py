@@ -104,10 +104,10 @@ class StudyPanel:
     """Widgets in the caller's container, and what they show in the scene.
 
     Args:
-        taken: whether a click's ray in the map, its origin and direction, was meant for something else.
+        taken: whether a click was meant for something else.
     """
 
-    def __init__(self, page: Page, taken: Callable[[F64, F64], bool] = lambda origin, direction: False) -> None:
+    def __init__(self, page: Page, taken: Callable[[viser.SceneClickEvent], bool] = lambda _: False) -> None:
         gui = page.gui
         self._page, self._taken = page, taken
         self._scene = StudyScene(page.scene)
@@ -186,9 +186,8 @@ class StudyPanel:
             self._summary.content = panel("curve", drawn.points_under, drawn.points_over, colours, why)
 
     def _click(self, event: viser.SceneClickEvent) -> None:
-        ray = self._page.in_map(event)
-        if not self._taken(*ray):
-            self._clicked = ray
+        if not self._taken(event):
+            self._clicked = self._page.in_map(event)
 
     def _download(self, kind: Any, client: viser.ClientHandle) -> None:
         snapshot = self._page.snapshot()

@@ -1,16 +1,12 @@
-"""The bar at the scene's lower edge: play, step, speed and time, the same by keyboard; where playing pauses; notes."""
+"""The bar at the scene's lower edge: play, step, speed and time, the same by keyboard; where playing pauses."""
 
 import json
 import math
 from datetime import UTC, datetime
 from typing import Any, Final
 
-import viser
-
 from app.mapping.breakpoints import BREAKPOINTS, Breakpoints
 from app.server.protocol import (
-    AddNote,
-    EditNote,
     Pause,
     Play,
     Progress,
@@ -22,7 +18,7 @@ from app.server.protocol import (
 )
 from app.ui.html import number, panel, source
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, as_set, by_user, dialog, show
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, as_set, show
 
 SPEEDS: Final = {
     "0.1×": 0.1,
@@ -36,7 +32,6 @@ SPEEDS: Final = {
 }
 _SWITCHES: Final = tuple(one for one in BREAKPOINTS if one.limit is None)
 _LIMITS: Final = tuple((one, one.limit) for one in BREAKPOINTS if one.limit is not None)
-_SHOWN_NOTES: Final = 30
 
 
 class TransportPanel:
@@ -172,47 +167,3 @@ class BreakpointPanel:
             switch, number = self._limits[one.name]
             chosen[one.name] = max(number.value, 0.0) / limit.scale if switch.value else None
         self._send(SetBreakpoints(Breakpoints(**chosen)))
-
-
-class NotesPanel:
-    """A field for a note on the present frame, and the notes made so far."""
-
-    def __init__(self, page: Page) -> None:
-        self._send, self._snapshot = page.send, page.snapshot
-        self._bridge = Bridge(page.gui, "notes", self._act)
-        self._text = page.gui.add_text("note", "", hint="On the frame that is shown; kept in the session.")
-        self._add = page.gui.add_button("Add note", icon=viser.Icon.NOTE, color="gray")
-        self._list = page.gui.add_html("", visible=False)
-        self._add.on_click(by_user(lambda _value, _client: self._note()))
-
-    def draw(self, snapshot: Snapshot) -> None:
-        listed = list(enumerate(snapshot.notes))[-_SHOWN_NOTES:][::-1]
-        self._list.content = self._bridge.live(panel("notes", listed)) if listed else ""
-        self._list.visible = bool(snapshot.notes)
-
-    def _note(self) -> None:
-        if self._text.value.strip():
-            self._send(AddNote(self._text.value))
-            self._text.value = ""  # type: ignore[misc]  # mypy overlooks viser's setter
-
-    def _act(self, word: str, client: viser.ClientHandle) -> None:
-        """What the list sends: "go 812", "edit 3", "delete 3"."""
-        verb, _, text = word.partition(" ")
-        number, notes = int(text) if text.isdecimal() else -1, self._snapshot().notes
-        if verb == "go" and number >= 0:
-            self._send(Seek(number))
-        elif 0 <= number < len(notes) and verb == "delete":
-            self._send(EditNote(number, notes[number].text, ""))
-        elif 0 <= number < len(notes) and verb == "edit":
-            self._ask(number, notes[number].text, client)
-
-    def _ask(self, place: int, before: str, client: viser.ClientHandle) -> None:
-        with dialog(client, "Edit note") as close:
-            text = client.gui.add_text("note", before)
-            keep = client.gui.add_button("Keep", icon=viser.Icon.CHECK)
-
-        def kept(_: object) -> None:
-            self._send(EditNote(place, before, text.value))
-            close()
-
-        keep.on_click(kept)

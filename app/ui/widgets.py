@@ -11,6 +11,7 @@ import numpy as np
 import viser
 
 from app.server.protocol import Command, Snapshot
+from app.slam import lie
 from app.slam.types import F64
 from app.ui.colours import LOOK, Limits
 
@@ -31,7 +32,7 @@ class View:
 
     Attributes:
         colour_by: a name of `app.ui.colours.COLOUR_BY`. point_size: m. follow: keep the sensor in the middle.
-        ceilings: show points above the ceiling too. map, scan, wedge, plane, path, grid: whether shown.
+        ceilings: show points above the ceiling too. map, scan, wedge, plane, path, grid, notes: whether shown.
         light: a light background. tuning: the map stands back behind the present scan.
     """
 
@@ -45,6 +46,7 @@ class View:
     plane: bool = True
     path: bool = True
     grid: bool = True
+    notes: bool = True
     light: bool = False
     tuning: bool = False
 
@@ -79,6 +81,17 @@ class Page:
     def in_map(self, event: viser.SceneClickEvent) -> tuple[F64, F64]:
         """A click's ray in the map: origin and direction, (3,) each."""
         return np.array(event.ray_origin) - self.offset(), np.array(event.ray_direction)
+
+    def in_picture(self, client: viser.ClientHandle, points: F64) -> F64:
+        """Where (n, 3) points of the map are in a browser's picture, (n, 2), 0-1 from its top left.
+
+        Points behind the camera are nowhere: nan.
+        """
+        camera = client.camera
+        w, x, y, z = (float(value) for value in camera.wxyz)
+        seen = (points + self.offset() - np.asarray(camera.position)) @ lie.matrix(np.array([x, y, z, w]))
+        depth = np.where(seen[:, 2] > 0, seen[:, 2], np.nan) * np.tan(camera.fov / 2)
+        return seen[:, :2] / np.stack((depth * camera.aspect, depth), axis=1) / 2 + 0.5
 
 
 def poses_of(snapshot: Snapshot) -> F64:

@@ -32,6 +32,7 @@ from app.ui.html import render
 from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
 from app.ui.measure import MeasurePanel
+from app.ui.notes import NotesPanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.readouts import ReadoutPanel
 from app.ui.scale import FromAbove, ScaleBars
@@ -39,7 +40,7 @@ from app.ui.scene import Scene
 from app.ui.status import DoctorPanel, HeaderPanel, NoticePanel
 from app.ui.study import StudyPanel
 from app.ui.timeline import TimelinePanel
-from app.ui.transport import BreakpointPanel, NotesPanel, TransportPanel
+from app.ui.transport import BreakpointPanel, TransportPanel
 from app.ui.tune import TunePanel
 from app.ui.viser_adapter import prepare_page
 from app.ui.widgets import PANEL_PERIOD_S, SCENE_PERIOD_S, Changes, Page, View
@@ -102,15 +103,15 @@ class Workbench:
                 self._breakpoints = BreakpointPanel(page)
         with tabs.add_tab("Loops", viser.Icon.INFINITY):
             self._loops = LoopsPanel(
-                page, lambda client: self._appearance.look_freely(client), taken=lambda: self._measure.picking
+                page, lambda client: self._appearance.look_freely(client), taken=lambda click: self._picks(click)
             )
         with tabs.add_tab("Study", viser.Icon.MICROSCOPE):
             self._study = StudyPanel(
                 page,
-                taken=lambda *ray: self._measure.picking or self._brush.painting or self._loops.points_at(*ray),
+                taken=lambda click: self._picks(click) or self._brush.painting or self._loops.points_at(click),
             )
             with gui.add_folder("Label by hand", expand_by_default=False):
-                self._brush = BrushPanel(page, taken=lambda *_: self._measure.picking)
+                self._brush = BrushPanel(page, taken=lambda: self._measure.picking)
         with tabs.add_tab("A/B", viser.Icon.GIT_COMPARE):
             self._compare = ComparePanel(page, forks, self._sides)
         with tabs.add_tab("Tune", viser.Icon.TARGET_ARROW):
@@ -129,14 +130,14 @@ class Workbench:
             with gui.add_folder("Georeference", expand_by_default=False):
                 self._georeference = GeoreferencePanel(page, folders, self._measure)
             with gui.add_folder("Notes"):
-                self._notes = NotesPanel(page)
+                self._notes = NotesPanel(page, taken=lambda: self._measure.picking or self._brush.painting)
             self._notices = NoticePanel(server)
         with tabs.add_tab("Help", viser.Icon.HELP):
             gui.add_html(render("help.html"))
         self._files = files
 
         self._panels = (
-            self._transport, self._breakpoints, self._notes, self._notices, self._header, self._recent, self._timeline,
+            self._transport, self._breakpoints, self._notices, self._header, self._recent, self._timeline,
             self._readouts, self._doctor, self._calibration, self._live, self._files, self._camera,
             self._tune, self._georeference,
         )  # fmt: skip
@@ -181,9 +182,14 @@ class Workbench:
         self._study.draw(current, view)
         self._measure.draw(current, view)
         self._brush.draw(current, view)
+        self._notes.draw(current, view)
         for panel in self._panels:
             panel.draw(current)
         self._scale.draw()
+
+    def _picks(self, click: viser.SceneClickEvent) -> bool:
+        """Whether a click picks a point to measure, or goes to a note."""
+        return self._measure.picking or self._notes.points_at(click)
 
     def _draw_scene(self, current: Snapshot, view: View) -> None:
         drawn = self._drawn

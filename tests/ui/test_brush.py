@@ -12,7 +12,7 @@ from app.mapping.painted import UNMARKED, marks
 from app.server.protocol import Command, Paint, Play, Seek, StepFrame, UndoPaint
 from app.slam import lie
 from app.slam.types import GROUND, NON_GROUND, StepResult
-from app.ui.brush import BrushPanel, on_screen
+from app.ui.brush import BrushPanel
 from app.ui.widgets import View
 from tests.ui.conftest import clouds, page_of, user_clicks, user_sets
 from tests.ui.fake_engine import FakeEngine
@@ -136,11 +136,6 @@ def test_labels_that_are_loaded_are_marked(painting: Painting) -> None:
     user_clicks(painting.panel._undo)
     painting.panel._read(SimpleNamespace(content=files[0], name="walk.labels.json"), client)
     assert np.array_equal(painting.marks, before)
-
-
-def test_points_behind_the_camera_are_nowhere_in_the_picture() -> None:
-    seen = on_screen(np.array([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [2.0, 2.0, 2.0]]), np.pi / 2, 1.0)
-    assert np.allclose(seen[0], 0.5) and np.isnan(seen[1]).all() and np.allclose(seen[2], 1.0)
 
 
 def test_play_is_not_in_the_way_of_the_panel(painting: Painting) -> None:

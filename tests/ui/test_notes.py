@@ -1,13 +1,17 @@
-"""The notes panel: a remark becomes a command, what the session keeps is listed, and none of it is taken for html."""
+"""Notes: a remark becomes a command, what the session keeps is listed and pinned, and none of it is taken for html."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 import viser
 
 from app.mapping.session_file import Note
 from app.server.protocol import AddNote, Command, EditNote, Seek, Snapshot
-from app.ui.transport import _SHOWN_NOTES, NotesPanel
+from app.ui.notes import _SHOWN_NOTES, NotesPanel
+from app.ui.widgets import View
 from tests.ui.conftest import BusyThreads, Wire, browser_sends, page_of, user_clicks, user_sets
 
 
@@ -25,7 +29,7 @@ class Notes:
 
     def show(self, *notes: Note) -> str:
         self.snapshot = replace(self.snapshot, notes=notes)
-        self.panel.draw(self.snapshot)
+        self.panel.draw(self.snapshot, View())
         return str(self.panel._list.content)
 
 
@@ -97,7 +101,74 @@ def test_a_remark_is_no_html(notes: Notes) -> None:
 def test_nothing_is_sent_to_the_page_while_no_note_is_added(notes: Notes, wire: Wire) -> None:
     notes.show(Note(3, "here"))
     wire.clear()
-    notes.panel.draw(replace(notes.snapshot, revision=9))
+    notes.panel.draw(replace(notes.snapshot, revision=9), View())
     assert wire.messages == []
     notes.show(Note(3, "here"), Note(4, "and there"))
     assert wire.messages
+
+
+# --- pins ----------------------------------------------------------------------------------------
+WALK = np.column_stack((np.arange(100.0), np.zeros(100), np.zeros(100)))
+"""m, a frame at every metre along x."""
+
+
+def click(x: float, y: float = 0.0) -> Any:
+    """A click on the map at (x, y, 0), seen from 10 m above it; the picture's top is +y, and 900 pixels show 20 m."""
+    camera = SimpleNamespace(
+        position=np.array([50.0, 0.0, 10.0]), wxyz=np.array([0.0, 1.0, 0.0, 0.0]), fov=np.pi / 2, aspect=2.0,
+        image_width=1800, image_height=900,
+    )  # fmt: skip
+    seen = np.array([(x - 50.0) / 40 + 0.5, 0.5 - y / 20])
+    return SimpleNamespace(client=SimpleNamespace(camera=camera), screen_pos=seen)
+
+
+def labels(server: viser.ViserServer) -> dict[str, np.ndarray]:
+    """Where each label stands, by its text, as a browser has them that connects now."""
+    kept = list(server._websock_server._broadcast_buffer.message_from_id.values())
+    texts = {m.name: m.props.text for m in kept if type(m).__name__ == "LabelMessage"}  # type: ignore[attr-defined]
+    places = {m.name: m.position for m in kept if type(m).__name__ == "SetPositionMessage"}  # type: ignore[attr-defined]
+    return {text: np.array(places[name]) for name, text in texts.items()}
+
+
+def test_notes_stand_where_the_sensor_was_and_move_with_the_trajectory(server: viser.ViserServer, notes: Notes) -> None:
+    notes.snapshot = replace(notes.snapshot, trajectory=WALK)
+    notes.show(Note(40, "a door"), Note(40, "open"), Note(45, "a lift " * 20), Note(300, "not reached"))
+    found = labels(server)
+    assert found["a door · open"].tolist() == [40.0, 0.0, 0.0] and len(found) == 2
+    assert max(map(len, found)) <= 32, "a long note does not cover the map"
+    notes.panel.draw(replace(notes.snapshot, trajectory=WALK + np.array([0.0, 2.0, 0.0])), View())  # a loop closed
+    assert labels(server)["a door · open"].tolist() == [40.0, 2.0, 0.0]
+    notes.panel.draw(notes.snapshot, View(notes=False))
+    assert labels(server) == {}
+
+
+@pytest.mark.parametrize(
+    ("at", "frame"),
+    [
+        ((40.0, 0.0), 40),
+        ((40.9, 0.1), 40),  # on the text
+        ((39.5, 0.0), None),  # left of it
+        ((40.0, 0.6), None),  # above it
+        ((45.1, 0.0), 45),
+    ],
+)
+def test_a_click_on_a_pin_goes_to_its_frame(notes: Notes, at: tuple[float, float], frame: int | None) -> None:
+    notes.snapshot = replace(notes.snapshot, trajectory=WALK)
+    notes.show(Note(40, "a door"), Note(45, "a lift"))
+    notes.panel._pins._clicked(click(*at))
+    assert notes.sent == ([Seek(frame)] if frame is not None else [])
+    assert notes.panel.points_at(click(*at)) == (frame is not None)
+
+
+def test_a_pin_behind_the_camera_is_not_clicked(notes: Notes) -> None:
+    notes.snapshot = replace(notes.snapshot, trajectory=WALK + np.array([0.0, 0.0, 20.0]))
+    notes.show(Note(50, "above"))
+    assert not notes.panel.points_at(click(50.0))
+
+
+def test_pins_leave_clicks_alone_that_measure(server: viser.ViserServer) -> None:
+    sent: list[Command] = []
+    panel = NotesPanel(page_of(server, sent.append), taken=lambda: True)
+    panel.draw(replace(Snapshot(), trajectory=WALK, notes=(Note(40, "a door"),)), View())
+    panel._pins._clicked(click(40.0))
+    assert sent == []

@@ -31,7 +31,7 @@ _SOLVE_HINT: Final = (
 )
 _NONE_YET: Final = (
     "No loops yet. They are searched for where the trajectory comes back to a place that it left at least 15 s before; "
-    "the parameters are under Tune, Loops."
+    "the parameters are under Parameters, Loops."
 )
 
 
@@ -44,7 +44,10 @@ class LoopsPanel:
     """
 
     def __init__(
-        self, page: Page, look_freely: Callable[[viser.ClientHandle], None], taken: Callable[[], bool] = lambda: False
+        self,
+        page: Page,
+        look_freely: Callable[[viser.ClientHandle], None],
+        taken: Callable[[viser.SceneClickEvent], bool] = lambda _: False,
     ) -> None:
         gui = page.gui
         self._taken = taken
@@ -93,9 +96,9 @@ class LoopsPanel:
         alone = self._inspector.alone or self._add_loop.nudging
         return replace(view, map=False, scan=False, wedge=False, plane=False) if alone else view
 
-    def points_at(self, origin: F64, direction: F64) -> bool:
-        """Whether a click's ray in the map is for the loops: at an arch, or while keyframes are picked."""
-        return self._add_loop.picking or self._edges.pick(origin, direction) is not None
+    def points_at(self, event: viser.SceneClickEvent) -> bool:
+        """Whether a click is for the loops: at an arch, or while keyframes are picked."""
+        return self._add_loop.picking or self._edges.pick(*self._page.in_map(event)) is not None
 
     def choose(self, pair: Pair | None) -> None:
         """Show everything about a loop; None: about none."""
@@ -172,7 +175,7 @@ class LoopsPanel:
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         origin, direction = self._page.in_map(event)
-        if self._taken():
+        if self._taken(event):
             return
         if self._add_loop.picking:
             self._add_loop.pick(origin, direction)

@@ -1,0 +1,136 @@
+"""Notes: a field for a new one, their list, and pins in the scene where the sensor was when they were taken."""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import viser
+
+from app.mapping.session_file import Note
+from app.server.protocol import AddNote, EditNote, Seek, Snapshot
+from app.slam.types import F64
+from app.ui.html import panel
+from app.ui.nodes import add_exact_points
+from app.ui.viser_adapter import Bridge
+from app.ui.widgets import ROOT, Changes, Page, View, by_user, dialog
+
+_SHOWN_NOTES: Final = 30
+_PINNED: Final = 100
+_PIN_TEXT: Final = 32
+"""Letters of a note on its pin."""
+_PIN_COLOUR: Final = (255, 190, 60)
+_PIN_M: Final = 0.16
+_REACH_PX: Final = 14.0
+_LETTER_PX: Final = 7.0
+"""A click so near to a pin, or on its text to the right of it, is meant for it."""
+
+
+class NotesPanel:
+    """A field for a note on the present frame, the notes made so far, and their pins.
+
+    taken: whether a click in the scene was meant for something else than pins.
+    """
+
+    def __init__(self, page: Page, taken: Callable[[], bool] = lambda: False) -> None:
+        self._send, self._snapshot = page.send, page.snapshot
+        self._pins = Pins(page, taken)
+        self._bridge = Bridge(page.gui, "notes", self._act)
+        self._text = page.gui.add_text("note", "", hint="On the frame that is shown; kept in the session.")
+        self._add = page.gui.add_button("Add note", icon=viser.Icon.NOTE, color="gray")
+        self._list = page.gui.add_html("", visible=False)
+        self._add.on_click(by_user(lambda _value, _client: self._note()))
+
+    def draw(self, snapshot: Snapshot, view: View) -> None:
+        self._pins.draw(snapshot, view)
+        listed = list(enumerate(snapshot.notes))[-_SHOWN_NOTES:][::-1]
+        self._list.content = self._bridge.live(panel("notes", listed)) if listed else ""
+        self._list.visible = bool(snapshot.notes)
+
+    def points_at(self, event: viser.SceneClickEvent) -> bool:
+        """Whether a click is on a pin."""
+        return self._pins.at(event) is not None
+
+    def _note(self) -> None:
+        if self._text.value.strip():
+            self._send(AddNote(self._text.value))
+            self._text.value = ""  # type: ignore[misc]  # mypy overlooks viser's setter
+
+    def _act(self, word: str, client: viser.ClientHandle) -> None:
+        """What the list sends: "go 812", "edit 3", "delete 3"."""
+        verb, _, text = word.partition(" ")
+        number, notes = int(text) if text.isdecimal() else -1, self._snapshot().notes
+        if verb == "go" and number >= 0:
+            self._send(Seek(number))
+        elif 0 <= number < len(notes) and verb == "delete":
+            self._send(EditNote(number, notes[number].text, ""))
+        elif 0 <= number < len(notes) and verb == "edit":
+            self._ask(number, notes[number].text, client)
+
+    def _ask(self, place: int, before: str, client: viser.ClientHandle) -> None:
+        with dialog(client, "Edit note") as close:
+            text = client.gui.add_text("note", before)
+            keep = client.gui.add_button("Keep", icon=viser.Icon.CHECK)
+
+        def kept(_: object) -> None:
+            self._send(EditNote(place, before, text.value))
+            close()
+
+        keep.on_click(kept)
+
+
+class Pins:
+    """A knob and a label for every frame with notes; a click goes to that frame."""
+
+    def __init__(self, page: Page, taken: Callable[[], bool]) -> None:
+        self._page, self._taken = page, taken
+        self._changes = Changes()
+        self._nodes: list[viser.SceneNodeHandle] = []
+        self._pinned: list[tuple[int, str]] = []  # frame and text
+        self._where: F64 = np.empty((0, 3))
+        page.scene.on_click()(self._clicked)
+
+    def draw(self, snapshot: Snapshot, view: View) -> None:
+        """Pin the newest notes of frames that the trajectory reaches, sending what differs."""
+        path = snapshot.trajectory if snapshot.trajectory is not None else np.empty((0, 3))
+        pinned = pins(snapshot.notes, len(path)) if view.notes else []
+        where = path[[frame for frame, _ in pinned]].reshape(-1, 3)
+        if not self._changes(str(pinned), str(where.round(2).tolist())):
+            return
+        self._pinned, self._where = pinned, where
+        for node in self._nodes:
+            node.remove()
+        self._nodes.clear()
+        scene, root = self._page.scene, f"{ROOT}/notes"
+        if pinned:
+            self._nodes.append(add_exact_points(scene, f"{root}/knobs", where.astype(np.float32), _PIN_COLOUR, _PIN_M))
+        for (frame, text), position in zip(pinned, where, strict=True):
+            label = scene.add_label(f"{root}/{frame}", text, position=position, anchor="center-left")
+            self._nodes.append(label)
+
+    def at(self, event: viser.SceneClickEvent) -> int | None:
+        """The frame of the pin that was clicked."""
+        if not self._pinned or self._taken():
+            return None
+        camera = event.client.camera
+        pixels = np.array([camera.image_width, camera.image_height])
+        x, y = ((event.screen_pos - self._page.in_picture(event.client, self._where)) * pixels).T
+        width = _REACH_PX + _LETTER_PX * np.array([len(text) for _, text in self._pinned])
+        hit = np.flatnonzero((np.abs(y) <= _REACH_PX) & (x >= -_REACH_PX) & (x <= width))
+        return self._pinned[int(hit[np.hypot(x, y)[hit].argmin()])][0] if len(hit) else None
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        frame = self.at(event)
+        if frame is not None:
+            self._page.send(Seek(frame))
+
+
+def pins(notes: tuple[Note, ...], frames: int) -> list[tuple[int, str]]:
+    """Frame and text of each pin: notes of one frame share it. frames: that the trajectory has."""
+    texts: dict[int, str] = {}
+    for note in notes[-_PINNED:]:
+        if 0 <= note.frame < frames:
+            texts[note.frame] = f"{texts[note.frame]} · {note.text}" if note.frame in texts else note.text
+    return [
+        (frame, text if len(text) <= _PIN_TEXT else text[: _PIN_TEXT - 1].rstrip() + "…")
+        for frame, text in texts.items()
+    ]
