@@ -91,7 +91,7 @@ class Page:
         w, x, y, z = (float(value) for value in camera.wxyz)
         seen = (points + self.offset() - np.asarray(camera.position)) @ lie.matrix(np.array([x, y, z, w]))
         depth = np.where(seen[:, 2] > 0, seen[:, 2], np.nan) * np.tan(camera.fov / 2)
-        return seen[:, :2] / np.stack((depth * camera.aspect, depth), axis=1) / 2 + 0.5
+        return np.asarray(seen[:, :2] / np.stack((depth * camera.aspect, depth), axis=1) / 2 + 0.5)
 
 
 def poses_of(snapshot: Snapshot) -> F64:
