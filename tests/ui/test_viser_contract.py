@@ -63,6 +63,10 @@ ASSUMPTIONS = {
         "components/NumberInput.tsx",
         'import { NumberInput } from "@mantine/core";',
     ),
+    "Panels are no longer dimmed while the server is lost: nothing says so in words.": (
+        "ControlPanel/Generated.tsx",
+        'pointerEvents: connected ? undefined : "none",\n        transition: "opacity 150ms ease",',
+    ),
     "A slider no longer has a track and a number box side by side: the box may cut long numbers off.": (
         "components/Slider.tsx",
         '<Flex justify="space-between">\n      <Slider',

@@ -51,6 +51,18 @@ if (!window.hemislamSay) {
     }
   }).observe(document.body, {childList: true, subtree: true});
 
+  // A lost server is said in words. viser itself connects again, every second while the page has the focus.
+  let missed = 0;
+  setInterval(() => {
+    const lost = document.querySelector('[style*="opacity 150ms"][style*="pointer-events: none"]');
+    const words = document.querySelector('.hs-lost');
+    missed = lost ? missed + 1 : 0;
+    if (!lost && words) words.remove();
+    if (missed < 2 || words) return; // not for a moment's break
+    document.body.insertAdjacentHTML('beforeend', `<div class="hs hs-lost" role="alert"><b>The server does not answer.</b>
+      What you see is from before. This page connects again by itself as soon as the server is back.</div>`);
+  }, 500);
+
   // A number box is taken as a whole, on Enter or when it is left; Escape brings the old number back.
   let taking = false;
   const isBox = (node) => node.classList && node.classList.contains('mantine-NumberInput-input');
