@@ -38,6 +38,8 @@ class AppearancePanel:
         default = View()
         self._above = above
         self._legend = legend
+        self._limits: Limits | None = None  # of all values
+        self._ends: dict[str, Limits] = {}  # by colour mode, as the user chose them
         self._colour_by = gui.add_dropdown(
             "colour by", COLOUR_BY, initial_value=default.colour_by, hint="What colours mean. C: the next."
         )
@@ -73,9 +75,19 @@ class AppearancePanel:
             point_size=self._point_size.value / 100,
             follow=self._follow.value,
             light=self._light.value,
+            ends=self._ends.get(self._colour_by.value),
             ceilings=self._ceilings.value == _SHOWN or (self._ceilings.value == _BY_ITSELF and not self._above()),
             **{name: layer.value for name, layer in self._layers.items()},
         )
+
+    def choose_ends(self, low: int, high: int) -> None:
+        """Spread the colours over a part of all values, in percent; 0 to 100 follows the values again."""
+        all_ = self._limits
+        if (low, high) == (0, 100):
+            self._ends.pop(self._colour_by.value, None)
+        elif all_ is not None:
+            width = (all_.high - all_.low) / 100
+            self._ends[self._colour_by.value] = Limits(all_.low + low * width, all_.low + high * width)
 
     def look_freely(self, client: viser.ClientHandle) -> None:
         """Stop following, and say so if it was on."""
@@ -85,6 +97,7 @@ class AppearancePanel:
 
     def draw(self, view: View, limits: Limits | None, points: int, budget: int) -> None:
         """Explain the colours as drawn and say how many points the page holds."""
-        self._legend.content = panel("legend", legend(view.colour_by, limits), view.grid)
+        self._limits = limits
+        self._legend.content = panel("legend", legend(view.colour_by, limits, view.ends), view.grid)
         words = f"{points:,} map points in the page, at most {budget:,}, and fewer the longer the trajectory."
         self._count.content = panel("note", f"{words} The engine keeps the whole map.")

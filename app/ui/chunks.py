@@ -14,7 +14,7 @@ import viser
 from app.server.chunks import voxel_of_level
 from app.server.protocol import Chunk
 from app.slam.types import F32, F64, NON_GROUND, U8
-from app.ui.colours import BY_POSE, INTENSITY, MODES, Limits, PointSet, colours, grown
+from app.ui.colours import BY_POSE, INTENSITY, MODES, Limits, PointSet, chosen_ends, colours, grown
 from app.ui.geometry import STILL_M
 from app.ui.nodes import add_points, place
 from app.ui.shading import light
@@ -90,7 +90,8 @@ class MapChunks:
         moved = self._move(poses[: len(chunks), :3])
         for chunk, T in zip(chunks[known:], self._T_map_imu[known:], strict=True):
             self._drawn.append(_Drawn(chunk, self._grown(chunk, T), light(chunk.points, T @ chunk.T_imu_lidar)))
-        seen, limits = self._view, (self.limits.get(view.colour_by), self.limits.get(INTENSITY))
+        ends = chosen_ends(self.limits, view.colour_by, view.ends)
+        seen, limits = self._view, (ends.get(view.colour_by), ends.get(INTENSITY))
         recolour = view.colour_by != seen.colour_by or limits != self._coloured
         self._view, self._coloured = view, limits
         for index, (drawn, chunk) in enumerate(zip(self._drawn, chunks, strict=True)):
@@ -186,7 +187,8 @@ class MapChunks:
         return not isinstance(shown_points(chunk, T_map_imu @ chunk.T_imu_lidar, ceilings=False), slice)
 
     def _colours(self, cloud: PointSet) -> U8:
-        return colours(cloud, self._view.colour_by, self.limits)
+        by = self._view.colour_by
+        return colours(cloud, by, chosen_ends(self.limits, by, self._view.ends))
 
 
 def shown_points(chunk: Chunk, T_map_lidar: F64, ceilings: bool) -> Chosen:

@@ -175,11 +175,21 @@ def grown(limits: Limits | None, mode: ColourMode, values: npt.ArrayLike) -> Lim
     return Limits(low, max(high, low + mode.step))
 
 
-def legend(by: str, limits: Limits | None) -> str:
+def chosen_ends(limits: Mapping[str, Limits], by: str, ends: Limits | None) -> Mapping[str, Limits]:
+    """The ends of the colour maps, with those that the user chose for the mode `by`."""
+    return limits if ends is None else {**limits, by: ends}
+
+
+def legend(by: str, limits: Limits | None, ends: Limits | None = None) -> str:
+    """What the colours mean. limits: of all values, None before there are any. ends: as chosen by the user."""
     if by == LABEL:
         return panel("keys", [(LABEL_COLOURS[label], name) for label, name in LABEL_NAMES.items()])
     mode = MODES[by]
-    low, high = ("", "") if limits is None else (f"{limits.low:g}", f"{limits.high:g}")
-    if by == LOOK:
-        return panel("colour_bar", TABLES[mode.table][::32], low, "height · m", high) + legend(LABEL, None)
-    return panel("colour_bar", TABLES[mode.table][::32], low, f"{mode.name} · {mode.legend}", high)
+    what = "height · m" if by == LOOK else f"{mode.name} · {mode.legend}"
+    stops, keys = TABLES[mode.table][::32], legend(LABEL, None) if by == LOOK else ""
+    if limits is None:
+        return panel("colour_bar", stops, "", what, "") + keys
+    shown = ends or limits
+    shares = [round(100 * (end - limits.low) / (limits.high - limits.low)) for end in (shown.low, shown.high)]
+    low, high = (min(max(share, 0), 100) for share in shares)
+    return panel("colour_ends", stops, f"{shown.low:.3g}", what, f"{shown.high:.3g}", low, high) + keys

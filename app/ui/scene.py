@@ -13,7 +13,7 @@ from app.server.protocol import Snapshot
 from app.slam.types import F64, StepResult
 from app.ui.camera import Framing
 from app.ui.chunks import MapChunks
-from app.ui.colours import Limits
+from app.ui.colours import Limits, chosen_ends
 from app.ui.nodes import TrajectoryNode, Truth
 from app.ui.sensor import SensorScene
 from app.ui.widgets import ROOT, Changes, View, poses_of
@@ -104,7 +104,8 @@ class Scene:
             return
         limits = self._chunks.limits
         if self._changes(result, current.params, view, limits):
-            self._sensor.draw(self._shown, result, current.params, view, limits, start_ns)
+            ends = chosen_ends(limits, view.colour_by, view.ends)
+            self._sensor.draw(self._shown, result, current.params, view, ends, start_ns)
         z = self._sensor.ground_z
         if z is not None and abs(z - self._grid.position[2]) > _GRID_STEP_M:  # smaller steps would make it shiver
             self._grid.position = (0.0, 0.0, z)

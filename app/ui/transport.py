@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any, Final
 
@@ -38,11 +39,13 @@ class TransportPanel:
     """The bar, a piece of HTML that `templates/transport.js` moves to the scene's lower edge.
 
     The strips of `app.ui.timeline` unfold above it.
+
+    choose_ends: called with the ends that the user gave the colour bar, in percent of all values.
     """
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: Page, choose_ends: Callable[[int, int], None] = lambda low, high: None) -> None:
         gui, send = page.gui, page.send
-        self._send, self._snapshot = page.send, page.snapshot
+        self._send, self._snapshot, self._choose_ends = page.send, page.snapshot, choose_ends
         self._changes = Changes(page.now, PANEL_PERIOD_S)
         self._bridge = Bridge(gui, "transport", lambda word, _: self._asked(word))
         gui.add_html(self._bridge.live(panel("transport", list(SPEEDS), source("transport.js"))))
@@ -65,7 +68,7 @@ class TransportPanel:
             self._state.content = panel("transport_state", json.dumps(state(snapshot)))
 
     def _asked(self, word: str) -> None:
-        """What the page's script sends: "play", "step -1", "seek 812", "speed 2×"."""
+        """What the page's script sends: "play", "step -1", "seek 812", "speed 2×", "ends 0 80"."""
         match word.split(" ", 1):
             case ["play"]:
                 self.toggle()
@@ -75,6 +78,10 @@ class TransportPanel:
                 self._send(Seek(int(frame)))
             case ["speed", name] if name in SPEEDS:
                 self._send(SetSpeed(SPEEDS[name]))
+            case ["ends", shares]:
+                low, _, high = shares.partition(" ")
+                if low.isdecimal() and high.isdecimal() and int(low) < int(high) <= 100:
+                    self._choose_ends(int(low), int(high))
 
 
 def state(snapshot: Snapshot) -> dict[str, Any]:

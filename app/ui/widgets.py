@@ -34,6 +34,7 @@ class View:
         colour_by: a name of `app.ui.colours.COLOUR_BY`. point_size: m. follow: keep the sensor in the middle.
         ceilings: show points above the ceiling too. map, scan, wedge, plane, path, grid, notes: whether shown.
         light: a light background. tuning: the map stands back behind the present scan.
+        ends: of the colour map, where the user chose them.
     """
 
     colour_by: str = LOOK
@@ -49,6 +50,7 @@ class View:
     notes: bool = True
     light: bool = False
     tuning: bool = False
+    ends: Limits | None = None
 
     @property
     def map_point_size(self) -> float:

@@ -87,7 +87,8 @@ class Workbench:
 
         prepare_page(gui)
         self._header, self._scale = HeaderPanel(gui), ScaleBars(page)
-        self._transport, self._timeline = TransportPanel(page), TimelinePanel(page)
+        self._transport = TransportPanel(page, lambda low, high: self._appearance.choose_ends(low, high))
+        self._timeline = TimelinePanel(page)
         legend = gui.add_html("")
         files = FilesPanel(page, folders, results)
         self._recent = RecentPanel(page, folders, results / "sessions", files.browse)

@@ -10,7 +10,7 @@ from app.server import chunks as server_chunks
 from app.server.chunks import within_budget
 from app.server.protocol import Seek, SetParams, Snapshot, StepFrame
 from app.ui.chunks import MapChunks
-from app.ui.colours import COLOUR_BY, LABEL_COLOURS
+from app.ui.colours import COLOUR_BY, LABEL_COLOURS, Limits
 from app.ui.scene import Scene
 from app.ui.widgets import View
 from tests.ui.conftest import Cloud, Wire, clouds
@@ -160,6 +160,22 @@ def test_higher_points_are_lighter_when_coloured_by_height(drawn: Drawn, server:
     order = np.argsort(height)
     third = len(order) // 3
     assert node.colors[order[-third:]].mean() > node.colors[order[:third]].mean() + 20
+
+
+def test_colours_spread_over_the_chosen_ends_and_saturate_beyond(drawn: Drawn, server: viser.ViserServer) -> None:
+    drawn.draw(View(colour_by="height"))
+    all_values = drawn.scene.limits("height")
+    assert all_values is not None
+    low, high = all_values.low, all_values.low + 0.4 * (all_values.high - all_values.low)
+    drawn.draw(View(colour_by="height", ends=Limits(low, high)))
+    node = chunk_nodes(server)["/map/keyframes/0"]
+    pose = drawn.engine.snapshot.keyframe_poses[0]  # type: ignore[index]
+    chunk = drawn.engine.snapshot.chunks[0]
+    height = (node.points.astype(float) @ (pose @ chunk.T_imu_lidar)[2, :3]) + (pose @ chunk.T_imu_lidar)[2, 3]
+    beyond = node.colors[height > high + 0.05].astype(int)
+    red = beyond.max(axis=1, keepdims=True)
+    assert len(beyond) > 10 and np.ptp(beyond / red, axis=0).max() < 0.03, "one colour, lit differently"
+    assert drawn.scene.limits("height") == all_values, "the bar still ends at all values"
 
 
 def test_sessions_that_come_and_go_leave_nothing_behind(drawn: Drawn, wire: Wire, server: viser.ViserServer) -> None:

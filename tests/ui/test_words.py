@@ -82,6 +82,12 @@ def test_the_legend_names_limits_and_unit() -> None:
     assert all(name in legend(LABEL, None) for name in ("ground", "not ground", "seed"))
 
 
+def test_the_legend_shows_chosen_ends_where_they_lie_among_all_values() -> None:
+    text = legend("height", Limits(-2.0, 3.0), Limits(-1.0, 2.0))
+    assert ">-1<" in text and ">2<" in text
+    assert 'value="20"' in text and 'value="80"' in text
+
+
 def test_result_folders_sort_and_need_no_quoting() -> None:
     now = datetime(2026, 5, 1, 13, 45, 2)
     assert result_folder_name(Path("/x/hall bpearl (1).mcap"), now) == "hall_bpearl__1_-2026-05-01-134502"

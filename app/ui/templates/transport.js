@@ -217,7 +217,21 @@ const watch = (name, act) => {
   act();
 };
 new MutationObserver(paint).observe(document.documentElement, {attributes: true});
-for (const name of ['.hs-legend', '.hs-scale'])
-  watch(name + '-data', () => { dock.querySelector(name).innerHTML = document.querySelector(name + '-data').innerHTML; });
+const copy = (name) => () => { dock.querySelector(name).innerHTML = document.querySelector(name + '-data').innerHTML; };
+watch('.hs-scale-data', copy('.hs-scale'));
+// The ends of the colour bar. While one is dragged the legend is not put in anew; a key keeps its focus.
+const legend = dock.querySelector('.hs-legend'), ends = () => [...legend.querySelectorAll('input')];
+let spread = false;
+const explain = () => {
+  if (spread) return;
+  const focus = ends().indexOf(document.activeElement);
+  copy('.hs-legend')();
+  if (focus >= 0 && ends()[focus]) ends()[focus].focus();
+};
+const choose = (at) => tell(`ends ${Math.min(...at)} ${Math.max(...at)}`);
+legend.onpointerdown = () => { spread = true; window.addEventListener('pointerup', () => { spread = false; }, {once: true}); };
+legend.onchange = () => { choose(ends().map((end) => Number(end.value))); setTimeout(explain, 600); };
+legend.ondblclick = () => choose([0, 100]);
+watch('.hs-legend-data', explain);
 watch('.hs-tl-data', read); watch('.hs-state', show); unfold(localStorage.getItem('hemislam-diagnostics') === 'open');
 settle();
