@@ -25,7 +25,8 @@ from app.ui import hints
 from app.ui.colours import LABEL, Limits, legend
 from app.ui.files import _FORMATS, result_folder_name, size_text
 from app.ui.hints import HINTS
-from app.ui.html import BAD, GOOD, Tile, panel
+from app.ui.html import BAD, GOOD, Tile, panel, source
+from app.ui.loops.words import KINDS, LoopKind
 from app.ui.readouts import HISTORY, plotted, stacked_stages
 from app.ui.status import findings_html, log_html, settled, title, verdicts
 from tests.ui.fake_engine import FINDINGS, FakeEngine
@@ -130,3 +131,22 @@ def test_stages_are_stacked_to_the_total(engine: FakeEngine) -> None:
 def test_the_workbench_offers_each_file_of_the_table_of_formats() -> None:
     offered = " ".join(_FORMATS)
     assert all(name in offered for name in ("trajectory.csv", "trajectory.gpx", "map.kmz", "map.laz"))
+
+
+def luminance(rgb: np.ndarray) -> float:
+    """Relative, as WCAG 2.2 defines it."""
+    share = rgb / 255
+    return float(np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4) @ (0.2126, 0.7152, 0.0722))
+
+
+@pytest.mark.parametrize(("sheet", "background"), [("style.css", 255.0), ("viser_adapter.css", 36.0)])
+@pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
+def test_verdicts_are_readable_also_in_a_row_that_is_chosen(sheet: str, background: float, kind: LoopKind) -> None:
+    text = re.search(r"--hs-text:#(\w{6})", source(sheet))
+    share = re.search(r"--hs-share:(\d+)%", source(sheet))
+    assert text and share
+    colour = np.array(kind.colour) * int(share[1]) / 100
+    colour += np.array([int(text[1][i : i + 2], 16) for i in (0, 2, 4)]) * (1 - int(share[1]) / 100)
+    chosen = 0.35 * np.array([38.0, 166.0, 154.0]) + 0.65 * background
+    dark, light = sorted((luminance(colour), luminance(chosen)))
+    assert (light + 0.05) / (dark + 0.05) >= 4.5
