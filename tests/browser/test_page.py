@@ -22,6 +22,8 @@ def seed_pixels(bench: Bench) -> int:
     return int(((r > 180) & (g > 110) & (g < 210) & (b < 90)).sum())
 
 
+SLIDERS = "[role=slider][aria-valuenow]"
+"""The sliders of parameters; those of the legend's colour bar are inputs of the browser's own."""
 ALPHA = 1
 """Number of the slider of α: after that of M."""
 
@@ -84,7 +86,7 @@ def test_space_after_a_click_on_a_button_does_not_click_it_again(bench: Bench) -
 def test_a_focused_slider_takes_the_arrow_for_itself_and_the_scene_is_relabelled(bench: Bench) -> None:
     bench.engine.send(SetParams({"ground.alpha": 60.0, "ground.scan_lines": 16}))
     bench.engine.sent.clear()
-    slider = bench.page.locator("[role=slider]").nth(ALPHA)
+    slider = bench.page.locator(SLIDERS).nth(ALPHA)
     expect(slider).to_have_attribute("aria-valuenow", "60")
     bench.eventually(lambda: seed_pixels(bench) > 80)
     many = seed_pixels(bench)
@@ -149,7 +151,7 @@ def test_yaml_that_can_not_be_used_is_told_in_the_dialog_which_keeps_it(bench: B
 
 def test_a_tooltip_covers_no_control(bench: Bench) -> None:
     page = bench.page
-    page.locator("[role=slider]").nth(ALPHA).hover()
+    page.locator(SLIDERS).nth(ALPHA).hover()
     tip = page.locator(".mantine-Tooltip-tooltip")
     expect(tip).to_be_visible()
     page.wait_for_timeout(500)
@@ -190,7 +192,7 @@ def test_a_reload_finds_everything_again(bench: Bench) -> None:
     bench.engine.send(SetParams({"ground.alpha": 37.0}))
     bench.page.reload()
     expect(bench.page.get_by_text("frame 8 of 400")).to_be_visible()
-    expect(bench.page.locator("[role=slider]").nth(ALPHA)).to_have_attribute("aria-valuenow", "37")
+    expect(bench.page.locator(SLIDERS).nth(ALPHA)).to_have_attribute("aria-valuenow", "37")
     bench.eventually(lambda: bench.pixels().std() > 8)
 
 
@@ -198,9 +200,9 @@ def test_two_browsers_see_one_session(bench: Bench, chromium: Browser) -> None:
     other = new_page(chromium, 1000, 620)
     try:
         other.goto(bench.url)
-        theirs = other.locator("[role=slider]").nth(ALPHA)
+        theirs = other.locator(SLIDERS).nth(ALPHA)
         expect(theirs).to_have_attribute("aria-valuenow", "37")
-        mine = bench.page.locator("[role=slider]").nth(ALPHA)
+        mine = bench.page.locator(SLIDERS).nth(ALPHA)
         theirs.focus()
         bench.press("ArrowRight", lambda: bench.engine.snapshot.params.ground.alpha > 37.0, other)
         alpha = f"{bench.engine.snapshot.params.ground.alpha:.0f}"
