@@ -9,7 +9,8 @@ from app.cli.options import progress_bar
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
-    from app.export.points import Box, Choice
+    from app.export.box import Box
+    from app.export.points import Choice
     from app.export.results import Export, Results
 
 
@@ -27,8 +28,16 @@ def export(
         float, typer.Option("--thin", metavar="METRES", help="Only the first point in each voxel of this size.")
     ] = 0.0,
     box: Annotated[
-        str | None, typer.Option("--box", metavar="xmin,ymin,zmin,xmax,ymax,zmax", help="Only points inside, m.")
+        str | None,
+        typer.Option(
+            "--box",
+            metavar="xmin,ymin,zmin,xmax,ymax,zmax[,TURN]",
+            help="Only points inside, m; TURN turns the box about its middle, degrees anticlockwise.",
+        ),
     ] = None,
+    slab: Annotated[
+        float, typer.Option("--slab", metavar="METRES", help="Width of the slab along the walk that a profile shows.")
+    ] = 1.0,
 ) -> None:
     """Write a map in the formats of other programs.
 
@@ -51,6 +60,8 @@ def export(
       dxf         floor.dxf                the same as outlines
       terrain     terrain.tif              height of the ground as GeoTIFF
       density     density.tif              points per square metre as GeoTIFF
+      section     section.png, .svg, .dxf  the --box from its front
+      profile     profile.png, .svg, .dxf  the same along the walked path: chainage, height
       kmz         map.kmz                  walk, picture and keyframes for Google Earth
       html        share.html               the map in one page that needs no server
 
@@ -59,13 +70,14 @@ def export(
       hemislam export runs/walk-1 --format laz,e57
       hemislam export runs/walk-1 --format pcd --thin 0.05 --out to_client
       hemislam export session.hemislam --format laz --box=-10,-10,-1,10,10,3
+      hemislam export runs/walk-1 --format section --box=-10,-0.2,-2,10,0.2,3,30
     """
     from app.export.folder import read_results
     from app.export.points import Choice
     from app.export.results import of_formats
 
     exports = of_formats([name.strip() for name in formats.split(",") if name.strip()])
-    choice = Choice(thin, _box(box))
+    choice = Choice(thin, _box(box), slab)
     if source.is_dir():
         results, folder = read_results(source), out or source / "export"
         if folder.resolve() == source.resolve():
@@ -107,10 +119,13 @@ def _save(results: "Results", folder: Path, exports: "tuple[Export, ...]") -> No
 
 
 def _box(text: str | None) -> "Box | None":
+    from app.export.box import Box
+
     if text is None:
         return None
     try:
-        a, b, c, d, e, f = map(float, text.split(","))
+        a, b, c, d, e, f, *turn = map(float, text.split(","))
+        (turned,) = turn or [0.0]
     except ValueError:
-        raise HemislamError(f"--box takes six numbers xmin,ymin,zmin,xmax,ymax,zmax, not {text}.") from None
-    return a, b, c, d, e, f
+        raise HemislamError(f"--box takes six numbers xmin,ymin,zmin,xmax,ymax,zmax, or seven, not {text}.") from None
+    return Box((a, b, c), (d, e, f), turned)

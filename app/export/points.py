@@ -10,13 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from app.export.box import Box
 from app.slam.errors import HemislamError
 from app.slam.kernels.clouds import first_in_voxels
 from app.slam.map_frame import MapFrame
 from app.slam.ply import Keyframes
 from app.slam.types import F32, F64, I64, U8, U16, Cloud, Keyframe
-
-Box = tuple[float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,17 +24,19 @@ class Choice:
 
     Attributes:
         thin: m, edge of the voxels of which only the first point is taken; 0: all points.
-        box: least x, y, z and greatest x, y, z in the map, m; None: everywhere.
+        box: in which they lie; None: everywhere.
+        slab: m, width of the slab along the walked path that a profile shows.
     """
 
     thin: float = 0.0
     box: Box | None = None
+    slab: float = 1.0
 
     def __post_init__(self) -> None:
         if not (self.thin == 0 or 0.001 <= self.thin <= 100):
             raise HemislamError(f"Voxels of {self.thin:g} m do not thin a map; choose 0.001 to 100 m.")
-        if self.box is not None and not all(low < high for low, high in zip(self.box[:3], self.box[3:], strict=True)):
-            raise HemislamError("The box is empty; give xmin,ymin,zmin,xmax,ymax,zmax with each minimum first.")
+        if not 0.01 <= self.slab <= 100:
+            raise HemislamError(f"A slab of {self.slab:g} m shows no profile; choose 0.01 to 100 m.")
 
 
 EVERYTHING = Choice()
@@ -75,9 +76,7 @@ def blocks(keyframes: Keyframes, frame: MapFrame, choice: Choice) -> Iterator[Bl
     for index in range(len(keyframes)):
         block = _block(keyframes[index], frame.at(index))
         if choice.box is not None:
-            low, high = np.reshape(choice.box, (2, 3))
-            inside = (block.points >= low) & (block.points <= high)
-            block = block.chosen(np.all(inside, axis=1))
+            block = block.chosen(choice.box.holds(block.points))
         yield block if voxels is None else block.chosen(voxels.new(block.points))
 
 

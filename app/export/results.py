@@ -18,6 +18,7 @@ import numpy.typing as npt
 from app.export import map_file
 from app.export.points import EVERYTHING, Block, Choice, blocks
 from app.export.raster import CELL, Raster, rasterise
+from app.export.section import Section, of_box, of_walk
 from app.georeference import ledger, reference
 from app.georeference.align import Alignment
 from app.georeference.reference import GeoReference
@@ -61,7 +62,8 @@ class Results:
     problem: str = ""
     marks: tuple[Mark, ...] = ()
     progress: Callable[[float], None] = lambda share: None
-    _rasters: dict[tuple[bool, float], Raster] = field(default_factory=dict, repr=False)
+    _rasters: dict[tuple[bool, float], Raster] = field(default_factory=dict, init=False, repr=False)
+    _sections: dict[str, Section] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def frame(self) -> MapFrame:
@@ -84,6 +86,12 @@ class Results:
         if key not in self._rasters:
             self._rasters[key] = rasterise(self.blocks, self.where if on_earth else None, cell)
         return self._rasters[key]
+
+    def section(self, kind: str) -> Section:
+        """A slab of the map from its side, counted once for all files that show it. kind: section or profile."""
+        if kind not in self._sections:
+            self._sections[kind] = of_box(self) if kind == "section" else of_walk(self)
+        return self._sections[kind]
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +124,17 @@ def _later(module: str, function: str) -> Callable[[Path, Results], object]:
 def _wanted(format: str, name: str, meaning: str, writer: str, extra: str = "", *, on_earth: bool = False) -> Export:
     """A file that is written only if it is asked for, by `module.function`."""
     return Export(name, meaning, _later(*writer.split(".")), format, by_run=False, extra=extra, on_earth=on_earth)
+
+
+def _drawn(kind: str, suffix: str) -> Export:
+    """A section of the box or a profile of the walk as one kind of drawing."""
+    meaning = "what is in the box, from its front" if kind == "section" else "along the walk: chainage and height"
+
+    def write(path: Path, results: Results) -> None:
+        files = importlib.import_module("app.export.section_files")
+        getattr(files, f"write_{suffix}")(path, results, results.section(kind))
+
+    return Export(f"{kind}.{suffix}", meaning, write, kind, by_run=False, extra="plan" if suffix == "dxf" else "")
 
 
 def _write_map(path: Path, results: Results) -> None:
@@ -184,6 +203,7 @@ EXPORTS = (
     _wanted("dxf", "floor.dxf", "the same as outlines", "plan.write_dxf", "plan"),
     _wanted("terrain", "terrain.tif", "height of the ground as GeoTIFF", "plan.write_terrain", "plan"),
     _wanted("density", "density.tif", "points per square metre as GeoTIFF", "plan.write_density", "plan"),
+    *(_drawn(kind, suffix) for kind in ("section", "profile") for suffix in ("png", "svg", "dxf")),
     _wanted("kmz", "map.kmz", "walk, picture and keyframes for Google Earth", "google_earth.write", on_earth=True),
     _wanted("html", "share.html", "the map in one page that needs no server", "share.write"),
 )

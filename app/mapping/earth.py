@@ -39,7 +39,7 @@ def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> tup
     overruled = {edit.what: edit.accepted for edit in edits if isinstance(edit, Overrule)}
     if survey.control:
         found = _by_points(results, survey, _named(overruled, POINT))
-        return replace(results, where=found.reference, found=found, _rasters={}), MapFrame()
+        return replace(results, where=found.reference, found=found), MapFrame()
     fixes, told = fixes_of(results.info.recording, survey.gnss, int(results.trajectory.stamps_ns[0]))
     of_fixes = _named(overruled, FIX)
     found = align(
@@ -53,7 +53,7 @@ def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> tup
     )
     if survey.factors:
         return bent(results, fixes, found, of_fixes)
-    return replace(results, where=found.reference, found=found, _rasters={}), MapFrame()
+    return replace(results, where=found.reference, found=found), MapFrame()
 
 
 def lay_if_possible(results: Results, survey: Survey | None, edits: Sequence[LoopEdit] = ()) -> Results:
@@ -80,7 +80,7 @@ def bent(results: Results, fixes: Fixes, found: Alignment, overruled: Mapping[st
     corrections, found = bend(results.trajectory, stamps_ns, graph, fixes, found, overruled)
     by_fixes = MapFrame(stamps_ns, corrections)
     again = replace(loops, frame=by_fixes.over(loops.frame))
-    return replace(results, loops=again, where=found.reference, found=found, _rasters={}), by_fixes
+    return replace(results, loops=again, where=found.reference, found=found), by_fixes
 
 
 def fixes_of(recording: Path, gnss: Path | None, near_ns: int) -> tuple[Fixes, str]:

@@ -14,6 +14,7 @@ from PIL import Image
 from test_las import UTM
 from test_results import keyframe, logged
 
+from app.export.box import Box
 from app.export.points import Choice
 from app.export.results import Results, of_formats, save_results
 from app.georeference.reference import GeoReference
@@ -100,6 +101,6 @@ def test_a_plan_needs_ground_and_points(tmp_path: Path) -> None:
     results.keyframes[0].cloud.labels[:] = NON_GROUND
     with pytest.raises(HemislamError, match="No point of the map is ground"):
         save_results(tmp_path, results, of_formats(["terrain"]))
-    results.choice = Choice(box=(90.0, 90, 90, 91, 91, 91))
+    results.choice = Choice(box=Box((90.0, 90, 90), (91, 91, 91)))
     with pytest.raises(HemislamError, match="no points to draw"):
         save_results(tmp_path, results, of_formats(["terrain"]))

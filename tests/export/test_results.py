@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.export.box import Box
 from app.export.folder import read_results
 from app.export.map_file import KEYFRAME, VERTEX, MapFile, write
 from app.export.points import Choice, blocks
@@ -315,7 +316,8 @@ def test_only_the_first_point_in_a_voxel_and_in_the_box_is_taken() -> None:
     keyframes = [keyframe(0, one, [NON_GROUND] * 3000) for one in points]
     everything = np.concatenate([block.points for block in blocks(keyframes, MapFrame(), Choice())])
     box = (-1.0, -1.5, 0.0, 1.0, 1.5, 2.0)
-    taken = np.concatenate([block.points for block in blocks(keyframes, MapFrame(), Choice(0.05, box))])
+    choice = Choice(0.05, Box(box[:3], box[3:]))
+    taken = np.concatenate([block.points for block in blocks(keyframes, MapFrame(), choice)])
     inside = everything[((everything >= box[:3]) & (everything <= box[3:])).all(axis=1)]
     _, first = np.unique(np.floor(inside / 0.05), axis=0, return_index=True)
     np.testing.assert_array_equal(taken, inside[np.sort(first)])
@@ -325,7 +327,7 @@ def test_only_the_first_point_in_a_voxel_and_in_the_box_is_taken() -> None:
 @pytest.mark.parametrize(("thin", "box"), [(-1.0, None), (1e-6, None), (0.0, (0.0, 0, 0, 1, 1, 0))])
 def test_a_choice_without_sense_is_refused(thin: float, box: tuple[float, float, float, float, float, float]) -> None:
     with pytest.raises(HemislamError, match=r"Voxels|empty"):
-        Choice(thin, box)
+        Choice(thin, box and Box(box[:3], box[3:]))
 
 
 def test_a_file_that_is_no_map_is_refused(tmp_path: Path) -> None:

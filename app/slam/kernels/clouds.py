@@ -88,3 +88,39 @@ def first_in_voxels(keys, table, first):
         table[slot] = key
         count += first[j]
     return count
+
+
+@njit(cache=True)
+def passages(points, path, half, indices, along, aside):
+    """Lay points beside a path on it: once for each passage of the path within `half`, m.
+
+    points (n, 2), path (m >= 2, 2) f64, m, no two of it the same in a row. Out, as far as they reach: indices (k,) i64
+    of the points; along (k,) f64, m from the path's begin; aside (k,) f64, m to its left. Points before its begin and
+    after its end are left out. Returns how many there are, which may be more than k.
+    """
+    count, total = 0, 0.0
+    for i in range(len(path) - 1):
+        total += math.hypot(path[i + 1, 0] - path[i, 0], path[i + 1, 1] - path[i, 1])
+    for j in range(len(points)):
+        begin, before, nearing = 0.0, math.inf, False
+        s, left = 0.0, 0.0
+        for i in range(len(path)):
+            d = math.inf
+            if i < len(path) - 1:
+                x, y = points[j, 0] - path[i, 0], points[j, 1] - path[i, 1]
+                u, v = path[i + 1, 0] - path[i, 0], path[i + 1, 1] - path[i, 1]
+                length = math.hypot(u, v)
+                t = min(max((x * u + y * v) / length, 0.0), length)
+                d = math.hypot(x - t * u / length, y - t * v / length)
+            if d > before + 1e-9:
+                if nearing and before <= half and 0.0 < s < total:
+                    if count < len(indices):
+                        indices[count], along[count], aside[count] = j, s, left
+                    count += 1
+                nearing = False
+            elif d < before - 1e-9:
+                nearing, s = True, begin + t
+                left = d if u * y >= v * x else -d
+            before = d
+            begin += length
+    return count

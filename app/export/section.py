@@ -1,0 +1,152 @@
+"""A slab of the map from its side: what lies in a box, or along the walked path as a profile."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from app.export.points import Block
+from app.slam.errors import HemislamError
+from app.slam.kernels.clouds import passages
+from app.slam.types import F64, NON_GROUND, U8
+
+if TYPE_CHECKING:
+    from app.export.results import Results
+
+CELL: Final = 0.02
+"""m, of all but huge sections."""
+MOST_CELLS: Final = 8_000_000
+MOST_COLUMNS: Final = 20_000
+"""Wider pictures are not opened by many programs."""
+STRIDE: Final = 0.5
+"""m: steps along the walk are so long, since a walker sways."""
+
+Laid = Callable[[Block], tuple[F64, U8]]
+"""Gives (n, 2) chainage and height of the points in the slab, m, and their labels."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """Points of a slab in cells, row 0 at the bottom.
+
+    Attributes:
+        origin: (2,) chainage and height of the lower left corner of cell (0, 0), m. cell: m.
+        points, ground: (rows, columns) int32, numbers of points, and of those on the ground.
+        sums: (rows, columns, 2) float32 m, sum of where they are in their cell.
+    """
+
+    origin: F64
+    cell: float
+    points: npt.NDArray[np.int32]
+    ground: npt.NDArray[np.int32]
+    sums: npt.NDArray[np.float32]
+
+    @property
+    def size(self) -> F64:
+        """(2,) m, its length and height."""
+        return self.cell * np.array(self.points.shape[::-1], np.float64)
+
+    def means(self) -> tuple[F64, npt.NDArray[np.bool_]]:
+        """(n, 2) m, the mean of the points in each cell that has some, and (n,) whether most of them are ground."""
+        rows, columns = np.nonzero(self.points)
+        count = self.points[rows, columns]
+        at = self.origin + np.column_stack([columns, rows]) * self.cell + self.sums[rows, columns] / count[:, None]
+        return at, 2 * self.ground[rows, columns] > count
+
+
+def of_box(results: "Results") -> Section:
+    """What lies in the chosen box, from its front; chainage begins at its left side.
+
+    Raises:
+        HemislamError: no box is chosen, or nothing is in it.
+    """
+    box, up = results.choice.box, _up(results)
+    if box is None:
+        raise HemislamError("A section shows what lies in a box; choose one in the page, or by --box.")
+
+    def laid(block: Block) -> tuple[F64, U8]:
+        chainage = box.own(block.points)[:, 0] + box.size[0] / 2
+        return np.column_stack([chainage, block.points[:, 2] + up]), block.labels
+
+    return _counted(results.blocks, laid)
+
+
+def of_walk(results: "Results") -> Section:
+    """What lies beside the walked path, within half the chosen slab; chainage is the way walked, from above.
+
+    Raises:
+        HemislamError: nobody walked, or nothing is there.
+    """
+    path, half, up = strides(results.trajectory.positions[:, :2]), results.choice.slab / 2, _up(results)
+
+    def laid(block: Block) -> tuple[F64, U8]:
+        which, along, _ = along_path(block.points[:, :2], path, half)
+        return np.column_stack([along, block.points[which, 2] + up]), block.labels[which]
+
+    return _counted(results.blocks, laid)
+
+
+def strides(positions: F64) -> F64:
+    """(m, 2) of (n, 2) m, the first of them, every one that is a stride from the one before, and the last.
+
+    Raises:
+        HemislamError: all of them are within a stride.
+    """
+    chosen = [positions[0]] if len(positions) else []
+    for place in positions:
+        if math.hypot(*(place - chosen[-1])) >= STRIDE:
+            chosen.append(place)
+    if len(chosen) < 2:
+        raise HemislamError(f"A profile follows the walked path, and that is shorter than {STRIDE:g} m.")
+    if math.hypot(*(positions[-1] - chosen[-1])) > 0.1 * STRIDE:
+        chosen.append(positions[-1])
+    return np.array(chosen)
+
+
+def along_path(points: F64, path: F64, half: float) -> tuple[npt.NDArray[np.int64], F64, F64]:
+    """Lay (n, 2) points within `half` of a path (m, 2) on it, once for each passage of the path, all in m.
+
+    Returns:
+        (k,) indices of the points, (k,) m along the path and (k,) m to the left of it.
+    """
+    flat, count = np.ascontiguousarray(points, np.float64), len(points)
+    while True:
+        out = np.empty(count, np.int64), np.empty(count), np.empty(count)
+        count = passages(flat, path, half, *out)
+        if count <= len(out[0]):
+            return out[0][:count], out[1][:count], out[2][:count]
+
+
+def _up(results: "Results") -> float:
+    """m, from heights in the map to those that are known on Earth."""
+    return 0.0 if results.where is None else results.where.origin[2]
+
+
+def _counted(read: Callable[[], Iterable[Block]], laid: Laid) -> Section:
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for at, _ in _parts(read, laid):
+        low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
+    if not np.isfinite(low).all():
+        raise HemislamError("There are no points in the slab; choose a wider one, or another box.")
+    cell = CELL
+    while ((size := (high - low) // cell + 2).prod()) > MOST_CELLS or size[0] > MOST_COLUMNS:
+        cell *= 2
+    origin = np.floor(low / cell) * cell
+    shape = (int(size[1]), int(size[0]))
+    points, ground, sums = np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros((*shape, 2), np.float32)
+    for at, labels in _parts(read, laid):
+        columns, rows = ((at - origin) / cell).astype(np.int64).T
+        np.add.at(points, (rows, columns), 1)
+        np.add.at(ground, (rows, columns), labels != NON_GROUND)
+        np.add.at(sums, (rows, columns), (at - origin - np.column_stack([columns, rows]) * cell).astype(np.float32))
+    return Section(origin, cell, points, ground, sums)
+
+
+def _parts(read: Callable[[], Iterable[Block]], laid: Laid) -> Iterator[tuple[F64, U8]]:
+    for block in read():
+        at, labels = laid(block)
+        if len(at):
+            yield at, labels
