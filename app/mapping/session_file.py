@@ -34,6 +34,7 @@ from pydantic import (
 )
 
 from app import __version__
+from app.export.box import Box
 from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.labels import LabelEdit
@@ -123,6 +124,29 @@ class Measure:
     spots: tuple[Spot, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """What of the map is shown, and what exports may be limited to.
+
+    Attributes:
+        box: None: none was chosen yet. on: whether what is outside it is hidden.
+        unrolled: the map is shown as a profile along the walked path. slab: m, how wide that is.
+    """
+
+    box: Box | None = None
+    on: bool = False
+    unrolled: bool = False
+    slab: Annotated[float, Field(ge=0.01, le=100)] = 1.0
+
+    @property
+    def hiding(self) -> Box | None:
+        """The box outside which points are hidden, if there is one."""
+        return self.box if self.on else None
+
+
+WHOLE = Clip()
+
+
 Speed = Annotated[
     float,
     Field(ge=0.1),
@@ -141,7 +165,7 @@ class State:
     truth: trajectory to compare with. notes: in the order in which they were made. speed: to play at.
     views: where cameras stood that the user kept, and what they looked at, (x, y, z) each, m, in the map.
     measures: what was measured in the map. survey: what lays it on Earth.
-    painted: points marked as ground or not.
+    painted: points marked as ground or not. clip: what of the map is shown.
     """
 
     params: _Params
@@ -157,6 +181,7 @@ class State:
     measures: tuple[Measure, ...] = ()
     survey: Survey | None = None
     painted: tuple[_Stroke, ...] = ()
+    clip: Clip = WHOLE
 
 
 _OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)
@@ -301,7 +326,7 @@ def read_session(path: Path) -> SavedSession:
         state = _STATE.validate_python(states[-1]["state"]) if states else State(Params())
         place: dict[str, Any] = next((entry for entry in reversed(entries) if "frame" in entry), {})
         frame, ended, known = int(place.get("frame", -1)), bool(place.get("ended")), int(place.get("known", -1))
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError, zlib.error) as error:
+    except (HemislamError, AttributeError, KeyError, TypeError, ValueError, OverflowError, zlib.error) as error:
         why = repr(error)
         if isinstance(error, ValidationError):
             first = error.errors()[0]

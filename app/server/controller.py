@@ -6,17 +6,14 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.export.points import Choice
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.painted import Stroke
 from app.mapping.session import EFFECT, Session
 from app.mapping.session_file import (
     SUFFIX,
-    KeptView,
-    Measure,
     Note,
     SavedSession,
     SessionWriter,
@@ -30,7 +27,7 @@ from app.server.loop_commands import LoopCommands
 from app.server.player import Player
 from app.server.protocol import Command
 from app.server.publisher import Publisher, opened_recording
-from app.server.setup import Kept
+from app.server.setup import NOTHING_KEPT, Kept
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Edits
 from app.slam.params import Params
@@ -56,6 +53,7 @@ _FOR_THE_FRAME = (
     | protocol.AddNote
     | protocol.KeepView
     | protocol.KeepMeasure
+    | protocol.SetClip
     | protocol.LayOnEarth
     | protocol.Paint
     | protocol.UndoPaint
@@ -75,8 +73,8 @@ class Controller:
     Args:
         page: is told of all changes. params: to begin with.
         resolve: gives the parameters of a recording, before the user's changes; None: the present ones.
-        session_folder: for session files; None: none are kept. kept: notes, views, measures and painted labels of a
-            live session that another process began. clock: monotonic seconds.
+        session_folder: for session files; None: none are kept. kept: of a live session that another process
+            began. clock: monotonic seconds.
     """
 
     def __init__(
@@ -87,7 +85,7 @@ class Controller:
         *,
         resolve: Callable[[Path], Params] | None = None,
         session_folder: Path | None = None,
-        kept: Kept = ((), (), (), ()),
+        kept: Kept = NOTHING_KEPT,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._page = page
@@ -98,7 +96,7 @@ class Controller:
         self._shown_share: protocol.Progress | None = None
         self._open_session, self._resolve, self._session_folder = open_session, resolve, session_folder
         self._params = self._base = params  # with and without the user's changes
-        self._notes, self._views, self._measures, self._painted = kept
+        self._kept = kept
         self._resuming: SavedSession | None = None  # that is being repeated
         self._opening: Callable[[], None] | None = None  # opens the next session
         self._waiting: list[Command] = []  # until that session is at its frame
@@ -143,26 +141,31 @@ class Controller:
             case protocol.SetBreakpoints(breakpoints):
                 self._set_breakpoints(breakpoints)
             case protocol.AddNote(text) if text.strip():
-                if len(self._notes) >= MOST_NOTES:
+                if len(self._kept.notes) >= MOST_NOTES:
                     raise HemislamError(f"A session keeps {MOST_NOTES:,} notes; this one was not kept.")
-                self._show_notes((*self._notes, Note(self._need_session().frame, text.strip())))
+                self._keep(notes=(*self._kept.notes, Note(self._need_session().frame, text.strip())))
             case protocol.EditNote(place, before, text) if (
-                0 <= place < len(self._notes) and self._notes[place].text == before
+                0 <= place < len(notes := self._kept.notes) and notes[place].text == before
             ):
-                changed = (Note(self._notes[place].frame, text.strip()),) if text.strip() else ()
-                self._show_notes((*self._notes[:place], *changed, *self._notes[place + 1 :]))
+                changed = (Note(notes[place].frame, text.strip()),) if text.strip() else ()
+                self._keep(notes=(*notes[:place], *changed, *notes[place + 1 :]))
             case protocol.KeepView(view):
-                self._show_views((*self._views, view)[-MOST_VIEWS:])
+                self._keep(views=(*self._kept.views, view)[-MOST_VIEWS:])
             case protocol.KeepMeasure(measure):
-                self._show_measures((*self._measures, measure)[-MOST_MEASURES:])
+                self._keep(measures=(*self._kept.measures, measure)[-MOST_MEASURES:])
+            case protocol.RenameMeasure(measure, name):
+                renamed = replace(measure, name=name)
+                self._keep(measures=tuple(renamed if kept == measure else kept for kept in self._kept.measures))
             case protocol.DropMeasure(measure):
-                self._show_measures(tuple(kept for kept in self._measures if kept != measure))
+                self._keep(measures=tuple(kept for kept in self._kept.measures if kept != measure))
+            case protocol.SetClip(clip):
+                self._keep(clip=clip)
             case protocol.LayOnEarth(survey):
                 self._need_session().survey = survey
             case protocol.Paint(stroke):
-                self._show_painted((*self._painted, stroke))
+                self._keep(painted=(*self._kept.painted, stroke))
             case protocol.UndoPaint():
-                self._show_painted(self._painted[:-1])
+                self._keep(painted=self._kept.painted[:-1])
             case protocol.SetParams(values):
                 self._set_params(self._params.with_values(values))
             case protocol.LoadParams(text):
@@ -174,8 +177,8 @@ class Controller:
                 self._page.put(recording=opened_recording(self._need_session()), urgent=True)
             case protocol.Restart():
                 self._open_soon(self._need_session().feed.info.path, self._reopen)
-            case protocol.Save(folder, formats, thin):
-                session, choice = self._need_session(), Choice(thin)
+            case protocol.Save(folder, formats, choice):
+                session = self._need_session()
                 saved = session.saved(self._state(session))
                 save = session.save(folder, session=saved, formats=formats, choice=choice, progress=self._set_share)
                 self._saves.append((folder, save))
@@ -218,25 +221,10 @@ class Controller:
             self._shown_share = shown
             self._page.put(progress=shown, urgent=True)
 
-    def _show_notes(self, notes: tuple[Note, ...]) -> None:
-        self._notes = notes
-        self._page.put(notes=notes, urgent=True)
-
-    def _show_views(self, views: tuple[KeptView, ...]) -> None:
-        self._views = views
-        self._page.put(views=views, urgent=True)
-
-    def _show_measures(self, measures: tuple[Measure, ...]) -> None:
-        self._measures = measures
-        self._page.put(measures=measures, urgent=True)
-
-    def _show_painted(self, painted: tuple[Stroke, ...]) -> None:
-        self._painted = painted
-        self._page.put(painted=painted, urgent=True)
-
-    def _show_kept(self, kept: Kept) -> None:
-        self._notes, self._views, self._measures, self._painted = kept
-        self._page.put(**dict(zip(("notes", "views", "measures", "painted"), kept, strict=True)), urgent=True)
+    def _keep(self, **changes: Any) -> None:
+        """Replace fields of `Kept`."""
+        self._kept = self._kept._replace(**changes)
+        self._page.put(**changes, urgent=True)
 
     def _show_params(self) -> None:
         """Show the parameters, and which of them wait for a restart."""
@@ -255,10 +243,10 @@ class Controller:
         wait = self._work()
         session = self._player.session
         if session is not None and self._resuming is None:
-            self._keep(session)
+            self._write(session)
         return wait
 
-    def _keep(self, session: Session) -> None:
+    def _write(self, session: Session) -> None:
         """Write the session file; say it if that fails for the first time."""
         kept = not self._writer.error
         self._writer.write(session.frame, self._state(session), ended=session.ended, known=session.furthest)
@@ -302,14 +290,11 @@ class Controller:
             edits=session.edits.done,
             undone=session.edits.undone,
             truth=session.truth_path,
-            notes=self._notes,
-            views=self._views,
-            measures=self._measures,
             survey=session.survey,
-            painted=self._painted,
             breakpoints=self._player.breakpoints,
             speed=self._page.transport.speed,
             labels=session.keyframes.edits,
+            **self._kept._asdict(),
         )
 
     # --- opening ---------------------------------------------------------------------------------
@@ -348,13 +333,13 @@ class Controller:
 
     def _reopen(self) -> None:
         """Begin again with the present parameters. Notes, kept views, measures, painted labels and loop edits stay."""
-        before, kept = self._need_session(), (self._notes, self._views, self._measures, self._painted)
+        before, kept = self._need_session(), self._kept
         self._of_before = 0
         info, edits = before.feed.info, before.edits
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
         session.survey = before.survey
         self._take(session)
-        self._show_kept(kept)
+        self._keep(**kept._asdict())
         if session.loops is not None and edits != Edits():
             session.edit_loops(edits.done, edits.undone)
 
@@ -384,7 +369,7 @@ class Controller:
         self._player.take(session)
         if session.frame < 0:  # else it goes on where a process that died was
             state = saved.state if saved is not None else State(self._params)
-            self._show_kept((state.notes, state.views, state.measures, state.painted))
+            self._keep(**{name: getattr(state, name) for name in Kept._fields})
         self._resuming = None
         if saved is not None:
             # This process may die on the way there.
@@ -422,6 +407,6 @@ class Controller:
         if session is not None:
             session.finish_saves()
             if self._resuming is None:  # else it is written where the session is going to
-                self._keep(session)
+                self._write(session)
             session.close()
         self._writer.close()

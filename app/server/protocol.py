@@ -11,11 +11,12 @@ from typing import Any, Literal
 
 import msgspec
 
+from app.export.points import EVERYTHING, Choice
 from app.georeference.align import Alignment
 from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.painted import Stroke
-from app.mapping.session_file import KeptView, Measure, Note, Speed
+from app.mapping.session_file import WHOLE, Clip, KeptView, Measure, Note, Speed
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
 from app.slam.frames import READOUTS, Frame
@@ -100,6 +101,19 @@ class KeepMeasure(Command, frozen=True):
     measure: Measure
 
 
+class RenameMeasure(Command, frozen=True):
+    """Give a measure of the session another name."""
+
+    measure: Measure
+    name: str
+
+
+class SetClip(Command, frozen=True):
+    """Show only a part of the map, or all of it."""
+
+    clip: Clip
+
+
 class DropMeasure(Command, frozen=True):
     """Delete a measure from the session."""
 
@@ -145,12 +159,12 @@ class Save(Command, frozen=True):
     """Write the results of the frames so far, replacing older ones in the folder; `Snapshot.saved` tells when.
 
     Attributes:
-        formats: as `hemislam export` has them; none: all files of a run. thin: m, as there.
+        formats: as `hemislam export` has them; none: all files of a run. choice: of points, as there.
     """
 
     folder: Path
     formats: tuple[str, ...] = ()
-    thin: float = 0.0
+    choice: Choice = EVERYTHING
 
 
 class EditLabels(Command, frozen=True):
@@ -337,7 +351,7 @@ class Snapshot:
         trajectory: (n, 3) m, positions of the IMU in the map. corrections: of odometry, by loops.
         series: (n,) arrays by SERIES name.
         T_map_truth: (4, 4), aligns the truth with the trajectory; None until the trajectory determines it.
-        notes, views, measures, painted: in the order in which they were made.
+        notes, views, measures, painted: in the order in which they were made. clip: what of the map is shown.
         notices: the newest 50. saved: the newest 10.
         live: state of the live source; None for a recording.
         earth: as the map was when the session last stood still.
@@ -363,6 +377,7 @@ class Snapshot:
     views: tuple[KeptView, ...] = ()
     measures: tuple[Measure, ...] = ()
     painted: tuple[Stroke, ...] = ()
+    clip: Clip = WHOLE
     progress: Progress | None = None
     notices: tuple[Notice, ...] = ()
     saved: tuple[Saved, ...] = ()

@@ -3,18 +3,30 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.painted import Stroke
-from app.mapping.session_file import KeptView, Measure, Note
+from app.mapping.session_file import WHOLE, Clip, KeptView, Measure, Note
 from app.slam.params import Params
 
 if TYPE_CHECKING:
     from app.sensors.live.address import LiveAddress
 
 POINT_BUDGET = 3_000_000
-Kept = tuple[tuple[Note, ...], tuple[KeptView, ...], tuple[Measure, ...], tuple[Stroke, ...]]
+
+
+class Kept(NamedTuple):
+    """What the user made beside the map, as `State` and `Snapshot` have it."""
+
+    notes: tuple[Note, ...] = ()
+    views: tuple[KeptView, ...] = ()
+    measures: tuple[Measure, ...] = ()
+    painted: tuple[Stroke, ...] = ()
+    clip: Clip = WHOLE
+
+
+NOTHING_KEPT = Kept()
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,4 +62,4 @@ class Setup:
     notices: int = 0
     frames: int = 0
     chunks: int = 0
-    kept: Kept = ((), (), (), ())
+    kept: Kept = NOTHING_KEPT

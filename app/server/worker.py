@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol
 from app.child import Child, ChildDied, Link, RestartLimit
 from app.server.fold import Fold
 from app.server.protocol import ACKNOWLEDGED, LIVE, Command, Notice, OpenRecording, Progress, Restart, Snapshot
-from app.server.setup import Setup
+from app.server.setup import Kept, Setup
 
 MOST_RESTARTS: Final = 25
 """Deaths of the engine's process after which it is started again without being asked."""
@@ -146,7 +146,7 @@ class EngineProcess:
             breakpoints=last.breakpoints,
             session=last.session,
             notices=_number(last),
-            kept=(last.notes, last.views, last.measures, last.painted),
+            kept=Kept(*(getattr(last, name) for name in Kept._fields)),
         )
 
     def _edit(self, **values: Any) -> None:

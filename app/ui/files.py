@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import viser
 
+from app.export.points import Choice
 from app.export.results import BY_RUN, EXPORTS
 from app.mapping.session_file import SUFFIX, SavedSession
 from app.server.folders import RECORDINGS, TRAJECTORIES, FolderEntry, Folders
@@ -212,7 +213,7 @@ class FilesPanel:
                 problem.content = panel("text", "The folder needs a name without /.")
                 problem.visible = True
                 return
-            self._page.send(Save(self._results / chosen, _FORMATS.get(files.value, ()), thin.value))
+            self._page.send(Save(self._results / chosen, _FORMATS.get(files.value, ()), Choice(thin.value)))
             close()
 
         save.on_click(confirmed)

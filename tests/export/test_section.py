@@ -21,7 +21,7 @@ from app.export.section import along_path, strides
 from app.slam.errors import HemislamError
 from app.slam.frames import Frame
 from app.slam.run_log import RunLog
-from app.slam.types import GROUND, NON_GROUND
+from app.slam.types import NON_GROUND
 
 ACROSS = Box((-4.0, -0.5, -2.0), (4.0, 0.5, 2.0))
 """Cuts both short walls, the floor and the table, not the short wall."""

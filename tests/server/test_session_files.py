@@ -11,6 +11,7 @@ import pytest
 import server_fakes as fakes
 from session_bench import Bench, last_notice
 
+from app.export.points import Choice
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import Note, read_session
 from app.server.protocol import (
@@ -156,7 +157,7 @@ def test_formats_of_other_programs_are_written_and_what_they_lack_is_said(tmp_pa
     recording.write_bytes(b"something to hash")
     bench = Bench(str(recording))
     bench.do(Seek(30))
-    save, shares = Save(tmp_path / "laz", ("laz", "csv"), 0.1), set()
+    save, shares = Save(tmp_path / "laz", ("laz", "csv"), Choice(0.1)), set()
     snapshot = bench.do(save, Save(tmp_path / "gpx", ("gpx",)))
     while len(snapshot.saved) < 2:
         shares.add(snapshot.progress.fraction if snapshot.progress else None)
