@@ -76,6 +76,8 @@ class AppearancePanel:
             follow=self._follow.value,
             light=self._light.value,
             ends=self._ends.get(self._colour_by.value),
+            clip=None,
+            slab=0.0,
             ceilings=self._ceilings.value == _SHOWN or (self._ceilings.value == _BY_ITSELF and not self._above()),
             **{name: layer.value for name, layer in self._layers.items()},
         )

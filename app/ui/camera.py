@@ -10,7 +10,7 @@ import viser
 
 from app.server.protocol import KeepView, Snapshot
 from app.slam.types import F64
-from app.ui.widgets import Changes, Page, by_user
+from app.ui.widgets import Changes, Page, by_user, show
 
 FOV: Final = float(np.radians(60.0))
 _NARROW: Final = float(np.radians(2.0))
@@ -20,9 +20,10 @@ _SHARE: Final = 2.0
 _LEAST_M: Final = 4.0
 _FAR: Final = 10.0
 """What lies behind the map by so many distances is drawn too."""
-FIT, TOP, FRONT, SIDE = "fit", "top", "front", "side"
+FIT, PLAN, TOP, FRONT, SIDE = "fit", "plan", "top", "front", "side"
 _WAYS: Final[dict[str, tuple[float, float, float]]] = {
     FIT: (-0.55, -0.55, 0.75),
+    PLAN: (0.0, -1e-3, 1.0),
     TOP: (0.0, -1e-3, 1.0),
     FRONT: (0.0, -1.0, 0.05),
     SIDE: (-1.0, 0.0, 0.05),
@@ -62,6 +63,7 @@ class Extent:
         return float(np.linalg.norm(other.middle - self.middle) + abs(other.radius - self.radius)) / self.radius
 
 
+_MAP: Final = np.eye(3)
 NOTHING: Final = Extent(np.array([0.3, 0.2, -0.6]), 5.0)
 """What is looked at before there is a map: around the sensor."""
 
@@ -74,9 +76,9 @@ def extent(points: F64) -> Extent:
     return Extent((low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, _LEAST_M))
 
 
-def whole(map_: Extent, way: str = FIT, fov: float = FOV) -> Stand:
-    """From where all of it is seen. fov: rad, of the smaller side of the picture."""
-    towards = np.array(_WAYS[way])
+def whole(map_: Extent, way: str = FIT, fov: float = FOV, axes: F64 = _MAP) -> Stand:
+    """From where all of it is seen. fov: rad, of the picture's smaller side. axes: (3, 3) columns, those of a way."""
+    towards = axes @ _WAYS[way]
     distance = 1.05 * map_.radius / np.tan(fov / 2)
     return Stand(map_.middle + towards / np.linalg.norm(towards) * distance, map_.middle)
 
@@ -86,6 +88,7 @@ class Framing:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
+        self.north = np.array([0.0, 1.0])  # in the map, which is up in plans
         self._ways: dict[int, str] = {}  # from which side browsers look; FIT unless it was chosen
         self._put: deque[F64] = deque(maxlen=_PUT)
         self._wanted = self._shown = NOTHING
@@ -139,8 +142,10 @@ class Framing:
 
     def _place(self, client: viser.ClientHandle, way: str, offset: F64) -> None:
         camera = client.camera
+        x, y = self.north
+        north_up = np.array([[y, x, 0.0], [-x, y, 0.0], [0.0, 0.0, 1.0]])
         narrow = 2 * np.arctan(np.tan(camera.fov / 2) * min(_shape(client), 1.0))
-        stand = whole(self._shown, way, float(narrow))
+        stand = whole(self._shown, way, float(narrow), north_up if way in (PLAN, TOP) else _MAP)
         move(client, Stand(stand.position + offset, stand.look_at + offset))
         self._put.append(stand.position + offset)
 
@@ -175,7 +180,11 @@ class CameraPanel:
         gui = page.gui
         self._page, self._framing, self._look_freely = page, framing, look_freely
         self._changes = Changes()
-        ways = gui.add_button_group("camera", tuple(_WAYS), hint="The whole map, also while it grows; G does the same.")
+        ways = gui.add_button_group(
+            "camera",
+            tuple(_WAYS),
+            hint="The whole map, also while it grows; G fits it. A plan is orthographic, north up.",
+        )
         ways.on_click(by_user(self.look))
         self._parallel = gui.add_checkbox(
             "orthographic", False, hint="Parallel lines stay parallel, and lengths can be compared."
@@ -194,7 +203,21 @@ class CameraPanel:
     def look(self, way: str, client: viser.ClientHandle) -> None:
         """Show the whole map from one side, also as it grows."""
         self._look_freely(client)
+        if way == PLAN:
+            show(self._parallel, True)
+            client.camera.fov = _NARROW
         self._framing.show(client, way, self._page.offset())
+
+    def face(self, client: viser.ClientHandle, middle: F64, size: tuple[float, float], axes: F64 = _MAP) -> None:
+        """Look at something from its front, without perspective.
+
+        Args:
+            middle: (3,) m, map. size: m, width and height. axes: (3, 3), its own, as columns.
+        """
+        self._look_freely(client)
+        show(self._parallel, True)
+        half = 0.6 * max(size[1], size[0] / _shape(client), 1.0)
+        self._go(client, Stand(middle - axes[:, 1] * half / np.tan(FOV / 2), middle))
 
     def _stand(self, client: viser.ClientHandle) -> Stand:
         """Where the usual lens would show what this camera shows."""
@@ -205,6 +228,9 @@ class CameraPanel:
 
     def draw(self, snapshot: Snapshot) -> None:
         """Offer the views that the session keeps."""
+        found = snapshot.earth.found
+        north = np.array(found.reference.rotation)[1, :2] if found is not None else np.array([0.0, 1.0])
+        self._framing.north = north / np.linalg.norm(north)
         if self._changes(snapshot.views):
             self._list.visible = bool(snapshot.views)
             self._list.options = tuple(str(number + 1) for number in range(len(snapshot.views))) or ("1",)

@@ -4,13 +4,15 @@ A keyframe's points are sent once, in its LiDAR frame; when its pose changes lat
 When the map outgrows the point budget, snapshots hold some keyframes with fewer points: those are sent again.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import viser
 
+from app.export.box import Box
 from app.server.chunks import voxel_of_level
 from app.server.protocol import Chunk
 from app.slam.types import F32, F64, NON_GROUND, U8
@@ -41,12 +43,13 @@ class _Drawn:
 
     Attributes:
         limits: ends of the colour maps with this keyframe and those before it. light: (n,) of the chunk's points.
-        count: points shown. handle: None while there are none.
+        shown: which of them were sent, `count` of them. handle: None while there are none.
     """
 
     chunk: Chunk
     limits: dict[str, Limits]
     light: F32
+    shown: Chosen = field(default_factory=lambda: slice(None))
     count: int = 0
     handle: viser.PointCloudHandle | None = None
 
@@ -93,10 +96,11 @@ class MapChunks:
         ends = chosen_ends(self.limits, view.colour_by, view.ends)
         seen, limits = self._view, (ends.get(view.colour_by), ends.get(INTENSITY))
         recolour = view.colour_by != seen.colour_by or limits != self._coloured
+        cut = (view.ceilings, view.clip) != (seen.ceilings, seen.clip)
         self._view, self._coloured = view, limits
         for index, (drawn, chunk) in enumerate(zip(self._drawn, chunks, strict=True)):
-            roofed = view.ceilings != seen.ceilings and self._roofed(chunk, self._T_map_imu[index])
-            if index >= known or chunk is not drawn.chunk or roofed:
+            new = index >= known or chunk is not drawn.chunk
+            if new or ((cut or (moved[index] and view.clip is not None)) and self._shows_others(drawn, index)):
                 if chunk is not drawn.chunk:
                     drawn.chunk = chunk
                     drawn.light = light(chunk.points, self._T_map_imu[index] @ chunk.T_imu_lidar)
@@ -132,6 +136,13 @@ class MapChunks:
                 limits = {**limits, name: wider}
         return limits
 
+    def shown(self) -> Iterator[tuple[F64, U8]]:
+        """(n, 3) points of the map that are shown, whether or not the map is, and their (n, 3) colours."""
+        for drawn, T in zip(self._drawn, self._T_map_imu, strict=False):
+            cloud = self._shown(drawn, T)
+            T_map_lidar = cloud.T_map_lidar
+            yield cloud.points @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3], self._colours(cloud)
+
     def sample(self) -> F64:
         """(m, 3) some points of all keyframes, in the map."""
         every = zip(self._drawn, self._T_map_imu, strict=False)
@@ -150,9 +161,15 @@ class MapChunks:
         )
 
     def _shown(self, drawn: _Drawn, T_map_imu: F64) -> PointSet:
-        chunk = drawn.chunk
-        shown = shown_points(chunk, T_map_imu @ chunk.T_imu_lidar, self._view.ceilings)
-        return self._cloud(chunk, T_map_imu, shown, drawn.light[shown])
+        return self._cloud(drawn.chunk, T_map_imu, drawn.shown, drawn.light[drawn.shown])
+
+    def _chosen(self, chunk: Chunk, T_map_imu: F64) -> Chosen:
+        return shown_points(chunk, T_map_imu @ chunk.T_imu_lidar, self._view.ceilings, self._view.clip)
+
+    def _shows_others(self, drawn: _Drawn, index: int) -> bool:
+        """Whether other points of it are to be shown than those that were sent."""
+        now = self._chosen(drawn.chunk, self._T_map_imu[index])
+        return not np.array_equal(as_mask(now, len(drawn.light)), as_mask(drawn.shown, len(drawn.light)))
 
     def _send(self, drawn: _Drawn, T_map_imu: F64) -> None:
         """Send a keyframe's points in place of those sent before.
@@ -160,6 +177,7 @@ class MapChunks:
         Under the same name instead of through the handle's properties: a page that connects later is
         then not sent what was thinned away.
         """
+        drawn.shown = self._chosen(drawn.chunk, T_map_imu)
         cloud = self._shown(drawn, T_map_imu)
         drawn.count = len(cloud.points)
         if not drawn.count:  # the page cannot draw a cloud without points
@@ -182,19 +200,23 @@ class MapChunks:
         gap = voxel_of_level(chunk.level) if chunk.level else 0.0
         return self._view.map_point_size * max(1.0, _SIZE_BY_GAP * gap / self._view.point_size)
 
-    @staticmethod
-    def _roofed(chunk: Chunk, T_map_imu: F64) -> bool:
-        return not isinstance(shown_points(chunk, T_map_imu @ chunk.T_imu_lidar, ceilings=False), slice)
-
     def _colours(self, cloud: PointSet) -> U8:
         by = self._view.colour_by
         return colours(cloud, by, chosen_ends(self.limits, by, self._view.ends))
 
 
-def shown_points(chunk: Chunk, T_map_lidar: F64, ceilings: bool) -> Chosen:
-    """The points of a chunk that are drawn, with or without the ceiling above them."""
+def shown_points(chunk: Chunk, T_map_lidar: F64, ceilings: bool, clip: Box | None = None) -> Chosen:
+    """The points of a chunk that are drawn: with or without the ceiling above them, and only those in the box."""
     mask = None if ceilings else below_ceiling(chunk.points, chunk.labels, T_map_lidar[2, :3])
+    if clip is not None:
+        inside = clip.holds(chunk.points @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3])
+        mask = inside if mask is None else mask & inside
     return slice(None) if mask is None or not len(mask) else mask
+
+
+def as_mask(chosen: Chosen, count: int) -> npt.NDArray[np.bool_]:
+    """(count,) whether each point is chosen."""
+    return np.ones(count, np.bool_) if isinstance(chosen, slice) else chosen
 
 
 def _same(drawn: Chunk, chunk: Chunk) -> bool:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import viser
 
 from app.export.points import Choice
-from app.export.results import BY_RUN, EXPORTS
+from app.export.results import BY_RUN, EXPORTS, FORMATS
 from app.mapping.session_file import SUFFIX, SavedSession
 from app.server.folders import RECORDINGS, TRAJECTORIES, FolderEntry, Folders
 from app.server.protocol import CompareWith, OpenRecording, Save, Snapshot
@@ -22,7 +22,19 @@ from app.ui.widgets import Changes, Page, by_user, dialog
 _MOST_ENTRIES: Final = 60
 _RECENT: Final = 3
 _OF_A_RUN: Final = "all of a run"
-_FORMATS: Final = {f"{export.name}: {export.meaning}": (export.format,) for export in EXPORTS if export.format}
+
+
+def _titles() -> dict[str, str]:
+    """Formats by what the page calls them: their files and what these hold."""
+    found: dict[str, str] = {}
+    for name in FORMATS:
+        first, *more = [export for export in EXPORTS if export.format == name]
+        files = ", ".join([first.name, *(Path(export.name).suffix for export in more)])
+        found[f"{files}: {first.meaning}"] = name
+    return found
+
+
+_FORMATS: Final = _titles()
 _EARLY: Final = 100
 """Before this frame the last session is offered."""
 
@@ -132,7 +144,7 @@ class FilesPanel:
         self._download.on_click(by_user(lambda _, client: self._offer(client)))
         self._open.on_click(by_user(self.browse))
         self._compare.on_click(by_user(self._browse_trajectories))
-        self._save.on_click(by_user(lambda _, client: self._ask_where(client)))
+        self._save.on_click(by_user(lambda _, client: self.ask_where(client)))
 
     def draw(self, snapshot: Snapshot) -> None:
         self._save.disabled = snapshot.result is None
@@ -189,8 +201,9 @@ class FilesPanel:
     def _send_file(client: viser.ClientHandle, path: Path, _: object) -> None:
         client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
 
-    def _ask_where(self, client: viser.ClientHandle) -> None:
-        recording = self._page.snapshot().recording
+    def ask_where(self, client: viser.ClientHandle, format: str = "") -> None:
+        """Ask for a folder, the files and the choice of points, and save. format: one of `FORMATS`, chosen at first."""
+        recording, clip = self._page.snapshot().recording, self._page.snapshot().clip
         if recording is None:
             return
         gui = client.gui
@@ -198,11 +211,18 @@ class FilesPanel:
             names = [export.name for export in BY_RUN]
             gui.add_html(panel("save", names, f"session{SUFFIX}", str(self._results)))
             name = gui.add_text("folder", result_folder_name(recording.path, datetime.now()))
+            titles = {name: title for title, name in _FORMATS.items()}
             files = gui.add_dropdown(
-                "files", (_OF_A_RUN, *_FORMATS), hint="Those of a run, or one in the format of other programs."
+                "files",
+                (_OF_A_RUN, *_FORMATS),
+                initial_value=titles.get(format, _OF_A_RUN),
+                hint="Those of a run, or one in the format of other programs.",
             )
             thin = gui.add_number(
                 "thin to (m)", 0.0, min=0.0, max=100.0, step=0.01, hint="One point in each voxel of this size; 0: all."
+            )
+            boxed = gui.add_checkbox(
+                "inside the clip box", clip.on, visible=clip.box is not None, hint="Only points that are in it."
             )
             problem = gui.add_html("", visible=False)
             save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
@@ -213,7 +233,13 @@ class FilesPanel:
                 problem.content = panel("text", "The folder needs a name without /.")
                 problem.visible = True
                 return
-            self._page.send(Save(self._results / chosen, _FORMATS.get(files.value, ()), Choice(thin.value)))
+            formats = (_FORMATS[files.value],) if files.value in _FORMATS else ()
+            try:
+                choice = Choice(thin.value, clip.box if boxed.value else None, clip.slab)
+            except HemislamError as error:
+                problem.content, problem.visible = panel("text", str(error)), True
+                return
+            self._page.send(Save(self._results / chosen, formats, choice))
             close()
 
         save.on_click(confirmed)

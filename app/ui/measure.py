@@ -33,7 +33,7 @@ class MeasurePanel:
         self._page = page
         self._changes = Changes()
         self._kind = STOP
-        self._taker: Callable[[Spot, Snapshot], None] | None = None  # of a spot that is picked, not measured
+        self.taker: Callable[[Spot, Snapshot], None] | None = None  # of a spot that is picked, not measured
         self._where: GeoReference | None = None
         self._click: tuple[F64, F64, float] | None = None  # of the newest click: its ray in the map, and its width
         self._spots: tuple[Spot, ...] = ()  # of the measure that is begun
@@ -60,7 +60,7 @@ class MeasurePanel:
     def pick(self, taker: Callable[[Spot, Snapshot], None]) -> None:
         """Give `taker` the spot that the next click meets, instead of measuring it."""
         self.begin(PICK)
-        self._taker = taker
+        self.taker = taker
 
     def draw(self, current: Snapshot, view: View) -> None:
         """Take the newest click, and show what the session keeps."""
@@ -68,7 +68,7 @@ class MeasurePanel:
         poses = poses_of(current)
         kind = self._kind
         if click is not None and kind != STOP and view.map:
-            spot = meet(current.chunks, poses, *click, ceilings=view.ceilings)
+            spot = meet(current.chunks, poses, *click, ceilings=view.ceilings, clip=view.clip)
             if spot is not None and self._kind == kind:  # meanwhile the user may have chosen another
                 self._take(kind, spot, current)
         kept = [(measure, places(measure, poses)) for measure in current.measures]
@@ -82,9 +82,9 @@ class MeasurePanel:
             self._draw_list()
 
     def _take(self, kind: str, spot: Spot, current: Snapshot) -> None:
-        if kind == PICK and self._taker is not None:
+        if kind == PICK and self.taker is not None:
             self.begin(STOP)
-            self._taker(spot, current)
+            self.taker(spot, current)
             return
         self._spots = (*self._spots, spot)
         if len(self._spots) == _SPOTS[kind]:

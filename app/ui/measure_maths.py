@@ -8,11 +8,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from app.export.box import Box
 from app.georeference.reference import GeoReference
 from app.mapping.session_file import Measure, Spot
 from app.server.protocol import Chunk
 from app.slam.types import F32, F64, NON_GROUND
-from app.ui.chunks import Chosen, shown_points
+from app.ui.chunks import as_mask, shown_points
 
 _DEEP_M: Final = 0.1
 """So far behind the nearest point that a click meets, others may be the one that was meant."""
@@ -41,13 +42,21 @@ class Numbers:
 
 
 def meet(
-    chunks: tuple[Chunk, ...], poses: F64, origin: F64, direction: F64, width: float, *, ceilings: bool
+    chunks: tuple[Chunk, ...],
+    poses: F64,
+    origin: F64,
+    direction: F64,
+    width: float,
+    *,
+    ceilings: bool,
+    clip: Box | None = None,
 ) -> Spot | None:
     """The visible point that a click means: of those at the front, the one nearest to its ray; None if it meets none.
 
     Args:
         poses: (k, 4, 4) T_map_imu of the chunks' keyframes. origin, direction: (3,) of the ray, in the map.
         width: rad, how far beside the ray a point may be seen. ceilings: whether they are shown.
+        clip: outside which points are hidden.
     """
     found: list[tuple[F32, F32, Chunk, F32]] = []
     for chunk, T_map_imu in zip(chunks, poses, strict=False):
@@ -55,7 +64,7 @@ def meet(
         along, aside = _from_ray(chunk.points, T[:3, :3].T @ (origin - T[:3, 3]), T[:3, :3].T @ direction)
         hit = (along > 0) & (aside < width * along)
         if hit.any():
-            hit &= _mask(shown_points(chunk, T, ceilings), len(hit))
+            hit &= as_mask(shown_points(chunk, T, ceilings, clip), len(hit))
         if hit.any():
             found.append((along[hit], aside[hit] / along[hit], chunk, chunk.points[hit]))
     if not found:
@@ -66,10 +75,6 @@ def meet(
     chunk, points = found[which][2:]
     x, y, z = (chunk.T_imu_lidar[:3, :3] @ points[np.argmin(best[which])] + chunk.T_imu_lidar[:3, 3]).tolist()
     return Spot(chunk.index, (x, y, z))
-
-
-def _mask(chosen: Chosen, count: int) -> npt.NDArray[np.bool_]:
-    return np.ones(count, np.bool_) if isinstance(chosen, slice) else chosen
 
 
 def _from_ray(points: F32, origin: F64, direction: F64) -> tuple[F32, F32]:

@@ -27,15 +27,21 @@ def length_text(metres: float) -> str:
     return f"{metres:g} m" if metres >= 1 else f"{100 * metres:g} cm"
 
 
-def scale_html(position: F64, look_at: F64, fov: float) -> str:
-    """Of a camera, in the scene: a bar for what it looks at, and which way x points as it sees it."""
+def scale_html(position: F64, look_at: F64, fov: float, north: F64 | None = None) -> str:
+    """Of a camera, in the scene: a bar for what it looks at, and which way north points as it sees it.
+
+    north: (2 or more,), its direction in the map; None: unknown, the map's x stands for it.
+    """
     ahead = look_at - position
     seen_m = 2 * float(np.linalg.norm(ahead)) * float(np.tan(fov / 2))
     if not seen_m > 0:
         return ""
     length = bar(seen_m)
-    turn = float(np.degrees(np.arctan2(ahead[1], ahead[0])))  # of x, clockwise from up
-    return panel("scale", f"{100 * length / seen_m:.1f}", length_text(length), round(turn))
+    x, y = (1.0, 0.0) if north is None else north[:2]
+    turn = float(np.degrees(np.arctan2(ahead[1], ahead[0]) - np.arctan2(y, x)))  # clockwise from up
+    return panel(
+        "scale", f"{100 * length / seen_m:.1f}", length_text(length), round(turn), "x" if north is None else "N"
+    )
 
 
 class ScaleBars:
@@ -47,12 +53,13 @@ class ScaleBars:
 
     def draw(self) -> None:
         """Called often; sends what differs, at most a few times a second."""
-        clients = self._page.server.get_clients()
+        clients, found = self._page.server.get_clients(), self._page.snapshot().earth.found
+        north = np.array(found.reference.rotation)[1] if found is not None else None
         for gone in self._bars.keys() - clients.keys():
             del self._bars[gone]
         for number, client in clients.items():
             camera = client.camera
-            html = scale_html(np.array(camera.position), np.array(camera.look_at), camera.fov)
+            html = scale_html(np.array(camera.position), np.array(camera.look_at), camera.fov, north)
             if number not in self._bars:
                 self._bars[number] = client.gui.add_html(html), Changes(self._page.now, PANEL_PERIOD_S)
             shown, changes = self._bars[number]

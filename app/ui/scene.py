@@ -15,6 +15,7 @@ from app.ui.camera import Framing
 from app.ui.chunks import MapChunks
 from app.ui.colours import Limits, chosen_ends
 from app.ui.nodes import TrajectoryNode, Truth
+from app.ui.profile import ProfileNode
 from app.ui.sensor import SensorScene
 from app.ui.widgets import ROOT, Changes, View, poses_of
 
@@ -59,6 +60,7 @@ class Scene:
         self._sensor = SensorScene(scene, f"{ROOT}/sensor")
         self._trajectory = TrajectoryNode(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
+        self._profile = ProfileNode(scene, self._chunks.shown)
         self.framing = Framing(server)
         self._framed, self._followed = 0, False
 
@@ -70,6 +72,10 @@ class Scene:
     @property
     def points(self) -> int:
         return self._chunks.points
+
+    def sample(self) -> F64:
+        """(n, 3) some points of the map."""
+        return self._chunks.sample()
 
     def limits(self, by: str) -> Limits | None:
         """Ends of a colour map as drawn; None for labels and before there is anything to colour."""
@@ -83,6 +89,7 @@ class Scene:
         with self._server.atomic():
             poses = poses_of(current)
             self._chunks.draw(current.chunks[: len(poses)], poses, view)
+            self._profile.draw(current, view)
             self._trajectory.draw(current.trajectory if current.trajectory is not None else np.empty((0, 3)), view.path)
             recording = current.recording
             self._truth.draw(recording.truth_positions if recording else None, current.T_map_truth, view.path)

@@ -68,7 +68,7 @@ class SensorScene:
             previous: what is drawn now. limits: ends of the colour maps by mode.
             start_ns: of the recording.
         """
-        self._imu.visible = True
+        self._imu.visible = not view.slab
         T_map_lidar = result.T_map_imu @ result.state.T_imu_lidar
         cloud, shown = result.cloud, shown_of(len(result.cloud))
         another = previous is None or previous.index != result.index or previous.stamp_ns != result.stamp_ns

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 import viser
 
+from app.export.box import Box
 from app.server.protocol import Command, Snapshot
 from app.slam import lie
 from app.slam.types import F64
@@ -34,7 +35,8 @@ class View:
         colour_by: a name of `app.ui.colours.COLOUR_BY`. point_size: m. follow: keep the sensor in the middle.
         ceilings: show points above the ceiling too. map, scan, wedge, plane, path, grid, notes: whether shown.
         light: a light background. tuning: the map stands back behind the present scan.
-        ends: of the colour map, where the user chose them.
+        ends: of the colour map, where the user chose them. clip: outside which points are hidden.
+        slab: m, how wide the profile along the walk is that is shown instead of the map; 0: none is.
     """
 
     colour_by: str = LOOK
@@ -51,6 +53,8 @@ class View:
     light: bool = False
     tuning: bool = False
     ends: Limits | None = None
+    clip: Box | None = None
+    slab: float = 0.0
 
     @property
     def map_point_size(self) -> float:

@@ -25,6 +25,7 @@ from app.ui.appearance import AppearancePanel, apply_theme
 from app.ui.brush import BrushPanel
 from app.ui.calibration import CalibrationPanel
 from app.ui.camera import CameraPanel
+from app.ui.clip import ClipPanel
 from app.ui.compare import ComparePanel, Sides
 from app.ui.files import FilesPanel, RecentPanel
 from app.ui.georeference import GeoreferencePanel
@@ -122,6 +123,8 @@ class Workbench:
             self._camera = CameraPanel(page, self._scene.framing, self._appearance.look_freely)
             with gui.add_folder("Measure"):
                 self._measure = MeasurePanel(page)
+            with gui.add_folder("Clip and section", expand_by_default=False):
+                self._clip = ClipPanel(page, self._measure, self._camera, self._scene.sample, files.ask_where)
         with tabs.add_tab("Recording", viser.Icon.STETHOSCOPE):
             files.add_buttons()
             self._live = LivePanel(gui)
@@ -140,7 +143,7 @@ class Workbench:
         self._panels = (
             self._transport, self._breakpoints, self._notices, self._header, self._recent, self._timeline,
             self._readouts, self._doctor, self._calibration, self._live, self._files, self._camera,
-            self._tune, self._georeference,
+            self._tune, self._georeference, self._clip,
         )  # fmt: skip
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
@@ -176,7 +179,7 @@ class Workbench:
         """Bring the page up to `current`: the scene first, since changed parameters show there."""
         view = self._study.seen(self._loops.seen(self._appearance.view))
         self._compare.draw(current, view)
-        view = self._compare.seen(view)
+        view = self._clip.seen(current, self._compare.seen(view))
         self._draw_scene(current, view)
         self._parameters.draw(self._sides.tuned(current))
         self._loops.draw(current, view)

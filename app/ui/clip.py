@@ -1,0 +1,258 @@
+"""The clip box with its handles, sections that are cut by two clicks, and the profile along the walk."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import viser
+
+from app.export.box import Box
+from app.export.section import strides
+from app.mapping.session_file import Clip, Spot
+from app.server.protocol import SetClip, Snapshot
+from app.slam import lie
+from app.slam.errors import HemislamError
+from app.slam.types import F64
+from app.ui.camera import FIT, CameraPanel
+from app.ui.clip_maths import FACES, along_line, carried, edges, handle, pulled
+from app.ui.geometry import wxyz
+from app.ui.html import panel
+from app.ui.measure import MeasurePanel
+from app.ui.nodes import add_lines
+from app.ui.widgets import ROOT, Changes, Page, View, by_user, notify_error, poses_of, show
+
+_NODE: Final = f"{ROOT}/clip"
+_COLOUR: Final = (255, 205, 80)
+_HANDLE_PX: Final = 70.0
+_CUT: Final = "Cut by two clicks"
+_MIDDLE: Final = -1
+"""Number of the handle in the middle; the others are those of `FACES`."""
+
+
+class ClipPanel:
+    """Widgets in the caller's container; the box and its handles in the scene, below the map's node.
+
+    Args:
+        measure: takes the clicks by which a section is cut. around: gives (n, 3) some points of the map.
+        ask_where: asks where to save a format.
+    """
+
+    def __init__(
+        self,
+        page: Page,
+        measure: MeasurePanel,
+        camera: CameraPanel,
+        around: Callable[[], F64],
+        ask_where: Callable[[viser.ClientHandle, str], None],
+    ) -> None:
+        gui = page.gui
+        self._page, self._measure, self._camera, self._around = page, measure, camera, around
+        self._changes, self._scene_changes = Changes(), Changes()
+        self._shown: Clip | None = None  # what the widgets were last set to
+        self._dragged: Box | None = None  # what a handle has made of the box, until the session has it
+        self._held = False
+        self._lines: viser.LineSegmentsHandle | None = None
+        self._handles: dict[int, viser.TransformControlsHandle] = {}
+        self._first: Spot | None = None
+        self._on = gui.add_checkbox("clip box", False, hint="Hide what is outside. Exports can be limited to it.")
+        self._fields = gui.add_folder(None, visible=False)
+        with self._fields:
+            self._middle = gui.add_vector3("middle (m)", (0.0, 0.0, 0.0), step=0.05)
+            self._size = gui.add_vector3("size (m)", (1.0, 1.0, 1.0), min=(0.05, 0.05, 0.05), step=0.05)
+            self._turn = gui.add_number("turn (°)", 0.0, min=-360.0, max=360.0, step=1.0)
+            self._pull = gui.add_checkbox("handles", True, hint="Arrows move the sides, the one in the middle the box.")
+            front = gui.add_button("Look from its front", icon=viser.Icon.VIEWPORT_NARROW, color="gray")
+            save = gui.add_button("Save as a section…", icon=viser.Icon.DEVICE_FLOPPY, color="gray")
+            whole = gui.add_button("Around the whole map", icon=viser.Icon.MAXIMIZE, color="gray")
+        self._slab = gui.add_number(
+            "slab (m)", 1.0, min=0.05, max=100.0, step=0.05, hint="How thick a cut section or the profile is."
+        )
+        self._cut = gui.add_button(
+            _CUT, icon=viser.Icon.SLICE, color="gray", hint="Click two points: the clip box becomes the slab between."
+        )
+        self._asked = gui.add_html("", visible=False)
+        self._unrolled = gui.add_checkbox(
+            "profile along the walk", False, hint="Chainage to the right, height up, in place of the map."
+        )
+        self._save_profile = gui.add_button(
+            "Save the profile…", icon=viser.Icon.DEVICE_FLOPPY, color="gray", visible=False
+        )
+        for control in (self._middle, self._size, self._turn):
+            control.on_update(by_user(lambda _, client: self._typed(client)))
+        self._on.on_update(by_user(lambda on, client: self._switch(on, client)))
+        self._slab.on_update(by_user(lambda slab, _: self._send(slab=slab)))
+        self._unrolled.on_update(by_user(self._unroll))
+        whole.on_click(by_user(lambda _, client: self._send(box=self._whole())))
+        front.on_click(by_user(lambda _, client: self.look(client)))
+        save.on_click(by_user(lambda _, client: ask_where(client, "section")))
+        self._save_profile.on_click(by_user(lambda _, client: ask_where(client, "profile")))
+        self._cut.on_click(by_user(lambda _, client: self._begin_cut(client)))
+
+    def seen(self, current: Snapshot, view: View) -> View:
+        """The view with the map clipped, or with a profile in its place."""
+        view = replace(view, clip=current.clip.hiding)
+        if not current.clip.unrolled:
+            return view
+        view = replace(view, map=False, scan=False, wedge=False, plane=False, path=False, grid=False, notes=False)
+        return replace(view, slab=current.clip.slab)
+
+    def draw(self, current: Snapshot) -> None:
+        """Show what the session keeps; while a handle is held, the box as it is then."""
+        clip = current.clip
+        if clip != self._shown:
+            self._shown, self._dragged = clip, None
+            self._show(clip)
+        if self._first is not None and not self._measure.picking:
+            self._first = None
+        cutting = self._measure.picking and self._measure.taker == self._picked
+        self._asked.visible = cutting
+        self._asked.content = panel("note", f"Click the {'first' if self._first is None else 'other'} end on the map.")
+        box = None if clip.unrolled else clip.hiding
+        if self._scene_changes(box, self._dragged, self._held, self._pull.value):
+            self._draw_scene(box)
+
+    # --- what is chosen --------------------------------------------------------------------------
+    def _send(self, **changes: Any) -> None:
+        self._page.send(SetClip(replace(self._page.snapshot().clip, **changes)))
+
+    def _switch(self, on: bool, client: viser.ClientHandle) -> None:
+        box = self._page.snapshot().clip.box
+        try:
+            self._send(on=on, box=box or self._whole())
+        except HemislamError as error:
+            show(self._on, False)
+            notify_error(client, error)
+
+    def _whole(self) -> Box:
+        """Around all of the map but a few far points. Raises HemislamError: there is none yet."""
+        points = self._around()
+        if not len(points):
+            raise HemislamError("There is no map yet that could be clipped; play the recording first.")
+        low, high = np.percentile(points, (0.5, 99.5), axis=0)
+        return Box.around((low + high) / 2, np.maximum(high - low, 1.0) + 0.1)
+
+    def _typed(self, client: viser.ClientHandle) -> None:
+        try:
+            self._send(box=Box.around(self._middle.value, self._size.value, self._turn.value))
+        except HemislamError as error:
+            notify_error(client, error)
+
+    def _show(self, clip: Clip) -> None:
+        show(self._on, clip.on)
+        show(self._unrolled, clip.unrolled)
+        show(self._slab, clip.slab)
+        self._fields.visible, self._save_profile.visible = clip.on, clip.unrolled
+        if clip.box is not None:
+            show(self._middle, tuple(clip.box.middle.round(3).tolist()))
+            show(self._size, tuple(clip.box.size.round(3).tolist()))
+            show(self._turn, round(clip.box.turn, 2))
+
+    def look(self, client: viser.ClientHandle) -> None:
+        """Look at the box from its front, without perspective."""
+        if (box := self._page.snapshot().clip.box) is not None:
+            self._face(client, box)
+
+    def _face(self, client: viser.ClientHandle, box: Box) -> None:
+        self._camera.face(client, box.middle, (box.size[0], box.size[2]), box.axes)
+
+    def _unroll(self, on: bool, client: viser.ClientHandle) -> None:
+        """Show the profile and look at all of it, or at the whole map again."""
+        trajectory, points = self._page.snapshot().trajectory, self._around()
+        try:
+            path = strides(trajectory[:, :2] if trajectory is not None else np.empty((0, 2)))
+        except HemislamError as error:
+            show(self._unrolled, False)
+            notify_error(client, error)
+            return
+        self._send(unrolled=on)
+        if on:
+            length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+            low, high = np.percentile(points[:, 2], (1, 99)) if len(points) else (0.0, 1.0)
+            self._camera.face(client, np.array([length / 2, 0.0, (low + high) / 2]), (length, high - low))
+        else:
+            self._camera.look(FIT, client)
+
+    # --- a section by two clicks -----------------------------------------------------------------
+    def _begin_cut(self, client: viser.ClientHandle) -> None:
+        self._first, self._client = None, client
+        self._measure.pick(self._picked)
+
+    def _picked(self, spot: Spot, current: Snapshot) -> None:
+        if self._first is None:
+            self._measure.pick(self._picked)
+            self._first = spot
+            return
+        poses = poses_of(current)
+        first, second = (
+            poses[one.keyframe][:3, :3] @ one.at + poses[one.keyframe][:3, 3] for one in (self._first, spot)
+        )
+        self._first = None
+        whole = self._whole()
+        box = along_line(first, second, current.clip.slab, whole.low[2], whole.high[2])
+        if box is None:
+            notify_error(self._client, "The two points are one above the other; click two that are apart.")
+            return
+        self._send(box=box, on=True)
+        self._face(self._client, box)
+
+    # --- in the scene ----------------------------------------------------------------------------
+    def _draw_scene(self, box: Box | None) -> None:
+        scene = self._page.scene
+        if box is None or not self._pull.value:
+            for gizmo in self._handles.values():
+                gizmo.remove()
+            self._handles.clear()
+        if box is None:
+            if self._lines is not None:
+                self._lines.remove()
+                self._lines = None
+            return
+        lines = edges(self._dragged or box)
+        if self._lines is None:
+            self._lines = add_lines(scene, f"{_NODE}/edges", lines, _COLOUR, 2.0)
+        else:
+            self._lines.points = lines
+        if self._pull.value and not self._held:
+            self._place_handles(box)
+
+    def _place_handles(self, box: Box) -> None:
+        for number in (_MIDDLE, *range(len(FACES))):
+            R, place = (box.axes, box.middle) if number == _MIDDLE else handle(box, *FACES[number])
+            if number in self._handles:
+                self._handles[number].wxyz, self._handles[number].position = wxyz(R), place
+                continue
+            axis = 2 if number == _MIDDLE else FACES[number][0]
+            gizmo = self._page.scene.add_transform_controls(
+                f"{_NODE}/handle/{number}",
+                scale=_HANDLE_PX,
+                fixed=True,
+                active_axes=tuple((k == axis) != (number == _MIDDLE) for k in range(3)),
+                disable_rotations=number != _MIDDLE,
+                disable_axes=number == _MIDDLE,
+                depth_test=False,
+                wxyz=wxyz(R),
+                position=place,
+            )
+            gizmo.on_update(self._noting(number))
+            self._handles[number] = gizmo
+
+    def _noting(self, number: int) -> Callable[[Any], Any]:
+        """A callback for a handle. A coroutine, since viser keeps their order."""
+
+        async def moved(event: viser.TransformControlsEvent) -> None:
+            box = self._page.snapshot().clip.box
+            if box is None or event.client is None:
+                return
+            gizmo = event.target
+            place = np.array(gizmo.position)
+            if number == _MIDDLE:
+                w, x, y, z = np.asarray(gizmo.wxyz, np.float64)
+                box = carried(box, lie.matrix(np.array([x, y, z, w])), place)
+            else:
+                box = pulled(box, *FACES[number], place)
+            self._dragged, self._held = box, event.phase != "end"
+            if not self._held:
+                self._send(box=box)
+
+        return moved
