@@ -1,0 +1,222 @@
+"""The clip box: its handles, its sections, and what of the map is shown.
+
+Tests app/ui/clip.py, app/ui/clip_maths.py, app/ui/profile.py.
+"""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import viser
+
+from app.export.box import Box
+from app.mapping.session_file import Clip, Spot
+from app.server.protocol import Chunk, Command, SetClip, Snapshot
+from app.slam import lie
+from app.slam.types import NON_GROUND
+from app.ui.chunks import MapChunks
+from app.ui.clip import ClipPanel
+from app.ui.clip_maths import FACES, along_line, carried, edges, handle, pulled
+from app.ui.measure import MeasurePanel
+from app.ui.measure_maths import meet
+from app.ui.profile import unrolled
+from app.ui.widgets import View
+from tests.ui.conftest import Wire, clouds, page_of
+
+BOX = Box.around((4.0, -2.0, 1.0), (6.0, 2.0, 3.0), 30.0)
+RANDOM = np.random.default_rng(5)
+
+
+# --- handles -------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("axis", "sign"), FACES)
+def test_a_side_follows_its_handle_and_all_others_stay(axis: int, sign: int) -> None:
+    R, place = handle(BOX, axis, sign)
+    outwards = R[:, axis]
+    assert np.linalg.det(R) == pytest.approx(1.0) and outwards @ (place - BOX.middle) > 0
+    wider = pulled(BOX, axis, sign, place + 0.5 * outwards)
+    expected = BOX.size.copy()
+    expected[axis] += 0.5
+    np.testing.assert_allclose(wider.size, expected)
+    for other in FACES:
+        moved = handle(wider, *other)[1] - handle(BOX, *other)[1]
+        along = moved @ BOX.axes[:, other[0]]
+        assert along == pytest.approx(0.5 * sign if other == (axis, sign) else 0.0, abs=1e-9)
+
+
+def test_a_side_that_is_pulled_through_the_box_stops_before_the_other() -> None:
+    R, place = handle(BOX, 0, 1)
+    thin = pulled(BOX, 0, 1, place - 20.0 * R[:, 0])
+    assert thin.size[0] == pytest.approx(0.05)
+    np.testing.assert_allclose(handle(thin, 0, -1)[1], handle(BOX, 0, -1)[1])
+
+
+def test_the_handle_in_the_middle_moves_and_turns_the_box() -> None:
+    moved = carried(BOX, lie.from_rpy_degrees((0.0, 0.0, -50.0)), np.array([1.0, 2.0, 3.0]))
+    assert moved.turn == pytest.approx(-50.0)
+    np.testing.assert_allclose(moved.middle, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(moved.size, BOX.size)
+
+
+def test_the_edges_of_a_box_are_as_long_as_its_sides_and_hold_it() -> None:
+    lines = edges(BOX).astype(np.float64)
+    lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
+    np.testing.assert_allclose(np.sort(lengths), np.sort(np.repeat(BOX.size, 4)), rtol=1e-5)
+    np.testing.assert_allclose(np.abs(BOX.own(lines.reshape(-1, 3))), np.tile(BOX.size / 2, (24, 1)), atol=1e-5)
+
+
+def test_a_slab_between_two_clicks_has_them_at_its_ends() -> None:
+    first, second = np.array([1.0, 2.0, 0.3]), np.array([4.0, 6.0, 1.9])
+    box = along_line(first, second, 0.4, -1.0, 5.0)
+    assert box is not None
+    np.testing.assert_allclose(box.own(np.stack([first, second]))[:, :2], [[-2.5, 0.0], [2.5, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(box.size, [5.0, 0.4, 6.0])
+    assert along_line(first, [*first, 0.0, 0.0, 2.0], 0.4, -1.0, 5.0) is None
+
+
+# --- what is shown -------------------------------------------------------------------------------
+def chunk(index: int, points: np.ndarray) -> Chunk:
+    n = len(points)
+    labels, ring = np.full(n, NON_GROUND, np.uint8), np.zeros(n, np.uint16)
+    return Chunk(index, index, index, points.astype(np.float32), labels, np.zeros(n, np.float32), ring, np.eye(4))
+
+
+def house() -> tuple[tuple[Chunk, ...], np.ndarray]:
+    """Three keyframes 10 m apart, each with points within 4 m."""
+    poses = np.stack(
+        [lie.transform(lie.from_rpy_degrees((0.0, 0.0, 40.0 * k)), np.array([10.0 * k, 0, 0])) for k in range(3)]
+    )
+    return tuple(chunk(k, RANDOM.uniform(-4, 4, (500, 3))) for k in range(3)), poses
+
+
+def in_map(chunks: tuple[Chunk, ...], poses: np.ndarray) -> np.ndarray:
+    return np.concatenate([one.points @ T[:3, :3].T + T[:3, 3] for one, T in zip(chunks, poses, strict=True)])
+
+
+def test_only_what_is_in_the_box_is_drawn_and_only_cut_keyframes_are_sent_again(
+    server: viser.ViserServer, wire: Wire
+) -> None:
+    chunks, poses = house()
+    drawn = MapChunks(server.scene, "/map/keyframes")
+    drawn.draw(chunks, poses, View(ceilings=True))
+    wire.clear()
+    box = Box((-6.0, -6.0, -6.0), (9.0, 6.0, 6.0), 0.0)  # all of the first, a part of the second, nothing of the last
+    drawn.draw(chunks, poses, View(ceilings=True, clip=box))
+    assert wire.nodes("PointCloudMessage") == ["/map/keyframes/1"]
+    assert "/map/keyframes/2" not in clouds(server)
+    points = in_map(chunks, poses)
+    assert drawn.points == box.holds(points).sum() > 500
+    shown = np.concatenate([at for at, _ in drawn.shown()])
+    np.testing.assert_allclose(shown, points[box.holds(points)], atol=1e-5)
+    drawn.draw(chunks, poses, View(ceilings=True))
+    assert drawn.points == 1500
+
+
+def test_a_loop_that_moves_the_map_through_the_box_shows_other_points(server: viser.ViserServer) -> None:
+    chunks, poses = house()
+    drawn, box = MapChunks(server.scene, "/map/keyframes"), Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
+    drawn.draw(chunks, poses, View(ceilings=True, clip=box))
+    moved = poses.copy()
+    moved[:, 0, 3] -= 10.0
+    drawn.draw(chunks, moved, View(ceilings=True, clip=box))
+    assert drawn.points == box.holds(in_map(chunks, moved)).sum()
+
+
+def test_a_click_takes_no_point_that_the_box_hides() -> None:
+    near, far = np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, 0.0]])
+    chunks, poses = (chunk(0, np.concatenate([near, far])),), np.eye(4)[None]
+    from_above = np.array([0.0, 0.0, 10.0]), np.array([0.0, 0.0, -1.0]), 0.01
+    hit = meet(chunks, poses, *from_above, ceilings=True)
+    below = meet(chunks, poses, *from_above, ceilings=True, clip=Box((-1.0, -1, -1), (1.0, 1, 1)))
+    assert hit is not None and below is not None and (hit.at[2], below.at[2]) == (3.0, 0.0)
+
+
+def test_an_unrolled_path_puts_what_is_left_of_it_behind_it() -> None:
+    path = np.array([[0.0, 0.0], [0.0, 5.0], [5.0, 5.0]])
+    points = np.array([[-0.3, 2.0, 1.0], [0.3, 2.0, 1.5], [2.0, 5.3, 0.5], [2.0, 9.0, 0.0]])
+    colours = np.arange(12, dtype=np.uint8).reshape(4, 3)
+    found, own = unrolled([(points, colours)], path, 1.0)
+    np.testing.assert_allclose(found, [[2.0, 0.3, 1.0], [2.0, -0.3, 1.5], [7.0, 0.3, 0.5]], atol=1e-12)
+    np.testing.assert_array_equal(own, colours[:3])
+
+
+# --- the panel -----------------------------------------------------------------------------------
+class Bench:
+    """A panel on the house, and an engine that does what it is told."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.chunks, self.poses = house()
+        self.now = Snapshot(chunks=self.chunks, keyframe_poses=self.poses, trajectory=self.poses[:, :3, 3])
+        self.asked: list[str] = []
+        self.faced: list[Any] = []
+        page = page_of(server, self.send, lambda: self.now)
+        self.measure = MeasurePanel(page)
+        camera = SimpleNamespace(face=lambda *args: self.faced.append(args), look=lambda *args: self.faced.append(args))
+        self.panel = ClipPanel(
+            page,
+            self.measure,
+            camera,  # type: ignore[arg-type]
+            lambda: in_map(self.chunks, self.poses),
+            lambda client, format: self.asked.append(format),
+        )
+        self.client = SimpleNamespace(add_notification=lambda *args, **_: self.asked.append(str(args[1])))
+
+    def send(self, command: Command) -> None:
+        assert isinstance(command, SetClip)
+        self.now = replace(self.now, clip=command.clip)
+
+    def draw(self) -> None:
+        self.panel.draw(self.now)
+
+
+def test_switched_on_it_holds_the_map_and_shows_its_handles(server: viser.ViserServer, wire: Wire) -> None:
+    bench = Bench(server)
+    bench.panel._switch(True, bench.client)  # type: ignore[arg-type]
+    bench.draw()
+    box = bench.now.clip.hiding
+    assert box is not None and box.holds(in_map(bench.chunks, bench.poses)).mean() > 0.9
+    assert len(wire.nodes("TransformControlsMessage")) == 7 and bench.panel._fields.visible
+    assert bench.panel.seen(bench.now, View()).clip == box
+    bench.now = replace(bench.now, clip=replace(bench.now.clip, on=False))
+    bench.draw()
+    assert bench.panel.seen(bench.now, View()).clip is None and not bench.panel._handles
+    bench.now = replace(bench.now, clip=Clip(BOX, on=True))
+    bench.draw()
+    np.testing.assert_allclose(bench.panel._middle.value, BOX.middle)
+
+
+def test_two_clicks_cut_a_slab_and_the_camera_looks_at_its_front(server: viser.ViserServer) -> None:
+    bench = Bench(server)
+    bench.now = replace(bench.now, clip=Clip(slab=0.5))
+    bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
+    assert bench.measure.picking
+    for keyframe in (0, 2):
+        taker = bench.measure.taker
+        assert taker is not None
+        bench.measure.begin("stop")  # as the measures do with a click that they give away
+        taker(Spot(keyframe, (0.0, 0.0, 0.0)), bench.now)
+    box = bench.now.clip.hiding
+    assert box is not None
+    np.testing.assert_allclose(box.middle[:2], [10.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(box.size[:2], [20.0, 0.5])
+    assert len(bench.faced) == 1 and not bench.measure.picking
+
+
+def test_a_profile_stands_in_the_place_of_the_map(server: viser.ViserServer) -> None:
+    bench = Bench(server)
+    bench.panel._unroll(True, bench.client)  # type: ignore[arg-type]
+    view = bench.panel.seen(bench.now, View())
+    assert view.slab == 1.0 and not view.map and not view.path
+    ((_, middle, size),) = bench.faced
+    assert middle[0] == pytest.approx(10.0) and size[0] == pytest.approx(20.0)
+
+
+def test_before_there_is_a_map_nothing_is_clipped_and_that_is_said(server: viser.ViserServer) -> None:
+    bench = Bench(server)
+    bench.chunks, bench.poses = (), np.empty((0, 4, 4))
+    bench.panel._around = lambda: np.empty((0, 3))
+    bench.now = Snapshot()
+    bench.panel._switch(True, bench.client)  # type: ignore[arg-type]
+    bench.panel._unroll(True, bench.client)  # type: ignore[arg-type]
+    assert bench.now.clip == Clip() and "no map yet" in bench.asked[0] and "walked path" in bench.asked[1]
