@@ -9,13 +9,13 @@ import viser
 
 from app.georeference.reference import GeoReference
 from app.mapping.session_file import Measure, Spot
-from app.server.protocol import DropMeasure, KeepMeasure, Snapshot
+from app.server.protocol import DropMeasure, KeepMeasure, RenameMeasure, Snapshot
 from app.slam.types import F64
 from app.ui.html import panel
 from app.ui.measure_maths import Numbers, as_csv, meet, numbers, places, words
 from app.ui.nodes import add_exact_points, add_lines, segments
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of
+from app.ui.widgets import ROOT, Changes, Page, View, by_user, dialog, poses_of
 
 POINT, DISTANCE, ANGLE, STOP, PICK = "point", "distance", "angle", "stop", "pick"
 _SPOTS: Final = {POINT: 1, DISTANCE: 2, ANGLE: 3}
@@ -126,6 +126,20 @@ class MeasurePanel:
         for place, (measure, *_) in enumerate(self._measured):
             if word == f"delete {place} {measure.name}":
                 self._page.send(DropMeasure(measure))
+            elif word == f"rename {place} {measure.name}":
+                self._ask_name(measure, client)
+
+    def _ask_name(self, measure: Measure, client: viser.ClientHandle) -> None:
+        with dialog(client, "Rename measure") as close:
+            name = client.gui.add_text("name", measure.name)
+            keep = client.gui.add_button("Rename", icon=viser.Icon.CHECK)
+
+        def renamed(_: object) -> None:
+            if name.value.strip():
+                self._page.send(RenameMeasure(measure, name.value.strip()))
+                close()
+
+        keep.on_click(renamed)
 
     def _download(self, client: viser.ClientHandle) -> None:
         recording = self._page.snapshot().recording

@@ -19,10 +19,12 @@ from test_rewind import SAMPLE, Bench, open_whole, page
 from typer.testing import CliRunner
 
 from app.__main__ import cli
+from app.export.box import Box
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session import Session
 from app.mapping.session_file import (
     SUFFIX,
+    Clip,
     Measure,
     Note,
     Opened,
@@ -45,8 +47,10 @@ from app.server.protocol import (
     OpenRecording,
     Pause,
     Play,
+    RenameMeasure,
     Save,
     Seek,
+    SetClip,
     SetParams,
     SetSpeed,
     Snapshot,
@@ -179,6 +183,7 @@ class Kept(Bench):
 
 
 VIEW = ((1.0, 2.0, 30.5), (0.0, 0.0, 0.0))
+CLIP = Clip(Box((-1.0, -2.0, 0.25), (3.0, 2.0, 2.5), 30.0), on=True, slab=0.5)
 DOOR = Measure("door", (Spot(1, (0.5, 0.25, -1.0)), Spot(2, (0.5, 0.25, 1.125))))
 
 
@@ -187,7 +192,8 @@ def walk_about(bench: Kept) -> Snapshot:
     bench.do(Seek(30), SetParams({"ground.sigma": 0.02}), Seek(60), Seek(45), SetParams({"scan.voxel_size": 0.6}))
     bench.do(Seek(80), Seek(70), AddNote("a turn"), KeepView(VIEW))
     wrong = Measure("wrong", DOOR.spots[:1])
-    bench.do(KeepMeasure(wrong), KeepMeasure(DOOR), DropMeasure(wrong))
+    bench.do(KeepMeasure(wrong), KeepMeasure(replace(DOOR, name="")), DropMeasure(wrong), SetClip(CLIP))
+    bench.do(RenameMeasure(replace(DOOR, name=""), DOOR.name))
     return bench.do(StepFrame(2), SetParams({"ground.alpha": 35.0}))
 
 
@@ -202,6 +208,7 @@ def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path)
     assert again.notes == there.notes == (Note(70, "a turn"),)
     assert again.views == there.views == (VIEW,)
     assert again.measures == there.measures == (DOOR,)
+    assert again.clip == there.clip == CLIP
     assert again.result is not None and there.result is not None
     np.testing.assert_array_equal(again.result.cloud.labels, there.result.cloud.labels, "relabelled by the last wish")
     third = Kept(tmp_path, second.session_file)  # the one reopened is kept as well
