@@ -130,7 +130,7 @@ def info(
 
     params = params_for(recording)
     options.say_calibrated(recording)
-    with options.progress_bar("Reading", total=1.0, bar_format="{desc}: {percentage:3.0f}% |{bar}|") as show:
+    with options.progress_bar("Reading") as show:
         findings = examine(recording, params, progress=show)
     width = max((len(finding.subject) for finding in findings), default=0)
     for finding in findings:
@@ -183,7 +183,7 @@ def simulate(
     imperfect: options.Imperfect = False,
     errors: Annotated[
         list[str] | None,
-        typer.Option("--error", metavar="NAME=SIZE", help="Size of one imperfection; 0: none. Repeatable."),
+        typer.Option("--error", metavar="NAME=VALUE", help="Size of one imperfection; 0: none. Repeatable."),
     ] = None,
     gnss: Annotated[
         list[str] | None,

@@ -61,7 +61,7 @@ def section(results: dict[str, Any]) -> str:
                 cells = " | ".join("–" if value is None else format(value, form) for value in values)
                 lines.append(f"| {name} | {label} | {cells} |")
                 name = ""
-    lines += ["", paper.NOT_COMPARABLE, "", "What it says of the whole method (`report.md` tells of its parts):", ""]
+    lines += ["", paper.NOT_COMPARABLE, "", "What it says of the whole method (`report.md` has its parts):", ""]
     lines += [f"- {finding}" for finding in results["findings"] if finding.startswith("Ours ")]
     return "\n".join(
         [

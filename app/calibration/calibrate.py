@@ -29,17 +29,18 @@ SURE = 3.0
 APART_ROTATION, APART_PLACE = np.radians(3.0), 0.1
 """rad, m: a mounting that is off by more spoils a map."""
 
-Progress = Callable[[str, float], None]
+Report = Callable[[float], None]
+"""Is called with the fraction done, 0-1."""
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a recording tells of its sensors. `params` are those that it was opened with.
+    """What a recording shows about its sensors. `params` are those that it was opened with.
 
     Attributes:
         recording: the file. params: what was taken so far. lasted_s: the part that was used.
         turned, moved: the fits. down: (3,) unit direction of gravity in the LiDAR frame at the begin.
-        residuals: m, RMS of the scans on the map without the IMU, and with it.
+        residuals: m, RMS of the scans to the map without the IMU, and with it.
         gyro_noise, accel_noise: of the IMU in most seconds, vibrations included.
     """
 
@@ -70,7 +71,7 @@ class Calibration:
 
     @property
     def observed(self) -> dict[str, bool]:
-        """Whether the motion told rotation, translation and offset."""
+        """Whether the motion determined rotation, translation and offset."""
         s = self.sigmas
         rotation = bool((s["rotation"] < LARGEST_ROTATION).all())
         return {
@@ -80,7 +81,7 @@ class Calibration:
         }
 
     def found(self) -> dict[str, Any]:
-        """Parameters that the recording tells, by their dotted names."""
+        """Parameters that the recording determines, by dotted name."""
         observed = self.observed
         values: dict[str, Any] = {}
         if observed["rotation"]:
@@ -99,12 +100,12 @@ class Calibration:
         return float(np.linalg.norm(lie.log(given.T @ self.turned.R_imu_lidar)))
 
     def contradiction(self) -> str:
-        """What is wrong with the mounting or the clock taken so far, in a sentence; "" if nothing is, or if it cannot
-        be told."""
+        """What is wrong with the mounting or the clock taken so far, in a sentence; "" if nothing is, or if
+        that cannot be determined."""
         found, parts = self.found(), []
         if "sensor.rotation" in found and self.apart > APART_ROTATION:
             angles = ", ".join(f"{round(angle)}°" for angle in self.rotation)
-            parts.append(f"the LiDAR seems to be turned by {angles} on the IMU")
+            parts.append(f"the LiDAR seems to be rotated by {angles} on the IMU")
         off = self.moved.p_imu_lidar - self.params.sensor.translation
         if "sensor.translation" in found and np.linalg.norm(off) > APART_PLACE:
             place = ", ".join(f"{x:.2f}" for x in self.moved.p_imu_lidar)
@@ -116,34 +117,34 @@ class Calibration:
 
 
 def calibrate(
-    path: Path, params: Params, duration_s: float = LONGEST_S, progress: Progress = lambda step, fraction: None
+    path: Path, params: Params, duration_s: float = LONGEST_S, progress: Report = lambda fraction: None
 ) -> Calibration:
     """Find the mounting, the clock offset and the biases from the recording alone; `sensor.rotation` and
     `sensor.translation` are not used.
 
     Args:
-        duration_s: only so much of it. progress: called with what is done and the fraction, 0-1.
+        duration_s: only so much of it. progress: called with the fraction done, 0-1.
 
     Raises:
         HemislamError: the recording cannot be read, or is too short.
     """
     with open_recording(path, params) as recording:
-        walk = read_walk(recording, params, duration_s, lambda done: progress("reading", READING * done))
+        walk = read_walk(recording, params, duration_s, lambda done: progress(READING * done))
     try:
         return calibrate_walk(path, params, walk, progress)
     except np.linalg.LinAlgError as error:
-        raise HemislamError(f"{path} cannot be calibrated ({error}); walk slowly where there are walls.") from None
+        raise HemislamError(
+            f"{path} cannot be calibrated ({error}); record again, walking slowly near walls."
+        ) from None
 
 
-def calibrate_walk(
-    path: Path, params: Params, walk: Walk, progress: Progress = lambda step, fraction: None
-) -> Calibration:
+def calibrate_walk(path: Path, params: Params, walk: Walk, progress: Report = lambda fraction: None) -> Calibration:
     """As `calibrate`, of what was read already."""
     inertial = Inertial(walk.seconds(walk.imu.stamps_ns), walk.imu.gyro, walk.imu.accel)
     given = lie.from_rpy_degrees(params.sensor.rotation), np.array(params.sensor.translation, np.float64)
 
-    def report(number: int) -> Callable[[float], None]:
-        return lambda done: progress("odometry", READING + ROUND * (number + done))
+    def report(number: int) -> Report:
+        return lambda done: progress(READING + ROUND * (number + done))
 
     way = track(walk, None, report(0))
     alone = way.residual

@@ -1,7 +1,7 @@
 """The path of the LiDAR by its scans alone: each is laid onto the map of those before it.
 
 Between two scans the LiDAR turns and moves at a constant rate, up to unknown accelerations. Each point is compared with
-the map where the LiDAR was at its own time, so a scan tells its rates and not only its pose (continuous-time ICP,
+the map where the LiDAR was at its own time, so a scan determines its rates and not only its pose (continuous-time ICP,
 Dellenbach et al. 2022, "CT-ICP").
 """
 
@@ -82,7 +82,7 @@ def track(walk: Walk, guide: Guide | None = None, progress: Callable[[float], No
     """Lay each scan onto the local map of those before it.
 
     Args:
-        guide: how the LiDAR turns and sways between two scans; None: at constant rates, up to what the scans tell.
+        guide: how the LiDAR turns and sways between two scans; None: at constant rates, up to what the scans show.
     """
     params, mapping = FilterParams(), MapParams()
     local_map = LocalMap(mapping)

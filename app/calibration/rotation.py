@@ -16,7 +16,7 @@ LATEST_S, STEP_S = 0.5, 0.01
 FAR = np.radians(1.5)
 """Turns that differ by more between two scans are taken as errors of the odometry."""
 WIDEST = np.array([3.0, 3.0, 3.0, 1.0, 1.0, 1.0, 1.0])
-"""Standard deviations of rotation (rad), offset (s) and bias (rad/s) where nothing tells them."""
+"""Standard deviations of rotation (rad), offset (s) and bias (rad/s) where nothing determines them."""
 STEPS, SLIPPED = 20, 3.0
 """Most steps of the fit. Windows whose differences are so many times the usual ones are errors of the odometry."""
 WINDOW = 10

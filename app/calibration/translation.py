@@ -20,7 +20,7 @@ BIAS, TILT = 0.3, 0.02
 """m/s²: how large an accelerometer's bias may be; and how much gravity may seem to turn from a window to the next, as
 the odometry drifts."""
 WIDEST = np.array([10.0, 10.0, 10.0, BIAS, BIAS, BIAS])
-"""Standard deviations of position (m) and bias (m/s²) where nothing tells them."""
+"""Standard deviations of position (m) and bias (m/s²) where nothing determines them."""
 HUBER = 1.5
 """Windows whose residuals are so many times the usual count for less."""
 

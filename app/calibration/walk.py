@@ -14,7 +14,7 @@ from app.slam.types import F64, I64, ImuSamples, Scan
 from app.slam.voxel import VoxelGrid
 
 LONGEST_S = 120.0
-"""More of a recording costs time and tells little more."""
+"""More of a recording costs time and adds little."""
 LEAST_SCANS = 50
 REST_S = 1.0
 VOXEL = 0.3
@@ -71,8 +71,8 @@ def read_walk(
     usable = [after for before, after in pairwise(scans) if after.end_ns > before.end_ns and len(after)]
     if len(usable) < LEAST_SCANS or len(stamps) < 10:
         raise HemislamError(
-            f"{recording.path} has {len(usable)} usable scans and {len(stamps)} IMU samples; to calibrate it takes"
-            f" {LEAST_SCANS} scans at least, better 30 s of lively motion."
+            f"{recording.path} has {len(usable)} usable scans and {len(stamps)} IMU samples; calibration needs"
+            f" at least {LEAST_SCANS} scans, better 30 s of lively motion."
         )
     imu = _samples(stamps, values)
     return Walk(tuple(scan for scan in usable if scan.end_ns >= _sets_off_ns(imu)), imu)

@@ -10,6 +10,7 @@ from app.calibration.calibrate import Calibration
 from app.calibration.inertial import Noise
 from app.sensors.presets import CALIBRATED, sidecar
 from app.slam.errors import HemislamError
+from app.slam.params import nested
 from app.slam.user_text import read_yaml
 
 WALK = "not observable: walk a figure of eight, tilting the scanner"
@@ -34,10 +35,10 @@ def table(calibration: Calibration) -> list[tuple[str, str]]:
         ("bias of the accelerometer", _vector(c.moved.bias, sigmas["accel_bias"], "m/s²")),
         ("noise of the gyroscope", _noise(c.gyro_noise, 1e3, "mrad/s/√Hz")),
         ("noise of the accelerometer", _noise(c.accel_noise, 1e3, "mm/s²/√Hz")),
-        ("down at the begin, LiDAR frame", ", ".join(f"{value:+.3f}" for value in c.down)),
+        ("down at the start, LiDAR frame", ", ".join(f"{value:+.3f}" for value in c.down)),
         ("turning by scans against IMU", f"{_degrees(c.turned.before)} deg before, {_degrees(c.turned.after)} after"),
         ("motion by scans against IMU", f"{_mm(c.moved.before)} mm before, {_mm(c.moved.after)} after"),
-        ("scans on the map", f"{c.residuals[0] * 1e3:.1f} mm by themselves, {c.residuals[1] * 1e3:.1f} with the IMU"),
+        ("scans to the map", f"{c.residuals[0] * 1e3:.1f} mm without the IMU, {c.residuals[1] * 1e3:.1f} with the IMU"),
     ]  # fmt: skip
 
 
@@ -70,11 +71,8 @@ def as_json(calibration: Calibration) -> dict[str, Any]:
 
 def params_yaml(calibration: Calibration) -> str:
     """What was found as the text of a parameter file."""
-    tree: dict[str, dict[str, Any]] = {}
-    for name, value in calibration.found().items():
-        section, _, leaf = name.partition(".")
-        tree.setdefault(section, {})[leaf] = value
-    return f"{CALIBRATED}; delete this file to undo it.\n" + yaml.safe_dump(tree, default_flow_style=None)
+    tree = yaml.safe_dump(nested(calibration.found()), default_flow_style=None)
+    return f"{CALIBRATED}; delete this file to undo it.\n{tree}"
 
 
 def write_beside(calibration: Calibration, *, replace: bool = False) -> Path:
@@ -87,17 +85,18 @@ def write_beside(calibration: Calibration, *, replace: bool = False) -> Path:
         HemislamError: nothing was found; or there is such a file.
     """
     if not calibration.found():
-        raise HemislamError(f"{calibration.recording} tells nothing to keep: {WALK}.")
+        raise HemislamError(f"Nothing that was found in {calibration.recording} can be kept: {WALK}.")
     path, text = sidecar(calibration.recording), params_yaml(calibration)
     try:
         before = path.read_text(encoding="utf-8") if path.exists() else ""
         if before and not before.startswith(CALIBRATED):
             if not replace:
-                raise HemislamError(f"{path} is yours; add --force to put these values into it (it is kept as .old).")
-            tree = read_yaml(before, str(path), "write it anew") or {}
-            for name, value in calibration.found().items():
-                section, _, leaf = name.partition(".")
-                tree[section] = {**(tree.get(section) or {}), leaf: value}
+                raise HemislamError(
+                    f"You wrote {path} yourself; add --force to change these values in it (it is kept as .old)."
+                )
+            tree = read_yaml(before, str(path), "write it again") or {}
+            for section, found in nested(calibration.found()).items():
+                tree[section] = (tree.get(section) or {}) | found
             text = f"{CALIBRATED} into the one kept as .old.\n" + yaml.safe_dump(tree, default_flow_style=None)
             path.with_name(path.name + ".old").write_text(before, encoding="utf-8")
         path.write_text(text, encoding="utf-8")

@@ -15,10 +15,10 @@ def calibrate(
     recording: RecordingPath,
     params_for: ParamsFor,
     write: Annotated[
-        bool, typer.Option("--write", help="Keep what was found beside the recording, in NAME.params.yaml.")
+        bool, typer.Option("--write", help="Save the result beside the recording, as NAME.params.yaml.")
     ] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="With --write: put it into a NAME.params.yaml that you wrote, too.")
+        bool, typer.Option("--force", help="With --write: also change a NAME.params.yaml that you wrote.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print numbers for programs.")] = False,
     plot: Annotated[
@@ -28,11 +28,11 @@ def calibrate(
         float, typer.Option("--duration", min=5, metavar="SECONDS", help="Use only so much of the recording.")
     ] = 120.0,
 ) -> None:
-    """Find how the LiDAR sits on the IMU, and how far apart their clocks are.
+    """Find the pose of the LiDAR on the IMU and the offset of their clocks.
 
-    Takes nothing but the recording: `sensor.rotation` and `sensor.translation` are ignored. It follows the LiDAR by its
-    scans alone and compares how it turns and moves with the IMU. Walk and turn the scanner about all axes: what the
-    motion does not tell is said.
+    Only the recording is used: `sensor.rotation` and `sensor.translation` are ignored. The LiDAR is tracked by its
+    scans alone, and its motion is compared with the IMU's. Walk and turn the scanner about all axes; values that the
+    motion does not determine are reported as such.
 
     \b
     Examples:
@@ -48,8 +48,8 @@ def calibrate(
         raise HemislamError("--force belongs to --write; give both.")
     params = params_for(recording)
     compile_behind_bar()
-    with progress_bar("Calibrating", total=1.0, bar_format="{desc}: {percentage:3.0f}% |{bar}| {elapsed}") as show:
-        found = find(recording, params, duration, lambda step, fraction: show(fraction))
+    with progress_bar("Calibrating") as show:
+        found = find(recording, params, duration, show)
     if as_json:
         typer.echo(json.dumps(words.as_json(found), indent=2))
     else:
@@ -58,7 +58,7 @@ def calibrate(
         for name, value in rows:
             typer.echo(f"{name:<{width}}  {value}")
         if contradiction := found.contradiction():
-            typer.echo(f"{contradiction}; the parameters say otherwise.")
+            typer.echo(f"{contradiction}, contrary to the parameters.")
     if plot is not None:
         from app.cli.calibration_plot import residual_plot
 
@@ -68,9 +68,9 @@ def calibrate(
             raise HemislamError(f"{plot} cannot be written ({error.strerror}); choose another --plot.") from None
     if write:
         path = words.write_beside(found, replace=force)
-        typer.echo(f"Kept in {path}; `run`, `serve` and `info` use it. Delete it to undo that.", err=as_json)
+        typer.echo(f"Saved as {path}; `run`, `serve` and `info` use it. Delete it to undo this.", err=as_json)
     elif not as_json and found.found():
-        typer.echo("Add --write to keep this beside the recording, or give " + _settings(found.found()))
+        typer.echo("Add --write to save this beside the recording, or pass " + _settings(found.found()))
 
 
 def _settings(values: dict[str, object]) -> str:

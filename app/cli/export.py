@@ -108,7 +108,7 @@ def _export_session(source: Path, out: Path | None, exports: "tuple[Export, ...]
 def _save(results: "Results", folder: Path, exports: "tuple[Export, ...]") -> None:
     from app.export.results import save_results
 
-    with progress_bar("Exporting", total=1.0, bar_format="{desc}: {percentage:3.0f}% |{bar}| {elapsed}") as show:
+    with progress_bar("Exporting") as show:
         results.progress = show
         save_results(folder, results, exports, replace=True)
     for one in exports:

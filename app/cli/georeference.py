@@ -28,7 +28,8 @@ def georeference(
         Path | None, typer.Option("--picks", metavar="FILE", help="CSV of where they are in the map: name,x,y,z.")
     ] = None,
     crs: Annotated[
-        str, typer.Option("--crs", metavar="EPSG:CODE", help="A plane grid in metres; else the UTM zone of the place.")
+        str,
+        typer.Option("--crs", metavar="EPSG:CODE", help="A plane grid in metres; default: the UTM zone of the place."),
     ] = "",
     lever_arm: Annotated[
         tuple[float, float, float] | None,
@@ -49,15 +50,16 @@ def georeference(
     force: Annotated[bool, typer.Option("--force", help="Replace results that --out already holds.")] = False,
     height: Annotated[
         str,
-        typer.Option("--height", metavar="TEXT", help="What the file's heights are above, to be written beside them."),
+        typer.Option(
+            "--height", metavar="TEXT", help="What the heights in the file are measured from; written into the results."
+        ),
     ] = "",
 ) -> None:
-    """Find where on Earth a map lies, by satellite fixes or control points.
+    """Georeference a map by satellite fixes or control points.
 
-    By fixes, the map is only turned about the vertical and moved; with --factors they bend it, too. The command
-    finds how late the receiver's clock is by comparing the motion, and the lever arm if it is not given and the motion
-    tells it.
-    Fixes that contradict the others are rejected and named.
+    Fixes only rotate the map about the vertical and shift it; with --factors they bend it, too. The offset of the
+    receiver's clock is estimated by comparing the motion, and so is the lever arm if it is not given and the motion
+    determines it. Fixes that contradict the others are rejected and listed.
 
     \b
     Writes into RESULTS, or with --factors into --out, beside the bent trajectory.tum and map.ply:
@@ -85,7 +87,7 @@ def georeference(
     if factors != (out is not None) or (factors and control is not None):
         raise HemislamError("--factors and --out go together, for fixes.")
     if out is not None and out.resolve() == results.resolve():
-        raise HemislamError("The bent map would replace the one that it is made from; give --out another folder.")
+        raise HemislamError("The bent map would replace the original; give --out another folder.")
     if (accept or reject) and control is not None:
         raise HemislamError("--accept and --reject are for fixes.")
     trajectory = read_tum(results / "trajectory.tum")
@@ -99,7 +101,9 @@ def georeference(
         overruled = {str(fix): fix in (accept or []) for fix in (*(accept or []), *(reject or []))}
         found = align(trajectory, fixes, grid=crs, height=height or told, lever=lever_arm, overruled=overruled)
         if unknown := sorted(set(overruled) - set(found.names)):
-            raise HemislamError(f"There is no fix {unknown[0]} within the walk; gnss_residuals.csv lists all.")
+            raise HemislamError(
+                f"There is no fix {unknown[0]} within the time of the trajectory; gnss_residuals.csv lists all."
+            )
         if out is not None:
             found, trajectory = _bent(results, out, fixes, found, overruled, replace=force)
             results = out
@@ -139,8 +143,8 @@ def _recording_of(results: Path) -> Path:
 
 def _write(results: Path, found: "Alignment", trajectory: "Trajectory") -> None:
     from app.cli.georeference_plot import georeference_plot
-    from app.evaluation.report import write_texts
     from app.georeference import ledger, reference
+    from app.slam.text_files import write_texts
 
     texts = ledger.files(found) | {reference.PLOT: georeference_plot(found, trajectory.positions)}
     write_texts(results, texts)

@@ -113,11 +113,14 @@ def with_params(command: Callable[..., None]) -> Callable[..., None]:
 
 @contextmanager
 def progress_bar(description: str, **options: Any) -> Iterator[Callable[..., None]]:
-    """A bar on stderr that goes away at the end, as a function of what is done and, once that is known, of how much
-    there is to do. `options` are those of tqdm."""
+    """A bar on stderr that disappears at the end, as a function of what is done and, once known, of how much there is.
+
+    options: of tqdm; none: what is done is a share, 0-1.
+    """
     from tqdm import tqdm
 
-    with tqdm(desc=description, leave=False, disable=None, **options) as bar:
+    share = {"total": 1.0, "bar_format": "{desc}: {percentage:3.0f}% |{bar}| {elapsed}"}
+    with tqdm(desc=description, leave=False, disable=None, **(options or share)) as bar:
 
         def show(done: float, total: float | None = None) -> None:
             bar.total = bar.total if total is None else total

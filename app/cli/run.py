@@ -110,15 +110,13 @@ def prepare(session: "Session") -> None:
 
 
 def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
-    """The parameters with the mounting that the recording itself tells, if none is given; and that, in a sentence."""
+    """The parameters, with the mounting found in the recording if none is given; and that, in a sentence."""
     from app.calibration.by_itself import advice, contradicted, is_mounting_unknown
 
     if not is_mounting_unknown(params):
         return params, ""
-    with progress_bar(
-        "Finding how the LiDAR sits on the IMU", total=1.0, bar_format="{desc} |{bar}| {elapsed}"
-    ) as show:
-        found = contradicted(recording, params, lambda step, fraction: show(fraction))
+    with progress_bar("Finding how the LiDAR sits on the IMU") as show:
+        found = contradicted(recording, params, show)
     if found is None:
         return params, ""
     typer.echo(told := advice(found, used=True))
@@ -126,11 +124,11 @@ def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
 
 
 def look_for_mounting(recording: Path, params: "Params") -> str:
-    """What the recording tells of its mounting against the parameters, in a sentence; "" if nothing."""
+    """What the recording shows about its mounting if the parameters differ, in a sentence; "" if nothing."""
     from app.calibration.by_itself import advice, contradicted
 
-    with progress_bar("Looking for the cause", total=1.0, bar_format="{desc} |{bar}| {elapsed}") as show:
-        found = contradicted(recording, params, lambda step, fraction: show(fraction))
+    with progress_bar("Looking for the cause") as show:
+        found = contradicted(recording, params, show)
     return advice(found, used=False) if found else ""
 
 
@@ -138,7 +136,7 @@ def save(session: "Session", folder: Path, stop: BaseException | None, *, replac
     """Write the results and sum them up.
 
     Args:
-        calibration: what the recording tells of its mounting, in a sentence.
+        calibration: what the recording shows about its mounting, in a sentence.
 
     Raises:
         BaseException: `stop`, what ended the run early, once the frames so far are saved.
@@ -187,8 +185,7 @@ def compile_behind_bar() -> None:
     """Compile the kernels behind a progress bar; a moment only, once they are in the cache."""
     from app.slam.warmup import compile_kernels
 
-    bar_format = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}"
-    with progress_bar("Compiling, first start only", total=1.0, bar_format=bar_format) as show:
+    with progress_bar("Compiling, first start only") as show:
         compile_kernels(lambda name, fraction: show(fraction))
 
 
@@ -214,4 +211,4 @@ def process(session: "Session", *, until: int | None = None) -> BaseException | 
 def _nothing_processed(session: "Session") -> str:
     reasons = "; ".join(f"{count} x {reason}" for reason, count in session.log.dropped.most_common(3))
     why = f"all were dropped: {reasons}" if reasons else "there is none in the part asked for"
-    return f"No scan of {session.feed.info.path} could be processed ({why}); `hemislam info` tells more."
+    return f"No scan of {session.feed.info.path} could be processed ({why}); `hemislam info` shows more."

@@ -13,9 +13,8 @@ from app.evaluation.runner import RunJobs
 from app.evaluation.truth import TruePoses, check_overlap
 from app.evaluation.variants import Variant
 from app.sensors.recording import open_recording
-from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.provenance import hash_input
+from app.slam.provenance import sha256_of
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64
 
@@ -65,10 +64,7 @@ def evaluate(
         with open_recording(subject.recording, subject.params) as recording:
             if subject.truth is not None:
                 check_overlap(subject.truth, recording.start_ns, recording.duration_s)
-        digest = hash_input(subject.recording)
-        if digest is None:
-            raise HemislamError(f"{subject.recording} cannot be read; check its permissions.")
-        hashes[subject.name] = digest
+        hashes[subject.name] = digest = sha256_of(subject.recording)
         for variant in variants:
             jobs[subject.name, variant.name] = Job(
                 recording=subject.recording,

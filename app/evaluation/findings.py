@@ -18,7 +18,7 @@ CHANCE = 2.0
 """A mean difference of fewer standard errors than this, over the recordings, may be chance."""
 
 MANY = 10
-"""From so many times on, a difference is not told in per cent."""
+"""A difference by more than this factor is not given in per cent."""
 
 _SAME = "stays the same"
 _CLAIMS = (

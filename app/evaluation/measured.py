@@ -188,7 +188,7 @@ def _accuracy(estimate: Trajectory, matched: Matched) -> Accuracy:
         errors=errors | ratios(errors) | {"ate_after_start_m": _later(estimate, truth)},
         times_s=(ours.stamps_ns - estimate.stamps_ns[0]) * 1e-9,
         errors_m=np.linalg.norm(aligned - theirs.positions, axis=1),
-        walked_m=walked_m(theirs),
+        walked_m=walked_m(theirs.positions),
         aligned=aligned,
         drift={metres: found for metres in PIECES_M if len(found := drift(estimate, truth, metres))},
     )

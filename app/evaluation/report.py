@@ -1,9 +1,7 @@
 """Write what was measured: report.html, report.md, results.json, and the tables as CSV and LaTeX."""
 
-import csv
-import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,9 +12,9 @@ from app.evaluation.findings import MOST_TOLD, findings
 from app.evaluation.job import GROUND_RANGES_M, code_digest
 from app.evaluation.measured import Evaluated
 from app.evaluation.tables import make_tables
-from app.slam.errors import HemislamError
 from app.slam.provenance import describe_machine
 from app.slam.report import finite
+from app.slam.text_files import csv_text, write_texts
 
 
 def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
@@ -49,18 +47,6 @@ def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
     }
     write_texts(folder, texts)
     return found
-
-
-def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write files by their names; older ones stay until all are whole. Raises HemislamError: they cannot be written."""
-    parts = {name: folder / f".{name}.part" for name in texts}
-    try:
-        for name, part in parts.items():
-            part.write_text(texts[name], encoding="utf-8")
-        for name, part in parts.items():
-            part.replace(folder / name)
-    except OSError as error:
-        raise HemislamError(f"{', '.join(texts)} cannot be written to {folder}: {error.strerror}.") from error
 
 
 def _results(recordings: Sequence[Evaluated], machine: dict[str, Any], found: list[str]) -> dict[str, Any]:
@@ -106,11 +92,7 @@ def _flat(results: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 def _csv(rows: list[dict[str, Any]]) -> str:
     names = list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return csv_text(names, *([row.get(name, "") for name in names] for row in rows))
 
 
 def _leaves(entry: Any, path: str = "") -> Iterable[tuple[str, Any]]:

@@ -119,7 +119,7 @@ def read_poses(path: Path) -> Trajectory:
 
 
 def _read_file(path: Path) -> TruePoses:
-    """Read a truth file. The number of columns tells its format.
+    """Read a truth file. Its number of columns determines its format.
 
     Raises:
         HemislamError: it cannot be read, or is none of the formats, or holds NaN.

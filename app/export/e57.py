@@ -10,14 +10,11 @@ import pye57
 from pye57 import libe57
 from scipy.spatial.transform import Rotation
 
-from app.export.points import Block
+from app.export.points import GPS_MINUS_UNIX_S, Block
 from app.georeference.reference import GeoReference
 
 if TYPE_CHECKING:
     from app.export.results import Results
-
-GPS_MINUS_UNIX_S = -315_964_800 + 18
-"""From Unix to GPS time, with the leap seconds since 2017."""
 
 
 def write(path: Path, results: "Results") -> None:

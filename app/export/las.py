@@ -10,7 +10,7 @@ import numpy as np
 from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from app import __version__
-from app.export.points import Block
+from app.export.points import GPS_MINUS_UNIX_S, Block
 from app.georeference.reference import GeoReference
 from app.slam.types import F64, NON_GROUND
 
@@ -22,8 +22,8 @@ SCALE = 0.001
 BATCH = 1_000_000
 """Points that are compressed at once: lazrs gives each core chunks of 50,000."""
 OTHER, GROUND_CLASS = 1, 2
-GPS_MINUS_UNIX_S = -315_964_800 + 18 - 1_000_000_000
-"""From Unix time to "adjusted standard GPS time", with the leap seconds since 2017."""
+ADJUSTED_S = GPS_MINUS_UNIX_S - 1_000_000_000
+"""From Unix time to "adjusted standard GPS time"."""
 
 
 def write_las(path: Path, results: "Results") -> None:
@@ -81,5 +81,5 @@ def _record(block: Block, header: laspy.LasHeader, where: GeoReference | None) -
     array["classification"] = np.where(block.labels == NON_GROUND, OTHER, GROUND_CLASS)
     array["user_data"] = np.minimum(block.ring, 255)
     array["point_source_id"] = block.keyframe % 65536
-    array["gps_time"] = block.stamps_ns * 1e-9 + GPS_MINUS_UNIX_S
+    array["gps_time"] = block.stamps_ns * 1e-9 + ADJUSTED_S
     return array

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from app.slam.ply import pcd_header
 from app.slam.types import NON_GROUND
 
 if TYPE_CHECKING:
@@ -13,14 +14,14 @@ if TYPE_CHECKING:
 POINT = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("ground", "u1"), ("time", "<f8")]
 )
-_LETTERS = {"f": "F", "u": "U"}
+_COMMENT = "hemislam map, metres, z up"
 
 
 def write(path: Path, results: "Results") -> None:
     """The number of points enters the header at the end."""
     count = 0
     with path.open("wb") as file:
-        file.write(_header(0))
+        file.write(pcd_header(POINT, 0, _COMMENT))
         for block in results.blocks():
             points = np.empty(len(block), POINT)
             points["x"], points["y"], points["z"] = block.points.T
@@ -29,22 +30,4 @@ def write(path: Path, results: "Results") -> None:
             file.write(points.tobytes())
             count += len(points)
         file.seek(0)
-        file.write(_header(count))
-
-
-def _header(count: int) -> bytes:
-    kinds = [POINT[name] for name in POINT.names or ()]
-    lines = [
-        "# .PCD v0.7 - hemislam map, metres, z up",
-        "VERSION 0.7",
-        f"FIELDS {' '.join(POINT.names or ())}",
-        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
-        f"TYPE {' '.join(_LETTERS[kind.kind] for kind in kinds)}",
-        f"COUNT {' '.join('1' for _ in kinds)}",
-        f"WIDTH {count:012d}",
-        "HEIGHT 1",
-        "VIEWPOINT 0 0 0 1 0 0 0",
-        f"POINTS {count:012d}",
-        "DATA binary",
-    ]
-    return "\n".join([*lines, ""]).encode("ascii")
+        file.write(pcd_header(POINT, count, _COMMENT))

@@ -259,7 +259,7 @@ def save_results(
     prepare_folder(folder, replace=replace)
     written = [export for export in exports if results.loops or not export.of_loops]
     if results.where is None and (lost := [export.name for export in written if export.on_earth]):
-        unknown = f"{lost[0]} needs to know where on Earth the map is; see Georeference in the page, or the command."
+        unknown = f"{lost[0]} needs a georeferenced map; use Georeference in the page, or `hemislam georeference`."
         raise HemislamError(results.problem or unknown)
     parts, show = {export.name: folder / f".{export.name}.part" for export in written}, results.progress
     try:

@@ -1,4 +1,4 @@
-"""Lays a trajectory on satellite fixes: yaw, translation, the clocks' offset, and the antenna's lever arm.
+"""Aligns a trajectory with satellite fixes: yaw, translation, the clocks' offset, and the antenna's lever arm.
 
 The model of a fix g, in metres east, north and up, stamped s:
 
@@ -129,15 +129,15 @@ def align(
 
     Args:
         trajectory: T_map_imu with z up. grid: a projected system; "": the UTM zone there. height: what the heights of
-            the fixes are above. lever: m from the IMU to the antenna, IMU frame; None: found, if the fixes tell it.
+            the fixes are above. lever: m from the IMU to the antenna, IMU frame; None: estimated, if possible.
         offset_s: how much later the fixes are stamped than measured; None: found. overruled: whether fixes of these
             names count, whatever their residuals.
 
     Raises:
-        HemislamError: the fixes do not fit the trajectory in time or place, or tell no heading.
+        HemislamError: the fixes do not fit the trajectory in time or place, or do not determine a heading.
     """
     if len(trajectory) < 4:
-        raise HemislamError("The trajectory has fewer than 4 poses; there is nothing to lay on the fixes.")
+        raise HemislamError("The trajectory has fewer than 4 poses; that is too few to align it with fixes.")
     path = WalkedPath(trajectory)
     seconds: F64 = (fixes.stamps_ns - path.start_ns).astype(np.float64) * 1e-9
     rows = np.flatnonzero(path.within_search(seconds))
@@ -163,21 +163,23 @@ def align(
         lever is None,
     )
     if (blind := np.isnan(problem.sigmas.sum(axis=1))).any():
-        notes.append("Fixes come without a covariance; how far they scatter about the map stands for it.")
+        notes.append("The fixes have no covariance; their scatter about the map is used instead.")
         problem = replace(problem, sigmas=np.where(blind[:, None], median / MEDIAN_SIGMAS, problem.sigmas))
         scatter = float(np.median(problem.solve().distances)) / MEDIAN_SIGMAS
         problem = replace(problem, sigmas=np.where(blind[:, None], problem.sigmas * scatter, problem.sigmas))
     solved = problem.solve()
     if lever is None and not solved.lever_sigma < WORST_LEVER_M:
-        notes.append("The motion does not tell the antenna's lever arm; it is taken as zero, give it if it is not.")
+        notes.append(
+            "The motion does not determine the antenna's lever arm; it is taken as zero. Give it if you know it."
+        )
         problem = replace(problem, lever_free=False)
         solved = problem.solve()
     if offset_s is None and not solved.offset_sigma < WORST_OFFSET_S:
-        notes.append("The motion does not tell the clocks' offset; it is taken as zero.")
+        notes.append("The motion does not determine the clock offset; it is taken as zero.")
         solved = replace(problem, offset=None).solve()
     if not solved.yaw_sigma < WORST_YAW:
         raise HemislamError(
-            f"The fixes tell the map's heading only to {np.degrees(solved.yaw_sigma):.0f}°; walk farther under the sky."
+            f"The fixes determine the map's heading only to {np.degrees(solved.yaw_sigma):.0f}°; walk farther outdoors."
         )
     reference = ground.reference(solved.yaw, solved.shift, height)
     return Alignment(

@@ -47,7 +47,7 @@ def bend(
     before = WalkedPath(trajectory).poses((keyframe_stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
     if np.isfinite(found.offset_sigma_s):
         offset_s = offset_by_parts(trajectory, fixes, found)
-        told = f"Clock offset by stretches of the walk: {offset_s * 1e3:.1f} ms."
+        told = f"Clock offset, estimated in stretches of the trajectory: {offset_s * 1e3:.1f} ms."
         found = replace(found, offset_s=offset_s, offset_sigma_s=float("nan"), notes=(*found.notes, told))
     priors = _priors(trajectory, keyframe_stamps_ns, before, fixes, found)
     word = as_told(overruled, found.names)

@@ -1,4 +1,4 @@
-"""Lays a map on control points: known places, each picked in the map."""
+"""Aligns a map with control points: known places, each picked in the map."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -12,6 +12,7 @@ from app.georeference.reference import ELLIPSOIDAL
 from app.georeference.tables import NamedColumns
 from app.slam.arrays import F64
 from app.slam.errors import HemislamError
+from app.slam.metrics import umeyama
 
 CONTROL = ("name", "east", "north", "height", "latitude", "longitude")
 PICKS = ("name", "x", "y", "z")
@@ -28,7 +29,7 @@ def lay_on_control(
     height: str = ELLIPSOIDAL,
     overruled: Mapping[str, bool] = MappingProxyType({}),
 ) -> Alignment:
-    """Where a map lies by the least squares of control points, turned about all axes. Its shape does not change.
+    """Where a map lies, by least squares over control points, rotated about all axes. Its shape does not change.
 
     Args:
         control: name, E, N, H in `grid`, or name, latitude, longitude, height. picked: (3,) m in the map, by name.
@@ -62,8 +63,8 @@ def read_picks(table: NamedColumns) -> dict[str, F64]:
 def _left_open(names: list[str]) -> str:
     """What fewer than three points leave open, in a sentence."""
     found = f"only {' and '.join(names)} {'is' if len(names) == 1 else 'are'}" if names else "none is"
-    rest = ("where the map lies", "how the map is turned", "how the map is turned about the line through both")
-    return f"At least 3 control points must be picked in the map, but {found}: it stays open {rest[len(names)]}."
+    rest = ("the map's place", "the map's rotation", "the map's rotation about the line through both")
+    return f"At least 3 control points must be picked in the map, but {found}: {rest[len(names)]} is undetermined."
 
 
 def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64]]:
@@ -97,22 +98,22 @@ def _refuse_line(points: F64, names: list[str]) -> None:
     along, beside, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if beside <= LEAST_WIDTH * along:
         raise HemislamError(
-            f"The control points {', '.join(names)} lie on one line, so the map may still turn about it;"
-            " pick one beside it."
+            f"The control points {', '.join(names)} lie on one line, so the map can still rotate about it;"
+            " pick another one off this line."
         )
 
 
 def _fitted(points: F64, ground: Ground, names: tuple[str, ...], used: Mask, height: str) -> Alignment:
-    """The rigid transform with the least squares of distances (Arun et al. 1987, Umeyama 1991)."""
-    middle, there = points[used].mean(axis=0), ground.places[used].mean(axis=0)
-    u, _, vt = np.linalg.svd((ground.places - there)[used].T @ (points - middle)[used])
-    R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    shift = there - R @ middle
+    """The rigid transform with the least squares of distances."""
+    T = umeyama(points[used], ground.places[used])
+    R, shift = T[:3, :3], T[:3, 3]
     residuals = ground.places - points @ R.T - shift
     tilt = float(np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0))))
     notes = [f"The control points tilt the map by {tilt:.3f}° against gravity."]
     if tilt > 2.0:
-        notes.append("Gravity knows better: check the heights, the names, and whether x, y, z are of this map.")
+        notes.append(
+            "Gravity is more accurate than that: check the heights, the names, and whether x, y, z are of this map."
+        )
     rms = float(np.sqrt((residuals[used] ** 2).sum() / max(3 * used.sum() - 6, 1)))
     return Alignment(
         ground.reference(R, shift, height),

@@ -15,7 +15,7 @@ class Fixes(Samples):
 
     Attributes:
         latitude, longitude: (k,) degrees. height: (k,) m.
-        sigmas: (k, 3) m, standard deviations to the east, north and up; nan where the receiver does not tell.
+        sigmas: (k, 3) m, standard deviations to the east, north and up; nan where the receiver does not report them.
     """
 
     latitude: F64

@@ -1,13 +1,12 @@
 """What became of each fix or control point: as a table, as CSV, and in sentences."""
 
-import csv
-import io
 from typing import Any
 
 import numpy as np
 
 from app.georeference import crs, reference
 from app.georeference.align import Alignment
+from app.slam.text_files import csv_text
 
 COLUMNS = (
     "name", "east_m", "north_m", "height_m", "d_east_m", "d_north_m", "d_height_m", "sigmas", "verdict",
@@ -16,14 +15,11 @@ COLUMNS = (
 
 def residuals_csv(alignment: Alignment) -> str:
     """One line a fix: its place in the grid, measured minus map, and whether it counts."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    rows = []
     for name, place, off, sigmas, used in _rows(alignment):
-        verdict = "accepted" if used else "rejected"
-        numbers = [f"{value:.4f}" for value in (*place, *off)]
-        writer.writerow([name, *numbers, f"{sigmas:.2f}" if np.isfinite(sigmas) else "", verdict])
-    return out.getvalue()
+        cells = [f"{value:.4f}" for value in (*place, *off)] + [f"{sigmas:.2f}" if np.isfinite(sigmas) else ""]
+        rows.append([name, *cells, "accepted" if used else "rejected"])
+    return csv_text(COLUMNS, *rows)
 
 
 def files(alignment: Alignment) -> dict[str, str]:

@@ -16,7 +16,7 @@ class Sentences:
     """Collects sentences, in the order of the receiver.
 
     Attributes:
-        near_ns: a time within half a day, for sentences before the first one that tells the day.
+        near_ns: a time within half a day, for sentences before the first one with a date.
         separated: whether every place came with the geoid's height, so that heights are above the ellipsoid.
     """
 

@@ -1,4 +1,4 @@
-"""What a map is to be laid on Earth by, as a session keeps it."""
+"""What a map is georeferenced by, as a session stores it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +22,8 @@ class Survey:
     Attributes:
         gnss: file of fixes; None: those of the recording. control: text of a table of control points.
         picks: where these are in the map. crs: "EPSG:code" of a projected system; "": the UTM zone there.
-        height: what heights are above; "": as the fixes tell. lever: m from the IMU to the antenna, IMU frame; None:
-            found, if the motion tells it. offset_s: how much later fixes are stamped than measured; None: found.
+        height: what heights are above; "": as the fixes say. lever: m from the IMU to the antenna, IMU frame; None:
+            estimated, if the motion allows. offset_s: how much later fixes are stamped than measured; None: estimated.
         factors: the fixes bend the map.
     """
 

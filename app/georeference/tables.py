@@ -103,7 +103,7 @@ def read_fixes(path: Path, near_ns: int) -> tuple[Fixes, str]:
     """Fixes of a file: NMEA sentences, CSV of time, latitude, longitude, height, or the GNSS/INS table of H2LID.
 
     Args:
-        near_ns: a time of the recording; tells the day of NMEA sentences and the week of GPS seconds.
+        near_ns: a time of the recording; gives the day of NMEA sentences and the week of GPS seconds.
 
     Returns:
         The fixes, and what their heights are above.

@@ -1,4 +1,4 @@
-"""Lays results on Earth as the user of a session asked for it: by satellite fixes, or by control points."""
+"""Georeferences results as the user of a session asked: by satellite fixes, or by control points."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -35,7 +35,7 @@ def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> tup
         HemislamError: the survey cannot be read, or leaves open where the map lies.
     """
     if not len(results.trajectory):
-        raise HemislamError("Nothing is mapped yet that could be laid on Earth.")
+        raise HemislamError("Nothing is mapped yet that could be georeferenced.")
     overruled = {edit.what: edit.accepted for edit in edits if isinstance(edit, Overrule)}
     if survey.control:
         found = _by_points(results, survey, _named(overruled, POINT))

@@ -56,7 +56,7 @@ class Session:
         params: for frames not yet processed; set them with `choose`.
         history: parameters by the frame from which they apply, ascending.
         ended: the feed has no more to give. keyframes: with the labels that the user gave them.
-        survey: what lays the results on Earth; None: nothing does. by_fixes: what bent the map when it was last laid.
+        survey: what the results are georeferenced by; None: nothing. by_fixes: what bent the map then.
 
     Raises:
         HemislamError: the truth cannot be read.
@@ -356,7 +356,7 @@ class Session:
             session: to be written beside the files of a run. formats: of `EXPORTS`, instead of the files of a run.
             choice: of points. progress: called with the share that is written, 0-1, in that thread.
             replace: overwrite older results. stopped: why the session ended early, if it did.
-            calibration: what the recording tells of its mounting, in a sentence.
+            calibration: what the recording shows about its mounting, in a sentence.
 
         Returns:
             The content of report.json, or HemislamError if the folder cannot be written to.

@@ -164,7 +164,7 @@ class State:
     edits: of loops, in force. undone: those that can be redone, the next one last. labels: edits of labels.
     truth: trajectory to compare with. notes: in the order in which they were made. speed: to play at.
     views: where cameras stood that the user kept, and what they looked at, (x, y, z) each, m, in the map.
-    measures: what was measured in the map. survey: what lays it on Earth.
+    measures: what was measured in the map. survey: what it is georeferenced by.
     painted: points marked as ground or not. clip: what of the map is shown.
     """
 
@@ -373,7 +373,7 @@ def session_files(folder: Path) -> list[Path]:
 
 
 def recording_of(path: Path) -> Path | None:
-    """What a session file says that it opened; None if that cannot be told."""
+    """The recording that a session file names; None if it cannot be read."""
     try:
         with path.open(encoding="utf-8") as lines:
             return Path(json.loads(lines.readline())["recording"])

@@ -143,7 +143,7 @@ def _rate(subject: str, stamps: I64, least: float) -> Finding:
     steps = np.diff(stamps)
     steps = steps[steps > 0]
     if not len(steps):
-        return Finding(subject, "needs you", "too few messages to tell")
+        return Finding(subject, "needs you", "too few messages to determine it")
     rate = 1e9 / float(np.median(steps))
     spread = (np.percentile(steps, 99) - np.percentile(steps, 1)) / 1e6
     text = f"{rate:.2f} Hz, {len(stamps)} messages; 98 % of the intervals within {spread:.2f} ms"

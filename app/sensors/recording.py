@@ -31,7 +31,7 @@ SILENCE_S = 0.5
 NO_IMU = Finding(
     "IMU topic",
     "corrected",
-    "there is no IMU: the LiDAR alone tells the motion, less accurately, and not through quick turns",
+    "there is no IMU: motion is estimated from the LiDAR alone, less accurately, and not in quick turns",
 )
 IMU_BEFORE_NS = 200_000_000
 """IMU samples given from before `start_s`."""

@@ -16,7 +16,7 @@ class Turns:
         self._ended: int | None = None
 
     def add(self, turn: int, column: int, packet: bytes) -> Iterator[list[bytes]]:
-        """The turns, each in order of its columns, that are over by what this packet tells."""
+        """The turns that this packet shows to be over, each in order of its columns."""
         if turn not in self._open:
             if self._ended is not None and _ahead(turn, self._ended) in (-1, 0):
                 return  # too late

@@ -261,7 +261,7 @@ def _note(engine: RunningEngine, place: int) -> str:
 
 def _exported(engine: RunningEngine, name: str, background: BackgroundTasks) -> FileResponse:
     if engine.snapshot.earth.survey is None and any(export.on_earth for export in EXPORTS if export.name == name):
-        raise HTTPException(409, f"{name} needs to know where on Earth the map is; lay it there in the page first.")
+        raise HTTPException(409, f"{name} needs a georeferenced map; georeference it in the page first.")
     folder = Path(tempfile.mkdtemp(prefix="hemislam-export-"))
     background.add_task(shutil.rmtree, folder, ignore_errors=True)
     try:

@@ -14,6 +14,7 @@ import numpy as np
 
 from app.server.protocol import Chunk
 from app.slam import lie
+from app.slam.metrics import walked_m
 from app.slam.types import F32, F64, I64, Keyframe
 
 VOXEL_M: Final = 0.05
@@ -78,8 +79,7 @@ def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
     if len(shown) <= MOST_SHOWN:
         return chunks
     kept = list(chunks)
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    distance = np.concatenate([[0.0], np.cumsum(steps)])
+    distance = walked_m(poses[:, :3, 3])
     while len(shown) > MOST_SHOWN:
         where = distance[[chunks[index].index for index in shown]]
         place = 1 + int(np.argmin(where[2:] - where[:-2]))

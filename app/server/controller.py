@@ -71,7 +71,7 @@ class Controller:
     """The open session and its transport. One thread calls `handle` and `work`.
 
     Args:
-        page: is told of all changes. params: to begin with.
+        page: receives all changes. params: to begin with.
         resolve: gives the parameters of a recording, before the user's changes; None: the present ones.
         session_folder: for session files; None: none are kept. kept: of a live session that another process
             began. clock: monotonic seconds.

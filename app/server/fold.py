@@ -16,6 +16,7 @@ from app.server.setup import POINT_BUDGET
 from app.slam.frames import FRAME, READOUTS, as_table
 from app.slam.loops.types import changed_by
 from app.slam.map_frame import MapFrame
+from app.slam.metrics import walked_m
 from app.slam.rows import Rows
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64, I64
@@ -106,7 +107,6 @@ class Fold:
         """T_map_truth, if the first `shown` frames determine it, and their arrays by SERIES name."""
         frames, positions = self._frames.view()[:shown], self._positions.view()[:shown]
         start_ns = recording.start_ns if recording is not None else 0
-        steps = np.linalg.norm(np.diff(positions, axis=0, prepend=positions[:1]), axis=1)
         T_map_truth, error = None, np.full(shown, np.nan)
         if recording is not None and recording.truth_stamps_ns is not None and recording.truth_positions is not None:
             T_map_truth, error = compared(
@@ -114,7 +114,7 @@ class Fold:
             )
         series = {
             "stamp_s": (frames["stamp_ns"] - start_ns) * 1e-9,
-            "distance": np.cumsum(steps),
+            "distance": walked_m(positions),
             "error_m": error,
             **{name: frames["readouts"][:, column] for column, name in enumerate(READOUTS)},
         }

@@ -35,7 +35,7 @@ FOLDER = "forks"
 PERIOD_S = 0.02
 """How often to look where A is."""
 AGAIN_S = 1.0
-"""B is told again where to go after so long: a process that dies loses its commands."""
+"""The command to B is repeated after this time: a process that dies loses its commands."""
 APART = 1_000_000
 """Between the session and notice numbers of one engine and the next, so that the page never takes one for another."""
 _MOST_KEPT = 30

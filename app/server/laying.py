@@ -1,4 +1,4 @@
-"""Lays the map of the open session on Earth whenever it has changed and stands still, and shows how it lies."""
+"""Georeferences the map of the open session whenever it has changed and the session is paused."""
 
 import logging
 from concurrent.futures import Future
@@ -59,7 +59,7 @@ class Laying:
             self._show(session, Earth(survey, results.found), by_fixes)
             return
         if not isinstance(error, HemislamError):
-            log.error("The map could not be laid on Earth", exc_info=error)
+            log.error("The map could not be georeferenced", exc_info=error)
         self._show(session, Earth(survey, problem=str(error) or type(error).__name__), MapFrame())
 
     def _show(self, session: Session, earth: Earth, by_fixes: MapFrame) -> None:

@@ -121,7 +121,7 @@ class DropMeasure(Command, frozen=True):
 
 
 class LayOnEarth(Command, frozen=True):
-    """Lay the map on Earth by these fixes or control points, from now on; None: no longer."""
+    """Georeference the map by these fixes or control points from now on; None: no longer."""
 
     survey: Survey | None
 
@@ -156,7 +156,7 @@ class Restart(Command, frozen=True):
 
 
 class Save(Command, frozen=True):
-    """Write the results of the frames so far, replacing older ones in the folder; `Snapshot.saved` tells when.
+    """Write the results of the frames so far, replacing older ones in the folder; `Snapshot.saved` reports when.
 
     Attributes:
         formats: as `hemislam export` has them; none: all files of a run. choice: of points, as there.
@@ -329,7 +329,7 @@ class Earth:
     """Where on Earth the map is.
 
     Attributes:
-        survey: what lays it there; None: nothing.
+        survey: what it is georeferenced by; None: nothing.
         found: how its fixes or points lie on the map; None until that is known.
         problem: why they cannot lie there, in a sentence.
     """

@@ -78,7 +78,7 @@ class Engine:
         belief, still, waiting = before.belief, before.still, False
         if belief is None and not len(samples):
             belief = coast.begin(scan, p)
-            notices.append("There is no IMU: the LiDAR alone tells the motion, less accurately.")
+            notices.append("There is no IMU: motion is estimated from the LiDAR alone, less accurately.")
         elif belief is None:
             started = start.proceed(still, scan, samples, p)
             belief, still, waiting = started.belief, started.still, started.waiting

@@ -33,19 +33,29 @@ def interpolate(truth: Trajectory, stamps_ns: I64) -> tuple[Trajectory, npt.NDAr
     Returns the interpolated poses, and a mask over `stamps_ns` of those that have one: inside the time of the truth
     and not in a gap longer than MAX_TRUTH_GAP_S.
     """
-    right = np.searchsorted(truth.stamps_ns, stamps_ns).clip(1, len(truth) - 1)
-    gap = truth.stamps_ns[right] - truth.stamps_ns[right - 1]
-    inside = (stamps_ns >= truth.stamps_ns[0]) & (stamps_ns <= truth.stamps_ns[-1])
-    exact = (stamps_ns == truth.stamps_ns[right]) | (stamps_ns == truth.stamps_ns[right - 1])
-    usable = inside & (exact | (gap <= MAX_TRUTH_GAP_S * 1e9))
-    stamps, right = stamps_ns[usable], right[usable]
-    fraction = ((stamps - truth.stamps_ns[right - 1]) / gap[usable])[:, None]
-    positions = (1 - fraction) * truth.positions[right - 1] + fraction * truth.positions[right]
+    places = places_at(truth.stamps_ns, truth.positions, stamps_ns)
+    usable = np.isfinite(places[:, 0])
+    stamps, positions = stamps_ns[usable], places[usable]
     if not len(stamps):
         return Trajectory(stamps, positions, np.zeros((0, 4))), usable
     since_start = (truth.stamps_ns - truth.stamps_ns[0]) * 1e-9
     quaternions = Slerp(since_start, truth.rotations)((stamps - truth.stamps_ns[0]) * 1e-9).as_quat()
     return Trajectory(stamps, positions, quaternions), usable
+
+
+def places_at(truth_ns: I64, positions: F64, stamps_ns: I64) -> F64:
+    """(n, 3) true positions at `stamps_ns` (n,), linear between poses (m, 3) at `truth_ns` (m,).
+
+    nan outside their time and in gaps longer than MAX_TRUTH_GAP_S.
+    """
+    right = np.searchsorted(truth_ns, stamps_ns).clip(1, len(truth_ns) - 1)
+    before, after = truth_ns[right - 1], truth_ns[right]
+    fraction = ((stamps_ns - before) / (after - before))[:, None]
+    places: F64 = (1 - fraction) * positions[right - 1] + fraction * positions[right]
+    exact = (stamps_ns == before) | (stamps_ns == after)
+    outside = (stamps_ns < truth_ns[0]) | (stamps_ns > truth_ns[-1])
+    places[outside | (~exact & (after - before > MAX_TRUTH_GAP_S * 1e9))] = np.nan
+    return places
 
 
 def paired(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
@@ -206,7 +216,7 @@ def drift(estimate: Trajectory, truth: Trajectory, metres: float, every: int = 1
         HemislamError: fewer than 3 stamps of the estimate have a truth.
     """
     ours, theirs = paired(estimate, truth)
-    walked = walked_m(theirs)
+    walked = walked_m(theirs.positions)
     i = np.arange(0, len(theirs), every)
     j = np.searchsorted(walked, walked[i] + metres)
     i, j = i[j < len(theirs)], j[j < len(theirs)]
@@ -216,10 +226,9 @@ def drift(estimate: Trajectory, truth: Trajectory, metres: float, every: int = 1
     return np.asarray(100 * np.linalg.norm(wrong, axis=1) / metres)
 
 
-def walked_m(trajectory: Trajectory) -> F64:
-    """(n,) m of path up to each pose."""
-    steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+def walked_m(positions: F64) -> F64:
+    """(n,) m of path up to each of (n, 3) positions."""
+    return np.cumsum(np.linalg.norm(np.diff(positions, axis=0, prepend=positions[:1]), axis=1))
 
 
 def compare(estimate: Trajectory, truth: Trajectory, *, rotations: bool = True) -> dict[str, Any]:

@@ -73,13 +73,9 @@ class Params(Section):
 
     def with_values(self, values: Mapping[str, Any]) -> "Params":
         """This, with dotted names set: `params.with_values({"ground.alpha": 30})`. Raises as `merged`."""
-        tree: dict[str, dict[str, Any]] = {}
-        for path, value in values.items():
-            section, dot, name = path.partition(".")
-            if not dot:
-                raise HemislamError(_unknown("parameter", path, {leaf.path for leaf in leaves()}))
-            tree.setdefault(section, {})[name] = value
-        return self.merged(tree)
+        if flat := next((path for path in values if "." not in path), None):
+            raise HemislamError(_unknown("parameter", flat, {leaf.path for leaf in leaves()}))
+        return self.merged(nested(values))
 
     def with_assignments(self, assignments: list[str]) -> "Params":
         """This, with command-line texts `section.name=value` applied; values are read as YAML."""
@@ -113,6 +109,15 @@ class Params(Section):
             return self.merged({} if tree is None else tree)
         except HemislamError as error:
             raise HemislamError(f"{source}: {error}") from None
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Values by dotted name as a tree of sections, as `Params.merged` and parameter files have it."""
+    tree: dict[str, dict[str, Any]] = {}
+    for path, value in values.items():
+        section, _, name = path.partition(".")
+        tree.setdefault(section, {})[name] = value
+    return tree
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The header of binary PLY files."""
+"""Headers of binary PLY and PCD files."""
 
 from typing import Protocol
 
@@ -24,6 +24,26 @@ def header(vertex: np.dtype, count: int, *comments: str, keyframe: np.dtype | No
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     lines += _element("vertex", vertex, count) + ([] if keyframe is None else _element("keyframe", keyframe, keyframes))
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
+def pcd_header(kind: np.dtype, count: int, comment: str, viewpoint: str = "0 0 0 1 0 0 0") -> bytes:
+    """The header of `count` points as binary PCD 0.7. viewpoint: x y z qw qx qy qz. As long for every count."""
+    kinds = [kind[name] for name in kind.names or ()]
+    lines = [
+        f"# .PCD v0.7 - {comment}",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(kind.names or ())}",
+        f"SIZE {' '.join(str(one.itemsize) for one in kinds)}",
+        f"TYPE {' '.join(one.kind.upper() for one in kinds)}",
+        f"COUNT {' '.join('1' for _ in kinds)}",
+        f"WIDTH {count:012d}",
+        "HEIGHT 1",
+        f"VIEWPOINT {viewpoint}",
+        f"POINTS {count:012d}",
+        "DATA binary",
+        "",
+    ]
+    return "\n".join(lines).encode("ascii")
 
 
 def _element(name: str, kind: np.dtype, count: int) -> list[str]:

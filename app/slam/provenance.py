@@ -9,6 +9,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from app.slam.errors import HemislamError
+
 
 def hash_input(recording: Path) -> str | None:
     """SHA-256 of a file, or of a folder's files in order of name; None if it cannot be read."""
@@ -22,6 +24,13 @@ def hash_input(recording: Path) -> str | None:
     except OSError:
         return None
     return digest.hexdigest()
+
+
+def sha256_of(recording: Path) -> str:
+    """As `hash_input`. Raises HemislamError: it cannot be read."""
+    if (digest := hash_input(recording)) is None:
+        raise HemislamError(f"{recording} cannot be read; check its permissions.")
+    return digest
 
 
 def peak_memory_mb() -> float:

@@ -25,7 +25,7 @@ class RunInfo:
         recording: the input. params: as used last. start_s, duration_s: the part asked for.
         truth: to compare with. truth_path: its file.
         stopped: why the run ended before the recording did, in a sentence; "" if it did not.
-        calibration: what the recording tells of its mounting beside the parameters, in a sentence; "" if nothing.
+        calibration: what the recording shows about its mounting, in a sentence; "" if nothing.
     """
 
     recording: Path
@@ -40,7 +40,7 @@ class RunInfo:
 
 @dataclass(frozen=True)
 class RunLog:
-    """What the results tell of the frames of a session up to some moment. Arrays are read-only.
+    """The frames of a session up to some moment, as results need them. Arrays are read-only.
 
     Attributes:
         frames: in order. dropped_since: why scans after the last of them were dropped.

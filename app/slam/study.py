@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from app.slam.lie import quaternion
-from app.slam.ply import header
+from app.slam.ply import header, pcd_header
 from app.slam.types import F32, F64, I64, StepResult
 
 VERTEX = np.dtype(
@@ -134,15 +134,8 @@ def ply(result: StepResult) -> bytes:
 def pcd(result: StepResult) -> bytes:
     """The same as a binary PCD file; its viewpoint is the pose of the LiDAR in the map."""
     table = vertices(result)
-    kinds = [table.dtype[name] for name in table.dtype.names or ()]
     T = result.T_map_imu @ result.state.T_imu_lidar
     x, y, z, w = quaternion(T[:3, :3])
     viewpoint = " ".join(f"{value:.9g}" for value in (*T[:3, 3], w, x, y, z))
-    head = (
-        f"# hemislam frame {result.index}, {result.stamp_ns} ns; {_UNITS}\n"
-        f"VERSION 0.7\nFIELDS {' '.join(table.dtype.names or ())}\n"
-        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}\n"
-        f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}\nCOUNT {' '.join('1' for _ in kinds)}\n"
-        f"WIDTH {len(table)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {len(table)}\nDATA binary\n"
-    )
-    return head.encode("ascii") + table.tobytes()
+    comment = f"hemislam frame {result.index}, {result.stamp_ns} ns; {_UNITS}"
+    return pcd_header(VERTEX, len(table), comment, viewpoint) + table.tobytes()

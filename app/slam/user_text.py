@@ -1,6 +1,7 @@
 """Read text that users wrote, YAML and tables of numbers. What is wrong becomes one sentence with source and line."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,20 @@ def read_assignments(texts: Iterable[str], option: str, example: str) -> dict[st
         if not equals:
             raise HemislamError(f"`{option}` needs a value for `{text}`; write it as `{example}`.")
         values[path.strip()] = read_yaml(value, f"The value of `{text}`", f"write it as `{example}`")
+    return values
+
+
+def read_numbers(texts: Iterable[str], names: Sequence[str], least: float = -math.inf) -> dict[str, float]:
+    """Finite numbers by name from texts `name=value`. Raises HemislamError: a name is unknown, or its value is none."""
+    values = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            values[name] = float(value)
+        except ValueError:
+            values[name] = math.nan
+        if name not in names or not (math.isfinite(values[name]) and values[name] >= least):
+            raise HemislamError(f"`{text}` is not NAME=VALUE with a NAME of {', '.join(sorted(names))}.")
     return values
 
 

@@ -1,4 +1,4 @@
-"""A search in a process of its own, for the page: it tells its trials as they come and leaves what `tune` leaves."""
+"""A search in a process of its own, for the page: it reports trials as they finish and writes what `tune` writes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,10 +1,8 @@
 """What a search leaves: trials.csv, tuning.json, the best parameters as YAML, and tuning.html with its plots."""
 
-import csv
-import io
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +11,9 @@ import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from app import __version__
-from app.evaluation.report import write_texts
+from app.slam.params import nested
 from app.slam.provenance import describe_machine
+from app.slam.text_files import csv_text, write_texts
 from app.tuning.objectives import Objective
 from app.tuning.trial import Trial, front
 
@@ -56,7 +55,7 @@ def write_results(
         "tuning.html": _html(trials, best, held_back, objectives, study),
     }
     if best:
-        texts[BEST] = _yaml(best[0].values)
+        texts[BEST] = yaml.safe_dump(nested(best[0].values), sort_keys=False)  # fits every recording
     write_texts(folder, texts)
 
 
@@ -107,24 +106,13 @@ def _entry(trial: Trial, objectives: Sequence[Objective]) -> dict[str, Any]:
     return {"trial": trial.number, "values": dict(trial.values), "scores": scores, "error": trial.error or None}
 
 
-def _yaml(values: Mapping[str, Any]) -> str:
-    """A setting for `--config`: only what was searched for, so that it fits every recording."""
-    tree: dict[str, dict[str, Any]] = {}
-    for path, value in values.items():
-        section, _, name = path.partition(".")
-        tree.setdefault(section, {})[name] = value
-    return yaml.safe_dump(tree, sort_keys=False)
-
-
 def _csv(trials: Sequence[Trial], objectives: Sequence[Objective]) -> str:
     paths = list(dict.fromkeys(path for trial in trials for path in trial.values))
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["trial", *paths, *(f"{one.name}_{one.unit}".rstrip("_") for one in objectives), "error"])
+    rows: list[list[Any]] = [["trial", *paths, *(f"{one.name}_{one.unit}".rstrip("_") for one in objectives), "error"]]
     for trial in trials:
         scores = ["" if value is None else f"{value:.9g}" for value in trial.scores]
-        writer.writerow([trial.number, *(trial.values.get(path, "") for path in paths), *scores, trial.error])
-    return text.getvalue()
+        rows.append([trial.number, *(trial.values.get(path, "") for path in paths), *scores, trial.error])
+    return csv_text(*rows)
 
 
 def _html(

@@ -16,8 +16,7 @@ from app.evaluation.evaluate import Subject
 from app.evaluation.job import RUN_FILES, Job
 from app.evaluation.measured import Outcome, load, measure
 from app.evaluation.runner import RunJobs
-from app.slam.errors import HemislamError
-from app.slam.provenance import hash_input
+from app.slam.provenance import sha256_of
 from app.tuning.objectives import Objective, score
 from app.tuning.space import Dimension, grid
 from app.tuning.trial import Search, Trial, front
@@ -55,7 +54,7 @@ class Runs:
     ) -> None:
         self._subjects, self._objectives, self._folder = subjects, objectives, folder
         self._known, self._run, self._threads = known, run, threads
-        self.hashes = [_hash(subject.recording) for subject in subjects]
+        self.hashes = [sha256_of(subject.recording) for subject in subjects]
 
     def asked(self, how: Search, trials: int, seed: int, part: Part) -> dict[str, Any]:
         """What a search was asked for, as its report keeps it."""
@@ -194,10 +193,3 @@ def known_runs(folder: Path) -> dict[str, Path]:
         if all((report.parent / name).is_file() for name in RUN_FILES):
             known[str(key)] = report.parent
     return known
-
-
-def _hash(recording: Path) -> str:
-    digest = hash_input(recording)
-    if digest is None:
-        raise HemislamError(f"{recording} cannot be read; check its permissions.")
-    return digest

@@ -11,7 +11,7 @@ from app.ui.html import panel
 from app.ui.widgets import Page
 
 _EXPLAINED = (
-    "Finds rotation and position of the LiDAR on the IMU, and the offset of their clocks, from the recording alone. "
+    "Finds the rotation and position of the LiDAR on the IMU and the offset of their clocks from the recording alone. "
     "Takes about as long as the recording."
 )
 
@@ -25,7 +25,7 @@ class CalibrationPanel:
         self._button = gui.add_button("Calibrate", hint=_EXPLAINED, disabled=True)
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._html = gui.add_html("", visible=False)
-        self._apply = gui.add_button("Apply", hint="Undo it as any parameter.", visible=False)
+        self._apply = gui.add_button("Apply", hint="Undo it like any parameter.", visible=False)
         self._button.on_click(lambda _: self._begin())
         self._apply.on_click(lambda _: self._use())
         self._child: Child | None = None
@@ -85,7 +85,7 @@ def find(owner: Link, recording: Path, params: Params) -> None:
     from app.calibration.words import table
 
     try:
-        found = calibrate(recording, params, progress=lambda step, fraction: owner.send(float(fraction)))
+        found = calibrate(recording, params, progress=lambda fraction: owner.send(float(fraction)))
     except HemislamError as error:
         owner.send(str(error))
         return

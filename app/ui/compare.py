@@ -113,7 +113,7 @@ class ComparePanel:
     """Everything about the fork in the caller's container, and what differs in space.
 
     Args:
-        sides: told which side a new fork's parameters are on.
+        sides: shows which side a new fork's parameters are on.
     """
 
     def __init__(self, page: Page, forks: Workspace, sides: Sides) -> None:

@@ -1,4 +1,4 @@
-"""Georeference: what lays the map on Earth is chosen, its residuals are shown, fixes are overruled, points picked."""
+"""Georeference the map in the page: choose fixes or control points, see residuals, accept or reject, pick points."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -49,7 +49,7 @@ class GeoreferencePanel:
         self._file: Path | None = None
         self._control = ""
         self._nodes: list[Any] = []
-        self._by = gui.add_dropdown("lay it by", (NOTHING, RECORDED, FILE, CONTROL))
+        self._by = gui.add_dropdown("georeference by", (NOTHING, RECORDED, FILE, CONTROL))
         self._choose = gui.add_button("Choose a file of fixes…", icon=viser.Icon.FOLDER_OPEN, color="gray")
         self._table = gui.add_folder(None, visible=False)  # an upload button cannot be hidden by itself
         with self._table:
@@ -63,13 +63,15 @@ class GeoreferencePanel:
         self._use = gui.add_dropdown("use them", (_ALIGN, _FACTORS), hint="As factors, fixes bend the map.")
         self._crs = gui.add_text("grid", "", hint="EPSG:25832, for example; empty: the UTM zone of the place.")
         self._lever = gui.add_text(
-            "lever arm (m)", "", hint="From the IMU to the antenna, in the IMU's axes: 0.05 -0.1 0.4; empty: found."
+            "lever arm (m)", "", hint="From the IMU to the antenna, in the IMU's axes: 0.05 -0.1 0.4; empty: estimated."
         )
         self._offset = gui.add_text(
-            "clock offset (ms)", "", hint="How much later fixes are stamped than they were measured; empty: found."
+            "clock offset (ms)", "", hint="How much later fixes are stamped than measured; empty: estimated."
         )
-        self._height = gui.add_text("heights above", "", hint="To be written beside them; empty: as the fixes tell.")
-        self._lay = gui.add_button("Lay the map on Earth", icon=viser.Icon.WORLD)
+        self._height = gui.add_text(
+            "heights above", "", hint="The reference of the heights, for the files; empty: as in the fixes."
+        )
+        self._lay = gui.add_button("Georeference the map", icon=viser.Icon.WORLD)
         self._name = gui.add_dropdown("control point", ("–",))
         self._fit = gui.add_dropdown("pick", (_POINT, _SPHERE), hint="By a click on the map.")
         self._radius = gui.add_number("sphere's radius (m)", 0.0725, min=0.01, max=1.0, step=0.0005)
@@ -129,7 +131,9 @@ class GeoreferencePanel:
                 raise HemislamError(f"A table of control points may have at most {_MOST_BYTES >> 10} kB.")
             text = content.decode("utf-8-sig", errors="replace")
             if not names_of(text):
-                raise HemislamError("The table names no control points; its first line must be name,E,N,H, say.")
+                raise HemislamError(
+                    "The table names no control points; its first line must be, for example, name,E,N,H."
+                )
         except HemislamError as error:
             if client is not None:
                 notify_error(client, error)
@@ -159,7 +163,7 @@ class GeoreferencePanel:
         self._choose.visible, self._table.visible = by == FILE, by == CONTROL
         self._use.visible = self._lever.visible = self._offset.visible = by in (RECORDED, FILE)
         self._crs.visible = self._height.visible = by != NOTHING
-        self._lay.label = "Leave the map where it is" if by == NOTHING else "Lay the map on Earth"
+        self._lay.label = "Leave the map where it is" if by == NOTHING else "Georeference the map"
         self._name.visible = self._fit.visible = self._pick.visible = bool(names)
         self._radius.visible = bool(names) and self._fit.value == _SPHERE
         if names and self._name.options != names:

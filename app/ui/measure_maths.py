@@ -1,7 +1,5 @@
 """Measures in the map: the point that a click meets, coordinates, distances, heights, angles; as words and as CSV."""
 
-import csv
-import io
 from dataclasses import astuple, dataclass
 from typing import Final
 
@@ -12,6 +10,7 @@ from app.export.box import Box
 from app.georeference.reference import GeoReference
 from app.mapping.session_file import Measure, Spot
 from app.server.protocol import Chunk
+from app.slam.text_files import csv_text
 from app.slam.types import F32, F64, NON_GROUND
 from app.ui.chunks import as_mask, shown_points
 
@@ -142,13 +141,11 @@ def words(at: F64, found: Numbers, where: GeoReference | None = None) -> str:
 
 def as_csv(measured: list[tuple[Measure, F64, Numbers]], where: GeoReference | None = None) -> str:
     """A row for each spot, in the map's axes and where it is on Earth; the first of a measure has its numbers too."""
-    text = io.StringIO()
-    write = csv.writer(text, lineterminator="\n").writerow
-    write((*COLUMNS, *(ON_EARTH if where is not None else ())))
+    rows: list[tuple[object, ...]] = [(*COLUMNS, *(ON_EARTH if where is not None else ()))]
     for measure, at, found in measured:
         cells = [f"{value:.4f}" if np.isfinite(value) else "" for value in astuple(found)]
         for row, place in enumerate(at):
             there = where.to_crs(place)[0].tolist() if where is not None else []
             own, grid = ([f"{value:.4f}" for value in values] for values in (place, there))
-            write((measure.name, *own, *(cells if row == 0 else [""] * len(cells)), *grid))
-    return text.getvalue()
+            rows.append((measure.name, *own, *(cells if row == 0 else [""] * len(cells)), *grid))
+    return csv_text(*rows)

@@ -39,7 +39,7 @@ class TunePanel:
     """What is asked for, the progress, and plots of the trials.
 
     Args:
-        folder: for the files that a search leaves. sides: told to show the parameters of the trial that is opened.
+        folder: for the files that a search leaves. sides: shows the parameters of the trial that is opened.
     """
 
     def __init__(self, page: Page, forks: Workspace, sides: Sides, folder: Path) -> None:
@@ -127,7 +127,7 @@ class TunePanel:
     def _left(self, wanted: Wanted) -> str:
         """By the pace of the newest runs: those that were finished before take no time."""
         if len(self._runs) < 2:
-            return "the first runs tell how long it takes"
+            return "the remaining time is not known yet"
         (begin, first), (end, last) = self._runs[-9:][0], self._runs[-1]
         if last > wanted.trials:
             return "checking the best on the part held back"

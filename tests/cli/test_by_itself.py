@@ -26,8 +26,8 @@ def test_an_unknown_mounting_is_found_used_and_told(
     rehearsed(monkeypatch)
     done = CliRunner().invoke(cli, ["run", str(walk), "--out", str(tmp_path / "out")])
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert "The LiDAR seems to be turned by 70°, -50°, 104° on the IMU" in done.output
-    assert "turned by 70°, -50°, 104°" in report["calibration"] and "--write" in report["calibration"]
+    assert "The LiDAR seems to be rotated by 70°, -50°, 104° on the IMU" in done.output
+    assert "rotated by 70°, -50°, 104°" in report["calibration"] and "--write" in report["calibration"]
     assert np.allclose(report["parameters"]["sensor"]["rotation"], [70, -50, 104], atol=0.01)
 
 
@@ -54,5 +54,5 @@ def test_what_a_motion_does_not_tell_changes_nothing(
 def test_info_tells_how_the_lidar_is_turned(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rehearsed(monkeypatch)
     told = CliRunner().invoke(cli, ["info", str(walk)]).output
-    assert "turned by 70°, -50°, 104° on the IMU, and the IMU's clock" in told
+    assert "rotated by 70°, -50°, 104° on the IMU, and the IMU's clock" in told
     assert f"hemislam calibrate {walk} --write" in told

@@ -58,7 +58,7 @@ def test_a_session_gives_the_points_of_a_run_to_its_frame(hemislam: Call, walk: 
     [
         (("--format", "dwg"), "There is no format dwg"),
         (("--format", "laz", "--box", "1,2,3"), "--box takes six numbers"),
-        (("--format", "gpx"), "needs to know where on Earth"),
+        (("--format", "gpx"), "needs a georeferenced map"),
     ],
 )
 def test_what_cannot_be_exported_is_said_in_a_sentence(

@@ -85,7 +85,7 @@ def test_csv_and_gpx_place_the_walk_on_earth(tmp_path: Path) -> None:
 
 
 def test_a_map_without_a_place_gives_no_gpx(tmp_path: Path) -> None:
-    with pytest.raises(HemislamError, match=r"trajectory\.gpx needs to know where on Earth"):
+    with pytest.raises(HemislamError, match=r"trajectory\.gpx needs a georeferenced map"):
         save_results(tmp_path, room(), of_formats(["gpx"]))
     save_results(tmp_path, room(), of_formats(["csv"]))
     assert (tmp_path / "trajectory.csv").read_text().startswith("stamp_s,x_m,y_m,z_m,qx,qy,qz,qw\n")

@@ -56,5 +56,5 @@ def test_walk_picture_and_keyframes_lie_where_they_are(tmp_path: Path) -> None:
 
 
 def test_a_kmz_needs_a_place(tmp_path: Path) -> None:
-    with pytest.raises(HemislamError, match=r"map\.kmz needs to know where on Earth"):
+    with pytest.raises(HemislamError, match=r"map\.kmz needs a georeferenced map"):
         save_results(tmp_path, room(), of_formats(["kmz"]))

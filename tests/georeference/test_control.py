@@ -80,7 +80,7 @@ def test_a_point_without_its_easting_is_told_as_such(tmp_path: Path) -> None:
         (
             dict([*CORNERS.items()][:2]),
             "EPSG:32632",
-            "only A and B are: it stays open how the map is turned about the line",
+            "only A and B are: the map's rotation about the line",
         ),
         ({name: (10.0 * k, 5.0 * k, 0.1 * k) for k, name in enumerate("ABCD")}, "EPSG:32632", "lie on one line"),
         (CORNERS, "", "say of which grid: EPSG:CODE"),

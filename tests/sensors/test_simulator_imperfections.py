@@ -166,7 +166,7 @@ def test_sizes_are_set_by_name() -> None:
     assert IMPERFECT.with_sizes(["companions=0"]).companions == 0
     assert all(getattr(IMPERFECT, field.name) > 0 for field in fields(IMPERFECT))
     for wrong in ("delay=1", "late=soon", "late", "late=-1"):
-        with pytest.raises(HemislamError, match=f"`{wrong}` is not NAME=SIZE with a NAME of accel_scale"):
+        with pytest.raises(HemislamError, match=f"`{wrong}` is not NAME=VALUE with a NAME of accel_scale"):
             NONE.with_sizes([wrong])
 
 

@@ -151,7 +151,7 @@ def test_three_points_picked_on_the_map_lay_it_and_with_two_it_is_said_what_stay
     assert found is not None and found.rms.max() < 1e-6
     np.testing.assert_allclose(found.reference.origin, true.origin, atol=1e-6)
     two = bench.do(LayOnEarth(replace(survey, picks=picks[:2]))).earth
-    assert two.found is None and "only P0 and P1 are: it stays open how the map is turned about" in two.problem
+    assert two.found is None and "only P0 and P1 are: the map's rotation about" in two.problem
     left = bench.do(LayOnEarth(survey), EditLoop(Overrule("point P2", accepted=False))).earth
     assert "only P0 and P1" in left.problem
     bench.do(UndoLoop())

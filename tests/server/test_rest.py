@@ -69,7 +69,7 @@ def test_exports_by_rest(site: Site) -> None:
     assert httpx.get(site.url("/api/export/passwd")).status_code == 422
     for name in ("trajectory.gpx", "map.kmz"):
         refused = httpx.get(site.url(f"/api/export/{name}"))
-        assert refused.status_code == 409 and "where on Earth the map is" in refused.json()["detail"]
+        assert refused.status_code == 409 and "needs a georeferenced map" in refused.json()["detail"]
     without_loops = httpx.get(site.url("/api/export/graph.g2o"), timeout=TIMEOUT_S)
     assert without_loops.status_code == 404 and "loop search is off" in without_loops.json()["detail"]
 

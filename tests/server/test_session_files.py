@@ -164,7 +164,7 @@ def test_formats_of_other_programs_are_written_and_what_they_lack_is_said(tmp_pa
         snapshot = bench.do(StepFrame())
     assert snapshot.progress is None and shares != {None}
     assert {file.name for file in (tmp_path / "laz").iterdir()} == {"map.laz", "trajectory.csv"}
-    assert snapshot.saved[0].error == "" and "where on Earth" in snapshot.saved[1].error
+    assert snapshot.saved[0].error == "" and "georeferenced" in snapshot.saved[1].error
 
 
 def test_a_save_that_waits_does_not_show_how_far_the_last_one_was(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ _CUT_DEG = 4.0
 _CUT_BLOCKS = 2
 """Ends of a scan at most this far beyond azimuth 0 are moved into the revolution."""
 _LEAST_TURN_DEG = 30.0
-"""A shorter part of a turn does not tell its speed."""
+"""A shorter part of a turn does not determine its speed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ def _turn(scan: Scan, calibration: ChannelAngles, model: Model, rate_hz: int) ->
     step = 360.0 * rate_hz * model.block_ns * 1e-9
     x, y = scan.points[:, 0].astype(np.float64), scan.points[:, 1].astype(np.float64)
     flat = np.hypot(x, y)
-    # High up the azimuth tells little, and the lever matters much.
+    # Near the zenith the azimuth says little, and the lever matters much.
     good = (calibration.elevations_deg[channel] < 60.0) & (flat > 0.5)
     if not good.any():
         good = np.ones(len(x), bool)

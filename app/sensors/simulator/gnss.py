@@ -1,7 +1,7 @@
 """A satellite receiver on the simulated scanner."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from app.georeference.reference import GeoReference
 from app.sensors.simulator.trajectory import SmoothTrajectory
 from app.slam import lie
 from app.slam.errors import HemislamError
+from app.slam.user_text import read_numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,17 +41,7 @@ class Gnss:
 
     def with_sizes(self, assignments: Sequence[str]) -> "Gnss":
         """With other values, each given as `name=value`. Raises HemislamError, which names them."""
-        values = {}
-        known = {field.name for field in fields(self)}
-        for text in assignments:
-            name, _, value = text.partition("=")
-            try:
-                values[name] = float(value)
-            except ValueError:
-                values[name] = float("nan")
-            if name not in known or not np.isfinite(values[name]):
-                raise HemislamError(f"`{text}` is not NAME=VALUE with a NAME of {', '.join(sorted(known))}.")
-        made = replace(self, **values)
+        made = replace(self, **read_numbers(assignments, self.__slots__))
         if not (0.1 <= made.rate <= 50 and made.noise > 0 and 0 <= made.outliers <= 1 and abs(made.latitude) <= 84):
             raise HemislamError(
                 "A simulated receiver has a rate of 0.1 to 50, a noise over 0, outliers of 0 to 1, and a latitude"

@@ -4,7 +4,7 @@ Each term is one field of `Imperfections`: its size, 0 where it is off. `IMPERFE
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,9 +12,9 @@ from app.sensors.robosense import CHANNELS
 from app.sensors.simulator.raycast import Hits, Mover, Raycaster
 from app.sensors.simulator.scenes.props import person_mesh
 from app.sensors.simulator.trajectory import SmoothTrajectory, Walker, seconds
-from app.slam.errors import HemislamError
 from app.slam.lie import exp
 from app.slam.types import F64, ImuSamples
+from app.slam.user_text import read_numbers
 
 GLASS_REFLECTIVITY = 0.05
 """A surface that reflects less than this is a pane."""
@@ -65,17 +65,7 @@ class Imperfections:
 
     def with_sizes(self, assignments: Sequence[str]) -> "Imperfections":
         """With other sizes, each given as `name=size`. Raises HemislamError, which names the terms."""
-        sizes = {}
-        for text in assignments:
-            name, _, size = text.partition("=")
-            try:
-                sizes[name] = float(size)
-            except ValueError:
-                sizes[name] = -1.0
-            known = {field.name for field in fields(self)}
-            if name not in known or not 0.0 <= sizes[name] < np.inf:
-                raise HemislamError(f"`{text}` is not NAME=SIZE with a NAME of {', '.join(sorted(known))}.")
-        return replace(self, **sizes)
+        return replace(self, **read_numbers(assignments, self.__slots__, least=0.0))
 
 
 NONE = Imperfections()

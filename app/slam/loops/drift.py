@@ -1,6 +1,6 @@
 """How far odometry may have drifted between two keyframes, and whether measured loops agree with it.
 
-The filter's covariance does not tell: it takes the map as exact, so it stays at millimetres however long the
+The filter's covariance does not show this: it takes the map as exact, so it stays at millimetres however long the
 trajectory. Drift grows with the distance. Model: position drifts by a share of the distance, heading by an angle per
 metre, both constant (the worst case, as nothing averages out) and independent. Gravity fixes roll and pitch. The
 distance between two keyframes is the shortest one through the graph: accepted loops are short cuts.

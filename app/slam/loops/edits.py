@@ -75,7 +75,7 @@ class Solve(_Edit):
 
 @dataclass(frozen=True, slots=True)
 class Overrule(_Edit):
-    """Count or leave out what lays the map on Earth, whatever its residual. It changes nothing of the loops.
+    """Count or leave out what georeferences the map, whatever its residual. It changes nothing of the loops.
 
     Attributes:
         what: "fix 12" or "point P1", as the table of residuals names them.

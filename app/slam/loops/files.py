@@ -1,13 +1,12 @@
 """What is written about loops beside the other results of a run."""
 
-import csv
-import io
 from dataclasses import dataclass
 
 from scipy.spatial.transform import Rotation
 
 from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.map_frame import MapFrame
+from app.slam.text_files import csv_text
 from app.slam.trajectory import stamp_text
 from app.slam.types import I64
 
@@ -43,14 +42,12 @@ def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
     Args:
         stamps_ns: (k,) of keyframes.
     """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    rows = []
     for edge in edges:
         T, e = edge.T_older_newer, edge.evidence
         pose = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
         measures = (e.context_distance, e.overlap, e.residual_rms, e.slide, e.alternative_m, e.mahalanobis, e.gate_m)
-        writer.writerow(
+        rows.append(
             [
                 edge.older,
                 edge.newer,
@@ -67,4 +64,4 @@ def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
                 edge.reason,
             ]
         )
-    return out.getvalue()
+    return csv_text(COLUMNS, *rows)

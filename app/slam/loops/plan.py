@@ -1,6 +1,6 @@
 """Where one submap lies on another, without a good guess: their plans are compared at every shift and turn.
 
-A plan is a raster of what stands upright: the taller, the more it counts. Ground fits anywhere; it only tells that
+A plan is a raster of what stands upright: the taller, the more it counts. Ground fits anywhere; it only shows that
 nothing stands there. The shifts at which two plans agree best are found at once, by a circular correlation for each
 turn; heights follow from the ground. Registration begins at the best few.
 """
@@ -16,7 +16,7 @@ from app.slam.loops.verification import Prepared
 from app.slam.types import F64, I64
 
 CELL_M, CELLS = 0.4, 128
-"""Of a plan. It wraps around; submaps reach 20 m, so shifts of up to `FARTHEST_M` are told from one another."""
+"""Of a plan. It wraps around; submaps reach 20 m, so shifts of up to `FARTHEST_M` can be distinguished."""
 FARTHEST_M = 11.0
 TURN = np.radians(3.0)
 """Step of the turns that are tried; at the rim of a submap it moves a point by a metre."""

@@ -20,7 +20,7 @@ LIKELY = 2.5
 
 
 def slipped(before: Prepared, after: Prepared) -> bool:
-    """Whether the surroundings seen after a step lie elsewhere than odometry says, in a direction that they tell of.
+    """Whether the surroundings seen after a step lie elsewhere than odometry says, in a direction that they constrain.
 
     Args:
         before, after: submaps in the same level frame, by odometry.

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from app.slam import lie
 from app.slam.loops.drift import Drift
 from app.slam.loops.types import LOOP_HUBER, LoopEdge, Origin, Pair, Verdict
+from app.slam.metrics import walked_m
 from app.slam.sections import LoopsParams
 from app.slam.types import F64
 
@@ -48,7 +49,7 @@ def settle(
     Returns:
         All of `fresh`, and earlier candidates whose verdict changed, without the user's edits.
     """
-    walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+    walked = walked_m(poses[:, :3, 3])
 
     def ways(a: LoopEdge, b: LoopEdge) -> tuple[float, float]:
         return abs(float(walked[a.older] - walked[b.older])), abs(float(walked[a.newer] - walked[b.newer]))

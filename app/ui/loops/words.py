@@ -1,4 +1,4 @@
-"""How the page tells loops apart, and what it says of them, of edits and of the graph's residuals."""
+"""How the page distinguishes loops, and its words for them, for edits and for the graph's residuals."""
 
 from dataclasses import dataclass
 from typing import Any, Final

@@ -1,0 +1,27 @@
+"""Text files that this program writes: tables as CSV, and files that are complete or not there."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from app.slam.errors import HemislamError
+
+
+def csv_text(*rows: Iterable[object]) -> str:
+    """Rows as CSV, the heading first."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write files by name; older ones stay until all are complete. Raises HemislamError: they cannot be written."""
+    parts = {name: folder / f".{name}.part" for name in texts}
+    try:
+        for name, part in parts.items():
+            part.write_text(texts[name], encoding="utf-8")
+        for name, part in parts.items():
+            part.replace(folder / name)
+    except OSError as error:
+        raise HemislamError(f"{', '.join(texts)} cannot be written to {folder}: {error.strerror}.") from error

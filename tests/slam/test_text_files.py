@@ -1,0 +1,24 @@
+from pathlib import Path
+
+import pytest
+
+from app.slam.errors import HemislamError
+from app.slam.text_files import csv_text, write_texts
+
+
+def test_cells_with_commas_are_quoted() -> None:
+    assert csv_text(("name", "x"), ("a, b", 0.5), ["c", ""]) == 'name,x\n"a, b",0.5\nc,\n'
+
+
+def test_no_file_is_replaced_unless_all_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("old")
+    (tmp_path / ".b.txt.part").mkdir()
+    with pytest.raises(HemislamError, match=r"a.txt, b.txt cannot be written to"):
+        write_texts(tmp_path, {"a.txt": "new", "b.txt": "new"})
+    assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_files_hold_their_texts(tmp_path: Path) -> None:
+    write_texts(tmp_path, {"a.txt": "α", "b.txt": "β"})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.txt", "b.txt"]
+    assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "α"
