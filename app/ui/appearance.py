@@ -1,12 +1,12 @@
 """The controls of how the scene looks, and the legend that explains its colours."""
 
-from collections.abc import Callable
 from typing import Final
 
 import viser
 
 from app.ui.colours import COLOUR_BY, Limits, legend
 from app.ui.html import panel
+from app.ui.scale import Looks
 from app.ui.widgets import View, choose_next, show
 
 _ACCENTS: Final = {False: (38, 166, 154), True: (13, 110, 102)}
@@ -31,12 +31,12 @@ def apply_theme(gui: viser.GuiApi, *, light: bool) -> None:
 class AppearancePanel:
     """Widgets whose values are the `View`; the engine does not know of them.
 
-    above: whether a browser looks down from above. legend: what `templates/transport.js` copies into the scene.
+    looks: how browsers look at the scene. legend: what `templates/transport.js` copies into the scene.
     """
 
-    def __init__(self, gui: viser.GuiApi, legend: viser.GuiHtmlHandle, above: Callable[[], bool]) -> None:
+    def __init__(self, gui: viser.GuiApi, legend: viser.GuiHtmlHandle, looks: Looks) -> None:
         default = View()
-        self._above = above
+        self._looks = looks
         self._legend = legend
         self._limits: Limits | None = None  # of all values
         self._ends: dict[str, Limits] = {}  # by colour mode, as the user chose them
@@ -51,7 +51,12 @@ class AppearancePanel:
             hint="Keep the sensor in the middle; orbit and zoom as you like. F toggles; G shows the whole map again.",
         )
         self._point_size = gui.add_slider(
-            "points (cm)", 0.5, 15.0, 0.5, 100 * default.point_size, hint="Diameter of the points drawn."
+            "points (cm)",
+            0.5,
+            15.0,
+            0.5,
+            100 * default.point_size,
+            hint="Diameter of points from nearby; from afar they grow to stay visible.",
         )
         with gui.add_folder("Layers", expand_by_default=True):
             self._ceilings = gui.add_dropdown(
@@ -72,13 +77,14 @@ class AppearancePanel:
     def view(self) -> View:
         return View(
             colour_by=self._colour_by.value,
-            point_size=self._point_size.value / 100,
+            point_size=self._looks.point_size(self._point_size.value / 100),
             follow=self._follow.value,
             light=self._light.value,
             ends=self._ends.get(self._colour_by.value),
             clip=None,
             slab=0.0,
-            ceilings=self._ceilings.value == _SHOWN or (self._ceilings.value == _BY_ITSELF and not self._above()),
+            ceilings=self._ceilings.value == _SHOWN
+            or (self._ceilings.value == _BY_ITSELF and not self._looks.from_above),
             **{name: layer.value for name, layer in self._layers.items()},
         )
 

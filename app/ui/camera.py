@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -15,9 +16,14 @@ from app.ui.widgets import Changes, Page, by_user, show
 FOV: Final = float(np.radians(60.0))
 _NARROW: Final = float(np.radians(2.0))
 """viser has no parallel projection: from far away, through a narrow lens, lines stay parallel to the eye."""
-_SHARE: Final = 2.0
-"""Percent of the points at each end that a fitted view may leave out."""
+_LEFT_OUT: Final = 0.5
+"""Percent of the points that may lie beyond each edge of a fitted view: few far ones would make the rest small."""
 _LEAST_M: Final = 4.0
+_SOME: Final = 20_000
+"""Points that say where the map is."""
+_BAR_PX: Final = 80
+_WIDE_PX: Final = 577
+"""What the transport covers of the scene's lower edge, on pages at least so wide."""
 _FAR: Final = 10.0
 """What lies behind the map by so many distances is drawn too."""
 FIT, PLAN, TOP, FRONT, SIDE = "fit", "plan", "top", "front", "side"
@@ -32,7 +38,7 @@ _WAYS: Final[dict[str, tuple[float, float, float]]] = {
 _EASE: Final = 0.2
 """Share of the way to the newest extent of the map that cameras go per drawing, so that they glide as it grows."""
 _ARRIVED: Final = 0.01
-"""So near, as a share of the map's size, cameras rest."""
+"""So near, as a share of the distance to the map, cameras rest."""
 _PUT: Final = 300
 """Places of cameras that are remembered: a slow browser says late where its camera was put."""
 _FOLLOWED_FROM_M: Final = 25.0
@@ -45,42 +51,62 @@ class Stand:
     position: F64
     look_at: F64
 
+    @property
+    def distance(self) -> float:
+        return float(np.linalg.norm(self.position - self.look_at))
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Extent:
-    """A ball around a map: middle (3,) and radius, m."""
+    def towards(self, other: "Stand", share: float) -> "Stand":
+        """A part of the way to another one; that one itself where little is left."""
+        ways = other.position - self.position, other.look_at - self.look_at
+        if max(float(np.linalg.norm(way)) for way in ways) < _ARRIVED * other.distance:
+            return other
+        return Stand(self.position + share * ways[0], self.look_at + share * ways[1])
 
-    middle: F64
-    radius: float
 
-    def towards(self, other: "Extent", share: float) -> "Extent":
-        return Extent(
-            self.middle + share * (other.middle - self.middle), self.radius + share * (other.radius - self.radius)
-        )
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """What a browser shows the scene in.
 
-    def apart(self, other: "Extent") -> float:
-        """How far the other one is off, as a share of this one's size."""
-        return float(np.linalg.norm(other.middle - self.middle) + abs(other.radius - self.radius)) / self.radius
+    Attributes:
+        fov: rad, of its height. shape: width over height. covered: share of its height that is hidden, at the bottom.
+    """
+
+    fov: float = FOV
+    shape: float = 1.0
+    covered: float = 0.0
 
 
 _MAP: Final = np.eye(3)
-NOTHING: Final = Extent(np.array([0.3, 0.2, -0.6]), 5.0)
-"""What is looked at before there is a map: around the sensor."""
+NOTHING: Final[F64] = np.array([0.3, 0.2, -0.6]) + 2.5 * np.array(list(product((-1.0, 1.0), repeat=3)))
+"""Looked at before there is a map: around the sensor."""
 
 
-def extent(points: F64) -> Extent:
-    """The ball around all of (n, 3) points but a few far ones."""
-    if not len(points):
-        return NOTHING
-    low, high = np.percentile(points, (_SHARE, 100 - _SHARE), axis=0)
-    return Extent((low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, _LEAST_M))
+def whole(points: F64, way: str = FIT, picture: Picture = Picture(), axes: F64 = _MAP) -> Stand:
+    """From where (n, 3) points, all but a few, just fill a picture. axes: (3, 3) columns, those of a way."""
+    towards = axes @ _WAYS[way] / np.linalg.norm(_WAYS[way])
+    right = np.cross((0.0, 0.0, 1.0), towards)
+    right /= np.linalg.norm(right)
+    up = np.cross(towards, right)
+    middle = np.median(points, axis=0)
+    x, y, z = ((points - middle) @ axis for axis in (right, up, towards))
+    high = float(np.tan(picture.fov / 2))
+    wide, hidden = high * picture.shape, 2 * high * picture.covered
+    across, back_x = _between(x, z, wide, wide)
+    upwards, back_y = _between(y, z, high, high - hidden)
+    distance = 1.03 * max(back_x, back_y, _LEAST_M / min(high, wide))
+    look_at = middle + across * right + (upwards - hidden / 2 * (distance - back_y)) * up
+    return Stand(look_at + distance * towards, look_at)
 
 
-def whole(map_: Extent, way: str = FIT, fov: float = FOV, axes: F64 = _MAP) -> Stand:
-    """From where all of it is seen. fov: rad, of the picture's smaller side. axes: (3, 3) columns, those of a way."""
-    towards = axes @ _WAYS[way]
-    distance = 1.05 * map_.radius / np.tan(fov / 2)
-    return Stand(map_.middle + towards / np.linalg.norm(towards) * distance, map_.middle)
+def _between(across: F64, near: F64, one: float, other: float) -> tuple[float, float]:
+    """Where the axis of a camera is, and how far back the camera, to have points between two edges of its picture.
+
+    Args:
+        across, near: (n,) m, to one side and towards the camera. one, other: tangents of that side's edge and of the
+            opposite one.
+    """
+    first, second = (float(np.percentile(near + at, 100 - _LEFT_OUT)) for at in (across / one, -across / other))
+    return (first - second) * one * other / (one + other), (first * one + second * other) / (one + other)
 
 
 class Framing:
@@ -91,39 +117,42 @@ class Framing:
         self.north = np.array([0.0, 1.0])  # in the map, which is up in plans
         self._ways: dict[int, str] = {}  # from which side browsers look; FIT unless it was chosen
         self._put: deque[F64] = deque(maxlen=_PUT)
-        self._wanted = self._shown = NOTHING
-        self._at_once = False
-        self._pictures = self.pictures
+        self._points, self._at_once = NOTHING, False
+        self._fitted: dict[tuple[object, ...], Stand] = {}
+        self._stands: dict[int, Stand] = {}  # of browsers, as last shown
         server.initial_camera.fov = FOV
         self._begin(np.zeros(3))
 
     def see(self, points: F64, *, at_once: bool) -> None:
         """Take in some points of the map, (n, 3); at_once: it is another map."""
-        self._wanted, self._at_once = extent(points), at_once
+        self._points = points[:: len(points) // _SOME + 1] if len(points) else NOTHING
+        self._at_once |= at_once
+        self._fitted.clear()
 
     @property
-    def pictures(self) -> frozenset[tuple[int, float]]:
-        """Number and width over height of each browser's picture."""
-        return frozenset((number, _shape(client)) for number, client in self._server.get_clients().items())
+    def pictures(self) -> frozenset[tuple[int, Picture]]:
+        """Number and picture of each browser."""
+        return frozenset((number, _picture(client)) for number, client in self._server.get_clients().items())
 
     def draw(self, offset: F64) -> bool:
         """Move the cameras on; False while they are on their way. offset: (3,) m, of the map in the scene."""
-        before, self._pictures = self._pictures, self.pictures
-        if not self._at_once and self._shown.apart(self._wanted) < _ARRIVED and self._pictures == before:
-            return True
-        self._shown = self._wanted if self._at_once else self._shown.towards(self._wanted, _EASE)
-        self._at_once = False
-        clients = {number: client for number, client in self._server.get_clients().items() if self._untouched(client)}
-        self._begin(offset)
+        at_once, self._at_once = self._at_once, False
+        clients = self._server.get_clients()
+        moving = False
         for number, client in clients.items():
-            self._place(client, self._ways.get(number, FIT), offset)
-        return False
+            wanted = self._whole(client)
+            shown = self._stands.get(number)
+            if shown is not wanted and self._untouched(client):
+                there = wanted if shown is None or at_once else shown.towards(wanted, _EASE)
+                self._place(client, there, offset)
+                moving = True
+        self._begin(offset)
+        return not moving
 
     def show(self, client: viser.ClientHandle, way: str, offset: F64) -> None:
         """Let a browser look at the whole map from one side, and keep doing so."""
-        self._shown = self._wanted
         self._ways[client.client_id] = way
-        self._place(client, way, offset)
+        self._place(client, self._whole(client), offset)
 
     def follow(self) -> None:
         """Let every browser look at the sensor, which is kept at the scene's origin."""
@@ -136,34 +165,46 @@ class Framing:
 
     def _begin(self, offset: F64) -> None:
         """Where pages that open later look from."""
-        stand, camera = whole(self._shown), self._server.initial_camera
-        camera.position, camera.look_at = stand.position + offset, stand.look_at + offset
-        self._put.append(camera.position)
+        stand, camera = self._fit(FIT, Picture()), self._server.initial_camera
+        position = stand.position + offset
+        if not self._put or not np.array_equal(position, camera.position):
+            camera.position, camera.look_at = position, stand.look_at + offset
+            self._put.append(position)
 
-    def _place(self, client: viser.ClientHandle, way: str, offset: F64) -> None:
-        camera = client.camera
-        x, y = self.north
-        north_up = np.array([[y, x, 0.0], [-x, y, 0.0], [0.0, 0.0, 1.0]])
-        narrow = 2 * np.arctan(np.tan(camera.fov / 2) * min(_shape(client), 1.0))
-        stand = whole(self._shown, way, float(narrow), north_up if way in (PLAN, TOP) else _MAP)
+    def _whole(self, client: viser.ClientHandle) -> Stand:
+        return self._fit(self._ways.get(client.client_id, FIT), _picture(client))
+
+    def _fit(self, way: str, picture: Picture) -> Stand:
+        """The same object while the map is the same."""
+        x, y = self.north.tolist()
+        key = way, picture, x, y
+        if key not in self._fitted:
+            north_up = np.array([[y, x, 0.0], [-x, y, 0.0], [0.0, 0.0, 1.0]])
+            self._fitted[key] = whole(self._points, way, picture, north_up if way in (PLAN, TOP) else _MAP)
+        return self._fitted[key]
+
+    def _place(self, client: viser.ClientHandle, stand: Stand, offset: F64) -> None:
+        self._stands[client.client_id] = stand
         move(client, Stand(stand.position + offset, stand.look_at + offset))
         self._put.append(stand.position + offset)
 
     def _untouched(self, client: viser.ClientHandle) -> bool:
         """Whether the browser's camera is where it was put."""
         off = np.linalg.norm(np.array(self._put) - client.camera.position, axis=1)
-        return bool(off.min() < 1e-3 * self._shown.radius)
+        return bool(off.min() < 1e-3 * np.linalg.norm(np.array(client.camera.position) - client.camera.look_at))
 
 
-def _shape(client: viser.ClientHandle) -> float:
-    """Width over height of a browser's picture."""
+def _picture(client: viser.ClientHandle) -> Picture:
     camera = client.camera
-    return round(max(camera.image_width, 1) / max(camera.image_height, 1), 2) or 0.01
+    width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+    shape = round(width / height, 2) or 0.01
+    covered = round(_BAR_PX / height, 2) if width >= _WIDE_PX else 0.0
+    return Picture(camera.fov, shape, min(covered, 0.4))
 
 
 def move(client: viser.ClientHandle, stand: Stand) -> None:
     """Put a browser's camera somewhere in the scene, and its clipping planes around what it sees."""
-    camera, distance = client.camera, float(np.linalg.norm(stand.position - stand.look_at))
+    camera, distance = client.camera, stand.distance
     with client.atomic():
         camera.far, camera.near = _FAR * max(distance, 100.0), max(distance / 1e4, 0.01)
         camera.position, camera.look_at = stand.position, stand.look_at
@@ -216,7 +257,7 @@ class CameraPanel:
         """
         self._look_freely(client)
         show(self._parallel, True)
-        half = 0.6 * max(size[1], size[0] / _shape(client), 1.0)
+        half = 0.6 * max(size[1], size[0] / _picture(client).shape, 1.0)
         self._go(client, Stand(middle - axes[:, 1] * half / np.tan(FOV / 2), middle))
 
     def _stand(self, client: viser.ClientHandle) -> Stand:

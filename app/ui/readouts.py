@@ -65,9 +65,9 @@ def state_tiles(snapshot: Snapshot, result: StepResult) -> list[Tile]:
         Tile("acceleration bias", accel_norm, "mm/s²", _vector(accel, 1), width="half"),
     ]
     errors = series.get("error_m", np.empty(0))
-    if np.isfinite(errors).any():
-        rms = f"cm · RMS {100 * float(np.sqrt(np.nanmean(errors**2))):.1f} cm"
-        tiles.append(Tile("position error to truth", number(100 * float(errors[-1]), 1), rms, width="wide"))
+    if len(known := errors[np.isfinite(errors)]):
+        rms = f"cm · RMS {100 * float(np.sqrt(np.mean(known**2))):.1f} cm"
+        tiles.append(Tile("position error to truth", number(100 * float(known[-1]), 1), rms, width="wide"))
     return tiles
 
 

@@ -91,17 +91,15 @@ def settled(params: Params, option: str) -> Params | None:
 
 
 def findings_html(findings: tuple[Finding, ...], params: Params) -> str:
-    """The findings, those that need the user first, each with a button for what would change something."""
-    order = list(_LOOKS)[::-1]
-    ranked = sorted(findings, key=lambda finding: order.index(finding.verdict))
-    rows = []
-    for finding in ranked:
-        after = settled(params, finding.option)
-        change = (
-            "" if after in (None, params) else "Settle it" if finding.verdict == "needs you" else "Use this instead"
-        )
-        rows.append((finding, *_LOOKS[finding.verdict], change))
-    return panel("findings", rows)
+    """The findings, those that need the user first, with a button for what would change something; the rest folded."""
+    rows: dict[str, list[tuple[Finding, str, str, str]]] = {verdict: [] for verdict in reversed(_LOOKS)}
+    for finding in findings:
+        needed = finding.verdict == "needs you"
+        after = settled(params, finding.option) if finding.verdict != "fine" else None
+        change = "" if after in (None, params) else "Settle it" if needed else "Use this instead"
+        rows[finding.verdict].append((finding, *_LOOKS[finding.verdict], change))
+    fine = rows.pop("fine")
+    return panel("findings", [row for told in rows.values() for row in told], fine)
 
 
 def verdicts(findings: tuple[Finding, ...]) -> tuple[str, str] | None:

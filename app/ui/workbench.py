@@ -36,7 +36,7 @@ from app.ui.measure import MeasurePanel
 from app.ui.notes import NotesPanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.readouts import ReadoutPanel
-from app.ui.scale import FromAbove, ScaleBars
+from app.ui.scale import Looks, ScaleBars
 from app.ui.scene import Scene
 from app.ui.status import DoctorPanel, HeaderPanel, NoticePanel
 from app.ui.study import StudyPanel
@@ -119,7 +119,7 @@ class Workbench:
         with tabs.add_tab("Tune", viser.Icon.TARGET_ARROW):
             self._tune = TunePanel(page, forks, self._sides, results / "tuning")
         with tabs.add_tab("View", viser.Icon.EYE):
-            self._appearance = AppearancePanel(gui, legend, FromAbove(server))
+            self._appearance = AppearancePanel(gui, legend, Looks(server))
             self._camera = CameraPanel(page, self._scene.framing, self._appearance.look_freely)
             with gui.add_folder("Measure"):
                 self._measure = MeasurePanel(page)

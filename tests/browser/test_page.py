@@ -272,3 +272,26 @@ def test_a_click_on_the_map_measures_the_point_under_it(bench: Bench) -> None:
     assert np.linalg.norm(spot.at[:2]) < 12.0 and -3.0 < spot.at[2] < 5.0
     bench.page.get_by_role("button", name="stop", exact=True).click()
     bench.page.get_by_role("tab", name="Parameters").click()
+
+
+def test_on_a_phone_the_scene_has_most_of_the_page_until_a_tab_is_tapped(bench: Bench, chromium: Browser) -> None:
+    page = new_page(chromium, 390, 844)
+    page.goto(bench.url)
+    tab = page.get_by_role("tab", name="Parameters").first
+    expect(tab).to_be_visible()
+
+    def scene_share() -> float:
+        page.wait_for_timeout(500)
+        return float(
+            page.evaluate("document.querySelector('canvas[data-engine]').getBoundingClientRect().height / 844")
+        )
+
+    bench.eventually(lambda: scene_share() > 0.6)
+    tab.click()
+    bench.eventually(lambda: scene_share() < 0.45)
+    expect(page.get_by_text("M scan lines")).to_be_in_viewport()
+    page.get_by_role("tab", name="Help").first.click()
+    assert scene_share() < 0.45, "another tab keeps it up"
+    page.get_by_role("tab", name="Help").first.click()
+    bench.eventually(lambda: scene_share() > 0.6)
+    page.close()

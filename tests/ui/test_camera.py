@@ -12,9 +12,9 @@ import viser
 
 from app.server.protocol import Command, KeepView, Snapshot
 from app.slam import lie
-from app.ui.camera import FOV, FRONT, SIDE, TOP, CameraPanel, Framing, extent, whole
+from app.ui.camera import FOV, FRONT, NOTHING, SIDE, TOP, CameraPanel, Framing, Picture, Stand, whole
 from app.ui.colours import INTENSITY, LOOK, Limits, PointSet, colours
-from app.ui.scale import FromAbove, bar, scale_html
+from app.ui.scale import Looks, bar, scale_html
 from app.ui.shading import light
 from tests.ui.conftest import page_of
 
@@ -22,28 +22,44 @@ RANDOM = np.random.default_rng(3)
 HALL = RANDOM.uniform((-10, 5, 0), (50, 25, 6), (4000, 3))
 
 
+WIDE = Picture(shape=1.6, covered=0.08)
+"""As on a desk: the transport hides the lowest part."""
+
+
+def seen(points: np.ndarray, stand: Stand, picture: Picture) -> np.ndarray:
+    """(n, 2) where points are in a picture, each axis from -1 to 1, up positive."""
+    forward = (stand.look_at - stand.position) / stand.distance
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    off = points - stand.position
+    at = np.stack((off @ right / picture.shape, off @ np.cross(right, forward)), axis=1)
+    return np.asarray(at / (off @ forward)[:, None] / np.tan(picture.fov / 2))
+
+
+@pytest.mark.parametrize("picture", [WIDE, Picture(shape=0.6), Picture(fov=0.03)])
 @pytest.mark.parametrize("way", ["fit", TOP, FRONT, SIDE])
-def test_all_of_a_hall_but_a_few_points_is_inside_the_picture(way: str) -> None:
-    stand = whole(extent(np.concatenate((HALL, [[900.0, 0.0, 0.0]]))), way)
-    forward = stand.look_at - stand.position
-    forward /= np.linalg.norm(forward)
-    towards = HALL - stand.position
-    off = np.arccos(towards @ forward / np.linalg.norm(towards, axis=1))
-    assert np.mean(off < FOV / 2) > 0.9
-    assert off.max() > FOV / 8, "and it fills the picture"
+def test_all_of_a_hall_but_far_points_just_fills_the_picture(way: str, picture: Picture) -> None:
+    def outside(stand: Stand) -> list[float]:
+        """The share of points beyond each edge."""
+        across, up = seen(HALL, stand, picture).T
+        bottom = -1 + 2 * picture.covered
+        return [float(np.mean(beyond)) for beyond in (across < -1, across > 1, up < bottom, up > 1)]
+
+    stand = whole(np.concatenate((HALL, [[900.0, 0.0, 0.0]])), way, picture)
+    assert max(outside(stand)) < 0.008
+    nearer = Stand(stand.position + 0.2 * (stand.look_at - stand.position), stand.look_at)
+    lost = outside(nearer)
+    assert min(lost[:2]) > 0.01 or min(lost[2:]) > 0.01, "it fills the picture, between two edges at least"
 
 
 def test_from_above_one_looks_down_and_from_the_front_along_the_floor() -> None:
-    assert (s := whole(extent(HALL), TOP)).position[2] - s.look_at[2] > 10 * np.linalg.norm(
-        (s.position - s.look_at)[:2]
-    )
-    assert (s := whole(extent(HALL), FRONT)).position[2] - s.look_at[2] < 0.1 * np.linalg.norm(
-        (s.position - s.look_at)[:2]
-    )
+    for way, least, most in ((TOP, 10.0, np.inf), (FRONT, 0.0, 0.1)):
+        back = (stand := whole(HALL, way)).position - stand.look_at
+        assert least <= back[2] / np.linalg.norm(back[:2]) < most
 
 
 def test_an_empty_map_is_looked_at_from_above_the_sensor() -> None:
-    assert whole(extent(np.empty((0, 3)))).position[2] > 2.0
+    assert whole(NOTHING).position[2] > 2.0
 
 
 def plane(normal: int) -> np.ndarray:
@@ -130,20 +146,21 @@ def settle(framing: Framing) -> int:
 def test_the_map_stays_in_the_picture_as_it_grows(framed: Framed) -> None:
     framing, browser, server = framed
     near = browser.distance()
-    assert browser.camera.position == pytest.approx(whole(extent(HALL / 4)).position)
+    assert browser.camera.position == pytest.approx(whole(HALL / 4, "fit", WIDE).position)
     framing.see(HALL, at_once=False)
     assert settle(framing) > 5, "it glides"
     assert browser.distance() == pytest.approx(4 * near, rel=0.05)
-    assert server.initial_camera.position == pytest.approx(browser.camera.position), "pages that open now"
+    assert server.initial_camera.position == pytest.approx(whole(HALL).position), "pages that open now"
 
 
 def test_in_a_picture_that_is_higher_than_wide_all_of_the_map_is_seen_too(framed: Framed) -> None:
     framing, browser, _ = framed
     wide = browser.distance()
-    browser.camera.image_width = 500
+    browser.camera.image_width = 580
     settle(framing)
-    assert browser.distance() == pytest.approx(2 * wide), "half as wide at the same distance"
-    browser.camera.image_width = 2000
+    stand, picture = Stand(browser.camera.position, browser.camera.look_at), Picture(shape=0.58, covered=0.08)
+    assert (np.abs(seen(HALL / 4, stand, picture)) < 1).mean() > 0.97 and stand.distance > 1.5 * wide
+    browser.camera.image_width = 1600
     settle(framing)
     assert browser.distance() == pytest.approx(wide), "a phone that is turned"
 
@@ -156,10 +173,10 @@ def test_who_moves_the_camera_keeps_it_until_he_asks_for_the_whole_map(framed: F
     settle(framing)
     assert (browser.camera.position == mine).all()
     framing.show(browser, TOP, np.zeros(3))  # type: ignore[arg-type]
-    assert browser.camera.look_at == pytest.approx(extent(HALL).middle)
+    assert browser.camera.look_at == pytest.approx(whole(HALL, TOP, WIDE).look_at)
     framing.see(2 * HALL, at_once=False)
     settle(framing)
-    assert browser.camera.position == pytest.approx(whole(extent(2 * HALL), TOP).position, rel=0.05)
+    assert browser.camera.position == pytest.approx(whole(2 * HALL, TOP, WIDE).position)
 
 
 def test_following_looks_at_the_sensor_from_nearby(framed: Framed) -> None:
@@ -200,11 +217,23 @@ def test_the_bar_measures_the_middle_of_the_picture_and_the_needle_points_along_
 
 def test_ceilings_go_where_one_looks_from_above_and_come_back_inside() -> None:
     server = Server()
-    above = FromAbove(server)  # type: ignore[arg-type]
-    assert above(), "so that a map opens without them"
+    looks = Looks(server)  # type: ignore[arg-type]
+    assert looks.from_above, "so that a map opens without them"
     seen = []
     for degrees in (60, 15, 5, 15, 30):
         back = np.array([np.cos(np.radians(degrees)), 0.0, np.sin(np.radians(degrees))])
         server.browsers[1] = Browser(9 * back)
-        seen.append(above())
+        seen.append(looks.from_above)
     assert seen == [True, True, False, False, True], "not to and fro in between"
+
+
+def test_points_grow_with_the_distance_of_the_nearest_browser_so_that_they_stay_visible() -> None:
+    server = Server()
+    looks = Looks(server)  # type: ignore[arg-type]
+    assert looks.point_size(0.04) == 0.04
+    for distance, pixels in ((1.0, 34.0), (100.0, 1.5), (400.0, 1.5)):
+        server.browsers[1] = Browser(np.array([0.0, 0.0, distance]))
+        pixel = 2 * distance * np.tan(FOV / 2) / 1000
+        assert looks.point_size(0.04) == pytest.approx(pixels * pixel, rel=0.13)
+    server.browsers[2] = Browser(np.array([0.0, 0.0, 1.0]))
+    assert looks.point_size(0.04) == 0.04, "else it would be full of discs"

@@ -51,6 +51,10 @@ ASSUMPTIONS = {
         "ControlPanel/BottomPanel.tsx",
         'maxHeight: "60%",\n            width: "20em",',
     ),
+    "The head of a phone's panel is no longer styled so: it takes the room of the tabs.": (
+        "ControlPanel/BottomPanel.tsx",
+        'cursor: "pointer",\n        position: "relative",',
+    ),
     "A folder is no longer a bordered Paper: folded ones look like empty boxes.": (
         "components/Folder.tsx",
         "<Paper\n      withBorder",

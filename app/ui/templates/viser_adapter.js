@@ -14,6 +14,14 @@ if (!window.hemislamSay) {
     input.dispatchEvent(new Event('input', {bubbles: true}));
   };
 
+  // On a phone the panel is low, its tabs alone, until one is tapped; the same one lowers it again.
+  const sheet = document.documentElement.dataset;
+  sheet.hsSheet = 'low';
+  document.addEventListener('click', (event) => {
+    const tab = event.target.closest('.mantine-Tabs-list [role=tab]');
+    if (tab) sheet.hsSheet = tab.ariaSelected === 'true' && sheet.hsSheet === 'high' ? 'low' : 'high';
+  }, true);
+
   // Show a tab, docked or on a phone.
   window.hemislamOpenTab = (name) => {
     const tab = [...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === name);
@@ -21,6 +29,7 @@ if (!window.hemislamSay) {
     tab.click();
     tab.dispatchEvent(new KeyboardEvent('keydown', {key: 'Enter', bubbles: true}));
     tab.scrollIntoView({block: 'nearest'});
+    sheet.hsSheet = 'high';
   };
 
   // Keys. On its way up an event passes widgets (the page's root), the body, viser's hotkeys (the html element) and
