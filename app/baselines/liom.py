@@ -6,13 +6,14 @@ fits them, with their information, so that what they leave open is left to the I
 """
 
 from collections import deque
+from functools import partial
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from app.baselines.features import extract
-from app.baselines.matching import FeatureMap, PoseFit, moved, solve
+from app.baselines.matching import FeatureMap, PoseFit, moved, register
 from app.baselines.mounting import mounting
 from app.slam import lie, start
 from app.slam.errors import HemislamError
@@ -126,7 +127,7 @@ class Liom:
             parts.append([moved(T, cloud) for cloud in clouds])
         all_edges, all_planes = (np.concatenate(clouds) for clouds in zip(*parts, strict=True))
         local.insert(all_edges, all_planes, np.zeros(3))
-        return first, _registered(local, edges, planes, T_first_odom @ T_odom_imu)
+        return first, register(T_first_odom @ T_odom_imu, partial(local.pairs, edges, planes), ROUNDS)
 
     def _smooth(
         self, summed: gtsam.PreintegratedCombinedMeasurements, predicted: gtsam.NavState, end_ns: int,
@@ -153,20 +154,9 @@ class Liom:
 
     def _refine(self, edges: F64, planes: F64, T_odom_imu: F64) -> None:
         """Their section III.D: register to the map, without roll and pitch."""
-        T = _registered(self._map, edges, planes, self._T_map_odom @ T_odom_imu, UPRIGHT).T
+        T = register(self._T_map_odom @ T_odom_imu, partial(self._map.pairs, edges, planes), ROUNDS, UPRIGHT).T
         self._T_map_odom = T @ lie.inverse(T_odom_imu)
         self._map.insert(moved(T, edges), moved(T, planes), T[:3, 3])
-
-
-def _registered(local: FeatureMap, edges: F64, planes: F64, T: F64, free: F64 | None = None) -> PoseFit:
-    """The pose that fits the map best, from a good guess `T`."""
-    for _ in range(ROUNDS):
-        fit = solve(T, local.pairs(edges, planes, T), free=free)
-        change = lie.log_se3(lie.inverse(T) @ fit.T)
-        T = fit.T
-        if np.linalg.norm(change) < 1e-3:
-            break
-    return fit
 
 
 def _in_body(fit: PoseFit) -> F64:

@@ -6,10 +6,12 @@ sees a wall only early in each turn swings up from scan to scan. So does one ste
 far apart: 0.1 m at rest outdoors. Hence the speed is a mean of steps in the map, to which every scan is registered.
 """
 
+from functools import partial
+
 import numpy as np
 
 from app.baselines.features import Features, extract
-from app.baselines.matching import FeatureMap, LastScan, moved, solve
+from app.baselines.matching import FeatureMap, LastScan, moved, register
 from app.baselines.mounting import levelled, mounting
 from app.slam import lie
 from app.slam.params import Params
@@ -51,25 +53,14 @@ class Loam:
 
     def _odometry(self, features: Features) -> F64:
         """Section V: the motion (4, 4) since the last scan's end."""
-        T = self._predicted
         if self._last is None:
-            return T
-        for _ in range(ODOMETRY_ROUNDS):
-            fit = solve(T, self._last.pairs(features.edges, features.planes, T))
-            change = lie.log_se3(lie.inverse(T) @ fit.T)
-            T = fit.T
-            if np.linalg.norm(change) < 1e-3:
-                break
-        return T
+            return self._predicted
+        pairs = partial(self._last.pairs, features.edges, features.planes)
+        return register(self._predicted, pairs, ODOMETRY_ROUNDS).T
 
     def _mapping(self, features: Features, T: F64) -> F64:
         """Section VI: register the undistorted scan to the map from T_map_lidar on, and add it there."""
-        few = self._map.thinned(features.edge_map.points, features.plane_map.points)
-        for _ in range(MAP_ROUNDS):
-            fit = solve(T, self._map.pairs(*few, T))
-            change = lie.log_se3(lie.inverse(T) @ fit.T)
-            T = fit.T
-            if np.linalg.norm(change) < 1e-3:
-                break
-        self._map.insert(moved(T, few[0]), moved(T, few[1]), T[:3, 3])
+        edges, planes = self._map.thinned(features.edge_map.points, features.plane_map.points)
+        T = register(T, partial(self._map.pairs, edges, planes), MAP_ROUNDS).T
+        self._map.insert(moved(T, edges), moved(T, planes), T[:3, 3])
         return T

@@ -4,6 +4,7 @@ Both of LOAM's distances, of a point to a line and to a plane, are written as di
 planes at right angles meet. So one solver does for both, and for LIOM's factors.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,6 +114,17 @@ def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64
     back = np.linalg.pinv(basis) @ vectors[:, seen]
     step = (vectors @ np.where(seen, along / np.where(seen, values, 1.0), 0.0)) @ basis
     return step, (back * values[seen]) @ back.T, int(np.sum(~seen))
+
+
+def register(T: F64, pairs: Callable[[F64], Pairs], rounds: int, free: F64 | None = None) -> PoseFit:
+    """Match and solve in turn from a good guess `T` on, at most `rounds` times. pairs: what lies together at a pose."""
+    for _ in range(rounds):
+        fit = solve(T, pairs(T), free=free)
+        change = lie.log_se3(lie.inverse(T) @ fit.T)
+        T = fit.T
+        if np.linalg.norm(change) < 1e-3:
+            break
+    return fit
 
 
 class LastScan:

@@ -105,11 +105,11 @@ def tune(
     from app.evaluation.truth import read_truth
     from app.mapping.session_file import read_marks
     from app.tuning.objectives import choose_objectives
-    from app.tuning.report import BEST, write_results
+    from app.tuning.report import BEST
     from app.tuning.space import parse_dimensions
     from app.tuning.trial import Trial, front
-    from app.tuning.tune import Part, Runs, check, known_runs
-    from app.tuning.tune import search as find
+    from app.tuning.tune import Part, Runs, known_runs
+    from app.tuning.tune import tune as find
 
     dimensions = parse_dimensions(parameters)
     if labels is not None and len(recordings) > 1:
@@ -125,9 +125,8 @@ def tune(
     if held_back and duration is None:
         raise HemislamError("--held-back needs --duration: without it the search sees the whole recording.")
     timed = any(one.name == "frame-time" for one in wanted)  # runs beside each other would spoil it
-    part, rest = Part(start, duration), None
-    if duration is not None and held_back != 0 and not marks:
-        rest = Part(start + duration, held_back or duration)
+    part = Part(start, duration)
+    rest = part.next(held_back) if held_back != 0 and not marks else None
     make_folder(out)
     run, threads = runner(jobs or (1 if timed else cores()), cluster, cluster_data, quiet=True)
     runs = Runs(
@@ -146,12 +145,12 @@ def tune(
             if best := front(so_far, wanted):
                 bar.set_postfix_str(f"best {wanted[0].told(best[0].scores[0])}")
 
-        done, study = find(runs, dimensions, wanted, part, how=search, trials=trials, seed=seed, progress=progress)
+        done, checked = find(
+            runs, dimensions, wanted, part, rest, out, how=search, trials=trials, seed=seed, progress=progress
+        )
     best = front(done, wanted)
     if not best:
         raise HemislamError(f"No trial gave a result: {done[0].error or 'no run has a value for the objective'}")
-    checked = check(runs, done, wanted, rest)
-    write_results(out, done, checked, wanted, study, runs.asked(search, trials, seed, part))
     for label, shown in (("as given", done[:1]), ("best", best[:5]), ("held back", checked)):
         for trial in shown:
             told = ", ".join(f"{one.title} {one.told(v)}" for one, v in zip(wanted, trial.scores, strict=True))

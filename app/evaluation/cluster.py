@@ -2,13 +2,19 @@
 
 A worker runs a job in a folder of its own and sends the files back; they are written here, as if run here. Recordings
 are read from their own path where workers have it, else from an fsspec URL, else they are copied to the workers.
+
+A job is given to one worker that has nothing else to do, not to the cluster as a whole. So workers may join at any
+time, and each is asked for its version and the recording before it gets work.
 """
 
 import contextlib
+import os
 import shutil
 import tempfile
+import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -17,19 +23,26 @@ from typing import Any
 from tqdm import tqdm
 
 from app import __version__
-from app.evaluation.job import RUN_FILES, Job, clear_remains, code_digest, finished, run_job
+from app.evaluation.job import RUN_FILES, Job, clear_remains, code_digest, finished
+from app.evaluation.run_job import run_job
 from app.slam.errors import HemislamError
 from app.slam.provenance import hash_input
 
 CONNECT_S = 15.0
 LOOK_S = 0.5
-"""How often it is looked what has ended, and whether the workers are still there."""
+"""How often it is looked whether workers have come or gone."""
 PIECE = 16 << 20
 """Bytes of a recording that are sent at a time."""
+MOST_DEATHS = 3
+"""A job that so many workers died of is not tried again."""
 
 
 class _Gone(Exception):
     """The scheduler or all workers are gone, or not there yet. `str` says it in a sentence."""
+
+
+class _Died(Exception):
+    """A worker no longer answers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +68,7 @@ class Cluster:
         waiting = {job.folder: job for job in jobs if finished(job) is None}
         try:
             with self._client() as client:
-                _checked_workers(client)
+                _checked(client, _workers(client))
         except _Gone as gone:  # at first the cluster must be there
             raise HemislamError(str(gone)) from None
         patient_until = time.monotonic() + self.wait_s
@@ -79,27 +92,37 @@ class Cluster:
 
     def _results(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str]]:
         """Jobs as they end, and why they failed. Raises _Gone."""
+        waiting, running = deque(jobs), dict[str, tuple[Job, Any]]()
+        deaths, news = Counter[Path](), threading.Event()
         with self._client() as client:
-            workers = _checked_workers(client)
-            for job in {job.recording: job for job in jobs}.values():
-                self._bring(client, workers, job)
-            running = {
-                client.submit(
-                    _work, job, self.url, key=f"hemislam-{job.key}-{job.name}-{job.variant}", workers=workers
-                ): job
-                for job in jobs
-            }
-            while running:
-                for future in [future for future in running if future.done()]:
-                    job = running.pop(future)
-                    yield job, _taken(job, future)
-                if not set(workers) & set(_workers(client)):
-                    raise _Gone("All workers of the Dask cluster are gone; start them again.")
-                time.sleep(LOOK_S)
+            while waiting or running:
+                there = _workers(client)
+                for worker in running.keys() - there.keys():
+                    job, _ = running.pop(worker)
+                    deaths[job.folder] += 1
+                    if deaths[job.folder] == MOST_DEATHS:
+                        yield job, f"{MOST_DEATHS} workers died of it; they may have too little memory."
+                    else:
+                        waiting.appendleft(job)
+                free = sorted(there.keys() - running.keys())[: len(waiting)]
+                for worker in _checked(client, {worker: there[worker] for worker in free}):
+                    with contextlib.suppress(_Died):
+                        self._bring(client, worker, waiting[0])
+                        job = waiting.popleft()
+                        key = f"hemislam-{job.key}-{job.name}-{job.variant}-{deaths[job.folder]}"
+                        future = client.submit(_work, job, self.url, key=key, workers=[worker])
+                        future.add_done_callback(lambda _: news.set())
+                        running[worker] = job, future
+                news.wait(LOOK_S)
+                news.clear()
+                for worker, (job, future) in list(running.items()):
+                    if future.done():
+                        del running[worker]
+                        yield job, _taken(job, future)
 
     @contextlib.contextmanager
     def _client(self) -> Iterator[Any]:
-        """Raises _Gone: it cannot be reached, or not any more."""
+        """Connected, with a worker at least. Raises _Gone: the scheduler cannot be reached, or not any more."""
         from distributed import Client
         from distributed.comm import CommClosedError
 
@@ -109,57 +132,70 @@ class Cluster:
         except (OSError, ValueError):
             raise _Gone(gone) from None
         try:
+            with contextlib.suppress(TimeoutError):
+                client.wait_for_workers(1, timeout=CONNECT_S)
             yield client
         except (CommClosedError, TimeoutError):
             raise _Gone(gone) from None
         finally:
             client.close(timeout=5)
 
-    def _bring(self, client: Any, workers: Sequence[str], job: Job) -> None:
-        """Copy a recording to the workers that can have it from nowhere else, piece by piece."""
-        lack = [worker for worker, has in client.run(_has, job, workers=workers).items() if not has]
-        if self.url or not lack:
+    def _bring(self, client: Any, worker: str, job: Job) -> None:
+        """Copy a job's recording to a worker that can have it from nowhere else, piece by piece. Raises _Died."""
+        if self.url or _ask(client, worker, _has, job):
             return
         if job.recording.is_dir():
             raise HemislamError(
-                f"Worker {lack[0]} cannot read {job.recording}, and folders are not copied; put it where it can."
+                f"Worker {worker} cannot read {job.recording}, and folders are not copied; put it where it can."
             )
         with job.recording.open("rb") as file:
             while piece := file.read(PIECE):
-                client.run(_append, job, file.tell() - len(piece), piece, workers=lack)
+                if problem := _ask(client, worker, _append, job, file.tell() - len(piece), piece):
+                    raise HemislamError(f"Worker {worker} cannot keep a copy of {job.recording}: {problem}.")
+        _ask(client, worker, _settle, job)
+
+
+def _ask(client: Any, worker: str, function: Callable[..., Any], *about: Any) -> Any:
+    """What the function gives on this worker. Raises _Died."""
+    answer = client.run(function, *about, workers=[worker], on_error="return").get(worker, OSError())
+    if isinstance(answer, OSError):
+        raise _Died
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
 
 
 def _workers(client: Any) -> dict[str, Any]:
-    """What the scheduler knows of its workers, by address; nothing if it is gone."""
-    return dict(client.scheduler_info(n_workers=-1).get("workers", {}))
-
-
-def _checked_workers(client: Any) -> list[str]:
-    """Addresses of the workers.
-
-    Raises:
-        _Gone: there is none. HemislamError: one has another version or no hemislam, or runs jobs beside each other.
-    """
-    with contextlib.suppress(TimeoutError):
-        client.wait_for_workers(1, timeout=CONNECT_S)
-    workers = _workers(client)
+    """What the scheduler knows of its workers, by address. Raises _Gone: there is none."""
+    workers = dict(client.scheduler_info(n_workers=-1).get("workers", {}))
     if not workers:
         raise _Gone("The Dask cluster has no workers; start some with `dask worker ADDRESS --nthreads 1`.")
-    for worker, facts in workers.items():
-        if facts["nthreads"] > 1:
+    return workers
+
+
+def _checked(client: Any, workers: dict[str, Any]) -> list[str]:
+    """Addresses of those that answer and can be used.
+
+    Raises:
+        HemislamError: one has another version or no hemislam, or runs jobs beside each other.
+    """
+    good = []
+    for worker, version in (client.run(_version, workers=list(workers), on_error="return") if workers else {}).items():
+        if isinstance(version, OSError):
+            continue  # it has just died
+        threads = workers[worker]["nthreads"]
+        if threads > 1:
             raise HemislamError(
-                f"Worker {worker} runs {facts['nthreads']} jobs at a time in one process, which spoils their times;"
+                f"Worker {worker} runs {threads} jobs at a time in one process, which spoils their times;"
                 " start it with --nthreads 1."
             )
-    for worker, version in client.run(_version, workers=list(workers), on_error="return").items():
         if isinstance(version, ModuleNotFoundError):
             raise HemislamError(f"Worker {worker} has no hemislam ({version}); install version {__version__} there.")
-        if isinstance(version, OSError):
-            raise _Gone(f"Worker {worker} is gone.")
         if version != (__version__, code_digest()):
             told = f"version {version[0]}" if isinstance(version, tuple) and version[0] != __version__ else "other code"
             raise HemislamError(f"Worker {worker} has {told}, and this is {__version__}; install the same on all.")
-    return list(workers)
+        good.append(worker)
+    return good
 
 
 def _taken(job: Job, future: Any) -> str:
@@ -203,13 +239,26 @@ def _copy_of(job: Job) -> Path:
     return Path(tempfile.gettempdir()) / "hemislam-recordings" / f"{job.sha256[:16]}-{job.recording.name}"
 
 
-def _append(job: Job, offset: int, piece: bytes) -> None:
-    """Write a piece of a recording into this worker's copy, the first one into a new file."""
+def _part_of(job: Job) -> Path:
+    """A copy in the making, of this worker's own: others on the same machine may be making theirs."""
     copy = _copy_of(job)
     copy.parent.mkdir(exist_ok=True)
-    with copy.open("r+b" if offset else "wb") as file:
-        file.seek(offset)
-        file.write(piece)
+    return copy.with_name(f"{copy.name}.part-{os.getpid()}")
+
+
+def _append(job: Job, offset: int, piece: bytes) -> str:
+    """Write a piece of a recording, the first one into a new file. Returns why it cannot be written, "" if it was."""
+    try:
+        with _part_of(job).open("ab" if offset else "wb") as file:
+            file.write(piece)
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+def _settle(job: Job) -> None:
+    """All pieces are there."""
+    _part_of(job).replace(_copy_of(job))
 
 
 def _work(job: Job, url: str) -> dict[str, bytes] | str:
@@ -239,9 +288,9 @@ def _found(job: Job, url: str) -> Path:
     if url and not _is_it(copy, job.sha256):
         import fsspec
 
-        copy.parent.mkdir(exist_ok=True)
-        with fsspec.open(f"{url.rstrip('/')}/{job.recording.name}") as source, copy.open("wb") as file:
+        with fsspec.open(f"{url.rstrip('/')}/{job.recording.name}") as source, _part_of(job).open("wb") as file:
             shutil.copyfileobj(source, file, PIECE)
+        _settle(job)
     if not _is_it(copy, job.sha256):
         raise HemislamError(f"The worker has no {job.recording.name} with the same content as here.")
     return copy

@@ -79,7 +79,10 @@ class Outcome:
             "map_sharpness": run.get("map_sharpness"),
             "ground": [asdict(s) | {"precision": s.precision, "recall": s.recall, "f1": s.f1} for s in scores] or None,
             **{name: run.get(name) for name in ("frames", "lost", "dropped", "distance_m", "ground_share")},
-            "parameters": run.get("parameters"),
+            **{
+                name: run.get(name)
+                for name in ("key", "hemislam", "code", "machine", "start_s", "duration_s", "parameters")
+            },
         }
 
     def value(self, path: str) -> Any:

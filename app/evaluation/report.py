@@ -11,6 +11,7 @@ from app.evaluation.figures import CROP_NOTE, colours, pictures, render
 from app.evaluation.findings import MOST_TOLD, findings
 from app.evaluation.job import GROUND_RANGES_M, code_digest
 from app.evaluation.measured import Evaluated
+from app.evaluation.origin import machines, parameters
 from app.evaluation.tables import make_tables
 from app.slam.provenance import describe_machine
 from app.slam.report import finite
@@ -37,6 +38,8 @@ def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
         "variants": {o.name: o.missing or o.meaning or "as given" for o in outcomes},
         "pictures": {recording.name: pictures(recording, colour) for recording in recordings},
         "crop_note": CROP_NOTE,
+        "machines": machines(recordings),
+        "parameters": parameters(recordings),
     }
     texts = {
         "report.html": render("report.html", **shown),

@@ -1,12 +1,11 @@
-"""Runs jobs side by side, each in a process of its own, with a progress bar for each.
+"""Runs jobs side by side, each in a process of its own, with a progress bar for each and one for all.
 
 With a process for each job, its peak memory is its own, and a crash costs one column only.
 """
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from time import monotonic
 from typing import NoReturn
@@ -14,7 +13,8 @@ from typing import NoReturn
 from tqdm import tqdm
 
 from app.child import Child, ChildDied, Link
-from app.evaluation.job import Job, clear_remains, finished, run_job
+from app.evaluation.job import Job, clear_remains, finished
+from app.evaluation.run_job import run_job
 from app.slam.errors import HemislamError
 
 REPORT_EVERY_S = 0.2
@@ -35,31 +35,40 @@ def run_jobs(
     """Run all jobs that are not finished yet, `parallel` at a time.
 
     Args:
-        quiet: say nothing of single jobs. ended: called whenever one has ended, in whatever thread.
+        quiet: say nothing. ended: called whenever one has ended.
 
     Returns:
         Why jobs failed, by (recording, variant); those not named are finished.
     """
     clear_remains(folder)
-    stop = threading.Event()
-    with ThreadPoolExecutor(parallel) as pool:
+    todo = [job for job in jobs if finished(job) is None]
+    before = len(jobs) - len(todo)
+    for _ in range(before):
+        ended()
+    if before and not quiet:
+        tqdm.write(f"{before} of {len(jobs)} runs were finished before")
+    stop, errors = threading.Event(), dict[tuple[str, str], str]()
+    every = tqdm(
+        desc="All runs", total=len(jobs), initial=before, unit=" runs", smoothing=0, disable=quiet or None
+    )  # smoothing 0: the time left is by the mean of all runs
+    with every, ThreadPoolExecutor(parallel) as pool:
         try:
-            errors = list(pool.map(partial(_run, stop, quiet, ended), jobs))
+            running = {pool.submit(_run, stop, quiet, job): job for job in todo}
+            for future in as_completed(running):
+                if error := future.result():
+                    errors[running[future].name, running[future].variant] = error
+                every.update()
+                ended()
         except BaseException:  # Ctrl-C
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    return {(job.name, job.variant): error for job, error in zip(jobs, errors, strict=True) if error}
+    return errors
 
 
-def _run(stop: threading.Event, quiet: bool, ended: Callable[[], None], job: Job) -> str:
+def _run(stop: threading.Event, quiet: bool, job: Job) -> str:
     """Run a job in a process until it ends or `stop` is set. Returns why it failed, "" if it did not."""
     title, error = f"{job.name}, {job.variant}", ""
-    if finished(job) is not None:
-        if not quiet:
-            tqdm.write(f"{title}: finished before")
-        ended()
-        return ""
     child = Child(_work, job, name="job", title="Its process", fork=True, grace_s=0.0)
     bar: tqdm[NoReturn]
     with tqdm(desc=title, unit=" frames", leave=False, disable=quiet or None) as bar:
@@ -78,7 +87,6 @@ def _run(stop: threading.Event, quiet: bool, ended: Callable[[], None], job: Job
             child.close()
     if not quiet:
         tqdm.write(f"{title}: {error or 'finished'}")
-    ended()
     return error
 
 

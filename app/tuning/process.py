@@ -69,16 +69,15 @@ def _find(owner: Link, wanted: Wanted) -> None:
     from app.evaluation.runner import run_jobs
     from app.evaluation.truth import read_truth
     from app.tuning.objectives import choose_objectives
-    from app.tuning.report import importances, write_results
+    from app.tuning.report import importances
     from app.tuning.space import parse_dimensions
-    from app.tuning.tune import Part, Runs, check, known_runs, search
+    from app.tuning.tune import Part, Runs, known_runs, tune
 
     truth = read_truth(str(wanted.truth)) if wanted.truth is not None else None
     subject = Subject(wanted.recording.stem, wanted.recording, wanted.params, truth, marks=wanted.marks)
     dimensions, objectives = parse_dimensions(wanted.parameters), choose_objectives(wanted.objectives, [subject])
-    part, rest = Part(wanted.start_s, wanted.duration_s), None
-    if wanted.duration_s is not None and not wanted.marks:  # marks are on the part itself
-        rest = Part(wanted.start_s + wanted.duration_s, wanted.duration_s)
+    part = Part(wanted.start_s, wanted.duration_s)
+    rest = part.next() if not wanted.marks else None  # marks are on the part itself
     count, latest = 0, Tried()
 
     def ended() -> None:
@@ -101,8 +100,7 @@ def _find(owner: Link, wanted: Wanted) -> None:
         run=partial(run_jobs, parallel=parallel, quiet=True, ended=ended),
         threads=1,
     )
-    done, study = search(runs, dimensions, objectives, part, how=wanted.how, trials=wanted.trials, progress=progress)
-    checked = check(runs, done, objectives, rest) if latest.best else ()
-    asked = runs.asked(wanted.how, wanted.trials, 0, part)
-    write_results(wanted.folder, done, checked, objectives, study, asked)
+    _, checked = tune(
+        runs, dimensions, objectives, part, rest, wanted.folder, how=wanted.how, trials=wanted.trials, progress=progress
+    )
     owner.send(replace(latest, held_back=checked, finished=True))

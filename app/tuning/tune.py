@@ -18,6 +18,7 @@ from app.evaluation.measured import Outcome, load, measure
 from app.evaluation.runner import RunJobs
 from app.slam.provenance import sha256_of
 from app.tuning.objectives import Objective, score
+from app.tuning.report import write_results
 from app.tuning.space import Dimension, grid
 from app.tuning.trial import Search, Trial, front
 
@@ -33,6 +34,12 @@ class Part:
 
     start_s: float = 0.0
     duration_s: float | None = None
+
+    def next(self, duration_s: float | None = None) -> "Part | None":
+        """The part right after it, as long if nothing else is said; None if it goes to the end."""
+        if self.duration_s is None:
+            return None
+        return Part(self.start_s + self.duration_s, duration_s or self.duration_s)
 
 
 class Runs:
@@ -111,6 +118,37 @@ class Runs:
         return outcome
 
 
+Progress = Callable[[Sequence[Trial], optuna.Study], None]
+"""Called with all trials so far after each batch."""
+
+
+def tune(
+    runs: Runs,
+    dimensions: Sequence[Dimension],
+    objectives: Sequence[Objective],
+    part: Part,
+    rest: Part | None,
+    folder: Path,
+    *,
+    how: Search = "bayes",
+    trials: int = 100,
+    seed: int = 0,
+    progress: Progress,
+) -> tuple[list[Trial], tuple[Trial, ...]]:
+    """Search on `part`, check the best on `rest`, and write the files that `write_results` names into `folder`.
+
+    Returns:
+        All trials, and those of them that were run again on `rest`.
+
+    Raises:
+        HemislamError: a grid has more points than trials, or the folder cannot be written to.
+    """
+    done, study = search(runs, dimensions, objectives, part, how=how, trials=trials, seed=seed, progress=progress)
+    checked = check(runs, done, objectives, rest)
+    write_results(folder, done, checked, objectives, study, runs.asked(how, trials, seed, part))
+    return done, checked
+
+
 def search(
     runs: Runs,
     dimensions: Sequence[Dimension],
@@ -120,9 +158,9 @@ def search(
     how: Search = "bayes",
     trials: int = 100,
     seed: int = 0,
-    progress: Callable[[Sequence[Trial], optuna.Study], None] = lambda so_far, study: None,
+    progress: Progress = lambda so_far, study: None,
 ) -> tuple[list[Trial], optuna.Study]:
-    """Try the parameters as given and then `trials` settings. `progress` is called with the trials after each batch.
+    """Try the parameters as given and then `trials` settings.
 
     Raises:
         HemislamError: a grid has more points than trials.
@@ -146,10 +184,11 @@ def search(
 
 
 def check(runs: Runs, trials: Sequence[Trial], objectives: Sequence[Objective], rest: Part | None) -> tuple[Trial, ...]:
-    """The parameters as given and the best settings, on a part that the search has not seen; nothing without one."""
-    if rest is None:
+    """The parameters as given and the best settings, on a part that the search has not seen; nothing without either."""
+    best = front(trials, objectives)[:MOST_CHECKED]
+    if rest is None or not best:
         return ()
-    chosen = [trials[0], *(trial for trial in front(trials, objectives)[:MOST_CHECKED] if trial.number)]
+    chosen = [trials[0], *(trial for trial in best if trial.number)]
     results = runs.score([trial.values for trial in chosen], rest)
     return tuple(
         Trial(one.number, one.values, scores, error) for one, (scores, error) in zip(chosen, results, strict=True)

@@ -22,8 +22,6 @@ from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, by_user, notify_error
 
 _PARTS: Final = {"5 s from here": 5.0, "20 s from here": 20.0, "60 s from here": 60.0, "the whole recording": None}
 _LABELLED: Final = "the labelled frames"
-_LEAD_S: Final = 2.0
-"""The engine starts so long before the first labelled frame."""
 _NONE: Final = "–"
 _TITLES: Final = {one.title: one.name for one in OBJECTIVES.values()}
 _FORK: Final = "trial "
@@ -193,7 +191,7 @@ class TunePanel:
         start_ns = snapshot.recording.start_ns
         if self._part.value == _LABELLED:
             first, last = ((stamp - start_ns) * 1e-9 for stamp in (stamps[0], stamps[-1]))
-            begin = round(max(first - _LEAD_S, 0.0), 1)
+            begin = round(max(first - 0.15, 0.0), 1)  # a scan before its end
             return begin, round(last - begin + 0.2, 1)
         length, here = _PARTS[self._part.value], snapshot.transport.stamp_ns or start_ns
         return (round(max((here - start_ns) * 1e-9, 0.0), 1) if length is not None else 0.0), length

@@ -1,6 +1,7 @@
 """The report shows every figure that was measured, with its unit, in all of its forms.
 
-Tests app/evaluation/crops.py, app/evaluation/figures.py, app/evaluation/measured.py, app/evaluation/tables.py.
+Tests app/evaluation/crops.py, app/evaluation/figures.py, app/evaluation/measured.py, app/evaluation/origin.py,
+app/evaluation/tables.py.
 """
 
 import csv
@@ -17,6 +18,7 @@ from app.evaluation.figures import Line, bodies, box, chart, violin
 from app.evaluation.measured import Accuracy, Evaluated, Outcome, ratios
 from app.evaluation.report import write_report
 from app.evaluation.tables import _row
+from app.slam.params import Params, leaves
 from app.slam.trajectory import Trajectory
 from app.slam.types import TIMINGS
 
@@ -51,7 +53,9 @@ def column(name: str, size: float, *, bent: bool = True) -> Outcome:
         drift={5.0: np.array([0.5, 1.0, 2.0])},
     )
     run = {
-        "peak_memory_mb": 100.0, "threads": 1, "load": 0.5, "ground": None, "parameters": {},
+        "peak_memory_mb": 100.0, "threads": 1, "load": 0.5, "ground": None,
+        "parameters": Params().with_values({"scan.voxel_size": size}).model_dump(mode="json"), "hemislam": "1.0",
+        "code": "c0de", "machine": dict.fromkeys(("processor", "cores", "system", "python", "numpy", "numba"), "m"),
         "map_sharpness": dict.fromkeys(("entropy", "thickness", "revisit_median", "revisit_p95")),
     }  # fmt: skip
     there = Trajectory(np.arange(2), np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
@@ -181,3 +185,14 @@ def test_a_curve_below_another_shows_beside_it() -> None:
     svg = chart([Line(name, "red", line, line) for name in "abc"], "x", "y")
     widths = [float(width) for width in re.findall(r'stroke-width="([\d.]+)"', svg)]
     assert widths == sorted(widths, reverse=True) and widths[0] > widths[1] + 1 > widths[2] + 2
+
+
+def test_every_parameter_and_the_machine_stand_in_the_report(folder: Path) -> None:
+    """Where the variants differ, each value is told with whose it is."""
+    page = (folder / "report.md").read_text()
+    for leaf in leaves():
+        assert f"- `{leaf.path}` " in page
+    assert "- `scan.voxel_size` 0.2 (FAST-LIO); 0.1 (Ours); 0.4 (Theirs) m" in page
+    assert "- `ground.alpha` 25.0 deg" in page
+    assert "hemislam 1.0, code c0de, on m, m cores" in page
+    assert "scan.voxel_size" in (folder / "report.html").read_text()

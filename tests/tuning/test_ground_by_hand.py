@@ -1,6 +1,6 @@
 """Ground tuned on five frames labelled by hand is as good on all others as a fine grid can make it.
 
-Tests app/tuning/tune.py and app/evaluation/job.py with marks of the brush.
+Tests app/tuning/tune.py and app/evaluation/run_job.py with marks of the brush.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.evaluation.job import Job, finished, run_job
+from app.evaluation.job import Job, finished
+from app.evaluation.run_job import run_job
 from app.mapping.opening import open_session
 from app.mapping.painted import UNMARKED, Stroke, marks
 from app.sensors.simulator.lidar import Lidar, firing_pattern

@@ -1,0 +1,45 @@
+"""A part of a recording is measured as the same part of a whole run.
+
+Tests app/evaluation/run_job.py.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.evaluation.job import Job, finished
+from app.evaluation.run_job import run_job
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.trajectory import read_tum
+from tests.cli.conftest import write_walk
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "walk.mcap"
+    write_walk(path)
+    return path
+
+
+def test_a_part_in_the_middle_is_entered_early_and_only_it_counts(recording: Path, tmp_path: Path) -> None:
+    """The walk is shorter than the lead, so the run that is measured from its middle is the whole run."""
+
+    def run(name: str, start_s: float, baseline: str = "") -> Job:
+        job = Job(recording, "x", "walk", name, Params(), tmp_path / name, start_s=start_s, baseline=baseline)
+        run_job(job, lambda done, total: None)
+        return job
+
+    for baseline in ("", "loam"):
+        whole, part = run(f"whole{baseline}", 0.0, baseline), run(f"part{baseline}", 1.0, baseline)
+        lines, later = ((job.folder / "trajectory.tum").read_text().splitlines() for job in (whole, part))
+        assert 0 < len(later) < len(lines) and lines[-len(later) :] == later
+        first, begin = read_tum(part.folder / "trajectory.tum"), read_tum(whole.folder / "trajectory.tum")
+        assert 0.9 < (first.stamps_ns[0] - begin.stamps_ns[0]) * 1e-9 <= 1.1
+        facts, of_whole = finished(part), finished(whole)
+        assert facts is not None and of_whole is not None
+        assert facts["frames"] == len(later) and facts["distance_m"] < of_whole["distance_m"]
+        assert np.loadtxt(part.folder / "timings.csv", delimiter=",", skiprows=1).shape[0] == len(later)
+    with pytest.raises(HemislamError, match="no scan after 4 s"):
+        run("late", 4.0)
