@@ -29,7 +29,7 @@ from typing import Any, Final
 from app.logs import process_logs
 from app.slam.errors import HemislamError
 
-PRELOADED: Final = ("app.server.engine_process", "app.evaluation.job", "app.fork_server")
+PRELOADED: Final = ("app.server.engine_process", "app.evaluation.run_job", "app.fork_server")
 """What the fork server imports, so that its forks need not: importing the engine takes seconds."""
 GRACE_S: Final = 10.0
 """How long a child may take to finish its work after its owner died or asked it to end."""

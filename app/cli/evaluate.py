@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import Duration, Imperfect, ParamsFor, Start, make_folder, with_params
+from app.cli.options import Duration, Imperfect, ParamsFor, make_folder, with_params
 from app.slam.errors import HemislamError
 from app.slam.provenance import cores
 
@@ -28,6 +28,15 @@ ClusterData = Annotated[
         "--cluster-data",
         metavar="URL",
         help="Where its workers find the recordings, e.g. s3://bucket/walks. Default: the same path, else from here.",
+    ),
+]
+Start = Annotated[
+    float,
+    typer.Option(
+        "--start",
+        min=0,
+        metavar="SECONDS",
+        help="Measure from so long after the first scan on; every system starts 5 s before that.",
     ),
 ]
 Out = Annotated[

@@ -12,12 +12,13 @@ from app.cli.evaluate import (
     ClusterData,
     Jobs,
     Out,
+    Start,
     Truths,
     name_recordings,
     runner,
     truth_texts,
 )
-from app.cli.options import Duration, ParamsFor, Start, make_folder, with_params
+from app.cli.options import Duration, ParamsFor, make_folder, with_params
 from app.slam.errors import HemislamError
 from app.slam.provenance import cores
 

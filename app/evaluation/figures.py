@@ -195,7 +195,7 @@ def stacked(rows: Sequence[tuple[str, Sequence[float]]], parts: Sequence[str], u
 def density_image(counts: U16, densest: float) -> str:
     """Points per pixel as a PNG in a data URL, light to dark on a logarithmic scale up to `densest`."""
     level = np.log1p(counts.astype(np.float64)) / np.log1p(max(densest, 1.0))
-    level = np.where(counts > 0, 0.25 + 0.75 * level, 0.0)  # a single point is visible too
+    level = np.where(counts > 0, 0.45 + 0.55 * level, 0.0)  # a single point is visible too
     stops = np.array([[255, 255, 255], [168, 200, 236], [84, 140, 210], [38, 78, 158], [12, 18, 58]])
     ramp = [np.interp(np.linspace(0, 1, 256), np.linspace(0, 1, 5), stops[:, channel]) for channel in range(3)]
     image = Image.fromarray(np.rint(255 * level.clip(0, 1)).astype(np.uint8))

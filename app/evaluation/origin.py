@@ -1,6 +1,6 @@
 """How runs were made: versions, machines, and every parameter, in words for the report."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from app.evaluation.measured import Evaluated
@@ -16,7 +16,7 @@ def machines(recordings: Sequence[Evaluated]) -> list[str]:
 
 
 def parameters(recordings: Sequence[Evaluated]) -> list[tuple[str, str]]:
-    """Every parameter by its dotted name; where runs differ in it, each value with the runs that have it."""
+    """Every parameter of this engine's runs by its dotted name; where they differ, each value with whose it is."""
     told = []
     for leaf in leaves():
 
@@ -24,7 +24,7 @@ def parameters(recordings: Sequence[Evaluated]) -> list[tuple[str, str]]:
             found = run["parameters"][section][name]
             return " ".join(map(str, found)) if isinstance(found, list) else str(found)
 
-        values = _by_text(recordings, value)
+        values = _by_text(recordings, value, of_engine=True)
         text = "; ".join(f"{value}{_of(who)}" for value, who in values)
         told.append((leaf.path, f"{text} {leaf.unit}".strip()))
     return told
@@ -38,9 +38,12 @@ def _machine(run: dict[str, Any]) -> str:
     )
 
 
-def _by_text(recordings: Sequence[Evaluated], of: Any) -> list[tuple[str, str]]:
+def _by_text(
+    recordings: Sequence[Evaluated], of: Callable[[dict[str, Any]], str], *, of_engine: bool = False
+) -> list[tuple[str, str]]:
     """What `of` gives for the runs, each text once, with the names of its runs; "" if all have the same."""
-    runs = {(r.name, outcome.name): of(outcome.run) for r in recordings for outcome in r.outcomes if outcome.run}
+    outcomes = [(r.name, outcome) for r in recordings for outcome in r.outcomes if outcome.staged or not of_engine]
+    runs = {(name, outcome.name): of(outcome.run) for name, outcome in outcomes if outcome.run}
     texts = dict.fromkeys(runs.values())
     if len(texts) < 2:
         return [(text, "") for text in texts]
