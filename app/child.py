@@ -29,8 +29,6 @@ from typing import Any, Final
 from app.logs import process_logs
 from app.slam.errors import HemislamError
 
-PRELOADED: Final = ("app.server.engine_process", "app.evaluation.run_job", "app.fork_server")
-"""What the fork server imports, so that its forks need not: importing the engine takes seconds."""
 GRACE_S: Final = 10.0
 """How long a child may take to finish its work after its owner died or asked it to end."""
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
@@ -130,8 +128,8 @@ class Child(Link):
     Args:
         main: called there with a `Link` and `args`, all picklable. It ends by returning, or by `LinkClosed`.
         name: for `ps` ("hemislam-NAME", 15 characters) and the log. title: for messages.
-        fork: fork a process that has imported the engine, where possible, which takes 20 ms; else a new interpreter
-            starts, with `environment` added to its variables.
+        fork: fork a process that has imported what the first such child needs, which takes 20 ms, where possible; else
+            a new interpreter starts, with `environment` added to its variables.
         grace_s: how long it may go on working when its owner dies or asks it to end.
     """
 
@@ -145,7 +143,7 @@ class Child(Link):
         environment: Mapping[str, str] | None = None,
         grace_s: float = GRACE_S,
     ) -> None:
-        context = fork_context() if fork else multiprocessing.get_context("spawn")
+        context = fork_context(main.__module__) if fork else multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         call = pickle.dumps((main, args))  # to be loaded once the variables are set, since that imports numpy
         self._process = context.Process(target=_run, args=(theirs, name, grace_s, dict(environment or {}), call))
@@ -224,15 +222,16 @@ def _end_with_owner(grace_s: float) -> None:
     os._exit(1)
 
 
-def fork_context() -> ForkServerContext | SpawnContext:
-    """The context of `multiprocessing` that forks a process that has imported the engine, where possible.
+def fork_context(module: str) -> ForkServerContext | SpawnContext:
+    """The context of `multiprocessing` that forks a process that has imported a module, where possible.
 
-    The first call starts that process and returns at once. It has a single thread, since forks of thread pools hang.
+    The first call starts that process and returns at once; of later calls the module does not matter. It has a single
+    thread, since forks of thread pools hang.
     """
     if sys.platform != "linux":  # macOS cannot fork a process that has used its frameworks
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(PRELOADED))
+    context.set_forkserver_preload([module, "app.fork_server"])
     with _signals_blocked(), _main_hidden():
         forkserver.ensure_running()
     return context

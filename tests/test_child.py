@@ -80,7 +80,7 @@ def test_a_signal_to_the_whole_group_does_not_end_it(number: signal.Signals, wai
     """Not even while it imports."""
     code, out, err = owned(f"""
 signal.signal({number}, signal.SIG_IGN if {number} == signal.SIGTERM else lambda *_: None)
-fork_context()
+fork_context("app.server.engine_process")
 time.sleep({wait})
 os.killpg(0, {number})
 pid = begin()

@@ -1,4 +1,4 @@
-"""No module imports, over however many steps, a module that imports it; no two classes of app share a name."""
+"""No module imports, over however many steps, a module that imports it; no two types of app share a name."""
 
 import ast
 from collections import defaultdict
@@ -21,11 +21,15 @@ def test_there_are_no_import_circles() -> None:
     assert len(modules) > 100 and not circles, circles[:3]
 
 
-def test_no_two_classes_share_a_name() -> None:
+def test_no_two_types_share_a_name() -> None:
+    """Classes, and other types that are given a name, such as Vector = tuple[float, float, float]."""
     places = defaultdict(list)
     for path in (ROOT / "app").rglob("*.py"):
         for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                places[node.name].append(path.relative_to(ROOT).as_posix())
+            name = node.name if isinstance(node, ast.ClassDef) else ""
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                name = node.targets[0].id if not node.targets[0].id.isupper() else ""
+            if name[:1].isupper():
+                places[name].append(path.relative_to(ROOT).as_posix())
     shared = {name: paths for name, paths in places.items() if len(paths) > 1}
     assert not shared, shared

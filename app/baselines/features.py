@@ -6,13 +6,10 @@ Zhang and Singh, "LOAM: Lidar Odometry and Mapping in Real-time", RSS 2014.
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import maximum_filter1d, minimum_filter1d  # type: ignore[attr-defined]  # scipy ships no types
 
 from app.slam import lie
-from app.slam.types import F64, I64, Scan
-
-Mask = npt.NDArray[np.bool_]
+from app.slam.types import F64, I64, Mask, Scan
 
 REACH = 5
 """Neighbours on each side of a point that its curvature is measured from."""

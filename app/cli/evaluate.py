@@ -30,7 +30,7 @@ ClusterData = Annotated[
         help="Where its workers find the recordings, e.g. s3://bucket/walks. Default: the same path, else from here.",
     ),
 ]
-Start = Annotated[
+PartStart = Annotated[
     float,
     typer.Option(
         "--start",
@@ -98,7 +98,7 @@ def evaluate(
     jobs: Jobs = None,
     cluster: ClusterAddress = None,
     cluster_data: ClusterData = "",
-    start: Start = 0.0,
+    start: PartStart = 0.0,
     duration: Duration = None,
 ) -> None:
     """Measure accuracy, time and map sharpness: the paper's ablation, and yours.

@@ -46,7 +46,7 @@ Calibrate = Annotated[
         help="If no mounting is given, or the run is in doubt, find how the LiDAR sits on the IMU.",
     ),
 ]
-Truth = Annotated[
+TruthFile = Annotated[
     Path | None,
     typer.Option(
         "--truth",

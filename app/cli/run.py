@@ -13,7 +13,7 @@ from app.cli.options import (
     ParamsFor,
     RecordingPath,
     Start,
-    Truth,
+    TruthFile,
     progress_bar,
     say_calibrated,
     with_params,
@@ -36,7 +36,7 @@ def run(
     force: Annotated[bool, typer.Option("--force", help="Replace results that DIR already holds.")] = False,
     start: Start = 0.0,
     duration: Duration = None,
-    truth: Truth = None,
+    truth: TruthFile = None,
     loops: Annotated[
         Path | None, typer.Option("--loops", metavar="FILE", help="Edits of loops, as the workbench saves them.")
     ] = None,

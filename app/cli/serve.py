@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.options import Duration, ParamsFor, Start, Truth, say_calibrated, with_params
+from app.cli.options import Duration, ParamsFor, Start, TruthFile, say_calibrated, with_params
 from app.slam.errors import HemislamError
 
 
@@ -76,7 +76,7 @@ def serve(
     log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr, one JSON object per line.")] = False,
     start: Start = 0.0,
     duration: Duration = None,
-    truth: Truth = None,
+    truth: TruthFile = None,
 ) -> None:
     """Open the workbench in the browser.
 
@@ -97,7 +97,7 @@ def serve(
     from app.logs import start_logging
 
     start_logging(json_lines=log_json)
-    fork_context()  # it imports the engine while this process imports the rest
+    fork_context("app.server.engine_process")  # imported there while this process imports the rest
     from app.evaluation.truth import read_poses
     from app.mapping.session_file import SUFFIX, read_session
     from app.sensors.live.process import LiveProcess

@@ -12,7 +12,7 @@ from app.cli.evaluate import (
     ClusterData,
     Jobs,
     Out,
-    Start,
+    PartStart,
     Truths,
     name_recordings,
     runner,
@@ -74,7 +74,7 @@ def tune(
     jobs: Jobs = None,
     cluster: ClusterAddress = None,
     cluster_data: ClusterData = "",
-    start: Start = 0.0,
+    start: PartStart = 0.0,
     duration: Duration = None,
 ) -> None:
     """Find the parameters that fit a sensor and a place.

@@ -7,9 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from app.slam.errors import HemislamError
-from app.slam.types import F64
+from app.slam.types import F64, Vector
 
-Place = tuple[float, float, float]
 _FARTHEST_M: Final = 1e6
 """From the map's origin: no map is so large."""
 
@@ -26,8 +25,8 @@ class Box:
         HemislamError: there is no such box.
     """
 
-    low: Place
-    high: Place
+    low: Vector
+    high: Vector
     turn: float = 0.0
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from app.export import map_file
 from app.export.points import EVERYTHING, Block, Choice, blocks
 from app.export.raster import CELL, Raster, rasterise
-from app.export.section import Section, of_box, of_walk
+from app.export.section import Slab, of_box, of_walk
 from app.georeference import ledger, reference
 from app.georeference.align import Alignment
 from app.georeference.reference import GeoReference
@@ -36,7 +36,7 @@ EXTRAS = {"e57": ("pye57",), "plan": ("ezdxf", "rasterio")}
 """Modules that the extras of the package install."""
 
 
-Mark = tuple[str, tuple[tuple[int, tuple[float, float, float]], ...]]
+MapMark = tuple[str, tuple[tuple[int, tuple[float, float, float]], ...]]
 
 
 @dataclass
@@ -60,10 +60,10 @@ class Results:
     where: GeoReference | None = None
     found: Alignment | None = None
     problem: str = ""
-    marks: tuple[Mark, ...] = ()
+    marks: tuple[MapMark, ...] = ()
     progress: Callable[[float], None] = lambda share: None
     _rasters: dict[tuple[bool, float], Raster] = field(default_factory=dict, init=False, repr=False)
-    _sections: dict[str, Section] = field(default_factory=dict, init=False, repr=False)
+    _sections: dict[str, Slab] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def frame(self) -> MapFrame:
@@ -87,10 +87,15 @@ class Results:
             self._rasters[key] = rasterise(self.blocks, self.where if on_earth else None, cell)
         return self._rasters[key]
 
-    def section(self, kind: str) -> Section:
+    def section(self, kind: str) -> Slab:
         """A slab of the map from its side, counted once for all files that show it. kind: section or profile."""
         if kind not in self._sections:
-            self._sections[kind] = of_box(self) if kind == "section" else of_walk(self)
+            up = 0.0 if self.where is None else self.where.origin[2]
+            self._sections[kind] = (
+                of_box(self.blocks, self.choice.box, up)
+                if kind == "section"
+                else of_walk(self.blocks, self.trajectory.positions, self.choice.slab / 2, up)
+            )
         return self._sections[kind]
 
 

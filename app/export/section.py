@@ -3,18 +3,16 @@
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from app.export.box import Box
 from app.export.points import Block
 from app.slam.errors import HemislamError
 from app.slam.kernels.clouds import passages
 from app.slam.types import F64, NON_GROUND, U8
-
-if TYPE_CHECKING:
-    from app.export.results import Results
 
 CELL: Final = 0.02
 """m, of all but huge sections."""
@@ -29,8 +27,8 @@ Laid = Callable[[Block], tuple[F64, U8]]
 
 
 @dataclass(frozen=True)
-class Section:
-    """Points of a slab in cells, row 0 at the bottom.
+class Slab:
+    """Points of a slab of the map in cells, row 0 at the bottom.
 
     Attributes:
         origin: (2,) chainage and height of the lower left corner of cell (0, 0), m. cell: m.
@@ -57,13 +55,15 @@ class Section:
         return at, 2 * self.ground[rows, columns] > count
 
 
-def of_box(results: "Results") -> Section:
-    """What lies in the chosen box, from its front; chainage begins at its left side.
+def of_box(read: Callable[[], Iterable[Block]], box: Box | None, up: float) -> Slab:
+    """What lies in the box, from its front; chainage begins at its left side.
+
+    Args:
+        read: gives the points from the first on. up: m, from heights in the map to those of the drawing.
 
     Raises:
         HemislamError: no box is chosen, or nothing is in it.
     """
-    box, up = results.choice.box, _up(results)
     if box is None:
         raise HemislamError("A section shows what lies in a box; choose one in the page, or by --box.")
 
@@ -71,22 +71,22 @@ def of_box(results: "Results") -> Section:
         chainage = box.own(block.points)[:, 0] + box.size[0] / 2
         return np.column_stack([chainage, block.points[:, 2] + up]), block.labels
 
-    return _counted(results.blocks, laid)
+    return _counted(read, laid)
 
 
-def of_walk(results: "Results") -> Section:
-    """What lies beside the walked path, within half the chosen slab; chainage is the way walked, from above.
+def of_walk(read: Callable[[], Iterable[Block]], positions: F64, half: float, up: float) -> Slab:
+    """What lies within `half` m beside a walked path, (n, 3) m; chainage is the way walked, from above. As `of_box`.
 
     Raises:
         HemislamError: nobody walked, or nothing is there.
     """
-    path, half, up = strides(results.trajectory.positions[:, :2]), results.choice.slab / 2, _up(results)
+    path = strides(positions[:, :2])
 
     def laid(block: Block) -> tuple[F64, U8]:
         which, along, _ = along_path(block.points[:, :2], path, half)
         return np.column_stack([along, block.points[which, 2] + up]), block.labels[which]
 
-    return _counted(results.blocks, laid)
+    return _counted(read, laid)
 
 
 def strides(positions: F64) -> F64:
@@ -120,12 +120,7 @@ def along_path(points: F64, path: F64, half: float) -> tuple[npt.NDArray[np.int6
             return out[0][:count], out[1][:count], out[2][:count]
 
 
-def _up(results: "Results") -> float:
-    """m, from heights in the map to those that are known on Earth."""
-    return 0.0 if results.where is None else results.where.origin[2]
-
-
-def _counted(read: Callable[[], Iterable[Block]], laid: Laid) -> Section:
+def _counted(read: Callable[[], Iterable[Block]], laid: Laid) -> Slab:
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for at, _ in _parts(read, laid):
         low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
@@ -142,7 +137,7 @@ def _counted(read: Callable[[], Iterable[Block]], laid: Laid) -> Section:
         np.add.at(points, (rows, columns), 1)
         np.add.at(ground, (rows, columns), labels != NON_GROUND)
         np.add.at(sums, (rows, columns), (at - origin - np.column_stack([columns, rows]) * cell).astype(np.float32))
-    return Section(origin, cell, points, ground, sums)
+    return Slab(origin, cell, points, ground, sums)
 
 
 def _parts(read: Callable[[], Iterable[Block]], laid: Laid) -> Iterator[tuple[F64, U8]]:

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from app.export.paths import name_of, write_xml
-from app.export.section import Section
+from app.export.section import Slab
 
 if TYPE_CHECKING:
     from app.export.results import Results
@@ -25,7 +25,7 @@ _MM: Final = 10.0
 """Millimetres of an SVG for each metre: 1:100."""
 
 
-def write_png(path: Path, results: "Results", section: Section) -> None:
+def write_png(path: Path, results: "Results", section: Slab) -> None:
     """A pixel for each cell; the darker, the more points, ground in green."""
     rows, columns = section.points.shape
     left, top, right, bottom = _MARGIN
@@ -54,7 +54,7 @@ def write_png(path: Path, results: "Results", section: Section) -> None:
     picture.save(path, format="PNG")
 
 
-def write_svg(path: Path, results: "Results", section: Section) -> None:
+def write_svg(path: Path, results: "Results", section: Slab) -> None:
     """1:100 on paper: a dot for each cell with points, at their mean to the millimetre, over a grid."""
     (length, height), step = section.size.tolist(), _step(_APART / 4 / _MM)
     size = length + 3.0, height + 2.5  # m, with the margins
@@ -87,7 +87,7 @@ def write_svg(path: Path, results: "Results", section: Section) -> None:
     write_xml(path, root)
 
 
-def write_dxf(path: Path, results: "Results", section: Section) -> None:
+def write_dxf(path: Path, results: "Results", section: Slab) -> None:
     """A point for each cell with points, at their mean, in metres: x is the chainage, y the height."""
     import ezdxf  # of the extra
 
@@ -102,11 +102,11 @@ def write_dxf(path: Path, results: "Results", section: Section) -> None:
         drawing.write(file)
 
 
-def _is_ground(section: Section) -> np.ndarray:
+def _is_ground(section: Slab) -> np.ndarray:
     return np.asarray(2 * section.ground > section.points)
 
 
-def _many(section: Section) -> float:
+def _many(section: Slab) -> float:
     """So many points of a cell are drawn black."""
     return max(4.0, float(np.percentile(section.points[section.points > 0], 90)))
 
@@ -126,7 +126,7 @@ def _step(least: float) -> float:
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= least * (1 - 1e-9))
 
 
-def _ticks(section: Section, axis: int, step: float) -> Iterator[float]:
+def _ticks(section: Slab, axis: int, step: float) -> Iterator[float]:
     low = float(section.origin[axis])
     first, last = math.ceil(low / step - 1e-9), math.floor((low + section.size[axis]) / step + 1e-9)
     yield from (round(number * step, 6) for number in range(first, last + 1))

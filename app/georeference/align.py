@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import optimize
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
@@ -22,7 +21,7 @@ from app.georeference import crs
 from app.georeference.fixes import Fixes
 from app.georeference.reference import ELLIPSOIDAL, GeoReference
 from app.slam import lie
-from app.slam.arrays import F64
+from app.slam.arrays import F64, Mask, Vector
 from app.slam.errors import HemislamError
 from app.slam.trajectory import Trajectory
 
@@ -42,9 +41,6 @@ COARSE_FIXES = 200
 
 _least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
 _minimize: Any = optimize.minimize_scalar
-
-Vector = tuple[float, float, float]
-Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

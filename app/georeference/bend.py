@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.georeference.align import MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, Mask, WalkedPath, as_told, offset_by_parts
+from app.georeference.align import MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, WalkedPath, as_told, offset_by_parts
 from app.georeference.fixes import Fixes
 from app.slam import lie
-from app.slam.arrays import F64, I64
+from app.slam.arrays import F64, I64, Mask
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.factors import Closing, PositionPrior

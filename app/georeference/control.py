@@ -6,11 +6,11 @@ from types import MappingProxyType
 import numpy as np
 
 from app.georeference import crs
-from app.georeference.align import Alignment, Ground, Mask
+from app.georeference.align import Alignment, Ground
 from app.georeference.fixes import Fixes
 from app.georeference.reference import ELLIPSOIDAL
 from app.georeference.tables import NamedColumns
-from app.slam.arrays import F64
+from app.slam.arrays import F64, Mask
 from app.slam.errors import HemislamError
 from app.slam.metrics import umeyama
 

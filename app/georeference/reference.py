@@ -8,14 +8,12 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from app.georeference import crs
-from app.slam.arrays import F64
+from app.slam.arrays import F64, Vector
 from app.slam.errors import HemislamError
 
 FILE, RESIDUALS, PLOT = "georeference.json", "gnss_residuals.csv", "georeference.svg"
 """Beside the results: itself, the fixes that it is made from, and a drawing of both."""
 ELLIPSOIDAL = "ellipsoidal"
-
-Row = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +29,8 @@ class GeoReference:
     """
 
     crs: str
-    origin: Row
-    rotation: tuple[Row, Row, Row] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    origin: Vector
+    rotation: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     scale: float = 1.0
     height: str = ELLIPSOIDAL
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from app.georeference.reference import Row
+from app.slam.arrays import Vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -12,7 +12,7 @@ class Pick:
 
     name: str
     keyframe: int
-    at: Row
+    at: Vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +32,6 @@ class Survey:
     picks: tuple[Pick, ...] = ()
     crs: str = ""
     height: str = ""
-    lever: Row | None = None
+    lever: Vector | None = None
     offset_s: float | None = None
     factors: bool = False

@@ -44,6 +44,7 @@ from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import edit_files
 from app.slam.loops.edits import LoopEdit
 from app.slam.params import Params
+from app.slam.types import Vector
 
 log = logging.getLogger(__name__)
 
@@ -104,8 +105,7 @@ _Path = Annotated[Path, PlainSerializer(lambda path: str(path.resolve()))]
 _Note = Annotated[
     Note, PlainValidator(lambda entry: Note(*entry)), PlainSerializer(lambda note: (note.frame, note.text))
 ]
-_Place = tuple[float, float, float]
-KeptView = tuple[_Place, _Place]
+KeptView = tuple[Vector, Vector]
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class Spot:
     """A place on what a keyframe saw, so that it moves with the map. at: (x, y, z), m, in the keyframe's IMU frame."""
 
     keyframe: int
-    at: _Place
+    at: Vector
 
 
 @dataclass(frozen=True, slots=True)

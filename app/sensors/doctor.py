@@ -14,7 +14,7 @@ import numpy as np
 from app.sensors.clocks import clock_finding
 from app.sensors.cloud_types import CLOUD_TYPES
 from app.sensors.findings import Finding as Finding
-from app.sensors.findings import Verdict
+from app.sensors.findings import FindingVerdict
 from app.sensors.layout import settle_cloud
 from app.sensors.probe import choose_topic, probe_clouds
 from app.sensors.recording import ImuEntry, OtherEntry, ScanEntry, open_recording
@@ -180,7 +180,9 @@ def _imu_values(counts: Counts, samples: int, limits: ImuParams) -> Finding:
         return Finding("IMU values", "needs you", text)
     if not wrong:
         return Finding("IMU values", "fine", f"none beyond {bounds}, no spikes")
-    verdict: Verdict = "corrected" if counts.imu_out_of_range + counts.imu_spikes < 0.01 * samples else "needs you"
+    verdict: FindingVerdict = (
+        "corrected" if counts.imu_out_of_range + counts.imu_spikes < 0.01 * samples else "needs you"
+    )
     return Finding("IMU values", verdict, f"of {samples} samples {wrong}; those are left out")
 
 
@@ -204,7 +206,7 @@ def _pairing(paired: int, reasons: Counter[str], imu_topic: str) -> Finding:
             "pairing", "fine", f"all {paired} scans " + ("are covered by IMU samples" if imu_topic else "can be used")
         )
     why = ", ".join(f"{count} because {reason}" for reason, count in reasons.most_common(3))
-    verdict: Verdict = "corrected" if dropped < 0.1 * (dropped + paired) else "needs you"
+    verdict: FindingVerdict = "corrected" if dropped < 0.1 * (dropped + paired) else "needs you"
     return Finding("pairing", verdict, f"{paired} scans can be used, {dropped} are left out: {why}")
 
 
@@ -216,7 +218,7 @@ def _returns(census: _Census, scans: int) -> Finding:
     text = f"{each} a scan; of the places in the clouds {nan:.1%} are NaN, {returns:.1%} are returns"
     if census.refused:
         text += f"; {census.refused / census.places:.1%} are beyond 10 km or without a time and are left out"
-    usual: Verdict = "corrected" if census.refused else "fine"
+    usual: FindingVerdict = "corrected" if census.refused else "fine"
     return Finding("returns", usual if returns > 0.05 and census.refused < 0.3 * census.places else "needs you", text)
 
 

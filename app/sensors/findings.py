@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-Verdict = Literal["fine", "corrected", "needs you"]
+FindingVerdict = Literal["fine", "corrected", "needs you"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,12 +11,12 @@ class Finding:
     """One line of the recording doctor.
 
     Attributes:
-        subject: what was examined, e.g. "point time". verdict: see `Verdict`.
+        subject: what was examined, e.g. "point time". verdict: see `FindingVerdict`.
         text: what was found and how it was decided, in one sentence with units.
         option: the option that settles it, e.g. "--set recording.time_unit=us"; "" if none.
     """
 
     subject: str
-    verdict: Verdict
+    verdict: FindingVerdict
     text: str
     option: str = ""

@@ -11,12 +11,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from app.sensors.findings import Finding
-from app.sensors.ros import Vector
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.sections import RecordingParams
-from app.slam.types import F64, I64
+from app.slam.types import F64, I64, Vector
 
 STANDARD_GRAVITY = 9.80665
 ABSURD = 1e6

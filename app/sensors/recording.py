@@ -17,12 +17,12 @@ from app.sensors.navsat import fix_of, navsat_topic
 from app.sensors.pointcloud import decode, read_scan
 from app.sensors.presets import preset_for
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu, usable_types
-from app.sensors.ros import Vector, stamp_ns
+from app.sensors.ros import stamp_ns
 from app.sensors.sequencer import Sequencer
 from app.sensors.source import Mark, Source
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import I64, DroppedScan, Measurement, Samples, Scan
+from app.slam.types import I64, DroppedScan, Measurement, Samples, Scan, Vector
 
 LOG_MARGIN_NS = 2_000_000_000
 """How much later or earlier than usual a message may be logged and is still found by time."""

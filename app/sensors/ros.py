@@ -14,14 +14,13 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from app.sensors.livox import CUSTOM_MSGS, DEFINITION, CustomMsg, encoded
-from app.slam.types import Scan
+from app.slam.types import Scan, Vector
 
 LIDAR_TOPIC, IMU_TOPIC = "/rslidar_points", "/imu/data"
 CLOUD, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
 ENCODINGS: Final = {"cdr": "ros2msg", "ros1": "ros1msg"}
 """Encodings of messages that can be read, and how their definitions are written."""
 
-Vector = tuple[float, float, float]
 
 _ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 _DATATYPES = {"<u4": 6, "<f4": 7, "<f8": 8, "<u2": 4, "|u1": 2, "<i8": 9}

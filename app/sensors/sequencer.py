@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from app.sensors.ros import Vector
 from app.slam.sections import ImuParams
-from app.slam.types import DroppedScan, ImuSamples, Measurement, Samples, Scan
+from app.slam.types import DroppedScan, ImuSamples, Measurement, Samples, Scan, Vector
 
 OUTAGE_NS = 1_000_000_000
 """A sample that comes more than this after the one before must be confirmed by the next."""

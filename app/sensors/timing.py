@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.sensors.cloud_types import CloudType, Probe
-from app.sensors.findings import Finding, Verdict
+from app.sensors.findings import Finding, FindingVerdict
 from app.slam.sections import RecordingParams
 from app.slam.types import I64
 
@@ -207,7 +207,7 @@ def _header_by_delay(clouds: list[Probe], duration_ns: float) -> tuple[End, Find
     return _header("last", f"{text}, which shows neither, so as most drivers do by default", "needs you")
 
 
-def _header(end: End, evidence: str, verdict: Verdict) -> tuple[End, Finding]:
+def _header(end: End, evidence: str, verdict: FindingVerdict) -> tuple[End, Finding]:
     option = f"--set recording.header_stamp={'first' if end == 'last' else 'last'}"
     return end, Finding("header stamp", verdict, f"of the {end} point: {evidence}", option)
 
@@ -239,7 +239,7 @@ def _without_field(
     text = f"derived from the azimuth at {rate} ({why}); times recorded by the driver would be better"
     if not agrees:
         text += f"; but clouds come every {measured / 1e9:.3f} s"
-    verdict: Verdict = "corrected" if agrees and known else "needs you"
+    verdict: FindingVerdict = "corrected" if agrees and known else "needs you"
     finding = Finding("point time", verdict, text, "--set recording.rotation_rate=10")
     if chosen.header_stamp == "auto":
         header, stamp_finding = _header_by_delay(clouds, period_ns)

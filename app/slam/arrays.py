@@ -1,4 +1,4 @@
-"""Names of the array types that the values of this package hold."""
+"""Names of the array types that the values of this package hold, and of three numbers."""
 
 import numpy as np
 import numpy.typing as npt
@@ -9,3 +9,5 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
+Mask = npt.NDArray[np.bool_]
+Vector = tuple[float, float, float]

@@ -15,7 +15,7 @@ Effect = Literal["now", "frame", "restart"]
 
 Metres = Annotated[float, Field(ge=-100, le=100)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
-Axes = Annotated[str, Field(pattern=r"^-?(x-?(y-?z|z-?y)|y-?(x-?z|z-?x)|z-?(x-?y|y-?x))$")]
+AxesName = Annotated[str, Field(pattern=r"^-?(x-?(y-?z|z-?y)|y-?(x-?z|z-?x)|z-?(x-?y|y-?x))$")]
 
 
 def _param(
@@ -73,8 +73,8 @@ class RecordingParams(Section):
     )
     acceleration_unit: Literal["auto", "m/s2", "g", "mg"] = _on_restart("auto", "Unit of the accelerometer.")
     gyroscope_unit: Literal["auto", "rad/s", "deg/s"] = _on_restart("auto", "Unit of the gyroscope.")
-    accelerometer_axes: Axes = _on_restart("xyz", "Recorded axes that are x, y and z of the IMU, such as -yxz.")
-    gyroscope_axes: Axes = _on_restart("xyz", "The same for the gyroscope, where its axes differ.")
+    accelerometer_axes: AxesName = _on_restart("xyz", "Recorded axes that are x, y and z of the IMU, such as -yxz.")
+    gyroscope_axes: AxesName = _on_restart("xyz", "The same for the gyroscope, where its axes differ.")
     imu_time_offset: float = _on_restart(
         0.0, "Time added to the IMU's stamps, if its clock differs from the LiDAR's.", (-4e9, 4e9, 0.001), "s"
     )

@@ -21,6 +21,8 @@ from app.slam.arrays import I32 as I32
 from app.slam.arrays import I64 as I64
 from app.slam.arrays import U8 as U8
 from app.slam.arrays import U16 as U16
+from app.slam.arrays import Mask as Mask
+from app.slam.arrays import Vector as Vector
 from app.slam.loops.types import LoopEdge
 
 NON_GROUND, GROUND, SEED = 0, 1, 2

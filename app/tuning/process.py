@@ -10,7 +10,7 @@ from app.child import Link
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.provenance import cores
-from app.tuning.trial import Search, Trial, front
+from app.tuning.trial import SearchMethod, Trial, front
 
 if TYPE_CHECKING:
     import optuna
@@ -31,7 +31,7 @@ class Wanted:
     truth: Path | None
     parameters: str
     objectives: tuple[str, ...]
-    how: Search
+    how: SearchMethod
     trials: int
     start_s: float
     duration_s: float | None

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from app.tuning.objectives import Objective
 
-Search = Literal["bayes", "random", "grid"]
+SearchMethod = Literal["bayes", "random", "grid"]
 """How the next settings are chosen."""
 DEFAULTS = "as given"
 """Name of the first trial: the parameters that the user gave."""

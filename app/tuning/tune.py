@@ -20,7 +20,7 @@ from app.slam.provenance import sha256_of
 from app.tuning.objectives import Objective, score
 from app.tuning.report import write_results
 from app.tuning.space import Dimension, grid
-from app.tuning.trial import Search, Trial, front
+from app.tuning.trial import SearchMethod, Trial, front
 
 BATCH = 8
 """Trials between two looks at the results; the same for any number of processes, so that trials repeat."""
@@ -63,7 +63,7 @@ class Runs:
         self._known, self._run, self._threads = known, run, threads
         self.hashes = [sha256_of(subject.recording) for subject in subjects]
 
-    def asked(self, how: Search, trials: int, seed: int, part: Part) -> dict[str, Any]:
+    def asked(self, how: SearchMethod, trials: int, seed: int, part: Part) -> dict[str, Any]:
         """What a search was asked for, as its report keeps it."""
         return {
             "recordings": [
@@ -118,7 +118,7 @@ class Runs:
         return outcome
 
 
-Progress = Callable[[Sequence[Trial], optuna.Study], None]
+OnTrials = Callable[[Sequence[Trial], optuna.Study], None]
 """Called with all trials so far after each batch."""
 
 
@@ -130,10 +130,10 @@ def tune(
     rest: Part | None,
     folder: Path,
     *,
-    how: Search = "bayes",
+    how: SearchMethod = "bayes",
     trials: int = 100,
     seed: int = 0,
-    progress: Progress,
+    progress: OnTrials,
 ) -> tuple[list[Trial], tuple[Trial, ...]]:
     """Search on `part`, check the best on `rest`, and write the files that `write_results` names into `folder`.
 
@@ -155,10 +155,10 @@ def search(
     objectives: Sequence[Objective],
     part: Part,
     *,
-    how: Search = "bayes",
+    how: SearchMethod = "bayes",
     trials: int = 100,
     seed: int = 0,
-    progress: Progress = lambda so_far, study: None,
+    progress: OnTrials = lambda so_far, study: None,
 ) -> tuple[list[Trial], optuna.Study]:
     """Try the parameters as given and then `trials` settings.
 
@@ -199,7 +199,7 @@ Batch = list[tuple[optuna.trial.Trial, Mapping[str, Any]]]
 
 
 def _batches(
-    study: optuna.Study, dimensions: Sequence[Dimension], how: Search, trials: int, seed: int
+    study: optuna.Study, dimensions: Sequence[Dimension], how: SearchMethod, trials: int, seed: int
 ) -> Iterator[Batch]:
     distributions = {dimension.path: dimension.distribution for dimension in dimensions}
     if how == "grid":
@@ -215,7 +215,7 @@ def _batches(
         yield [(trial, {one.path: one.rounded(trial.params[one.path]) for one in dimensions}) for trial in asked]
 
 
-def _sampler(how: Search, seed: int) -> optuna.samplers.BaseSampler:
+def _sampler(how: SearchMethod, seed: int) -> optuna.samplers.BaseSampler:
     if how == "random":
         return optuna.samplers.RandomSampler(seed=seed)
     return optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)

@@ -13,7 +13,7 @@ from app.server.protocol import LIVE, Snapshot
 from app.slam.errors import HemislamError
 from app.tuning.objectives import OBJECTIVES
 from app.tuning.process import Tried, Wanted, find
-from app.tuning.trial import Search
+from app.tuning.trial import SearchMethod
 from app.ui import tune_maths as maths
 from app.ui.compare import Sides
 from app.ui.html import panel
@@ -62,7 +62,7 @@ class TunePanel:
             initial_value="20 s from here",
             hint="The best are then checked on as much behind it.",
         )
-        self._search = gui.add_dropdown("search", get_args(Search), hint="How the next trials are chosen.")
+        self._search = gui.add_dropdown("search", get_args(SearchMethod), hint="How the next trials are chosen.")
         self._trials = gui.add_slider("trials", 8, 400, 8, 48)
         self._start = gui.add_button("Start", icon=viser.Icon.PLAYER_PLAY)
         self._stop = gui.add_button(

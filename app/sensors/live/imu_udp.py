@@ -40,7 +40,7 @@ from app.sensors.imu_units import STANDARD_GRAVITY
 from app.sensors.live import livox_udp
 from app.sensors.live.msop import read_utc, utc_bytes
 from app.sensors.live.status import Counters
-from app.sensors.ros import Vector
+from app.slam.types import Vector
 
 IMU_PORT = 6700
 IMU_MAGIC = b"HIMU"

@@ -20,10 +20,9 @@ from app.sensors.imu_units import ABSURD, AS_RECORDED, ImuProbe, ImuUnits, settl
 from app.sensors.live.clock import JUMP_NS, ClockMap, OffsetEstimate
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Counters, Kind, LiveState, Status
-from app.sensors.ros import Vector
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import DroppedScan, Scan
+from app.slam.types import DroppedScan, Scan, Vector
 
 MAX_BACKLOG = 100
 """Scans that may wait for the engine: ten seconds of them at 10 Hz, enough to start another engine."""

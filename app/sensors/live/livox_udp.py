@@ -14,9 +14,8 @@ import numpy.typing as npt
 
 from app.sensors.imu_units import STANDARD_GRAVITY
 from app.sensors.livox import CustomMsg
-from app.sensors.ros import Vector
 from app.slam.errors import HemislamError
-from app.slam.types import I64, U8, Scan
+from app.slam.types import I64, U8, Scan, Vector
 
 POINTS_PORT, IMU_PORT = 56301, 56401
 SCAN_NS = 100_000_000

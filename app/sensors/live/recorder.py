@@ -11,9 +11,9 @@ import threading
 from collections import deque
 from pathlib import Path
 
-from app.sensors.ros import RecordingWriter, Vector
+from app.sensors.ros import RecordingWriter
 from app.slam.errors import HemislamError
-from app.slam.types import Scan
+from app.slam.types import Scan, Vector
 
 FLUSH_S = 0.5
 MAX_SCANS, MAX_SAMPLES = 200, 100_000

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from app.slam.types import F32, F64, U8
 
 Faces = npt.NDArray[np.int32]
-Vector = Sequence[float] | F64
+Triple = Sequence[float] | F64
 """A point or direction, 2 or 3 numbers."""
 
 _BOX_CORNERS: F64 = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -70,20 +70,20 @@ class MeshBuilder:
         """Four corners in order around."""
         self.add(np.array(corners, np.float64), np.array([[0, 1, 2], [0, 2, 3]]), reflectivity, ground)
 
-    def box(self, centre: Vector, size: Vector, reflectivity: float, yaw: float = 0.0, tilt: float = 0.0) -> None:
+    def box(self, centre: Triple, size: Triple, reflectivity: float, yaw: float = 0.0, tilt: float = 0.0) -> None:
         """A closed box; `tilt` leans it about its own x axis before the yaw."""
         c, s = np.cos(tilt), np.sin(tilt)
         corners = (_BOX_CORNERS * np.asarray(size)) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T
         self.add(_turned(corners, yaw) + np.asarray(centre), _BOX_FACES, reflectivity)
 
-    def boxes(self, centres: Iterable[Vector], size: Vector, reflectivity: float, yaw: float = 0.0) -> None:
+    def boxes(self, centres: Iterable[Triple], size: Triple, reflectivity: float, yaw: float = 0.0) -> None:
         """Equal boxes at several places."""
         for centre in centres:
             self.box(centre, size, reflectivity, yaw)
 
     def cylinder(
         self,
-        base: Vector,
+        base: Triple,
         radius: float,
         height: float,
         reflectivity: float,
@@ -102,7 +102,7 @@ class MeshBuilder:
         lid = np.column_stack([i + sides, j + sides, np.full(sides, 2 * sides + 1)])
         self.add(vertices + np.asarray(base), np.vstack([band_faces(sides), bottom, lid]), reflectivity)
 
-    def ellipsoid(self, centre: Vector, radii: Vector, reflectivity: float, yaw: float = 0.0) -> None:
+    def ellipsoid(self, centre: Triple, radii: Triple, reflectivity: float, yaw: float = 0.0) -> None:
         u = np.linspace(0, 2 * np.pi, 13)
         v = np.linspace(-np.pi / 2, np.pi / 2, 8)
         uu, vv = np.meshgrid(u, v, indexing="ij")
@@ -112,8 +112,8 @@ class MeshBuilder:
 
     def leaves(
         self,
-        centre: Vector,
-        radii: Vector,
+        centre: Triple,
+        radii: Triple,
         count: int,
         size: float,
         reflectivity: float,
@@ -145,8 +145,8 @@ class MeshBuilder:
 
     def wall(
         self,
-        start: Vector,
-        end: Vector,
+        start: Triple,
+        end: Triple,
         height: float,
         reflectivity: float,
         openings: Sequence[tuple[float, float, float, float]] = (),
@@ -182,7 +182,7 @@ def band_faces(count: int) -> Faces:
     return np.vstack([np.column_stack([i, j, j + count]), np.column_stack([i, j + count, i + count])])
 
 
-def line_through(start: Vector, end: Vector) -> tuple[F64, F64, float, float]:
+def line_through(start: Triple, end: Triple) -> tuple[F64, F64, float, float]:
     """Of a line in plan: its start, its unit direction, its length and its yaw."""
     a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
     length = float(np.linalg.norm(b - a))

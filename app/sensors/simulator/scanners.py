@@ -16,7 +16,7 @@ from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.types import F64
 
-Turns = Callable[[int], Pattern]
+PatternOfTurn = Callable[[int], Pattern]
 """The firings of the k-th scan."""
 
 _RATE_HZ = 10
@@ -40,7 +40,7 @@ class Scanner:
         layout: of its recordings. accel_unit: m/s² that its driver calls 1.
     """
 
-    patterns: Callable[[int, int, Path | None], Turns]
+    patterns: Callable[[int, int, Path | None], PatternOfTurn]
     upright: bool = False
     R_imu_lidar: F64 = field(default_factory=lambda: np.eye(3))
     p_imu_lidar: F64 = field(default_factory=lambda: np.zeros(3))
@@ -59,12 +59,12 @@ class Scanner:
         return np.asarray(R_body_lidar @ self.R_imu_lidar.T)
 
 
-def _bpearl(rate_hz: int, every_block: int, _: Path | None) -> Turns:
+def _bpearl(rate_hz: int, every_block: int, _: Path | None) -> PatternOfTurn:
     pattern = firing_pattern(robosense.BPEARL, rate_hz, every_block)
     return lambda turn: pattern
 
 
-def _airy(rate_hz: int, every_block: int, _: Path | None) -> Turns:
+def _airy(rate_hz: int, every_block: int, _: Path | None) -> PatternOfTurn:
     """A RoboSense Airy: 96 channels, eight at a time, over a hemisphere."""
     elevation, us = np.radians(AIRY.elevations_deg), AIRY.firing_offsets_ns / 1000
     pattern = _turning(
@@ -73,7 +73,7 @@ def _airy(rate_hz: int, every_block: int, _: Path | None) -> Turns:
     return lambda turn: pattern
 
 
-def _jt128(rate_hz: int, every_block: int, tables: Path | None) -> Turns:
+def _jt128(rate_hz: int, every_block: int, tables: Path | None) -> PatternOfTurn:
     """A Hesai JT128: 128 channels, far apart in azimuth [HesaiLidar_SDK_2.0, angles and firing times]."""
     folder = _tables(tables, "jt128_angles.csv", "jt128_firetimes.csv")
     angles = np.genfromtxt(folder / "jt128_angles.csv", delimiter=",", skip_header=1, max_rows=128)
@@ -102,7 +102,7 @@ def _turning(
     return Pattern(offsets_ns, directions, levers, rings, blocks_ns, block_ns, len(elevation))
 
 
-def _mid360(rate_hz: int, every_block: int, tables: Path | None) -> Turns:
+def _mid360(rate_hz: int, every_block: int, tables: Path | None) -> PatternOfTurn:
     """A Livox Mid-360: its pattern of 4 s, which does not repeat from scan to scan."""
     pattern = np.load(_tables(tables, "mid360_pattern.npy") / "mid360_pattern.npy").astype(np.float64)
     firings = _MID360_RATE_HZ // rate_hz

@@ -38,7 +38,7 @@ from app.slam.map_frame import MapFrame
 from app.slam.sections import LoopsParams
 from app.slam.types import Keyframe
 
-Request = Question | Callable[[Edits], Edits]
+UserRequest = Question | Callable[[Edits], Edits]
 """What the user asks, or makes of the edits: `Edits.undo`, for example, which may raise HemislamError."""
 EVERY: Final = 8
 """Keyframes after which a state is asked for if no frame needs one: so many travel together."""
@@ -100,7 +100,7 @@ class LoopSchedule:
         self._wanted = Moment(0)  # what should be in effect
         self._shown: Moment | None = self._wanted  # what is; None if that is with other edits
         self._asked: deque[_Asked] = deque()
-        self._requests: deque[Request] = deque()  # of the user, not yet sent
+        self._requests: deque[UserRequest] = deque()  # of the user, not yet sent
         self._visit = 0
         self._reported: tuple[LoopEdge, ...] | None = ()  # candidates at the frame before; None after going elsewhere
         self._answers: list[Answer] = []
@@ -182,7 +182,7 @@ class LoopSchedule:
         self._settle()
 
     # --- the user --------------------------------------------------------------------------------
-    def command(self, request: Request) -> None:
+    def command(self, request: UserRequest) -> None:
         """Ask on behalf of the user, or change the edits; `poll` until it is `idle` brings the answer."""
         self._requests.append(request)
         self._ask_next()
@@ -270,7 +270,7 @@ class LoopSchedule:
             if moment != self._shown and moment not in self._states and moment not in outstanding:
                 self._ask(Ask(Target(moment.count, self._edits, moment.finished)))
 
-    def _ask_for_user(self, request: Request) -> None:
+    def _ask_for_user(self, request: UserRequest) -> None:
         question = request if isinstance(request, Question) else AskState()
         try:
             edits = _after(self._edits, request)
@@ -371,7 +371,7 @@ class LoopSchedule:
         return MapFrame(self._log.stamps_ns(state.count), state.corrections)
 
 
-def _after(edits: Edits, request: Request) -> Edits:
+def _after(edits: Edits, request: UserRequest) -> Edits:
     """What a request of the user makes of the edits. Raises HemislamError: it cannot be done."""
     if isinstance(request, ApplyEdit):
         check(request.edit)

@@ -8,15 +8,12 @@ the neighbours, on one thread, so that the result is the same every time.
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import small_gicp
 
 from app.slam import lie
 from app.slam.kernels import patches, small, submaps
 from app.slam.loops.submap import Submap
-from app.slam.types import F64, I64
-
-Flags = npt.NDArray[np.bool_]
+from app.slam.types import F64, I64, Mask
 
 ONE_THREAD = 1
 """Results must not depend on the order in which threads finish."""
@@ -60,9 +57,9 @@ class Prepared:
     submap: Submap
     points: F64
     normals: F64
-    flat: Flags
-    level: Flags
-    upright: Flags
+    flat: Mask
+    level: Mask
+    upright: Mask
     tree: small_gicp.KdTree
     chosen: I64
     few: I64
@@ -116,7 +113,7 @@ def prepare(submap: Submap) -> Prepared:
     return Prepared(submap, points, normals, flat, ground, upright, tree, chosen, few, _thinned(upright, MOST_POINTS))
 
 
-def _thinned(which: Flags, most: int) -> I64:
+def _thinned(which: Mask, most: int) -> I64:
     """Indices of at most so many of them, evenly."""
     indices = np.flatnonzero(which)
     return indices[:: max(1, -(-len(indices) // most))]
@@ -207,7 +204,7 @@ def _overlap(target: Prepared, source: Prepared, T: F64) -> float:
     return float((_nearest(target, near)[1] < PARTNER_M**2).mean()) if len(near) >= LEAST_UPRIGHT else 0.0
 
 
-def _near(points: F64, origin: F64) -> Flags:
+def _near(points: F64, origin: F64) -> Mask:
     """Which points (n, 3), target frame, lie near both the target's origin and `origin`."""
     to_target = np.einsum("ni,ni->n", points, points)
     to_source = np.einsum("ni,ni->n", points - origin, points - origin)

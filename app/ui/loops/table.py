@@ -13,7 +13,7 @@ MOST_ROWS: Final = 300
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class TableColumn:
     """Attributes:
     title: with its unit, as short as possible. meaning: the long form. key: sorts (nan goes last). text: of a cell.
     """
@@ -24,27 +24,27 @@ class Column:
     text: Callable[[LoopEdge], str]
 
 
-COLUMNS: Final[dict[str, Column]] = {
-    "verdict": Column(
+COLUMNS: Final[dict[str, TableColumn]] = {
+    "verdict": TableColumn(
         "", "Verdict", lambda e: list(KINDS).index(kind_of(e).name) + 0.1 * list(SIGNS).index(e.verdict),
         lambda e: SIGNS[e.verdict] + ("✎" if kind_of(e).name == EDITED else ""),
     ),
-    "keyframe": Column(
+    "keyframe": TableColumn(
         "loop", "Older and newer keyframe", lambda e: e.newer + e.older * 1e-7, lambda e: name(e.pair)
     ),
-    "context": Column(
+    "context": TableColumn(
         "ctx", "Distance of the Scan Contexts, 0 (same) to 1",
         lambda e: e.evidence.context_distance, lambda e: number(e.evidence.context_distance),
     ),
-    "overlap": Column(
+    "overlap": TableColumn(
         "over %", "Share of points near both that have a partner in the other submap",
         lambda e: e.evidence.overlap, lambda e: number(100 * e.evidence.overlap, 0),
     ),
-    "residual": Column(
+    "residual": TableColumn(
         "res mm", "Residual (RMS), point to plane",
         lambda e: e.evidence.residual_rms, lambda e: number(1000 * e.evidence.residual_rms, 0),
     ),
-    "mahalanobis": Column(
+    "mahalanobis": TableColumn(
         "odo σ", "Mahalanobis distance to what odometry expects, in standard deviations",
         lambda e: e.evidence.mahalanobis, lambda e: number(e.evidence.mahalanobis, 1),
     ),

@@ -9,7 +9,7 @@ from itertools import pairwise, product
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from app.sensors.simulator.mesh import Mesh, MeshBuilder, Vector, band_faces
+from app.sensors.simulator.mesh import Mesh, MeshBuilder, Triple, band_faces
 from app.sensors.simulator.raycast import Mover
 from app.sensors.simulator.trajectory import arc_lengths
 from app.slam.types import F64
@@ -63,13 +63,13 @@ def storey(
     mesh.quad([(x, y, height) for x, y in corners], ceiling)
 
 
-def _place(at: Vector, yaw: float) -> Callable[[float, float, float], tuple[float, float, float]]:
+def _place(at: Triple, yaw: float) -> Callable[[float, float, float], tuple[float, float, float]]:
     """From a prop's own coordinates to the world's."""
     c, s = float(np.cos(yaw)), float(np.sin(yaw))
     return lambda x, y, z: (at[0] + c * x - s * y, at[1] + s * x + c * y, at[2] + z)
 
 
-def table(mesh: MeshBuilder, at: Vector, yaw: float = 0.0, size: tuple[float, float, float] = (1.6, 0.8, 0.74)) -> None:
+def table(mesh: MeshBuilder, at: Triple, yaw: float = 0.0, size: tuple[float, float, float] = (1.6, 0.8, 0.74)) -> None:
     p = _place(at, yaw)
     length, width, height = size
     mesh.box(p(0, 0, height - 0.02), (length, width, 0.04), 0.55, yaw)
@@ -77,7 +77,7 @@ def table(mesh: MeshBuilder, at: Vector, yaw: float = 0.0, size: tuple[float, fl
     mesh.boxes([p(*leg) for leg in legs], (0.06, 0.06, height - 0.04), 0.35, yaw)
 
 
-def chair(mesh: MeshBuilder, at: Vector, yaw: float = 0.0) -> None:
+def chair(mesh: MeshBuilder, at: Triple, yaw: float = 0.0) -> None:
     """Its back is at -x."""
     p = _place(at, yaw)
     mesh.box(p(0, 0, 0.45), (0.45, 0.45, 0.05), 0.4, yaw)
@@ -86,7 +86,7 @@ def chair(mesh: MeshBuilder, at: Vector, yaw: float = 0.0) -> None:
 
 
 def shelf(
-    mesh: MeshBuilder, at: Vector, yaw: float, rng: np.random.Generator, size: tuple[float, float] = (1.2, 2.0)
+    mesh: MeshBuilder, at: Triple, yaw: float, rng: np.random.Generator, size: tuple[float, float] = (1.2, 2.0)
 ) -> None:
     """Open to +x, with books."""
     p = _place(at, yaw)
@@ -102,7 +102,7 @@ def shelf(
             y += thick + (0.0 if rng.random() < 0.8 else 0.15)
 
 
-def sofa(mesh: MeshBuilder, at: Vector, yaw: float = 0.0, width: float = 1.9) -> None:
+def sofa(mesh: MeshBuilder, at: Triple, yaw: float = 0.0, width: float = 1.9) -> None:
     """Its back is at -x."""
     p = _place(at, yaw)
     mesh.box(p(0, 0, 0.22), (0.85, width, 0.44), 0.3, yaw)
@@ -110,24 +110,24 @@ def sofa(mesh: MeshBuilder, at: Vector, yaw: float = 0.0, width: float = 1.9) ->
     mesh.boxes([p(0, y, 0.32) for y in (-width / 2, width / 2)], (0.85, 0.18, 0.64), 0.28, yaw)
 
 
-def plant(mesh: MeshBuilder, at: Vector, rng: np.random.Generator) -> None:
+def plant(mesh: MeshBuilder, at: Triple, rng: np.random.Generator) -> None:
     mesh.cylinder(at, 0.18, 0.4, 0.25, top_radius=0.23)
     mesh.leaves((at[0], at[1], at[2] + 0.9), (0.4, 0.4, 0.5), 160, 0.05, 0.5, rng)
 
 
-def extinguisher(mesh: MeshBuilder, at: Vector) -> None:
+def extinguisher(mesh: MeshBuilder, at: Triple) -> None:
     mesh.cylinder((at[0], at[1], at[2] + 0.5), 0.08, 0.5, 0.6)
     mesh.cylinder((at[0], at[1], at[2] + 1.0), 0.03, 0.1, 0.2)
 
 
-def door_leaf(mesh: MeshBuilder, hinge: Vector, yaw: float, width: float = 0.9, height: float = 2.1) -> None:
+def door_leaf(mesh: MeshBuilder, hinge: Triple, yaw: float, width: float = 0.9, height: float = 2.1) -> None:
     """A leaf that reaches from its hinge along +x of `yaw`, with a handle on either side."""
     p = _place(hinge, yaw)
     mesh.box(p(width / 2, 0, height / 2), (width, 0.04, height), 0.5, yaw)
     mesh.box(p(width - 0.1, 0, 1.05), (0.12, 0.14, 0.03), 0.25, yaw)
 
 
-def tree(mesh: MeshBuilder, at: Vector, rng: np.random.Generator, height: float = 7.0) -> None:
+def tree(mesh: MeshBuilder, at: Triple, rng: np.random.Generator, height: float = 7.0) -> None:
     trunk = height * rng.uniform(0.3, 0.4)
     mesh.cylinder((at[0], at[1], at[2] - 0.3), 0.025 * height, trunk + 0.3 + height * 0.2, 0.25, top_radius=0.08)
     crown = (height - trunk) / 2
@@ -137,18 +137,18 @@ def tree(mesh: MeshBuilder, at: Vector, rng: np.random.Generator, height: float 
         mesh.leaves(centre, crown * rng.uniform(0.5, 0.8, 3), 220, 0.09, 0.45, rng)
 
 
-def bush(mesh: MeshBuilder, at: Vector, rng: np.random.Generator, size: float = 0.9) -> None:
+def bush(mesh: MeshBuilder, at: Triple, rng: np.random.Generator, size: float = 0.9) -> None:
     mesh.leaves((at[0], at[1], at[2] + 0.4 * size), (size, size, 0.6 * size), 320, 0.06, 0.45, rng)
 
 
-def hedge(mesh: MeshBuilder, start: Vector, end: Vector, rng: np.random.Generator, height: float = 1.0) -> None:
+def hedge(mesh: MeshBuilder, start: Triple, end: Triple, rng: np.random.Generator, height: float = 1.0) -> None:
     a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
     for share in np.arange(0.0, 1.0, 0.7 / float(np.linalg.norm(b - a))):
         middle = a + (b - a) * share + [0, 0, height / 2]
         mesh.leaves(middle, (0.5, 0.5, height / 2), 200, 0.06, 0.45, rng)
 
 
-def car(mesh: MeshBuilder, at: Vector, yaw: float, rng: np.random.Generator) -> None:
+def car(mesh: MeshBuilder, at: Triple, yaw: float, rng: np.random.Generator) -> None:
     p = _place(at, yaw)
     paint = rng.uniform(0.1, 0.7)
     side = np.array(
@@ -162,14 +162,14 @@ def car(mesh: MeshBuilder, at: Vector, yaw: float, rng: np.random.Generator) -> 
         mesh.ellipsoid(p(*wheel), (0.32, 0.12, 0.32), 0.08, yaw)
 
 
-def bench(mesh: MeshBuilder, at: Vector, yaw: float = 0.0) -> None:
+def bench(mesh: MeshBuilder, at: Triple, yaw: float = 0.0) -> None:
     p = _place(at, yaw)
     mesh.box(p(0, 0, 0.44), (0.45, 1.6, 0.06), 0.5, yaw)
     mesh.box(p(-0.25, 0, 0.72), (0.05, 1.6, 0.3), 0.5, yaw)
     mesh.boxes([p(0, y, 0.2) for y in (-0.65, 0.65)], (0.4, 0.08, 0.42), 0.3, yaw)
 
 
-def lamp_post(mesh: MeshBuilder, at: Vector, height: float = 4.5) -> None:
+def lamp_post(mesh: MeshBuilder, at: Triple, height: float = 4.5) -> None:
     mesh.cylinder((at[0], at[1], at[2] - 0.3), 0.07, height + 0.3, 0.4, top_radius=0.04)
     mesh.ellipsoid((at[0], at[1], at[2] + height), (0.25, 0.25, 0.18), 0.7)
 
@@ -217,7 +217,7 @@ def _rounded(outline: F64) -> F64:
     return np.array(points)
 
 
-def building(mesh: MeshBuilder, at: Vector, size: Vector, yaw: float = 0.0) -> None:
+def building(mesh: MeshBuilder, at: Triple, size: Triple, yaw: float = 0.0) -> None:
     """Rows of windows on all sides, a plinth, a gabled roof; walls reach 2 m below `at`, for slopes."""
     p = _place(at, yaw)
     length, depth, height = size
