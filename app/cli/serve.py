@@ -38,7 +38,7 @@ def serve(
             "--point-budget",
             min=10_000,
             metavar="N",
-            help="Most map points that the page draws. After hours of recording it draws fewer, at least half as many.",
+            help="Most map points that the page draws; of a larger map, more of what is near the camera.",
         ),
     ] = 3_000_000,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address only.")] = False,

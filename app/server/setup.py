@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from app.sensors.live.address import LiveAddress
 
 POINT_BUDGET = 3_000_000
+"""Most map points that a page draws."""
+HELD = 7
+"""So many times as many are held for pages, so that each can show in detail what it looks at: 400 MB."""
 
 
 class Kept(NamedTuple):
@@ -36,7 +39,7 @@ class Setup:
     Attributes:
         recording: to open; None: wait for OpenRecording. start_s, duration_s: the part to process.
         resolve, session_folder: see `Controller`. play: begin at once.
-        point_budget: most points of the map that are held for pages. checkpoint_bytes: memory for checkpoints.
+        point_budget: most points of the map that a page draws. checkpoint_bytes: memory for checkpoints.
         live: source of scans if `recording` is `app.server.protocol.LIVE`. live_folder: keeps what a process that takes
             over needs. revive: this process takes over.
         session, notices, frames, chunks: how many there were before, if this process takes over.

@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol
 from app.child import Child, ChildDied, Link, RestartLimit
 from app.server.fold import Fold
 from app.server.protocol import ACKNOWLEDGED, LIVE, Command, Notice, OpenRecording, Progress, Restart, Snapshot
-from app.server.setup import Kept, Setup
+from app.server.setup import HELD, Kept, Setup
 
 MOST_RESTARTS: Final = 25
 """Deaths of the engine's process after which it is started again without being asked."""
@@ -48,7 +48,8 @@ class EngineProcess:
     def __init__(self, setup: Setup, *, main: Main = _run_engine) -> None:
         self._setup = setup
         self._main = main
-        self._fold = Fold(Snapshot(params=setup.params, progress=Progress.opening(setup.recording)), setup.point_budget)
+        opening = Snapshot(params=setup.params, progress=Progress.opening(setup.recording))
+        self._fold = Fold(opening, HELD * setup.point_budget)
         self._changed = threading.Condition()
         self._restarts, self._restarting = RestartLimit(MOST_RESTARTS), threading.Lock()
         self._child: Child | None = None

@@ -107,5 +107,5 @@ class AppearancePanel:
         """Explain the colours as drawn and say how many points the page holds."""
         self._limits = limits
         self._legend.content = panel("legend", legend(view.colour_by, limits, view.ends), view.grid)
-        words = f"{points:,} map points in the page, at most {budget:,}, and fewer the longer the trajectory."
+        words = f"{points:,} map points in the page, at most {budget:,}: of a larger map, more of what is near."
         self._count.content = panel("note", f"{words} The engine keeps the whole map.")

@@ -1,7 +1,8 @@
 """The growing map: one scene node per keyframe, named by its index.
 
 A keyframe's points are sent once, in its LiDAR frame; when its pose changes later, 7 numbers are sent.
-When the map outgrows the point budget, snapshots hold some keyframes with fewer points: those are sent again.
+Of a map larger than the page's budget of points only a part of each keyframe is sent, and again when that part changes
+because someone looks from elsewhere (`app.ui.detail`). Of a huge map snapshots hold some keyframes with fewer points.
 """
 
 from collections.abc import Iterator
@@ -13,10 +14,12 @@ import numpy.typing as npt
 import viser
 
 from app.export.box import Box
-from app.server.chunks import voxel_of_level
+from app.server.chunks import VOXEL_M, voxel_of_level
 from app.server.protocol import Chunk
-from app.slam.types import F32, F64, NON_GROUND, U8
+from app.server.setup import POINT_BUDGET
+from app.slam.types import F32, F64, I64, NON_GROUND, U8
 from app.ui.colours import BY_POSE, INTENSITY, MODES, Limits, PointSet, chosen_ends, colours, grown
+from app.ui.detail import parts
 from app.ui.geometry import STILL_M
 from app.ui.nodes import add_points, place
 from app.ui.shading import light
@@ -31,6 +34,11 @@ _FLATNESS_M: Final = 0.12
 """Most median deviation of the points overhead from their median height: treetops are rougher."""
 _MARGIN_M: Final = 0.25
 _SIZE_BY_GAP: Final = 0.5
+_GAP_BY_SHARE: Final = 0.25
+"""How gaps grow with the number of points left out: by its square root, but other keyframes fill half of them."""
+_NO_EYES: Final[F64] = np.zeros((0, 3))
+_AT_ONCE: Final = 300_000
+"""Most points by which known keyframes grow at once: what is nearest comes first."""
 _SAMPLE: Final = 200
 """Points of each keyframe that say how large the map is."""
 Chosen: TypeAlias = npt.NDArray[np.bool_] | slice
@@ -43,22 +51,29 @@ class _Drawn:
 
     Attributes:
         limits: ends of the colour maps with this keyframe and those before it. light: (n,) of the chunk's points.
-        shown: which of them were sent, `count` of them. handle: None while there are none.
+        part: how many of them may be drawn. shown: which of these were sent, `count` of them.
+        handle: None while there are none.
     """
 
     chunk: Chunk
     limits: dict[str, Limits]
     light: F32
+    part: int = 0
     shown: Chosen = field(default_factory=lambda: slice(None))
     count: int = 0
     handle: viser.PointCloudHandle | None = None
 
 
 class MapChunks:
-    """Draws keyframes below the scene node `root`."""
+    """Draws keyframes below the scene node `root`, with at most `budget` points.
 
-    def __init__(self, scene: viser.SceneApi, root: str) -> None:
-        self._scene = scene
+    Attributes:
+        settled: whether all that was asked for is drawn. partial: whether the map has more points than are drawn.
+    """
+
+    def __init__(self, scene: viser.SceneApi, root: str, budget: int = POINT_BUDGET) -> None:
+        self._scene, self._budget = scene, budget
+        self.settled, self.partial = True, False
         self._root = root
         self._drawn: list[_Drawn] = []
         self._T_map_imu: F64 = np.empty((0, 3, 4))  # of each keyframe, as drawn
@@ -81,11 +96,11 @@ class MapChunks:
         self._start_ns = start_ns
         self._fixed = {name: mode.fixed(duration_s) for name, mode in MODES.items() if mode.fixed is not None}
 
-    def draw(self, chunks: tuple[Chunk, ...], poses: F64, view: View) -> None:
+    def draw(self, chunks: tuple[Chunk, ...], poses: F64, view: View, eyes: F64 = _NO_EYES) -> None:
         """Show these keyframes: remove, add, thin, move and colour those that differ from what is drawn.
 
         Args:
-            poses: (k, 4, 4) T_map_imu of at least these keyframes.
+            poses: (k, 4, 4) T_map_imu of at least these keyframes. eyes: (e, 3) m, where cameras are in the map.
         """
         same = (_same(drawn.chunk, chunk) for drawn, chunk in zip(self._drawn, chunks, strict=False))
         self._keep(next((n for n, is_same in enumerate(same) if not is_same), min(len(chunks), len(self._drawn))))
@@ -98,8 +113,10 @@ class MapChunks:
         recolour = view.colour_by != seen.colour_by or limits != self._coloured
         cut = (view.ceilings, view.clip) != (seen.ceilings, seen.clip)
         self._view, self._coloured = view, limits
+        parts = self._parts(chunks, known, eyes)
         for index, (drawn, chunk) in enumerate(zip(self._drawn, chunks, strict=True)):
-            new = index >= known or chunk is not drawn.chunk
+            new = index >= known or chunk is not drawn.chunk or parts[index] != drawn.part
+            drawn.part = int(parts[index])
             if new or ((cut or (moved[index] and view.clip is not None)) and self._shows_others(drawn, index)):
                 if chunk is not drawn.chunk:
                     drawn.chunk = chunk
@@ -110,9 +127,23 @@ class MapChunks:
                 if moved[index]:
                     place(drawn.handle, T @ chunk.T_imu_lidar)
                 if view.map_point_size != seen.map_point_size or view.map != seen.map:
-                    drawn.handle.point_size, drawn.handle.visible = self._size(chunk), view.map
+                    drawn.handle.point_size, drawn.handle.visible = self._size(drawn), view.map
                 if recolour or (moved[index] and view.colour_by in BY_POSE):
                     drawn.handle.colors = self._colours(self._shown(drawn, T))
+
+    def _parts(self, chunks: tuple[Chunk, ...], known: int, eyes: F64) -> I64:
+        """(k,) how many points of each to draw now: less at once, more of known ones little by little."""
+        positions = self._T_map_imu[:, :, 3]
+        counts = np.array([len(chunk.points) for chunk in chunks], np.int64)
+        self.partial = counts.sum() > self._budget
+        wanted = parts(counts, positions, eyes, self._budget)
+        before = np.array([drawn.part for drawn in self._drawn[:known]], np.int64)
+        growing = np.flatnonzero(wanted[:known] > before)
+        growing = growing[np.argsort(-wanted[growing])]  # those that are near have most
+        waiting = growing[1:][np.cumsum(wanted[growing])[1:] > _AT_ONCE]
+        wanted[waiting] = before[waiting]
+        self.settled = not len(waiting)
+        return wanted
 
     def _keep(self, count: int) -> None:
         for drawn in self._drawn[count:]:
@@ -163,12 +194,13 @@ class MapChunks:
     def _shown(self, drawn: _Drawn, T_map_imu: F64) -> PointSet:
         return self._cloud(drawn.chunk, T_map_imu, drawn.shown, drawn.light[drawn.shown])
 
-    def _chosen(self, chunk: Chunk, T_map_imu: F64) -> Chosen:
-        return shown_points(chunk, T_map_imu @ chunk.T_imu_lidar, self._view.ceilings, self._view.clip)
+    def _chosen(self, drawn: _Drawn, T_map_imu: F64) -> Chosen:
+        T_map_lidar = T_map_imu @ drawn.chunk.T_imu_lidar
+        return shown_points(drawn.chunk, T_map_lidar, self._view.ceilings, self._view.clip, drawn.part)
 
     def _shows_others(self, drawn: _Drawn, index: int) -> bool:
         """Whether other points of it are to be shown than those that were sent."""
-        now = self._chosen(drawn.chunk, self._T_map_imu[index])
+        now = self._chosen(drawn, self._T_map_imu[index])
         return not np.array_equal(as_mask(now, len(drawn.light)), as_mask(drawn.shown, len(drawn.light)))
 
     def _send(self, drawn: _Drawn, T_map_imu: F64) -> None:
@@ -177,7 +209,7 @@ class MapChunks:
         Under the same name instead of through the handle's properties: a page that connects later is
         then not sent what was thinned away.
         """
-        drawn.shown = self._chosen(drawn.chunk, T_map_imu)
+        drawn.shown = self._chosen(drawn, T_map_imu)
         cloud = self._shown(drawn, T_map_imu)
         drawn.count = len(cloud.points)
         if not drawn.count:  # the page cannot draw a cloud without points
@@ -190,14 +222,16 @@ class MapChunks:
             f"{self._root}/{drawn.chunk.index}",
             cloud.points,
             self._colours(cloud),
-            self._size(drawn.chunk),
+            self._size(drawn),
             cloud.T_map_lidar,
             visible=self._view.map,
         )
 
-    def _size(self, chunk: Chunk) -> float:
-        """m: points that are far apart, because they were thinned, are drawn larger, so that surfaces stay closed."""
-        gap = voxel_of_level(chunk.level) if chunk.level else 0.0
+    def _size(self, drawn: _Drawn) -> float:
+        """m: points that are far apart, because many are left out, are drawn larger, so that surfaces stay closed."""
+        chunk = drawn.chunk
+        gap = voxel_of_level(chunk.level) if chunk.level else VOXEL_M
+        gap *= float((len(chunk.points) / max(drawn.part, 1)) ** _GAP_BY_SHARE)
         return self._view.map_point_size * max(1.0, _SIZE_BY_GAP * gap / self._view.point_size)
 
     def _colours(self, cloud: PointSet) -> U8:
@@ -205,18 +239,30 @@ class MapChunks:
         return colours(cloud, by, chosen_ends(self.limits, by, self._view.ends))
 
 
-def shown_points(chunk: Chunk, T_map_lidar: F64, ceilings: bool, clip: Box | None = None) -> Chosen:
-    """The points of a chunk that are drawn: with or without the ceiling above them, and only those in the box."""
+def shown_points(
+    chunk: Chunk, T_map_lidar: F64, ceilings: bool, clip: Box | None = None, part: int | None = None
+) -> Chosen:
+    """The points of a chunk that are drawn: with or without the ceiling above them, only those in the box.
+
+    Args:
+        part: of how many from the first on; None: of all.
+    """
     mask = None if ceilings else below_ceiling(chunk.points, chunk.labels, T_map_lidar[2, :3])
     if clip is not None:
         inside = clip.holds(chunk.points @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3])
         mask = inside if mask is None else mask & inside
-    return slice(None) if mask is None or not len(mask) else mask
+    if mask is None or not len(mask):
+        return slice(part)
+    if part is not None:
+        mask[part:] = False
+    return mask
 
 
 def as_mask(chosen: Chosen, count: int) -> npt.NDArray[np.bool_]:
     """(count,) whether each point is chosen."""
-    return np.ones(count, np.bool_) if isinstance(chosen, slice) else chosen
+    if isinstance(chosen, slice):
+        return np.arange(count) < (count if chosen.stop is None else chosen.stop)
+    return chosen
 
 
 def _same(drawn: Chunk, chunk: Chunk) -> bool:

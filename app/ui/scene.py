@@ -10,6 +10,7 @@ import numpy as np
 import viser
 
 from app.server.protocol import Snapshot
+from app.server.setup import POINT_BUDGET
 from app.slam.types import F64, StepResult
 from app.ui.camera import Framing
 from app.ui.chunks import MapChunks
@@ -27,6 +28,7 @@ _GROUND_BEFORE_SEEN_M: Final = -1.2
 _GRID_STEP_M: Final = 0.03
 _GRID: Final = {False: ((42, 48, 58), (62, 72, 88)), True: ((214, 220, 228), (186, 195, 207))}
 """Colours of its cells and of every fifth line, on a dark and on a light background."""
+_EYE_STEP_M: Final = 1.0
 _FRAMED_AGAIN: Final = 1.05
 """The view of the whole map is chosen again when it has so many times as many keyframes."""
 
@@ -34,7 +36,7 @@ _FRAMED_AGAIN: Final = 1.05
 class Scene:
     """Draws snapshots on a viser server, sending differences only."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, budget: int = POINT_BUDGET) -> None:
         scene = server.scene
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
@@ -56,7 +58,7 @@ class Scene:
         self._session, self._light = -1, False
         self._shown: StepResult | None = None
         self._changes = Changes()
-        self._chunks = MapChunks(scene, f"{ROOT}/keyframes")
+        self._chunks = MapChunks(scene, f"{ROOT}/keyframes", budget)
         self._sensor = SensorScene(scene, f"{ROOT}/sensor")
         self._trajectory = TrajectoryNode(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
@@ -77,6 +79,15 @@ class Scene:
         """(n, 3) some points of the map."""
         return self._chunks.sample()
 
+    @property
+    def eyes(self) -> frozenset[tuple[float, ...]]:
+        """(x, y, z) of every camera in the map, coarsely; none while all of the map is drawn anyway."""
+        if not self._chunks.partial:
+            return frozenset()
+        cameras = (client.camera for client in self._server.get_clients().values())
+        places = (np.array(camera.position) - self.offset for camera in cameras)
+        return frozenset(tuple(np.round(place / _EYE_STEP_M) * _EYE_STEP_M) for place in places)
+
     def limits(self, by: str) -> Limits | None:
         """Ends of a colour map as drawn; None for labels and before there is anything to colour."""
         return self._chunks.limits.get(by)
@@ -88,12 +99,13 @@ class Scene:
             self._draw_scan(current, view)
         with self._server.atomic():
             poses = poses_of(current)
-            self._chunks.draw(current.chunks[: len(poses)], poses, view)
+            eyes = np.array(list(self.eyes)).reshape(-1, 3)
+            self._chunks.draw(current.chunks[: len(poses)], poses, view, eyes)
             self._profile.draw(current, view)
             self._trajectory.draw(current.trajectory if current.trajectory is not None else np.empty((0, 3)), view.path)
             recording = current.recording
             self._truth.draw(recording.truth_positions if recording else None, current.T_map_truth, view.path)
-        return self._look(current, view) and self._chunks.limits is limits
+        return self._look(current, view) and self._chunks.limits is limits and self._chunks.settled
 
     def _draw_scan(self, current: Snapshot, view: View) -> None:
         """What is measured just now. It does not wait for the map."""

@@ -83,7 +83,7 @@ class Workbench:
         gui.set_panel_label("hemislam")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(360)
-        self._scene = Scene(server)
+        self._scene = Scene(server, point_budget)
         page = Page(server, engine.send, lambda: engine.snapshot, now, lambda: self._scene.offset)
 
         prepare_page(gui)
@@ -201,7 +201,7 @@ class Workbench:
         if tuned and drawn is not None:
             self._tuned_at = self._now()
         view = replace(view, tuning=self._now() - self._tuned_at < _TUNING_S)
-        if self._scene_due(current, view, self._more, self._scene.framing.pictures, at_once=tuned):
+        if self._scene_due(current, view, self._more, self._scene.framing.pictures, self._scene.eyes, at_once=tuned):
             if current.result is not None and (drawn is None or drawn.result is None):
                 self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
             self._more += not self._scene.draw(current, view)

@@ -132,6 +132,32 @@ def test_the_map_stays_within_its_budget(server: viser.ViserServer, wire: Wire, 
     assert len(newest.points) > 2 * len(oldest.points)
 
 
+def test_of_a_map_larger_than_the_page_s_budget_what_is_near_the_eye_is_sent_again(
+    server: viser.ViserServer, wire: Wire, engine: FakeEngine
+) -> None:
+    engine.send(StepFrame(60))
+    snapshot = engine.snapshot
+    chunks = snapshot.chunks
+    poses = np.tile(np.eye(4), (len(chunks), 1, 1))
+    poses[:, 0, 3] = 5.0 * np.arange(len(chunks))
+    budget = sum(len(chunk.points) for chunk in chunks) // 3
+    drawn = MapChunks(server.scene, "/map/keyframes", budget)
+
+    def shown(*eyes: np.ndarray) -> np.ndarray:
+        drawn.draw(chunks, poses, View(ceilings=True), np.array(eyes).reshape(-1, 3))
+        found = chunk_nodes(server)
+        assert drawn.points <= budget and drawn.points == sum(len(node.points) for node in found.values())
+        return np.array([len(found[f"/map/keyframes/{chunk.index}"].points) for chunk in chunks])
+
+    first = shown(poses[0, :3, 3])
+    assert first[0] == len(chunks[0].points) and first[-1] < len(chunks[-1].points) / 2
+    wire.clear()
+    assert (shown(poses[0, :3, 3]) == first).all() and not wire.nodes("PointCloudMessage"), "who stands still"
+    last = shown(poses[-1, :3, 3])
+    assert last[-1] == len(chunks[-1].points) and last[0] < first[0]
+    assert len(chunk_nodes(server)) == len(chunks)
+
+
 def test_two_pages_thin_the_same_way(server: viser.ViserServer, wire: Wire, engine: FakeEngine) -> None:
     shown = []
     for _ in range(2):
