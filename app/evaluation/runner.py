@@ -30,12 +30,12 @@ def run_jobs(
     *,
     parallel: int,
     quiet: bool = False,
-    ended: Callable[[], None] = lambda: None,
+    ended: Callable[[bool], None] = lambda ran: None,
 ) -> dict[tuple[str, str], str]:
     """Run all jobs that are not finished yet, `parallel` at a time.
 
     Args:
-        quiet: say nothing. ended: called whenever one has ended.
+        quiet: say nothing. ended: called for each that has ended, with whether it ran now or was finished before.
 
     Returns:
         Why jobs failed, by (recording, variant); those not named are finished.
@@ -44,7 +44,7 @@ def run_jobs(
     todo = [job for job in jobs if finished(job) is None]
     before = len(jobs) - len(todo)
     for _ in range(before):
-        ended()
+        ended(False)
     if before and not quiet:
         tqdm.write(f"{before} of {len(jobs)} runs were finished before")
     stop, errors = threading.Event(), dict[tuple[str, str], str]()
@@ -58,7 +58,7 @@ def run_jobs(
                 if error := future.result():
                     errors[running[future].name, running[future].variant] = error
                 every.update()
-                ended()
+                ended(True)
         except BaseException:  # Ctrl-C
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)

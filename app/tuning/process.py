@@ -40,6 +40,14 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
+class Ended:
+    """runs: how many have ended. ran: whether the last one ran now, or was found finished, which takes no time."""
+
+    runs: int
+    ran: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Tried:
     """What is known so far.
 
@@ -57,7 +65,7 @@ class Tried:
 
 
 def find(owner: Link, wanted: Wanted) -> None:
-    """Send the number of runs that have ended, and a `Tried` whenever there is more; or why there is none, in words."""
+    """Send an `Ended` after each run and a `Tried` after each batch of trials; or why there is none, in words."""
     try:
         _find(owner, wanted)
     except HemislamError as error:
@@ -80,10 +88,10 @@ def _find(owner: Link, wanted: Wanted) -> None:
     rest = part.next() if not wanted.marks else None  # marks are on the part itself
     count, latest = 0, Tried()
 
-    def ended() -> None:
+    def ended(ran: bool) -> None:
         nonlocal count
         count += 1
-        owner.send(count)
+        owner.send(Ended(count, ran))
 
     def progress(so_far: Sequence[Trial], study: "optuna.Study") -> None:
         nonlocal latest

@@ -12,7 +12,7 @@ from app.server.fork import Workspace
 from app.server.protocol import LIVE, Snapshot
 from app.slam.errors import HemislamError
 from app.tuning.objectives import OBJECTIVES
-from app.tuning.process import Tried, Wanted, find
+from app.tuning.process import Ended, Tried, Wanted, find
 from app.tuning.trial import SearchMethod
 from app.ui import tune_maths as maths
 from app.ui.compare import Sides
@@ -46,7 +46,7 @@ class TunePanel:
         self._child: Child | None = None
         self._wanted: Wanted | None = None  # by the search that was started last
         self._found, self._chosen = Tried(), -1
-        self._runs: list[tuple[float, int]] = []  # when how many runs had ended
+        self._runs: list[tuple[float, int]] = []  # when how many runs had ended, since the last that took no time
         self._changes = Changes(page.now, PANEL_PERIOD_S)
         self._why = gui.add_html("")
         self._parameters = gui.add_text(
@@ -123,7 +123,7 @@ class TunePanel:
         return f"{told} · saved in {wanted.folder}" if found.finished else f"{told} · stopped"
 
     def _left(self, wanted: Wanted) -> str:
-        """By the pace of the newest runs: those that were finished before take no time."""
+        """By the pace of the newest runs."""
         if len(self._runs) < 2:
             return "the remaining time is not known yet"
         (begin, first), (end, last) = self._runs[-9:][0], self._runs[-1]
@@ -145,8 +145,8 @@ class TunePanel:
             match message:
                 case None:
                     return
-                case int():
-                    self._runs.append((self._page.now(), message))
+                case Ended(runs, ran):
+                    self._runs = [*(self._runs if ran else ()), (self._page.now(), runs)]
                 case Tried():
                     self._found = message
                     if message.finished:

@@ -59,7 +59,9 @@ def number_axis(name: str, values: Sequence[float]) -> Axis:
     def share(value: float) -> float:
         return (by(min(max(value, low), high)) - begin) / span if span else 0.5
 
-    return Axis(name, f"{low:.4g}", f"{high:.4g}", share)
+    # so many digits that the ends differ in three
+    digits = max(4, 3 + math.ceil(math.log10(max(abs(low), abs(high)) / (high - low)))) if span else 4
+    return Axis(name, f"{low:.{digits}g}", f"{high:.{digits}g}", share)
 
 
 def score_axis(trials: Sequence[Trial], index: int, objective: Objective) -> Axis:

@@ -21,7 +21,7 @@ from app.__main__ import cli
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.tuning.objectives import OBJECTIVES
-from app.tuning.process import Tried, Wanted, find
+from app.tuning.process import Ended, Tried, Wanted, find
 from app.tuning.space import grid, parse_dimensions
 from app.tuning.trial import Trial, front
 from app.tuning.tune import Part, search
@@ -187,7 +187,7 @@ def test_a_search_for_the_page_tells_each_run_and_its_trials_and_leaves_the_same
 ) -> None:
     owner = Owner()
     find(owner, wanted(recording, tmp_path / "tuning", "entropy"))  # type: ignore[arg-type]
-    runs = [message for message in owner.told if isinstance(message, int)]
+    runs = [message.runs for message in owner.told if isinstance(message, Ended)]
     found = [message for message in owner.told if isinstance(message, Tried)]
     assert runs[:4] == [1, 2, 3, 4] and [len(one.trials) for one in found] == [1, 4, 4]
     assert found[-1].finished and found[-1].held_back[0].number == 0

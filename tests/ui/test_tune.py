@@ -10,7 +10,7 @@ import viser
 
 from app.server.protocol import OpenedRecording, Snapshot, StepFrame, Transport
 from app.tuning.objectives import OBJECTIVES
-from app.tuning.process import Tried
+from app.tuning.process import Ended, Tried
 from app.tuning.trial import Trial
 from app.ui import tune
 from app.ui import tune_maths as maths
@@ -81,9 +81,9 @@ def test_a_search_is_of_the_part_that_is_looked_at_and_shows_its_trials_and_the_
     user_clicks(panel._start)
     (wanted,) = tuning.process.arguments
     assert (wanted.start_s, wanted.duration_s, wanted.objectives) == (10.0, 20.0, ("entropy",))
-    tuning.draw(1)
-    tuning.draw(5)
-    tuning.draw(9, Tried(TRIALS, (3,), {"ground.sigma": 0.8, "ground.alpha": 0.2}))
+    tuning.draw(Ended(1, True))
+    tuning.draw(Ended(5, True))
+    tuning.draw(Ended(9, True), Tried(TRIALS, (3,), {"ground.sigma": 0.8, "ground.alpha": 0.2}))
     assert tuning.says("4 of 49 trials · 100 s left") or tuning.says("4 of 49 trials · 2 min left")
     assert panel._progress.visible and panel._progress.value == pytest.approx(100 * 9 / 49)
     html = panel._plots.content
@@ -102,6 +102,10 @@ def test_a_search_that_is_stopped_goes_on_with_the_same_settings(tuning: Tuning)
     tuning.now = replace(OPEN, params=OPEN.params.with_values({"ground.alpha": 11.0}))
     user_clicks(tuning.panel._go_on)
     assert tuning.process is not first and tuning.process.arguments == first.arguments
+    tuning.draw(*(Ended(runs, False) for runs in range(1, 10)), Tried(TRIALS, (3,)))
+    assert tuning.says("not known yet"), "what was finished before tells nothing of the pace"
+    tuning.draw(Ended(10, True))
+    assert tuning.says("6 min left"), "39 runs of 10 s"
     tuning.draw(Tried(TRIALS, (3,), held_back=(replace(TRIALS[0], scores=(2.1,)),), finished=True))
     assert tuning.process is None and not tuning.panel._go_on.visible and tuning.says("saved in")
     assert "held back" in tuning.panel._plots.content
@@ -159,6 +163,11 @@ def test_one_wild_score_does_not_press_all_others_together() -> None:
     wild = (*(Trial(number, {}, (1.0 + 0.01 * number,)) for number in range(40)), Trial(40, {}, (900.0,)))
     axis = maths.score_axis(wild, 0, ENTROPY)
     assert axis.share(1.2) > 0.3 and axis.share(900.0) == 1.0
+
+
+def test_the_ends_of_an_axis_can_be_told_apart() -> None:
+    axis = maths.number_axis("entropy", [-5.2413, -5.2401])
+    assert (axis.low, axis.high) == ("-5.2413", "-5.2401")
 
 
 def test_switches_and_choices_have_places_of_their_own_on_an_axis() -> None:
