@@ -140,7 +140,9 @@ def info(
     if calibrate and is_mounting_unknown(params) and (told := look_for_mounting(recording, params)):
         typer.echo(told)
     waiting = sum(finding.verdict == "needs you" for finding in findings)
-    typer.echo(f"{waiting} of {len(findings)} findings need you." if waiting else "Nothing here needs you.")
+    typer.echo(
+        f"{waiting} of {len(findings)} findings need your attention." if waiting else "Nothing needs your attention."
+    )
     if broken := next((f for f in findings if f.subject == DAMAGE and f.verdict == "needs you"), None):
         raise HemislamError(broken.text)
 
@@ -226,7 +228,7 @@ def simulate(
     if scene is None:
         raise HemislamError(f"Name a SCENE, one of {', '.join(SCENES)}, or use --suite paper.")
     if out.exists() and not force:
-        raise HemislamError(f"{out} exists already; choose another --out, or add --force to replace it.")
+        raise HemislamError(f"{out} already exists; choose another --out, or add --force to replace it.")
     with options.progress_bar("Simulating", unit=" scans") as show:
         made = simulate(
             scene,

@@ -67,8 +67,8 @@ class System:
 
 
 SYSTEMS = {
-    "loam": System("LOAM", "edges and planes, LiDAR only (Zhang and Singh 2014), written anew", Loam),
-    "liom": System("LIOM", "IMU and LiDAR in a fixed-lag smoother (Ye et al. 2019), written anew", Liom),
+    "loam": System("LOAM", "edges and planes, LiDAR only (Zhang and Singh 2014), reimplemented", Loam),
+    "liom": System("LIOM", "IMU and LiDAR in a fixed-lag smoother (Ye et al. 2019), reimplemented", Liom),
     "kiss-icp": System("KISS-ICP", "point to point, LiDAR only, its own defaults", peers.KissIcp, "kiss-icp>=1.3"),
     "rko-lio": System("RKO-LIO", "LiDAR and IMU, its own defaults", peers.RkoLio, "rko_lio>=0.4"),
     "genz-icp": System("GenZ-ICP", "point and plane, LiDAR only, its own defaults", peers.GenzIcp, "genz-icp>=0.3"),

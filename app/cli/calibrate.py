@@ -25,7 +25,7 @@ def calibrate(
         Path | None, typer.Option("--plot", metavar="FILE.svg", help="Draw the residuals before and after.")
     ] = None,
     duration: Annotated[
-        float, typer.Option("--duration", min=5, metavar="SECONDS", help="Use only so much of the recording.")
+        float, typer.Option("--duration", min=5, metavar="SECONDS", help="Use only this much of the recording.")
     ] = 120.0,
 ) -> None:
     """Find the pose of the LiDAR on the IMU and the offset of their clocks.

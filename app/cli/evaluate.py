@@ -36,7 +36,7 @@ PartStart = Annotated[
         "--start",
         min=0,
         metavar="SECONDS",
-        help="Measure from so long after the first scan on; every system starts 5 s before that.",
+        help="Measure from this time after the first scan on; every system starts 5 s earlier.",
     ),
 ]
 Out = Annotated[

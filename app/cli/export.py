@@ -81,7 +81,7 @@ def export(
     if source.is_dir():
         results, folder = read_results(source), out or source / "export"
         if folder.resolve() == source.resolve():
-            raise HemislamError(f"{source} is what is exported; choose another folder as --out.")
+            raise HemislamError(f"{source} is the folder to export; choose another folder as --out.")
         results.choice = choice
         _save(results, folder, exports)
     else:
@@ -115,7 +115,7 @@ def _save(results: "Results", folder: Path, exports: "tuple[Export, ...]") -> No
         if (folder / one.name).exists():
             typer.echo(f"{folder / one.name}: {(folder / one.name).stat().st_size / 1e6:.1f} MB")
         else:
-            typer.echo(f"There is no {one.name}, because loops were not searched.")
+            typer.echo(f"There is no {one.name}, because the loop search was off.")
 
 
 def _box(text: str | None) -> "Box | None":

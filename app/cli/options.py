@@ -32,18 +32,20 @@ LidarTopic = Annotated[
     str | None, typer.Option("--lidar-topic", metavar="TOPIC", help="Point clouds; else the first of type PointCloud2.")
 ]
 ImuTopic = Annotated[str | None, typer.Option("--imu-topic", metavar="TOPIC", help="IMU; else the first of type Imu.")]
-Start = Annotated[float, typer.Option("--start", min=0, metavar="SECONDS", help="Begin so long after the first scan.")]
+Start = Annotated[
+    float, typer.Option("--start", min=0, metavar="SECONDS", help="Begin this long after the first scan.")
+]
 Duration = Annotated[
-    float | None, typer.Option("--duration", min=0, metavar="SECONDS", help="Process only so much of the recording.")
+    float | None, typer.Option("--duration", min=0, metavar="SECONDS", help="Process only this much of the recording.")
 ]
 Imperfect = Annotated[
-    bool, typer.Option("--imperfect", help="With the errors of a real scanner and hand, and with people beside.")
+    bool, typer.Option("--imperfect", help="With the errors of a real scanner, a lively hand, and people nearby.")
 ]
 Calibrate = Annotated[
     bool,
     typer.Option(
         "--calibrate/--no-calibrate",
-        help="If no mounting is given, or the run is in doubt, find how the LiDAR sits on the IMU.",
+        help="If no mounting is given, or the run is doubtful, estimate the pose of the LiDAR on the IMU.",
     ),
 ]
 TruthFile = Annotated[

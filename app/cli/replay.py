@@ -59,7 +59,7 @@ def repeat(path: Path, *, to_end: bool = False) -> "Iterator[tuple[Session, Base
     saved = read_session(path)
     opened, truth = saved.opened, saved.state.truth
     if truth is not None and not truth.exists():  # no result but its errors follows from it
-        typer.echo(f"The session was compared with {truth}, which is gone.")
+        typer.echo(f"The session was compared with {truth}, which no longer exists.")
         truth = None
     session = open_session(opened.recording, saved.first_params, opened.start_s, opened.duration_s, truth=truth)
     try:

@@ -80,7 +80,7 @@ def run(
         if truth:
             session.compare_with(truth)
         elif truth_path:
-            typer.echo(f"Using the truth that lies beside the recording: {truth_path}")
+            typer.echo(f"Using the truth beside the recording: {truth_path}")
         prepare_folder(folder, replace=force)
         for finding in session.findings:
             if finding.verdict != "fine":
@@ -115,7 +115,7 @@ def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
 
     if not is_mounting_unknown(params):
         return params, ""
-    with progress_bar("Finding how the LiDAR sits on the IMU") as show:
+    with progress_bar("Estimating the pose of the LiDAR on the IMU") as show:
         found = contradicted(recording, params, show)
     if found is None:
         return params, ""

@@ -84,7 +84,7 @@ class Cluster:
                 except _Gone as gone:
                     if time.monotonic() > patient_until:
                         kept = (
-                            " What is finished is kept: the same command goes on." if len(waiting) < len(jobs) else ""
+                            " Finished runs are kept; the same command continues." if len(waiting) < len(jobs) else ""
                         )
                         raise HemislamError(f"{gone}{kept}") from None
                     time.sleep(LOOK_S)

@@ -55,7 +55,7 @@ SEQUENCES: dict[str, Sequence] = {
 
 NOT_COMPARABLE = (
     "The paper ran LOAM, LIOM and FAST-LIO on real recordings, on an Intel i7-8565U. Ours are simulated twins with the"
-    " same number of frames, duration and length, on other streets and with exact truth. LOAM and LIOM are written anew"
+    " same number of frames, duration and length, on other streets and with exact truth. LOAM and LIOM are written"
     " from their papers (`--baseline`); the other columns are this engine with parts switched off. Compare the order of"
     " the columns, and which part helps where. Do not compare the metres and milliseconds: a simulation has no"
     " calibration error, no drifting clock and no GNSS error, and the machine is another one."

@@ -70,7 +70,7 @@ class GeoReference:
         except ValidationError as error:
             first = error.errors()[0]
             raise HemislamError(
-                f"This is no georeference ({'.'.join(map(str, first['loc']))}: {first['msg']}); write a new one with"
+                f"This is not a georeference ({'.'.join(map(str, first['loc']))}: {first['msg']}); write a new one with"
                 " hemislam georeference."
             ) from None
         crs.projected(read.crs)

@@ -61,7 +61,9 @@ class NamedColumns:
                 try:
                     out[row, at] = float(word) if word else np.nan
                 except ValueError:
-                    raise HemislamError(f"{self.source}, row {row + 1}: `{word[:40]}` is no number ({name}).") from None
+                    raise HemislamError(
+                        f"{self.source}, row {row + 1}: `{word[:40]}` is not a number ({name})."
+                    ) from None
         return out
 
 

@@ -210,7 +210,7 @@ class Session:
     def edit_loops(self, edits: tuple[LoopEdit, ...], undone: tuple[LoopEdit, ...] = ()) -> None:
         """Replace all loop edits; the undone ones can be redone. Raises HemislamError: the loop search is off."""
         if self.loops is None:
-            raise HemislamError("Loops are not looked for, so there are none to edit; set loops.enabled.")
+            raise HemislamError("The loop search is off, so there are no loops to edit; set loops.enabled.")
         self.loops.command(lambda _: Edits(edits, undone))
 
     def resume(self, saved: SavedSession) -> None:
@@ -252,7 +252,7 @@ class Session:
         behind = heading < self.frame or (heading == self.frame >= 0 and self.result is None)
         if behind or (nearest is not None and nearest > self.frame):
             if nearest is None or self.checkpoints is None:
-                raise HemislamError("This session only goes on; open its recording to go back in it.")
+                raise HemislamError("This session cannot go back; open its recording to do that.")
             self.finish_saves()
             self.return_to(self.checkpoints.get(nearest))
         self.heading = heading

@@ -264,7 +264,9 @@ class SessionWriter:
             self._failed(error)
 
     def _failed(self, error: OSError) -> None:
-        self.error = f"The session cannot be kept in {self.path} ({error.strerror}); what is done now is not recorded."
+        self.error = (
+            f"The session file {self.path} cannot be written ({error.strerror}); changes from now on are not saved."
+        )
         log.warning(self.error)
         with contextlib.suppress(OSError):  # the rest of the line is given up
             self.close()
@@ -331,7 +333,9 @@ def read_session(path: Path) -> SavedSession:
         if isinstance(error, ValidationError):
             first = error.errors()[0]
             why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise HemislamError(f"The session {path} is damaged ({why[:200]}); an older copy may be whole.") from None
+        raise HemislamError(
+            f"The session {path} is damaged ({why[:200]}); use an older copy, if you have one."
+        ) from None
     if not states:
         raise HemislamError(f"The session {path} ends before its first frame; open its recording {opened.recording}.")
     try:
@@ -339,7 +343,7 @@ def read_session(path: Path) -> SavedSession:
     except OSError as error:
         raise HemislamError(f"The session {path} names {opened.recording}: {error.strerror}.") from None
     if not same:
-        gone = "is a different file now" if opened.recording.exists() else "is gone"
+        gone = "is a different file now" if opened.recording.exists() else "is missing"
         raise HemislamError(f"The recording {opened.recording} of the session {path} {gone}; put it back there.")
     return SavedSession(opened, state, frame, ended, known)
 

@@ -70,7 +70,7 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
         base_ns, times_ns = exact_ns(time.take(index), timing.unit_ns)
     earliest, latest = int(times_ns.min()), int(times_ns.max())
     if latest - earliest > np.iinfo(np.int32).max:
-        raise CloudError("its points are more than 2 s apart, which is no single scan")
+        raise CloudError("its points are more than 2 s apart, too long for one scan")
     match timing.anchor:
         case "absolute":
             begin_ns = base_ns + earliest

@@ -107,7 +107,7 @@ def calibrated_beside(recording: Path) -> str:
             ours = file.readline().startswith(CALIBRATED)
     except (OSError, UnicodeDecodeError):
         return ""
-    return f"Using the calibration that lies beside the recording: {path}; delete it to undo that." if ours else ""
+    return f"Using the calibration beside the recording: {path}; delete it to undo this." if ours else ""
 
 
 def resolve_params(recording: Path | None, preset: str | None, config: Path | None, assignments: list[str]) -> Params:

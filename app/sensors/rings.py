@@ -78,7 +78,7 @@ def settle_rings(probes: list[Probe], kind: CloudType, names: dict[str, str]) ->
             why = f"points of each `{field}` have all elevations"
         else:
             constant = raw.max() == raw.min()
-            why = f"field `{field}` is always {raw[0]}" if constant else f"field `{field}` is no line number"
+            why = f"field `{field}` is always {raw[0]}" if constant else f"field `{field}` is not a line number"
     else:
         why = "the clouds have no ring field"
     if not kind.rings:

@@ -215,7 +215,7 @@ def _open_capture(path: Path) -> CaptureStream | OusterStream:
     try:
         stream = CaptureStream(path) if metadata is None else OusterStream(path, metadata)
     except CaptureError as error:
-        raise HemislamError(f"{path} is no capture of a network ({error}); {_KINDS} can be read.") from None
+        raise HemislamError(f"{path} is not a network capture ({error}); hemislam reads {_KINDS}.") from None
     if not stream.counts:
         raise HemislamError(
             f"{path} holds no packets of an RS-Bpearl, an Airy or a Mid-360 and no imu-udp datagrams; capture their "
@@ -267,7 +267,7 @@ def _recording_files(path: Path) -> list[Path]:
             pcap = path.with_suffix(".pcap")
             raise HemislamError(f"{path} is read by Ouster's own tool only; `ouster-cli source {path} save {pcap}`.")
         if path.suffix.lower() not in SUFFIXES:
-            raise HemislamError(f"{path} is no recording by its name; what can be read is {_KINDS}.")
+            raise HemislamError(f"{path} does not look like a recording; hemislam reads {_KINDS}.")
         if path.stat().st_size == 0:
             raise HemislamError(f"{path} is empty (0 bytes); record or copy it again.")
         with path.open("rb") as file:
@@ -281,7 +281,7 @@ def _recording_files(path: Path) -> list[Path]:
     magic = _MAGIC[path.suffix.lower()]
     if not start.startswith(magic[: len(start)]):
         other = next((suffix for suffix, known in _MAGIC.items() if start.startswith(known)), None)
-        hint = f"by its content it is a {other}: rename it" if other else f"what can be read is {_KINDS}"
+        hint = f"by its content it is a {other}: rename it" if other else f"hemislam reads {_KINDS}"
         raise HemislamError(f"{path} does not begin like a {path.suffix} file; {hint}.")
     return [path]
 
@@ -294,7 +294,7 @@ def _folder_files(path: Path) -> list[Path]:
             return files
     bags = sorted(path.glob("*.bag"))
     hint = f"open one of its files, such as {bags[0].name}" if bags else "give the folder that holds metadata.yaml"
-    raise HemislamError(f"The folder {path} is no ROS 2 recording (it has neither metadata.yaml nor .mcap); {hint}.")
+    raise HemislamError(f"The folder {path} is not a ROS 2 recording (it has neither metadata.yaml nor .mcap); {hint}.")
 
 
 def _repair(path: Path) -> str:

@@ -142,7 +142,7 @@ class Controller:
                 self._set_breakpoints(breakpoints)
             case protocol.AddNote(text) if text.strip():
                 if len(self._kept.notes) >= MOST_NOTES:
-                    raise HemislamError(f"A session keeps {MOST_NOTES:,} notes; this one was not kept.")
+                    raise HemislamError(f"A session holds at most {MOST_NOTES:,} notes; this one was not added.")
                 self._keep(notes=(*self._kept.notes, Note(self._need_session().frame, text.strip())))
             case protocol.EditNote(place, before, text) if (
                 0 <= place < len(notes := self._kept.notes) and notes[place].text == before
@@ -190,7 +190,7 @@ class Controller:
             case protocol.LoopCommand():
                 loops = self._need_session().loops
                 if loops is None:
-                    raise HemislamError("Loops are not looked for; set loops.enabled and restart.")
+                    raise HemislamError("The loop search is off; set loops.enabled and restart.")
                 self._loops.handle(command, loops)
 
     def relabel(self) -> None:
@@ -357,7 +357,7 @@ class Controller:
         self._set_breakpoints(state.breakpoints)
         self._player.set_speed(state.speed)
         if gone:
-            self._page.notice("warning", f"The session was compared with {state.truth}, which is gone.")
+            self._page.notice("warning", f"The session was compared with {state.truth}, which no longer exists.")
 
     def _take(self, session: Session, saved: SavedSession | None = None) -> None:
         """Replace the present session by this one, at its first frame or at that of `saved`."""

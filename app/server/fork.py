@@ -39,7 +39,7 @@ AGAIN_S = 1.0
 APART = 1_000_000
 """Between the session and notice numbers of one engine and the next, so that the page never takes one for another."""
 _MOST_KEPT = 30
-_NOT_KEPT = "This session is not kept in a file, so it cannot be forked; serve keeps one."
+_NOT_KEPT = "This session has no session file, so it cannot be forked."
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ def forked(a: Snapshot, values: Mapping[str, Any]) -> SavedSession:
     if frame < 0:
         raise HemislamError("There is no frame to fork at yet; play or step first.")
     if a.live is not None:
-        raise HemislamError("A live source cannot be forked; record it, and open the recording.")
+        raise HemislamError("A live source cannot be forked; record it, then open the recording.")
     if a.session_file is None:
         raise HemislamError(_NOT_KEPT)
     return read_session(a.session_file).forked(frame, a.params.with_values(dict(values)))
@@ -198,7 +198,7 @@ class Workspace:
             if before.transport.playing:
                 b.engine.send(Play())
             self._sides = (b, a)
-            b.engine.send(AddNote(f"Swapped: goes on in place of {a.name}."))
+            b.engine.send(AddNote(f"Swapped: replaces {a.name}."))
 
     def discard(self) -> None:
         """End B and delete its files. Raises HemislamError without a fork."""
@@ -218,14 +218,14 @@ class Workspace:
             b = self._end()
             session_file = b.engine.snapshot.session_file or (b.folder / f"start{SUFFIX}" if b.folder else None)
             if session_file is None or self._setup.session_folder is None:
-                raise HemislamError("B was not kept in a file.")
+                raise HemislamError("B has no session file.")
             session = read_session(session_file)
             stem = f"{session.opened.recording.stem}-{_plain(name.strip() or b.name)}"
             path = free_path(self._setup.session_folder / stem, SUFFIX)
             try:
                 write_session(path, session)
             except HemislamError as error:
-                raise HemislamError(f"{error} The fork still is in {session_file}.") from None
+                raise HemislamError(f"{error} The fork is still in {session_file}.") from None
             if b.folder is not None:
                 shutil.rmtree(b.folder, ignore_errors=True)
             self.send(AddNote(f"Kept {b.name} as {path.name}."))

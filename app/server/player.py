@@ -24,7 +24,7 @@ LONGEST_LAG_S = 0.5
 """Playing that is later than this does not catch up; it goes on from where it is."""
 LONG_SEEK = 20
 """Frames to process on the way to a frame, from which on progress is shown."""
-ONLY_ON = "A live source can only go on; record it, and open the recording to go back in it."
+ONLY_ON = "A live source cannot go back; record it, then open the recording."
 _WARNINGS = ("disconnected", "silent", "jump", "recording", "units", "restarted")
 """Kinds of `Status` that are a warning, not only news."""
 
@@ -191,7 +191,7 @@ class Player:
             try:
                 state = session.feed.live_state()
             except HemislamError as error:
-                self.fail("Nothing more comes live", error)
+                self.fail("The live source has ended", error)
                 self._page.show(finished=True)
                 return None
             self._page.put(live=state, recording=opened_recording(session))
@@ -220,7 +220,7 @@ class Player:
             self.halt()
             self._page.show(finished=True)
             for doubt in doubts(session.log):
-                self._page.notice("warning", f"This run is in doubt. {doubt}")
+                self._page.notice("warning", f"This run is doubtful. {doubt}")
             return None
         if isinstance(entry, Quiet):
             if entry.status is not None:

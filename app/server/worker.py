@@ -124,7 +124,7 @@ class EngineProcess:
         last = self.snapshot
         place = last.session_file or (LIVE if last.live is not None else None)
         restarts = place is not None and self._restarts.allows()
-        again, ended = "It is started again and returns to where it was.", "Restart it to begin at the first frame."
+        again, ended = "It is restarted and returns to where it was.", "Restart it to begin at the first frame."
         notices = (Notice(_number(last) + 1, "error", f"{death} {again if restarts else ended}"),)
         if not restarts:
             transport = replace(last.transport, playing=False, frames_per_second=0.0)

@@ -89,7 +89,7 @@ def finite(value: Any) -> Any:
 
 def summarise(report: dict[str, Any], folder: Path) -> str:
     """The report in a few lines; what speaks against the result comes first and last."""
-    warning = [("WARNING", f"this is in doubt: {' '.join(report['doubts'])}")] if report["doubts"] else []
+    warning = [("WARNING", f"the result is doubtful: {' '.join(report['doubts'])}")] if report["doubts"] else []
     frames, ground, loops, accuracy = (report[name] for name in ("frames", "ground", "loops", "accuracy"))
     total, points = report["timings_ms"]["total"], report["map"]
     counts = f"{frames['processed']} processed, {frames['dropped']} dropped, {frames['lost']} lost"

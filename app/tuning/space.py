@@ -92,7 +92,7 @@ def _dimension(leaf: Leaf, limits: str | None) -> Dimension:
     try:
         low, high = (float(end) for end in limits.split(":"))
     except ValueError:
-        raise HemislamError(f"`{leaf.path}={limits}` is no range; write it as {leaf.path}=LEAST:GREATEST.") from None
+        raise HemislamError(f"`{leaf.path}={limits}` is not a range; write it as {leaf.path}=LEAST:GREATEST.") from None
     if not leaf.minimum <= low < high <= leaf.maximum:
         raise HemislamError(f"`{leaf.path}={limits}` is not a range within {leaf.range} {leaf.unit}".rstrip() + ".")
     return Dimension(leaf, low, high)

@@ -88,7 +88,7 @@ class BrushPanel:
 
     def _words(self, snapshot: Snapshot, any_marks: bool) -> str:
         if self.painting:
-            return "Click points of the scan, or hold Shift and drag a rectangle. Marks lie on this frame alone."
+            return "Click points of the scan, or hold Shift and drag a rectangle. Marks belong to this frame only."
         if any_marks:
             return "Tune uses these marks for Ground F1."
         return "Mark ground in a few frames, and Tune finds the parameters that label them best."

@@ -236,7 +236,7 @@ class ComparePanel:
                     self._forks.swap()
                 case "keep":
                     path = self._forks.keep(self._name.value)
-                    client.add_notification("Kept", f"The fork is {path}; hemislam serve opens it again.")
+                    client.add_notification("Kept", f"The fork is saved as {path}; hemislam serve opens it.")
                 case "discard":
                     self._forks.discard()
                 case Path():

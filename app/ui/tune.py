@@ -109,7 +109,7 @@ class TunePanel:
             return _NO_OPTUNA
         if snapshot.recording is None:
             return "Open a recording first, under Recording."
-        return "A live source cannot be repeated; record it, and open the recording." if snapshot.live else ""
+        return "A live source cannot be repeated; record it, then open the recording." if snapshot.live else ""
 
     def _words(self) -> str:
         wanted, found = self._wanted, self._found

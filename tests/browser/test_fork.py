@@ -59,7 +59,7 @@ def test_a_fork_is_tuned_seen_swapped_and_kept(bench: Bench, forks: Workspace, t
     expect(page.get_by_text("A · wide band")).to_be_visible()
     page.get_by_role("button", name="keep", exact=True).click()
     bench.eventually(lambda: forks.other is None)
-    expect(page.get_by_text("hemislam serve opens it again")).to_be_visible()
+    expect(page.get_by_text("hemislam serve opens it")).to_be_visible()
     expect(page.get_by_role("button", name="Fork here")).to_be_visible()
     page.get_by_role("button", name="Open as B").click()
     page.get_by_role("button", name="hall_bpearl-wide-band").click()

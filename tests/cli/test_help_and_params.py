@@ -113,4 +113,4 @@ def test_simulate_writes_a_recording_with_truth_that_info_finds_fine(hemislam: C
     assert sorted(path.name for path in tmp_path.iterdir()) == ["room.mcap", "room.params.yaml", "room_truth.tum"]
     examined = hemislam("info", made)
     assert examined.code == 0, examined.err
-    assert examined.out.endswith("Nothing here needs you.\n")
+    assert examined.out.endswith("Nothing needs your attention.\n")

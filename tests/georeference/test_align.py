@@ -52,7 +52,7 @@ def test_fixes_without_a_covariance_are_judged_by_their_scatter() -> None:
     made = walked()
     blind = replace(made.fixes, sigmas=np.full((len(made.fixes), 3), np.nan))
     found = align(made.trajectory, blind, lever=LEVER)
-    assert "without a covariance" in found.notes[0]
+    assert "have no covariance" in found.notes[0]
     assert found.offset_s == pytest.approx(0.08, abs=0.002)
     assert not verdicts(found, made)[0]
 

@@ -54,7 +54,7 @@ def test_a_georeference_is_read_from_its_file_as_it_was_written(tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("{}", "no georeference"), ('{"crs": "EPSG:4326", "origin": [0, 0, 0]}', "not a plane grid")],
+    [("{}", "not a georeference"), ('{"crs": "EPSG:4326", "origin": [0, 0, 0]}', "not a plane grid")],
 )
 def test_a_file_that_is_no_georeference_is_refused_in_one_sentence(text: str, words: str) -> None:
     with pytest.raises(HemislamError, match=words):

@@ -75,7 +75,7 @@ def checksum(sentence: str) -> str:
         ("time,lat,lon,height\n1,48,11,5\n", "holds 1 fixes"),
         ("time,lat,lon,height\n" + "1,148,11,5\n" * 3, "swapped: exchange them"),
         ("time,lat,lon,height\n" + "1,48,11\n" * 3, "row 1 has 3 columns"),
-        ("time,lat,lon,height\n" + "1,x,11,5\n" * 3, "`x` is no number"),
+        ("time,lat,lon,height\n" + "1,x,11,5\n" * 3, "`x` is not a number"),
         ("time,lat,lon,height\n" + "noon,48,11,5\n" * 3, "neither Unix seconds nor a date"),
         ("time,lat,lon,height\n" + "1700000000000,48,11,5\n" * 3, "neither Unix seconds nor a date"),
         ("time,lat,lon,height\n" + "nan,48,11,5\n" * 3, "neither Unix seconds nor a date"),

@@ -139,7 +139,7 @@ def test_a_fork_knows_only_what_came_before_it(tmp_path: Path) -> None:
     assert session.state.params == latest.with_values({"ground.sigma": 0.2})
     with pytest.raises(HemislamError, match="play or step first"):
         forked(replace(a, transport=Transport()), {})
-    with pytest.raises(HemislamError, match="not kept in a file"):
+    with pytest.raises(HemislamError, match="has no session file"):
         forked(replace(a, session_file=None), {})
 
 
@@ -304,7 +304,7 @@ def test_a_killed_b_leaves_a_going_and_comes_back(real: Workspace) -> None:
     a = until(lambda: real.snapshot, lambda s: s.transport.frame == frame)
     assert a.session == before.session and len(a.notices) == len(before.notices)
     _, again = both_at(real, frame)
-    assert any("started again" in notice.text for notice in again.notices)
+    assert any("restarted" in notice.text for notice in again.notices)
     assert again.params == b.params and again.trajectory is not None and b.trajectory is not None
     np.testing.assert_array_equal(again.trajectory[: len(b.trajectory)], b.trajectory)
 
@@ -339,4 +339,4 @@ def test_breakpoints_stay_with_what_is_shown() -> None:
     workspace.swap()
     *led, noted = b.sent
     assert led == [SetSpeed(1.0), SetBreakpoints(Breakpoints(no_ground=True)), Seek(7)] and a.sent == [Pause()]
-    assert noted == AddNote("Swapped: goes on in place of main.")
+    assert noted == AddNote("Swapped: replaces main.")

@@ -226,9 +226,9 @@ def test_there_is_no_going_back_live_and_it_is_said(live: Live) -> None:
     thread = live.play(4.0)
     live.until(lambda s: s.transport.frame >= 10)
     for command in (Seek(2), StepFrame(-1)):
-        told = sum("only go on" in notice.text for notice in live.engine.snapshot.notices)
+        told = sum("cannot go back" in notice.text for notice in live.engine.snapshot.notices)
         live.engine.send(command)
-        live.until(lambda s, told=told: sum("only go on" in notice.text for notice in s.notices) > told)  # type: ignore[misc]
+        live.until(lambda s, told=told: sum("cannot go back" in notice.text for notice in s.notices) > told)  # type: ignore[misc]
     live.engine.send(Pause())
     paused = live.until(lambda s: not s.transport.playing)
     assert paused.transport.frame >= 10, "it stayed where it was, or went on"
@@ -246,6 +246,6 @@ def test_paused_the_source_is_still_watched_and_its_end_is_said_and_survived(liv
     pid = live.engine.pid
     live.source.close()
     ended = live.until(lambda s: s.transport.finished)
-    assert "Nothing more comes live" in ended.notices[-1].text
+    assert "The live source has ended" in ended.notices[-1].text
     assert live.engine.pid == pid and ended.engine_alive
     assert ended.transport.frame == paused.transport.frame, "what was mapped stays"

@@ -175,7 +175,7 @@ def test_an_edit_that_has_no_effect_is_noticed(site: Site) -> None:
     for action in ({"action": "reject", "older": 1, "newer": 5}, {"action": "solve"}):
         assert httpx.post(site.url("/api/loops"), json=action).status_code == 202
     deadline = time.monotonic() + TIMEOUT_S
-    while sum("Loops are not looked for" in text for text in notices(site)[before:]) < 2:
+    while sum("The loop search is off" in text for text in notices(site)[before:]) < 2:
         assert time.monotonic() < deadline
     for bad in ({"action": "reject", "older": 1}, {"action": "weigh", "older": 1, "newer": 5, "weight": 0}):
         assert httpx.post(site.url("/api/loops"), json=bad).status_code == 422

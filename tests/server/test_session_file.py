@@ -130,14 +130,14 @@ def test_a_recording_that_is_gone_or_another_is_said(saved: SavedSession, tmp_pa
     with pytest.raises(HemislamError, match="a different file now"):
         read_session(tmp_path / "a.hemislam")
     saved.opened.recording.unlink()
-    with pytest.raises(HemislamError, match="is gone"):
+    with pytest.raises(HemislamError, match="is missing"):
         read_session(tmp_path / "a.hemislam")
 
 
 def test_a_folder_that_cannot_be_written_ends_the_file_not_the_session(saved: SavedSession, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     writer = SessionWriter(tmp_path / "file" / "a.hemislam", saved.opened)
-    assert "not recorded" in writer.error
+    assert "are not saved" in writer.error
     writer.write(0, saved.state)
     writer.close()
 
@@ -252,7 +252,7 @@ def test_notes_are_kept_up_to_a_limit_and_what_is_beyond_it_is_told(tmp_path: Pa
     bench.do(*[AddNote(f"note {number}") for number in range(MOST_NOTES + 1)])
     seen = bench.see()
     assert [note.text for note in seen.notes] == [f"note {number}" for number in range(MOST_NOTES)]
-    assert "A session keeps 1,000 notes; this one was not kept." in seen.notices[-1].text
+    assert "A session holds at most 1,000 notes; this one was not added." in seen.notices[-1].text
     bench.controller.close()
 
 

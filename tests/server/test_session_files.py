@@ -233,7 +233,7 @@ def test_a_session_remembers_what_it_was_compared_with_and_opens_without_it_if_t
     truth.unlink()
     without = Bench(str(snapshot.session_file)).see()
     assert without.transport.frame == 30 and np.isnan(without.series["error_m"]).all()
-    assert "truth.tum, which is gone" in last_notice(without)
+    assert "truth.tum, which no longer exists" in last_notice(without)
 
 
 # --- on the way back to where a session was -------------------------------------------------------
@@ -316,6 +316,6 @@ def test_a_disk_that_fills_up_is_told_once_and_playing_goes_on(tmp_path: Path, m
 
     monkeypatch.setattr(Path, "open", lambda *_, **__: Full())
     bench = Bench(session_folder=tmp_path)
-    told = [notice.text for notice in bench.do(Seek(40)).notices if "not recorded" in notice.text]
+    told = [notice.text for notice in bench.do(Seek(40)).notices if "are not saved" in notice.text]
     assert len(told) == 1 and "No space left on device" in told[0]
     assert bench.see().transport.frame == 40

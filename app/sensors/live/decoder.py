@@ -74,7 +74,7 @@ class Decoder:
         times = times[:n]
         earliest = int(times.min())
         if int(times.max()) - earliest > np.iinfo(np.int32).max:
-            return DroppedScan(base_ns, "its points are more than 2 s apart, which is no single scan")
+            return DroppedScan(base_ns, "its points are more than 2 s apart, too long for one scan")
         offsets_ns = (times - earliest).astype(np.int32)
         scan = Scan(base_ns + earliest, points[:n].copy(), offsets_ns, intensity[:n].copy(), ring[:n].copy())
         for array in (scan.points, scan.offsets_ns, scan.intensity, scan.ring):

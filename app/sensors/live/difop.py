@@ -142,8 +142,8 @@ def read_angles(path: Path) -> ChannelAngles:
     counts = (BPEARL.channels, AIRY.channels)
     if table.shape not in [(count, 2) for count in counts] or not (np.abs(table) <= (91.0, np.finfo(float).max)).all():
         raise HemislamError(
-            f"{path} is no calibration of an RS-Bpearl or Airy; it must hold {counts[0]} or {counts[1]} lines, one for "
-            "each channel, of elevation and horizontal correction in degrees."
+            f"{path} is not a calibration of an RS-Bpearl or Airy; it must hold {counts[0]} or {counts[1]} lines, one "
+            "for each channel, of elevation and horizontal correction in degrees."
         )
     return ChannelAngles(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
 

@@ -283,7 +283,7 @@ class Intake:
             self.counters.jumps += 1
             self._offset.clear()
             self._tell(
-                "jump", name, f"the {name}'s clock was set by {clock_map.jump_ns / 1e9:+.3f} s; its time goes on"
+                "jump", name, f"the {name}'s clock was set by {clock_map.jump_ns / 1e9:+.3f} s; its time continues"
             )
         return mapped
 

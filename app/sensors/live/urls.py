@@ -60,7 +60,7 @@ def parse_address(text: str) -> Address:
     scheme, separator, rest = text.partition("://")
     if not separator or scheme not in _KINDS:
         raise HemislamError(
-            f"`{text}` is no live source; write one of {', '.join(kind.example for kind in _KINDS.values())}."
+            f"`{text}` is not a live source; write one of {', '.join(kind.example for kind in _KINDS.values())}."
         )
     kind = _KINDS[scheme]
     try:
@@ -123,7 +123,7 @@ def open_live(
     if address.scheme == "imu-udp":
         raise HemislamError(f"`{lidar}` gives no point clouds; use {', '.join(DEVICES)} or foxglove:// for them.")
     if beside is not None and beside.scheme in DEVICES:
-        raise HemislamError(f"`{imu}` is no IMU of its own; write --imu imu-udp://:6700 or foxglove://HOST:8765.")
+        raise HemislamError(f"`{imu}` is not an IMU address; write --imu imu-udp://:6700 or foxglove://HOST:8765.")
     if beside is None and device is not None and not device.has_imu:
         raise HemislamError(
             "An RS-Bpearl's packets hold no IMU samples; say where those come from, e.g. --imu imu-udp://:6700."

@@ -90,5 +90,5 @@ def failure(factor: Closing) -> str:
     if isinstance(factor, PositionPrior):
         return f"The solver failed with the position of keyframe {factor.keyframe}; it is left out."
     if factor.robust:
-        return f"The solver failed with the loop {'{}-{}'.format(*factor.name)}; the graph goes on without."
+        return f"The solver failed with the loop {'{}-{}'.format(*factor.name)}; the graph continues without it."
     return f"The solver failed with the step to keyframe {factor.second}; it now says little."

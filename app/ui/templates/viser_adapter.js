@@ -69,7 +69,7 @@ if (!window.hemislamSay) {
     if (!lost && words) words.remove();
     if (missed < 2 || words) return; // not for a moment's break
     document.body.insertAdjacentHTML('beforeend', `<div class="hs hs-lost" role="alert"><b>The server does not answer.</b>
-      What you see is from before. This page connects again by itself as soon as the server is back.</div>`);
+      What you see is the last state. This page reconnects automatically as soon as the server is back.</div>`);
   }, 500);
 
   // A number box is taken as a whole, on Enter or when it is left; Escape brings the old number back.

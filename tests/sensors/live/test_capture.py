@@ -169,7 +169,7 @@ def test_a_file_cut_off_is_used_up_to_there(tmp_path: Path) -> None:
 def test_other_files_are_refused_with_the_reason(tmp_path: Path) -> None:
     path = tmp_path / "x.pcap"
     for content, words in (
-        (b"hello", "is no capture"),
+        (b"hello", "is not a network capture"),
         (captures.pcap([(1, 53, b"dns")]), "holds no packets"),
     ):
         path.write_bytes(content)

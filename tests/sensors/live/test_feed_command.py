@@ -27,7 +27,7 @@ def test_it_plays_packets_whether_or_not_anybody_listens() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--to", "http://x"], "is no live source"),
+        (["--to", "http://x"], "is not a live source"),
         (["--to", "imu-udp://127.0.0.1:1"], "Play it out to rsbpearl://, airy://, mid360:// or foxglove://"),
         (["--to", "rsbpearl://127.0.0.1:1,2?clock=host"], "the receiver chooses the clock"),
         (["--to", "foxglove://127.0.0.1:1", "--speed", "-1"], "is negative"),

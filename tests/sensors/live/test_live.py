@@ -283,7 +283,7 @@ def test_angles_are_waited_for_but_not_forever() -> None:
 @pytest.mark.parametrize(
     ("lidar", "imu", "words"),
     [
-        ("rosbag://x", None, "is no live source"),
+        ("rosbag://x", None, "is not a live source"),
         ("rsbpearl://0.0.0.0:6699,7788", None, "hold no IMU samples"),
         ("rsbpearl://0.0.0.0:66999", "imu-udp://:1", "no valid ports"),
         ("rsbpearl://0.0.0.0:a,b", "imu-udp://:1", "no valid ports"),

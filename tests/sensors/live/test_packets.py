@@ -117,7 +117,7 @@ def test_angles_come_from_a_file_the_device_or_the_data_sheet(tmp_path: Path) ->
     assert decoder.calibration.elevations_deg[3] == pytest.approx(ANGLES[3][0], abs=0.0051)
     for text in ("", "1,2\n", "a,b\n" * 32, "200,0\n" * 32):
         file.write_text(text)
-        with pytest.raises(HemislamError, match=r"angles\.csv is no calibration"):
+        with pytest.raises(HemislamError, match=r"angles\.csv is not a calibration"):
             read_angles(file)
     with pytest.raises(HemislamError, match="cannot be read"):
         read_angles(tmp_path / "none.csv")
