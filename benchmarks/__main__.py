@@ -6,6 +6,7 @@ from pathlib import Path
 
 from benchmarks import (
     consistency,
+    earth,
     export,
     fed,
     frame,
@@ -24,6 +25,7 @@ from benchmarks.record import show
 
 BENCHMARKS = {
     "consistency": consistency.run,
+    "earth": earth.run,
     "export": export.run,
     "fed": fed.run,
     "frame": frame.run,

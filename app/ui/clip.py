@@ -73,7 +73,7 @@ class ClipPanel:
         )
         self._asked = gui.add_html("", visible=False)
         self._unrolled = gui.add_checkbox(
-            "profile along the walk", False, hint="Chainage to the right, height up, in place of the map."
+            "profile", False, hint="The map along the walked path: to the right the way walked, up the height."
         )
         self._save_profile = gui.add_button(
             "Save the profile…", icon=viser.Icon.DEVICE_FLOPPY, color="gray", visible=False

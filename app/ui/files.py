@@ -209,7 +209,7 @@ class FilesPanel:
         gui = client.gui
         with dialog(client, "Save results") as close:
             names = [export.name for export in BY_RUN]
-            gui.add_html(panel("save", names, f"session{SUFFIX}", str(self._results)))
+            of_a_run = gui.add_html(panel("save", names, f"session{SUFFIX}", str(self._results)), visible=not format)
             name = gui.add_text("folder", result_folder_name(recording.path, datetime.now()))
             titles = {name: title for title, name in _FORMATS.items()}
             files = gui.add_dropdown(
@@ -243,6 +243,7 @@ class FilesPanel:
             close()
 
         save.on_click(confirmed)
+        files.on_update(by_user(lambda chosen, _: setattr(of_a_run, "visible", chosen == _OF_A_RUN)))
 
 
 class FileList:

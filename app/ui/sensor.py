@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 import viser
 
+from app.export.box import Box
 from app.slam.params import Params
 from app.slam.types import F64, GROUND, SEED, StepResult
 from app.ui.colours import LABEL, LABEL_COLOURS, LOOK, Limits, PointSet, colours
@@ -45,6 +46,7 @@ class SensorScene:
         add_lines(scene, f"{below}/plane/rim", rim, ground, 2.0)
         self._elevations: F64 = np.empty(0)
         self._height = 1.3
+        self._clip: Box | None = None
         self.ground_z: float | None = None
 
     def clear(self) -> None:
@@ -70,9 +72,12 @@ class SensorScene:
         """
         self._imu.visible = not view.slab
         T_map_lidar = result.T_map_imu @ result.state.T_imu_lidar
-        cloud, shown = result.cloud, shown_of(len(result.cloud))
+        cloud, shown = result.cloud, np.arange(len(result.cloud))[shown_of(len(result.cloud))]
+        if view.clip is not None:
+            shown = shown[view.clip.holds(cloud.points[shown] @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3])]
         another = previous is None or previous.index != result.index or previous.stamp_ns != result.stamp_ns
-        if len(cloud):  # the page cannot draw a cloud without points: it is hidden instead
+        cut, self._clip = view.clip != self._clip, view.clip
+        if len(shown):  # the page cannot draw a cloud without points: it is hidden instead
             points = PointSet(
                 cloud.points[shown],
                 cloud.labels[shown],
@@ -83,13 +88,13 @@ class SensorScene:
             )
             by = LABEL if view.colour_by == LOOK else view.colour_by  # what is tuned stands out from the map
             self._scan.colors = colours(points, by, limits)
-            if another:
+            if another or cut or view.clip is not None:
                 self._scan.points = points.points.astype(np.float16)
         if another:
             place(self._imu, result.T_map_imu)
             place(self._lidar, result.state.T_imu_lidar)
         self._scan.point_size = view.point_size * SCAN_POINT_SCALE
-        self._scan.visible = view.scan and len(cloud) > 0
+        self._scan.visible = view.scan and len(shown) > 0
         self._draw_plane(result, T_map_lidar, view)
         self._draw_wedge(result, params, view)
 

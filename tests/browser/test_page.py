@@ -6,7 +6,20 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
-from app.server.protocol import CompareWith, KeepMeasure, OpenRecording, Pause, Play, Seek, SetParams, StepFrame
+from app.export.box import Box
+from app.mapping.session_file import Clip
+from app.server.protocol import (
+    CompareWith,
+    KeepMeasure,
+    OpenRecording,
+    Pause,
+    Play,
+    Seek,
+    SetClip,
+    SetParams,
+    StepFrame,
+)
+from app.ui.clip_maths import FACES, handle
 from tests.browser.conftest import Bench, new_page
 
 
@@ -295,3 +308,39 @@ def test_on_a_phone_the_scene_has_most_of_the_page_until_a_tab_is_tapped(bench: 
     page.get_by_role("tab", name="Help").first.click()
     bench.eventually(lambda: scene_share() > 0.6)
     page.close()
+
+
+def test_a_side_of_the_clip_box_is_pulled_by_its_handle(bench: Bench) -> None:
+    for _ in range(3):
+        bench.engine.send(StepFrame())
+    bench.page.get_by_role("tab", name="View").click()
+    bench.look((6.0, -1e-3, 45.0), (6.0, 0.0, -1.0))
+    bench.page.get_by_text("Clip and section").click()
+    bench.page.get_by_label("clip box").check()
+    bench.eventually(lambda: bench.engine.snapshot.clip.hiding is not None)
+    before = Box.around((6.0, 0.0, 0.0), (10.0, 6.0, 4.0), 20.0)
+    bench.engine.send(SetClip(Clip(before, on=True)))
+    panel = bench.workbench._clip
+    bench.eventually(lambda: np.allclose(panel._handles[1].position, handle(before, *FACES[1])[1]))
+    bench.page.wait_for_timeout(2000)
+    (client,) = bench.server.get_clients().values()
+    scene = bench.page.locator("canvas[data-engine]").bounding_box()
+    assert scene is not None
+    R, place = handle(before, *FACES[1])
+    picture = panel._page.in_picture(client, np.stack([place, place + R[:, 0]]))
+    at = np.array([scene["x"], scene["y"]]) + picture * [scene["width"], scene["height"]]
+    along = (at[1] - at[0]) / np.linalg.norm(at[1] - at[0])
+    bench.page.mouse.move(*(at[0] + 40 * along))
+    bench.page.wait_for_timeout(1000)
+    bench.page.mouse.down()
+    for pixels in (45, 55, 75, 100):
+        bench.page.mouse.move(*(at[0] + pixels * along))
+        bench.page.wait_for_timeout(300)
+    bench.page.mouse.up()
+    bench.eventually(lambda: bench.engine.snapshot.clip.box != before)
+    after = bench.engine.snapshot.clip.hiding
+    assert after is not None and after.size[0] > before.size[0] + 0.5
+    np.testing.assert_allclose([after.size[1], after.size[2], after.turn], [6.0, 4.0, 20.0], atol=1e-6)
+    np.testing.assert_allclose(handle(after, *FACES[0])[1], handle(before, *FACES[0])[1], atol=1e-6)
+    bench.engine.send(SetClip(Clip()))
+    bench.page.get_by_role("tab", name="Parameters").click()

@@ -26,6 +26,7 @@ from app.server.protocol import (
     Restart,
     Seek,
     SetBreakpoints,
+    SetClip,
     SetParams,
     SetSpeed,
     Snapshot,
@@ -202,6 +203,8 @@ class FakeEngine:
                 self._transport(speed=factor)
             case SetBreakpoints(breakpoints):
                 self.publish(breakpoints=breakpoints)
+            case SetClip(clip):
+                self.publish(clip=clip)
             case Seek(frame):
                 self._go_back(frame)
                 while self._snapshot.transport.frame < frame:

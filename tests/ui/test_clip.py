@@ -72,7 +72,7 @@ def test_a_slab_between_two_clicks_has_them_at_its_ends() -> None:
     assert box is not None
     np.testing.assert_allclose(box.own(np.stack([first, second]))[:, :2], [[-2.5, 0.0], [2.5, 0.0]], atol=1e-9)
     np.testing.assert_allclose(box.size, [5.0, 0.4, 6.0])
-    assert along_line(first, [*first, 0.0, 0.0, 2.0], 0.4, -1.0, 5.0) is None
+    assert along_line(first, first + np.array([0.0, 0.0, 2.0]), 0.4, -1.0, 5.0) is None
 
 
 # --- what is shown -------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import viser
 
+from app.export.box import Box
 from app.server import chunks as server_chunks
 from app.server.chunks import within_budget
 from app.server.protocol import Seek, SetParams, Snapshot, StepFrame
@@ -118,6 +119,22 @@ def test_without_ceilings_the_map_has_no_points_above_the_walls(drawn: Drawn, se
     drawn.draw(View(ceilings=True))
     node = chunk_nodes(server)["/map/keyframes/0"]
     assert (node.points.astype(float) @ up).max() > 1.4
+
+
+def test_of_the_scan_only_what_is_in_the_clip_box_is_shown(drawn: Drawn, server: viser.ViserServer) -> None:
+    result = drawn.engine.snapshot.result
+    assert result is not None
+    T = result.T_map_imu @ result.state.T_imu_lidar
+    whole = len(clouds(server)["/map/sensor/lidar/scan"].points)
+    box = Box.around(T[:3, 3] + [2.0, 0.0, 0.0], (4.0, 4.0, 4.0), 20.0)
+    drawn.draw(View(clip=box))
+    scan = clouds(server)["/map/sensor/lidar/scan"]
+    places = scan.points.astype(float) @ T[:3, :3].T + T[:3, 3]
+    assert 10 < len(scan.points) < whole and np.abs(box.own(places)).max() < 2.02  # float16
+    drawn.draw(View(clip=Box((90.0, 90, 90), (91.0, 91, 91))))
+    assert not clouds(server)["/map/sensor/lidar/scan"].visible
+    drawn.draw(View())
+    assert len(clouds(server)["/map/sensor/lidar/scan"].points) == whole
 
 
 def test_the_map_stays_within_its_budget(server: viser.ViserServer, wire: Wire, engine: FakeEngine) -> None:

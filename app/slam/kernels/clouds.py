@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 from numba import njit, prange
 
 from app.slam.kernels.small import CHUNKS
@@ -98,29 +99,32 @@ def passages(points, path, half, indices, along, aside):
     of the points; along (k,) f64, m from the path's begin; aside (k,) f64, m to its left. Points before its begin and
     after its end are left out. Returns how many there are, which may be more than k.
     """
-    count, total = 0, 0.0
-    for i in range(len(path) - 1):
-        total += math.hypot(path[i + 1, 0] - path[i, 0], path[i + 1, 1] - path[i, 1])
+    steps = len(path) - 1
+    segments = np.empty((steps, 4))  # direction, length, and how long the path is before it
+    total = 0.0
+    for i in range(steps):
+        u, v = path[i + 1, 0] - path[i, 0], path[i + 1, 1] - path[i, 1]
+        length = math.sqrt(u * u + v * v)
+        segments[i, 0], segments[i, 1], segments[i, 2], segments[i, 3] = u / length, v / length, length, total
+        total += length
+    count = 0
     for j in range(len(points)):
-        begin, before, nearing = 0.0, math.inf, False
-        s, left = 0.0, 0.0
-        for i in range(len(path)):
-            d = math.inf
-            if i < len(path) - 1:
+        before, nearing, s, left = math.inf, False, 0.0, 1.0
+        for i in range(steps + 1):
+            d = math.inf  # squared distance; behind the last segment the path is nowhere
+            if i < steps:
                 x, y = points[j, 0] - path[i, 0], points[j, 1] - path[i, 1]
-                u, v = path[i + 1, 0] - path[i, 0], path[i + 1, 1] - path[i, 1]
-                length = math.hypot(u, v)
-                t = min(max((x * u + y * v) / length, 0.0), length)
-                d = math.hypot(x - t * u / length, y - t * v / length)
-            if d > before + 1e-9:
-                if nearing and before <= half and 0.0 < s < total:
+                u, v = segments[i, 0], segments[i, 1]
+                t = min(max(x * u + y * v, 0.0), segments[i, 2])
+                d = (x - t * u) ** 2 + (y - t * v) ** 2
+            if d > before * (1 + 1e-12):
+                if nearing and before <= half * half and 0.0 < s < total:
                     if count < len(indices):
-                        indices[count], along[count], aside[count] = j, s, left
+                        indices[count], along[count], aside[count] = j, s, left * math.sqrt(before)
                     count += 1
                 nearing = False
-            elif d < before - 1e-9:
-                nearing, s = True, begin + t
-                left = d if u * y >= v * x else -d
+            elif d < before * (1 - 1e-12):
+                nearing, s = True, segments[i, 3] + t
+                left = 1.0 if u * y >= v * x else -1.0
             before = d
-            begin += length
     return count

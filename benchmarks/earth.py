@@ -1,0 +1,98 @@
+"""How well a map lies on Earth: simulated walks with a receiver of 2 cm, 80 ms late, a tenth of its fixes 5 m off.
+
+Every point of the map is compared with where it truly is in UTM, by the true poses and the place of the scene. The
+alignment knows only the fixes and the lever arm of 0.5 m.
+"""
+
+import numpy as np
+
+from app.cli.run import process
+from app.export.results import Results
+from app.georeference.fixes import Fixes
+from app.georeference.survey import Survey
+from app.mapping.earth import lay
+from app.mapping.opening import open_session
+from app.sensors.navsat import recorded_fixes
+from app.sensors.presets import resolve_params
+from app.sensors.simulator.gnss import Gnss
+from app.sensors.simulator.imperfections import IMPERFECT, NONE
+from app.sensors.simulator.simulate import simulate
+from app.slam.metrics import interpolate
+from app.slam.trajectory import Trajectory, read_tum, truth_beside
+from app.slam.types import F64
+from app.slam.warmup import compile_kernels
+from benchmarks.record import Line
+from benchmarks.scenes import FOLDER
+
+LEVER = (0.1, -0.2, 0.447)
+GNSS = Gnss(rate=5.0, noise=0.02, offset=0.08, outliers=0.1, wild=5.0, x=LEVER[0], y=LEVER[1], z=LEVER[2])
+WALKS = (("outdoor", False), ("corridor", False), ("outdoor", True))
+"""Scenes, and whether scanner and hand have the errors of real ones."""
+SECONDS = 60.0
+
+
+def run() -> list[Line]:
+    compile_kernels()
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    return [line for scene, imperfect in WALKS for line in measure(scene, imperfect=imperfect)]
+
+
+def measure(scene: str, *, imperfect: bool) -> list[Line]:
+    name = f"{scene}{'-imperfect' if imperfect else ''}"
+    path = FOLDER / f"gnss-{name}.mcap"
+    if not path.exists():
+        errors = IMPERFECT if imperfect else NONE
+        simulate(scene, path, duration_s=SECONDS, seed=5, every_block=4, gnss=GNSS, imperfections=errors)
+    session = open_session(path, resolve_params(path, None, None, []))
+    if (stop := process(session)) is not None:
+        raise stop
+    beside = truth_beside(path)
+    assert beside is not None
+    truth, fixes = read_tum(beside), recorded_fixes(path)
+    lines = []
+    for factors in (False, True):
+        laid, _ = lay(session.results(), Survey(lever=LEVER, factors=factors))
+        lines += compare(laid, truth, fixes, f"{name}, {'as factors' if factors else 'align only'}")
+    session.close()
+    return lines
+
+
+def compare(laid: Results, truth: Trajectory, fixes: Fixes, on: str) -> list[Line]:
+    """Offset, points of the map and names of wild fixes against the truth."""
+    found = laid.found
+    assert found is not None and laid.where is not None
+    off = np.concatenate([_off(laid, truth, index) for index in range(len(laid.keyframes))])
+    wild = _wild(fixes, truth)
+    left_out = {name for name, used in zip(found.names, found.used, strict=True) if not used}
+    told = set(found.names)
+    return [
+        Line.of("offset of the clocks, error", on, "ms", [abs(found.offset_s - GNSS.offset) * 1e3]),
+        Line.of("points of the map, RMS", on, "cm", [100 * float(np.sqrt((off**2).mean()))]),
+        Line.of("points of the map, error", on, "cm", 100 * off),
+        Line.of("wild fixes", on, "", [len(wild & told)]),
+        Line.of("wild fixes that count", on, "", [len((wild & told) - left_out)]),
+        Line.of("sound fixes left out", on, "", [len(left_out - wild)]),
+    ]
+
+
+def _off(laid: Results, truth: Trajectory, index: int) -> F64:
+    """(n,) m, how far each point of a keyframe is from where it truly is."""
+    keyframe = laid.keyframes[index]
+    there, inside = interpolate(truth, np.array([keyframe.stamp_ns]))
+    if not inside.all() or laid.where is None:
+        return np.empty(0)
+    (T_scene_imu,) = there.poses
+    own = keyframe.cloud.points.astype(np.float64) @ keyframe.T_imu_lidar[:3, :3].T + keyframe.T_imu_lidar[:3, 3]
+    T_map_imu = laid.frame.at(index) @ keyframe.T_odom_imu
+    ours = laid.where.to_crs(own @ T_map_imu[:3, :3].T + T_map_imu[:3, 3])
+    true = GNSS.reference.to_crs(own @ T_scene_imu[:3, :3].T + T_scene_imu[:3, 3])
+    return np.asarray(np.linalg.norm(ours - true, axis=1))
+
+
+def _wild(fixes: Fixes, truth: Trajectory) -> set[str]:
+    """Names of the fixes that are farther than 1 m from where the antenna truly was."""
+    poses, inside = interpolate(truth, fixes.stamps_ns - round(GNSS.offset * 1e9))
+    T = poses.poses
+    antenna = GNSS.reference.to_geographic(T[:, :3, :3] @ np.array(LEVER) + T[:, :3, 3])
+    metres = (fixes.places[inside] - antenna) * [111_200.0, 74_300.0, 1.0]
+    return {str(row + 1) for row in np.flatnonzero(inside)[np.linalg.norm(metres, axis=1) > 1.0]}
