@@ -90,11 +90,10 @@ class Results:
     def section(self, kind: str) -> Slab:
         """A slab of the map from its side, counted once for all files that show it. kind: section or profile."""
         if kind not in self._sections:
-            up = 0.0 if self.where is None else self.where.origin[2]
             self._sections[kind] = (
-                of_box(self.blocks, self.choice.box, up)
+                of_box(self.blocks, self.choice.box, self.where)
                 if kind == "section"
-                else of_walk(self.blocks, self.trajectory.positions, self.choice.slab / 2, up)
+                else of_walk(self.blocks, self.trajectory.positions, self.choice.slab / 2, self.where)
             )
         return self._sections[kind]
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from app.export.box import Box
 from app.export.points import Block
+from app.georeference.reference import GeoReference
 from app.slam.errors import HemislamError
 from app.slam.kernels.clouds import passages
 from app.slam.types import F64, NON_GROUND, U8
@@ -55,11 +56,11 @@ class Slab:
         return at, 2 * self.ground[rows, columns] > count
 
 
-def of_box(read: Callable[[], Iterable[Block]], box: Box | None, up: float) -> Slab:
+def of_box(read: Callable[[], Iterable[Block]], box: Box | None, where: GeoReference | None) -> Slab:
     """What lies in the box, from its front; chainage begins at its left side.
 
     Args:
-        read: gives the points from the first on. up: m, from heights in the map to those of the drawing.
+        read: gives the points from the first on. where: on Earth heights are known; None: they are those of the map.
 
     Raises:
         HemislamError: no box is chosen, or nothing is in it.
@@ -69,12 +70,12 @@ def of_box(read: Callable[[], Iterable[Block]], box: Box | None, up: float) -> S
 
     def laid(block: Block) -> tuple[F64, U8]:
         chainage = box.own(block.points)[:, 0] + box.size[0] / 2
-        return np.column_stack([chainage, block.points[:, 2] + up]), block.labels
+        return np.column_stack([chainage, heights(block.points, where)]), block.labels
 
     return _counted(read, laid)
 
 
-def of_walk(read: Callable[[], Iterable[Block]], positions: F64, half: float, up: float) -> Slab:
+def of_walk(read: Callable[[], Iterable[Block]], positions: F64, half: float, where: GeoReference | None) -> Slab:
     """What lies within `half` m beside a walked path, (n, 3) m; chainage is the way walked, from above. As `of_box`.
 
     Raises:
@@ -84,7 +85,7 @@ def of_walk(read: Callable[[], Iterable[Block]], positions: F64, half: float, up
 
     def laid(block: Block) -> tuple[F64, U8]:
         which, along, _ = along_path(block.points[:, :2], path, half)
-        return np.column_stack([along, block.points[which, 2] + up]), block.labels[which]
+        return np.column_stack([along, heights(block.points, where)[which]]), block.labels[which]
 
     return _counted(read, laid)
 
@@ -118,6 +119,11 @@ def along_path(points: F64, path: F64, half: float) -> tuple[npt.NDArray[np.int6
         count = passages(flat, path, half, *out)
         if count <= len(out[0]):
             return out[0][:count], out[1][:count], out[2][:count]
+
+
+def heights(points: F64, where: GeoReference | None) -> F64:
+    """(n,) m of points of the map: z, or what is known of them on Earth."""
+    return points[:, 2] if where is None else where.to_crs(points)[:, 2]
 
 
 def _counted(read: Callable[[], Iterable[Block]], laid: Laid) -> Slab:

@@ -91,11 +91,10 @@ class ClipPanel:
 
     def seen(self, current: Snapshot, view: View) -> View:
         """The view with the map clipped, or with a profile in its place."""
-        view = replace(view, clip=current.clip.hiding)
-        if not current.clip.unrolled:
-            return view
-        view = replace(view, map=False, scan=False, wedge=False, plane=False, path=False, grid=False, notes=False)
-        return replace(view, slab=current.clip.slab)
+        clip = current.clip
+        if clip.unrolled:
+            return replace(view, clip=clip.hiding, slab=clip.slab, map=False)
+        return replace(view, clip=clip.hiding)
 
     def draw(self, current: Snapshot) -> None:
         """Show what the session keeps; while a handle is held, the box as it is then."""

@@ -12,7 +12,7 @@ from app.server.protocol import Snapshot
 from app.slam.errors import HemislamError
 from app.slam.types import F64, U8
 from app.ui.nodes import add_exact_points
-from app.ui.widgets import ROOT, Changes, View
+from app.ui.widgets import Changes, View
 
 _PERIOD_S: Final = 1.0
 """A map that grows is unrolled so often."""
@@ -36,15 +36,21 @@ def unrolled(parts: Iterable[tuple[F64, U8]], path: F64, slab: float) -> tuple[F
 
 
 class ProfileNode:
-    """Takes the place of the map while a profile is shown. shown: gives the map's points with their colours."""
+    """Takes the place of the map and all in it while a profile is shown.
 
-    def __init__(self, scene: viser.SceneApi, shown: Callable[[], Iterable[tuple[F64, U8]]]) -> None:
-        self._scene, self._shown = scene, shown
+    root: the node of the map. shown: gives the map's points with their colours.
+    """
+
+    def __init__(
+        self, scene: viser.SceneApi, root: viser.FrameHandle, shown: Callable[[], Iterable[tuple[F64, U8]]]
+    ) -> None:
+        self._scene, self._root, self._shown = scene, root, shown
         self._changes = Changes(period_s=_PERIOD_S)
         self._node: viser.PointCloudHandle | None = None
 
     def draw(self, current: Snapshot, view: View) -> None:
         """Show the profile that the view asks for, if it asks for one and somebody has walked."""
+        self._root.visible = not view.slab
         if not view.slab:
             self._remove()
             self._changes()
@@ -54,8 +60,9 @@ class ProfileNode:
                 path = strides(current.trajectory[:, :2])
                 points, colours = unrolled(self._shown(), path, view.slab)
                 if len(points):
-                    exact, name = points.astype(np.float32), f"{ROOT}/profile"
-                    self._node = add_exact_points(self._scene, name, exact, colours, view.point_size)
+                    exact = points.astype(np.float32)
+                    self._node = add_exact_points(self._scene, "/profile", exact, colours, view.point_size)
+                    self._node.position = self._root.position
 
     def _remove(self) -> None:
         if self._node is not None:

@@ -62,7 +62,7 @@ class Scene:
         self._sensor = SensorScene(scene, f"{ROOT}/sensor")
         self._trajectory = TrajectoryNode(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
-        self._profile = ProfileNode(scene, self._chunks.shown)
+        self._profile = ProfileNode(scene, self._root, self._chunks.shown)
         self.framing = Framing(server)
         self._framed, self._followed = 0, False
 

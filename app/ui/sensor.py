@@ -70,7 +70,7 @@ class SensorScene:
             previous: what is drawn now. limits: ends of the colour maps by mode.
             start_ns: of the recording.
         """
-        self._imu.visible = not view.slab
+        self._imu.visible = True
         T_map_lidar = result.T_map_imu @ result.state.T_imu_lidar
         cloud, shown = result.cloud, np.arange(len(result.cloud))[shown_of(len(result.cloud))]
         if view.clip is not None:

@@ -94,6 +94,11 @@ def test_geotiffs_give_height_and_density_in_the_coordinate_system(tmp_path: Pat
         assert next(density.sample([place[:2]]))[0] == pytest.approx(1 / 0.02**2, rel=0.15)
         corner = (terrain.bounds.left + 0.1, terrain.bounds.bottom + 0.1)  # of the raster; the room stands aslant in it
         assert np.isnan(next(terrain.sample([corner]))[0]) and next(density.sample([corner]))[0] == 0
+    with Image.open(tmp_path / "terrain.tif") as picture:  # by a reader that knows nothing of GDAL
+        scale, tie, keys = (picture.tag_v2[tag] for tag in (33550, 33922, 34735))  # type: ignore[attr-defined]
+        column, row = ((place[:2] - tie[3:5]) / [scale[0], -scale[1]]).astype(int)
+        assert np.asarray(picture)[row, column] == pytest.approx(place[2], abs=1e-3)
+    assert dict(zip(keys[4::4], keys[7::4], strict=True))[3072] == 32632
 
 
 def test_a_plan_needs_ground_and_points(tmp_path: Path) -> None:

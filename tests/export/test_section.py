@@ -18,6 +18,8 @@ from app.export.box import Box
 from app.export.points import Choice
 from app.export.results import Results, of_formats, save_results
 from app.export.section import along_path, strides
+from app.georeference.reference import GeoReference
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.frames import Frame
 from app.slam.run_log import RunLog
@@ -52,6 +54,18 @@ def test_a_box_without_sense_is_refused() -> None:
         Box((0.0, 0, 0), (1.0, 1, float("nan")))
     with pytest.raises(HemislamError, match="turned"):
         Box((0.0, 0, 0), (1.0, 1, 1), 1e9)
+
+
+def test_a_map_that_control_points_have_levelled_has_their_heights(tmp_path: Path) -> None:
+    """A map tilted by 1° along x, where a metre of chainage is 17.5 mm of height."""
+    results = room()
+    rows = tuple(map(tuple, lie.from_rpy_degrees((0.0, -1.0, 0.0)).tolist()))
+    results.where = GeoReference("EPSG:32632", (456_789.0, 5_432_100.0, 300.0), rows)  # type: ignore[arg-type]
+    results.choice = Choice(box=ACROSS)
+    save_results(tmp_path, results, of_formats(["section"]))
+    floor = points_of(tmp_path / "section.dxf")["ground"]
+    expected = 300.0 + np.cos(np.radians(1)) * FLOOR + np.sin(np.radians(1)) * (floor[:, 0] - 4.0)
+    np.testing.assert_allclose(floor[:, 1], expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("on_earth", [False, True])

@@ -7,14 +7,18 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
+import laspy
 import numpy as np
 import pytest
 from test_rewind import Bench, open_whole
 from typer.testing import CliRunner
 
 from app.__main__ import cli
+from app.export.box import Box
 from app.export.map_file import MapFile
+from app.export.points import Choice
 from app.georeference import reference
 from app.georeference.reference import GeoReference
 from app.georeference.survey import Pick, Survey
@@ -136,6 +140,27 @@ def test_a_session_file_repeats_the_georeference_to_the_same_bytes(bench: Laid, 
     head = (tmp_path / "export" / "trajectory.csv").read_text().splitlines()[0]
     assert "east" in head and (tmp_path / "export" / "map.kmz").exists()
     bench.do(UndoLoop())
+
+
+def test_every_format_of_the_page_is_where_the_map_was_laid_and_what_is_in_the_box(bench: Laid, tmp_path: Path) -> None:
+    found = bench.do(LayOnEarth(Survey(lever=LEVER))).earth.found
+    assert found is not None
+    box = Box((-1.0, -2.0, -3.0), (2.0, 1.0, 3.0), 20.0)
+    bench.do(Save(tmp_path / "page", ("gpx", "kmz", "laz"), Choice(0.1, box)))
+    assert not bench.see().saved[-1].error
+    las = laspy.read(tmp_path / "page" / "map.laz")
+    inside = np.abs(box.own(found.reference.from_crs(las.xyz))) - box.size / 2
+    assert len(las.xyz) > 100 and inside.max() < 1e-3
+    assert las.header.parse_crs().to_epsg() == 32632
+    track = ElementTree.parse(tmp_path / "page" / "trajectory.gpx").getroot()
+    first = next(track.iter("{http://www.topografix.com/GPX/1/1}trkpt"))
+    trajectory = bench.see().trajectory
+    assert trajectory is not None
+    expected = found.reference.to_geographic(np.asarray(trajectory[:1], np.float64))[0, :2]
+    np.testing.assert_allclose([float(first.get(k, "nan")) for k in ("lat", "lon")], expected, atol=1e-7)
+    assert (tmp_path / "page" / "map.kmz").exists()
+    bench.do(LayOnEarth(None), Save(tmp_path / "nowhere", ("gpx",)))
+    assert "where on Earth" in bench.see().saved[-1].error and not (tmp_path / "nowhere" / "trajectory.gpx").exists()
 
 
 def test_three_points_picked_on_the_map_lay_it_and_with_two_it_is_said_what_stays_open(bench: Laid, walk: Path) -> None:

@@ -21,7 +21,7 @@ from app.ui.clip import ClipPanel
 from app.ui.clip_maths import FACES, along_line, carried, edges, handle, pulled
 from app.ui.measure import MeasurePanel
 from app.ui.measure_maths import meet
-from app.ui.profile import unrolled
+from app.ui.profile import ProfileNode, unrolled
 from app.ui.widgets import View
 from tests.ui.conftest import Wire, clouds, page_of
 
@@ -141,6 +141,22 @@ def test_an_unrolled_path_puts_what_is_left_of_it_behind_it() -> None:
     np.testing.assert_array_equal(own, colours[:3])
 
 
+def test_the_profile_takes_the_place_of_the_map_and_gives_it_back(server: viser.ViserServer) -> None:
+    chunks, poses = house()
+    drawn, root = MapChunks(server.scene, "/map/keyframes"), server.scene.add_frame("/map")
+    drawn.draw(chunks, poses, View(ceilings=True, map=False))
+    profile = ProfileNode(server.scene, root, drawn.shown)
+    now = Snapshot(chunks=chunks, keyframe_poses=poses, trajectory=poses[:, :3, 3])
+    profile.draw(now, View(slab=2.0))
+    points = in_map(chunks, poses)
+    beside = points[(np.abs(points[:, 1]) < 1.0) & (points[:, 0] > 0) & (points[:, 0] < 20)]
+    assert not root.visible and len(clouds(server)["/profile"].points) == len(beside) > 100
+    profile.draw(now, View())
+    assert root.visible and "/profile" not in clouds(server)
+    profile.draw(replace(now, trajectory=poses[:1, :3, 3]), View(slab=2.0))
+    assert "/profile" not in clouds(server), "nobody has walked yet"
+
+
 # --- the panel -----------------------------------------------------------------------------------
 class Bench:
     """A panel on the house, and an engine that does what it is told."""
@@ -207,7 +223,7 @@ def test_a_profile_stands_in_the_place_of_the_map(server: viser.ViserServer) -> 
     bench = Bench(server)
     bench.panel._unroll(True, bench.client)  # type: ignore[arg-type]
     view = bench.panel.seen(bench.now, View())
-    assert view.slab == 1.0 and not view.map and not view.path
+    assert view.slab == 1.0 and not view.map
     ((_, middle, size),) = bench.faced
     assert middle[0] == pytest.approx(10.0) and size[0] == pytest.approx(20.0)
 
