@@ -25,10 +25,10 @@ from benchmarks.record import Line
 from benchmarks.scenes import FOLDER
 
 LEVER = (0.1, -0.2, 0.447)
-GNSS = Gnss(rate=5.0, noise=0.02, offset=0.08, outliers=0.1, wild=5.0, x=LEVER[0], y=LEVER[1], z=LEVER[2])
+GNSS = Gnss(rate=10.0, noise=0.02, offset=0.08, outliers=0.1, wild=5.0, x=LEVER[0], y=LEVER[1], z=LEVER[2])
 WALKS = (("outdoor", False), ("corridor", False), ("outdoor", True))
 """Scenes, and whether scanner and hand have the errors of real ones."""
-SECONDS = 60.0
+SECONDS = 90.0
 
 
 def run() -> list[Line]:
@@ -42,7 +42,7 @@ def measure(scene: str, *, imperfect: bool) -> list[Line]:
     path = FOLDER / f"gnss-{name}.mcap"
     if not path.exists():
         errors = IMPERFECT if imperfect else NONE
-        simulate(scene, path, duration_s=SECONDS, seed=5, every_block=4, gnss=GNSS, imperfections=errors)
+        simulate(scene, path, duration_s=SECONDS, seed=5, every_block=6, gnss=GNSS, imperfections=errors)
     session = open_session(path, resolve_params(path, None, None, []))
     if (stop := process(session)) is not None:
         raise stop

@@ -1,10 +1,11 @@
-"""Aligns a trajectory with satellite fixes: yaw, translation, the clocks' offset, and the antenna's lever arm.
+"""Aligns a trajectory with satellite fixes: rotation, translation, the clocks' offset, and the antenna's lever arm.
 
 The model of a fix g, in metres east, north and up, stamped s:
 
-    g = Rz(yaw) (p(s - offset) + R(s - offset) lever) + shift
+    g = Rz(yaw) Rxy(tilt) (p(s - offset) + R(s - offset) lever) + shift
 
-where p, R is T_map_imu. The map's z is up already. Its shape does not change.
+where p, R is T_map_imu. The map's z is nearly up: it was levelled by an accelerometer, whose bias tilts it by tenths of
+a degree. The map's shape does not change.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,6 +34,8 @@ MOST_SIGMAS = 4.03
 """Of the distance of a sound fix: 99.9 % of a Gaussian in three directions are nearer."""
 MEDIAN_SIGMAS = 1.538
 """Half of them are nearer than this."""
+LEVEL = np.radians(0.5)
+"""Standard deviation of the map's tilt before fixes tell it: that of an accelerometer biased by 0.09 m/s²."""
 WORST_YAW, WORST_OFFSET_S, WORST_LEVER_M = np.radians(10.0), 0.1, 0.1
 """What is less certain than this (standard deviation) is not taken from the fixes."""
 FEWEST = 8
@@ -177,7 +180,7 @@ def align(
         raise HemislamError(
             f"The fixes determine the map's heading only to {np.degrees(solved.yaw_sigma):.0f}°; walk farther outdoors."
         )
-    reference = ground.reference(solved.yaw, solved.shift, height)
+    reference = ground.reference(solved.rotation, solved.shift, height)
     return Alignment(
         reference,
         names,
@@ -243,9 +246,9 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """As in `Alignment`, with yaw as the rotation (3, 3) and shift (3,) from the map to the ground."""
+    """As in `Alignment`, with the rotation (3, 3) and shift (3,) from the map to the ground."""
 
-    yaw: F64
+    rotation: F64
     shift: F64
     offset: float
     lever: F64
@@ -282,11 +285,11 @@ class _Problem:
         some = self.told != 0
         antenna = self.path.antenna(self.seconds[some] - (self.offset or 0.0), self.lever)
         yaw, shift, _ = _laid(antenna, self.places[some])
-        start = np.r_[yaw, shift, [self.offset] * late, [0.0] * (3 * free)].astype(np.float64)
+        start = np.r_[yaw, shift, 0.0, 0.0, [self.offset] * late, [0.0] * (3 * free)].astype(np.float64)
         x, used = _robust(self._errors, start, self.told)
         R, shift, offset, arm = self._model(x)
         errors = self._errors(x)
-        J = _jacobian(lambda x: self._errors(x)[used].ravel(), x)
+        J = _jacobian(lambda x: _with_level(self._errors(x)[used], x), x)
         spread = max(1.0, float((errors[used] ** 2).sum()) / max(3 * int(used.sum()) - len(x), 1))
         sigmas = _deviations(J) * spread**0.5
         return _Solved(
@@ -297,20 +300,26 @@ class _Problem:
             errors * self.sigmas,
             np.linalg.norm(errors, axis=1),
             used,
-            float(sigmas[4]) if late else float("nan"),
+            float(sigmas[6]) if late else float("nan"),
             float(sigmas[0]),
             float(sigmas[-3:].max()) if free else float("nan"),
         )
 
     def _model(self, x: F64) -> tuple[F64, F64, float, F64]:
         """Rotation, shift, offset and lever arm of the unknowns."""
-        late = float(x[4]) if self.offset is not None else 0.0
-        return lie.exp(np.array([0.0, 0.0, x[0]])), x[1:4], late, x[-3:] if self.lever_free else self.lever
+        late = float(x[6]) if self.offset is not None else 0.0
+        R = lie.exp(np.array([0.0, 0.0, x[0]])) @ lie.exp(np.array([x[4], x[5], 0.0]))
+        return R, x[1:4], late, x[-3:] if self.lever_free else self.lever
 
     def _errors(self, x: F64) -> F64:
         """(n, 3) in standard deviations."""
         R, shift, late, arm = self._model(x)
         return np.asarray((self.places - self.path.antenna(self.seconds - late, arm) @ R.T - shift) / self.sigmas)
+
+
+def _with_level(errors: F64, x: F64) -> F64:
+    """Errors (n, 3) and the tilt among the unknowns, all in standard deviations, as (3 n + 2,)."""
+    return np.concatenate((errors.ravel(), x[4:6] / LEVEL))
 
 
 def _deviations(J: F64) -> F64:
@@ -327,7 +336,7 @@ def _robust(errors: Callable[[F64], F64], start: F64, told: F64) -> tuple[F64, M
     used = np.asarray(told != 0)
     if used.sum() < FEWEST:
         raise HemislamError(f"Only {used.sum()} fixes are left, {FEWEST} are needed; accept some of them again.")
-    first = _least_squares(lambda x: errors(x)[used].ravel(), start, loss="cauchy", f_scale=2.0, x_scale="jac")
+    first = _least_squares(lambda x: _with_level(errors(x)[used], x), start, loss="cauchy", f_scale=2.0, x_scale="jac")
     x = np.asarray(first.x)
     for _ in range(10):
         distances = np.linalg.norm(errors(x), axis=1)
@@ -335,7 +344,7 @@ def _robust(errors: Callable[[F64], F64], start: F64, told: F64) -> tuple[F64, M
         agree = ((distances < MOST_SIGMAS * scale) | (told == 1)) & (told != 0)
         if agree.sum() < 3:
             break
-        x = np.asarray(_least_squares(lambda x, w=agree: errors(x)[w].ravel(), x, x_scale="jac").x)
+        x = np.asarray(_least_squares(lambda x, w=agree: _with_level(errors(x)[w], x), x, x_scale="jac").x)
         if (agree == used).all():
             break
         used = agree
@@ -379,7 +388,7 @@ def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> f
     path, rows = WalkedPath(trajectory), np.array([int(name) - 1 for name in found.names])
     seconds: F64 = (fixes.stamps_ns[rows] - path.start_ns).astype(np.float64) * 1e-9
     places = Ground.in_grid(found.grid, found.reference.crs).places
-    arm = np.array(found.lever_arm)
+    arm, R = np.array(found.lever_arm), np.array(found.reference.rotation)
     count = max(1, round(float(seconds[-1] - seconds[0]) / PART_S))
     ends = np.searchsorted(seconds, np.linspace(seconds[0], seconds[-1], count + 1)[1:-1])
     parts = [part for part in np.split(np.arange(len(rows)), ends) if len(part) >= FEWEST_IN_PART]
@@ -387,7 +396,7 @@ def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> f
         return found.offset_s
 
     def cost(offset: float) -> float:
-        laid = (_laid(path.antenna(seconds[part] - offset, arm), places[part]) for part in parts)
+        laid = (_laid(path.antenna(seconds[part] - offset, arm) @ R.T, places[part]) for part in parts)
         return sum(float(off.sum()) for _, _, off in laid)
 
     around = found.offset_s + np.linspace(-1.0, 1.0, 41)

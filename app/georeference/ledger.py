@@ -48,6 +48,7 @@ def in_rows(alignment: Alignment, what: str) -> list[tuple[str, str]]:
         ("Coordinate system", f"{where.crs} ({crs.projected(where.crs).name}), heights {where.height}"),
         ("Map origin", f"E {east:.3f} m, N {north:.3f} m, H {height:.3f} m"),
         ("Map x axis", f"{_bearing(alignment):.3f}° from grid north{turned}"),
+        ("Tilt taken out", f"{np.degrees(np.arccos(min(where.rotation[2][2], 1.0))):.3f}°"),
         ("Grid scale", f"{where.scale:.7f}"),
     ]
     if np.isfinite(alignment.offset_sigma_s):

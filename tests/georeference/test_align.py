@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from app.georeference.align import Alignment, align
 from app.georeference.fixes import Fixes
 from app.georeference.ledger import summary
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.trajectory import Trajectory
-from tests.georeference.walks import LEVER, LINE, TRUTH, Walked, off, walked
+from app.slam.types import F64
+from tests.georeference.walks import LEVER, LINE, LOOP, TRUTH, Walked, off, walked
 
 
 def verdicts(found: Alignment, made: Walked) -> tuple[set[int], int]:
@@ -28,6 +31,23 @@ def test_a_walk_with_a_late_receiver_and_wild_fixes_is_placed_to_centimetres() -
     missed, wronged = verdicts(found, made)
     assert not missed and wronged <= 0.01 * len(found.names)  # 0.1 % of the sound ones are expected
     assert found.reference.scale == pytest.approx(TRUTH.scale, abs=1e-6)
+
+
+@pytest.mark.parametrize("path", [LOOP, LINE])
+def test_a_tilt_that_the_accelerometer_left_is_taken_out_as_far_as_the_walk_tells_it(path: F64) -> None:
+    """On a straight line nothing tells how the map is turned about it; then it stays as level as it was."""
+    made = walked(path=path)
+    tilt = lie.from_rpy_degrees((0.4, -0.3, 0.0))
+    rotations = Rotation.from_matrix(tilt) * made.trajectory.rotations
+    leaning = Trajectory(made.trajectory.stamps_ns, made.trajectory.positions @ tilt.T, rotations.as_quat())
+    found = align(leaning, made.fixes, lever=LEVER).reference
+    far = np.random.default_rng(1).uniform((-30, -30, -2), (50, 45, 10), (1000, 3))
+    error = np.linalg.norm(found.to_crs(far @ tilt.T) - TRUTH.to_crs(far), axis=1)
+    if path is LOOP:
+        assert np.sqrt((error**2).mean()) < 0.02
+    assert np.degrees(np.arccos(found.rotation[2][2])) < 0.6
+    along = np.column_stack([np.linspace(0, 25, 50), np.zeros((50, 2))])
+    assert np.abs(found.to_crs(along @ tilt.T) - TRUTH.to_crs(along))[:, 2].max() < 0.02
 
 
 def test_the_lever_arm_is_found_with_its_uncertainty_where_the_hand_turns_enough() -> None:
