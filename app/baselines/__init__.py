@@ -1,1 +1,4 @@
-"""Other systems, fed as our engine is, to be compared with it: the paper's LOAM and LIOM, and odometries from PyPI."""
+"""Other systems to compare with, fed like our engine: the paper's LOAM and LIOM, and odometries from PyPI (`peers`).
+
+`systems` lists them.
+"""

@@ -1,1 +1,5 @@
-"""The engine's process, its mailbox, and the one public port."""
+"""The engine's process, what pages are sent of it, and the one public port.
+
+`engine_process` runs a `controller` and a `player` there; `publisher` makes deltas, which `worker` and `fold` turn into
+snapshots here. `protocol` declares both. `web`, `access`, `bridge` and `api` are the port; `fork` runs two engines.
+"""

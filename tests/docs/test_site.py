@@ -2,11 +2,16 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import typer
+from typer.core import TyperGroup
+
+from app.__main__ import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -43,6 +48,19 @@ def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
     links = [part.partition(")")[0] for part in text.split("](")[1:]]
     missing = [link for link in links if not link.startswith("http") and not (ROOT / link).exists()]
     assert not missing
+
+
+def test_every_command_in_the_documentation_is_understood() -> None:
+    group = typer.main.get_command(cli)
+    assert isinstance(group, TyperGroup)
+    lines = []
+    for path in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
+        for block in re.findall(r"```sh\n(.*?)```", path.read_text(), re.DOTALL):
+            lines += [line for line in block.replace("\\\n", " ").splitlines() if line.startswith("hemislam ")]
+    for line in lines:
+        _, name, *arguments = shlex.split(line, comments=True)
+        group.commands[name].make_context(name, arguments)  # raises for what the command does not know
+    assert len(lines) > 40
 
 
 def test_every_path_that_the_architecture_names_exists() -> None:

@@ -1,1 +1,4 @@
-"""Loops in the page: arches in the scene, the table of candidates, everything about one of them, and editing them."""
+"""Loops in the page: arches in the scene (`edges`), the `table` of candidates, the `inspector` of one, and `edits`.
+
+`panel` puts them together.
+"""
