@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 from app import TEMPORARY_KERNEL_CACHE, __version__
 from app.cli import options
 from app.cli.calibrate import calibrate as calibrate_command
+from app.cli.compare import compare
 from app.cli.evaluate import evaluate
 from app.cli.export import export as export_command
 from app.cli.feed import feed
@@ -95,6 +96,7 @@ cli.command()(serve)
 cli.command()(run)
 cli.command()(replay)
 cli.command("export")(export_command)
+cli.command()(compare)
 cli.command("calibrate")(calibrate_command)
 cli.command()(evaluate)
 cli.command()(georeference)

@@ -98,7 +98,7 @@ def _export_session(source: Path, out: Path | None, exports: "tuple[Export, ...]
     with repeat(source) as (session, stop):
         if stop is not None:
             raise stop
-        results = session.results(measures=read_session(source).state.measures)
+        results = session.results(state=read_session(source).state)
         results = lay_if_possible(results, session.survey, session.edits.done)
         results.where = results.where or reference.read(source.parent)
         results.choice = choice

@@ -75,7 +75,7 @@ class Block:
 
 def blocks(keyframes: Keyframes, frame: MapFrame, choice: Choice) -> Iterator[Block]:
     """The chosen points, where `frame` puts them in the map."""
-    voxels = _Voxels(choice.thin) if choice.thin else None
+    voxels = Voxels(choice.thin) if choice.thin else None
     for index in range(len(keyframes)):
         block = _block(keyframes[index], frame.at(index))
         if choice.box is not None:
@@ -100,7 +100,7 @@ def as_cloud(block: Block) -> Cloud:
     return Cloud(points, block.labels, block.intensity, block.ring, offsets_ns)
 
 
-class _Voxels:
+class Voxels:
     """Voxels that hold a point already: 8 bytes each, twice as many slots as voxels."""
 
     def __init__(self, edge: float) -> None:

@@ -48,6 +48,7 @@ class Results:
         choice: of points. where: on Earth the map is, if that is known. found: how fixes or points lie on it, if it is
             these results that they were laid on. problem: why they could not be, in a sentence.
         marks: what was measured, each a name and its spots: keyframe and (x, y, z) m in its IMU frame.
+        notes: taken in the session, each the index of a frame and a text.
         progress: called with the share of the points that a file has got, 0-1, for each file.
     """
 
@@ -61,6 +62,7 @@ class Results:
     found: Alignment | None = None
     problem: str = ""
     marks: tuple[MapMark, ...] = ()
+    notes: tuple[tuple[int, str], ...] = ()
     progress: Callable[[float], None] = lambda share: None
     _rasters: dict[tuple[bool, float], Raster] = field(default_factory=dict, init=False, repr=False)
     _sections: dict[str, Slab] = field(default_factory=dict, init=False, repr=False)

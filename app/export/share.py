@@ -25,7 +25,7 @@ PATH, LOOP, MARK, ARROW = (255, 255, 255), (255, 120, 40), (120, 255, 160), (255
 
 
 def write(path: Path, results: "Results") -> None:
-    """Points to a budget, trajectory, loops, what was measured, a scale, an arrow to the north, title, credits."""
+    """Points to a budget, trajectory, loops, notes, measures, a scale, an arrow to the north, title, credits."""
     points, keyframes = _sample(results)
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints when it starts and stops
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
@@ -74,6 +74,9 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: "Resu
         server.scene.add_label(f"/marks/{number}", text, position=tuple(at.mean(axis=0)))
         if len(at) > 1:
             _lines(server, f"/marks/{number}/line", np.stack([at[:-1], at[1:]], axis=1), MARK)
+    for number, (frame, text) in enumerate(results.notes):
+        if 0 <= frame < len(trajectory):
+            scene.add_label(f"/notes/{number}", text, position=tuple(trajectory[frame]))
     seen = points if len(points) else np.zeros((1, 3), np.float32)
     low, high = seen.min(axis=0), seen.max(axis=0)
     _add_scale_and_arrow(server, low, high, results)

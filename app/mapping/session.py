@@ -16,7 +16,7 @@ from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
 from app.mapping.earth import lay, lay_if_possible
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelledKeyframes
-from app.mapping.session_file import SUFFIX, Measure, Opened, SavedSession, State, size_of, write_session
+from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
 from app.mapping.truth import compared
 from app.sensors.findings import Finding
 from app.slam.engine import Engine
@@ -328,14 +328,21 @@ class Session:
         ours = self.map_frame.trajectory(self.log.odometry)
         return compared(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns, ours.positions)[1]
 
-    def results(self, stopped: str = "", calibration: str = "", measures: tuple[Measure, ...] = ()) -> Results:
-        """What result files are written from: the frames so far, with all loops, in effect or not. As `save`."""
+    def results(self, stopped: str = "", calibration: str = "", state: State | None = None) -> Results:
+        """What result files are written from: the frames so far, with all loops, in effect or not. As `save`.
+
+        Args:
+            state: holds the measures and notes that some files show.
+        """
         info = self.feed.info
         made_from = RunInfo(
             info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped, calibration
         )
         results = Results(self.log, self.keyframes.now(), made_from, self.loops.results() if self.loops else None)
-        results.marks = tuple((one.name, tuple((spot.keyframe, spot.at) for spot in one.spots)) for one in measures)
+        if state is not None:
+            measures = state.measures
+            results.marks = tuple((one.name, tuple((spot.keyframe, spot.at) for spot in one.spots)) for one in measures)
+            results.notes = tuple((note.frame, note.text) for note in state.notes)
         return results
 
     def save(
@@ -361,7 +368,7 @@ class Session:
         Returns:
             The content of report.json, or HemislamError if the folder cannot be written to.
         """
-        results = self.results(stopped, calibration, session.state.measures if session is not None else ())
+        results = self.results(stopped, calibration, session.state if session is not None else None)
         results.choice, results.progress = choice, progress
         survey, edits = self.survey, self.edits.done
 

@@ -48,6 +48,9 @@ RESPONSE_HEADERS: Final = {
 
 MOST_BYTES: Final = 1 << 20
 """Of a request's body, and of a file uploaded in the page: YAML of some kilobytes."""
+MOST_OF_MESSAGE: Final = 2 * MOST_BYTES
+MOST_OF_PICTURE: Final = 48 * MOST_BYTES
+"""Of what a page sends over its WebSocket: of any message, and of a picture that it was asked to render."""
 MOST_BYTES_AT_ONCE: Final = 16 * MOST_BYTES
 """Of the bodies of all requests that are being read or answered."""
 BODY_S: Final = 30.0

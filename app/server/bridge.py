@@ -12,7 +12,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.typing import Subprotocol
 
-from app.server.access import MOST_BYTES
+from app.server.access import MOST_BYTES, MOST_OF_MESSAGE
 from app.server.viser_adapter import KEY_HEADER, Viser, is_readable
 
 VIEWER_MESSAGES: Final = frozenset({"ViewerCameraMessage"})
@@ -20,6 +20,8 @@ VIEWER_MESSAGES: Final = frozenset({"ViewerCameraMessage"})
 NEVER: Final = frozenset({"ShareUrlRequest", "ShareUrlDisconnect"})
 """What no page may send: it would open viser's public tunnel to this machine."""
 
+PICTURE: Final = "GetRenderResponseMessage"
+"""A picture of the scene that the page was asked for: the only message that may be large."""
 MOST_UPLOADS: Final = 4
 """At the same time, from one browser."""
 
@@ -51,13 +53,15 @@ class Gate:
         """The message to pass on, encoded again so that viser reads exactly what was checked; None: leave it out.
 
         Raises:
-            Refused: it is not a message, or it belongs to an upload that is too large.
+            Refused: it is not a message, is too large, or belongs to an upload that is.
         """
         try:
             message = msgspec.msgpack.decode(raw, type=dict[str, Any])
             kind = msgspec.convert(message.get("type"), str)
         except (msgspec.MsgspecError, ValueError, RecursionError):
             raise Refused(1007, NO_MESSAGE) from None
+        if len(raw) > MOST_OF_MESSAGE and (self._viewer or kind != PICTURE):
+            raise Refused(1009, f"A message may have at most {MOST_OF_MESSAGE >> 10} kB.")
         if kind in NEVER or (self._viewer and kind not in VIEWER_MESSAGES):
             return None
         if kind == "FileTransferStartUpload":

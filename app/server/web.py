@@ -24,7 +24,7 @@ from starlette.websockets import WebSocket
 from tqdm import tqdm
 
 from app import __version__
-from app.server.access import MOST_BYTES, VIEWER, Access, Guard
+from app.server.access import MOST_OF_PICTURE, VIEWER, Access, Guard
 from app.server.address import has_display, links, listen
 from app.server.api import make_router
 from app.server.bridge import bridge
@@ -221,7 +221,7 @@ def make_server(app: FastAPI, tls: Tls | None = None) -> uvicorn.Server:
             http="h11",
             ws="websockets-sansio",
             ws_per_message_deflate=False,
-            ws_max_size=2 * MOST_BYTES,
+            ws_max_size=MOST_OF_PICTURE,
             limit_concurrency=MOST_CONNECTIONS,
             ssl_certfile=tls.certificate if tls else None,
             ssl_keyfile=tls.key if tls else None,

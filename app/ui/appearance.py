@@ -4,7 +4,7 @@ from typing import Final
 
 import viser
 
-from app.ui.colours import COLOUR_BY, Limits, legend
+from app.ui.colours import COLOUR_BY, Key, Limits, key, legend
 from app.ui.html import panel
 from app.ui.scale import Looks
 from app.ui.widgets import View, choose_next, show
@@ -83,10 +83,21 @@ class AppearancePanel:
             ends=self._ends.get(self._colour_by.value),
             clip=None,
             slab=0.0,
+            numbers=None,
             ceilings=self._ceilings.value == _SHOWN
             or (self._ceilings.value == _BY_ITSELF and not self._looks.from_above),
             **{name: layer.value for name, layer in self._layers.items()},
         )
+
+    @property
+    def key(self) -> Key:
+        """What the colours mean now."""
+        return key(self._colour_by.value, self._limits, self._ends.get(self._colour_by.value))
+
+    def colour_by(self, mode: str) -> None:
+        """Choose a colour mode, and follow its values again."""
+        self._ends.pop(mode, None)
+        show(self._colour_by, mode)
 
     def choose_ends(self, low: int, high: int) -> None:
         """Spread the colours over a part of all values, in percent; 0 to 100 follows the values again."""

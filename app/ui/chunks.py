@@ -80,10 +80,15 @@ class MapChunks:
         self._view = View()
         self._coloured: tuple[Limits | None, Limits | None] = None, None
         self._fixed: dict[str, Limits] = {}
+        self._limits: dict[str, Limits] = {}
         self._start_ns = 0
 
     @property
     def limits(self) -> dict[str, Limits]:
+        """Ends of the colour maps as drawn, by mode."""
+        return self._limits
+
+    def _of_keyframes(self) -> dict[str, Limits]:
         return self._drawn[-1].limits if self._drawn else self._fixed
 
     @property
@@ -95,6 +100,7 @@ class MapChunks:
         self._keep(0)
         self._start_ns = start_ns
         self._fixed = {name: mode.fixed(duration_s) for name, mode in MODES.items() if mode.fixed is not None}
+        self._limits = self._fixed
 
     def draw(self, chunks: tuple[Chunk, ...], poses: F64, view: View, eyes: F64 = _NO_EYES) -> None:
         """Show these keyframes: remove, add, thin, move and colour those that differ from what is drawn.
@@ -108,11 +114,14 @@ class MapChunks:
         moved = self._move(poses[: len(chunks), :3])
         for chunk, T in zip(chunks[known:], self._T_map_imu[known:], strict=True):
             self._drawn.append(_Drawn(chunk, self._grown(chunk, T), light(chunk.points, T @ chunk.T_imu_lidar)))
-        ends = chosen_ends(self.limits, view.colour_by, view.ends)
-        seen, limits = self._view, (ends.get(view.colour_by), ends.get(INTENSITY))
-        recolour = view.colour_by != seen.colour_by or limits != self._coloured
+        limits = self._of_keyframes() | ({view.colour_by: view.numbers.limits} if view.numbers is not None else {})
+        if limits != self._limits:
+            self._limits = limits
+        ends = chosen_ends(self._limits, view.colour_by, view.ends)
+        seen, used = self._view, (ends.get(view.colour_by), ends.get(INTENSITY))
+        recolour = (view.colour_by, view.numbers, used) != (seen.colour_by, seen.numbers, self._coloured)
         cut = (view.ceilings, view.clip) != (seen.ceilings, seen.clip)
-        self._view, self._coloured = view, limits
+        self._view, self._coloured = view, used
         parts = self._parts(chunks, known, eyes)
         for index, (drawn, chunk) in enumerate(zip(self._drawn, chunks, strict=True)):
             new = index >= known or chunk is not drawn.chunk or parts[index] != drawn.part
@@ -160,9 +169,10 @@ class MapChunks:
         return moved
 
     def _grown(self, chunk: Chunk, T_map_imu: F64) -> dict[str, Limits]:
-        limits, cloud = self.limits, self._cloud(chunk, T_map_imu)
+        limits, cloud = self._of_keyframes(), self._cloud(chunk, T_map_imu)
         for name, mode in MODES.items():
-            wider = grown(limits.get(name), mode, mode.values(cloud)) if mode.fixed is None else None
+            of_each = mode.fixed is None and not mode.of_map
+            wider = grown(limits.get(name), mode, mode.values(cloud)) if of_each else None
             if wider is not None and wider != limits.get(name):
                 limits = {**limits, name: wider}
         return limits
@@ -189,6 +199,8 @@ class MapChunks:
             T_map_imu @ chunk.T_imu_lidar,
             (chunk.stamp_ns - self._start_ns) * 1e-9,
             light,
+            chunk.index,
+            self._view.numbers.of(chunk)[shown] if self._view.numbers is not None else None,
         )
 
     def _shown(self, drawn: _Drawn, T_map_imu: F64) -> PointSet:

@@ -1,7 +1,7 @@
 """Colours of points: by label, or by a number through a perceptually uniform map. `MODES` declares every mode."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -28,6 +28,10 @@ _ANCHORS: Final[dict[str, str]] = {
     "plasma": "7e03a8 a92395 cc4778 e56b5d f89540 fdc527 f0f921",
     "cividis": "3b496c 575d6d 707173 8a8678 a59c74 c3b369 e1cc55 fee838",
     "magma": "812581 b5367a e55964 fb8761 fec287 fcfdbf",
+    # From behind to in front, grey between them: seen on a dark and on a light page.
+    "sides": "2f62d9 5f8ae0 94aed8 b0b4ba d9a58c d9704f c8321f",
+    # Neighbours in the list of keyframes get colours far apart.
+    "wheel": "e0564f d9913a c9c23c 6cc24a 3fc1a5 4aa3dc 6f74e0 b565d9 e0569a e0564f",
 }
 
 
@@ -41,6 +45,8 @@ def _table(anchors: str) -> U8:
 TABLES: Final[dict[str, U8]] = {name: _table(anchors) for name, anchors in _ANCHORS.items()}
 """(256, 3) uint8 per map, from the lowest value to the highest."""
 
+NOTHING: Final[Rgb] = (92, 100, 114)
+"""Of points without a number."""
 _LABEL_TABLE: Final[U8] = np.array([LABEL_COLOURS[label] for label in range(3)], dtype=np.uint8)
 
 
@@ -59,6 +65,7 @@ class PointSet:
     Attributes:
         points: (n, 3) m, LiDAR frame. labels, intensity, ring: (n,). T_map_lidar: (4, 4).
         seconds: of the scan, since the recording's start. light: (n,) brightness up to 1, or None.
+        keyframe: its index, or -1. numbers: (n,) what `app.ui.map_numbers` knows of the points, or None.
     """
 
     points: F32
@@ -68,6 +75,8 @@ class PointSet:
     T_map_lidar: F64
     seconds: float
     light: F32 | None = None
+    keyframe: int = -1
+    numbers: F32 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +88,7 @@ class ColourMode:
         values: (n,) the number of each point. step: limits that are read from the data grow by it, so that the map is
             rarely coloured again. share: percent of the values that the limits leave out at each end.
         fixed: limits known beforehand, from the recording's duration in s; None: read from the data.
+        of_map: a point's number depends on the whole map (`app.ui.map_numbers`).
     """
 
     name: str
@@ -88,16 +98,29 @@ class ColourMode:
     step: float = 1.0
     share: float = 0.0
     fixed: Callable[[float], Limits] | None = None
+    of_map: bool = False
 
 
 def _height(cloud: PointSet) -> F64:
     return np.asarray(cloud.points @ cloud.T_map_lidar[2, :3] + cloud.T_map_lidar[2, 3], dtype=np.float64)
 
 
+def _numbers(cloud: PointSet) -> F32:
+    return cloud.numbers if cloud.numbers is not None else np.full(len(cloud.points), np.nan, np.float32)
+
+
+def _own_colour(cloud: PointSet) -> F64:
+    """Far from that of the keyframes before and after: the golden ratio is the worst to approximate by fractions."""
+    return np.full(len(cloud.points), cloud.keyframe * 0.618034 % 1.0 if cloud.keyframe >= 0 else np.nan)
+
+
 LABEL: Final = "label"
 """The mode without numbers: each label has its colour."""
 HEIGHT: Final = "height"
 INTENSITY: Final = "intensity"
+DENSITY: Final = "density"
+DISTANCE: Final = "distance"
+KEYFRAME: Final = "keyframe"
 LOOK: Final = "height × intensity"
 """The usual mode: colour by height, brightness by intensity, and the labels as a tint."""
 BY_POSE: Final = (HEIGHT, LOOK)
@@ -120,6 +143,9 @@ MODES: Final[dict[str, ColourMode]] = {
             lambda cloud: np.full(len(cloud.points), cloud.seconds),
             fixed=lambda duration: Limits(0.0, max(duration, 1.0)),
         ),
+        ColourMode(KEYFRAME, "each its own colour", "wheel", _own_colour, fixed=lambda _: Limits(0.0, 1.0)),
+        ColourMode(DENSITY, "points within 25 cm", "viridis", _numbers, of_map=True),
+        ColourMode(DISTANCE, "m in front", "sides", _numbers, of_map=True),
     )
 }
 """Every other mode, in the order shown."""
@@ -133,6 +159,8 @@ def colours(cloud: PointSet, by: str, limits: Mapping[str, Limits]) -> U8:
     if by != LABEL and by in limits:
         values = value_colours(MODES[by].values(cloud), limits[by], TABLES[MODES[by].table])
         found = _tinted(values, found, cloud, limits[INTENSITY]) if by == LOOK else values
+    elif by != LABEL and MODES[by].of_map:
+        found[:] = NOTHING
     if cloud.light is None or by not in (LOOK, LABEL):
         return found
     return np.asarray(found * cloud.light[:, None], dtype=np.uint8)
@@ -153,9 +181,12 @@ def label_colours(labels: U8) -> U8:
 
 
 def value_colours(values: npt.ArrayLike, limits: Limits, table: U8) -> U8:
-    """(n,) numbers -> (n, 3) colours; values beyond the limits take the colour of the nearer end."""
+    """(n,) numbers -> (n, 3) colours; values beyond the limits take the colour of the nearer end, nan is grey."""
     scaled = (np.asarray(values, dtype=np.float32) - limits.low) * (255.0 / (limits.high - limits.low))
-    found: U8 = table[np.nan_to_num(np.clip(scaled, 0.0, 255.0), nan=0.0).astype(np.uint8)]
+    known = np.isfinite(scaled)
+    found: U8 = table[np.where(known, np.clip(scaled, 0.0, 255.0), 0.0).astype(np.uint8)]
+    if not known.all():
+        found[~known] = NOTHING
     return found
 
 
@@ -180,16 +211,41 @@ def chosen_ends(limits: Mapping[str, Limits], by: str, ends: Limits | None) -> M
     return limits if ends is None else {**limits, by: ends}
 
 
-def legend(by: str, limits: Limits | None, ends: Limits | None = None) -> str:
+@dataclass(frozen=True, slots=True, eq=False)
+class Key:
+    """What colours mean.
+
+    Attributes:
+        stops: (k, 3) from the value `low` to `high`, of `what`; none where colours stand for no numbers.
+        names: of single colours.
+    """
+
+    stops: U8 = field(default_factory=lambda: np.empty((0, 3), np.uint8))
+    low: str = ""
+    what: str = ""
+    high: str = ""
+    names: tuple[tuple[Rgb, str], ...] = ()
+
+
+def key(by: str, limits: Limits | None, ends: Limits | None = None) -> Key:
     """What the colours mean. limits: of all values, None before there are any. ends: as chosen by the user."""
+    names = tuple((LABEL_COLOURS[label], name) for label, name in LABEL_NAMES.items()) if by in (LABEL, LOOK) else ()
     if by == LABEL:
-        return panel("keys", [(LABEL_COLOURS[label], name) for label, name in LABEL_NAMES.items()])
-    mode = MODES[by]
-    what = "height · m" if by == LOOK else f"{mode.name} · {mode.legend}"
-    stops, keys = TABLES[mode.table][::32], legend(LABEL, None) if by == LOOK else ""
-    if limits is None:
-        return panel("colour_bar", stops, "", what, "") + keys
+        return Key(names=names)
+    mode, shown = MODES[by], ends or limits
+    low, high = (f"{shown.low:.3g}", f"{shown.high:.3g}") if shown is not None and by != KEYFRAME else ("", "")
+    return Key(TABLES[mode.table], low, "height · m" if by == LOOK else f"{mode.name} · {mode.legend}", high, names)
+
+
+def legend(by: str, limits: Limits | None, ends: Limits | None = None) -> str:
+    """HTML of the key, with the same arguments. The ends of its bar can be dragged."""
+    found = key(by, limits, ends)
+    names, stops = panel("keys", found.names) if found.names else "", found.stops[::32]
+    if not len(stops):
+        return names
+    if limits is None or by == KEYFRAME:
+        return panel("colour_bar", stops, "", found.what, "") + names
     shown = ends or limits
     shares = [round(100 * (end - limits.low) / (limits.high - limits.low)) for end in (shown.low, shown.high)]
     low, high = (min(max(share, 0), 100) for share in shares)
-    return panel("colour_ends", stops, f"{shown.low:.3g}", what, f"{shown.high:.3g}", low, high) + keys
+    return panel("colour_ends", stops, found.low, found.what, found.high, low, high) + names

@@ -14,6 +14,7 @@ from app.server.protocol import Chunk, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Overrule
 from app.slam.types import F32, F64
+from app.ui.measure_maths import around
 
 _least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
 MOST_ROWS: Final = 100
@@ -87,7 +88,7 @@ def centre_of_sphere(chunks: tuple[Chunk, ...], poses: F64, spot: Spot, radius: 
     """
     T = poses[spot.keyframe]
     at = T[:3, :3] @ spot.at + T[:3, 3]
-    points = _around(chunks, poses, at, 2.5 * radius)
+    points = around(chunks, poses, at, 2.5 * radius)
     behind = at + radius * (at - T[:3, 3]) / np.linalg.norm(at - T[:3, 3])
 
     def off(centre: F64) -> F64:
@@ -104,14 +105,3 @@ def centre_of_sphere(chunks: tuple[Chunk, ...], poses: F64, spot: Spot, radius: 
     raise HemislamError(
         f"The points there do not form a sphere of {radius:g} m radius; click its middle, or pick a point instead."
     )
-
-
-def _around(chunks: tuple[Chunk, ...], poses: F64, place: F64, radius: float) -> F64:
-    """(n, 3) points of the map within a radius (m) of a place."""
-    found = [np.empty((0, 3))]
-    for chunk in chunks:
-        T = poses[chunk.index] @ chunk.T_imu_lidar
-        own = (place - T[:3, 3]) @ T[:3, :3]
-        near = np.linalg.norm(chunk.points - own, axis=1) < radius
-        found.append(chunk.points[near] @ T[:3, :3].T + T[:3, 3])
-    return np.concatenate(found)

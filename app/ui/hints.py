@@ -36,6 +36,10 @@ HINTS: Final[dict[str, str]] = {
     "in both": "Points that both call ground.",
     "frame, mean of A → B": "Mean time of a frame in A and in B, in ms.",
     "error to truth, RMS of A → B": "Distance to the truth in A and in B, RMS in cm.",
+    # another map
+    "median": "Half of the points lie farther in front of the other map, in cm.",
+    "half within": "Half of the points are nearer to the other map's surface, in cm.",
+    "95 % within": "Of twenty points 19 are nearer to the other map's surface, in cm.",
     # a point
     "label": "What the point was labelled: ground, seed or not ground.",
     "ring": "Scan line of the point; 0 is the outermost.",

@@ -11,6 +11,7 @@ from app.georeference.reference import GeoReference
 from app.mapping.session_file import Measure, Spot
 from app.server.protocol import DropMeasure, KeepMeasure, RenameMeasure, Snapshot
 from app.slam.types import F64
+from app.ui.corners import snapped
 from app.ui.html import panel
 from app.ui.measure_maths import Numbers, as_csv, meet, numbers, places, words
 from app.ui.nodes import add_exact_points, add_lines, segments
@@ -42,6 +43,9 @@ class MeasurePanel:
         self._name = gui.add_text("name", "", hint="Of the next measure; empty: a number.")
         kinds = gui.add_button_group("measure", (*_SPOTS, STOP), hint="Then click points of the map.")
         kinds.on_click(by_user(lambda kind, _: self.begin(kind)))
+        self._snap = gui.add_checkbox(
+            "snap to corners", False, hint="A click near a corner means where the surfaces around meet; else an edge."
+        )
         self._asked = gui.add_html("", visible=False)
         self._bridge = Bridge(gui, "measures", self._act)
         self._list = gui.add_html("", visible=False)
@@ -69,6 +73,8 @@ class MeasurePanel:
         kind = self._kind
         if click is not None and kind != STOP and view.map:
             spot = meet(current.chunks, poses, *click, ceilings=view.ceilings, clip=view.clip)
+            if spot is not None and self._snap.value:
+                spot = snapped(current.chunks, poses, spot)
             if spot is not None and self._kind == kind:  # meanwhile the user may have chosen another
                 self._take(kind, spot, current)
         kept = [(measure, places(measure, poses)) for measure in current.measures]

@@ -14,8 +14,8 @@ from app.slam.text_files import csv_text
 from app.slam.types import F32, F64, NON_GROUND
 from app.ui.chunks import as_mask, shown_points
 
-_DEEP_M: Final = 0.1
-"""So far behind the nearest point that a click meets, others may be the one that was meant."""
+_GAP_M: Final = 0.2
+"""Points that a click meets are of one surface as long as each lies no farther behind the one before it."""
 _AROUND_M: Final = (0.3, 1.0)
 """Where ground is looked for below a point: so far beside it, or else so far."""
 _FLOOR_M: Final = 0.3
@@ -68,7 +68,8 @@ def meet(
             found.append((along[hit], aside[hit] / along[hit], chunk, chunk.points[hit]))
     if not found:
         return None
-    front = min(float(along.min()) for along, *_ in found) + _DEEP_M
+    every = np.sort(np.concatenate([along for along, *_ in found]))
+    front = every[np.argmax(np.append(np.diff(every), np.inf) > _GAP_M)]  # of a wall along the ray, to its far end
     best = [np.where(along <= front, off, np.inf) for along, off, *_ in found]
     which = int(np.argmin([one.min() for one in best]))
     chunk, points = found[which][2:]
@@ -123,6 +124,17 @@ def height(place: F64, chunks: tuple[Chunk, ...], poses: F64) -> float:
 def _ground(chunk: Chunk, T_map_imu: F64) -> npt.NDArray[np.floating]:
     T = T_map_imu @ chunk.T_imu_lidar
     return np.asarray(chunk.points[chunk.labels != NON_GROUND] @ T[:3, :3].T + T[:3, 3])
+
+
+def around(chunks: tuple[Chunk, ...], poses: F64, place: F64, radius: float) -> F64:
+    """(n, 3) points of the map within a radius (m) of a place."""
+    found = [np.empty((0, 3))]
+    for chunk in chunks:
+        T = poses[chunk.index] @ chunk.T_imu_lidar
+        own = (place - T[:3, 3]) @ T[:3, :3]
+        near = np.linalg.norm(chunk.points - own, axis=1) < radius
+        found.append(chunk.points[near] @ T[:3, :3].T + T[:3, 3])
+    return np.concatenate(found)
 
 
 def words(at: F64, found: Numbers, where: GeoReference | None = None) -> str:

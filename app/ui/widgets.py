@@ -15,6 +15,7 @@ from app.server.protocol import Command, Snapshot
 from app.slam import lie
 from app.slam.types import F64
 from app.ui.colours import LOOK, Limits
+from app.ui.map_numbers import MapNumbers
 
 SCENE_PERIOD_S: Final = 1 / 15
 PANEL_PERIOD_S: Final = 1 / 4
@@ -37,6 +38,7 @@ class View:
         light: a light background. tuning: the map stands back behind the present scan.
         ends: of the colour map, where the user chose them. clip: outside which points are hidden.
         slab: m, how wide the profile along the walk is that is shown instead of the map; 0: none is.
+        numbers: those of the points that `colour_by` shows, where they depend on the whole map.
     """
 
     colour_by: str = LOOK
@@ -55,6 +57,7 @@ class View:
     ends: Limits | None = None
     clip: Box | None = None
     slab: float = 0.0
+    numbers: MapNumbers | None = None
 
     @property
     def map_point_size(self) -> float:

@@ -32,9 +32,11 @@ from app.ui.georeference import GeoreferencePanel
 from app.ui.html import render
 from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
+from app.ui.map_compare import MapComparePanel
 from app.ui.measure import MeasurePanel
 from app.ui.notes import NotesPanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
+from app.ui.pictures import PicturesPanel
 from app.ui.readouts import ReadoutPanel
 from app.ui.scale import Looks, ScaleBars
 from app.ui.scene import Scene
@@ -121,10 +123,16 @@ class Workbench:
         with tabs.add_tab("View", viser.Icon.EYE):
             self._appearance = AppearancePanel(gui, legend, Looks(server))
             self._camera = CameraPanel(page, self._scene.framing, self._appearance.look_freely)
+            with gui.add_folder("Pictures", expand_by_default=False):
+                self._pictures = PicturesPanel(
+                    page, results, lambda: (self._appearance.key, self._appearance.view.light)
+                )
             with gui.add_folder("Measure"):
                 self._measure = MeasurePanel(page)
             with gui.add_folder("Clip and section", expand_by_default=False):
                 self._clip = ClipPanel(page, self._measure, self._camera, self._scene.sample, files.ask_where)
+            with gui.add_folder("Distance to another map", expand_by_default=False):
+                self._map_compare = MapComparePanel(page, folders, results, self._appearance.colour_by)
         with tabs.add_tab("Recording", viser.Icon.STETHOSCOPE):
             files.add_buttons()
             self._live = LivePanel(gui)
@@ -143,7 +151,7 @@ class Workbench:
         self._panels = (
             self._transport, self._breakpoints, self._notices, self._header, self._recent, self._timeline,
             self._readouts, self._doctor, self._calibration, self._live, self._files, self._camera,
-            self._tune, self._georeference, self._clip,
+            self._tune, self._georeference, self._clip, self._map_compare, self._pictures,
         )  # fmt: skip
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
@@ -159,8 +167,8 @@ class Workbench:
     def close(self) -> None:
         """Stop drawing; the page stays as it is until its server stops."""
         self._stop.set()
-        self._calibration.close()
-        self._tune.close()
+        for panel in (self._calibration, self._tune, self._map_compare, self._pictures):
+            panel.close()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
 
@@ -179,7 +187,7 @@ class Workbench:
         """Bring the page up to `current`: the scene first, since changed parameters show there."""
         view = self._study.seen(self._loops.seen(self._appearance.view))
         self._compare.draw(current, view)
-        view = self._clip.seen(current, self._compare.seen(view))
+        view = self._clip.seen(current, self._map_compare.seen(current, self._compare.seen(view)))
         self._draw_scene(current, view)
         self._parameters.draw(self._sides.tuned(current))
         self._loops.draw(current, view)

@@ -16,6 +16,7 @@ from playwright.sync_api import Browser
 
 from app.export import share
 from app.export.results import Results
+from app.slam.frames import READOUTS, Frame
 from app.slam.params import Params
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.types import Cloud, Keyframe
@@ -56,8 +57,11 @@ def test_a_shared_page_opens_from_the_disk_without_a_complaint(chromium: Browser
     page.close()
 
 
-def test_what_was_measured_is_named_with_its_distance(tmp_path: Path) -> None:
+def test_measures_are_named_with_their_distance_and_notes_stand_where_they_were_taken(tmp_path: Path) -> None:
     results = plaza(20)
+    one = Frame(10**18, False, np.array([1.0, 2.0, 3.0]), np.array([0.0, 0, 0, 1]), np.zeros(len(READOUTS)))
+    results.log = RunLog([one])
+    results.notes = ((0, "a loose tile"), (5, "not there yet"))
     results.marks = (
         ("door", ((0, (0.0, 0.0, 0.0)), (1, (3.0, 4.0, 0.0)))),
         ("gone", ((7, (0.0, 0.0, 0.0)),)),
@@ -68,7 +72,8 @@ def test_what_was_measured_is_named_with_its_distance(tmp_path: Path) -> None:
     _, begin, rest = (tmp_path / "share.html").read_text().partition('window.__VISER_EMBED_DATA__="')
     assert begin, "viser's page holds its scene otherwise"
     scene = base64.b64decode(rest.partition('"')[0])
-    assert b"door 5.000 m" in zstandard.ZstdDecompressor().decompressobj().decompress(scene[8:])
+    told = zstandard.ZstdDecompressor().decompressobj().decompress(scene[8:])
+    assert b"door 5.000 m" in told and b"a loose tile" in told and b"not there yet" not in told
 
 
 def test_a_million_points_take_less_than_15_megabytes(tmp_path: Path) -> None:

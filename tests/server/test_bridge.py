@@ -168,6 +168,18 @@ def test_a_file_of_a_sensible_size_arrives(public_site: Site) -> None:
     button.remove()
 
 
+def test_only_a_picture_that_an_owner_s_page_rendered_may_be_large() -> None:
+    large = b"x" * (3 * MOST_BYTES)
+    picture = packed(type="GetRenderResponseMessage", render_uuid="one", payload=large)
+    assert Gate(viewer=False).let(picture) is not None
+    for viewer, message in (
+        (True, picture),
+        (False, packed(type="GuiUpdateMessage", uuid="one", updates={"value": large})),
+    ):
+        with pytest.raises(Refused):
+            Gate(viewer=viewer).let(message)
+
+
 def test_uploads_that_never_end_do_not_pile_up() -> None:
     gate = Gate(viewer=False)
     with pytest.raises(Refused):

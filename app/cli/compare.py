@@ -1,0 +1,68 @@
+"""`hemislam compare`: how far one map lies from another."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from app.cli.options import progress_bar
+
+if TYPE_CHECKING:
+    from app.evaluation.cloud_distance import Comparison
+    from app.slam.types import F64
+
+
+def compare(
+    map_: Annotated[Path, typer.Argument(metavar="MAP", help="A folder of results, or a .ply, .las or .laz.")],
+    other: Annotated[Path, typer.Argument(metavar="OTHER", help="The same, in the same frame.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE.ply", help="Write the points of MAP with their distances.")
+    ] = None,
+    fit: Annotated[
+        bool, typer.Option("--fit", help="Move OTHER onto MAP first; they must lie within 2 m and a few degrees.")
+    ] = False,
+    reach: Annotated[
+        float, typer.Option("--reach", metavar="METRES", min=0.01, max=10.0, help="What is farther is not the same.")
+    ] = 0.5,
+) -> None:
+    """Measure how far one map lies from another.
+
+    Distances are along the surface's normal, positive where MAP lies in front
+    of OTHER: towards the sensor for results, upwards for other files. The
+    smallest distance that is no chance is known for each point.
+
+    \b
+    Examples:
+      hemislam compare runs/walk-1 runs/walk-2
+      hemislam compare runs/walk-1 survey.laz --fit --out changes.ply
+    """
+    from app.evaluation import cloud_distance
+    from app.evaluation.map_comparison import read_map, sentences
+
+    points, sensors = read_map(map_)
+    with progress_bar("Comparing", total=1.0, bar_format="{desc}: {percentage:3.0f}% |{bar}| {elapsed}") as show:
+        found = cloud_distance.compare(points, sensors, read_map(other)[0], reach=reach, fit=fit, progress=show)
+    typer.echo(f"median       {100 * found.median:+7.1f} cm")
+    typer.echo(f"half within  {100 * found.typical:7.1f} cm")
+    typer.echo(f"95 % within  {100 * found.p95:7.1f} cm")
+    typer.echo(" ".join(sentences(found, str(other))))
+    if out is not None:
+        _write(out, points, found)
+        typer.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+
+
+def _write(path: Path, points: "F64", found: "Comparison") -> None:
+    import numpy as np
+
+    from app.slam.ply import header
+
+    names = ("x", "y", "z", "distance", "detectable")
+    vertices = np.empty(len(points), [(name, "<f8" if name in "xyz" else "<f4") for name in names])
+    for name, column in zip(names, (*points.T, found.distance, found.detectable), strict=True):
+        vertices[name] = column
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_bytes(header(vertices.dtype, len(vertices), "metres") + vertices.tobytes())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

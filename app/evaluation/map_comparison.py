@@ -1,0 +1,129 @@
+"""Comparing the map of a session with another one, or with itself on the true trajectory, in a process of its own."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from app.child import Link
+from app.evaluation.cloud_distance import REACH_M, THIN_M, Comparison, compare
+from app.evaluation.truth import read_truth
+from app.evaluation.truth_match import match
+from app.export.map_file import MapFile
+from app.export.points import EVERYTHING, Voxels, blocks
+from app.export.read_points import read_points
+from app.georeference.reference import GeoReference
+from app.slam import lie
+from app.slam.errors import HemislamError
+from app.slam.map_frame import MapFrame
+from app.slam.metrics import interpolate, umeyama
+from app.slam.trajectory import Trajectory
+from app.slam.types import F32, F64
+
+_OF_A_GRID_M: Final = 20_000.0
+"""Coordinates beyond this are those of a grid on Earth: no walk is so long."""
+_ABOVE_M: Final = 100.0
+_READ: Final = 0.3
+"""Share of the work that reading the other map is."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframePoints:
+    """A keyframe's points: (n, 3) m, LiDAR frame. stamp_ns: of its pose T_map_imu; T_imu_lidar: (4, 4) as well."""
+
+    points: F32
+    stamp_ns: int
+    T_map_imu: F64
+    T_imu_lidar: F64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapsToCompare:
+    """What is compared with the scans' map.
+
+    Attributes:
+        other: a map (PLY, LAS, LAZ), or, if `by_truth`, the file of the true trajectory.
+        where: on Earth the map is, for other maps in coordinates of a grid. fit, reach: as `compare` has them.
+    """
+
+    scans: tuple[KeyframePoints, ...]
+    other: Path
+    by_truth: bool = False
+    where: GeoReference | None = None
+    fit: bool = False
+    reach: float = REACH_M
+
+
+def find(owner: Link, wanted: MapsToCompare) -> None:
+    """Send the share that is done as it grows, and at the end a `Comparison`, or why there is none, in words."""
+    try:
+        owner.send(_find(owner, wanted))
+    except HemislamError as error:
+        owner.send(str(error))
+
+
+def _find(owner: Link, wanted: MapsToCompare) -> Comparison:
+    poses = np.array([scan.T_map_imu for scan in wanted.scans])
+    points, sensors = placed(wanted.scans, poses)
+    if wanted.by_truth:
+        known, true_poses = _true(wanted, poses)
+        other, _ = placed([scan for scan, is_known in zip(wanted.scans, known, strict=True) if is_known], true_poses)
+    else:
+        other = read_points(wanted.other, THIN_M, lambda share: owner.send(_READ * share))
+        if wanted.where is not None and np.abs(np.median(other, axis=0)).max() > _OF_A_GRID_M:
+            other = wanted.where.from_crs(other)
+    return compare(
+        points, sensors, other, reach=wanted.reach, fit=wanted.fit,
+        progress=lambda share: owner.send(_READ + (1 - _READ) * share),
+    )  # fmt: skip
+
+
+def placed(scans: "tuple[KeyframePoints, ...] | list[KeyframePoints]", poses: F64) -> tuple[F64, F64]:
+    """(n, 3) m, the points in the map by (k, 4, 4) poses T_map_imu, and from where each was seen."""
+    points, sensors = [np.empty((0, 3))], [np.empty((0, 3))]
+    for scan, T_map_imu in zip(scans, poses, strict=True):
+        T = T_map_imu @ scan.T_imu_lidar
+        points.append(scan.points @ T[:3, :3].T + T[:3, 3])
+        sensors.append(np.broadcast_to(T[:3, 3], scan.points.shape))
+    return np.concatenate(points), np.concatenate(sensors)
+
+
+def read_map(path: Path) -> tuple[F64, F64]:
+    """(n, 3) m, the points of a results folder or a file, thinned, and from where each was seen: a file's from above.
+
+    Raises:
+        HemislamError: it holds no map.
+    """
+    if not path.is_dir():
+        read = read_points(path, THIN_M)
+        return read, read + np.array([0.0, 0.0, _ABOVE_M])
+    voxels, points, sensors = Voxels(THIN_M), [np.empty((0, 3))], [np.empty((0, 3))]
+    for block in blocks(MapFile(path / "map.ply"), MapFrame(), EVERYTHING):
+        points.append(block.points[voxels.new(block.points)])
+        sensors.append(np.broadcast_to(block.T_map_lidar[:3, 3], points[-1].shape))
+    return np.concatenate(points), np.concatenate(sensors)
+
+
+def sentences(found: Comparison, name: str) -> list[str]:
+    """What a comparison with a map of this name says beside its distances."""
+    moved = float(np.linalg.norm(found.T[:3, 3]))
+    turned = float(np.degrees(np.linalg.norm(lie.log(found.T[:3, :3]))))
+    return [
+        f"To {name}.",
+        f"{100 * found.changed:.0f} % differ by more than chance.",
+        f"{100 * (1 - found.covered):.0f} % have no counterpart within reach.",
+        *([f"It was moved by {moved:.2f} m and {turned:.1f}° first."] if moved or turned else []),
+    ]
+
+
+def _true(wanted: MapsToCompare, poses: F64) -> tuple[np.ndarray, F64]:
+    """(k,) which scans have a true pose, and those poses in the map, aligned to the estimated ones."""
+    stamps_ns = np.array([scan.stamp_ns for scan in wanted.scans], np.int64)
+    estimate = Trajectory.from_poses(stamps_ns, poses)
+    truth = match(read_truth(str(wanted.other)), estimate).trajectory
+    there, known = interpolate(truth, stamps_ns)
+    if np.count_nonzero(known) < 3:
+        raise HemislamError(f"{wanted.other.name} has fewer than 3 poses within the time of the map.")
+    T_map_truth = umeyama(there.positions, estimate.chosen(known).positions)
+    return known, np.array([T_map_truth @ T for T in there.poses])

@@ -1,0 +1,168 @@
+"""Distance of the map to another one: chosen from the disk or made by the truth, in colours and as a histogram."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import viser
+
+from app.child import Child, ChildDied
+from app.evaluation.cloud_distance import REACH_M, Comparison
+from app.evaluation.map_comparison import KeyframePoints, MapsToCompare, find, sentences
+from app.export.read_points import CLOUDS
+from app.server.folders import Folders
+from app.server.protocol import Chunk, Snapshot
+from app.ui.colours import DENSITY, DISTANCE, MODES, TABLES, Limits, value_colours
+from app.ui.files import FileList
+from app.ui.html import Tile, number, panel
+from app.ui.map_numbers import Density, MapNumbers
+from app.ui.widgets import Changes, Page, View, by_user, dialog, notify_error, poses_of
+
+_BINS: Final = 41
+_LEAST_M: Final = 0.005
+"""The colours spread over at least so much to either side."""
+_WHAT: Final = "How far each point of the map lies in front of the surface of another map, or behind it."
+_OLD: Final = "The map has changed since; what has no distance yet is grey. Compare again."
+
+
+class MapComparePanel:
+    """Widgets in the caller's container; what they find colours the map.
+
+    Args:
+        results: folder below which results are saved. colour_by: chooses a colour mode.
+    """
+
+    def __init__(self, page: Page, folders: Folders, results: Path, colour_by: Callable[[str], None]) -> None:
+        gui = page.gui
+        self._page, self._folders, self._results, self._colour_by = page, folders, results, colour_by
+        self._child: Child | None = None
+        self._chunks: tuple[Chunk, ...] = ()  # that were compared last
+        self._name, self._share = "", 0.0
+        self._comparison: Comparison | None = None
+        self._distance: MapNumbers | None = None
+        self._density = Density(page.now)
+        self._changes = Changes()
+        gui.add_html(panel("quiet", _WHAT))
+        self._found = gui.add_html("", visible=False)
+        self._choose = gui.add_button("Choose a map…", icon=viser.Icon.FOLDER_OPEN, color="gray", hint="PLY, LAS, LAZ.")
+        self._truth = gui.add_button(
+            "The map by the truth",
+            icon=viser.Icon.ROUTE,
+            color="gray",
+            visible=False,
+            hint="The same scans, put where the true trajectory has them.",
+        )
+        self._fit = gui.add_checkbox(
+            "fit it first", False, hint="Move the other map onto this one; they must lie within 2 m and a few degrees."
+        )
+        self._reach = gui.add_number(
+            "reach (m)", REACH_M, min=0.05, max=5.0, step=0.05, hint="What is farther has no counterpart."
+        )
+        self._progress = gui.add_progress_bar(0.0, visible=False)
+        self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
+        self._choose.on_click(by_user(lambda _, client: self._browse(client)))
+        self._truth.on_click(by_user(lambda _, client: self._by_truth(client)))
+        self._stop.on_click(by_user(lambda _, __: self.close()))
+
+    def seen(self, current: Snapshot, view: View) -> View:
+        """The view with the numbers that its colour mode needs."""
+        if view.colour_by == DENSITY:
+            return replace(view, numbers=self._density.of(current.chunks, poses_of(current)))
+        return replace(view, numbers=self._distance) if view.colour_by == DISTANCE else view
+
+    def draw(self, current: Snapshot) -> None:
+        self._receive()
+        running, recording = self._child is not None, current.recording
+        self._choose.disabled = self._truth.disabled = running or not current.chunks
+        self._truth.visible = recording is not None and recording.truth is not None
+        self._progress.visible = self._stop.visible = running
+        old = self._distance is not None and current.chunks is not self._chunks
+        if self._changes(self._comparison, old, int(100 * self._share)):
+            self._progress.value = 100 * self._share  # type: ignore[misc]  # mypy overlooks viser's setter
+            self._found.visible = self._comparison is not None
+            if self._comparison is not None:
+                self._found.content = told(self._comparison, self._name, [_OLD] if old else [])
+
+    def close(self) -> None:
+        """End what is under way."""
+        child, self._child = self._child, None
+        if child is not None:
+            child.close(0.0)
+
+    def _browse(self, client: viser.ClientHandle) -> None:
+        folders = Folders([*self._folders.roots, *([self._results] if self._results.is_dir() else [])])
+        with dialog(client, "Compare with a map") as close:
+            nothing = "No maps (.ply, .las, .laz) here. “Save results…” writes one."
+            FileList(client.gui, folders, CLOUDS, nothing, lambda path: self._begin(folders.inside(path)), close)
+
+    def _by_truth(self, client: viser.ClientHandle) -> None:
+        recording = self._page.snapshot().recording
+        if recording is not None and recording.truth is not None:
+            self._begin(recording.truth, by_truth=True)
+
+    def _begin(self, other: Path, *, by_truth: bool = False) -> None:
+        current = self._page.snapshot()
+        if self._child is not None or not current.chunks:
+            return
+        poses, found = poses_of(current), current.earth.found
+        scans = tuple(
+            KeyframePoints(chunk.points, chunk.stamp_ns, poses[chunk.index], chunk.T_imu_lidar)
+            for chunk in current.chunks
+        )
+        where = found.reference if found is not None else None
+        wanted = MapsToCompare(
+            scans, other, by_truth, where, self._fit.value and not by_truth, float(self._reach.value)
+        )
+        self._chunks, self._name, self._share = current.chunks, "the truth" if by_truth else other.name, 0.0
+        self._child = Child(find, wanted, name="compare", title="The comparison", fork=True, grace_s=0.0)
+
+    def _receive(self) -> None:
+        while (child := self._child) is not None:
+            try:
+                message = child.receive(0.0)
+            except ChildDied as death:
+                message = str(death)
+            if child is not self._child:
+                return  # stopped meanwhile
+            match message:
+                case None:
+                    return
+                case float():
+                    self._share = message
+                case Comparison():
+                    self.close()
+                    self._comparison = message
+                    self._distance = MapNumbers.split(self._chunks, message.distance, _limits(message))
+                    self._colour_by(DISTANCE)
+                case sentence:
+                    self.close()
+                    for client in self._page.server.get_clients().values():
+                        notify_error(client, sentence)
+
+
+def _limits(found: Comparison) -> Limits:
+    """Alike to both sides, so that grey is no distance."""
+    end = round(max(float(np.nan_to_num(found.p95)), _LEAST_M), 3)
+    return Limits(-end, end)
+
+
+def told(found: Comparison, name: str, notes: list[str]) -> str:
+    """A comparison in numbers, and a histogram of its distances in the colours of the map."""
+    limits = _limits(found)
+    counts, edges = np.histogram(np.clip(found.known, limits.low, limits.high), _BINS, (limits.low, limits.high))
+    colours = value_colours((edges[:-1] + edges[1:]) / 2, limits, TABLES[MODES[DISTANCE].table])
+    bars = [
+        (tuple(rgb), share)
+        for rgb, share in zip(colours.tolist(), (counts / max(counts.max(), 1)).tolist(), strict=True)
+    ]
+    tiles = [
+        Tile("median", f"{100 * found.median:+.1f}", "cm"),
+        Tile("half within", number(100 * found.typical, 1), "cm"),
+        Tile("95 % within", number(100 * found.p95, 1), "cm"),
+    ]
+    words = [*sentences(found, name), *notes]
+    alt = f"Distances to {name}, from {100 * limits.low:.1f} to {100 * limits.high:.1f} cm"
+    low, high = (f"{100 * end:+.1f} cm" for end in (limits.low, limits.high))
+    return panel("compared", tiles, words) + panel("histogram", bars, low, high, alt)

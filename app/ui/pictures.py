@@ -1,0 +1,192 @@
+"""Pictures of the scene at any size, and a flight along the path as a series of pictures."""
+
+import io
+import threading
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import viser
+
+from app.server.protocol import Snapshot
+from app.slam.errors import HemislamError
+from app.slam.types import U8
+from app.ui.colours import Key
+from app.ui.files import result_folder_name, size_text
+from app.ui.html import panel
+from app.ui.picture_maths import Station, composed, flight
+from app.ui.widgets import Changes, Page, by_user, notify_error
+
+_LARGEST: Final = 8192
+_MOST_PIXELS: Final = 6144 * 4096
+"""What the browser sends must fit into a message (`app.server.access.MOST_OF_PICTURE`)."""
+_PATIENCE_S: Final = 120.0
+_RATE: Final = 25
+"""Pictures in a second of a flight."""
+_WAYS: Final = {"the walker's eyes": (0.0, 0.0), "behind and above": (5.0, 3.0)}
+"""How far behind the path and above it, m."""
+_MOST_SENT: Final = 500_000_000
+
+
+class PicturesPanel:
+    """Widgets in the caller's container.
+
+    Args:
+        results: folder below which flights are saved. key: what the colours mean now, and whether the page is light.
+    """
+
+    def __init__(self, page: Page, results: Path, key: Callable[[], tuple[Key, bool]]) -> None:
+        gui = page.gui
+        self._page, self._results, self._key = page, results, key
+        self._flying: threading.Thread | None = None
+        self._stopped = threading.Event()
+        self._share, self._saved = 0.0, Path()
+        self._changes = Changes()
+        self._width = gui.add_number("width", 1920, min=64, max=_LARGEST, step=1, hint="Pixels.")
+        self._height = gui.add_number("height", 1080, min=64, max=_LARGEST, step=1, hint="Pixels.")
+        self._explain = gui.add_checkbox("with legend and scale", True)
+        shoot = gui.add_button("Take a picture", icon=viser.Icon.CAMERA, color="gray", hint="A PNG of this view.")
+        shoot.on_click(by_user(lambda _, client: self._told(client, self._shoot)))
+        self._way = gui.add_dropdown("fly with", tuple(_WAYS))
+        self._seconds = gui.add_number("seconds", 20.0, min=1.0, max=600.0, step=1.0, hint=f"{_RATE} pictures each.")
+        self._start = gui.add_button(
+            "Fly along the path",
+            icon=viser.Icon.MOVIE,
+            color="gray",
+            hint="Numbered PNGs in a zip file, in this size. Keep this tab in front.",
+        )
+        self._progress = gui.add_progress_bar(0.0, visible=False)
+        self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
+        self._where = gui.add_html("", visible=False)
+        self._download = gui.add_button("Download the flight", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
+        self._start.on_click(by_user(lambda _, client: self._told(client, self._fly)))
+        self._stop.on_click(by_user(lambda _, __: self._stopped.set()))
+        self._download.on_click(by_user(lambda _, client: self._send(client)))
+
+    def draw(self, snapshot: Snapshot) -> None:
+        flying = self._flying is not None and self._flying.is_alive()
+        path = snapshot.trajectory
+        self._start.disabled = flying or path is None or len(path) < 2
+        if self._changes(flying, int(100 * self._share), str(self._saved)):
+            self._progress.visible = self._stop.visible = flying
+            self._progress.value = 100 * self._share  # type: ignore[misc]  # mypy overlooks viser's setter
+            done = not flying and self._saved.is_file()
+            self._where.visible = self._download.visible = done
+            if done:
+                self._where.content = panel("path", "Saved as ", str(self._saved))
+
+    def close(self) -> None:
+        """Stop flying."""
+        self._stopped.set()
+
+    # --- one picture -----------------------------------------------------------------------------
+    def _size(self) -> tuple[int, int]:
+        width, height = int(self._width.value), int(self._height.value)
+        if width * height > _MOST_PIXELS:
+            raise HemislamError(f"{width} × {height} are more pixels than a browser renders; choose a smaller size.")
+        return width, height
+
+    def _shoot(self, client: viser.ClientHandle) -> None:
+        camera, (key, light) = client.camera, self._key()
+        rendered = self._rendered(client, None)
+        away = float(np.linalg.norm(np.array(camera.position) - camera.look_at))
+        seen_m = 2 * away * float(np.tan(camera.fov / 2))
+        picture = (
+            composed(rendered, key, light=light, seen_m=seen_m)
+            if self._explain.value
+            else composed(rendered, Key(), light=light)
+        )
+        file = io.BytesIO()
+        picture.save(file, "PNG", compress_level=3)
+        client.send_file_download(f"{self._name()}.png", file.getvalue(), save_immediately=True)
+
+    def _rendered(self, client: viser.ClientHandle, station: Station | None) -> U8:
+        """(h, w, 4) what the browser sees from a station, or from where its camera is.
+
+        Raises:
+            HemislamError: it sends no picture.
+        """
+        width, height = self._size()
+        camera = client.camera
+        if station is None:
+            station = Station(np.array(camera.position), np.array(camera.wxyz), camera.fov)
+        try:
+            rendered: U8 = client.get_render(
+                height,
+                width,
+                position=station.position,
+                wxyz=station.wxyz,
+                fov=station.fov,
+                transport_format="png",
+                timeout=_PATIENCE_S,
+            )
+            return rendered
+        except TimeoutError:
+            raise HemislamError(
+                "The browser sent no picture in time; keep its tab in front, or choose a smaller size."
+            ) from None
+        except RuntimeError:
+            raise HemislamError("The browser could not render this; choose a smaller size.") from None
+
+    def _name(self) -> str:
+        recording = self._page.snapshot().recording
+        return result_folder_name(recording.path if recording else Path("map"), datetime.now())
+
+    # --- a flight --------------------------------------------------------------------------------
+    def _fly(self, client: viser.ClientHandle) -> None:
+        path = self._page.snapshot().trajectory
+        if path is None or len(path) < 2 or (self._flying is not None and self._flying.is_alive()):
+            return
+        self._size()
+        stations = flight(path, round(_RATE * self._seconds.value), *_WAYS[self._way.value])
+        file = self._results / "flights" / f"{self._name()}.zip"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        self._share = 0.0
+        self._stopped.clear()
+        self._flying = threading.Thread(
+            target=self._told, args=(client, lambda client: self._take(client, stations, file)), daemon=True
+        )
+        self._flying.start()
+
+    def _take(self, client: viser.ClientHandle, stations: list[Station], file: Path) -> None:
+        """Write the pictures one after the other. If it is stopped, nothing is left."""
+        part, (key, light) = file.with_suffix(".part"), self._key()
+        try:
+            with zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as pictures:
+                for number, station in enumerate(stations, 1):
+                    here = replace(station, position=station.position + self._page.offset())
+                    rendered = self._rendered(client, here)
+                    if self._stopped.is_set():
+                        return
+                    picture = composed(rendered, key if self._explain.value else Key(), light=light)
+                    png = io.BytesIO()
+                    picture.save(png, "PNG", compress_level=3)
+                    pictures.writestr(f"{number:05d}.png", png.getvalue())
+                    self._share = number / len(stations)
+            part.replace(file)
+            self._saved = file
+        finally:
+            part.unlink(missing_ok=True)
+
+    def _send(self, client: viser.ClientHandle) -> None:
+        size = self._saved.stat().st_size
+        if size > _MOST_SENT:
+            notify_error(client, f"{size_text(size)} are too much for a download; the file is {self._saved}.")
+            return
+        client.send_file_download(self._saved.name, self._saved.read_bytes(), save_immediately=True)
+
+    def _told(self, client: viser.ClientHandle, act: Callable[[viser.ClientHandle], None]) -> None:
+        """Do something, and tell the browser if it fails."""
+        problem = ""
+        try:
+            act(client)
+        except HemislamError as error:
+            problem = str(error)
+        except OSError as error:
+            problem = f"The pictures cannot be written: {error.strerror or error}."
+        if problem and client.client_id in self._page.server.get_clients():
+            notify_error(client, problem)
