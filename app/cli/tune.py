@@ -108,7 +108,7 @@ def tune(
     from app.tuning.objectives import choose_objectives
     from app.tuning.report import BEST
     from app.tuning.space import parse_dimensions
-    from app.tuning.trial import Trial, front
+    from app.tuning.trial import Trial, advice, front
     from app.tuning.tune import Part, Runs, known_runs
     from app.tuning.tune import tune as find
 
@@ -156,6 +156,8 @@ def tune(
         for trial in shown:
             told = ", ".join(f"{one.title} {one.told(v)}" for one, v in zip(wanted, trial.scores, strict=True))
             typer.echo(f"{label:<10} {told}  ({trial.name}){' ' + trial.error if trial.error else ''}")
+    if told := advice(checked, wanted):
+        typer.echo(told)
     failed = [trial for trial in done if trial.error]
     if failed:
         typer.echo(f"{len(failed)} of {len(done)} trials failed; the first: {failed[0].error}")

@@ -15,7 +15,7 @@ from app.slam.params import nested
 from app.slam.provenance import describe_machine
 from app.slam.text_files import csv_text, write_texts
 from app.tuning.objectives import Objective
-from app.tuning.trial import Trial, front
+from app.tuning.trial import Trial, advice, front
 
 BEST = "best.params.yaml"
 
@@ -128,5 +128,11 @@ def _html(
     ]
     page = Environment(loader=PackageLoader("app.tuning"), autoescape=True, undefined=StrictUndefined)
     return page.get_template("tuning.html").render(
-        version=__version__, trials=trials, best=best, held_back=held_back, objectives=objectives, figures=figures
+        version=__version__,
+        trials=trials,
+        best=best,
+        held_back=held_back,
+        advice=advice(held_back, objectives),
+        objectives=objectives,
+        figures=figures,
     )

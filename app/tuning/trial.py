@@ -51,3 +51,10 @@ def front(trials: Sequence[Trial], objectives: Sequence[Objective]) -> list[Tria
 
     best = [trial for trial in trials if trial.number in costs and not beaten(trial.number)]
     return sorted(best, key=lambda trial: costs[trial.number])
+
+
+def advice(held_back: Sequence[Trial], objectives: Sequence[Objective]) -> str:
+    """A sentence if no setting beats the parameters as given on the part held back; else ""."""
+    if [trial.number for trial in front(held_back, objectives)] != [0]:
+        return ""
+    return "On the part held back nothing is better than the parameters as given: keep them."

@@ -13,7 +13,7 @@ from app.server.protocol import LIVE, Snapshot
 from app.slam.errors import HemislamError
 from app.tuning.objectives import OBJECTIVES
 from app.tuning.process import Ended, Tried, Wanted, find
-from app.tuning.trial import SearchMethod
+from app.tuning.trial import SearchMethod, advice
 from app.ui import tune_maths as maths
 from app.ui.compare import Sides
 from app.ui.html import panel
@@ -120,7 +120,9 @@ class TunePanel:
             return (
                 f"{told} · {self._left(wanted)}" if self._runs else "The first trial runs with the parameters as given."
             )
-        return f"{told} · saved in {wanted.folder}" if found.finished else f"{told} · stopped"
+        if not found.finished:
+            return f"{told} · stopped"
+        return " ".join((f"{told} · saved in {wanted.folder}", advice(found.held_back, self._objectives())))
 
     def _left(self, wanted: Wanted) -> str:
         """By the pace of the newest runs."""

@@ -23,7 +23,7 @@ from app.slam.params import Params
 from app.tuning.objectives import OBJECTIVES
 from app.tuning.process import Ended, Tried, Wanted, find
 from app.tuning.space import grid, parse_dimensions
-from app.tuning.trial import Trial, front
+from app.tuning.trial import Trial, advice, front
 from app.tuning.tune import Part, search
 from tests.cli.conftest import write_walk
 
@@ -90,6 +90,14 @@ def test_the_front_holds_what_no_other_trial_beats() -> None:
     scores = [(1.0, 0.5), (2.0, 0.9), (1.0, 0.6), (3.0, 0.8), (0.5, None), (1.0, 0.6)]
     trials = [Trial(number, {}, pair) for number, pair in enumerate(scores)]
     assert [trial.number for trial in front(trials, (ATE, F1))] == [2, 1]
+
+
+def test_what_is_better_only_where_it_was_searched_is_not_recommended() -> None:
+    given, worse, better = (Trial(number, {}, (score,)) for number, score in ((0, 1.0), (7, 1.2), (8, 0.9)))
+    assert "keep them" in advice((given, worse), (ATE,))
+    assert "keep them" in advice((given, Trial(7, {}, (1.0,))), (ATE,)), "as good is not better"
+    assert advice((given, better), (ATE,)) == advice((), (ATE,)) == ""
+    assert advice((given, worse), (F1,)) == "", "a greater F1 is better"
 
 
 def test_ranges_come_from_the_declaration_or_are_narrowed() -> None:
