@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops.plan import Window, placements
+from app.slam.loops.plan import EVERYWHERE, Window, placements
 from app.slam.loops.verification import Fit, Prepared, assess, refine, register, rough, slide
 from app.slam.types import F64
 
@@ -53,6 +53,8 @@ def place(
 ) -> Placement:
     """Lay a submap on another.
 
+    If the best alignment is against odometry, odometry cannot rule out others either: they are looked for everywhere.
+
     Args:
         T_guess: (4, 4) of the level frames, by odometry; along a direction that is open, the result stays there.
         deviation: of such a transform from odometry, in standard deviations. most_sigmas: up to which it is allowed.
@@ -69,6 +71,8 @@ def place(
     allowed = [fit for fit in good if deviation(fit.T_target_source) <= most_sigmas] or good
     chosen = max(allowed, key=lambda fit: fit.overlap)
     fit = assess(target, source, refine(target, source, chosen.T_target_source))
+    if window is not EVERYWHERE and deviation(fit.T_target_source) > most_sigmas:
+        return place(target, source, T_guess, EVERYWHERE, deviation, most_sigmas, most_slide)
 
     weakest, second, _ = fit.directions
     slides = slide(target, source, fit, weakest) if fit.overlap else float("inf")

@@ -39,6 +39,9 @@ class Window:
     turn: float
 
 
+EVERYWHERE = Window(FARTHEST_M, np.pi)
+
+
 def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window) -> list[F64]:
     """Alignments (4, 4) T_target_source of the level frames from which to register, the likeliest first."""
     steps = min(int(np.ceil(window.turn / TURN)), round(np.pi / TURN))
