@@ -21,8 +21,11 @@ SURE_M = 0.1
 """If odometry knows its position better than this (standard deviation), places are not searched beside its guess."""
 OPEN_M = 10.0
 """Standard deviation of a registration along a direction that nothing holds."""
-FLOOR_M, FLOOR_RAD = 0.04, np.radians(0.5)
-"""Least standard deviations of a registration, however many points it has."""
+FLOOR_M, FLOOR_YAW, FLOOR_TILT = 0.04, np.radians(0.5), np.radians(1.5)
+"""Least standard deviations of a registration, however many points it has. An error of the mounting tilts clouds to
+another side at another heading; gravity, in the odometry, knows better."""
+NEAR_M = 5.0
+"""Places farther apart are not tied: an error of 1 degree in the mounting moves one by 0.1 m as seen from the other."""
 POINT_M, INDEPENDENT = 0.1, 0.05
 """Standard deviation of a point's distance to a plane, including systematic errors, and the share of points whose
 errors are independent of their neighbours'."""
@@ -103,7 +106,7 @@ def covariance(detector: Detector, newer: int, fit: Fit, along: F64 | None = Non
         along: (3,) unit, axes of the older's level frame; nothing holds it in this direction.
     """
     information = fit.information * (INDEPENDENT / POINT_M**2)
-    level = np.linalg.pinv(information) + np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
+    level = np.linalg.pinv(information) + np.diag([FLOOR_TILT**2] * 2 + [FLOOR_YAW**2] + [FLOOR_M**2] * 3)
     if along is not None:
         level[3:, 3:] += OPEN_M**2 * np.outer(along, along)
     R = (fit.T_target_source @ detector.T_level_imu(newer))[:3, :3]
@@ -117,6 +120,9 @@ def _objection(place: Placement, e: Evidence, p: LoopsParams) -> str:
     fit = place.fit
     if len(fit.residuals) < 100:
         return f"only {len(fit.residuals)} points correspond (least 100)"
+    apart = float(np.linalg.norm(fit.T_target_source[:3, 3]))
+    if apart > NEAR_M:
+        return f"the places are {apart:.1f} m apart (most {NEAR_M:g} m)"
     if e.overlap < p.min_overlap:
         return f"the submaps overlap by {e.overlap:.2f} (least {p.min_overlap:g})"
     if e.residual_rms > p.max_residual:

@@ -14,7 +14,7 @@ from app.slam.loops.factors import Factor, loop_factors
 from app.slam.loops.solvers import optimise
 from app.slam.loops.support import laid, placed, settle
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
-from app.slam.loops.verdicts import FLOOR_M, FLOOR_RAD
+from app.slam.loops.verdicts import FLOOR_M, FLOOR_YAW
 from app.slam.sections import LoopsParams
 from app.slam.types import F64
 from tests.slam.loops.conftest import Walked, accepted
@@ -39,7 +39,7 @@ def loop(older: int, off: F64 | None = None) -> LoopEdge:
     newer = 2 * TURN - 1 - older
     T = lie.inverse(POSES[older]) @ POSES[newer]
     T[:3, 3] += np.zeros(3) if off is None else off
-    covariance = np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
+    covariance = np.diag([FLOOR_YAW**2] * 3 + [FLOOR_M**2] * 3)
     return LoopEdge(older, newer, newer, T, covariance, Evidence(), Verdict.ACCEPTED, "")
 
 
@@ -290,13 +290,13 @@ def test_along_a_direction_that_both_leave_open_loops_need_not_agree() -> None:
     apart = [loop(older, np.array([0.8 * (older % 2), 0.0, 0.0])) for older in range(40, 34, -1)]
     near = replace(SLIPPED, mahalanobis=1.0)
     assert Verdict.ACCEPTED not in {edge.verdict for edge in judged(apart[:3], near).values()}
-    along = np.diag([FLOOR_RAD**2] * 3 + [100.0, FLOOR_M**2, FLOOR_M**2])
+    along = np.diag([FLOOR_YAW**2] * 3 + [100.0, FLOOR_M**2, FLOOR_M**2])
     opened = [replace(edge, covariance=along) for edge in apart]
     assert {edge.verdict for edge in judged(opened, near).values()} == {Verdict.ACCEPTED}
 
 
 def test_a_loop_that_leaves_a_direction_open_stands_for_none_that_does_not() -> None:
-    along = np.diag([FLOOR_RAD**2] * 3 + [100.0, FLOOR_M**2, FLOOR_M**2])
+    along = np.diag([FLOOR_YAW**2] * 3 + [100.0, FLOOR_M**2, FLOOR_M**2])
     opened = replace(loop(40), covariance=along)
     assert [edge.represented_by for edge in placed([loop(39)], [opened], POSES, POSES, HALF)] == [None]
     assert [edge.represented_by for edge in placed([opened], [loop(39)], POSES, POSES, HALF)] == [loop(39).pair]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
-from app.slam.loops.verdicts import FLOOR_M, FLOOR_RAD, worth_correcting
+from app.slam.loops.verdicts import FLOOR_M, FLOOR_YAW, worth_correcting
 
 POSES = np.tile(np.eye(4), (60, 1, 1))
 POSES[:, 0, 3] = np.arange(60)
@@ -20,7 +20,7 @@ def loops(off_m: float, verdict: Verdict = Verdict.ACCEPTED, sideways_m: float =
 
     sideways_m: standard deviation that they have in that direction.
     """
-    covariance = np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2, sideways_m**2, FLOOR_M**2])
+    covariance = np.diag([FLOOR_YAW**2] * 3 + [FLOOR_M**2, sideways_m**2, FLOOR_M**2])
     edges = []
     for newer in range(50, 60):
         T = np.linalg.inv(POSES[newer - 50]) @ POSES[newer]
