@@ -1,7 +1,4 @@
-"""The examples run as a user would run them, and come to the right results.
-
-Tests app/mapping/feed.py.
-"""
+"""The examples run as a user would run them, and come to the right results."""
 
 import os
 import re

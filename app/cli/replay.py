@@ -61,7 +61,8 @@ def repeat(path: Path, *, to_end: bool = False) -> "Iterator[tuple[Session, Base
     if truth is not None and not truth.exists():  # no result but its errors follows from it
         typer.echo(f"The session was compared with {truth}, which no longer exists.")
         truth = None
-    session = open_session(opened.recording, saved.first_params, opened.start_s, opened.duration_s, truth=truth)
+    part = opened.start_s, opened.duration_s
+    session = open_session(opened.recording, saved.first_params, *part, truth=truth, read_ahead=True)
     try:
         prepare(session)
         session.resume(saved)

@@ -73,7 +73,7 @@ def run(
     params, told = settle_mounting(recording, params) if calibrate else (params, "")
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
-    session = open_session(recording, params, start, duration, truth=truth_path)
+    session = open_session(recording, params, start, duration, truth=truth_path, read_ahead=True)
     try:
         if truth_path:
             read_poses(truth_path)  # raises for poses that cannot be true

@@ -1,5 +1,8 @@
 """Where measurements come from. A session knows nothing else of its source."""
 
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -77,12 +80,44 @@ class Feed(Protocol):
         return
 
 
+AHEAD = 4
+"""Measurements that are read ahead. They take a few MB each."""
+
+
+class _Ahead(Iterator[Measurement | DroppedScan | None]):
+    """The same entries, then None, read by a thread."""
+
+    def __init__(self, entries: Iterator[Measurement | DroppedScan]) -> None:
+        self._entries = entries
+        self._reader = ThreadPoolExecutor(1, "read")
+        self._coming = deque(self._reader.submit(next, entries, None) for _ in range(AHEAD))
+
+    def __next__(self) -> Measurement | DroppedScan | None:
+        self._coming.append(self._reader.submit(next, self._entries, None))
+        return self._coming.popleft().result()
+
+    def close(self) -> None:
+        self._reader.shutdown(cancel_futures=True)
+
+
 class FileFeed(Feed):
-    """A recording, or a part of it. Raises HemislamError: it cannot be used."""
+    """A recording, or a part of it. Raises HemislamError: it cannot be used.
+
+    Args:
+        read_ahead: a thread reads the next measurements while frames are processed. Such a feed cannot go back.
+    """
 
     repeatable = True
 
-    def __init__(self, path: Path, params: Params, start_s: float = 0.0, duration_s: float | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        params: Params,
+        start_s: float = 0.0,
+        duration_s: float | None = None,
+        *,
+        read_ahead: bool = False,
+    ) -> None:
         self._recording = recording = open_recording(path, params)
         rest = max(0.0, recording.duration_s - start_s)
         share = (rest if duration_s is None else min(rest, duration_s)) / max(recording.duration_s, 1e-9)
@@ -96,13 +131,14 @@ class FileFeed(Feed):
             findings=recording.findings,
         )
         self._measurements = self._read(None)
+        self._ahead = _Ahead(self._measurements) if read_ahead else None
 
     @property
     def info(self) -> FeedInfo:
         return self._info
 
     def next(self) -> Measurement | DroppedScan | None:
-        return next(self._measurements, None)
+        return next(self._ahead or self._measurements, None)
 
     def place(self) -> Place:
         return self._measurements.place()
@@ -111,6 +147,8 @@ class FileFeed(Feed):
         self._measurements = self._read(place)
 
     def close(self) -> None:
+        if self._ahead:
+            self._ahead.close()
         self._recording.close()
 
     def _read(self, after: Place | None) -> Measurements:

@@ -22,6 +22,7 @@ def open_session(
     truth: Path | None = None,
     loops: Callable[[KeyframeLog], LoopClient] = RestartingLoops,
     checkpoint_bytes: int | None = None,
+    read_ahead: bool = False,
 ) -> Session:
     """Open a recording, or a part of it, with a new engine.
 
@@ -29,11 +30,12 @@ def open_session(
         truth: a trajectory (TUM) to compare with.
         loops: makes the client that looks for loops, if `loops.enabled`.
         checkpoint_bytes: memory for checkpoints; None: the session only goes on.
+        read_ahead: as `FileFeed`.
 
     Raises:
         HemislamError: the recording or the truth cannot be used.
     """
-    feed = FileFeed(path, params, start_s, duration_s)
+    feed = FileFeed(path, params, start_s, duration_s, read_ahead=read_ahead)
     try:
         return Session(
             feed,

@@ -1,0 +1,50 @@
+"""A recording read ahead by a thread gives what it gives without."""
+
+from pathlib import Path
+
+import pytest
+
+from app.mapping.feed import FileFeed
+from app.slam.errors import HemislamError
+from app.slam.params import Params
+from app.slam.types import Measurement
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "museum.mcap"
+
+
+def read(path: Path, *, read_ahead: bool) -> tuple[list[bytes], str]:
+    """The points of every measurement, and what ended it."""
+    feed, clouds, ended = FileFeed(path, Params(), 0.0, 3.0, read_ahead=read_ahead), [], ""
+    try:
+        while (entry := feed.next()) is not None:
+            assert isinstance(entry, Measurement)
+            clouds.append(entry.scan.points.tobytes() + entry.imu.accel.tobytes())
+    except HemislamError as error:
+        ended = str(error)
+    assert feed.next() is None, "after the end nothing comes"
+    feed.close()
+    return clouds, ended
+
+
+def test_what_is_read_ahead_is_the_same() -> None:
+    ahead, ended = read(SAMPLE, read_ahead=True)
+    assert len(ahead) > 25 and not ended
+    assert read(SAMPLE, read_ahead=False) == (ahead, "")
+
+
+def test_damage_is_told_after_the_same_measurements(tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.mcap"
+    whole = SAMPLE.read_bytes()
+    middle = len(whole) // 40
+    damaged.write_bytes(whole[:middle] + b"\xff" * 2000 + whole[middle + 2000 :])
+    ahead, ended = read(damaged, read_ahead=True)
+    assert ahead and ended
+    assert read(damaged, read_ahead=False) == (ahead, ended)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_a_feed_is_closed_while_it_reads(count: int) -> None:
+    feed = FileFeed(SAMPLE, Params(), read_ahead=True)
+    for _ in range(count):
+        assert feed.next() is not None
+    feed.close()
