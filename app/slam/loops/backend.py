@@ -38,7 +38,7 @@ class LoopBackend:
         self.edits = Edits()
         self._search = Search()
         self._edited = self._search.graph  # with the edits; the search's own without any
-        self._made: dict[tuple[Add, int], LoopEdge] = {}  # loops by hand, by the last keyframe of the newer submap
+        self._made: dict[tuple[Add, int], LoopEdge] = {}  # loops by hand, by the last keyframe that they depend on
         self._state: tuple[F64, dict[Pair, LoopEdge]] | None = None  # poses and loops; None: not up to date
         self._notices: list[str] = []
         self._said: set[str] = set()  # all notices ever
@@ -200,7 +200,7 @@ class LoopBackend:
     def _make(self, edit: Add) -> LoopEdge:
         """The loop by hand of keyframes that exist, by their surroundings as far as there are any."""
         detector = self._search.detector
-        key = edit, detector.last(edit.newer)
+        key = edit, min(edit.newer + detector.ahead, len(self) - 1)
         if key not in self._made:
             self._made[key] = by_hand(edit, detector, self._search.start)
         return self._made[key]

@@ -1,7 +1,7 @@
 """From a keyframe to candidates with evidence: place recognition and registration.
 
-A keyframe is looked at once all keyframes of its submap have come, so that its surroundings are as dense as those of
-the older ones it is compared with.
+A keyframe is looked at once all keyframes of its submap have come and odometry between them can be judged, so that its
+surroundings are as dense as those of the older ones it is compared with.
 """
 
 from collections.abc import Iterable, Sequence
@@ -55,15 +55,18 @@ class Detector:
         params: only those that act on restart are read here.
 
     Attributes:
-        half: keyframes on either side of one that make its submap with it.
+        half: keyframes on either side of one that make its submap with it. ahead: those that must follow it before its
+            surroundings are known: its submap, and whether odometry slipped there.
     """
 
     def __init__(self, params: LoopsParams) -> None:
         self.half = params.submap_keyframes
+        self.ahead = self.half + slips.REACH - 1
         self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS)
         self._around = lru_cache(KEPT_SUBMAPS)(lambda *key: self._submaps.around(key[0], self._poses, *key[1:]))
         self._prepared = lru_cache(KEPT_PREPARED)(lambda *key: verification.prepare(self._around(*key)))
-        self._slips: dict[tuple[int, int], bool] = {}
+        self._pieces = lru_cache(slips.REACH + 2)(self._piece)
+        self._slips: dict[tuple[int, int], F64 | None] = {}
         self._heads: list[Keyframe] = []
         self._poses = np.empty((0, 4, 4))
         self._stamps = np.empty(0, np.int64)
@@ -117,6 +120,7 @@ class Detector:
         self._submaps.truncate(len(self))
         self._around.cache_clear()
         self._prepared.cache_clear()
+        self._pieces.cache_clear()
         self._slips.clear()
 
     def close(self) -> None:
@@ -131,11 +135,18 @@ class Detector:
 
     def submap(self, index: int) -> Prepared:
         """From the keyframes around one that no slip of odometry parts from it."""
-        before, last = range(index, self._first(index), -1), self.last(index)
-        after = (k for k in range(index + 1, last) if k + slips.REACH <= last + 1 or k == last - 1)
-        first = next((k for k in before if self._slipped(k, last)), before.stop)
-        end = next((k - 1 for k in after if self._slipped(k, last)), last)
+        before, after = range(index, self._first(index), -1), range(index + 1, self.last(index) + 1)
+        first = next((k for k in before if self.slip(k) is not None), before.stop)
+        end = next((k for k in after if self.slip(k) is not None), after.stop) - 1
         return self._prepared(index, first, end)
+
+    def slip(self, index: int) -> F64 | None:
+        """How far odometry slipped on the step to a keyframe, by the few on either side; see `slips`."""
+        first, last = max(0, index - slips.REACH), min(len(self), index + slips.REACH) - 1
+        if (index, last) not in self._slips:
+            before, after = self._pieces(first, index - 1), self._pieces(index, last)
+            self._slips[index, last] = slips.slip(before, after, self.guess(first, index, self._poses))
+        return self._slips[index, last]
 
     def T_level_imu(self, index: int) -> F64:
         """(4, 4) from a keyframe's IMU frame to its level frame: a rotation."""
@@ -217,14 +228,8 @@ class Detector:
         """The first keyframe of the submap about one."""
         return max(0, index - self.half)
 
-    def _slipped(self, index: int, last: int) -> bool:
-        """Whether odometry slipped on the step to a keyframe, by those around it up to `last`."""
-        key = index, min(index + slips.REACH - 1, last)
-        if key not in self._slips:
-            before = self._submaps.around(index, self._poses, max(0, index - slips.REACH), index - 1)
-            after = self._submaps.around(index, self._poses, *key)
-            self._slips[key] = slips.slipped(verification.prepare(before), verification.prepare(after))
-        return self._slips[key]
+    def _piece(self, first: int, last: int) -> Prepared:
+        return verification.prepare(self._submaps.around(first, self._poses, first, last))
 
 
 def _wrapped(angle: npt.NDArray[np.float64]) -> F64:

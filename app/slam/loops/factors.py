@@ -1,7 +1,7 @@
 """Factors of the pose graph: what was measured between two keyframes, or of one."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -82,9 +82,17 @@ def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift
     turn = np.kron(np.eye(2), T[:3, :3].T)
     first = turn @ _own_axes(before) @ turn.T
     even = walked * EVEN_M
-    noise = np.array([STILL_RAD**2 + drift.rotation**2 * even] * 3 + [STILL_M**2 + drift.translation**2 * even] * 3)
-    covariance = first + _own_axes(after) + np.diag(noise)
+    covariance = first + _own_axes(after)
+    up = after.T_odom_imu[2, :3]  # gravity fixes the others
+    covariance[:3, :3] += STILL_RAD**2 * np.eye(3) + drift.rotation**2 * even * np.outer(up, up)
+    covariance[3:, 3:] += (STILL_M**2 + drift.translation**2 * even) * np.eye(3)
     return Factor(KeyframeId(0, second - 1), KeyframeId(0, second), T, (covariance + covariance.T) / 2)
+
+
+def loosened(step: Factor, slip: F64, R_odom_imu: F64) -> Factor:
+    """Odometry to a keyframe that says little along a slip (6,) of rotation and translation, in odom's axes."""
+    moved = np.kron(np.eye(2), R_odom_imu.T) @ slip
+    return replace(step, covariance=step.covariance + np.outer(moved, moved))
 
 
 def _own_axes(head: Keyframe) -> F64:

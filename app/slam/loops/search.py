@@ -6,15 +6,16 @@ which tells it where to look.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from app.slam.errors import HemislamError
+from app.slam.loops import slips
 from app.slam.loops.detection import Detector
 from app.slam.loops.drift import Drift, Expectation, expect
 from app.slam.loops.edits import lay_over
-from app.slam.loops.factors import PositionPrior, odometry_factor
+from app.slam.loops.factors import PositionPrior, loosened, odometry_factor
 from app.slam.loops.graph import Graph, Measured
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.support import placed, settle
@@ -52,6 +53,7 @@ class Search:
         self.finished = False
         self._params: list[LoopsParams] = []  # with each keyframe
         self._measured: list[Measured] = []
+        self._loose: dict[int, Measured] = {}  # of keyframes before which odometry slipped
         self._found: list[Found | None] = []  # with each; None until loops were looked for
         self._ends: dict[int, Found] = {}  # found in addition where the session ended, by the number of keyframes
         self.graph = Graph(np.eye(4), 0)
@@ -66,8 +68,9 @@ class Search:
 
     @property
     def measured(self) -> Sequence[Measured]:
-        """Of the first `len` keyframes."""
-        return self._measured[: len(self)]
+        """Of the first `len` keyframes. Once a slip of odometry is seen, the graph may bend there."""
+        seen = len(self) - slips.REACH
+        return [self._loose.get(k, one) if k <= seen else one for k, one in enumerate(self._measured[: len(self)])]
 
     @property
     def solved(self) -> tuple[F64, dict[Pair, LoopEdge]]:
@@ -133,6 +136,7 @@ class Search:
         for history in (self._params, self._measured, self._found):
             del history[count:]
         self._ends = {end: found for end, found in self._ends.items() if end <= count}
+        self._loose = {k: one for k, one in self._loose.items() if k + slips.REACH <= count}
         self.detector.forget()
 
     def _is_known(self, keyframe: Keyframe, params: LoopsParams) -> bool:
@@ -153,9 +157,17 @@ class Search:
         self.detector.go_on()
         found = self._found[index]
         if found is None:
-            complete = index - self.start.submap_keyframes
+            self._look_for_slip(index - slips.REACH + 1)
+            complete = index - self.detector.ahead
             found = self._found[index] = self._look(range(max(complete, self.detector.described), complete + 1))
         self._take(found)
+
+    def _look_for_slip(self, index: int) -> None:
+        """On the step to a keyframe, once the few after it have come."""
+        if index > 0 and self.start.enabled and (slip := self.detector.slip(index)) is not None:
+            measured, after = self._measured[index], self.detector.poses[index]
+            assert measured.odometry is not None
+            self._loose[index] = replace(measured, odometry=loosened(measured.odometry, slip, after[:3, :3]))
 
     def _take(self, found: Found) -> None:
         self.detector.learn(found.contexts[self.detector.described - found.first :])

@@ -8,6 +8,7 @@ import numpy as np
 
 from app.slam import lie
 from app.slam.loops.verification import Prepared, information, register
+from app.slam.types import F64
 
 REACH = 4
 """Keyframes on either side of a step that are laid on one another."""
@@ -19,14 +20,17 @@ LIKELY = 2.5
 """Standard deviations up to which odometry holds."""
 
 
-def slipped(before: Prepared, after: Prepared) -> bool:
-    """Whether the surroundings seen after a step lie elsewhere than odometry says, in a direction that they constrain.
+def slip(before: Prepared, after: Prepared, T_guess: F64) -> F64 | None:
+    """How far the surroundings seen after a step lie from where odometry says, in directions that they constrain.
 
     Args:
-        before, after: submaps in the same level frame, by odometry.
+        T_guess: (4, 4) T_before_after of the level frames, by odometry.
+
+    Returns:
+        (6,) rad and m, rotation about the origin of `after`, then translation, in level axes; None: odometry holds.
     """
-    T = register(before, after, np.eye(4))
-    moved = np.concatenate([lie.log(T[:3, :3]), T[:3, 3]])
+    T = register(before, after, T_guess)
+    moved = np.concatenate([lie.log(T[:3, :3] @ T_guess[:3, :3].T), T[:3, 3] - T_guess[:3, 3]])
     certain = np.linalg.pinv(information(before, after, T) * (INDEPENDENT / POINT_M**2))
     floor = np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
-    return bool(moved @ np.linalg.solve(certain + floor, moved) > LIKELY**2)
+    return moved if moved @ np.linalg.solve(certain + floor, moved) > LIKELY**2 else None
