@@ -29,23 +29,23 @@ SOME_GROUND = 0.05
 
 
 def run() -> list[Line]:
-    with _served() as url, listening(url) as page:
-        return [_relabelling(url, page), _replay(url)]
+    with _served() as (server, url), listening(url) as page:
+        return [_relabelling(server, page), _replay(server)]
 
 
-def _relabelling(url: str, page: Client) -> Line:
+def _relabelling(server: httpx.Client, page: Client) -> Line:
     """While playing at real time, from setting a parameter of the ground until the page was sent colours without it."""
-    _transport(url, {"action": "play"})
-    while _state(url)["transport"]["frame"] < SETTLED:
+    _transport(server, {"action": "play"})
+    while _state(server)["transport"]["frame"] < SETTLED:
         time.sleep(0.1)
     delays = []
     for _ in range(TRIALS):
-        _look_for_ground(url, True)
+        _look_for_ground(server, True)
         time.sleep(1.0)
         first, begin = len(page.heard), time.monotonic()
-        _look_for_ground(url, False)
+        _look_for_ground(server, False)
         time.sleep(1.0)
-        shares = list(_ground_shares(page, max(first - 20, 0)))
+        shares = list(_ground_shares(page, max(first - 100, 0)))
         before = [share for at, share in shares if at < begin]
         after = [at for at, share in shares if at > begin and share == 0.0]
         if not after or not before or before[-1] < SOME_GROUND:
@@ -62,55 +62,56 @@ def _ground_shares(page: Client, first: int) -> Iterator[tuple[float, float]]:
             yield at, float(np.mean((colours == LABEL_COLOURS[1]).all(axis=1)))
 
 
-def _look_for_ground(url: str, enabled: bool) -> None:
-    httpx.patch(f"{url}api/params", json={"ground": {"enabled": enabled}}).raise_for_status()
+def _look_for_ground(server: httpx.Client, enabled: bool) -> None:
+    server.patch("api/params", json={"ground": {"enabled": enabled}}).raise_for_status()
 
 
-def _replay(url: str) -> Line:
+def _replay(server: httpx.Client) -> Line:
     """From the start, as fast as possible."""
-    _transport(url, {"action": "pause"})
-    _transport(url, {"action": "restart"})
-    while _state(url)["transport"]["frame"] > 0:
+    _transport(server, {"action": "pause"})
+    _transport(server, {"action": "restart"})
+    while _state(server)["transport"]["frame"] > 0:
         time.sleep(0.05)
-    _transport(url, {"action": "speed", "factor": "max"})
-    _transport(url, {"action": "play"})
-    while (state := _state(url))["transport"]["frame"] < 50:
+    _transport(server, {"action": "speed", "factor": "max"})
+    _transport(server, {"action": "play"})
+    while (state := _state(server))["transport"]["frame"] < 50:
         time.sleep(0.01)
     begin, first, last = time.perf_counter(), state["transport"]["frame"], state["recording"]["frames"] - 20
-    while (now := _state(url)["transport"]["frame"]) < last:
+    while (now := _state(server)["transport"]["frame"]) < last:
         time.sleep(0.1)
     rate = (now - first) / (time.perf_counter() - begin)
     seconds_a_frame = state["recording"]["duration_s"] / state["recording"]["frames"]
     return Line.of("replay with a page open", "museum", "x real time", [rate * seconds_a_frame])
 
 
-def _state(url: str) -> Any:
+def _state(server: httpx.Client) -> Any:
     """As JSON."""
-    return httpx.get(f"{url}api/state").raise_for_status().json()
+    return server.get("api/state").raise_for_status().json()
 
 
-def _transport(url: str, action: Mapping[str, object]) -> None:
-    httpx.post(f"{url}api/transport", json=action).raise_for_status()
+def _transport(server: httpx.Client, action: Mapping[str, object]) -> None:
+    server.post("api/transport", json=action).raise_for_status()
 
 
 @contextmanager
-def _served() -> Iterator[str]:
-    """The address of a workbench on the sample, paused, in a process of its own."""
+def _served() -> Iterator[tuple[httpx.Client, str]]:
+    """A connection to a workbench on the sample, paused, in a process of its own, and its address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = [sys.executable, "-m", "app", "serve", str(SAMPLE), "--paused", "--no-browser", "--port", str(port)]
-    server = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     url = f"http://127.0.0.1:{port}/"
     try:
-        for _ in range(600):
-            try:
-                if _state(url)["recording"]:
-                    break
-            except httpx.HTTPError:
-                pass
-            time.sleep(0.2)
-        yield url
+        with httpx.Client(base_url=url, timeout=30.0) as server:
+            for _ in range(600):
+                try:
+                    if _state(server)["recording"]:
+                        break
+                except httpx.HTTPError:
+                    pass
+                time.sleep(0.2)
+            yield server, url
     finally:
-        server.terminate()
-        server.wait()
+        process.terminate()
+        process.wait()
