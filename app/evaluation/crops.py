@@ -6,8 +6,8 @@ import numpy as np
 
 from app.slam.types import F64, U16, Keyframe
 
-HALF_M = 6.0
-PIXEL_M = 0.025
+HALF_M = 9.0
+PIXEL_M = 0.05
 SLICE_M = (-0.6, 0.7)
 """Heights above the sensor: walls and trunks show as lines, floor and ceiling stay out."""
 REACH_M = 15.0

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, BackgroundTasks, HTTPException
+from fastapi import APIRouter, BackgroundTasks, Body, HTTPException, Query
 from fastapi import Path as PathParam
 from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field, create_model
@@ -26,6 +26,7 @@ from app.mapping.session_file import SUFFIX, Speed
 from app.server import protocol
 from app.server.folders import Folders
 from app.server.protocol import Command
+from app.server.uploads import forget, receive
 from app.server.views import LoopsState, StateView, loops_state, state_view
 from app.server.worker import RunningEngine
 from app.slam.loops.edits import Accept, Add, LoopEdit, Reject, SetWeight, Solve
@@ -226,6 +227,21 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
         """Open one. The notices in the state say whether that worked."""
         path = folders.openable(body.path)
         _send(engine, protocol.OpenRecording(path, folders.inside(body.truth) if body.truth else truth_beside(path)))
+
+    @router.put("/recordings/{name}", status_code=204)
+    def upload(
+        name: str,
+        offset: Annotated[int, Query(ge=0)],
+        size: Annotated[int, Query(ge=1)],
+        piece: Annotated[bytes, Body(media_type="application/octet-stream")],
+    ) -> None:
+        """Copy a recording into the first folder, piece by piece: `offset` bytes of `size` came before this one."""
+        receive(folders, name, offset, size, piece)
+
+    @router.delete("/recordings/{name}", status_code=204)
+    def forget_upload(name: str) -> None:
+        """Remove the pieces of a copy that was not completed."""
+        forget(folders, name)
 
     @router.post("/truth", status_code=202)
     def compare_with(body: CompareBody) -> None:

@@ -26,7 +26,7 @@ from app.ui.widgets import by_user
 def prepare_page(gui: viser.GuiApi) -> None:
     """Add the style sheet and the script that everything else here relies on. Call it before other HTML is added."""
     styles = source("style.css") + source("viser_adapter.css")
-    gui.add_html(panel("page_head", styles, source("viser_adapter.js") + source("tour.js")))
+    gui.add_html(panel("page_head", styles, source("viser_adapter.js") + source("tour.js") + source("drop.js")))
 
 
 class Bridge:

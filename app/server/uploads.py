@@ -1,0 +1,64 @@
+"""Recordings that are dropped on the page: they arrive piece by piece, each no longer than any other request."""
+
+import shutil
+from pathlib import Path
+from typing import Final
+
+from app.server.folders import RECORDINGS, TRAJECTORIES, Folders
+from app.slam.errors import HemislamError
+
+SUFFIXES: Final = (*RECORDINGS, *TRAJECTORIES, ".yaml", ".json")
+"""Recordings and sessions, and what lies beside them: a truth, parameters, an Ouster's metadata."""
+_LONGEST_NAME: Final = 200
+_LEFT_FREE: Final = 1 << 30
+"""Bytes of the disk that uploads leave free."""
+
+
+def receive(folders: Folders, name: str, offset: int, size: int, piece: bytes) -> None:
+    """Append a piece of a file to it in the first folder. With its last piece it gets its name.
+
+    Args:
+        offset: bytes that came before. size: of the whole file, bytes.
+
+    Raises:
+        HemislamError: the name or the size cannot be taken, a piece is missing, or it cannot be written.
+    """
+    there = _place(folders, name)
+    if there.exists() or there.is_symlink():
+        raise HemislamError(f"{name} is in {there.parent} already; open it there, or rename the one that you drop.")
+    if offset + len(piece) > size:
+        raise HemislamError(f"{name} has grown while it was copied; drop it again when it is complete.")
+    part = _part(there)
+    try:
+        if offset == 0:
+            if shutil.disk_usage(there.parent).free < size + _LEFT_FREE:
+                raise HemislamError(f"{name} does not fit on the disk of {there.parent}; make room there.")
+            part.unlink(missing_ok=True)
+        with part.open("ab") as file:
+            if file.tell() != offset:
+                raise HemislamError(f"A piece of {name} is missing; drop it again.")
+            file.write(piece)
+        if offset + len(piece) == size:
+            part.rename(there)
+    except OSError as error:
+        raise HemislamError(f"{name} cannot be written to {there.parent}: {error.strerror}.") from None
+
+
+def forget(folders: Folders, name: str) -> None:
+    """Remove the pieces of a file that did not arrive as a whole. Raises HemislamError as `receive` does."""
+    _part(_place(folders, name)).unlink(missing_ok=True)
+
+
+def _place(folders: Folders, name: str) -> Path:
+    if Path(name).name != name or name.startswith(".") or len(name) > _LONGEST_NAME or not name.isprintable():
+        raise HemislamError("The file needs an ordinary name; rename it.")
+    if not name.lower().endswith(SUFFIXES):
+        raise HemislamError(f"{name} is no recording; drop a file that ends in {', '.join(RECORDINGS)}.")
+    if not folders.roots:
+        raise HemislamError("There is no folder to copy to; start hemislam with --folder.")
+    return folders.roots[0] / name
+
+
+def _part(there: Path) -> Path:
+    """Where a file is until it is complete; names that begin with a dot are not listed."""
+    return there.with_name(f".{there.name}.part")
