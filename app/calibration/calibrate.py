@@ -1,4 +1,5 @@
-"""From a recording to the pose of the LiDAR on the IMU: odometry by scans alone, then with the IMU's own help."""
+"""From a recording to the pose of the LiDAR on the IMU and the corrections of its scan lines: odometry by scans alone,
+then with the IMU's own help."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ import numpy as np
 
 from app.calibration.guide import Guide
 from app.calibration.inertial import Inertial, Noise
+from app.calibration.lines import Lines, fit_lines
 from app.calibration.odometry import track
 from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation
 from app.calibration.translation import Moved, fit_translation
@@ -42,6 +44,7 @@ class Calibration:
         turned, moved: the fits. down: (3,) unit direction of gravity in the LiDAR frame at the begin.
         residuals: m, RMS of the scans to the map without the IMU, and with it.
         gyro_noise, accel_noise: of the IMU in most seconds, vibrations included.
+        lines: corrections of the scan lines.
     """
 
     recording: Path
@@ -53,6 +56,7 @@ class Calibration:
     residuals: tuple[float, float]
     gyro_noise: Noise
     accel_noise: Noise
+    lines: Lines
 
     @property
     def rotation(self) -> tuple[float, float, float]:
@@ -91,7 +95,7 @@ class Calibration:
         if observed["offset"] and abs(self.turned.late) > max(0.001, SURE * float(self.sigmas["offset"][0])):
             late = self.params.recording.imu_time_offset + self.turned.late
             values["recording.imu_time_offset"] = round(late, 4)
-        return values
+        return {**values, **self.lines.found()}
 
     @property
     def apart(self) -> float:
@@ -151,13 +155,18 @@ def calibrate_walk(path: Path, params: Params, walk: Walk, progress: Report = la
     late = find_offset(way, inertial)
     turned = fit_rotation(way, inertial, first_rotation(way, inertial, late), late, given[0])
     guide = Guide.of(inertial, turned.R_imu_lidar, turned.late, turned.bias)
+    lines, seen = Lines.none(walk.lines), walk
     for number in range(ROUNDS):
-        way = track(walk, guide, report(number + 1))
+        way = track(seen, guide, report(number + 1))
         turned = fit_rotation(way, inertial, turned.R_imu_lidar, turned.late, given[0])
         moved = fit_translation(way, inertial, turned, given[1])
         guide = Guide.of(
             inertial, turned.R_imu_lidar, turned.late, turned.bias, moved.p_imu_lidar, moved.bias, moved.gravity
         )
+        if walk.lines:
+            lines = fit_lines(seen, way, lines)
+            seen = lines.applied(walk)
     down = moved.gravity / np.linalg.norm(moved.gravity)
-    noises = (Noise.of(inertial.times, values) for values in (inertial.gyro, inertial.accel))
-    return Calibration(path, params, walk.duration_s, turned, moved, down, (alone, way.residual), *noises)
+    gyro_noise, accel_noise = (Noise.of(inertial.times, values) for values in (inertial.gyro, inertial.accel))
+    residuals = alone, way.residual
+    return Calibration(path, params, walk.duration_s, turned, moved, down, residuals, gyro_noise, accel_noise, lines)

@@ -45,12 +45,14 @@ class Track:
     Attributes:
         times: (n,) s after the end of the first scan. rotations: (n, 3, 3) and positions (n, 3) m, in the world.
         residuals: (n,) m, RMS of point to plane; nan where the scan could not be laid onto the map.
+        points: of each scan (k, 3) m, in the LiDAR frame at the scan's end.
     """
 
     times: F64
     rotations: F64
     positions: F64
     residuals: F64
+    points: tuple[F32, ...] = ()
 
     @property
     def residual(self) -> float:
@@ -88,7 +90,7 @@ def track(walk: Walk, guide: Guide | None = None, progress: Callable[[float], No
     local_map = LocalMap(mapping)
     times = walk.seconds(walk.ends_ns)
     here = _Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.diag(np.repeat([1e-8, 1e-8, 1.0, 1.0], 3)))
-    rotations, positions, residuals = [here.R], [here.p], [float("nan")]
+    rotations, positions, residuals, deskewed = [here.R], [here.p], [float("nan")], [walk.scans[0].points]
     local_map.insert(walk.scans[0].points, here.p, mapping)
     for k, scan in enumerate(walk.scans[1:], 1):
         here = _predicted(here, float(times[k - 1]), float(times[k]), guide, _changes(walk, scan.end_ns))
@@ -102,8 +104,9 @@ def track(walk: Walk, guide: Guide | None = None, progress: Callable[[float], No
         rotations.append(here.R)
         positions.append(here.p)
         residuals.append(residual)
+        deskewed.append(points)
         progress(k / (len(walk.scans) - 1))
-    return Track(times, np.stack(rotations), np.stack(positions), np.array(residuals))
+    return Track(times, np.stack(rotations), np.stack(positions), np.array(residuals), tuple(deskewed))
 
 
 @dataclass(frozen=True, slots=True)

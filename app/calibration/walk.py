@@ -23,10 +23,15 @@ VOXEL = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Walk:
-    """Scans in order of their ends, and the IMU samples around them, in order of time."""
+    """Scans in order of their ends, and the IMU samples around them, in order of time.
+
+    Attributes:
+        lines: how many scan lines the LiDAR has; 0: none, or too few points on them.
+    """
 
     scans: tuple[Scan, ...]
     imu: ImuSamples
+    lines: int = 0
 
     @property
     def ends_ns(self) -> I64:
@@ -75,7 +80,9 @@ def read_walk(
             f" at least {LEAST_SCANS} scans, better 30 s of lively motion."
         )
     imu = _samples(stamps, values)
-    return Walk(tuple(scan for scan in usable if scan.end_ns >= _sets_off_ns(imu)), imu)
+    begin_ns = _sets_off_ns(imu)
+    lines = 1 + max(int(scan.ring.max()) for scan in usable) if recording.has_lines else 0
+    return Walk(tuple(scan for scan in usable if scan.end_ns >= begin_ns), imu, lines)
 
 
 def _sets_off_ns(imu: ImuSamples) -> int:

@@ -8,6 +8,7 @@ import yaml
 
 from app.calibration.calibrate import Calibration
 from app.calibration.inertial import Noise
+from app.calibration.lines import Lines
 from app.sensors.presets import CALIBRATED, sidecar
 from app.slam.errors import HemislamError
 from app.slam.params import nested
@@ -33,6 +34,7 @@ def table(calibration: Calibration) -> list[tuple[str, str]]:
         ("added to the IMU's clock", _if(observed["offset"], f"{c.turned.late * 1e3:+.1f} ± {offset:.1f} ms")),
         ("bias of the gyroscope", _vector(np.degrees(c.turned.bias), np.degrees(sigmas["gyro_bias"]), "deg/s")),
         ("bias of the accelerometer", _vector(c.moved.bias, sigmas["accel_bias"], "m/s²")),
+        *_of_lines(c.lines),
         ("noise of the gyroscope", _noise(c.gyro_noise, 1e3, "mrad/s/√Hz")),
         ("noise of the accelerometer", _noise(c.accel_noise, 1e3, "mm/s²/√Hz")),
         ("down at the start, LiDAR frame", ", ".join(f"{value:+.3f}" for value in c.down)),
@@ -57,6 +59,12 @@ def as_json(calibration: Calibration) -> dict[str, Any]:
         "gyro_noise": [c.gyro_noise.density, c.gyro_noise.sigma],
         "accel_noise": [c.accel_noise.density, c.accel_noise.sigma],
         "down_lidar": c.down.tolist(),
+        "lines": {
+            "elevations_rad": c.lines.elevations.tolist(),
+            "ranges_m": c.lines.ranges.tolist(),
+            "sigmas": c.lines.sigmas.tolist(),
+            "residuals_m": [_numbers(c.lines.before), _numbers(c.lines.after)],
+        },
         "sigmas": {name: values.tolist() for name, values in c.sigmas.items()},
         "observed": c.observed,
         "residuals": {
@@ -107,6 +115,31 @@ def write_beside(calibration: Calibration, *, replace: bool = False) -> Path:
 
 def _if(observed: bool, text: str) -> str:
     return text if observed else WALK
+
+
+def _of_lines(lines: Lines) -> list[tuple[str, str]]:
+    if not len(lines.ranges):
+        return [("scan lines", "this LiDAR has none to calibrate")]
+    rows = []
+    for k, (name, values, scale, unit) in enumerate(
+        [("elevations", lines.elevations, np.degrees(1.0), "deg"), ("distances", lines.ranges, 1e3, "mm")]
+    ):
+        off, sigma = values * scale, float(np.median(lines.sigmas[k])) * scale
+        usual, most = _rms(off), float(np.abs(off).max())
+        worth = "" if f"sensor.{('elevation', 'range')[k]}_corrections" in lines.found() else ": too little to correct"
+        rows.append(
+            (f"{name} of the scan lines", f"off by {usual:.2g} (RMS), {most:.2g} at most, ± {sigma:.1g} {unit}{worth}")
+        )
+    before, after = (float(np.sqrt(np.nanmean(values**2))) * 1e3 for values in (lines.before, lines.after))
+    return [
+        *rows,
+        ("distance offset of all lines", "not observable: grazing beams show the same"),
+        ("scan lines on planes", f"{before:.1f} mm before, {after:.1f} after"),
+    ]
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def _vector(values: np.ndarray, sigmas: np.ndarray, unit: str) -> str:

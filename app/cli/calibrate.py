@@ -28,7 +28,7 @@ def calibrate(
         float, typer.Option("--duration", min=5, metavar="SECONDS", help="Use only this much of the recording.")
     ] = 120.0,
 ) -> None:
-    """Find the pose of the LiDAR on the IMU and the offset of their clocks.
+    """Find the pose of the LiDAR on the IMU, the offset of their clocks and the errors of each scan line.
 
     Only the recording is used: `sensor.rotation` and `sensor.translation` are ignored. The LiDAR is tracked by its
     scans alone, and its motion is compared with the IMU's. Walk and turn the scanner about all axes; values that the
@@ -60,7 +60,7 @@ def calibrate(
         if contradiction := found.contradiction():
             typer.echo(f"{contradiction}, contrary to the parameters.")
     if plot is not None:
-        from app.cli.calibration_plot import residual_plot
+        from app.evaluation.calibration_plot import residual_plot
 
         try:
             plot.write_text(residual_plot(found), encoding="utf-8")

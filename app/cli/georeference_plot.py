@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from app.cli.calibration_plot import page
+from app.evaluation.calibration_plot import page
 from app.evaluation.figures import PALETTE, Line, chart
 from app.georeference.align import Alignment
 from app.slam.types import F64

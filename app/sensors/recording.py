@@ -119,6 +119,11 @@ class Recording:
         gravity = gravity_findings(imu, self._imu_units, self.params, preset)
         return [*probe_findings, *imu_findings, self._clocks, *gravity]
 
+    @property
+    def has_lines(self) -> bool:
+        """Whether `Scan.ring` names the LiDAR's scan lines, and not steps of elevation."""
+        return self._layout.rings.of_lines
+
     def sequencer(self) -> Sequencer:
         """A new one that pairs scans with what this recording has."""
         return Sequencer(self.params.imu, without_imu=not self.imu_topic)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.slam import coast, ground, iekf, imu, keyframes, rest, start
+from app.slam import channels, coast, ground, iekf, imu, keyframes, rest, start
 from app.slam.certainty import Certainty
 from app.slam.imu import Belief
 from app.slam.kernels import clouds
@@ -73,7 +73,7 @@ class Engine:
         """
         p, before, watch = self.params, self._progress, _Stopwatch()
         end_ns, notices = scan.end_ns, []
-        scan = _in_range(scan, p.sensor.min_range, p.sensor.max_range)
+        scan = _in_range(channels.corrected(scan, p.sensor), p.sensor.min_range, p.sensor.max_range)
 
         belief, still, waiting = before.belief, before.still, False
         if belief is None and not len(samples):

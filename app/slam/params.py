@@ -148,7 +148,7 @@ class Leaf:
         if isinstance(self.default, bool):
             return "true or false"
         if isinstance(self.default, str):
-            return "a text"
+            return f"a text ({self.meaning.removesuffix('.')})"
         limits = f"from {self.minimum:g} to {self.maximum:g} {self.unit}".rstrip()
         if isinstance(self.default, tuple):
             return f"{len(self.default)} numbers {limits}, such as {list(self.default)}"

@@ -16,6 +16,7 @@ Effect = Literal["now", "frame", "restart"]
 Metres = Annotated[float, Field(ge=-100, le=100)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 AxesName = Annotated[str, Field(pattern=r"^-?(x-?(y-?z|z-?y)|y-?(x-?z|z-?x)|z-?(x-?y|y-?x))$")]
+PerLine = Annotated[str, Field(pattern=r"^ *(-?\d+(\.\d*)?( +|$))*$", max_length=4000)]
 
 
 def _param(
@@ -95,6 +96,10 @@ class SensorParams(Section):
         step=0.1,
         unit="deg",
     )
+    elevation_corrections: PerLine = _next_frame(
+        "", "Added to the elevation of each scan line: numbers with spaces between, lowest line first.", unit="deg"
+    )
+    range_corrections: PerLine = _next_frame("", "The same for the distances that each line measures.", unit="m")
     min_range: float = _next_frame(
         0.4, "Nearer returns are dropped: they hit the person who carries it.", (0, 10, 0.1), "m"
     )

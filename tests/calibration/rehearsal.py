@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from app.calibration.calibrate import Calibration
 from app.calibration.inertial import Noise
+from app.calibration.lines import Lines
 from app.calibration.rotation import Turned
 from app.calibration.translation import Moved
 from app.slam.params import Params
@@ -32,4 +33,5 @@ def known(recording: Path, *, sure: bool = True, params: Params | None = None) -
         (0.02, 0.01),
         Noise(1e-3, 1e-4),
         Noise(1e-2, 1e-3),
+        Lines.none(0),
     )

@@ -1,5 +1,5 @@
 """Tests app/calibration/walk.py, app/calibration/odometry.py, app/calibration/calibrate.py, app/calibration/words.py,
-app/cli/calibrate.py and app/cli/calibration_plot.py: a recording alone tells how the LiDAR sits on the IMU."""
+app/cli/calibrate.py and app/evaluation/calibration_plot.py: a recording alone tells how the LiDAR sits on the IMU."""
 
 import json
 from dataclasses import replace
@@ -16,7 +16,7 @@ from app.__main__ import cli
 from app.calibration.calibrate import calibrate_walk
 from app.calibration.walk import Walk, read_walk
 from app.calibration.words import WALK, as_json, params_yaml, table, write_beside
-from app.cli.calibration_plot import residual_plot
+from app.evaluation.calibration_plot import residual_plot
 from app.sensors.presets import calibrated_beside, resolve_params, sidecar
 from app.sensors.recording import open_recording
 from app.slam import lie

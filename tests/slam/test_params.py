@@ -41,6 +41,8 @@ def any_value(leaf: Leaf) -> st.SearchStrategy[Any]:
         return st.booleans()
     if leaf.path.endswith("_axes"):
         return st.sampled_from(["xyz", "-yxz", "z-x-y"])
+    if leaf.path.endswith("_corrections"):
+        return st.sampled_from(["", "0.12 -0.3 0", "-0.004 1"])
     if isinstance(leaf.default, str):
         return st.sampled_from(["", "auto", "/a topic: #1", "yes", "12", "1e3", "~", "'"])
     assert leaf.minimum is not None and leaf.maximum is not None

@@ -29,6 +29,26 @@ def in_range(points, nearest, farthest, keep):
 
 
 @njit(cache=True)
+def correct(points, ring, elevations, ranges, out):
+    """Raise and lengthen each beam as its scan line asks for; lines beyond the tables stay as they are.
+
+    points (n, 3) f32 m, LiDAR frame; ring (n,) u16; elevations (k,) f64 rad and ranges (k,) f64 m, both added. Out: out
+    (n, 3) f32 m.
+    """
+    for j in range(len(points)):
+        x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
+        line = ring[j]
+        flat = math.sqrt(x * x + y * y)
+        reach = math.sqrt(flat * flat + z * z)
+        if line < len(elevations) and flat > 0.0:
+            c, s = math.cos(elevations[line]), math.sin(elevations[line])
+            bent = c - s * z / flat
+            x, y, z = x * bent, y * bent, c * z + s * flat
+        longer = (reach + ranges[line]) / reach if line < len(ranges) and reach > 0.0 else 1.0
+        out[j, 0], out[j, 1], out[j, 2] = x * longer, y * longer, z * longer
+
+
+@njit(cache=True)
 def centroids(points, chosen, voxel, table, stamp, generation, cells, sums, order, out):
     """Replace the chosen points of each voxel by their centroid; copy the others unchanged.
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from app.calibration.calibrate import Calibration
+from app.calibration.lines import Lines
 from app.evaluation.figures import PALETTE, Line, chart
 from app.slam.types import F64
 
@@ -16,12 +17,15 @@ _STYLE = (
 
 
 def residual_plot(calibration: Calibration) -> str:
-    """Two charts over the scans: how much the LiDAR's turns and ways differ from the IMU's."""
+    """How much the LiDAR's turns and ways differ from the IMU's, and how far the points of each scan line are from
+    planes."""
     turned, moved = calibration.turned, calibration.moved
     charts = [
         _chart(np.degrees(turned.before), np.degrees(turned.after), "turning (deg)"),
         _chart(moved.before * 1e3, moved.after * 1e3, "motion (mm)"),
     ]
+    if np.isfinite(calibration.lines.after).any():
+        charts.append(_of_lines(calibration.lines))
     return page(charts)
 
 
@@ -37,9 +41,17 @@ def page(charts: Sequence[str]) -> str:
 
 
 def _chart(before: F64, after: F64, label: str) -> str:
+    first, last = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
+    return _before_and_after(first, last, "scan", f"{label}: scans against IMU")
+
+
+def _of_lines(lines: Lines) -> str:
+    return _before_and_after(lines.before * 1e3, lines.after * 1e3, "scan line", "points on planes (mm)")
+
+
+def _before_and_after(before: F64, after: F64, x_label: str, label: str) -> str:
     lines = [
-        Line(name, colour, np.arange(len(values), dtype=np.float64), np.linalg.norm(values, axis=1))
+        Line(name, colour, np.flatnonzero(np.isfinite(values)).astype(np.float64), values[np.isfinite(values)])
         for name, colour, values in (("before", PALETTE[4], before), ("after", PALETTE[0], after))
     ]
-    title = f"{label}: scans against IMU, red before, blue after"
-    return str(chart(lines, "scan", title, from_zero=True, height=_HEIGHT))
+    return str(chart(lines, x_label, f"{label}, red before, blue after", from_zero=True, height=_HEIGHT))
