@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli.options import Duration, ParamsFor, Start, TruthFile, say_calibrated, with_params
+from app.cli.options import Calibrate, Duration, ParamsFor, Start, TruthFile, say_calibrated, with_params
 from app.slam.errors import HemislamError
 
 
@@ -77,6 +77,7 @@ def serve(
     start: Start = 0.0,
     duration: Duration = None,
     truth: TruthFile = None,
+    calibrate: Calibrate = True,
 ) -> None:
     """Open the workbench in the browser.
 
@@ -137,7 +138,9 @@ def serve(
             open_recording(opened, params).close()
         from app.ui.workbench import Workbench
 
-        return Workbench(viser, engine, folders, point_budget=point_budget, results=Path("runs"))
+        return Workbench(
+            viser, engine, folders, point_budget=point_budget, results=Path("runs"), calibrate=calibrate and not session
+        )
 
     with (
         TemporaryDirectory(prefix="hemislam-") as folder_live,

@@ -12,7 +12,7 @@ from app.mapping.feed import Quiet
 from app.mapping.session import EFFECT, Session
 from app.server.protocol import Progress
 from app.server.publisher import Publisher, opened_recording
-from app.slam.doubts import doubts
+from app.slam.doubts import IN_DOUBT, doubts
 from app.slam.errors import HemislamError
 from app.slam.types import DroppedScan, StepResult
 
@@ -220,7 +220,7 @@ class Player:
             self.halt()
             self._page.show(finished=True)
             for doubt in doubts(session.log):
-                self._page.notice("warning", f"This run is doubtful. {doubt}")
+                self._page.notice("warning", f"{IN_DOUBT} {doubt}")
             return None
         if isinstance(entry, Quiet):
             if entry.status is not None:

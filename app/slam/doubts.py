@@ -5,6 +5,8 @@ import numpy as np
 from app.slam.run_log import RunLog
 from app.slam.types import F64, FrameStatus
 
+IN_DOUBT = "This run is doubtful."
+"""How a notice about a doubt begins."""
 FASTEST = 10.0
 """m/s between two frames; a sprint."""
 HARDEST = 60.0

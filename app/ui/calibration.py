@@ -1,44 +1,75 @@
-"""Calibrate: how the LiDAR sits on the IMU by the open recording, found in a process of its own, applied by a click."""
+"""Calibrate: how the LiDAR sits on the IMU by the open recording, found in a process of its own, applied by a click.
 
+It begins by itself where the mounting is not known, and after a run in doubt. What it finds where nothing is known is
+applied at once, unless the user changed something in the meantime.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from app.calibration.by_itself import is_mounting_unknown
 from app.child import Child, ChildDied, Link
 from app.server.protocol import LIVE, Restart, SetParams, Snapshot
+from app.slam.doubts import IN_DOUBT
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.ui.html import panel
 from app.ui.widgets import Page
 
 _EXPLAINED = (
-    "Finds the rotation and position of the LiDAR on the IMU and the offset of their clocks from the recording alone. "
-    "Takes about as long as the recording."
+    "Finds rotation and position of the LiDAR on the IMU, the offset of their clocks, and what each scan line gets "
+    "wrong, from the recording alone. Takes about as long as the recording."
 )
 
 
-class CalibrationPanel:
-    """A button, then the progress, then what was found with its uncertainty and a button that applies it."""
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What the process sends at the end.
 
-    def __init__(self, page: Page) -> None:
-        self._page = page
+    Attributes:
+        rows: names and values of a table. values: parameters by dotted name. plot: SVG of the residuals.
+        contradiction: what is wrong with the parameters taken so far, in a sentence; "" if nothing is.
+    """
+
+    rows: list[tuple[str, str]]
+    values: dict[str, Any]
+    plot: str = ""
+    contradiction: str = ""
+
+
+class CalibrationPanel:
+    """A button, then the progress, then what was found with its uncertainty and a button that applies or undoes it.
+
+    Args:
+        by_itself: begin without being asked where that helps.
+    """
+
+    def __init__(self, page: Page, *, by_itself: bool = False) -> None:
+        self._page, self._by_itself = page, by_itself
         gui = page.gui
         self._button = gui.add_button("Calibrate", hint=_EXPLAINED, disabled=True)
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._html = gui.add_html("", visible=False)
-        self._apply = gui.add_button("Apply", hint="Undo it like any parameter.", visible=False)
+        self._apply = gui.add_button("Apply", visible=False)
+        self._plot = gui.add_html("", visible=False)
         self._button.on_click(lambda _: self._begin())
         self._apply.on_click(lambda _: self._use())
         self._child: Child | None = None
-        self._found: dict[str, Any] = {}
+        self._values: dict[str, Any] = {}
+        self._given = Params()
         self._of: Path | None = None
+        self._asked = self._tried = False
 
     def draw(self, snapshot: Snapshot) -> None:
         recording = snapshot.recording.path if snapshot.recording else None
         if recording != self._of:  # what was found belongs to another one
             self.close()
-            self._of, self._found = recording, {}
-            self._html.visible = self._apply.visible = False
+            self._of, self._values, self._tried = recording, {}, not self._by_itself
+            self._html.visible = self._apply.visible = self._plot.visible = False
         self._button.disabled = self._child is not None or recording is None or recording == LIVE
+        if not self._tried and not self._button.disabled and _helps(snapshot):
+            self._begin(asked=False)
         while self._child is not None:
             try:
                 message = self._child.receive(0.0)
@@ -59,34 +90,76 @@ class CalibrationPanel:
             self._progress.value = 100 * message  # type: ignore[misc]  # mypy overlooks viser's setter
             return
         self.close()
-        rows, self._found = message if isinstance(message, tuple) else ([("", message)], {})
+        found = message if isinstance(message, Found) else Found([("", message)], {})
+        self._values = found.values
+        rows = [("", f"{found.contradiction}."), *found.rows] if found.contradiction else found.rows
         self._html.content, self._html.visible = panel("calibration", rows), True
-        self._apply.visible = bool(self._found)
+        self._plot.content, self._plot.visible = found.plot, bool(found.plot)
+        self._offer("Apply", "Set these parameters and read the recording again.")
+        if not self._asked and found.contradiction:
+            self._tell(found.contradiction)
 
-    def _begin(self) -> None:
+    def _tell(self, contradiction: str) -> None:
+        """Say what was found unasked, and use it where nothing else is known."""
+        snapshot = self._page.snapshot()
+        use = is_mounting_unknown(snapshot.params) and snapshot.params == self._given and not _has_edits(snapshot)
+        where = "See Calibration under Recording"
+        text = f"{contradiction}. {where}; Undo is there, too." if use else f"{contradiction}. {where} to apply it."
+        for client in self._page.server.get_clients().values():
+            client.add_notification("Calibrated" if use else "Calibration", text, auto_close_seconds=None)
+        if use:
+            self._use()
+
+    def _begin(self, *, asked: bool = True) -> None:
         snapshot = self._page.snapshot()
         if self._child is not None or snapshot.recording is None or self._button.disabled:
             return
+        self._asked, self._tried, self._given = asked, True, snapshot.params
         self._progress.value = 0.0  # type: ignore[misc]  # as above
         self._progress.visible, self._apply.visible = True, False
         arguments = (snapshot.recording.path, snapshot.params)
         self._child = Child(find, *arguments, name="calibrate", title="Calibration", fork=True)
 
     def _use(self) -> None:
-        if self._found:
-            self._page.send(SetParams(dict(self._found)))
-            self._page.send(Restart())
-            self._apply.visible = False
+        """Set what was found; or, once that is done, what was there before."""
+        if not self._values:
+            return
+        params, undoing = self._page.snapshot().params, self._apply.label == "Undo"
+        before = {path: params.value(path) for path in self._values}
+        self._page.send(SetParams(dict(self._values)))
+        self._page.send(Restart())
+        self._values = before
+        if undoing:
+            self._offer("Apply", "Set what was found again.")
+        else:
+            self._offer("Undo", "Set what was there before, and read the recording again.")
+
+    def _offer(self, label: str, hint: str) -> None:
+        self._apply.label, self._apply.hint = label, hint
+        self._apply.visible = bool(self._values)
+
+
+def _helps(snapshot: Snapshot) -> bool:
+    """Whether a calibration is likely to mend something."""
+    in_doubt = any(notice.text.startswith(IN_DOUBT) for notice in snapshot.notices)
+    return in_doubt or is_mounting_unknown(snapshot.params)
+
+
+def _has_edits(snapshot: Snapshot) -> bool:
+    """Whether somebody made something that belongs to the frames as they are."""
+    s = snapshot
+    return bool(s.notes or s.measures or s.painted or s.views or s.loops.undo)
 
 
 def find(owner: Link, recording: Path, params: Params) -> None:
-    """In a process of its own: sends fractions done, then rows of a table with the parameters found, or a sentence."""
+    """In a process of its own: sends fractions done, then what was found, or a sentence why nothing was."""
     from app.calibration.calibrate import calibrate
     from app.calibration.words import table
+    from app.evaluation.calibration_plot import residual_plot
 
     try:
         found = calibrate(recording, params, progress=lambda fraction: owner.send(float(fraction)))
     except HemislamError as error:
         owner.send(str(error))
         return
-    owner.send((table(found), found.found()))
+    owner.send(Found(table(found), found.found(), residual_plot(found), found.contradiction()))

@@ -63,7 +63,7 @@ class Workbench:
         server: whose page this is. engine: where snapshots come from and commands go; a `Workspace` can be forked.
         folders: where recordings may be opened from. point_budget: of the engine's reader, shown to the user.
         results: folder below which results are saved.
-        now: monotonic seconds.
+        now: monotonic seconds. calibrate: begin calibrations without being asked, where they help.
     """
 
     def __init__(
@@ -75,6 +75,7 @@ class Workbench:
         *,
         results: Path = Path("results"),
         now: Callable[[], float] = time.monotonic,
+        calibrate: bool = False,
     ) -> None:
         forks = engine if isinstance(engine, Workspace) else Workspace(engine, Setup(), lambda _: engine)
         self._server = server
@@ -138,7 +139,7 @@ class Workbench:
             self._live = LivePanel(gui)
             self._doctor = DoctorPanel(page)
             with gui.add_folder("Calibration", expand_by_default=False):
-                self._calibration = CalibrationPanel(page)
+                self._calibration = CalibrationPanel(page, by_itself=calibrate)
             with gui.add_folder("Georeference", expand_by_default=False):
                 self._georeference = GeoreferencePanel(page, folders, self._measure)
             with gui.add_folder("Notes"):

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import viser
 
-from app.server.protocol import Command, OpenedRecording, Restart, SetParams, Snapshot
+from app.server.protocol import Command, Note, Notice, OpenedRecording, Restart, SetParams, Snapshot
 from app.slam.params import Params
 from app.ui import calibration
-from app.ui.calibration import CalibrationPanel
+from app.ui.calibration import CalibrationPanel, Found
 from tests.ui.conftest import page_of, user_clicks
 
 FOUND = {"sensor.rotation": [70.0, -50.0, 104.0]}
@@ -31,10 +31,14 @@ class Process:
 
 
 class Calibrating:
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, *, by_itself: bool = False) -> None:
         self.sent: list[Command] = []
-        self.panel = CalibrationPanel(page_of(server, self.sent.append, lambda: OPEN))
-        self.panel.draw(OPEN)
+        self.now = OPEN
+        self.panel = CalibrationPanel(page_of(server, self.sent.append, lambda: self.now), by_itself=by_itself)
+
+    def draw(self, now: Snapshot) -> None:
+        self.now = now
+        self.panel.draw(now)
 
     def process(self) -> Any:
         return self.panel._child
@@ -43,7 +47,9 @@ class Calibrating:
 @pytest.fixture
 def page(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> Calibrating:
     monkeypatch.setattr(calibration, "Child", Process)
-    return Calibrating(server)
+    page = Calibrating(server)
+    page.draw(OPEN)
+    return page
 
 
 def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> None:
@@ -54,12 +60,14 @@ def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> 
     process.messages += [0.25, 0.5]
     panel.draw(OPEN)
     assert panel._progress.visible and panel._progress.value == 50 and panel._button.disabled
-    process.messages.append(([("rotation of the LiDAR on the IMU", "roll 70.00 ± 0.05 <deg>")], FOUND))
+    process.messages.append(Found([("rotation of the LiDAR on the IMU", "roll 70.00 ± 0.05 <deg>")], FOUND, "<svg/>"))
     panel.draw(OPEN)
     assert process.closed and not panel._progress.visible and panel._apply.visible
     assert "roll 70.00 ± 0.05 &lt;deg&gt;" in panel._html.content and page.sent == []
     user_clicks(panel._apply)
-    assert page.sent == [SetParams(FOUND), Restart()] and not panel._apply.visible
+    assert page.sent == [SetParams(FOUND), Restart()] and panel._plot.content == "<svg/>"
+    user_clicks(panel._apply)
+    assert page.sent[2:] == [SetParams({"sensor.rotation": (0.0, 0.0, 0.0)}), Restart()]
 
 
 def test_what_cannot_be_told_is_said_and_nothing_is_offered(page: Calibrating) -> None:
@@ -83,3 +91,41 @@ def test_without_a_recording_there_is_nothing_to_calibrate(server: viser.ViserSe
     panel = CalibrationPanel(page_of(server, [].append, Snapshot))
     panel.draw(Snapshot())
     assert panel._button.disabled
+
+
+TOLD = Found([("position", "unknown")], FOUND, "", "The LiDAR seems to be turned by 70°, -50°, 104° on the IMU")
+
+
+@pytest.fixture
+def unasked(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> Calibrating:
+    monkeypatch.setattr(calibration, "Child", Process)
+    return Calibrating(server, by_itself=True)
+
+
+def test_an_unknown_mounting_is_found_and_used_on_opening_and_undone_by_a_click(unasked: Calibrating) -> None:
+    unasked.draw(OPEN)
+    unasked.process().messages.append(TOLD)
+    unasked.draw(OPEN)
+    assert unasked.sent == [SetParams(FOUND), Restart()] and unasked.panel._apply.label == "Undo"
+    assert "turned by 70°" in unasked.panel._html.content
+    unasked.draw(replace(OPEN, params=Params().with_values(FOUND)))
+    unasked.draw(OPEN)
+    assert unasked.process() is None, "it begins once for each recording"
+
+
+def test_what_somebody_made_in_the_meantime_is_not_restarted(unasked: Calibrating) -> None:
+    unasked.draw(OPEN)
+    unasked.process().messages.append(TOLD)
+    unasked.draw(replace(OPEN, notes=(Note(3, "a door"),)))
+    assert unasked.sent == [] and unasked.panel._apply.label == "Apply" and unasked.panel._apply.visible
+
+
+def test_a_given_mounting_is_questioned_only_by_a_run_in_doubt_and_never_replaced_unasked(unasked: Calibrating) -> None:
+    given = replace(OPEN, params=Params().with_values({"sensor.rotation": [0, 0, 90]}))
+    unasked.draw(given)
+    assert unasked.process() is None
+    doubtful = replace(given, notices=(Notice(1, "warning", "This run is doubtful. It moves at up to 20 m/s."),))
+    unasked.draw(doubtful)
+    unasked.process().messages.append(TOLD)
+    unasked.draw(doubtful)
+    assert unasked.sent == [] and unasked.panel._apply.visible and unasked.panel._apply.label == "Apply"
