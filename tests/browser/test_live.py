@@ -23,7 +23,7 @@ WELL = LiveState(
 )
 
 
-def test_the_panel_is_there_while_a_source_is_live_and_tells_when_it_is_not_well(bench: Bench) -> None:
+def test_the_panel_is_there_while_a_source_is_live_and_shows_when_it_is_not_well(bench: Bench) -> None:
     page = bench.page
     page.get_by_role("tab", name="Recording").click()
     heading = page.get_by_text("Live source", exact=True)

@@ -149,7 +149,7 @@ def test_parameters_can_be_had_as_yaml_and_given(bench: Bench) -> None:
     bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha == 33.0)
 
 
-def test_yaml_that_can_not_be_used_is_told_in_the_dialog_which_keeps_it(bench: Bench) -> None:
+def test_yaml_that_cannot_be_used_is_reported_in_the_dialog_which_keeps_it(bench: Bench) -> None:
     before = bench.engine.snapshot.params
     bench.page.get_by_role("button", name="Load YAML").click()
     bench.page.get_by_role("dialog").locator("textarea").fill("ground:\n  alhpa: 33\n")

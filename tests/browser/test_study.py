@@ -127,7 +127,7 @@ def pixel_of(bench: Bench, index: int) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def test_a_clicked_point_tells_its_numbers_until_another_frame_comes(bench: Bench) -> None:
+def test_a_clicked_point_shows_its_numbers_until_another_frame_comes(bench: Bench) -> None:
     bench.look((-4.0, -4.0, 9.0), (0.3, 0.2, -0.6))
     bench.page.get_by_role("tab", name="Study").click()
     asks = bench.page.get_by_text("Pause and click a point")

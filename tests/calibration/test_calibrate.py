@@ -82,7 +82,7 @@ def test_a_file_that_a_person_wrote_is_never_overwritten_unasked(tmp_path: Path)
     assert (tmp_path / "walk.params.yaml.old").read_text() == mine
 
 
-def test_what_the_motion_does_not_tell_is_said_and_not_kept(tmp_path: Path) -> None:
+def test_what_the_motion_does_not_determine_is_said_and_not_kept(tmp_path: Path) -> None:
     found = known(tmp_path / "walk.mcap", sure=False)
     assert [text for _, text in table(found)[:3]] == [WALK] * 3
     assert found.found() == {} and found.contradiction() == ""

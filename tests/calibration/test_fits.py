@@ -90,7 +90,7 @@ def test_turning_about_one_axis_leaves_the_rotation_about_it_unknown() -> None:
     assert np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1])) > 1.0
 
 
-def test_a_lively_motion_tells_the_place_of_the_lidar_to_a_centimetre() -> None:
+def test_a_lively_motion_shows_the_place_of_the_lidar_to_a_centimetre() -> None:
     R = Rotation.random(random_state=3).as_matrix()
     track, inertial = sensed(hand(40.0), R, 0.0, 40.0)
     turned = turned_by(track, inertial)
@@ -137,7 +137,7 @@ def test_within_a_scan_the_lidar_is_where_its_motion_had_it() -> None:
 
 
 @pytest.mark.parametrize("rate", [100, 200, 400])
-def test_an_imus_noise_is_told_from_a_hands_motion(rate: int) -> None:
+def test_an_imus_noise_is_distinguished_from_a_hands_motion(rate: int) -> None:
     """White noise of a known density on a lively walk, with a stretch in which the hand knocks against something."""
     rng = np.random.default_rng(1)
     times = np.arange(0.0, 30.0, 1.0 / rate)

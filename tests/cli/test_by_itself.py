@@ -20,7 +20,7 @@ def rehearsed(monkeypatch: pytest.MonkeyPatch, *, sure: bool = True) -> None:
     monkeypatch.setattr("app.calibration.by_itself.calibrate", found)
 
 
-def test_an_unknown_mounting_is_found_used_and_told(
+def test_an_unknown_mounting_is_found_used_and_reported(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rehearsed(monkeypatch)
@@ -42,7 +42,7 @@ def test_a_given_mounting_or_a_refusal_is_respected(
         assert report["calibration"] is None and report["parameters"]["sensor"]["rotation"] == [0, 0, 0]
 
 
-def test_what_a_motion_does_not_tell_changes_nothing(
+def test_what_a_motion_does_not_determine_changes_nothing(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rehearsed(monkeypatch, sure=False)
@@ -51,7 +51,7 @@ def test_what_a_motion_does_not_tell_changes_nothing(
     assert report["calibration"] is None and "seems to be" not in done.output
 
 
-def test_info_tells_how_the_lidar_is_turned(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_info_shows_how_the_lidar_is_turned(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rehearsed(monkeypatch)
     told = CliRunner().invoke(cli, ["info", str(walk)]).output
     assert "rotated by 70°, -50°, 104° on the IMU, and the IMU's clock" in told

@@ -75,7 +75,7 @@ def check_against_evo(estimate: Trajectory, truth: Trajectory) -> bool:
     return errors["ate_deg"] is not None
 
 
-def test_a_slip_at_the_start_is_told_from_the_errors_after_it() -> None:
+def test_a_slip_at_the_start_is_distinguished_from_the_errors_after_it() -> None:
     truth = walks.wandering(walks.frames(), 1)
     slipped = truth.positions + np.where(np.arange(len(truth)) < 30, 0.05, 0.0)[:, None] * [1.0, 0.0, 0.0]
     estimate = Trajectory(truth.stamps_ns, slipped, truth.quaternions)

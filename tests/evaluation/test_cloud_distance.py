@@ -32,7 +32,7 @@ def test_a_floor_that_was_raised_or_sank_is_so_far_away(apart: float) -> None:
 
 
 @pytest.mark.parametrize("noise", [0.003, 0.015])
-def test_of_two_samples_of_one_surface_one_in_twenty_distances_is_told_wrongly(noise: float) -> None:
+def test_of_two_samples_of_one_surface_one_in_twenty_distances_is_reported_wrongly(noise: float) -> None:
     found = from_above(floor(0.0, noise), floor(0.0, noise))
     assert found.changed == pytest.approx(0.05, abs=0.025)
     assert found.known.std() == pytest.approx(float(np.nanmedian(found.detectable)) / 1.96, rel=0.25)

@@ -155,7 +155,7 @@ def test_a_recording_that_cannot_be_used_costs_its_own_run_only(site: Site, reco
     assert list(errors) == [("walk", "bad")] and "empty.mcap" in errors["walk", "bad"]
 
 
-def test_no_scheduler_and_other_versions_are_told_in_a_sentence(
+def test_no_scheduler_and_other_versions_are_reported_in_a_sentence(
     site: Site, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster, "CONNECT_S", 1.0)

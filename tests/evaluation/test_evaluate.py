@@ -183,7 +183,7 @@ def test_a_variant_is_a_name_and_parameters() -> None:
         ("a/b:ground.sigma=0.03", "cannot be named `a/b`"),
     ],
 )
-def test_a_variant_that_is_none_is_refused(text: str, says: str) -> None:
+def test_a_malformed_variant_is_refused(text: str, says: str) -> None:
     with pytest.raises(HemislamError, match=says):
         parse_variant(text)
 

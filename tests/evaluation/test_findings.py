@@ -47,7 +47,7 @@ def about(texts: list[str], what: str) -> str:
         (50.0, 2.0, "is 25 times as large, 0.002 to 0.05 m", True),
     ],
 )
-def test_an_error_that_falls_and_one_that_rises_are_told_apart(
+def test_an_error_that_falls_and_one_that_rises_are_distinguished(
     ours: float, theirs: float, verdict: str, against: bool
 ) -> None:
     text = about(said("indoor", [ours], [theirs]), "error (ATE)")
@@ -56,14 +56,14 @@ def test_an_error_that_falls_and_one_that_rises_are_told_apart(
 
 
 @pytest.mark.parametrize(("ours", "theirs", "verdict"), [(2.0, 4.0, "falls by 50 %"), (6.0, 4.0, "rises by 50 %")])
-def test_time_outdoors_is_told_either_way_and_the_paper_promised_nothing(
+def test_time_outdoors_is_reported_either_way_and_the_paper_promised_nothing(
     ours: float, theirs: float, verdict: str
 ) -> None:
     text = about(said("outdoor", [1.0], [1.0], (ours, theirs)), "CPU time per frame outdoors")
     assert verdict in text and "against what the paper" not in text
 
 
-def test_outdoors_is_only_told_of_recordings_outdoors() -> None:
+def test_outdoors_is_only_reported_of_recordings_outdoors() -> None:
     assert not any("outdoors" in text for text in said("indoor", [1.0], [1.0]))
 
 
@@ -82,7 +82,7 @@ def test_a_difference_that_recordings_do_not_share_may_be_chance() -> None:
     assert "over 3 recordings (± 10.0 %, one standard error: may be chance)" in text
 
 
-def test_a_difference_that_all_recordings_share_is_none_of_chance() -> None:
+def test_a_difference_that_all_recordings_share_is_not_chance() -> None:
     text = about(said("indoor", [11.0, 11.1, 10.9], [10.0, 10.0, 10.0]), "error (ATE)")
     assert "(± 0.6 %, one standard error)" in text
 

@@ -53,7 +53,7 @@ def test_the_gnss_table_is_brought_into_clock_point_and_axes_of_the_imu(gnss: Pa
     assert "clock" in said and "lever arm" in said and "axes" in said
 
 
-def test_without_its_lever_arm_the_antenna_is_told_from_the_imu(gnss: Path) -> None:
+def test_without_its_lever_arm_the_antenna_is_distinguished_from_the_imu(gnss: Path) -> None:
     matched = match(read_truth(str(gnss), lever=(0.0, 0.0, 0.0)), ESTIMATE)
     assert 0.1 < ate(ESTIMATE, matched.trajectory).position.max < 0.6  # 0.45 m of arm, turned about
 
@@ -102,7 +102,7 @@ def test_kitti_poses_belong_to_frames_or_to_the_times_beside_them(tmp_path: Path
         (b"0.0\n0.1\n", "holds 2 times for 3 poses"),
     ],
 )
-def test_times_beside_kitti_poses_that_are_none_are_refused(tmp_path: Path, times: bytes, says: str) -> None:
+def test_malformed_times_beside_kitti_poses_are_refused(tmp_path: Path, times: bytes, says: str) -> None:
     path = walks.write(tmp_path / "poses.txt", ["1 0 0 0 0 1 0 0 0 0 1 0"] * 3)
     (tmp_path / "times.txt").write_bytes(times)
     with pytest.raises(HemislamError, match=says):
@@ -208,7 +208,7 @@ def test_a_truth_in_the_imus_axes_is_left_alone(tmp_path: Path) -> None:
     assert ate(ESTIMATE, matched.trajectory).position.max < 1e-6
 
 
-def test_axes_that_a_straight_walk_does_not_tell_are_not_guessed() -> None:
+def test_axes_that_a_straight_walk_does_not_determine_are_not_guessed() -> None:
     """Motion is compared nevertheless: guessed axes would bring along a roll about the way of any size."""
     seconds, rng = walks.frames(20.0), np.random.default_rng(3)
     walk = walks.wandering(seconds)

@@ -196,7 +196,7 @@ def test_degrees_that_positions_do_not_fix_are_withheld_with_the_reason(tmp_path
     assert "no rotation error: The truth lies within" in summarise(withheld, tmp_path)
 
 
-def test_a_truth_that_does_not_fit_is_told_in_the_report(tmp_path: Path, recording: Path) -> None:
+def test_a_truth_that_does_not_fit_is_reported_in_the_report(tmp_path: Path, recording: Path) -> None:
     log = logged(8)
     other_day = Trajectory(log.odometry.stamps_ns + 10**14, log.odometry.positions, log.odometry.quaternions)
     report = save_results(tmp_path / "out", Results(log, [], RunInfo(recording, Params(), truth=other_day)))
@@ -212,7 +212,7 @@ def test_a_run_without_a_single_frame_still_has_a_report(tmp_path: Path, recordi
     assert (tmp_path / "out" / "trajectory.tum").read_text() == ""
 
 
-def test_the_map_holds_every_keyframe_where_loops_lay_it(tmp_path: Path) -> None:
+def test_the_map_holds_every_keyframe_where_loops_place_it(tmp_path: Path) -> None:
     keyframes = [keyframe(0, [[1, 0, 0], [0, 2, 0]], [GROUND, NON_GROUND]), keyframe(1, [[1, 0, 0]], [SEED])]
     T_map_odom = np.tile(np.eye(4), (2, 1, 1))
     T_map_odom[:, 1, 3] = 100.0, 200.0

@@ -157,7 +157,7 @@ def test_a_walker_who_sways_walks_no_longer_way() -> None:
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() == pytest.approx(50, rel=0.005)
 
 
-def test_a_slab_without_points_or_walk_is_told(tmp_path: Path) -> None:
+def test_a_slab_without_points_or_walk_is_reported(tmp_path: Path) -> None:
     results = room()
     with pytest.raises(HemislamError, match="choose one in the page, or by --box"):
         save_results(tmp_path, results, of_formats(["section"]))

@@ -34,7 +34,7 @@ def test_a_walk_with_a_late_receiver_and_wild_fixes_is_placed_to_centimetres() -
 
 
 @pytest.mark.parametrize("path", [LOOP, LINE])
-def test_a_tilt_that_the_accelerometer_left_is_taken_out_as_far_as_the_walk_tells_it(path: F64) -> None:
+def test_a_tilt_that_the_accelerometer_left_is_taken_out_as_far_as_the_walk_shows_it(path: F64) -> None:
     """On a straight line nothing tells how the map is turned about it; then it stays as level as it was."""
     made = walked(path=path)
     tilt = lie.from_rpy_degrees((0.4, -0.3, 0.0))
@@ -77,7 +77,7 @@ def test_fixes_without_a_covariance_are_judged_by_their_scatter() -> None:
     assert not verdicts(found, made)[0]
 
 
-def test_a_straight_walk_with_the_antenna_above_tells_no_lever_arm_and_says_so() -> None:
+def test_a_straight_walk_with_the_antenna_above_shows_no_lever_arm_and_says_so() -> None:
     made = walked(path=LINE, noise=0.5, outliers=0.0, lever=(0.0, 0.0, 0.0), rate_hz=1.0, duration_s=40.0)
     found = align(made.trajectory, made.fixes)
     assert found.lever_arm == (0.0, 0.0, 0.0) and "lever arm" in " ".join(found.notes)
@@ -118,7 +118,7 @@ def test_an_hour_of_fixes_from_the_drive_to_the_site_does_not_matter() -> None:
     assert [int(name) - 3600 for name in found.names] == [int(name) for name in alone.names]
 
 
-def test_a_line_at_even_pace_tells_no_offset_and_none_is_made_up() -> None:
+def test_a_line_at_even_pace_shows_no_offset_and_none_is_made_up() -> None:
     made = walked(path=LINE, noise=3.0, outliers=0.0, lever=(0.0, 0.0, 0.0), rate_hz=1.0, duration_s=60.0)
     found = align(made.trajectory, made.fixes, lever=(0.0, 0.0, 0.0))
     assert found.offset_s == 0.0 and np.isnan(found.offset_sigma_s)

@@ -74,7 +74,7 @@ def test_the_users_word_on_a_fix_overrules_the_verdict(made: Walked, drifted: Tr
     assert verdict[wild] and not verdict[sound]
 
 
-def test_a_clock_offset_that_the_motion_does_not_tell_is_not_looked_for_again(
+def test_a_clock_offset_that_the_motion_does_not_determine_is_not_looked_for_again(
     made: Walked, drifted: Trajectory
 ) -> None:
     _, after, _ = solved(made, drifted, offset_known=False)

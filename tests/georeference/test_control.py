@@ -65,7 +65,7 @@ def test_a_point_that_is_only_in_one_file_is_left_out(tmp_path: Path) -> None:
     assert laid(control, picks, grid="EPSG:32632").names == ("A", "B", "C")
 
 
-def test_a_point_without_its_easting_is_told_as_such(tmp_path: Path) -> None:
+def test_a_point_without_its_easting_is_reported_as_such(tmp_path: Path) -> None:
     control, picks = written(tmp_path, CORNERS)
     head, first, *others = control.read_text().splitlines()
     name, _, north, height = first.split(",")

@@ -32,7 +32,7 @@ def test_what_is_read_ahead_is_the_same() -> None:
     assert read(SAMPLE, read_ahead=False) == (ahead, "")
 
 
-def test_damage_is_told_after_the_same_measurements(tmp_path: Path) -> None:
+def test_damage_is_reported_after_the_same_measurements(tmp_path: Path) -> None:
     damaged = tmp_path / "damaged.mcap"
     whole = SAMPLE.read_bytes()
     middle = len(whole) // 40

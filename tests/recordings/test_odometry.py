@@ -58,7 +58,7 @@ def test_no_frame_is_lost(passed: Passed, name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "f1"), [("hall", 0.95), ("outdoor", 0.85)])
-def test_ground_is_told_from_the_rest(passed: Passed, name: str, f1: float) -> None:
+def test_ground_is_distinguished_from_the_rest(passed: Passed, name: str, f1: float) -> None:
     score = passed(name).score
     assert score.true_positive > 100_000
     assert score.f1 >= f1

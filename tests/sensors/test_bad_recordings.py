@@ -85,7 +85,7 @@ def test_an_mcap_without_the_ros2_profile_is_read_all_the_same(tmp_path: Path) -
         assert sum(isinstance(entry, Measurement) for entry in recording.measurements()) == 4
 
 
-def test_a_folder_with_broken_metadata_names_the_command_that_makes_it_anew(tmp_path: Path) -> None:
+def test_a_folder_with_broken_metadata_names_the_command_that_makes_it_again(tmp_path: Path) -> None:
     path = rig.write(tmp_path / "walk", rig.walk(turns=2, columns=4), "sqlite3")
     (path / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}")
     assert "ros2 bag reindex" in refusal(path)
@@ -252,7 +252,7 @@ def spoilt(field: str, value: float, share: float, layout: rig.Layout | None = N
     ("field", "value"),
     [("timestamp", np.nan), ("timestamp", np.inf), ("timestamp", 1e300), ("x", np.inf), ("y", 1e30), ("z", -3e4)],
 )
-def test_points_that_cannot_be_returns_are_left_out_and_told(
+def test_points_that_cannot_be_returns_are_left_out_and_reported(
     tmp_path: Path, field: str, value: float, share: float
 ) -> None:
     path = rig.write(tmp_path / "walk", spoilt(field, value, share))

@@ -159,7 +159,7 @@ def test_g_that_is_said_to_be_metres_per_second_squared_is_contradicted(tmp_path
     assert text.startswith("needs you") and "not gravity in it" in text and "acceleration_unit=auto" in text
 
 
-def test_clocks_a_year_apart_are_told_with_the_offset_that_mends_it(tmp_path: Path) -> None:
+def test_clocks_a_year_apart_are_reported_with_the_offset_that_mends_it(tmp_path: Path) -> None:
     year_ns = 365 * 86_400 * 10**9
     entries = []
     for topic, log_ns, made in rig.walk(turns=30, columns=60):

@@ -360,7 +360,7 @@ def test_a_shock_that_lasts_is_no_spike() -> None:
     assert given_on(values)[0] == list(range(198))
 
 
-def test_a_refused_sample_is_told_with_the_measurement() -> None:
+def test_a_refused_sample_is_reported_with_the_measurement() -> None:
     sequencer = Sequencer(ImuParams(max_acceleration=20.0))
     for at in samples(0, 200):
         sequencer.add_imu(at * MS, (0.0, 0.0, 0.0), (0.0, 0.0, 25.0 if at == 50 else 9.81))

@@ -144,7 +144,7 @@ FAST = SetSpeed(math.inf)
 NO_GROUND = SetBreakpoints(Breakpoints(no_ground=True))
 
 
-def test_playing_pauses_there_also_at_full_speed_tells_why_and_play_goes_on() -> None:
+def test_playing_pauses_there_also_at_full_speed_shows_why_and_play_goes_on() -> None:
     bench = Bench()
     snapshot = bench.do(NO_GROUND, FAST, Play())
     assert snapshot.breakpoints == NO_GROUND.breakpoints

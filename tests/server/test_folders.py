@@ -43,7 +43,7 @@ OUTSIDE = (
 
 
 @pytest.mark.parametrize("path", OUTSIDE)
-def test_nothing_outside_is_reached_and_the_answer_tells_nothing(disk: Path, path: str) -> None:
+def test_nothing_outside_is_reached_and_the_answer_shows_nothing(disk: Path, path: str) -> None:
     with pytest.raises(HemislamError, match=r"There is no .* in the folders that hemislam may open"):
         Folders([disk / "open"]).inside(path)
 

@@ -38,7 +38,7 @@ def test_labels_that_do_not_fit_are_refused() -> None:
     assert not bench.sessions[-1].keyframes.edits
 
 
-def test_a_keyframe_that_is_made_anew_has_its_own_labels() -> None:
+def test_a_keyframe_that_is_made_again_has_its_own_labels() -> None:
     bench = Bench()
     bench.do(Seek(40))
     bench.do(EditLabels(6, GROUND), Seek(10), SetParams({"ground.sigma": 0.2}))

@@ -92,7 +92,9 @@ def verdicts(now: Snapshot) -> dict[str, bool]:
     return dict(zip(now.earth.found.names, now.earth.found.used.tolist(), strict=True))
 
 
-def test_a_map_is_laid_by_the_fixes_of_its_recording_and_again_when_it_has_grown(bench: Laid, walk: Path) -> None:
+def test_a_map_is_georeferenced_by_the_fixes_of_its_recording_and_again_when_it_has_grown(
+    bench: Laid, walk: Path
+) -> None:
     bench.do(Seek(50), LayOnEarth(Survey(lever=LEVER)))
     fewer = len(verdicts(bench.see()))
     bench.do(Seek(200))
@@ -142,7 +144,9 @@ def test_a_session_file_repeats_the_georeference_to_the_same_bytes(bench: Laid, 
     bench.do(UndoLoop())
 
 
-def test_every_format_of_the_page_is_where_the_map_was_laid_and_what_is_in_the_box(bench: Laid, tmp_path: Path) -> None:
+def test_every_format_of_the_page_is_where_the_map_was_georeferenced_and_what_is_in_the_box(
+    bench: Laid, tmp_path: Path
+) -> None:
     found = bench.do(LayOnEarth(Survey(lever=LEVER))).earth.found
     assert found is not None
     box = Box((-1.0, -2.0, -3.0), (2.0, 1.0, 3.0), 20.0)
@@ -163,7 +167,9 @@ def test_every_format_of_the_page_is_where_the_map_was_laid_and_what_is_in_the_b
     assert "needs a georeferenced map" in bench.see().saved[-1].error and not (tmp_path / "nowhere" / "trajectory.gpx").exists()
 
 
-def test_three_points_picked_on_the_map_lay_it_and_with_two_it_is_said_what_stays_open(bench: Laid, walk: Path) -> None:
+def test_three_points_picked_on_the_map_georeference_it_and_with_two_the_page_says_what_is_undetermined(
+    bench: Laid, walk: Path
+) -> None:
     now = bench.do(LayOnEarth(None))
     true = GeoReference.from_json(walk.with_name("walk_georeference.json").read_text())
     assert now.keyframe_poses is not None
@@ -182,7 +188,9 @@ def test_three_points_picked_on_the_map_lay_it_and_with_two_it_is_said_what_stay
     bench.do(UndoLoop())
 
 
-def test_a_map_that_cannot_be_laid_is_saved_all_the_same_and_the_report_says_why(bench: Laid, tmp_path: Path) -> None:
+def test_a_map_that_cannot_be_georeferenced_is_saved_all_the_same_and_the_report_says_why(
+    bench: Laid, tmp_path: Path
+) -> None:
     bench.do(LayOnEarth(Survey(gnss=tmp_path / "gone.csv")))
     assert "gone.csv" in bench.see().earth.problem
     folder = bench.save(tmp_path / "results")

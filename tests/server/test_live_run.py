@@ -202,7 +202,7 @@ def test_an_engine_that_is_killed_is_followed_by_one_that_goes_on_in_the_same_ma
     assert any("returns to where it was" in notice.text for notice in end.notices)
 
 
-def test_scans_that_an_engine_is_too_slow_for_are_dropped_counted_and_told(live: Live) -> None:
+def test_scans_that_an_engine_is_too_slow_for_are_dropped_counted_and_reported(live: Live) -> None:
     """At four times real time, and held for a while."""
     thread = live.play(4.0, patiently=False, length_s=14.0)
     live.until(lambda s: s.transport.frame >= 5)

@@ -231,7 +231,7 @@ def test_a_longer_way_shows_progress() -> None:
     assert bench.see().progress is None and bench.see().transport.frame == 40
 
 
-def test_scans_dropped_and_frames_failed_before_are_so_again_and_not_told_again() -> None:
+def test_scans_dropped_and_frames_failed_before_are_so_again_and_not_reported_again() -> None:
     for name in ("dropped-60-20.mcap", "failing-60-20.mcap"):
         bench = Bench(Params(), fakes.open_fake, Path(name))
         bench.do(SetSpeed(math.inf), Play())

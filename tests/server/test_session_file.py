@@ -247,7 +247,7 @@ def test_what_is_wanted_while_a_session_opens_is_not_lost(tmp_path: Path) -> Non
         each.controller.close()
 
 
-def test_notes_are_kept_up_to_a_limit_and_what_is_beyond_it_is_told(tmp_path: Path) -> None:
+def test_notes_are_kept_up_to_a_limit_and_what_is_beyond_it_is_reported(tmp_path: Path) -> None:
     bench = Kept(tmp_path)
     bench.do(*[AddNote(f"note {number}") for number in range(MOST_NOTES + 1)])
     seen = bench.see()

@@ -307,7 +307,9 @@ def test_a_session_that_had_gone_back_still_knows_the_frames_ahead(tmp_path: Pat
     np.testing.assert_array_equal(ahead.series["speed"], as_it_was.series["speed"])
 
 
-def test_a_disk_that_fills_up_is_told_once_and_playing_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_fills_up_is_reported_once_and_playing_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Full(io.StringIO):
         def write(self, text: str) -> int:
             if '"frame": 20' in text:

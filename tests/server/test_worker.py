@@ -213,7 +213,7 @@ def test_ctrl_c_ends_both_without_a_traceback(parent: tuple[subprocess.Popen[str
     assert gone(engine_pid)
 
 
-def test_the_page_is_told_that_a_recording_is_being_opened_before_it_is_open() -> None:
+def test_the_page_is_reported_that_a_recording_is_being_opened_before_it_is_open() -> None:
     class Owner:
         """Acknowledges each delta, opens a recording once nothing else is due, and leaves when that is done."""
 

@@ -27,7 +27,7 @@ def test_a_walk_a_rest_and_nothing_at_all_raise_no_doubt() -> None:
         assert doubts(log(positions)) == ()
 
 
-def test_one_leap_is_told_with_its_size_and_time() -> None:
+def test_one_leap_is_reported_with_its_size_and_time() -> None:
     moved = WALK.copy()
     moved[120:] += [0.0, 0.7, 0.0]
     (doubt,) = doubts(log(moved))
@@ -39,29 +39,29 @@ def test_no_person_moves_at_a_hundred_metres_a_second() -> None:
     assert "120 m/s, first at 0.1 s" in doubt
 
 
-def test_a_zigzag_that_no_hand_makes_is_told() -> None:
+def test_a_zigzag_that_no_hand_makes_is_reported() -> None:
     (doubt,) = doubts(log(np.where(np.arange(200) % 2, 1.0, 0.0)[:, None] * [0.6, 0, 0]))
     assert "accelerated by up to 120 m/s²" in doubt
 
 
 @pytest.mark.parametrize(("lost", "told"), [(10, False), (100, True)])
-def test_a_walk_that_is_mostly_lost_is_told(lost: int, told: bool) -> None:
+def test_a_walk_that_is_mostly_lost_is_reported(lost: int, told: bool) -> None:
     found = doubts(log(WALK, [FrameStatus.LOST] * lost))
     assert found == ((f"Tracking was lost in {lost} of 200 frames, first at 0.0 s.",) if told else ())
 
 
-def test_a_walk_of_which_most_scans_were_dropped_is_told() -> None:
+def test_a_walk_of_which_most_scans_were_dropped_is_reported() -> None:
     (doubt,) = doubts(log(WALK, dropped=300))
     assert doubt == "300 of 500 scans were dropped, mostly because it was dark."
 
 
-def test_poses_that_are_not_finite_are_told() -> None:
+def test_poses_that_are_not_finite_are_reported() -> None:
     broken = WALK.copy()
     broken[50, 2] = np.nan
     assert doubts(log(broken)) == ("1 poses are not finite, first at 5.0 s.",)
 
 
-def test_scans_that_contradict_the_imu_in_every_frame_are_told() -> None:
+def test_scans_that_contradict_the_imu_in_every_frame_are_reported() -> None:
     assert doubts(log(WALK, predicted_change=0.25, correction=0.01)) == ()
     (doubt,) = doubts(log(WALK, predicted_change=0.25, correction=0.06))
     assert "they take 24% back" in doubt

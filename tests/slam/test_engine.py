@@ -93,7 +93,7 @@ def test_the_start_waits_at_rest_and_then_tracks() -> None:
     assert results[3].ground.found  # the frame can be looked at while it waits
 
 
-def test_a_start_in_motion_is_told_and_survived() -> None:
+def test_a_start_in_motion_is_reported_and_survived() -> None:
     """Turned on while walking: what is known is relative to the first scan, and the tilt is found out."""
     walk = Walk(still=-4.0)
     results = run(Engine(params_for(REAL)), measurements(furnished_room(), walk, REAL, FRAMES))
@@ -133,7 +133,7 @@ def test_the_cloud_is_the_world_as_seen_at_the_scans_end() -> None:
     assert len(r.cloud) == len(r.cloud.labels) == len(r.cloud.ring) == r.points_in
 
 
-def test_a_result_tells_its_numbers() -> None:
+def test_a_result_shows_its_numbers() -> None:
     for m, r in zip(room_walk(), run(Engine(params_for(REAL)), room_walk()), strict=True):
         assert r.stamp_ns == m.scan.end_ns == r.state.stamp_ns
         assert r.points_filter <= r.points_reduced <= r.points_in == len(m.scan)

@@ -166,7 +166,7 @@ def test_the_limit_of_the_slope_decides_and_is_named() -> None:
     assert not refused.labels.any()
 
 
-def test_a_heap_under_the_sensor_is_no_plane_and_the_ratio_is_told() -> None:
+def test_a_heap_under_the_sensor_is_no_plane_and_the_ratio_is_reported() -> None:
     rng = np.random.default_rng(0)
     points = (FORWARD.T @ (np.array([0, 0, -1.3])[:, None] + rng.normal(scale=0.15, size=(3, 300)))).T.astype(
         np.float32
@@ -350,7 +350,7 @@ def test_a_floor_far_from_the_origin_of_the_seeds_keeps_its_precision() -> None:
     assert result.planarity == pytest.approx((0.002**2) / (40**2 / 12), rel=0.2)
 
 
-def test_a_box_beside_the_feet_is_told_rather_than_labelled() -> None:
+def test_a_box_beside_the_feet_is_reported_rather_than_labelled() -> None:
     """Half of the seeds on a box, half on the floor: no plane, so nothing is thinned in this frame (paper 2.2)."""
     scene = Scene(box(-3.0, -3.0, -1.3, 5.0, 3.0, 1.4), (box(0.1, 0.25, -1.3, 0.7, 0.9, -0.9),))
     result = segment(seen(scene, FORWARD), FORWARD)

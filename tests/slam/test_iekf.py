@@ -286,7 +286,7 @@ def test_twice_as_far_from_where_the_map_has_it_a_thing_pulls_no_harder(room: Lo
     assert pulled(0.06) < 1.2 * pulled(0.03) < 0.02
 
 
-def test_the_residual_told_is_that_of_the_inliers(room: LocalMap) -> None:
+def test_the_residual_reported_is_that_of_the_inliers(room: LocalMap) -> None:
     params, prior = FilterParams(max_iterations=1), Belief(truth(), uncertain(1e-3, 1e-2))
     points = points_of(furnished_room())
     problem = Problem(room, prior, points, params)

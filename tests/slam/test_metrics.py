@@ -261,7 +261,7 @@ def turned_by_a_degree(corners: list[tuple[float, float]], seed: int) -> tuple[T
 
 
 @pytest.mark.parametrize("corners", [STRAIGHT, RESTING])
-def test_a_rotation_that_positions_do_not_fix_is_not_told(corners: list[tuple[float, float]]) -> None:
+def test_a_rotation_that_positions_do_not_fix_is_not_reported(corners: list[tuple[float, float]]) -> None:
     told_by_evo = []
     for seed in range(5):
         estimate, truth = turned_by_a_degree(corners, seed)

@@ -53,7 +53,7 @@ def test_a_device_at_rest_stays_where_it_is_without_any_scan() -> None:
     assert np.linalg.norm(held.state.p_odom_imu) < 4 * np.sqrt(np.diag(held.covariance)[POS].sum())
 
 
-def test_a_rest_tells_the_bias_along_gravity_but_not_across() -> None:
+def test_a_rest_shows_the_bias_along_gravity_but_not_across() -> None:
     """Across, a bias and a tilt of gravity feel the same: their sum is known, each of them is not."""
     belief = start.standing(samples(Walk(still=100), 0, 1), START_NS + 10**9, Params())
     along, across = axes(belief)
@@ -68,7 +68,7 @@ def test_a_rest_tells_the_bias_along_gravity_but_not_across() -> None:
     assert np.all(of_the_sum < 0.012)
 
 
-def test_standing_longer_does_not_make_a_bias_known_that_a_rest_cannot_tell() -> None:
+def test_standing_longer_does_not_make_a_bias_known_that_a_rest_cannot_determine() -> None:
     """An inconsistent filter would gain certainty from nothing, frame by frame."""
     belief = after_a_rest(10, held=True)
     assert all(sigma_of(axis, belief) > 0.03 for axis in axes(belief)[1])

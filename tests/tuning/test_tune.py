@@ -190,7 +190,7 @@ def wanted(recording: Path, out: Path, objective: str) -> Wanted:
     return Wanted(recording, Params(), None, varied, (objective,), "grid", 3, 0.0, 1.5, out)
 
 
-def test_a_search_for_the_page_tells_each_run_and_its_trials_and_leaves_the_same_files(
+def test_a_search_for_the_page_shows_each_run_and_its_trials_and_leaves_the_same_files(
     recording: Path, tmp_path: Path
 ) -> None:
     owner = Owner()

@@ -70,7 +70,7 @@ def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> 
     assert page.sent[2:] == [SetParams({"sensor.rotation": (0.0, 0.0, 0.0)}), Restart()]
 
 
-def test_what_cannot_be_told_is_said_and_nothing_is_offered(page: Calibrating) -> None:
+def test_what_cannot_be_reported_is_said_and_nothing_is_offered(page: Calibrating) -> None:
     user_clicks(page.panel._button)
     page.process().messages.append("walk.mcap has 12 usable scans; it takes 50.")
     page.panel.draw(OPEN)

@@ -183,7 +183,7 @@ def test_a_value_typed_for_b_is_never_sent_to_a(page: Page) -> None:
     assert not any(isinstance(command, SetParams) for command in page.engine.sent)
 
 
-def test_the_drift_and_the_turn_are_told_and_plotted_over_time(page: Page) -> None:
+def test_the_drift_and_the_turn_are_reported_and_plotted_over_time(page: Page) -> None:
     page.forks.fork("")
     page.engine.send(Seek(60))
     page.both_at(60)
@@ -212,7 +212,7 @@ def test_b_s_trajectory_is_blue_from_the_fork_on(page: Page, wire: Wire, server:
     assert PATH not in server.scene._handle_from_node_name
 
 
-def test_the_scan_tells_who_calls_a_point_ground(page: Page, server: viser.ViserServer) -> None:
+def test_the_scan_shows_who_calls_a_point_ground(page: Page, server: viser.ViserServer) -> None:
     nodes = server.scene._handle_from_node_name
     page.forks.fork("", {"ground.sigma": 0.15})
     page.both_at(20)
@@ -228,7 +228,7 @@ def test_the_scan_tells_who_calls_a_point_ground(page: Page, server: viser.Viser
     assert not nodes["/map/compare_lidar"].visible and nodes["/map/sensor/lidar/scan"].visible
 
 
-def test_whose_ground_it_is_is_told_though_the_scene_is_drawn_after_the_panel(page: Page) -> None:
+def test_whose_ground_it_is_is_shown_though_the_scene_is_drawn_after_the_panel(page: Page) -> None:
     page.forks.fork("", {"ground.sigma": 0.15})
     eventually(lambda: (b := page.forks.other) is not None and b.transport.frame == 20)
     page.panel._scene_changes._at = page.clock.now + 1.0  # the scene was drawn just now, without B

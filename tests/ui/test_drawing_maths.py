@@ -50,7 +50,7 @@ def test_the_darkest_colour_stands_out_from_the_dark_page(name: str) -> None:
     assert lightness(TABLES[name][:1].astype(float))[0] > page + 10
 
 
-def test_labels_are_told_apart_in_black_and_white_too() -> None:
+def test_labels_are_distinguished_in_black_and_white_too() -> None:
     colours = label_colours(np.array([0, 1, 2], np.uint8))
     grey = np.sort(lightness(colours.astype(float)))
     assert np.diff(grey).min() > 5

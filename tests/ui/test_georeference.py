@@ -76,7 +76,7 @@ def choose(control: Any, value: Any) -> None:
     user_sets(control, value)
 
 
-def test_the_widgets_say_what_the_map_is_to_be_laid_by(paging: Paging, tmp_path: Path) -> None:
+def test_the_widgets_say_what_the_map_is_georeferenced_by(paging: Paging, tmp_path: Path) -> None:
     panel = paging.panel
     assert paging.lay() is None
     choose(panel._by, RECORDED)
@@ -98,12 +98,12 @@ def test_the_widgets_say_what_the_map_is_to_be_laid_by(paging: Paging, tmp_path:
 
 
 @pytest.mark.parametrize("text", ["0.1 0.2", "a b c", "nan 0 0"])
-def test_a_lever_arm_that_is_none_is_told(text: str) -> None:
+def test_a_malformed_lever_arm_is_reported(text: str) -> None:
     with pytest.raises(HemislamError, match=r"The lever arm is .* it takes 3 numbers, or nothing"):
         numbers_in(text, "lever arm", 3)
 
 
-def test_a_session_that_is_reopened_shows_what_it_was_laid_by(paging: Paging) -> None:
+def test_a_session_that_is_reopened_shows_what_it_was_georeferenced_by(paging: Paging) -> None:
     paging.show(LAID)
     assert paging.panel._by.value == RECORDED and paging.lay() == LAID.earth.survey
     paging.show(Snapshot())

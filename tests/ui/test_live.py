@@ -115,7 +115,7 @@ def test_a_live_session_cannot_go_back_and_the_page_says_why(server: viser.Viser
     assert "--record" not in panel._state.content
 
 
-def test_the_panel_tells_the_end_although_no_new_reading_came(server: viser.ViserServer, engine: FakeEngine) -> None:
+def test_the_panel_shows_the_end_although_no_new_reading_came(server: viser.ViserServer, engine: FakeEngine) -> None:
     panel = LivePanel(server.gui)
     engine.publish(live=WELL)
     panel.draw(engine.snapshot)

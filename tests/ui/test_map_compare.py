@@ -79,7 +79,7 @@ def test_the_map_is_coloured_when_the_comparison_has_come(comparing: Comparing) 
     assert comparing.panel.seen(NOW, View()).numbers is None
 
 
-def test_stop_ends_it_and_a_problem_is_told(comparing: Comparing) -> None:
+def test_stop_ends_it_and_a_problem_is_reported(comparing: Comparing) -> None:
     user_clicks(comparing.panel._truth)
     process = comparing.process
     user_clicks(comparing.panel._stop)
@@ -99,7 +99,7 @@ def test_a_map_that_has_changed_since_is_said_to_be_old(comparing: Comparing) ->
     assert "changed since" in comparing.panel._found.content
 
 
-def test_a_comparison_is_told_in_numbers() -> None:
+def test_a_comparison_is_reported_in_numbers() -> None:
     html = told(FOUND, "other.laz", [])
     assert "43 % differ by more than chance" in html, "40 of 70 are 1 cm, less than could be told"
     assert "12 % have no counterpart" in html and "other.laz" in html and html.count("<rect") == 41

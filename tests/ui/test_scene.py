@@ -342,7 +342,7 @@ def test_the_path_is_sent_in_blocks(server: viser.ViserServer, wire: Wire, engin
     assert wire.nodes("SceneNodeUpdateMessage") == ["/map/trajectory/0"]
 
 
-def test_truth_is_hidden_until_it_can_be_laid_over_the_map(drawn: Drawn, server: viser.ViserServer) -> None:
+def test_truth_is_hidden_until_it_can_be_drawn_over_the_map(drawn: Drawn, server: viser.ViserServer) -> None:
     truth = server.scene.get_handle_by_name("/map/truth")
     assert truth is not None and truth.visible
     drawn.draw(T_map_truth=None)

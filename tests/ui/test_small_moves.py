@@ -58,7 +58,7 @@ def test_a_turn_that_is_visible_far_away_is_sent(drawn: Drawn, wire: Wire, engin
         assert ("/map/keyframes/0" in wire.nodes("SetOrientationMessage")) is told
 
 
-def test_heights_that_change_little_by_little_are_coloured_anew(
+def test_heights_that_change_little_by_little_are_coloured_again(
     drawn: Drawn, server: viser.ViserServer, wire: Wire, engine: FakeEngine
 ) -> None:
     """Also where the clouds are moved for another axis each time, before they have risen by a millimetre."""

@@ -124,7 +124,7 @@ def test_a_click_into_the_void_or_at_what_is_behind_means_nothing() -> None:
     assert nearest_to_ray(np.empty((0, 3), np.float32), np.zeros(3), np.ones(3)) is None
 
 
-def test_a_point_of_the_floor_tells_its_numbers() -> None:
+def test_a_point_of_the_floor_shows_its_numbers() -> None:
     index = int(np.flatnonzero(FRAME.cloud.labels > 0)[100])
     picked = pick(FRAME, index, SIGMA, 12)
     assert picked.threshold == pytest.approx(SIGMA * picked.range)
@@ -207,7 +207,7 @@ def test_the_frame_is_drawn_in_place_of_the_scan_while_it_has_colours_of_its_own
     assert bench.nodes == set()
 
 
-def test_a_clicked_point_is_marked_and_told_until_another_frame_comes(bench: Bench) -> None:
+def test_a_clicked_point_is_marked_and_reported_until_another_frame_comes(bench: Bench) -> None:
     bench.click(300)
     bench.draw()
     assert bench.panel._picked is not None and "ring" in bench.panel._point.content

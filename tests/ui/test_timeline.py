@@ -97,7 +97,7 @@ def test_what_the_page_calls_degenerate_is_what_the_filter_does() -> None:
     assert DEGENERATE_CM == 100 * iekf.DEGENERATE_SIGMA
 
 
-def test_frames_gone_back_over_stay_until_they_are_processed_anew() -> None:
+def test_frames_gone_back_over_stay_until_they_are_processed_again() -> None:
     first = snapshot(40, 60, total_ms=np.full(40, 5.0))
     history = seen(first, snapshot(10, 60, total_ms=np.full(10, 5.0)))
     assert history.present == 9

@@ -165,7 +165,7 @@ def test_one_wild_score_does_not_press_all_others_together() -> None:
     assert axis.share(1.2) > 0.3 and axis.share(900.0) == 1.0
 
 
-def test_the_ends_of_an_axis_can_be_told_apart() -> None:
+def test_the_ends_of_an_axis_can_be_distinguished() -> None:
     axis = maths.number_axis("entropy", [-5.2413, -5.2401])
     assert (axis.low, axis.high) == ("-5.2413", "-5.2401")
 
@@ -187,5 +187,5 @@ def test_two_objectives_show_their_front() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "words"), [(0.2, "1 s left"), (89, "89 s left"), (600, "10 min left")])
-def test_a_time_left_is_told_in_its_unit(seconds: float, words: str) -> None:
+def test_a_time_left_is_reported_in_its_unit(seconds: float, words: str) -> None:
     assert maths.left(seconds) == words

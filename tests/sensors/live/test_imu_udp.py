@@ -47,7 +47,7 @@ def test_order_is_restored_and_loss_is_counted() -> None:
     assert order.counters.imu_late == 2
 
 
-def test_numbers_wrap_and_senders_begin_anew() -> None:
+def test_numbers_wrap_and_senders_begin_again() -> None:
     top = 2**32 - 2
     assert numbers(ImuOrder(), [top, top + 2, top + 1, top + 3]) == [top, top + 1, 0, 1]
     assert numbers(ImuOrder(), [50_000, 50_001, 0, 1, 2]) == [50_000, 50_001, 0, 1, 2]

@@ -343,7 +343,7 @@ def test_a_bad_sample_is_left_out_and_nothing_else(bad: tuple[float, float, floa
     assert max(np.abs(one.imu.accel).max() for one in found) < 20
 
 
-def test_an_accelerometer_that_reads_nothing_is_told_and_waited_for() -> None:
+def test_an_accelerometer_that_reads_nothing_is_reported_and_waited_for() -> None:
     rig = Rig()
     for turn in range(140):
         if turn < 20:

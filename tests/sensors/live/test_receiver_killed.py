@@ -147,7 +147,7 @@ def test_a_receiver_that_is_killed_comes_back_and_records_into_a_further_file(tm
     assert set(recorded(tmp_path / "session-3.mcap")) >= set(range(first + 1, first + 6))
 
 
-def test_scans_that_waited_for_the_engine_when_it_died_are_told(tmp_path: Path) -> None:
+def test_scans_that_waited_for_the_engine_when_it_died_are_reported(tmp_path: Path) -> None:
     with receiving(tmp_path / "session.mcap") as (process, client, sender):
         sender.until(sender.turn(16) + 13)
         sender.turn(8, polling=False)

@@ -102,7 +102,7 @@ def test_loops_between_the_same_two_poses_are_one_factor_that_says_what_they_say
     assert held(graph) == held(once)
 
 
-def test_against_odometry_they_pull_as_far_as_each_would_by_itself() -> None:
+def test_against_odometry_they_pull_as_far_as_each_would_alone() -> None:
     step = lie.transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
     odometry = [Factor(k, k + 1, step, np.eye(6) * 0.05**2) for k in range(5)]
     aside = lie.transform(np.eye(3), np.array([5.0, 3.0, 0.0]))

@@ -84,7 +84,7 @@ def test_an_edit_made_just_before_going_back_is_not_lost(session: HeldSession) -
     assert session.shift == shift_at(20)
 
 
-def test_a_session_that_goes_on_differently_sends_its_keyframes_anew(session: HeldSession) -> None:
+def test_a_session_that_goes_on_differently_sends_its_keyframes_again(session: HeldSession) -> None:
     for _ in range(30):
         session.step()
     session.go_to(10)

@@ -31,7 +31,7 @@ def test_between_surfaces_that_hold_every_slip_shows_as_large_as_it_is(moved: F6
     assert slip(before, seen(corridor(np.random.default_rng(1), FINS), np.eye(4)), np.eye(4)) is None
 
 
-def test_along_a_bare_corridor_no_slip_can_be_told() -> None:
+def test_along_a_bare_corridor_no_slip_can_be_reported() -> None:
     before = seen(corridor(np.random.default_rng(0)), np.eye(4))
     assert slip(before, seen(corridor(np.random.default_rng(1)), pose(0.3, 0.0, 0.0, 0.0)), np.eye(4)) is None
 

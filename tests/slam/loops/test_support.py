@@ -123,7 +123,7 @@ def test_whether_two_measured_the_same_does_not_depend_on_where_the_walk_lies() 
     assert [edge.repeats for edge in come(loops).values()] == [edge.repeats for edge in come(loops, moved).values()]
 
 
-def test_repeated_loops_hold_two_ways_together_nearly_as_well_as_each_by_itself() -> None:
+def test_repeated_loops_hold_two_ways_together_nearly_as_well_as_each_alone() -> None:
     """Odometry errs at random on the way there and back, loops by what their submaps' keyframes err by on average: how
     far apart the two ways come to lie."""
     sigmas = np.array([np.radians(0.1)] * 3 + [0.01] * 3)
@@ -187,7 +187,7 @@ def test_no_loop_is_laid_on_one_that_the_user_made() -> None:
     assert edge.counts and edge.repeats is None
 
 
-def test_what_was_found_beside_a_loop_by_hand_counts_by_itself_once_that_is_undone() -> None:
+def test_what_was_found_beside_a_loop_by_hand_counts_alone_once_that_is_undone() -> None:
     """Also if nothing else is in force, and whether it repeated the loop or was represented by it."""
     made = replace(loop(40), origin=Origin.USER, edited=True)
     beside = [replace(loop(38), represented_by=made.pair), replace(loop(34), repeats=made.pair)]
