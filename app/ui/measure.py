@@ -13,7 +13,7 @@ from app.server.protocol import DropMeasure, KeepMeasure, RenameMeasure, Snapsho
 from app.slam.types import F64
 from app.ui.corners import snapped
 from app.ui.html import panel
-from app.ui.measure_maths import Numbers, as_csv, meet, numbers, places, words
+from app.ui.measure_maths import Numbers, as_csv, load, meet, numbers, places, words
 from app.ui.nodes import add_exact_points, add_lines, segments
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, by_user, dialog, poses_of
@@ -59,6 +59,7 @@ class MeasurePanel:
         return self._kind != STOP
 
     def begin(self, kind: str) -> None:
+        load()
         self._kind, self._spots = kind, ()
 
     def pick(self, taker: Callable[[Spot, Snapshot], None]) -> None:

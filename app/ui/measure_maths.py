@@ -10,6 +10,7 @@ from app.export.box import Box
 from app.georeference.reference import GeoReference
 from app.mapping.session_file import Measure, Spot
 from app.server.protocol import Chunk
+from app.slam.kernels.cells import in_cone
 from app.slam.text_files import csv_text
 from app.slam.types import F32, F64, NON_GROUND
 from app.ui.chunks import as_mask, shown_points
@@ -40,6 +41,13 @@ class Numbers:
     angle: float = np.nan
 
 
+def load() -> None:
+    """Load the kernel of `meet` before the first click, which it would delay."""
+    points, nothing = np.empty((0, 3), np.float32), np.empty(0, np.float32)
+    points.setflags(write=False)  # as those of chunks are
+    in_cone(points, np.zeros(3), np.zeros(3), 0.0, np.empty(0, np.int32), nothing, nothing)
+
+
 def meet(
     chunks: tuple[Chunk, ...],
     poses: F64,
@@ -57,32 +65,25 @@ def meet(
         width: rad, how far beside the ray a point may be seen. ceilings: whether they are shown.
         clip: outside which points are hidden.
     """
+    most = max((len(chunk.points) for chunk in chunks), default=0)
+    hits, along, off = np.empty(most, np.int32), np.empty(most, np.float32), np.empty(most, np.float32)
     found: list[tuple[F32, F32, Chunk, F32]] = []
     for chunk, T_map_imu in zip(chunks, poses, strict=False):
         T = T_map_imu @ chunk.T_imu_lidar
-        along, aside = _from_ray(chunk.points, T[:3, :3].T @ (origin - T[:3, 3]), T[:3, :3].T @ direction)
-        hit = (along > 0) & (aside < width * along)
-        if hit.any():
-            hit &= as_mask(shown_points(chunk, T, ceilings, clip), len(hit))
-        if hit.any():
-            found.append((along[hit], aside[hit] / along[hit], chunk, chunk.points[hit]))
-    if not found:
+        eye, ahead = T[:3, :3].T @ (origin - T[:3, 3]), T[:3, :3].T @ direction / np.linalg.norm(direction)
+        count = in_cone(chunk.points, eye, ahead, width, hits, along, off)
+        if count:
+            seen = as_mask(shown_points(chunk, T, ceilings, clip), len(chunk.points))[hits[:count]]
+            found.append((along[:count][seen], off[:count][seen], chunk, chunk.points[hits[:count][seen]]))
+    every = np.sort(np.concatenate([np.empty(0), *(along for along, *_ in found)]))
+    if not len(every):
         return None
-    every = np.sort(np.concatenate([along for along, *_ in found]))
     front = every[np.argmax(np.append(np.diff(every), np.inf) > _GAP_M)]  # of a wall along the ray, to its far end
     best = [np.where(along <= front, off, np.inf) for along, off, *_ in found]
-    which = int(np.argmin([one.min() for one in best]))
+    which = int(np.argmin([one.min(initial=np.inf) for one in best]))
     chunk, points = found[which][2:]
     x, y, z = (chunk.T_imu_lidar[:3, :3] @ points[np.argmin(best[which])] + chunk.T_imu_lidar[:3, 3]).tolist()
     return Spot(chunk.index, (x, y, z))
-
-
-def _from_ray(points: F32, origin: F64, direction: F64) -> tuple[F32, F32]:
-    """(n,) m along a ray and aside from it. By the cross product: squares of long ones would lose short ones."""
-    x, y, z = (points - origin.astype(np.float32)).T
-    u, v, w = (direction / np.linalg.norm(direction)).astype(np.float32)
-    aside = np.sqrt((y * w - z * v) ** 2 + (z * u - x * w) ** 2 + (x * v - y * u) ** 2)
-    return x * u + y * v + z * w, aside
 
 
 def places(measure: Measure, poses: F64) -> F64 | None:

@@ -1,4 +1,4 @@
-"""Points sorted by the cube they lie in: how many are around a point, and how far two clouds are apart there."""
+"""Points in a cone; points sorted by cubes: how many are around a point, and how far two clouds are apart there."""
 
 import math
 
@@ -11,6 +11,24 @@ HALF = 1 << 20
 """Cubes are counted from -HALF to HALF along each axis, so that three numbers fit into one key."""
 MOST = 4096
 """Points of a cloud that a mean is made of."""
+
+
+@njit(cache=True, nogil=True)
+def in_cone(points, origin, direction, width, hits, along, off):
+    """The points (n, 3) f32 in a cone around a ray from origin (3,) f64, m, along the unit direction (3,) f64.
+
+    width: tangent of its half angle. Out, (n,) each: hits i32, indices of the points; along f32, m along the ray;
+    off f32, tangent of the angle to it. Returns how many.
+    """
+    count = 0
+    for j in range(len(points)):
+        x, y, z = points[j, 0] - origin[0], points[j, 1] - origin[1], points[j, 2] - origin[2]
+        d = x * direction[0] + y * direction[1] + z * direction[2]
+        aside = x * x + y * y + z * z - d * d
+        if d > 0 and aside < (width * d) ** 2:
+            hits[count], along[count], off[count] = j, d, math.sqrt(max(aside, 0.0)) / d
+            count += 1
+    return count
 
 
 @njit(cache=True)
