@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 from scipy.spatial.transform import Rotation
 
 from app.sensors.navsat import NAVSAT, fix_of
@@ -24,8 +25,6 @@ _FORMATS = (
     "TUM has 8 columns (stamp x y z qx qy qz qw), KITTI 12 (a 3x4 matrix), the GNSS/INS table of H2LID 13"
     " (GPSTime Easting Northing Height Heading Pitch Roll Latitude Longitude VEast VNorth VUp Q)"
 )
-_EARTH_A, _EARTH_E2 = 6_378_137.0, 6.694379990141316e-3
-"""WGS84: m, and squared eccentricity."""
 
 _POSES: dict[str, Callable[[Any], Any]] = {
     "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
@@ -236,11 +235,7 @@ def _pose(pose: Any) -> list[float]:
 
 def _east_north_up(fixes: F64) -> F64:
     """Geodetic (n, 3) degrees, degrees, m on WGS84 to metres east, north, up of the first."""
-    latitude, longitude = np.radians(fixes[:, 0]), np.radians(fixes[:, 1])
-    radius = _EARTH_A / np.sqrt(1 - _EARTH_E2 * np.sin(latitude) ** 2)
-    flat = (radius + fixes[:, 2]) * np.cos(latitude)
-    z = (radius * (1 - _EARTH_E2) + fixes[:, 2]) * np.sin(latitude)
-    earth = np.column_stack([flat * np.cos(longitude), flat * np.sin(longitude), z])
-    s, c, sl, cl = np.sin(latitude[0]), np.cos(latitude[0]), np.sin(longitude[0]), np.cos(longitude[0])
-    R_enu_earth = np.array([[-sl, cl, 0.0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
-    return np.asarray((earth - earth[0]) @ R_enu_earth.T)
+    latitude, longitude, height = fixes[0].tolist()
+    local = f"+proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={height!r}"
+    pipeline = pyproj.Transformer.from_pipeline(f"+proj=pipeline +step +proj=cart +ellps=WGS84 +step {local}")
+    return np.column_stack(pipeline.transform(fixes[:, 1], fixes[:, 0], fixes[:, 2]))

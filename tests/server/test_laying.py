@@ -164,7 +164,10 @@ def test_every_format_of_the_page_is_where_the_map_was_georeferenced_and_what_is
     np.testing.assert_allclose([float(first.get(k, "nan")) for k in ("lat", "lon")], expected, atol=1e-7)
     assert (tmp_path / "page" / "map.kmz").exists()
     bench.do(LayOnEarth(None), Save(tmp_path / "nowhere", ("gpx",)))
-    assert "needs a georeferenced map" in bench.see().saved[-1].error and not (tmp_path / "nowhere" / "trajectory.gpx").exists()
+    assert (
+        "needs a georeferenced map" in bench.see().saved[-1].error
+        and not (tmp_path / "nowhere" / "trajectory.gpx").exists()
+    )
 
 
 def test_three_points_picked_on_the_map_georeference_it_and_with_two_the_page_says_what_is_undetermined(
