@@ -10,6 +10,7 @@ from app.slam.errors import HemislamError
 SUFFIXES: Final = (*RECORDINGS, *TRAJECTORIES, ".yaml", ".json")
 """Recordings and sessions, and what lies beside them: a truth, parameters, an Ouster's metadata."""
 _LONGEST_NAME: Final = 200
+"""Bytes; file systems allow 255, with what is added."""
 _LEFT_FREE: Final = 1 << 30
 """Bytes of the disk that uploads leave free."""
 
@@ -50,7 +51,7 @@ def forget(folders: Folders, name: str) -> None:
 
 
 def _place(folders: Folders, name: str) -> Path:
-    if Path(name).name != name or name.startswith(".") or len(name) > _LONGEST_NAME or not name.isprintable():
+    if Path(name).name != name or name.startswith(".") or not name.isprintable() or len(name.encode()) > _LONGEST_NAME:
         raise HemislamError("The file needs an ordinary name; rename it.")
     if not name.lower().endswith(SUFFIXES):
         raise HemislamError(f"{name} is no recording; drop a file that ends in {', '.join(RECORDINGS)}.")

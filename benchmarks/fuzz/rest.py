@@ -51,7 +51,7 @@ class Rest:
             max_examples=REQUESTS_AT_ONCE, database=None, deadline=None, phases=[Phase.generate],
             suppress_health_check=list(HealthCheck),
         )  # fmt: skip
-        @given(self._document.requests(SLOW))
+        @given(self._document.requests(SLOW | {"/api/recordings/{name}"}))
         def send(sent: Sent) -> None:
             answer = self._client.request(
                 sent.method, sent.path, content=sent.body, headers=JSON if sent.body is not None else {}

@@ -20,6 +20,7 @@ from benchmarks.fuzz.requests import Document, Sent
 
 JSON = {"Content-Type": "application/json"}
 EXPORT = "/api/export/{name}"
+UPLOAD = "/api/recordings/{name}"
 MAY_BE_REFUSED = ("/api/recordings", "/api/truth", "/api/params", "/api/export/", "/api/notes/")
 """Whether a request is accepted there depends on more than its form: on files, other values, and what there is."""
 
@@ -53,7 +54,7 @@ def check(client: httpx.Client, site: Site, sent: Sent) -> None:
 
 
 @settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
-@given(sents=st.lists(described().requests(frozenset({EXPORT})), min_size=1, max_size=4))
+@given(sents=st.lists(described().requests(frozenset({EXPORT, UPLOAD})), min_size=1, max_size=4))
 def test_no_request_breaks_anything(real: Site, sents: list[Sent]) -> None:
     limits = httpx.Limits(keepalive_expiry=1.0)  # well before the server closes what is idle, after five
     with httpx.Client(timeout=TIMEOUT_S, limits=limits) as client:

@@ -42,7 +42,8 @@ def test_what_was_there_is_never_replaced(site: Site) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["..%2Fwalk.mcap", ".walk.mcap", "walk.exe", "%00.mcap", "x" * 300 + ".mcap", "a%5Cb.mcap%0A"]
+    "name",
+    ["..%2Fwalk.mcap", ".walk.mcap", "walk.exe", "%00.mcap", "x" * 300 + ".mcap", "ä" * 150 + ".mcap", "a%5Cb.mcap%0A"],
 )
 def test_only_ordinary_names_of_recordings_are_taken(site: Site, name: str) -> None:
     before = sorted(site.folder.parent.rglob("*"))
