@@ -2,7 +2,8 @@
 
     g = T_map_imu @ (T_keyframe_then @ lever)        the antenna, carried to the time of the fix by odometry
 
-Fixes that do not fit even a bent map are rejected; the user's word on a fix overrules that.
+Fixes that do not fit even a bent map are rejected; the user's word on a fix overrules that. The fixes also tell how
+stiff the graph is: those of some stretches must predict those of the others.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,23 +11,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.georeference.align import MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, WalkedPath, as_told, offset_by_parts
+from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, WalkedPath, as_told, offset_by_parts
 from app.georeference.fixes import Fixes
 from app.slam import lie
 from app.slam.arrays import F64, I64, Mask
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.factors import Closing, PositionPrior
+from app.slam.loops.factors import Factor, PositionPrior
 from app.slam.loops.solvers import optimise
 from app.slam.trajectory import Trajectory
 
 MOST_ROUNDS = 5
+STIFFNESS = (1.0, 3e-2, 1e-3, 3e-5)
+"""Factors of the graph's covariances that are tried: a good sensor drifts far less than the graph expects."""
+STRETCH_S = 3.0
+"""Fixes of every other stretch predict those between them."""
 
 
 def bend(
     trajectory: Trajectory,
     keyframe_stamps_ns: I64,
-    graph: Sequence[Closing],
+    graph: Sequence[Factor],
     fixes: Fixes,
     found: Alignment,
     overruled: Mapping[str, bool],
@@ -53,7 +58,10 @@ def bend(
     word = as_told(overruled, found.names)
     held, barred = np.asarray(word == 1.0), np.asarray(word == 0.0)
     chosen = [replace(prior, robust=True) for prior, no in zip(priors, barred, strict=True) if not no]
+    stretches = [int(name) - 1 for name, no in zip(found.names, barred, strict=True) if not no]
+    halves = np.asarray((fixes.stamps_ns[stretches] - fixes.stamps_ns[stretches[0]]) * 1e-9 // STRETCH_S % 2 == 0)
     try:
+        graph = _stiffened(graph, chosen, halves, before)
         poses = optimise(before[0], [*graph, *chosen], before, free=True)
         used: Mask = ~barred
         for _ in range(MOST_ROUNDS):
@@ -73,6 +81,30 @@ def bend(
     return poses @ lie.inverse(before), replace(
         found, residuals=turned, distances=distances, used=used, notes=notes, yaw_sigma=float("nan")
     )
+
+
+def _stiffened(graph: Sequence[Factor], priors: Sequence[PositionPrior], half: Mask, before: F64) -> list[Factor]:
+    """The graph with the smallest factor on its covariances with which fixes predict one another best.
+
+    Args:
+        half: (n,) which of the priors predict the others, and the other way round. before: (k, 4, 4) to start from.
+    """
+    best, cap, kept = np.inf, 0.0, list(graph)
+    for factor in STIFFNESS if min(half.sum(), (~half).sum()) >= FEWEST else ():
+        stiff = [replace(one, covariance=one.covariance * factor) for one in graph]
+        missed = []
+        for known in (half, ~half):
+            poses = optimise(
+                before[0], [*stiff, *(priors[i] for i in np.flatnonzero(known).tolist())], before, free=True
+            )
+            missed.append(_off([priors[i] for i in np.flatnonzero(~known).tolist()], poses)[1])
+        distances = np.concatenate(missed)
+        cap = cap or MOST_SIGMAS * max(1.0, float(np.median(distances)) / MEDIAN_SIGMAS)
+        score = float(np.minimum(distances, cap) @ np.minimum(distances, cap))
+        if score > best:
+            break
+        best, kept = score, stiff
+    return kept
 
 
 def _priors(

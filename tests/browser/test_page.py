@@ -321,6 +321,7 @@ def test_a_side_of_the_clip_box_is_pulled_by_its_handle(bench: Bench) -> None:
     before = Box.around((6.0, 0.0, 0.0), (10.0, 6.0, 4.0), 20.0)
     bench.engine.send(SetClip(Clip(before, on=True)))
     panel = bench.workbench._clip
+    bench.eventually(lambda: len(panel._handles) == 7)
     bench.eventually(lambda: np.allclose(panel._handles[1].position, handle(before, *FACES[1])[1]))
     bench.page.wait_for_timeout(2000)
     (client,) = bench.server.get_clients().values()

@@ -67,6 +67,16 @@ def test_a_map_that_turned_by_12_degrees_is_bent_back_to_where_it_was(made: Walk
     assert after.rms.max() < 0.03 < before.rms.max()
 
 
+def test_fixes_leave_a_map_that_has_not_drifted_as_it_is(made: Walked) -> None:
+    """The graph expects 0.3° of drift a step, so noise of 2 cm could turn keyframes and what they saw far away."""
+    corrections, after, _ = solved(made, made.trajectory)
+    far = np.random.default_rng(0).uniform((-20, -20, -2), (20, 20, 4), (100, 3))
+    own = made.trajectory.poses[::STEP]
+    seen, bent = (far @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3] for T in (own, corrections @ own))
+    off = after.reference.to_crs(bent.reshape(-1, 3)) - TRUTH.to_crs(seen.reshape(-1, 3))
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.03
+
+
 def test_the_users_word_on_a_fix_overrules_the_verdict(made: Walked, drifted: Trajectory) -> None:
     wild, sound = str(made.outliers[2]), next(str(n) for n in range(30, 99) if n not in made.outliers)
     _, after, _ = solved(made, drifted, overruled={wild: True, sound: False})
