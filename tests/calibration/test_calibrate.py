@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from app.__main__ import cli
 from app.calibration.calibrate import calibrate_walk
+from app.calibration.lines import Lines
 from app.calibration.walk import Walk, read_walk
 from app.calibration.words import WALK, as_json, params_yaml, table, write_beside
 from app.evaluation.calibration_plot import residual_plot
@@ -107,3 +108,20 @@ def test_numbers_for_programs_are_json_and_the_plot_is_an_image(tmp_path: Path) 
 def test_a_recording_that_is_too_short_is_refused_in_a_sentence(shared_data: Path) -> None:
     result = CliRunner().invoke(cli, ["calibrate", str(shared_data / "hall_mid360.mcap"), "--duration", "5"])
     assert result.exit_code == 2 and "needs at least 50 scans" in result.output
+
+
+def test_errors_of_scan_lines_are_told_drawn_and_kept(tmp_path: Path) -> None:
+    elevations, ranges = np.radians([0.2, -0.2, 0.1, 0.0]), np.array([0.01, -0.01, 0.002, 0.0])
+    sigmas = np.tile([[np.radians(0.01)], [0.001]], 4)
+    seen = np.array([0.02, 0.02, 0.02, np.nan])
+    found = replace(known(tmp_path / "walk.mcap"), lines=Lines(elevations, ranges, sigmas, seen, seen / 2))
+    rows = dict(table(found))
+    assert rows["elevations of the scan lines"] == "off by 0.15 (RMS), 0.2 at most, ± 0.01 deg"
+    assert rows["scan lines on planes"] == "20.0 mm before, 10.0 after"
+    assert "not observable" in rows["distance offset of all lines"]
+    assert json.loads(json.dumps(as_json(found)))["lines"]["residuals_m"][0][3] is None
+    assert "points on planes" in residual_plot(found)
+    ElementTree.fromstring(residual_plot(found))
+    params = resolve_params(write_beside(found).with_name("walk.mcap"), None, None, [])
+    assert params.sensor.elevation_corrections == "0.2 -0.2 0.1 0"
+    assert params.sensor.range_corrections == "0.01 -0.01 0.002 0"
