@@ -158,7 +158,7 @@ def told(found: Comparison, name: str, notes: list[str]) -> str:
         for rgb, share in zip(colours.tolist(), (counts / max(counts.max(), 1)).tolist(), strict=True)
     ]
     tiles = [
-        Tile("median", f"{100 * found.median:+.1f}", "cm"),
+        Tile("median", f"{round(100 * found.median, 1) + 0.0:+.1f}", "cm"),
         Tile("half within", number(100 * found.typical, 1), "cm"),
         Tile("95 % within", number(100 * found.p95, 1), "cm"),
     ]

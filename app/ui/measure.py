@@ -40,6 +40,7 @@ class MeasurePanel:
         self._spots: tuple[Spot, ...] = ()  # of the measure that is begun
         self._nodes: list[Any] = []
         self._measured: list[tuple[Measure, F64, Numbers]] = []
+        self._map: tuple[object, object] = None, None  # chunks and poses that they are of
         self._name = gui.add_text("name", "", hint="Of the next measure; empty: a number.")
         kinds = gui.add_button_group("measure", (*_SPOTS, STOP), hint="Then click points of the map.")
         kinds.on_click(by_user(lambda kind, _: self.begin(kind)))
@@ -84,7 +85,13 @@ class MeasurePanel:
         drawn = str([at.round(3).tolist() for _, at in where])
         self._where = current.earth.found.reference if current.earth.found is not None else None
         if self._changes(current.measures, self._kind, str(self._spots), drawn, current.session, self._where):
-            self._measured = [(measure, at, numbers(at, current.chunks, poses)) for measure, at in where]
+            map_ = current.chunks, current.keyframe_poses
+            same = all(before is now for before, now in zip(self._map, map_, strict=True))
+            known = {measure: found for measure, _, found in self._measured} if same else {}
+            self._map = map_
+            self._measured = [
+                (measure, at, known.get(measure) or numbers(at, current.chunks, poses)) for measure, at in where
+            ]
             self._draw_scene(begun)
             self._draw_list()
 
