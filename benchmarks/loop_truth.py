@@ -33,8 +33,10 @@ DRIFTING = (
 """So little of each scan that odometry drifts by decimetres, as it would on a worse sensor or a longer walk."""
 FALSE_M, FALSE_DEG = 0.5, 5.0
 """A loop farther than this from the truth is false: it ties another place, and is not merely inexact."""
-GOOD_M, GOOD_DEG = 0.10, 1.0
+GOOD_M, GOOD_DEG = 0.10, 0.5
 """A revisit counts as found by a loop this near to the truth."""
+HELD_DEG = 1.0
+"""A loop tells nothing of a rotation whose standard deviation is greater, as of roll and pitch."""
 WITHIN_M, APART_S, ALONG = 2.0, 15.0, 0.7
 """A revisit: so near to where the walk was so long before, heading the same way or the opposite one (cosine)."""
 WORSE_M = 0.0005
@@ -153,9 +155,15 @@ def score(walk: Walk, without: Trajectory, truth: Trajectory) -> Score:
 def _error(edge: LoopEdge, older: F64, newer: F64) -> tuple[float, float]:
     """m and deg between a loop and the true poses (4, 4) of its ends, in the directions that it holds."""
     wrong = lie.inverse(lie.inverse(older) @ newer) @ edge.T_older_newer
-    squares, directions = np.linalg.eigh(edge.covariance[3:, 3:])
-    held = directions[:, squares < OPEN_M**2]
-    return float(np.linalg.norm(held.T @ wrong[:3, 3])), float(np.degrees(np.linalg.norm(lie.log(wrong[:3, :3]))))
+    turned = _held(edge.covariance[:3, :3], np.radians(HELD_DEG)) @ lie.log(wrong[:3, :3])
+    moved = _held(edge.covariance[3:, 3:], OPEN_M) @ wrong[:3, 3]
+    return float(np.linalg.norm(moved)), float(np.degrees(np.linalg.norm(turned)))
+
+
+def _held(covariance: F64, most: float) -> F64:
+    """(n, 3) unit directions in which a covariance (3, 3) has a standard deviation of at most so much."""
+    squares, directions = np.linalg.eigh(covariance)
+    return np.asarray(directions[:, squares < most**2].T)
 
 
 def _good(errors: F64) -> np.ndarray:
