@@ -24,7 +24,7 @@ _EXPLAINED = (
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundMounting:
     """What the process sends at the end.
 
     Attributes:
@@ -90,7 +90,7 @@ class CalibrationPanel:
             self._progress.value = 100 * message  # type: ignore[misc]  # mypy overlooks viser's setter
             return
         self.close()
-        found = message if isinstance(message, Found) else Found([("", message)], {})
+        found = message if isinstance(message, FoundMounting) else FoundMounting([("", message)], {})
         self._values = found.values
         rows = [("", f"{found.contradiction}."), *found.rows] if found.contradiction else found.rows
         self._html.content, self._html.visible = panel("calibration", rows), True
@@ -162,4 +162,4 @@ def find(owner: Link, recording: Path, params: Params) -> None:
     except HemislamError as error:
         owner.send(str(error))
         return
-    owner.send(Found(table(found), found.found(), residual_plot(found), found.contradiction()))
+    owner.send(FoundMounting(table(found), found.found(), residual_plot(found), found.contradiction()))

@@ -10,7 +10,7 @@ import viser
 from app.server.protocol import Command, Note, Notice, OpenedRecording, Restart, SetParams, Snapshot
 from app.slam.params import Params
 from app.ui import calibration
-from app.ui.calibration import CalibrationPanel, Found
+from app.ui.calibration import CalibrationPanel, FoundMounting
 from tests.ui.conftest import page_of, user_clicks
 
 FOUND = {"sensor.rotation": [70.0, -50.0, 104.0]}
@@ -60,7 +60,9 @@ def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> 
     process.messages += [0.25, 0.5]
     panel.draw(OPEN)
     assert panel._progress.visible and panel._progress.value == 50 and panel._button.disabled
-    process.messages.append(Found([("rotation of the LiDAR on the IMU", "roll 70.00 ± 0.05 <deg>")], FOUND, "<svg/>"))
+    process.messages.append(
+        FoundMounting([("rotation of the LiDAR on the IMU", "roll 70.00 ± 0.05 <deg>")], FOUND, "<svg/>")
+    )
     panel.draw(OPEN)
     assert process.closed and not panel._progress.visible and panel._apply.visible
     assert "roll 70.00 ± 0.05 &lt;deg&gt;" in panel._html.content and page.sent == []
@@ -93,7 +95,7 @@ def test_without_a_recording_there_is_nothing_to_calibrate(server: viser.ViserSe
     assert panel._button.disabled
 
 
-TOLD = Found([("position", "unknown")], FOUND, "", "The LiDAR seems to be turned by 70°, -50°, 104° on the IMU")
+TOLD = FoundMounting([("position", "unknown")], FOUND, "", "The LiDAR seems to be turned by 70°, -50°, 104° on the IMU")
 
 
 @pytest.fixture
