@@ -2,15 +2,17 @@
 
 import contextlib
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from app.slam import channels, coast, ground, iekf, imu, keyframes, rest, start
 from app.slam.certainty import Certainty
+from app.slam.clock import Clock
 from app.slam.imu import Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
+from app.slam.lines import LineErrors
 from app.slam.local_map import LocalMap, MapState
 from app.slam.params import Params
 from app.slam.types import F32, F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
@@ -24,6 +26,7 @@ class EngineProgress:
     Attributes:
         frame: index of the next one. belief: None until the start is over. still: samples of the rest so far.
         T_odom_keyframe: T_odom_imu of the last keyframe. certainty: of its pose; both None before the first.
+        lines: errors of the scan lines, as learnt so far. clock: the same of the IMU's.
     """
 
     frame: int = 0
@@ -32,6 +35,8 @@ class EngineProgress:
     status: FrameStatus = FrameStatus.INITIALISING
     T_odom_keyframe: F64 | None = None
     certainty: Certainty | None = None
+    lines: LineErrors = field(default_factory=LineErrors.unknown)
+    clock: Clock = field(default_factory=Clock)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +79,11 @@ class Engine:
         p, before, watch = self.params, self._progress, _Stopwatch()
         end_ns, notices = scan.end_ns, []
         scan = _in_range(channels.corrected(scan, p.sensor), p.sensor.min_range, p.sensor.max_range)
+        lines = before.lines if p.filter.learn_lines else LineErrors.unknown()
+        if lines.errors.any():
+            scan = channels.bent(scan, -lines.errors[:, 1], -lines.errors[:, 0])
+        clock = before.clock if p.imu.learn_clock else Clock()
+        samples = clock.set_right(samples)
 
         belief, still, waiting = before.belief, before.still, False
         if belief is None and not len(samples):
@@ -109,6 +119,13 @@ class Engine:
         status = _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 
+        here, last = posterior.state.T_odom_imu, before.T_odom_keyframe
+        due = not waiting and keyframes.is_due(last, here, p.keyframe)
+        if due and last is not None and status is FrameStatus.TRACKING and p.filter.learn_lines:
+            walked = float(np.linalg.norm(here[:3, 3] - last[:3, 3]))
+            lines = lines.learnt(posterior, points, scan.ring, walked, self._map, p.filter)
+        if registration.inliers and status is FrameStatus.TRACKING and len(samples) and p.imu.learn_clock:
+            clock = clock.learnt(samples, predicted.state, posterior.state)
         if not waiting:
             self._insert(posterior, sampled.points)
         watch.lap("insert")
@@ -117,7 +134,7 @@ class Engine:
         for array in (points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns):
             array.setflags(write=False)
         keyframe, certainty = None, before.certainty
-        if not waiting and keyframes.is_due(before.T_odom_keyframe, posterior.state.T_odom_imu, p.keyframe):
+        if due:
             certainty = (certainty or Certainty.begin(posterior)).moved(posterior)
             keyframe = self._keyframe(posterior, cloud, certainty)
         watch.lap("keyframe")
@@ -144,7 +161,7 @@ class Engine:
         )
         T_odom_keyframe = before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu
         self._progress = EngineProgress(
-            before.frame + 1, None if waiting else posterior, still, status, T_odom_keyframe, certainty
+            before.frame + 1, None if waiting else posterior, still, status, T_odom_keyframe, certainty, lines, clock
         )
         return result
 

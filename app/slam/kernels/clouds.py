@@ -35,13 +35,14 @@ def correct(points, ring, elevations, ranges, out):
     points (n, 3) f32 m, LiDAR frame; ring (n,) u16; elevations (k,) f64 rad and ranges (k,) f64 m, both added. Out: out
     (n, 3) f32 m.
     """
+    cosines, sines = np.cos(elevations), np.sin(elevations)
     for j in range(len(points)):
         x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
         line = ring[j]
         flat = math.sqrt(x * x + y * y)
         reach = math.sqrt(flat * flat + z * z)
         if line < len(elevations) and flat > 0.0:
-            c, s = math.cos(elevations[line]), math.sin(elevations[line])
+            c, s = cosines[line], sines[line]
             bent = c - s * z / flat
             x, y, z = x * bent, y * bent, c * z + s * flat
         longer = (reach + ranges[line]) / reach if line < len(ranges) and reach > 0.0 else 1.0
