@@ -26,7 +26,7 @@ from app.mapping.session_file import SUFFIX, Speed
 from app.server import protocol
 from app.server.folders import Folders
 from app.server.protocol import Command
-from app.server.uploads import forget, receive
+from app.server.uploads import discard, receive
 from app.server.views import LoopsState, StateView, loops_state, state_view
 from app.server.worker import RunningEngine
 from app.slam.loops.edits import Accept, Add, LoopEdit, Reject, SetWeight, Solve
@@ -239,9 +239,9 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
         receive(folders, name, offset, size, piece)
 
     @router.delete("/recordings/{name}", status_code=204)
-    def forget_upload(name: str) -> None:
+    def discard_upload(name: str) -> None:
         """Remove the pieces of a copy that was not completed."""
-        forget(folders, name)
+        discard(folders, name)
 
     @router.post("/truth", status_code=202)
     def compare_with(body: CompareBody) -> None:

@@ -45,7 +45,7 @@ def receive(folders: Folders, name: str, offset: int, size: int, piece: bytes) -
         raise HemislamError(f"{name} cannot be written to {there.parent}: {error.strerror}.") from None
 
 
-def forget(folders: Folders, name: str) -> None:
+def discard(folders: Folders, name: str) -> None:
     """Remove the pieces of a file that did not arrive as a whole. Raises HemislamError as `receive` does."""
     _part(_place(folders, name)).unlink(missing_ok=True)
 

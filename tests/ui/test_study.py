@@ -269,4 +269,4 @@ def test_a_frame_is_downloaded_by_who_asked(bench: Bench) -> None:
         bench.panel._download(kind, browser)  # type: ignore[arg-type]
     (ply, first), (pcd, second) = browser.files
     assert (ply, pcd) == ("hall_bpearl-frame-000007.ply", "hall_bpearl-frame-000007.pcd")
-    assert first.startswith(b"ply\n") and second.startswith(b"# hemislam frame 7")
+    assert first.startswith(b"ply\n") and second.startswith(b"# .PCD v0.7 - hemislam frame 7")
