@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from app.calibration.excerpt import LONGEST_S, Excerpt, read_excerpt
 from app.calibration.guide import Guide
 from app.calibration.inertial import Inertial, Noise
 from app.calibration.lines import Lines, fit_lines
 from app.calibration.odometry import track
 from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation
 from app.calibration.translation import Moved, fit_translation
-from app.calibration.walk import LONGEST_S, Walk, read_walk
 from app.sensors.recording import open_recording
 from app.slam import lie
 from app.slam.errors import HemislamError
@@ -133,29 +133,31 @@ def calibrate(
         HemislamError: the recording cannot be read, or is too short.
     """
     with open_recording(path, params) as recording:
-        walk = read_walk(recording, params, duration_s, lambda done: progress(READING * done))
+        excerpt = read_excerpt(recording, params, duration_s, lambda done: progress(READING * done))
     try:
-        return calibrate_walk(path, params, walk, progress)
+        return calibrate_excerpt(path, params, excerpt, progress)
     except np.linalg.LinAlgError as error:
         raise HemislamError(
             f"{path} cannot be calibrated ({error}); record again, walking slowly near walls."
         ) from None
 
 
-def calibrate_walk(path: Path, params: Params, walk: Walk, progress: Report = lambda fraction: None) -> Calibration:
+def calibrate_excerpt(
+    path: Path, params: Params, excerpt: Excerpt, progress: Report = lambda fraction: None
+) -> Calibration:
     """As `calibrate`, of what was read already."""
-    inertial = Inertial(walk.seconds(walk.imu.stamps_ns), walk.imu.gyro, walk.imu.accel)
+    inertial = Inertial(excerpt.seconds(excerpt.imu.stamps_ns), excerpt.imu.gyro, excerpt.imu.accel)
     given = lie.from_rpy_degrees(params.sensor.rotation), np.array(params.sensor.translation, np.float64)
 
     def report(number: int) -> Report:
         return lambda done: progress(READING + ROUND * (number + done))
 
-    way = track(walk, None, report(0))
+    way = track(excerpt, None, report(0))
     alone = way.residual
     late = find_offset(way, inertial)
     turned = fit_rotation(way, inertial, first_rotation(way, inertial, late), late, given[0])
     guide = Guide.of(inertial, turned.R_imu_lidar, turned.late, turned.bias)
-    lines, seen = Lines.none(walk.lines), walk
+    lines, seen = Lines.none(excerpt.lines), excerpt
     for number in range(ROUNDS):
         way = track(seen, guide, report(number + 1))
         turned = fit_rotation(way, inertial, turned.R_imu_lidar, turned.late, given[0])
@@ -163,10 +165,10 @@ def calibrate_walk(path: Path, params: Params, walk: Walk, progress: Report = la
         guide = Guide.of(
             inertial, turned.R_imu_lidar, turned.late, turned.bias, moved.p_imu_lidar, moved.bias, moved.gravity
         )
-        if walk.lines:
+        if excerpt.lines:
             lines = fit_lines(seen, way, lines)
-            seen = lines.applied(walk)
+            seen = lines.applied(excerpt)
     down = moved.gravity / np.linalg.norm(moved.gravity)
     gyro_noise, accel_noise = (Noise.of(inertial.times, values) for values in (inertial.gyro, inertial.accel))
     residuals = alone, way.residual
-    return Calibration(path, params, walk.duration_s, turned, moved, down, residuals, gyro_noise, accel_noise, lines)
+    return Calibration(path, params, excerpt.duration_s, turned, moved, down, residuals, gyro_noise, accel_noise, lines)

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 
+from app.calibration.excerpt import Excerpt
 from app.calibration.odometry import Track
-from app.calibration.walk import Walk
 from app.slam import channels
 from app.slam.kernels.registration import EDGE_ON
 from app.slam.types import F64, I64, U16
@@ -62,10 +62,10 @@ class Lines:
         sigmas = np.repeat(np.array(WIDEST)[:, None], count, axis=1)
         return cls(np.zeros(count), np.zeros(count), sigmas, unknown, unknown)
 
-    def applied(self, walk: Walk) -> Walk:
-        """The walk with its beams corrected."""
-        scans = tuple(channels.bent(scan, self.elevations, self.ranges) for scan in walk.scans)
-        return replace(walk, scans=scans)
+    def applied(self, excerpt: Excerpt) -> Excerpt:
+        """The excerpt with its beams corrected."""
+        scans = tuple(channels.bent(scan, self.elevations, self.ranges) for scan in excerpt.scans)
+        return replace(excerpt, scans=scans)
 
     def found(self) -> dict[str, str]:
         """The parameters that apply what is worth it."""
@@ -79,16 +79,16 @@ class Lines:
         return values
 
 
-def fit_lines(walk: Walk, track: Track, so_far: Lines) -> Lines:
-    """Corrections beyond those that the scans of the walk already have.
+def fit_lines(excerpt: Excerpt, track: Track, so_far: Lines) -> Lines:
+    """Corrections beyond those that the scans of the excerpt already have.
 
     Args:
-        track: of this walk. so_far: what the walk is corrected by.
+        track: of this excerpt. so_far: what it is corrected by.
     """
     count = len(so_far.elevations)
     votes, squares, hits = [], np.zeros(count), np.zeros(count)
-    for begin in range(1, len(walk.scans) - WINDOW + 1, WINDOW):
-        window = _Window.of(walk, track, range(begin, begin + WINDOW))
+    for begin in range(1, len(excerpt.scans) - WINDOW + 1, WINDOW):
+        window = _Window.of(excerpt, track, range(begin, begin + WINDOW))
         if len(window.off) < FEWEST * WINDOW:
             continue
         votes.append(window.equations(count))
@@ -137,7 +137,7 @@ class _Window:
     raised: F64
 
     @classmethod
-    def of(cls, walk: Walk, track: Track, scans: range) -> "_Window":
+    def of(cls, excerpt: Excerpt, track: Track, scans: range) -> "_Window":
         parts = []
         for number, k in enumerate(scans):
             points = track.points[k][k % EVERY :: EVERY].astype(np.float64)
@@ -145,7 +145,7 @@ class _Window:
             beams = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-6)
             raised = np.hstack([-points[:, :2] * points[:, 2:] / flat, flat])
             R = track.rotations[k].T
-            ring = walk.scans[k].ring[k % EVERY :: EVERY]
+            ring = excerpt.scans[k].ring[k % EVERY :: EVERY]
             parts.append((points @ R, beams @ R, raised @ R, ring, np.full(len(points), number), track.positions[k]))
         arms, beams, raised, ring, scan = (np.concatenate(column) for column in list(zip(*parts, strict=True))[:5])
         places = arms + np.stack([part[5] for part in parts])[scan]

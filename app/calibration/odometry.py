@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from app.calibration.excerpt import Excerpt
 from app.calibration.guide import Guide
-from app.calibration.walk import Walk
 from app.slam import lie
 from app.slam.kernels import motion
 from app.slam.kernels.registration import EDGE_ON, REPEATED, RESIDUAL_HUBER
@@ -80,7 +80,9 @@ class _Motion:
         )
 
 
-def track(walk: Walk, guide: Guide | None = None, progress: Callable[[float], None] = lambda fraction: None) -> Track:
+def track(
+    excerpt: Excerpt, guide: Guide | None = None, progress: Callable[[float], None] = lambda fraction: None
+) -> Track:
     """Lay each scan onto the local map of those before it.
 
     Args:
@@ -88,12 +90,12 @@ def track(walk: Walk, guide: Guide | None = None, progress: Callable[[float], No
     """
     params, mapping = FilterParams(), MapParams()
     local_map = LocalMap(mapping)
-    times = walk.seconds(walk.ends_ns)
+    times = excerpt.seconds(excerpt.ends_ns)
     here = _Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.diag(np.repeat([1e-8, 1e-8, 1.0, 1.0], 3)))
-    rotations, positions, residuals, deskewed = [here.R], [here.p], [float("nan")], [walk.scans[0].points]
-    local_map.insert(walk.scans[0].points, here.p, mapping)
-    for k, scan in enumerate(walk.scans[1:], 1):
-        here = _predicted(here, float(times[k - 1]), float(times[k]), guide, _changes(walk, scan.end_ns))
+    rotations, positions, residuals, deskewed = [here.R], [here.p], [float("nan")], [excerpt.scans[0].points]
+    local_map.insert(excerpt.scans[0].points, here.p, mapping)
+    for k, scan in enumerate(excerpt.scans[1:], 1):
+        here = _predicted(here, float(times[k - 1]), float(times[k]), guide, _changes(excerpt, scan.end_ns))
         path = _Path.of(scan, float(times[k]), here.R, guide)
         here, residual = _laid(scan, here, path, local_map, params)
         if not (np.isfinite(here.p).all() and np.isfinite(here.R).all()):
@@ -105,7 +107,7 @@ def track(walk: Walk, guide: Guide | None = None, progress: Callable[[float], No
         positions.append(here.p)
         residuals.append(residual)
         deskewed.append(points)
-        progress(k / (len(walk.scans) - 1))
+        progress(k / (len(excerpt.scans) - 1))
     return Track(times, np.stack(rotations), np.stack(positions), np.array(residuals), tuple(deskewed))
 
 
@@ -139,10 +141,10 @@ class _Path:
         return out
 
 
-def _changes(walk: Walk, end_ns: int) -> tuple[float, float]:
+def _changes(excerpt: Excerpt, end_ns: int) -> tuple[float, float]:
     """How fast a scan's rates may change by the IMU (rad/s and m/s², norms, so that its mounting does not matter)."""
-    around = np.searchsorted(walk.imu.stamps_ns, end_ns + np.array([-AROUND_S - 0.1, AROUND_S]) * 1e9)
-    gyro, accel = walk.imu.gyro[slice(*around)], walk.imu.accel[slice(*around)]
+    around = np.searchsorted(excerpt.imu.stamps_ns, end_ns + np.array([-AROUND_S - 0.1, AROUND_S]) * 1e9)
+    gyro, accel = excerpt.imu.gyro[slice(*around)], excerpt.imu.accel[slice(*around)]
     if len(gyro) < 3:
         return 1.0, 3.0
     turning = float(np.linalg.norm(gyro - gyro.mean(axis=0), axis=1).max())

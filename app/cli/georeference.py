@@ -98,14 +98,14 @@ def georeference(
     else:
         recording = results if gnss is not None else _recording_of(results)
         fixes, told = fixes_of(recording, gnss, int(trajectory.stamps_ns[0]))
-        overruled = {str(fix): fix in (accept or []) for fix in (*(accept or []), *(reject or []))}
-        found = align(trajectory, fixes, grid=crs, height=height or told, lever=lever_arm, overruled=overruled)
-        if unknown := sorted(set(overruled) - set(found.names)):
+        overridden = {str(fix): fix in (accept or []) for fix in (*(accept or []), *(reject or []))}
+        found = align(trajectory, fixes, grid=crs, height=height or told, lever=lever_arm, overridden=overridden)
+        if unknown := sorted(set(overridden) - set(found.names)):
             raise HemislamError(
                 f"There is no fix {unknown[0]} within the time of the trajectory; gnss_residuals.csv lists all."
             )
         if out is not None:
-            found, trajectory = _bent(results, out, fixes, found, overruled, replace=force)
+            found, trajectory = _bent(results, out, fixes, found, overridden, replace=force)
             results = out
         lines = ledger.summary(found, "fixes")
         if not found.used.all():
@@ -115,14 +115,14 @@ def georeference(
 
 
 def _bent(
-    results: Path, out: Path, fixes: "Fixes", found: "Alignment", overruled: dict[str, bool], *, replace: bool
+    results: Path, out: Path, fixes: "Fixes", found: "Alignment", overridden: dict[str, bool], *, replace: bool
 ) -> "tuple[Alignment, Trajectory]":
     """Write trajectory and map, bent by the fixes, to `out`, and remove what another run has left there."""
     from app.export.folder import read_results
     from app.export.results import BY_RUN, save_results
     from app.mapping.earth import bent
 
-    after, _ = bent(read_results(results), fixes, found, overruled)
+    after, _ = bent(read_results(results), fixes, found, overridden)
     assert after.found is not None
     files = [one for one in BY_RUN if one.name in ("trajectory.tum", "map.ply")]
     save_results(out, after, files, replace=replace)

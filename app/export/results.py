@@ -18,7 +18,7 @@ import numpy.typing as npt
 from app.export import map_file
 from app.export.points import EVERYTHING, Block, Choice, blocks
 from app.export.raster import CELL, Raster, rasterise
-from app.export.section import Slab, of_box, of_walk
+from app.export.section import Slab, of_box, of_path
 from app.georeference import ledger, reference
 from app.georeference.align import Alignment
 from app.georeference.reference import GeoReference
@@ -95,7 +95,7 @@ class Results:
             self._sections[kind] = (
                 of_box(self.blocks, self.choice.box, self.where)
                 if kind == "section"
-                else of_walk(self.blocks, self.trajectory.positions, self.choice.slab / 2, self.where)
+                else of_path(self.blocks, self.trajectory.positions, self.choice.slab / 2, self.where)
             )
         return self._sections[kind]
 

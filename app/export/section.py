@@ -75,7 +75,7 @@ def of_box(read: Callable[[], Iterable[Block]], box: Box | None, where: GeoRefer
     return _counted(read, laid)
 
 
-def of_walk(read: Callable[[], Iterable[Block]], positions: F64, half: float, where: GeoReference | None) -> Slab:
+def of_path(read: Callable[[], Iterable[Block]], positions: F64, half: float, where: GeoReference | None) -> Slab:
     """What lies within `half` m beside a walked path, (n, 3) m; chainage is the way walked, from above. As `of_box`.
 
     Raises:

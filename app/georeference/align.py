@@ -78,7 +78,7 @@ class Alignment:
         return np.asarray(np.sqrt((self.residuals[self.used] ** 2).mean(axis=0)))
 
 
-class WalkedPath:
+class PathOverTime:
     """Where the IMU was between the poses of a trajectory (4 or more); times in s since the first pose."""
 
     def __init__(self, trajectory: Trajectory) -> None:
@@ -122,14 +122,14 @@ def align(
     height: str = ELLIPSOIDAL,
     lever: Vector | None = None,
     offset_s: float | None = None,
-    overruled: Mapping[str, bool] = MappingProxyType({}),
+    overridden: Mapping[str, bool] = MappingProxyType({}),
 ) -> Alignment:
     """Find where a trajectory lies by fixes that are in order of time; those before and after it do not matter.
 
     Args:
         trajectory: T_map_imu with z up. grid: a projected system; "": the UTM zone there. height: what the heights of
             the fixes are above. lever: m from the IMU to the antenna, IMU frame; None: estimated, if possible.
-        offset_s: how much later the fixes are stamped than measured; None: found. overruled: whether fixes of these
+        offset_s: how much later the fixes are stamped than measured; None: found. overridden: whether fixes of these
             names count, whatever their residuals.
 
     Raises:
@@ -137,7 +137,7 @@ def align(
     """
     if len(trajectory) < 4:
         raise HemislamError("The trajectory has fewer than 4 poses; that is too few to align it with fixes.")
-    path = WalkedPath(trajectory)
+    path = PathOverTime(trajectory)
     seconds: F64 = (fixes.stamps_ns - path.start_ns).astype(np.float64) * 1e-9
     rows = np.flatnonzero(path.within_search(seconds))
     if len(rows) < FEWEST:
@@ -156,7 +156,7 @@ def align(
         seconds[known],
         ground.places[known],
         fixes.sigmas[known],
-        as_told(overruled, names),
+        as_told(overridden, names),
         arm,
         offset if offset_s is None else None,
         lever is None,
@@ -197,9 +197,9 @@ def align(
     )
 
 
-def as_told(overruled: Mapping[str, bool], names: Sequence[str]) -> F64:
+def as_told(overridden: Mapping[str, bool], names: Sequence[str]) -> F64:
     """(n,) 1 or 0 where the user says that what has this name counts or does not, nan elsewhere."""
-    return np.array([float(overruled.get(name, np.nan)) for name in names], np.float64)
+    return np.array([float(overridden.get(name, np.nan)) for name in names], np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +270,7 @@ class _Problem:
         lever_free: whether the lever arm is to be found instead.
     """
 
-    path: WalkedPath
+    path: PathOverTime
     seconds: F64
     places: F64
     sigmas: F64
@@ -357,7 +357,7 @@ def _jacobian(function: Callable[[F64], F64], x: F64) -> F64:
     return np.stack(columns, axis=1)
 
 
-def _coarse(path: WalkedPath, seconds: F64, places: F64, lever: F64, *, search: bool = True) -> tuple[float, float]:
+def _coarse(path: PathOverTime, seconds: F64, places: F64, lever: F64, *, search: bool = True) -> tuple[float, float]:
     """The offset (s; 0 without a search) with which the fixes fit best, and how far off (m) they are in the median."""
     few = np.unique(np.linspace(0, len(seconds) - 1, COARSE_FIXES).astype(int))
     best = (np.inf, 0.0, np.inf)
@@ -373,7 +373,7 @@ def _coarse(path: WalkedPath, seconds: F64, places: F64, lever: F64, *, search: 
     return best[1], best[2]
 
 
-def _too_few(path: WalkedPath, seconds: F64) -> HemislamError:
+def _too_few(path: PathOverTime, seconds: F64) -> HemislamError:
     return HemislamError(
         f"Only {path.known(seconds).sum()} fixes lie within the time of the trajectory, {FEWEST} are needed: they begin"
         f" {seconds[0]:.0f} s and end {seconds[-1]:.0f} s after its start; both must be stamped in UTC."
@@ -385,7 +385,7 @@ def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> f
 
     Drift over the whole walk looks like an offset; within a stretch there is little of it.
     """
-    path, rows = WalkedPath(trajectory), np.array([int(name) - 1 for name in found.names])
+    path, rows = PathOverTime(trajectory), np.array([int(name) - 1 for name in found.names])
     seconds: F64 = (fixes.stamps_ns[rows] - path.start_ns).astype(np.float64) * 1e-9
     places = Ground.in_grid(found.grid, found.reference.crs).places
     arm, R = np.array(found.lever_arm), np.array(found.reference.rotation)
@@ -425,7 +425,7 @@ def _laid(points: F64, places: F64) -> tuple[float, F64, F64]:
     return yaw, shift, off
 
 
-def _refuse_swapped(path: WalkedPath, seconds: F64, fixes: Fixes, median: float) -> None:
+def _refuse_swapped(path: PathOverTime, seconds: F64, fixes: Fixes, median: float) -> None:
     """Raises HemislamError if the fixes fit far better with latitude and longitude exchanged: a mirrored path."""
     if (np.abs(fixes.longitude) > 84).any() or median < 0.5:
         return

@@ -2,7 +2,7 @@
 
     g = T_map_imu @ (T_keyframe_then @ lever)        the antenna, carried to the time of the fix by odometry
 
-Fixes that do not fit even a bent map are rejected; the user's word on a fix overrules that. The fixes also tell how
+Fixes that do not fit even a bent map are rejected; the user's word on a fix overrides that. The fixes also tell how
 stiff the graph is: those of some stretches must predict those of the others.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, WalkedPath, as_told, offset_by_parts
+from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, PathOverTime, as_told, offset_by_parts
 from app.georeference.fixes import Fixes
 from app.slam import lie
 from app.slam.arrays import F64, I64, Mask
@@ -34,13 +34,13 @@ def bend(
     graph: Sequence[Factor],
     fixes: Fixes,
     found: Alignment,
-    overruled: Mapping[str, bool],
+    overridden: Mapping[str, bool],
 ) -> tuple[F64, Alignment]:
     """Solve the graph with the fixes.
 
     Args:
         trajectory: T_map_imu at all scans, keyframes among them. graph: odometry and loops of the keyframes.
-        found: how the fixes lie on the map as it is. overruled: whether fixes of these names count, whatever their
+        found: how the fixes lie on the map as it is. overridden: whether fixes of these names count, whatever their
             residuals.
 
     Returns:
@@ -49,13 +49,13 @@ def bend(
     Raises:
         HemislamError: the solver fails.
     """
-    before = WalkedPath(trajectory).poses((keyframe_stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
+    before = PathOverTime(trajectory).poses((keyframe_stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
     if np.isfinite(found.offset_sigma_s):
         offset_s = offset_by_parts(trajectory, fixes, found)
         told = f"Clock offset, estimated in stretches of the trajectory: {offset_s * 1e3:.1f} ms."
         found = replace(found, offset_s=offset_s, offset_sigma_s=float("nan"), notes=(*found.notes, told))
     priors = _priors(trajectory, keyframe_stamps_ns, before, fixes, found)
-    word = as_told(overruled, found.names)
+    word = as_told(overridden, found.names)
     held, barred = np.asarray(word == 1.0), np.asarray(word == 0.0)
     chosen = [replace(prior, robust=True) for prior, no in zip(priors, barred, strict=True) if not no]
     stretches = [int(name) - 1 for name, no in zip(found.names, barred, strict=True) if not no]
@@ -117,7 +117,7 @@ def _priors(
     before = np.maximum(after - 1, 0)
     nearer = np.abs(keyframe_stamps_ns[before] - stamps_ns) <= np.abs(keyframe_stamps_ns[after] - stamps_ns)
     nearest = np.where(nearer, before, after)
-    then = WalkedPath(trajectory).poses((stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
+    then = PathOverTime(trajectory).poses((stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
     arms = (lie.inverse(keyframes[nearest]) @ then @ np.array([*found.lever_arm, 1.0]))[:, :3]
     places = found.reference.from_crs(found.grid)
     scatter = np.linalg.norm(found.residuals, axis=1) / np.maximum(found.distances, 1e-9)

@@ -27,20 +27,20 @@ def lay_on_control(
     *,
     grid: str = "",
     height: str = ELLIPSOIDAL,
-    overruled: Mapping[str, bool] = MappingProxyType({}),
+    overridden: Mapping[str, bool] = MappingProxyType({}),
 ) -> Alignment:
     """Where a map lies, by least squares over control points, rotated about all axes. Its shape does not change.
 
     Args:
         control: name, E, N, H in `grid`, or name, latitude, longitude, height. picked: (3,) m in the map, by name.
-        height: what heights are above. overruled: False for points that do not count.
+        height: what heights are above. overridden: False for points that do not count.
 
     Raises:
         HemislamError: a table cannot be used, or the points leave the map's place open.
     """
     name, places = read_places(control, grid)
     names = [one for one in places if one in picked]
-    used = np.array([overruled.get(one, True) for one in names], bool)
+    used = np.array([overridden.get(one, True) for one in names], bool)
     count = [one for one, uses in zip(names, used, strict=True) if uses]
     if len(count) < 3:
         raise HemislamError(_left_open(count))

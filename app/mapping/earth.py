@@ -17,7 +17,7 @@ from app.georeference.survey import Survey
 from app.georeference.tables import read_fixes, table_of
 from app.sensors.navsat import recorded_fixes
 from app.slam.errors import HemislamError
-from app.slam.loops.edits import LoopEdit, Overrule
+from app.slam.loops.edits import LoopEdit, Override
 from app.slam.loops.solvers import read_g2o
 from app.slam.map_frame import MapFrame
 
@@ -36,12 +36,12 @@ def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> tup
     """
     if not len(results.trajectory):
         raise HemislamError("Nothing is mapped yet that could be georeferenced.")
-    overruled = {edit.what: edit.accepted for edit in edits if isinstance(edit, Overrule)}
+    overridden = {edit.what: edit.accepted for edit in edits if isinstance(edit, Override)}
     if survey.control:
-        found = _by_points(results, survey, _named(overruled, POINT))
+        found = _by_points(results, survey, _named(overridden, POINT))
         return replace(results, where=found.reference, found=found), MapFrame()
     fixes, told = fixes_of(results.info.recording, survey.gnss, int(results.trajectory.stamps_ns[0]))
-    of_fixes = _named(overruled, FIX)
+    of_fixes = _named(overridden, FIX)
     found = align(
         results.trajectory,
         fixes,
@@ -49,7 +49,7 @@ def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> tup
         height=survey.height or told,
         lever=survey.lever,
         offset_s=survey.offset_s,
-        overruled=of_fixes,
+        overridden=of_fixes,
     )
     if survey.factors:
         return bent(results, fixes, found, of_fixes)
@@ -64,7 +64,7 @@ def lay_if_possible(results: Results, survey: Survey | None, edits: Sequence[Loo
         return replace(results, problem=str(error))
 
 
-def bent(results: Results, fixes: Fixes, found: Alignment, overruled: Mapping[str, bool]) -> tuple[Results, MapFrame]:
+def bent(results: Results, fixes: Fixes, found: Alignment, overridden: Mapping[str, bool]) -> tuple[Results, MapFrame]:
     """As `lay`, with fixes that lie on the results as `found`."""
     loops = results.loops
     if loops is None or not loops.g2o:
@@ -77,7 +77,7 @@ def bent(results: Results, fixes: Fixes, found: Alignment, overruled: Mapping[st
         raise HemislamError(f"The graph of {results.info.recording} cannot be read.") from None
     every = range(len(results.keyframes))
     stamps_ns = loops.stamps_ns if len(loops.stamps_ns) else np.array([results.keyframes[k].stamp_ns for k in every])
-    corrections, found = bend(results.trajectory, stamps_ns, graph, fixes, found, overruled)
+    corrections, found = bend(results.trajectory, stamps_ns, graph, fixes, found, overridden)
     by_fixes = MapFrame(stamps_ns, corrections)
     again = replace(loops, frame=by_fixes.over(loops.frame))
     return replace(results, loops=again, where=found.reference, found=found), by_fixes
@@ -95,7 +95,7 @@ def _read(recording: Path, gnss: Path | None, near_ns: int, changed_ns: int) -> 
     return read_fixes(gnss, near_ns) if gnss is not None else (recorded_fixes(recording), ELLIPSOIDAL)
 
 
-def _by_points(results: Results, survey: Survey, overruled: Mapping[str, bool]) -> Alignment:
+def _by_points(results: Results, survey: Survey, overridden: Mapping[str, bool]) -> Alignment:
     """By the control points that were picked on keyframes so far."""
     table = table_of(survey.control.splitlines(), "The table of control points", *CONTROL)
     picked = {}
@@ -103,8 +103,8 @@ def _by_points(results: Results, survey: Survey, overruled: Mapping[str, bool]) 
         if pick.keyframe < len(results.keyframes):
             T = results.frame.at(pick.keyframe) @ results.keyframes[pick.keyframe].T_odom_imu
             picked[pick.name] = T[:3, :3] @ pick.at + T[:3, 3]
-    return lay_on_control(table, picked, grid=survey.crs, height=survey.height or ELLIPSOIDAL, overruled=overruled)
+    return lay_on_control(table, picked, grid=survey.crs, height=survey.height or ELLIPSOIDAL, overridden=overridden)
 
 
-def _named(overruled: Mapping[str, bool], kind: str) -> dict[str, bool]:
-    return {what.removeprefix(kind): accepted for what, accepted in overruled.items() if what.startswith(kind)}
+def _named(overridden: Mapping[str, bool], kind: str) -> dict[str, bool]:
+    return {what.removeprefix(kind): accepted for what, accepted in overridden.items() if what.startswith(kind)}

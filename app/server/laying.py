@@ -9,7 +9,7 @@ from app.mapping.session import Session
 from app.server.protocol import Earth
 from app.server.publisher import Publisher
 from app.slam.errors import HemislamError
-from app.slam.loops.edits import Overrule
+from app.slam.loops.edits import Override
 from app.slam.map_frame import MapFrame
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ class Laying:
             self._under_way = None
         if session.loops is not None and not session.loops.idle:
             return False
-        words = tuple(edit for edit in session.edits.done if isinstance(edit, Overrule))
+        words = tuple(edit for edit in session.edits.done if isinstance(edit, Override))
         now = session, session.survey, words, session.frame, session.map_frame
         chosen = self._laid[0] is not session or self._laid[1:3] != now[1:3]
         moved = self._laid[3] != session.frame or self._laid[4] is not session.map_frame

@@ -21,7 +21,7 @@ LARGEST_TURN, LARGEST_CHANGE = 0.05, 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class ClockOffset:
     """Attributes:
     late: s by which the IMU's stamps are late, as learnt. They are moved back by it.
     rate: (3,) rad/s, mean of the last frame; None before the first. seen, moment: sums of squared changes of the rate,
@@ -36,7 +36,7 @@ class Clock:
     def set_right(self, samples: ImuSamples) -> ImuSamples:
         return replace(samples, stamps_ns=samples.stamps_ns - round(self.late * 1e9))
 
-    def learnt(self, samples: ImuSamples, predicted: NavState, posterior: NavState) -> "Clock":
+    def learnt(self, samples: ImuSamples, predicted: NavState, posterior: NavState) -> "ClockOffset":
         """With what a frame's scan says. samples: of the frame; predicted: from them; posterior: with the scan."""
         rate = np.asarray(samples.gyro.mean(axis=0))
         correction = lie.log(predicted.R_odom_imu.T @ posterior.R_odom_imu)
@@ -45,4 +45,4 @@ class Clock:
             return replace(self, rate=rate)
         turn = correction + self.late * change
         seen, moment = self.seen + float(change @ change), self.moment + float(change @ turn)
-        return Clock(moment / (seen + (TURN_RAD / USUAL_S) ** 2), rate, seen, moment)
+        return ClockOffset(moment / (seen + (TURN_RAD / USUAL_S) ** 2), rate, seen, moment)

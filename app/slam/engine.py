@@ -8,7 +8,7 @@ import numpy as np
 
 from app.slam import channels, coast, ground, iekf, imu, keyframes, rest, start
 from app.slam.certainty import Certainty
-from app.slam.clock import Clock
+from app.slam.clock import ClockOffset
 from app.slam.imu import Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
@@ -36,7 +36,7 @@ class EngineProgress:
     T_odom_keyframe: F64 | None = None
     certainty: Certainty | None = None
     lines: LineErrors = field(default_factory=LineErrors.unknown)
-    clock: Clock = field(default_factory=Clock)
+    clock: ClockOffset = field(default_factory=ClockOffset)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class Engine:
         lines = before.lines if p.filter.learn_lines else LineErrors.unknown()
         if lines.errors.any():
             scan = channels.bent(scan, -lines.errors[:, 1], -lines.errors[:, 0])
-        clock = before.clock if p.imu.learn_clock else Clock()
+        clock = before.clock if p.imu.learn_clock else ClockOffset()
         samples = clock.set_right(samples)
 
         belief, still, waiting = before.belief, before.still, False

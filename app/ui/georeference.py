@@ -14,7 +14,7 @@ from app.mapping.session_file import Spot
 from app.server.folders import Folders
 from app.server.protocol import EditLoop, LayOnEarth, RedoLoop, Snapshot, UndoLoop
 from app.slam.errors import HemislamError
-from app.slam.loops.edits import Overrule
+from app.slam.loops.edits import Override
 from app.ui.files import FileList
 from app.ui.georeference_maths import centre_of_sphere, lines_of, names_of, numbers_in, rows_of
 from app.ui.html import panel
@@ -224,7 +224,7 @@ class GeoreferencePanel:
                 self._nodes.append(scene.add_label(f"{name}/{text}", text, position=place))
 
     def _act(self, word: str, _: viser.ClientHandle) -> None:
-        """What the table sends: "overrule fix 12", "drop P1", "undo", "redo"."""
+        """What the table sends: "override fix 12", "drop P1", "undo", "redo"."""
         earth = self._page.snapshot().earth
         match word.split(" ", 1):
             case ["undo"]:
@@ -234,10 +234,10 @@ class GeoreferencePanel:
             case ["drop", name] if earth.survey is not None:
                 left = tuple(pick for pick in earth.survey.picks if pick.name != name)
                 self._page.send(LayOnEarth(replace(earth.survey, picks=left)))
-            case ["overrule", what] if earth.found is not None:
+            case ["override", what] if earth.found is not None:
                 used = dict(zip(earth.found.names, earth.found.used.tolist(), strict=True))
                 if (name := what.partition(" ")[2]) in used:
-                    self._page.send(EditLoop(Overrule(what, not used[name])))
+                    self._page.send(EditLoop(Override(what, not used[name])))
 
 
 def _result(current: Snapshot) -> str:

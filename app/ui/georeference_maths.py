@@ -12,7 +12,7 @@ from app.mapping.earth import FIX, POINT
 from app.mapping.session_file import Spot
 from app.server.protocol import Chunk, Snapshot
 from app.slam.errors import HemislamError
-from app.slam.loops.edits import Overrule
+from app.slam.loops.edits import Override
 from app.slam.types import F32, F64
 from app.ui.measure_maths import around
 
@@ -33,17 +33,17 @@ class Row(NamedTuple):
 
 
 def rows_of(found: Alignment, current: Snapshot) -> list[Row]:
-    """Those that are left out or overruled first, then by their residuals."""
+    """Those that are left out or overridden first, then by their residuals."""
     survey = current.earth.survey
     kind = POINT if survey is not None and survey.control else FIX
-    edited = {edit.what for edit in current.loops.undo if isinstance(edit, Overrule)}
+    edited = {edit.what for edit in current.loops.undo if isinstance(edit, Override)}
     told = np.array([kind + name in edited for name in found.names])
     length = np.linalg.norm(found.residuals, axis=1)
     order = np.lexsort((-length, found.used & ~told))
     return [
         Row(
             found.names[k],
-            f"overrule {kind}{found.names[k]}",
+            f"override {kind}{found.names[k]}",
             bool(found.used[k]),
             bool(told[k]),
             (*(f"{value:+.3f}" for value in found.residuals[k]), f"{found.distances[k]:.1f}"),

@@ -1,5 +1,6 @@
-"""Tests app/calibration/walk.py, app/calibration/odometry.py, app/calibration/calibrate.py, app/calibration/words.py,
-app/cli/calibrate.py and app/evaluation/calibration_plot.py: a recording alone tells how the LiDAR sits on the IMU."""
+"""Tests app/calibration/excerpt.py, app/calibration/odometry.py, app/calibration/calibrate.py,
+app/calibration/words.py, app/cli/calibrate.py and app/evaluation/calibration_plot.py: where the LiDAR sits on the IMU,
+from a recording alone."""
 
 import json
 from dataclasses import replace
@@ -13,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from app.__main__ import cli
-from app.calibration.calibrate import calibrate_walk
+from app.calibration.calibrate import calibrate_excerpt
+from app.calibration.excerpt import Excerpt, read_excerpt
 from app.calibration.lines import Lines
-from app.calibration.walk import Walk, read_walk
 from app.calibration.words import WALK, as_json, params_yaml, table, write_beside
 from app.evaluation.calibration_plot import residual_plot
 from app.sensors.presets import calibrated_beside, resolve_params, sidecar
@@ -27,16 +28,16 @@ from tests.calibration.rehearsal import MID360, TURN, known
 
 
 @pytest.fixture(scope="module")
-def walk(shared_data: Path) -> Walk:
+def excerpt(shared_data: Path) -> Excerpt:
     params = Params()
     with open_recording(shared_data / "hall_mid360.mcap", params) as recording:
-        return read_walk(recording, params)
+        return read_excerpt(recording, params)
 
 
-def test_a_lidar_turned_on_its_imu_and_a_late_clock_are_found_from_the_recording_alone(walk: Walk) -> None:
-    scans = tuple(replace(s, points=np.ascontiguousarray(s.points @ TURN.astype(np.float32))) for s in walk.scans)
-    imu = replace(walk.imu, stamps_ns=walk.imu.stamps_ns - 30_000_000)
-    found = calibrate_walk(Path("walk.mcap"), Params(), Walk(scans, imu))
+def test_a_lidar_turned_on_its_imu_and_a_late_clock_are_found_from_the_recording_alone(excerpt: Excerpt) -> None:
+    scans = tuple(replace(s, points=np.ascontiguousarray(s.points @ TURN.astype(np.float32))) for s in excerpt.scans)
+    imu = replace(excerpt.imu, stamps_ns=excerpt.imu.stamps_ns - 30_000_000)
+    found = calibrate_excerpt(Path("walk.mcap"), Params(), Excerpt(scans, imu))
     assert np.degrees(Rotation.from_matrix(TURN.T @ found.turned.R_imu_lidar).magnitude()) < 0.3
     assert abs(found.turned.late - 0.030) < 1e-3
     off = np.abs(found.moved.p_imu_lidar - MID360)
@@ -48,11 +49,11 @@ def test_a_lidar_turned_on_its_imu_and_a_late_clock_are_found_from_the_recording
     assert "+30 ms" in found.contradiction()
 
 
-def test_reading_skips_the_rest_at_the_start(walk: Walk, shared_data: Path) -> None:
+def test_reading_skips_the_rest_at_the_start(excerpt: Excerpt, shared_data: Path) -> None:
     """It stands still for three seconds, and a second of that is enough."""
     with open_recording(shared_data / "hall_mid360.mcap", Params()) as recording:
-        assert 1.5 < (walk.scans[0].end_ns - recording.start_ns) * 1e-9 < 3.0
-    assert all(a.end_ns < b.end_ns for a, b in zip(walk.scans, walk.scans[1:], strict=False))
+        assert 1.5 < (excerpt.scans[0].end_ns - recording.start_ns) * 1e-9 < 3.0
+    assert all(a.end_ns < b.end_ns for a, b in zip(excerpt.scans, excerpt.scans[1:], strict=False))
 
 
 def test_what_was_found_is_kept_beside_the_recording_and_undone_by_deleting_it(tmp_path: Path) -> None:

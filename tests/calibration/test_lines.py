@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from app.calibration.excerpt import Excerpt
 from app.calibration.lines import Lines, fit_lines
 from app.calibration.odometry import Track
-from app.calibration.walk import Walk
 from app.slam.types import F64, ImuSamples, Scan
 
 ROOM = np.array([4.3, 3.4, 2.2])
@@ -17,7 +17,7 @@ COUNT = 16
 NO_IMU = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
-def walk_in_a_room(elevations: F64, ranges: F64) -> tuple[Walk, Track]:
+def walk_in_a_room(elevations: F64, ranges: F64) -> tuple[Excerpt, Track]:
     """A scanner that is turned about all axes in a box; its lines are really `elevations` rad higher and measure
     `ranges` m too far."""
     rng = np.random.default_rng(1)
@@ -42,7 +42,7 @@ def walk_in_a_room(elevations: F64, ranges: F64) -> tuple[Walk, Track]:
         zero = np.zeros(len(ring), np.float32)
         scans.append(Scan(k * 100_000_000, points, zero.astype(np.int32), zero, ring))
     track = Track(t, rotations, positions, np.zeros(len(t)), tuple(scan.points for scan in scans))
-    return Walk(tuple(scans), NO_IMU, COUNT), track
+    return Excerpt(tuple(scans), NO_IMU, COUNT), track
 
 
 def uneven(values: F64) -> F64:
@@ -55,10 +55,10 @@ def test_what_each_line_gets_wrong_is_found_and_corrected() -> None:
     rng = np.random.default_rng(0)
     elevations, ranges = np.radians(0.2) * rng.normal(size=COUNT), 0.015 * rng.normal(size=COUNT)
     elevations, ranges = uneven(elevations), uneven(ranges)
-    walk, track = walk_in_a_room(elevations, ranges)
+    excerpt, track = walk_in_a_room(elevations, ranges)
     found = Lines.none(COUNT)
     for _ in range(2):
-        seen = found.applied(walk)
+        seen = found.applied(excerpt)
         found = fit_lines(seen, replace(track, points=tuple(scan.points for scan in seen.scans)), found)
     assert np.degrees(np.abs(found.elevations - elevations).max()) < 0.03
     assert np.abs(found.ranges + ranges).max() < 0.003
@@ -80,21 +80,21 @@ def test_the_stated_uncertainty_is_that_of_the_errors() -> None:
 
 
 def test_a_line_that_sees_nothing_stays_as_it_is() -> None:
-    walk, track = walk_in_a_room(np.full(COUNT, 0.0), 0.02 * np.cos(np.pi * np.arange(COUNT)))
-    blind = [scan.ring < COUNT - 1 for scan in walk.scans]
+    excerpt, track = walk_in_a_room(np.full(COUNT, 0.0), 0.02 * np.cos(np.pi * np.arange(COUNT)))
+    blind = [scan.ring < COUNT - 1 for scan in excerpt.scans]
     scans = [
         replace(scan, points=scan.points[seen], ring=scan.ring[seen])
-        for scan, seen in zip(walk.scans, blind, strict=True)
+        for scan, seen in zip(excerpt.scans, blind, strict=True)
     ]
     track = replace(track, points=tuple(scan.points for scan in scans))
-    found = fit_lines(replace(walk, scans=tuple(scans)), track, Lines.none(COUNT))
+    found = fit_lines(replace(excerpt, scans=tuple(scans)), track, Lines.none(COUNT))
     assert np.isnan(found.after[-1]) and abs(found.ranges[-1]) < 1e-6
     assert "sensor.range_corrections" in found.found()
 
 
 @pytest.mark.parametrize("scans", [0, 30])
 def test_a_walk_too_short_for_planes_tells_nothing(scans: int) -> None:
-    walk, track = walk_in_a_room(np.zeros(COUNT), np.zeros(COUNT))
+    excerpt, track = walk_in_a_room(np.zeros(COUNT), np.zeros(COUNT))
     so_far = Lines.none(COUNT)
-    assert fit_lines(replace(walk, scans=walk.scans[: scans + 1]), track, so_far) is so_far
+    assert fit_lines(replace(excerpt, scans=excerpt.scans[: scans + 1]), track, so_far) is so_far
     assert so_far.found() == {}

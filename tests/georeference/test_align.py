@@ -138,15 +138,15 @@ def test_someone_who_stands_still_learns_that_no_heading_follows() -> None:
         align(made.trajectory, made.fixes, lever=LEVER)
 
 
-def test_the_users_word_on_a_fix_overrules_the_residuals() -> None:
+def test_the_users_word_on_a_fix_overrides_the_residuals() -> None:
     made = walked()
     wild, sound = str(made.outliers[2]), next(str(n) for n in range(30, 99) if n not in made.outliers)
-    found = align(made.trajectory, made.fixes, lever=LEVER, overruled={wild: True, sound: False})
+    found = align(made.trajectory, made.fixes, lever=LEVER, overridden={wild: True, sound: False})
     verdict = dict(zip(found.names, found.used.tolist(), strict=True))
     assert verdict[wild] and not verdict[sound]
     few = dict.fromkeys(found.names[7:], False)
     with pytest.raises(HemislamError, match="Only 7 fixes are left"):
-        align(made.trajectory, made.fixes, lever=LEVER, overruled=few)
+        align(made.trajectory, made.fixes, lever=LEVER, overridden=few)
 
 
 def test_a_clock_offset_that_is_given_is_used_and_not_looked_for() -> None:

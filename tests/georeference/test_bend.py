@@ -37,7 +37,7 @@ def drifted(made: Walked) -> Trajectory:
 
 
 def solved(
-    made: Walked, drifted: Trajectory, *, offset_known: bool = True, overruled: dict[str, bool] | None = None
+    made: Walked, drifted: Trajectory, *, offset_known: bool = True, overridden: dict[str, bool] | None = None
 ) -> tuple[F64, Alignment, Alignment]:
     """(k, 4, 4) corrections, and the alignments after and before."""
     keyframes = drifted.poses[::STEP]
@@ -49,7 +49,7 @@ def solved(
     found = align(drifted, made.fixes, grid="EPSG:32632", lever=LEVER)
     if not offset_known:
         found = replace(found, offset_s=0.0, offset_sigma_s=float("nan"))
-    return *bend(drifted, drifted.stamps_ns[::STEP], graph, made.fixes, found, overruled or {}), found
+    return *bend(drifted, drifted.stamps_ns[::STEP], graph, made.fixes, found, overridden or {}), found
 
 
 def test_a_map_that_turned_by_12_degrees_is_bent_back_to_where_it_was(made: Walked, drifted: Trajectory) -> None:
@@ -77,9 +77,9 @@ def test_fixes_leave_a_map_that_has_not_drifted_as_it_is(made: Walked) -> None:
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.03
 
 
-def test_the_users_word_on_a_fix_overrules_the_verdict(made: Walked, drifted: Trajectory) -> None:
+def test_the_users_word_on_a_fix_overrides_the_verdict(made: Walked, drifted: Trajectory) -> None:
     wild, sound = str(made.outliers[2]), next(str(n) for n in range(30, 99) if n not in made.outliers)
-    _, after, _ = solved(made, drifted, overruled={wild: True, sound: False})
+    _, after, _ = solved(made, drifted, overridden={wild: True, sound: False})
     verdict = dict(zip(after.names, after.used.tolist(), strict=True))
     assert verdict[wild] and not verdict[sound]
 

@@ -97,6 +97,6 @@ def test_points_that_leave_the_place_open_are_refused_and_it_is_said_what(
 def test_a_point_that_the_user_leaves_out_pulls_nothing_and_still_shows_how_far_it_is_off(tmp_path: Path) -> None:
     control, picks = written(tmp_path, CORNERS, noise=0.0)
     picks.write_text(picks.read_text().replace("D,-3.0", "D,-2.0"))  # picked a metre beside
-    found = laid(control, picks, grid="EPSG:32632", overruled={"D": False})
+    found = laid(control, picks, grid="EPSG:32632", overridden={"D": False})
     assert found.used.tolist() == [True, True, True, False] and found.rms.max() < 1e-5
     assert np.linalg.norm(found.residuals[3]) == pytest.approx(1.0, abs=1e-3)

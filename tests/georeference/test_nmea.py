@@ -23,7 +23,7 @@ def test_the_day_is_that_of_the_recording_also_across_midnight() -> None:
         assert (int(fixes.stamps_ns[0]) // 10**9 - at) % DAY_S == 0, day
 
 
-def test_a_sentence_with_the_date_overrules_the_recordings_day() -> None:
+def test_a_sentence_with_the_date_overrides_the_recordings_day() -> None:
     rmc = "$GPRMC,123520,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*60"
     fixes, _ = nmea.read([GGA, rmc, GGA], "log", 1_700_000_000 * 10**9)
     assert (fixes.stamps_ns == 764_426_119 * 10**9).all()  # 1994-03-23T12:35:19Z

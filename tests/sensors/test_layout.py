@@ -55,7 +55,7 @@ def test_a_header_at_the_last_point_is_noticed_because_the_cloud_was_logged_too_
     assert findings["header stamp"].option == "--set recording.header_stamp=first"
 
 
-def test_the_user_overrules_the_header_convention() -> None:
+def test_the_user_overrides_the_header_convention() -> None:
     probes = clouds(relative(header="last"))
     layout, _ = settle(probes, header_stamp="first")
     assert abs(time_error_ns(probes[0], layout) - rig.PERIOD_NS) < 1_000

@@ -103,9 +103,9 @@ def test_a_loop_pauses_at_the_frame_at_which_it_takes_effect_and_says_why() -> N
 
 
 def test_the_users_own_word_on_a_loop_pauses_nothing() -> None:
-    overruled = replace(edge(Verdict.ACCEPTED), edited=True)
+    overridden = replace(edge(Verdict.ACCEPTED), edited=True)
     added = replace(edge(Verdict.ACCEPTED), origin=Origin.USER)
-    result = frame(loops=(overruled, added))
+    result = frame(loops=(overridden, added))
     assert reasons(Breakpoints(loop_found=True), CheckedFrame(GOOD), CheckedFrame(result)) == ()
 
 

@@ -30,7 +30,7 @@ from app.sensors.simulator.simulate import simulate
 from app.server.controller import Controller
 from app.server.protocol import EditLoop, LayOnEarth, RedoLoop, Save, Seek, Snapshot, UndoLoop
 from app.slam import lie
-from app.slam.loops.edits import Overrule
+from app.slam.loops.edits import Override
 from app.slam.trajectory import read_tum
 from app.slam.types import F64
 
@@ -102,11 +102,11 @@ def test_a_map_is_georeferenced_by_the_fixes_of_its_recording_and_again_when_it_
     assert np.sqrt((off(bench, walk) ** 2).mean()) < 0.05
 
 
-def test_a_fix_is_overruled_and_that_is_undone_as_a_loop_is(bench: Laid) -> None:
+def test_a_fix_is_overridden_and_that_is_undone_as_a_loop_is(bench: Laid) -> None:
     bench.do(LayOnEarth(Survey(lever=LEVER)))
     assert verdicts(bench.see())["30"]
-    assert not verdicts(bench.do(EditLoop(Overrule("fix 30", accepted=False))))["30"]
-    assert bench.see().loops.undo[-1] == Overrule("fix 30", accepted=False)
+    assert not verdicts(bench.do(EditLoop(Override("fix 30", accepted=False))))["30"]
+    assert bench.see().loops.undo[-1] == Override("fix 30", accepted=False)
     assert verdicts(bench.do(UndoLoop()))["30"] and not verdicts(bench.do(RedoLoop()))["30"]
     bench.do(UndoLoop())
 
@@ -128,7 +128,7 @@ def T_imu_lidar(bench: Laid) -> F64:
 
 def test_a_session_file_repeats_the_georeference_to_the_same_bytes(bench: Laid, tmp_path: Path) -> None:
     survey = Survey(lever=LEVER, crs="EPSG:25832", factors=True)
-    bench.do(LayOnEarth(survey), EditLoop(Overrule("fix 30", accepted=False)))
+    bench.do(LayOnEarth(survey), EditLoop(Override("fix 30", accepted=False)))
     page = bench.save(tmp_path / "page")
     session = page / "session.hemislam"
     assert read_session(session).state.survey == survey
@@ -186,7 +186,7 @@ def test_three_points_picked_on_the_map_georeference_it_and_with_two_the_page_sa
     np.testing.assert_allclose(found.reference.origin, true.origin, atol=1e-6)
     two = bench.do(LayOnEarth(replace(survey, picks=picks[:2]))).earth
     assert two.found is None and "only P0 and P1 are: the map's rotation about" in two.problem
-    left = bench.do(LayOnEarth(survey), EditLoop(Overrule("point P2", accepted=False))).earth
+    left = bench.do(LayOnEarth(survey), EditLoop(Override("point P2", accepted=False))).earth
     assert "only P0 and P1" in left.problem
     bench.do(UndoLoop())
 

@@ -1,4 +1,4 @@
-"""Loops of the recording that ships, through a session: found beside the frames, overruled, taken back, replayed."""
+"""Loops of the recording that ships, through a session: found beside the frames, overridden, taken back, replayed."""
 
 import math
 import operator
@@ -76,7 +76,7 @@ def walk() -> Iterator[Walk]:
 
 @pytest.fixture(scope="module")
 def files(walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """As saved at the end, nothing overruled."""
+    """As saved at the end, nothing overridden."""
     return walk.saved(tmp_path_factory.mktemp("never_stopped"))
 
 

@@ -16,7 +16,7 @@ from app.server.folders import Folders
 from app.server.protocol import Chunk, Command, Earth, EditLoop, LayOnEarth, LoopsView, RedoLoop, Snapshot, UndoLoop
 from app.slam import lie
 from app.slam.errors import HemislamError
-from app.slam.loops.edits import Overrule
+from app.slam.loops.edits import Override
 from app.ui.georeference import CONTROL, FILE, NOTHING, RECORDED, GeoreferencePanel
 from app.ui.georeference_maths import centre_of_sphere, lines_of, names_of, numbers_in, rows_of
 from app.ui.measure import MeasurePanel
@@ -113,14 +113,14 @@ def test_a_session_that_is_reopened_shows_what_it_was_georeferenced_by(paging: P
 def test_rejected_fixes_come_first_and_a_click_lets_one_count(paging: Paging) -> None:
     paging.show(LAID)
     html = paging.panel._html.content
-    assert "E 0.0071 m" in html and html.index("overrule fix 2") < html.index("overrule fix 3") < html.index("fix 1")
-    paging.panel._act("overrule fix 2", None)  # type: ignore[arg-type]
-    assert paging.sent == [EditLoop(Overrule("fix 2", accepted=True))]
-    paging.panel._act("overrule fix 9", None)  # type: ignore[arg-type]
+    assert "E 0.0071 m" in html and html.index("override fix 2") < html.index("override fix 3") < html.index("fix 1")
+    paging.panel._act("override fix 2", None)  # type: ignore[arg-type]
+    assert paging.sent == [EditLoop(Override("fix 2", accepted=True))]
+    paging.panel._act("override fix 9", None)  # type: ignore[arg-type]
     paging.panel._act("undo", None)  # type: ignore[arg-type]
     paging.panel._act("redo", None)  # type: ignore[arg-type]
     assert paging.sent[1:] == [UndoLoop(), RedoLoop()]
-    edited = replace(LAID, loops=LoopsView(undo=(Overrule("fix 1", accepted=True),)))
+    edited = replace(LAID, loops=LoopsView(undo=(Override("fix 1", accepted=True),)))
     assert [(row.name, row.edited) for row in rows_of(FOUND, edited)] == [("2", False), ("1", True), ("3", False)]
     paging.show(edited)
     assert "Undo: accept fix 1" in paging.panel._html.content

@@ -13,7 +13,7 @@ import numpy as np
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.edits import Add, Edits, LoopEdit, Overrule, Solve, check, in_words, lay_over, rows
+from app.slam.loops.edits import Add, Edits, LoopEdit, Override, Solve, check, in_words, lay_over, rows
 from app.slam.loops.factors import Closing, PositionPrior, residuals
 from app.slam.loops.graph import Graph, failure, optimum
 from app.slam.loops.messages import Target
@@ -178,7 +178,7 @@ class LoopBackend:
             HemislamError: it makes no sense, or there is no such loop or keyframe yet.
         """
         check(edit)
-        if not isinstance(edit, Solve | Overrule):
+        if not isinstance(edit, Solve | Override):
             self._check_there(edit.older, edit.newer)
             if not isinstance(edit, Add) and edit.pair not in self.by_pair:
                 raise HemislamError(f"There is no loop candidate of keyframes {edit.older} and {edit.newer}.")

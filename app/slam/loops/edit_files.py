@@ -8,13 +8,13 @@
       register: false
       guess: [[1.0, 0.0, 0.0, 0.2], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
     - solve: at once
-    - overrule: fix 12
+    - override: fix 12
       accepted: false
 
 A loop is named by its older and its newer keyframe: an index, or `session/index` in another session than the first.
 `guess` is T_older_newer of the IMU frames; without it, the place is searched from where odometry has it. `register` is
 true by default. `solve: at once` takes the poses from all factors at once
-(Levenberg-Marquardt) instead of one after the other. `overrule` counts or leaves out a satellite fix,
+(Levenberg-Marquardt) instead of one after the other. `override` counts or leaves out a satellite fix,
 by its number, or a control point: `point P1`.
 """
 
@@ -28,12 +28,12 @@ from pydantic import Strict, TypeAdapter, ValidationError
 
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.edits import Accept, Add, LoopEdit, Overrule, Reject, SetWeight, Solve, check
+from app.slam.loops.edits import Accept, Add, LoopEdit, Override, Reject, SetWeight, Solve, check
 from app.slam.loops.types import Pair
 from app.slam.user_text import read_yaml
 
 _VERBS: Final[dict[str, Any]] = {
-    "accept": Accept, "reject": Reject, "weigh": SetWeight, "add": Add, "solve": Solve, "overrule": Overrule
+    "accept": Accept, "reject": Reject, "weigh": SetWeight, "add": Add, "solve": Solve, "override": Override
 }  # fmt: skip
 _AT_ONCE: Final = "at once"
 
@@ -47,7 +47,7 @@ class _Values:
 
 
 _VALUES: Final = TypeAdapter(_Values)
-_NEEDED: Final[dict[str, dict[str, Any]]] = {"weigh": {"weight": None}, "overrule": {"accepted": None}}
+_NEEDED: Final[dict[str, dict[str, Any]]] = {"weigh": {"weight": None}, "override": {"accepted": None}}
 _MUST_BE: Final = {
     "weight": "a number greater than 0",
     "register": "true or false",
@@ -94,7 +94,7 @@ def edits_of(entries: object, source: str = "the list of edits") -> tuple[LoopEd
 
 def _entry(edit: LoopEdit) -> dict[str, Any]:
     verb = next(verb for verb, kind in _VERBS.items() if isinstance(edit, kind))
-    if isinstance(edit, Overrule):
+    if isinstance(edit, Override):
         return {verb: edit.what, "accepted": edit.accepted}
     pair = [int(one) if one < KeyframeId(1, 0) else str(one) for one in edit.pair or ()]
     values = {name: getattr(edit, name) for name in _names(type(edit))}
@@ -108,7 +108,7 @@ def _edit(entry: object) -> LoopEdit:
     if not isinstance(entry, dict) or len(verbs) != 1:
         raise HemislamError(
             "it must hold one of accept, reject, weigh or add, with two keyframes: accept: [12, 340]; or `solve:"
-            f" {_AT_ONCE}`; or `overrule: fix 12`."
+            f" {_AT_ONCE}`; or `override: fix 12`."
         )
     (verb,) = verbs
     entry = {
@@ -139,10 +139,10 @@ def _subject(verb: str, value: object) -> tuple[Any, ...]:
     """What an edit is for, as its first arguments."""
     if verb == "solve":
         return ()
-    if verb != "overrule":
+    if verb != "override":
         return _pair(verb, value)
     if not isinstance(value, str) or not re.fullmatch(r"(fix \d{1,9}|point .{1,100})", value):
-        raise HemislamError(f"overrule is {value!r}; it takes `fix 12` or `point NAME`.")
+        raise HemislamError(f"override is {value!r}; it takes `fix 12` or `point NAME`.")
     return (value,)
 
 

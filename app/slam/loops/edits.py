@@ -74,7 +74,7 @@ class Solve(_Edit):
 
 
 @dataclass(frozen=True, slots=True)
-class Overrule(_Edit):
+class Override(_Edit):
     """Count or leave out what georeferences the map, whatever its residual. It changes nothing of the loops.
 
     Attributes:
@@ -85,7 +85,7 @@ class Overrule(_Edit):
     accepted: bool
 
 
-LoopEdit = Accept | Reject | SetWeight | Add | Solve | Overrule
+LoopEdit = Accept | Reject | SetWeight | Add | Solve | Override
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +132,7 @@ def lay_over(
 
 def check(edit: LoopEdit) -> None:
     """Raises HemislamError if the edit can never make sense, whatever is found."""
-    if isinstance(edit, Solve | Overrule):
+    if isinstance(edit, Solve | Override):
         return
     older, newer = edit.older, edit.newer
     if not 0 <= older < newer:
@@ -169,7 +169,7 @@ def _edited(edge: LoopEdge, edit: LoopEdit) -> LoopEdge:
     edge = replace(edge, represented_by=None, repeats=None)  # what the user has a word on is in the graph itself
     if isinstance(edit, SetWeight):
         return replace(edge, weight=edit.weight)
-    if isinstance(edit, Add | Solve | Overrule):  # one that waits; those that are for no loop
+    if isinstance(edit, Add | Solve | Override):  # one that waits; those that are for no loop
         return edge
     verdict = Verdict.ACCEPTED if isinstance(edit, Accept) else Verdict.REJECTED
     if verdict is edge.verdict:

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops.edits import Accept, Add, LoopEdit, Overrule, SetWeight, Solve
+from app.slam.loops.edits import Accept, Add, LoopEdit, Override, SetWeight, Solve
 from app.slam.loops.types import FactorResidual, LoopEdge, Origin, Pair, Preview, Verdict
 from app.slam.sections import LoopsParams
 from app.slam.types import F64
@@ -67,7 +67,7 @@ def name(pair: Pair) -> str:
 def describe_edit(command: LoopEdit) -> str:
     if isinstance(command, Solve):
         return "solve all at once"
-    if isinstance(command, Overrule):
+    if isinstance(command, Override):
         return f"{'accept' if command.accepted else 'reject'} {command.what}"
     pair = name((command.older, command.newer))
     match command:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.edit_files import read, write
-from app.slam.loops.edits import Accept, Add, LoopEdit, Overrule, Reject, SetWeight, Solve, rows
+from app.slam.loops.edits import Accept, Add, LoopEdit, Override, Reject, SetWeight, Solve, rows
 
 
 @st.composite
@@ -31,7 +31,7 @@ def _edits(draw: st.DrawFn) -> LoopEdit:
                 Add(older, newer, None, register),
                 Add(older, newer, rows(guess), register),
                 Solve(),
-                Overrule(f"fix {older}", register),
+                Override(f"fix {older}", register),
             )
         )
     )

@@ -31,7 +31,7 @@ def commands(backend: LoopBackend) -> st.SearchStrategy[LoopEdit]:
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
-def test_undoing_any_overrulings_is_never_having_done_them(walked: Walked, data: st.DataObject) -> None:
+def test_undoing_any_edits_is_never_having_done_them(walked: Walked, data: st.DataObject) -> None:
     backend = walked.again()
     poses, edges = backend.poses, backend.edges
     residuals = backend.factor_residuals()

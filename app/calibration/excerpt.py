@@ -22,7 +22,7 @@ VOXEL = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Walk:
+class Excerpt:
     """Scans in order of their ends, and the IMU samples around them, in order of time.
 
     Attributes:
@@ -46,12 +46,12 @@ class Walk:
         return np.asarray((stamps_ns - self.scans[0].end_ns) * 1e-9)
 
 
-def read_walk(
+def read_excerpt(
     recording: Recording,
     params: Params,
     duration_s: float = LONGEST_S,
     progress: Callable[[float], None] = lambda fraction: None,
-) -> Walk:
+) -> Excerpt:
     """The first `duration_s` of a recording.
 
     Args:
@@ -82,7 +82,7 @@ def read_walk(
     imu = _samples(stamps, values)
     begin_ns = _sets_off_ns(imu)
     lines = 1 + max(int(scan.ring.max()) for scan in usable) if recording.has_lines else 0
-    return Walk(tuple(scan for scan in usable if scan.end_ns >= begin_ns), imu, lines)
+    return Excerpt(tuple(scan for scan in usable if scan.end_ns >= begin_ns), imu, lines)
 
 
 def _sets_off_ns(imu: ImuSamples) -> int:
