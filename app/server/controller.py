@@ -27,7 +27,7 @@ from app.server.loop_commands import LoopCommands
 from app.server.player import Player
 from app.server.protocol import Command
 from app.server.publisher import Publisher, opened_recording
-from app.server.setup import NOTHING_KEPT, Kept
+from app.server.setup import NOTHING_KEPT, Kept, kept_in
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Edits
 from app.slam.params import Params
@@ -223,7 +223,7 @@ class Controller:
 
     def _keep(self, **changes: Any) -> None:
         """Replace fields of `Kept`."""
-        self._kept = self._kept._replace(**changes)
+        self._kept = replace(self._kept, **changes)
         self._page.put(**changes, urgent=True)
 
     def _show_params(self) -> None:
@@ -294,7 +294,7 @@ class Controller:
             breakpoints=self._player.breakpoints,
             speed=self._page.transport.speed,
             labels=session.keyframes.edits,
-            **self._kept._asdict(),
+            **kept_in(self._kept),
         )
 
     # --- opening ---------------------------------------------------------------------------------
@@ -339,7 +339,7 @@ class Controller:
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
         session.survey = before.survey
         self._take(session)
-        self._keep(**kept._asdict())
+        self._keep(**kept_in(kept))
         if session.loops is not None and edits != Edits():
             session.edit_loops(edits.done, edits.undone)
 
@@ -369,7 +369,7 @@ class Controller:
         self._player.take(session)
         if session.frame < 0:  # else it goes on where a process that died was
             state = saved.state if saved is not None else State(self._params)
-            self._keep(**{name: getattr(state, name) for name in Kept._fields})
+            self._keep(**kept_in(state))
         self._resuming = None
         if saved is not None:
             # This process may die on the way there.

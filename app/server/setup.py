@@ -1,9 +1,9 @@
 """What an engine's process is started with."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.painted import Stroke
@@ -19,14 +19,20 @@ HELD = 7
 """So many times as many are held for pages, so that each can show in detail what it looks at: 400 MB."""
 
 
-class Kept(NamedTuple):
-    """What the user made beside the map, as `State` and `Snapshot` have it."""
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What the user made beside the map. `State` and `Snapshot` have fields of the same names."""
 
     notes: tuple[Note, ...] = ()
     views: tuple[KeptView, ...] = ()
     measures: tuple[Measure, ...] = ()
     painted: tuple[Stroke, ...] = ()
     clip: Clip = WHOLE
+
+
+def kept_in(source: Any) -> dict[str, Any]:
+    """The fields of `Kept` by name, as a `Kept`, `State` or `Snapshot` has them."""
+    return {field.name: getattr(source, field.name) for field in fields(Kept)}
 
 
 NOTHING_KEPT = Kept()

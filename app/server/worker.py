@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol
 from app.child import Child, ChildDied, Link, RestartLimit
 from app.server.fold import Fold
 from app.server.protocol import ACKNOWLEDGED, LIVE, Command, Notice, OpenRecording, Progress, Restart, Snapshot
-from app.server.setup import HELD, Kept, Setup
+from app.server.setup import HELD, Kept, Setup, kept_in
 
 MOST_RESTARTS: Final = 25
 """Deaths of the engine's process after which it is started again without being asked."""
@@ -147,7 +147,7 @@ class EngineProcess:
             breakpoints=last.breakpoints,
             session=last.session,
             notices=_number(last),
-            kept=Kept(*(getattr(last, name) for name in Kept._fields)),
+            kept=Kept(**kept_in(last)),
         )
 
     def _edit(self, **values: Any) -> None:
