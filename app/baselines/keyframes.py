@@ -1,4 +1,4 @@
-"""Keyframes of a baseline, so that its map can be laid beside ours: its scans, undistorted by its own poses."""
+"""Keyframes of a baseline, so that its map can be compared with ours: its scans, undistorted by its own poses."""
 
 import numpy as np
 

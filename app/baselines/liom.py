@@ -26,7 +26,7 @@ WINDOW = 10
 MAP_EVERY = 2
 """Scans between two refinements on the map."""
 ROUNDS = 4
-"""Times that points are matched anew."""
+"""How often points are matched again."""
 WINDOW_VOXELS_M, MAP_VOXELS_M, MAP_REACH_M = (0.2, 0.3), (0.2, 0.4), 80.0
 """Of edges and of planes."""
 POINT_NOISE_M = 0.1
@@ -133,7 +133,7 @@ class Liom:
         self, summed: gtsam.PreintegratedCombinedMeasurements, predicted: gtsam.NavState, end_ns: int,
         relative: tuple[int, PoseFit] | None,
     ) -> None:  # fmt: skip
-        """Add the scan's state and factors, and estimate the window anew."""
+        """Add the scan's state and factors, and estimate the window again."""
         assert self._smoother is not None
         graph, values, k = gtsam.NonlinearFactorGraph(), gtsam.Values(), self._index + 1
         graph.add(gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), summed))
@@ -160,7 +160,7 @@ class Liom:
 
 
 def _in_body(fit: PoseFit) -> F64:
-    """The information (6, 6) of a fit for a perturbation in the moving frame, as gtsam's Pose3 has it."""
+    """The information (6, 6) of a fit for a perturbation in the moving frame, in the order of gtsam's Pose3."""
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = fit.T[:3, :3]
     return np.asarray(turned.T @ fit.information @ turned)

@@ -18,7 +18,7 @@ from app.slam.params import Params
 from app.slam.types import F64, Measurement
 
 ODOMETRY_ROUNDS, MAP_ROUNDS = 5, 4
-"""Times that points are matched anew."""
+"""How often points are matched again."""
 EDGE_VOXEL_M, PLANE_VOXEL_M, MAP_REACH_M = 0.2, 0.4, 80.0
 STEPS = 5
 """Scans over which the speed is averaged; a body hardly changes its own in so short a time, but turns."""

@@ -19,7 +19,7 @@ FOLDER = Path(__file__).parents[2] / "build" / "peers"
 
 
 class Baseline(Protocol):
-    """An odometry. It is made anew for each recording and gets every measurement in order."""
+    """An odometry. A new one is made for each recording and gets every measurement in order."""
 
     def step(self, measurement: Measurement) -> tuple[int, F64]:
         """Process a scan; returns a time in ns, of the scan's end if nothing else is said, and T_odom_imu (4, 4)."""

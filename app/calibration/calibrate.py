@@ -22,10 +22,10 @@ from app.slam.params import Params
 from app.slam.types import F64
 
 ROUNDS = 3
-"""Times that the scans are laid again with the IMU's help; after each the fit is better, and so is the help."""
+"""Rounds in which the scans are registered again with the IMU's help; each round improves the fit, and so the help."""
 READING, ROUND = 0.1, 0.9 / (ROUNDS + 1)
 LARGEST_ROTATION, LARGEST_PLACE, LARGEST_OFFSET = np.radians(1.0), 0.05, 0.002
-"""rad, m, s: what is less certain than this is not observable."""
+"""rad, m, s: values with a larger standard deviation count as not observable."""
 SURE = 3.0
 """Standard deviations by which two values must differ to be different."""
 APART_ROTATION, APART_PLACE = np.radians(3.0), 0.1

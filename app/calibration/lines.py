@@ -1,13 +1,13 @@
-"""What each scan line gets wrong, by how the points of all lines lie on the same planes.
+"""Systematic errors of each scan line, from how well the points of all lines lie on common planes.
 
 In windows of a few seconds the map is cut into cubes. In a flat one the points of all lines and scans must lie on one
 plane. The unknowns are the corrections of the lines, a pose of each scan and a plane of each cube. Poses and planes are
 eliminated, so that linear least squares for the corrections remain (as in bundle adjustment of planes, Liu & Zhang
 2021, "BALM").
 
-What all lines have in common, and what changes evenly from the lowest to the highest, is held at zero. It looks like
-beams that return from farther off where they graze a surface, which every LiDAR's do: on simulated scanners with such
-beams it came out wrong by centimetres.
+Errors that all lines share, or that change linearly from the lowest line to the highest, are held at zero. Beams that
+graze a surface return from farther off with every LiDAR, which looks the same: on simulated scanners with such beams,
+these shares came out wrong by centimetres.
 """
 
 from dataclasses import dataclass, replace
@@ -32,9 +32,9 @@ OUTLIER = 3.0
 WIDEST = np.radians(0.3), 0.03
 """rad, m: standard deviations of the corrections before anything is known."""
 COMMON = np.radians(1e-3), 1e-4
-"""rad, m: the same of what is common or changes evenly, over all points."""
+"""rad, m: the same for the shared and the linear part, over all points."""
 LOOSE = 1.0
-"""rad, m: the same of the scans' poses."""
+"""rad, m: the same for the scans' poses."""
 SURE, LEAST = 3.0, (np.radians(0.03), 0.003)
 """Corrections are worth applying if their RMS is so many times their uncertainty, and more than rad or m."""
 DIGITS = 3, 4

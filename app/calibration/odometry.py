@@ -1,4 +1,4 @@
-"""The path of the LiDAR by its scans alone: each is laid onto the map of those before it.
+"""The path of the LiDAR from its scans alone: each scan is registered to the map of the earlier ones.
 
 Between two scans the LiDAR turns and moves at a constant rate, up to unknown accelerations. Each point is compared with
 the map where the LiDAR was at its own time, so a scan determines its rates and not only its pose (continuous-time ICP,
@@ -23,7 +23,7 @@ MATCHED = 1000
 """Most points of a scan that are looked up in the map."""
 GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
 GUIDED_GATES = (2.0, 1.0, 1.0)
-"""Of the residuals in each iteration, times the filter's gate; wide at first, since nothing foretells the motion."""
+"""Of the residuals in each iteration, times the filter's gate; wide at first, since nothing predicts the motion."""
 ENOUGH = 0.45
 """Share of the points that good planes must be found for; else poor ones count too."""
 LEAST_PLANES = 30
@@ -44,7 +44,7 @@ class Track:
 
     Attributes:
         times: (n,) s after the end of the first scan. rotations: (n, 3, 3) and positions (n, 3) m, in the world.
-        residuals: (n,) m, RMS of point to plane; nan where the scan could not be laid onto the map.
+        residuals: (n,) m, RMS of point to plane; nan where the scan could not be registered to the map.
         points: of each scan (k, 3) m, in the LiDAR frame at the scan's end.
     """
 
@@ -83,7 +83,7 @@ class _Motion:
 def track(
     excerpt: Excerpt, guide: Guide | None = None, progress: Callable[[float], None] = lambda fraction: None
 ) -> Track:
-    """Lay each scan onto the local map of those before it.
+    """Register each scan to the local map of the earlier ones.
 
     Args:
         guide: how the LiDAR turns and sways between two scans; None: at constant rates, up to what the scans show.

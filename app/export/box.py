@@ -10,7 +10,7 @@ from app.slam.errors import HemislamError
 from app.slam.types import F64, Vector
 
 _FARTHEST_M: Final = 1e6
-"""From the map's origin: no map is so large."""
+"""Largest distance from the map's origin: no map is that large."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class Box:
         turn: degrees about the vertical through its middle, anticlockwise from above.
 
     Raises:
-        HemislamError: there is no such box.
+        HemislamError: a value is not a number, out of range, or low is not below high.
     """
 
     low: Vector

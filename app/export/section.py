@@ -19,9 +19,9 @@ CELL: Final = 0.02
 """m, of all but huge sections."""
 MOST_CELLS: Final = 8_000_000
 MOST_COLUMNS: Final = 20_000
-"""Wider pictures are not opened by many programs."""
+"""Many programs do not open wider pictures."""
 STRIDE: Final = 0.5
-"""m: steps along the walk are so long, since a walker sways."""
+"""m, length of a step along the path: a shorter one would follow the walker's sway."""
 
 Laid = Callable[[Block], tuple[F64, U8]]
 """Gives (n, 2) chainage and height of the points in the slab, m, and their labels."""
@@ -79,7 +79,7 @@ def of_path(read: Callable[[], Iterable[Block]], positions: F64, half: float, wh
     """What lies within `half` m beside a walked path, (n, 3) m; chainage is the way walked, from above. As `of_box`.
 
     Raises:
-        HemislamError: nobody walked, or nothing is there.
+        HemislamError: the path has no length, or no points lie beside it.
     """
     path = strides(positions[:, :2])
 
@@ -108,7 +108,7 @@ def strides(positions: F64) -> F64:
 
 
 def along_path(points: F64, path: F64, half: float) -> tuple[npt.NDArray[np.int64], F64, F64]:
-    """Lay (n, 2) points within `half` of a path (m, 2) on it, once for each passage of the path, all in m.
+    """Project (n, 2) points within `half` of a path (m, 2) onto it, once for each passage of the path, all in m.
 
     Returns:
         (k,) indices of the points, (k,) m along the path and (k,) m to the left of it.
@@ -122,7 +122,7 @@ def along_path(points: F64, path: F64, half: float) -> tuple[npt.NDArray[np.int6
 
 
 def heights(points: F64, where: GeoReference | None) -> F64:
-    """(n,) m of points of the map: z, or what is known of them on Earth."""
+    """(n,) m, heights of points of the map: z, or their heights on Earth where these are known."""
     return points[:, 2] if where is None else where.to_crs(points)[:, 2]
 
 

@@ -26,7 +26,7 @@ _MM: Final = 10.0
 
 
 def write_png(path: Path, results: "Results", section: Slab) -> None:
-    """A pixel for each cell; the darker, the more points, ground in green."""
+    """A pixel for each cell: darker with more points, ground in green."""
     rows, columns = section.points.shape
     left, top, right, bottom = _MARGIN
     picture = Image.new("RGB", (left + columns + right, top + rows + bottom), "white")

@@ -58,7 +58,7 @@ def settle_spin(clouds: list[tuple[F32, U16]], period_s: float) -> Spin:
     """How the sensor turns, from a few clouds ((n, 3) points, (n,) ring) in the order of the message."""
     points, ring = clouds[0]
     clockwise, turns = sense_of_rotation(points, ring)
-    if not turns < 1.2:  # the order tells nothing; almost every sensor turns clockwise seen from above
+    if not turns < 1.2:  # the order shows nothing; almost every sensor turns clockwise seen from above
         return Spin(period_s, clockwise=True, ordered=False, start=(0.0,))
     rings = 1 + max(int(ring.max()) for _, ring in clouds)
     begins: list[list[float]] = [[] for _ in range(rings)]
@@ -87,7 +87,7 @@ def sense_of_rotation(points: F32, ring: U16) -> tuple[bool, float]:
 
     About one turn is a scan of a rotating sensor; many, or inf, is no rotation at all.
     """
-    # Outdoors a ring may see only part of a turn, so its ends tell little; the small steps tell the sense.
+    # Outdoors a ring may see only part of a turn, so its ends show little; the small steps show the sense.
     order = np.argsort(ring, kind="stable")
     step = _centred(np.diff(turned_azimuth(points, True)[order]))
     same = (np.diff(ring[order].astype(np.int32)) == 0) & (np.abs(step) < _SMALL_STEP) & (step != 0)

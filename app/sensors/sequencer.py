@@ -274,7 +274,7 @@ class Sequencer:
         if self._last_stamp_ns is None:
             return
         interval = scan.stamp_ns - self._last_stamp_ns
-        # at first only the scan itself tells how often one comes
+        # at first only the scan itself shows how often scans come
         lasts = max(scan.end_ns - scan.stamp_ns, 100_000_000)
         usual = float(np.median(self._intervals_ns)) if len(self._intervals_ns) >= 5 else lasts
         if interval > 1.5 * usual:

@@ -15,7 +15,7 @@ import rosbags.rosbag2.storage_mcap
 import zstandard
 
 LIMIT: Final = 256 << 20
-"""Bytes of a chunk, or of a message that is compressed by itself. Writers make chunks of about 1 MB."""
+"""Bytes of a chunk, or of a message that is compressed on its own. Writers make chunks of about 1 MB."""
 
 
 class TooLarge(ValueError):
@@ -84,4 +84,4 @@ def limit_rosbags() -> None:
     rosbags.rosbag1.reader.decompressors |= {"bz2": unpack_bz2, "lz4": unpack_lz4}
     rosbags.rosbag2.storage_mcap.DECOMPRESSORS |= {"lz4": unpack_lz4, "zstd": unpack_zstd}
     limited: Any = SimpleNamespace(decompress=unpack_zstd, open=lambda file, mode: _LimitedFile(file))
-    rosbags.rosbag2.reader.zstd = limited  # type: ignore[attr-defined]  # of messages and files that are compressed by themselves
+    rosbags.rosbag2.reader.zstd = limited  # type: ignore[attr-defined]  # of messages and files compressed on their own

@@ -17,7 +17,7 @@ from app.slam.imu import EXT_POS, EXT_ROT, Belief
 from app.slam.types import F64
 
 VIEW_M = 50.0
-"""A walk so long leaves one view behind: the next is mapped anew."""
+"""After walking this far, the view has changed and new surfaces are mapped."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What each scan line of a LiDAR gets wrong, put right before anything else looks at a scan."""
+"""Correct the known errors of each scan line of a LiDAR, before anything else uses a scan."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -17,7 +17,7 @@ def corrected(scan: Scan, params: SensorParams) -> Scan:
 
 
 def bent(scan: Scan, elevations: F64, ranges: F64) -> Scan:
-    """The scan with its beams raised by `elevations` (k,) rad and lengthened by `ranges` (k,) m of their lines."""
+    """The scan with the beams of line i raised by `elevations[i]` rad and lengthened by `ranges[i]` m; both (k,)."""
     points = np.empty_like(scan.points)
     clouds.correct(scan.points, scan.ring, elevations, ranges, points)
     return replace(scan, points=points)
@@ -25,11 +25,11 @@ def bent(scan: Scan, elevations: F64, ranges: F64) -> Scan:
 
 @lru_cache(maxsize=8)
 def numbers(text: str) -> F64:
-    """(k,) of the numbers in a text."""
+    """(k,), the numbers in a text."""
     return np.array(text.split(), np.float64)
 
 
 def text(values: F64, digits: int) -> str:
-    """The reverse of `numbers`, rounded; "" if nothing is left of them."""
+    """The inverse of `numbers`, rounded; "" if all values round to zero."""
     rounded = np.round(values, digits) + 0.0
     return " ".join(f"{value:g}" for value in rounded) if rounded.any() else ""

@@ -1,8 +1,8 @@
-"""How late the IMU's clock is, learnt from how scans correct the turns that it foretells.
+"""How late the IMU's clock is, estimated from how scans correct the predicted turns.
 
-Of a clock that is late by c, the turn foretold for a frame lags behind: it is short of the true one by c times the
-change of the rate, which the scan then adds. The sum over many frames tells c, whatever the sensor's biases, scales and
-mounting, since their errors follow the rate and not its change.
+If the clock is late by c, the turn predicted for a frame lags: it falls short of the true turn by c times the change of
+the angular rate, and the scan's correction adds that. A regression over many frames gives c. Errors of bias, scale and
+mounting do not affect it, since they follow the rate and not its change.
 """
 
 from dataclasses import dataclass, replace
@@ -13,19 +13,19 @@ from app.slam import lie
 from app.slam.types import F64, ImuSamples, NavState
 
 USUAL_S = 5e-3
-"""s, standard deviation of clock offsets that are not known."""
+"""s, prior standard deviation of an unknown clock offset."""
 TURN_RAD = 3e-3
 """Standard deviation of a scan's correction of a turn."""
 LARGEST_TURN, LARGEST_CHANGE = 0.05, 10.0
-"""rad, rad/s: corrections and changes of the rate beyond these have another cause."""
+"""rad, rad/s: larger corrections or changes of the rate have another cause and are ignored."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
     """Attributes:
-    late: s by which the IMU's stamps are late, as learnt. They are moved back by it.
-    rate: (3,) rad/s, mean of the last frame; None before the first. seen, moment: sums of squared changes of the rate,
-        (rad/s)², and of their products with corrections, rad²/s.
+    late: s, the estimate of how late the IMU's stamps are. `set_right` moves them back by it.
+    rate: (3,) rad/s, mean of the last frame; None before the first.
+    seen, moment: sum of the squared changes of the rate, (rad/s)², and of their products with corrections, rad²/s.
     """
 
     late: float = 0.0
@@ -37,7 +37,7 @@ class ClockOffset:
         return replace(samples, stamps_ns=samples.stamps_ns - round(self.late * 1e9))
 
     def learnt(self, samples: ImuSamples, predicted: NavState, posterior: NavState) -> "ClockOffset":
-        """With what a frame's scan says. samples: of the frame; predicted: from them; posterior: with the scan."""
+        """This estimate, updated with a frame: its samples, the state predicted from them, and that after its scan."""
         rate = np.asarray(samples.gyro.mean(axis=0))
         correction = lie.log(predicted.R_odom_imu.T @ posterior.R_odom_imu)
         change = rate - (rate if self.rate is None else self.rate)

@@ -73,7 +73,7 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -
         state.b_gyro, state.b_accel, state.g_odom, basis, P, noise, knot_t, knot_T,
     )  # fmt: skip
     if not (np.isfinite(p).all() and np.isfinite(v).all() and np.isfinite(R).all() and np.isfinite(P).all()):
-        here = state.T_odom_imu[None, :3]  # the samples made no sense: stay, and let the scan tell
+        here = state.T_odom_imu[None, :3]  # the samples made no sense: stay, and leave the motion to the scan
         return Belief(replace(state, stamp_ns=end_ns), belief.covariance), Path(
             np.array([-1.0, 0.0]), np.r_[here, here]
         )

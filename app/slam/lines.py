@@ -1,11 +1,11 @@
-"""What each scan line measures wrong, learnt from the map while walking.
+"""Systematic errors of each scan line, estimated from the map while walking.
 
-A real scanner's channels are off by up to a centimetre in range and a tenth of a degree in elevation. That repeats in
-every scan, so it does not average out: lines at different elevations see one surface at different depths, and the
-surface is mapped thick and pulls at the pose. But as one walks, each line meets surfaces that other lines have mapped,
-and its mean distance from them tells its error.
+A real scanner's channels are off by up to a centimetre in range and a tenth of a degree in elevation. These errors
+repeat in every scan, so they do not average out: lines at different elevations see the same surface at different
+depths, so the map shows it too thick and the pose is pulled off. While walking, each line meets surfaces that other
+lines have mapped; its mean distance from them is its error.
 
-At rest each line meets only what it mapped itself. So a scan counts once for each keyframe.
+At rest, each line meets only what it mapped itself. So only one scan per keyframe is used.
 """
 
 from dataclasses import dataclass
@@ -21,20 +21,20 @@ from app.slam.sections import FilterParams
 from app.slam.types import F32, F64, U16
 
 LINES = 256
-"""Lines with errors of their own; a scanner with more keeps those of the others."""
+"""Number of lines whose errors are estimated; further lines of a scanner stay uncorrected."""
 USUAL = np.array([0.01, np.radians(0.12)])
-"""m, rad: standard deviations of these errors, from data sheets and from calibrations of one model's units."""
+"""m, rad: prior standard deviations of these errors, from data sheets and calibrations of units of one model."""
 DOUBT = np.array([0.003, np.radians(0.03)])
-"""m, rad: errors that lines seem to have because the map is not exact. A scanner whose lines seem no worse is good."""
+"""m, rad: apparent errors caused by the map's own inexactness. A scanner with no larger ones is left uncorrected."""
 POINTS = 500
-"""Points of a scan that are looked up, every k-th: so few that hardly any two meet the same patch of the map."""
+"""Points of a scan that are looked up (every k-th): so few that two rarely meet the same patch of the map."""
 
 
 @dataclass(frozen=True, slots=True)
 class LineErrors:
     """Attributes:
-    errors: (LINES, 2) of the range in m and the elevation in rad. They are taken off every return.
-    information, moment: (LINES, 2, 2) and (LINES, 2), weighted sums of what was seen of them.
+    errors: (LINES, 2), of the range in m and of the elevation in rad, to be subtracted from every return.
+    information, moment: (LINES, 2, 2) and (LINES, 2), the normal equations accumulated for each line.
     """
 
     errors: F64
@@ -48,15 +48,15 @@ class LineErrors:
     def learnt(
         self, belief: Belief, points: F32, rings: U16, walked: float, local_map: LocalMap, params: FilterParams
     ) -> "LineErrors":
-        """With what a scan at `belief` says, before it enters the map.
+        """These errors, updated with a scan at `belief` before it enters the map.
 
-        What was learnt fades over VIEW_M walked, since the map's own errors are others in the next view. The mean
-        error of all ranges is left out: a map that is larger all round fits the same scans. All are shrunk by how large
-        they would be for a good scanner (James and Stein 1961, positive part).
+        Earlier evidence fades over VIEW_M walked, because the next view has different map errors. The mean range error
+        of all lines is set to zero: scans cannot determine it, since a slightly larger map fits them as well. All
+        errors are then shrunk towards zero, fully for a good scanner (James and Stein 1961, positive part).
 
         Args:
-            points: (n, 3) float32 m, LiDAR frame, without the present errors. rings: (n,) of them.
-            walked: m since the last time.
+            points: (n, 3) float32 m, LiDAR frame, already corrected by `errors`. rings: (n,), their scan lines.
+            walked: m since the last update.
         """
         step = max(1, len(points) // POINTS)
         points, rings, state = np.ascontiguousarray(points[::step]), np.ascontiguousarray(rings[::step]), belief.state

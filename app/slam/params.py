@@ -43,7 +43,7 @@ class Params(Section):
     loops: LoopsParams = LoopsParams()
 
     def merged(self, tree: Mapping[str, Any]) -> "Params":
-        """This, with the values of a (partial) nested mapping laid over it.
+        """These parameters, overridden by the values of a (partial) nested mapping.
 
         Raises:
             HemislamError: naming the parameter that is unknown or out of range, its range and unit.
@@ -103,7 +103,7 @@ class Params(Section):
         return "\n".join(lines) + "\n"
 
     def merged_yaml(self, text: str, source: str = "the YAML text") -> "Params":
-        """This, with a YAML text laid over it. Raises `HemislamError` naming `source`."""
+        """These parameters, overridden by a YAML text. Raises `HemislamError` naming `source`."""
         tree = read_yaml(text, source, "`hemislam params` prints an example")
         try:
             return self.merged({} if tree is None else tree)

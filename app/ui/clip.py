@@ -50,7 +50,7 @@ class ClipPanel:
         self._page, self._measure, self._camera, self._around = page, measure, camera, around
         self._changes, self._scene_changes = Changes(), Changes()
         self._shown: Clip | None = None  # what the widgets were last set to
-        self._dragged: Box | None = None  # what a handle has made of the box, until the session has it
+        self._dragged: Box | None = None  # the box as a handle has set it, until the session stores it
         self._held = False
         self._lines: viser.LineSegmentsHandle | None = None
         self._handles: dict[int, viser.TransformControlsHandle] = {}

@@ -8,7 +8,7 @@ from app.export.box import Box
 from app.slam.types import F32, F64
 
 LEAST_M: Final = 0.05
-"""A box stays at least so long, wide and high."""
+"""Least length, width and height of a box."""
 FACES: Final = tuple((axis, sign) for axis in range(3) for sign in (-1, 1))
 """Sides of a box: an axis of its own, and whether towards its low or its high end."""
 _EDGES: Final = np.array([(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1])

@@ -13,14 +13,14 @@ from app.ui.measure_maths import around
 _AROUND_M: Final = 0.6
 """Planes are looked for so far around a spot."""
 _MOVED_M: Final = 0.4
-"""A spot moves at most so far."""
+"""Largest distance that a spot is moved."""
 _THICK_M: Final = 0.02
-"""Points so near a plane are its own."""
+"""Points this near a plane belong to it."""
 _FEWEST, _LEAST_SHARE = 15, 0.05
 """Points, and share of all there, that a plane needs."""
 _TRIALS, _MOST_POINTS, _MOST = 300, 3000, 5
 _APART: Final = float(np.sin(np.radians(25.0)))
-"""Planes at a smaller angle do not say well where they meet."""
+"""Planes at a smaller angle do not determine well where they meet."""
 
 
 def snapped(chunks: tuple[Chunk, ...], poses: F64, spot: Spot) -> Spot:

@@ -143,7 +143,7 @@ class MapComparePanel:
 
 
 def _limits(found: Comparison) -> Limits:
-    """Alike to both sides, so that grey is no distance."""
+    """Symmetric about zero, so that grey means no distance."""
     end = round(max(float(np.nan_to_num(found.p95)), _LEAST_M), 3)
     return Limits(-end, end)
 

@@ -180,7 +180,7 @@ class PicturesPanel:
         client.send_file_download(self._saved.name, self._saved.read_bytes(), save_immediately=True)
 
     def _told(self, client: viser.ClientHandle, act: Callable[[viser.ClientHandle], None]) -> None:
-        """Do something, and tell the browser if it fails."""
+        """Do something, and report to the browser if it fails."""
         problem = ""
         try:
             act(client)

@@ -3,7 +3,7 @@
 The curve is a quintic spline through samples of (x, y, z, yaw, pitch, roll), so that every derivative is exact: poses,
 angular rates and specific forces belong to the same curve.
 
-Frames: `world` has z up; `body` has x forward, y left, z up. Unless told otherwise the IMU is mounted as on H2LID:
+Frames: `world` has z up; `body` has x forward, y left, z up. By default the IMU is mounted as on H2LID:
 z forward, x down, y left, so that at rest it reads -9.81 m/s^2 on x.
 """
 

@@ -1,4 +1,4 @@
-"""Errors of scan lines, seen in the distances of their points from planes."""
+"""Normal equations of the errors of scan lines, from the distances of their points to planes."""
 
 import math
 
@@ -9,11 +9,11 @@ from app.slam.kernels.registration import EDGE_ON, RESIDUAL_HUBER
 
 @njit(cache=True, error_model="numpy")
 def observe(points, rings, world, R, normals, centers, variances, gate, errors, information, moment):
-    """Add what the distances of points from planes say of their lines' errors.
+    """Add the distances of points to planes to the normal equations of their lines' errors.
 
-    points (n, 3) f32 m, LiDAR frame, without the `errors` (lines, 2) that were taken off them; rings (n,) u16; world
-    (n, 3) m, odom; R (3, 3): R_odom_lidar; planes as from `kernels.map.planes`; gate m/√m. In and out: information
-    (lines, 2, 2) and moment (lines, 2), as weighted sums; range in m before elevation in rad.
+    points (n, 3) f32 m, LiDAR frame, already corrected by `errors` (lines, 2); rings (n,) u16; world (n, 3) m, odom;
+    R (3, 3): R_odom_lidar; planes as from `kernels.map.planes`; gate m/√m. In and out: information (lines, 2, 2) and
+    moment (lines, 2), weighted sums; the range in m comes before the elevation in rad.
     """
     for j in range(len(points)):
         line = rings[j]

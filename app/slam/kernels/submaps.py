@@ -1,4 +1,4 @@
-"""Submaps laid on one another: their plans, and point-to-plane normal equations of one on the other."""
+"""Compare submaps: their plans, and the point-to-plane normal equations of registering one to the other."""
 
 import math
 
@@ -48,7 +48,7 @@ def normal_equations(
     """Accumulate J^T W J and J^T W r of distances to the planes of partners, with Cauchy weights.
 
     Columns of J: a rotation about `origin` (3,) and a translation, in the target's axes. moved (n, 3) f64 m: source
-    points, laid on the target; normals (n, 3): theirs in their own axes, R (3, 3) turns them to the target's; partner
+    points, placed on the target; normals (n, 3): theirs in their own axes, R (3, 3) turns them to the target's; partner
     (n,) i64, squared (n,) f64 m²: nearest target point, and how far; there, their_normals (m, 3), flat (m,): of the
     target; reach m, facing (cosine): what a partner must meet; scale m: distance that halves the weight.
     Out: H (6, 6), b (6,), residuals (n,) m, nan without a partner. Returns the number with one.

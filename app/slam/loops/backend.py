@@ -206,7 +206,7 @@ class LoopBackend:
         return self._made[key]
 
     def _present(self, older: int, newer: int) -> F64:
-        """(4, 4) T_older_newer as the graph has it."""
+        """(4, 4) T_older_newer according to the graph."""
         poses = self.poses
         return np.asarray(lie.inverse(poses[older]) @ poses[newer])
 
@@ -224,7 +224,7 @@ class LoopBackend:
         return self._search.detector.poses
 
     def _begin(self) -> None:
-        """Another first keyframe: the graphs begin anew."""
+        """Start the graphs again from another first keyframe."""
         self._edited = Graph(self._odometry[0], self._search.start.window)
 
     def _laid_over(self, edits: Iterable[LoopEdit]) -> dict[Pair, LoopEdge]:

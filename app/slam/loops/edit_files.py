@@ -12,7 +12,7 @@
       accepted: false
 
 A loop is named by its older and its newer keyframe: an index, or `session/index` in another session than the first.
-`guess` is T_older_newer of the IMU frames; without it, the place is searched from where odometry has it. `register` is
+`guess` is T_older_newer of the IMU frames; without it, the search starts from where odometry places it. `register` is
 true by default. `solve: at once` takes the poses from all factors at once
 (Levenberg-Marquardt) instead of one after the other. `override` counts or leaves out a satellite fix,
 by its number, or a control point: `point P1`.

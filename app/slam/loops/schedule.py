@@ -81,7 +81,7 @@ class LoopSchedule:
         params: in force at the start. `latency` is read only here.
 
     Attributes:
-        state: in effect; None before the first. frame: where that lays odometry in the map.
+        state: in effect; None before the first. frame: where that places odometry in the map.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
-"""Where odometry slipped: there the surfaces seen just before and just after lie apart.
+"""Detect where odometry slipped: surfaces seen just before and just after do not coincide there.
 
-A submap across a slip holds every surface twice. What is laid on it comes to lie in between, or on the part that does
-not belong to its keyframe.
+A submap across a slip holds every surface twice. A cloud registered to it ends up in between, or on the part that does
+not belong to the submap's keyframe.
 """
 
 import numpy as np
@@ -11,23 +11,24 @@ from app.slam.loops.verification import Prepared, information, register
 from app.slam.types import F64
 
 REACH = 4
-"""Keyframes on either side of a step that are laid on one another."""
+"""Keyframes on each side of a step; their clouds are registered to each other."""
 POINT_M, INDEPENDENT = 0.03, 0.05
-"""Standard deviation of a point's distance to a plane seen moments before, and the share of independent errors."""
+"""Standard deviation of a point's distance to a plane seen moments before; share of points with independent errors."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.25)
-"""Least standard deviations of such a registration, however many points it has."""
+"""Smallest standard deviations of such a registration, however many points it has."""
 LIKELY = 2.5
-"""Standard deviations up to which odometry holds."""
+"""Largest deviation, in standard deviations, at which odometry still counts as right."""
 
 
 def slip(before: Prepared, after: Prepared, T_guess: F64) -> F64 | None:
-    """How far the surroundings seen after a step lie from where odometry says, in directions that they constrain.
+    """How far registration moves the surroundings seen after a step from where odometry places them.
 
     Args:
         T_guess: (4, 4) T_before_after of the level frames, by odometry.
 
     Returns:
-        (6,) rad and m, rotation about the origin of `after`, then translation, in level axes; None: odometry holds.
+        (6,) rad and m, rotation about the origin of `after`, then translation, in level axes; None if odometry is right
+        within `LIKELY` standard deviations.
     """
     T = register(before, after, T_guess)
     moved = np.concatenate([lie.log(T[:3, :3] @ T_guess[:3, :3].T), T[:3, 3] - T_guess[:3, 3]])

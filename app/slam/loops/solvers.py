@@ -287,7 +287,7 @@ def _noise(factor: Closing, times: int = 1) -> gtsam.noiseModel.Base:
 
 
 def _gtsam(factor: Closing, times: int = 1) -> gtsam.NonlinearFactor:
-    """The factor as gtsam has it."""
+    """The factor as a gtsam object."""
     if isinstance(factor, PositionPrior):
         return gtsam.GPSFactorArm(factor.keyframe, factor.p_map_imu, factor.arm, _noise(factor))
     T = gtsam.Pose3(factor.T_first_second)

@@ -157,7 +157,7 @@ def _align(
 
 
 def assess(target: Prepared, source: Prepared, T: F64) -> Fit:
-    """Overlap, residuals and information of a source laid on a target at T (4, 4)."""
+    """Overlap, residuals and information of a source placed on a target at T (4, 4)."""
     back = lie.inverse(T)
     overlap = min(_overlap(target, source, T), _overlap(source, target, back))
     near = np.flatnonzero(_near(source.points @ T[:3, :3].T + T[:3, 3], T[:3, 3]) & source.flat)
@@ -184,7 +184,7 @@ def slide(target: Prepared, source: Prepared, fit: Fit, direction: F64) -> float
 
 
 def _pull(target: Prepared, points: F64, normals: F64, T: F64, reach: float, scale: float) -> tuple[F64, F64, F64]:
-    """Normal equations (6, 6), (6,) of source points laid at T (4, 4), and their residuals, nan without a partner.
+    """Normal equations (6, 6), (6,) of source points placed at T (4, 4), and their residuals, nan without a partner.
 
     Errors are a rotation about the source's origin and a translation, in the target's axes.
     """
