@@ -2,7 +2,7 @@
 
 Written from Ye, Chen and Liu, "Tightly Coupled 3D Lidar Inertial Odometry and Mapping", ICRA 2019. Where the paper
 has a factor for each point, a scan's points make one factor here: the pose relative to the window's first scan that
-fits them, with their information, so that what they leave open is left to the IMU.
+fits them, with their information, so the IMU determines what they leave open.
 """
 
 from collections import deque
@@ -78,7 +78,7 @@ class Liom:
         return scan.end_ns, self._T_map_odom @ T_odom_imu
 
     def _begin(self, state: NavState) -> None:
-        """The first window, from where the start has left off."""
+        """The first window, from the state at the end of the start."""
         self._bias = gtsam.imuBias.ConstantBias(state.b_accel, state.b_gyro)
         pose = gtsam.Pose3(state.T_odom_imu)
         self._state, self._stamp_ns = gtsam.NavState(pose, state.v_odom_imu), state.stamp_ns

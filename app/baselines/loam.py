@@ -1,9 +1,9 @@
 """LOAM, the paper's first baseline: LiDAR odometry from scan to scan, then registration to the map. No IMU, no loops.
 
-Written from Zhang and Singh, "LOAM: Lidar Odometry and Mapping in Real-time", RSS 2014. A scan is freed of its
-distortion by the motion before it. The paper solves for the motion and the distortion together, which on a scanner that
-sees a wall only early in each turn swings up from scan to scan. So does one step from scan to scan where azimuths are
-far apart: 0.1 m at rest outdoors. Hence the speed is a mean of steps in the map, to which every scan is registered.
+Written from Zhang and Singh, "LOAM: Lidar Odometry and Mapping in Real-time", RSS 2014. A scan is
+undistorted with the motion before it. The paper solves for motion and distortion together, which begins to oscillate on
+a scanner that sees a wall only early in each turn. So does a single scan-to-scan step where azimuths are far apart: by
+0.1 m at rest outdoors. Hence the speed is a mean of steps in the map, to which every scan is registered.
 """
 
 from functools import partial
@@ -21,7 +21,7 @@ ODOMETRY_ROUNDS, MAP_ROUNDS = 5, 4
 """How often points are matched again."""
 EDGE_VOXEL_M, PLANE_VOXEL_M, MAP_REACH_M = 0.2, 0.4, 80.0
 STEPS = 5
-"""Scans over which the speed is averaged; a body hardly changes its own in so short a time, but turns."""
+"""Scans over which the speed is averaged; a person hardly changes speed in so short a time, but does turn."""
 
 
 class Loam:

@@ -26,13 +26,13 @@ LINE, PLANE = 5.0, 0.15
 SPREAD = 0.02
 """Least share of the variance along a plane's longer axis that the shorter one has: a scan line makes no plane."""
 THICK_M = 0.06
-"""RMS distance of the neighbours from their line or plane, above which they form none: three times a scanner's noise,
+"""RMS distance of neighbours from their line or plane above which they form none: three times a scanner's noise,
 so that hedges have no planes."""
 HUBER_M = 0.1
 WEAK = 0.1
-"""A direction in which the scan tells less than this share of a well-seen one keeps the prediction (Zhang, Kaess and
-Singh, "On Degeneracy of Optimization-based State Estimation Problems", ICRA 2016). Normals that are wrong by 0.2 rad
-tell 0.04 of directions that nothing is seen of."""
+"""A direction constrained by less than this share of a well-seen one keeps the prediction (Zhang, Kaess and Singh, "On
+Degeneracy of Optimization-based State Estimation Problems", ICRA 2016). Normals that are wrong by 0.2 rad seem to
+constrain unseen directions by a share of 0.04."""
 _LINE_APART_M = 1000.0
 
 

@@ -29,7 +29,7 @@ LARGEST_ROTATION, LARGEST_PLACE, LARGEST_OFFSET = np.radians(1.0), 0.05, 0.002
 SURE = 3.0
 """Standard deviations by which two values must differ to be different."""
 APART_ROTATION, APART_PLACE = np.radians(3.0), 0.1
-"""rad, m: a mounting that is off by more spoils a map."""
+"""rad, m: a mounting that is off by more than this spoils a map."""
 
 Report = Callable[[float], None]
 """Is called with the fraction done, 0-1."""

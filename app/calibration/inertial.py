@@ -1,4 +1,4 @@
-"""What the IMU says of a motion, at the times of the scans."""
+"""The motion as the IMU measures it, at the times of the scans."""
 
 from dataclasses import dataclass
 

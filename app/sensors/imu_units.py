@@ -19,12 +19,12 @@ from app.slam.types import F64, I64, Vector
 
 STANDARD_GRAVITY = 9.80665
 ABSURD = 1e6
-"""No IMU reads as much, in any unit."""
+"""No IMU reads more than this, in any unit."""
 ACCELERATION_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000}
 GYROSCOPE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
 
 MOST_ACCEL = 200.0
-"""m/s^2; what is more is no walk."""
+"""m/s^2; a larger value is no walking motion."""
 WINDOW_S, STRIDE_S, SPAN_S, STEPS = 0.5, 0.25, 1.0, 50
 """Accelerations are averaged over a window, about a step of walking, and compared with those one span later."""
 GAP_NS = 1_000_000_000
@@ -163,7 +163,7 @@ def _axes_finding(sway: "Sway", gyro_unit: float, chosen: RecordingParams) -> li
     if errors[best] > CLEARLY * errors[AS_IS] or errors[AS_IS] < LEAST_ERROR:
         return []
     # Turning all axes of one sensor or back those of the other is the same, and so is gravity upside down. A mirrored
-    # gyroscope is another matter: nothing that is done to the accelerometer mends it.
+    # gyroscope is different: no change of the accelerometer's axes corrects it.
     name, given, change = "gyroscope", chosen.gyroscope_axes, _matrix(best)
     if np.linalg.det(change) > 0:
         back = change.T

@@ -25,9 +25,9 @@ from app.slam.params import Params
 from app.slam.types import I64, DroppedScan, Measurement, Samples, Scan, Vector
 
 LOG_MARGIN_NS = 2_000_000_000
-"""How much later or earlier than usual a message may be logged and is still found by time."""
+"""A message logged this much later or earlier than usual is still found by its time."""
 SILENCE_S = 0.5
-"""Without a scan at the end, while the IMU goes on, is worth a word."""
+"""A gap without scans at the end, while the IMU goes on, is reported if it is longer than this."""
 NO_IMU = Finding(
     "IMU topic",
     "corrected",

@@ -1,11 +1,11 @@
 """How certain a pose is since the walk began, counting errors that repeat from frame to frame.
 
-The filter takes the map and the mounting of the LiDAR as exact, so its covariance says how well a scan fits the map,
-and stays at millimetres however long the walk. Two errors are left out, and neither averages out:
+The filter takes the map and the mounting of the LiDAR as exact, so its covariance shows how well a scan fits the map,
+and stays at millimetres however long the walk is. Two errors are left out, and neither averages out:
 
-- The map lies where the filter put it. Each time the walk has left one view behind, what it sees was mapped with an
-  error of its own, as large as the filter's at that time: a random walk, whose turns move all that follows.
-- A wrong mounting leans to another side as the device turns, and so do the poses of the IMU.
+- The map lies where the filter put it. Each new view is mapped with an error of its own, as large as the filter's at
+  that time. These errors add up to a random walk, and its rotations move all that follows.
+- The tilt caused by a wrong mounting changes direction as the device turns, and so do the errors of the IMU's poses.
 """
 
 from dataclasses import dataclass

@@ -16,7 +16,7 @@ LEAP, LEAP_TIMES = 0.5, 4.0
 MOST_LOST, MOST_DROPPED = 0.1, 0.5
 """Shares of the frames that may be lost, and of the scans that may be dropped."""
 WALKING = 0.1
-"""m/s; a device at rest has nothing to say about its IMU."""
+"""m/s; a device at rest gives no evidence about its IMU."""
 TAKEN_BACK, NOISE = 0.07, 0.05
 """Share of the velocity's change by the IMU that the scans may take back, beside NOISE m/s. A clean sensor leaves 0.01
 to 0.02, one with all the errors that data sheets admit 0.05; exchanged axes, a mounting off by 5 deg or a clock off by
@@ -44,7 +44,7 @@ def doubts(log: RunLog) -> tuple[str, ...]:
 
 
 def _of_imu(log: RunLog) -> list[str]:
-    """Whether the scans take back what the IMU says of the velocity, in a quarter of the frames or more."""
+    """Whether the scans undo the velocity changes that the IMU measures, in a quarter of the frames or more."""
     change, correction, speed = (log.readout(name) for name in ("predicted_change", "correction", "speed"))
     known = np.isfinite(correction) & ~(speed < WALKING)
     if np.count_nonzero(known) < 20:

@@ -26,7 +26,7 @@ class EngineProgress:
     Attributes:
         frame: index of the next one. belief: None until the start is over. still: samples of the rest so far.
         T_odom_keyframe: T_odom_imu of the last keyframe. certainty: of its pose; both None before the first.
-        lines: errors of the scan lines, as learnt so far. clock: the same of the IMU's.
+        lines: estimated errors of the scan lines. clock: estimated offset of the IMU's clock.
     """
 
     frame: int = 0
@@ -190,7 +190,7 @@ class Engine:
         self.keyframes.close()
 
     def _update(self, last: Belief, predicted: Belief, points: F32) -> tuple[Belief, Registration]:
-        """As `iekf.update`; if the numbers break down, the prediction stands and the frame is lost."""
+        """As `iekf.update`; after a numerical failure, the prediction stands and the frame is lost."""
         with contextlib.suppress(np.linalg.LinAlgError):
             posterior, registration = iekf.update(predicted, points, self._map, self.params.filter)
             if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():

@@ -23,8 +23,8 @@ CONVERGED_TRANSLATION = 1e-4
 MIN_INLIERS = 30
 """Least number of planes for an update; with fewer the prediction stands."""
 ENOUGH_PLANES, ENOUGH_SHARE, WALKING = 50, 0.45, 0.3
-"""Fewer good planes than ENOUGH_PLANES are too few, and above WALKING m/s less than ENOUGH_SHARE of the points. Then
-poor planes are used too, weighted by their certainty: where the map is noisy or cluttered, they are better than none.
+"""Fewer good planes than ENOUGH_PLANES, or above WALKING m/s than ENOUGH_SHARE of the points, are too few. Then poor
+planes are used too, weighted by their certainty: where the map is noisy or cluttered, they are better than none.
 Before the first step the map was seen from one place only, and poor planes along its scan lines would hold the scanner
 there."""
 DEGENERATE_SIGMA = 0.1

@@ -21,8 +21,8 @@ MAX_KNOT_STEP = 0.0025
 LONG_GAP = 0.4
 """s, half the time of a step. Over a longer gap the accelerations at both ends do not determine the velocity."""
 CLOCK_ERROR, SCALE_ERROR = 0.006, 0.006
-"""s by which the IMU's clock may be off, and the share by which its gyroscope may be: what they do grows with the
-motion. At rest both are harmless, and the noise of the data sheet is all there is."""
+"""Possible error of the IMU's clock in s, and of its gyroscope's scale as a share. Their effect grows with the motion;
+at rest both are harmless, and only the noise of the data sheet remains."""
 GAP_NOISE = (0.5, 3.0)
 """Noise densities (rad/s/√Hz, m/s²/√Hz) for bridging a gap: those of walking and turning."""
 
@@ -84,7 +84,7 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -
 
 
 def _unsteady(times: F64, rates: F64, forces: F64) -> F64:
-    """Noise densities (2,) (rad/s/√Hz, m/s²/√Hz) that do over these (k,) s what errors of clock and scale do.
+    """Noise densities (2,) (rad/s/√Hz, m/s²/√Hz) that have the effect of clock and scale errors over these (k,) s.
 
     rates, forces (k, 3) rad/s, m/s². A clock late by c gives an angle wrong by c times the change of the rate.
     """

@@ -1,7 +1,7 @@
-"""Keyframes: which frames are kept, and all of them on disk, so that memory does not grow.
+"""Keyframes: which frames become one, and their store on disk, so that memory does not grow.
 
 They are immutable and only ever appended, so a checkpoint needs no more than their number. After
-going back the later ones stay until others are put in their place, so that one can go forth again.
+going back, the later ones stay until others replace them, so going forward again is possible.
 """
 
 import os
@@ -122,12 +122,12 @@ class KeyframeStore:
         self._count += 1
 
     def truncate(self, count: int) -> None:
-        """Go back to the first `count` keyframes, or forth again to as many as there were.
+        """Go back to the first `count` keyframes, or forward again to at most as many as there were.
 
         A store that never held any stays empty.
 
         What is appended after going back must be what was there, or going forth again beyond it
-        gives keyframes of two different walks.
+        mixes keyframes of two different runs.
 
         Raises:
             IndexError: there never were so many, or others have been put in their place since.

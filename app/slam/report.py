@@ -1,4 +1,4 @@
-"""What a run amounts to: report.json, and the same in a few lines."""
+"""The report of a run: report.json, and a summary of a few lines."""
 
 import math
 from pathlib import Path

@@ -51,7 +51,7 @@ def level(belief: Belief, specific_force: F64, sigma: F64) -> Belief:
     """The belief of a device at rest that feels `specific_force` (3,) m/s², each axis known to `sigma` (3,).
 
     A device at rest does not accelerate, so the sum of gravity and the accelerometer's bias is known well, although
-    neither is by itself. The covariance holds that as their correlation.
+    neither of them is known alone. Their correlation in the covariance expresses this.
     """
     state = belief.state
     up = -state.R_odom_imu.T @ state.g_odom

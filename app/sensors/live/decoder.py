@@ -34,7 +34,7 @@ class Decoder:
         self.configure(Difop())
 
     def configure(self, difop: Difop) -> None:
-        """Decode by these settings from now on."""
+        """Use these settings from now on."""
         self.difop = difop
         self.calibration = self._angles or difop.calibration or ChannelAngles.nominal(self._model)
         elevation = np.radians(self.calibration.elevations_deg)

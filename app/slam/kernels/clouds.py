@@ -114,7 +114,7 @@ def first_in_voxels(keys, table, first):
 
 @njit(cache=True)
 def passages(points, path, half, indices, along, aside):
-    """Lay points beside a path on it: once for each passage of the path within `half`, m.
+    """Project points onto a path: once for each passage of the path within `half`, m.
 
     points (n, 2), path (m >= 2, 2) f64, m, no two of it the same in a row. Out, as far as they reach: indices (k,) i64
     of the points; along (k,) f64, m from the path's begin; aside (k,) f64, m to its left. Points before its begin and

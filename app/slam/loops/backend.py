@@ -1,8 +1,8 @@
 """The loop back end: keyframes in, loops and corrected poses out. Synchronous and deterministic.
 
-There are two layers. What was found is history (`search`). The user's edits lie over it and belong to the present. The
-graph is a function of both, so it does not matter when an edit was made, and undoing it is the same as never having
-made it.
+There are two layers: the loops that were found are history (`search`); the user's edits override them and belong to the
+present. The graph is a function of both, so it does not matter when an edit was made, and undoing it is the same as
+never having made it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -125,7 +125,7 @@ class LoopBackend:
         return self._solved()[1]
 
     def take_notices(self) -> tuple[str, ...]:
-        """What went wrong since the last call, in sentences. Each is said once."""
+        """What went wrong since the last call, in sentences. Each is reported once."""
         notices, self._notices = self._notices, []
         return tuple(notices)
 
@@ -172,7 +172,7 @@ class LoopBackend:
         self._made = {key: edge for key, edge in self._made.items() if key[0] in known}
 
     def preview(self, edit: LoopEdit) -> Preview:
-        """What the graph would become by a edit, without doing it.
+        """What the graph would become with an edit, without applying it.
 
         Raises:
             HemislamError: it makes no sense, or there is no such loop or keyframe yet.

@@ -24,7 +24,7 @@ from app.slam.sections import LoopsParams
 from app.slam.types import F64, I64, Cloud, Keyframe
 
 NEAR_M = 3.0
-"""Added to the reach of drift: places this far apart still see each other."""
+"""Added to the reach of drift: places this far apart still share a view."""
 WIDER = 2.0
 """Odometry that slipped is farther off than the model of drift allows, so it is searched this many times as far."""
 KEPT_PREPARED = 8
@@ -134,14 +134,14 @@ class Detector:
         return self._contexts[index] if index < self.described else self.describe(index)
 
     def submap(self, index: int) -> Prepared:
-        """From the keyframes around one that no slip of odometry parts from it."""
+        """From the keyframes around one, up to the nearest slip of odometry on either side."""
         before, after = range(index, self._first(index), -1), range(index + 1, self.last(index) + 1)
         first = next((k for k in before if self.slip(k) is not None), before.stop)
         end = next((k for k in after if self.slip(k) is not None), after.stop) - 1
         return self._prepared(index, first, end)
 
     def slip(self, index: int) -> F64 | None:
-        """How far odometry slipped on the step to a keyframe, by the few on either side; see `slips`."""
+        """How far odometry slipped on the step to a keyframe, from the few keyframes on each side; see `slips`."""
         first, last = max(0, index - slips.REACH), min(len(self), index + slips.REACH) - 1
         if (index, last) not in self._slips:
             before, after = self._pieces(first, index - 1), self._pieces(index, last)
@@ -153,7 +153,7 @@ class Detector:
         return lie.transform(self.poses[index, :3, :3], np.zeros(3))
 
     def look(self, newer: int, expectation: Expectation, params: LoopsParams) -> list[Sighting]:
-        """Older places that look like this one, the most alike first, each well apart from the others."""
+        """Older places that look like this one, the most similar first, each well apart from the others."""
         p = params
         candidates = self._eligible(newer, expectation, p)
         if not len(candidates):

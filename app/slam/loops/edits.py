@@ -1,4 +1,4 @@
-"""The user's edits: a list that lies over whatever was found, and of which any number can be undone.
+"""The user's edits: a list that overrides whatever was found. Any number of them can be undone.
 
 An edit names a pair of keyframes, whether that pair was found already or not. An edit without a loop to act on waits
 for it, so a list of edits can be given before the session begins.
@@ -57,7 +57,7 @@ class Add(_PairEdit):
 
     Attributes:
         guess: (4, 4) T_older_newer of the IMU frames from which their submaps are registered;
-            None: as odometry and structure have them. Rows of numbers, so that edits can be compared.
+            None: searched from where odometry places them. Rows of numbers, so that edits can be compared.
         register: False takes the guess as it is.
     """
 
@@ -147,7 +147,7 @@ def check(edit: LoopEdit) -> None:
 
 
 def _is_rigid(T: F64) -> bool:
-    """As exactly as numbers are written that people pass on."""
+    """Whether a matrix is a rigid transform, within the rounding of numbers written as text."""
     R = T[:3, :3]
     return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0 and np.allclose(T[3], (0, 0, 0, 1)))
 
@@ -166,7 +166,7 @@ _FOUND: Final = {
 
 
 def _edited(edge: LoopEdge, edit: LoopEdit) -> LoopEdge:
-    edge = replace(edge, represented_by=None, repeats=None)  # what the user has a word on is in the graph itself
+    edge = replace(edge, represented_by=None, repeats=None)  # loops that the user edited are in the graph themselves
     if isinstance(edit, SetWeight):
         return replace(edge, weight=edit.weight)
     if isinstance(edit, Add | Solve | Override):  # one that waits; those that are for no loop
@@ -181,7 +181,7 @@ def _edited(edge: LoopEdge, edit: LoopEdit) -> LoopEdge:
 def _standing(edge: LoopEdge, edges: Mapping[Pair, LoopEdge]) -> LoopEdge:
     """The same; in the graph itself if the one that was there for it, or that it repeats, no longer is.
 
-    A loop by hand is repeated by none: it is the user's word, and not to be outvoted.
+    No loop repeats one that was added by hand: that is the user's decision and must not be outvoted.
     """
     if edge.repeats is not None:
         tie = edges.get(edge.repeats)

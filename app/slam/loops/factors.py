@@ -90,7 +90,7 @@ def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift
 
 
 def loosened(step: Factor, slip: F64, R_odom_imu: F64) -> Factor:
-    """Odometry to a keyframe that says little along a slip (6,) of rotation and translation, in odom's axes."""
+    """Odometry to a keyframe, weakened along a slip (6,) of rotation and translation, in odom's axes."""
     moved = np.kron(np.eye(2), R_odom_imu.T) @ slip
     return replace(step, covariance=step.covariance + np.outer(moved, moved))
 

@@ -1,7 +1,7 @@
-"""Where a place lies on an older one: all the alignments that fit, and the one that odometry and structure prefer.
+"""Align a place with an older one: find all alignments that fit, and the one that odometry and structure prefer.
 
 A registration shows that two submaps fit, not that they fit nowhere else, as they may in corridors and rooms that
-repeat. So it begins at every placement that the plans allow (`plan`), within what odometry might be off by.
+repeat. So registration starts from every placement that the plans allow (`plan`), within odometry's possible error.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ LEAST_OVERLAP, MOST_RESIDUAL, RESIDUAL_M = 0.6, 1.6, 0.002
 """An alignment fits as well with at least this share of the overlap, and at most this many times the residual plus so
 many metres. (In a place that does not repeat, wrong alignments share less.)"""
 HOPEFUL, SAME_ROUGHLY = 0.5 * LEAST_OVERLAP, 0.25
-"""A rough alignment goes on with at least this share of the points that fit in the best, and this far from others."""
+"""A rough alignment is refined if it has at least this share of the best one's points and is this far from others."""
 ALONG = 0.9
 """Least cosine between the way from one alignment to another and a direction that is open, for them to be the same."""
 
@@ -51,9 +51,9 @@ def place(
     most_sigmas: float,
     most_slide: float,
 ) -> Placement:
-    """Lay a submap on another.
+    """Align a submap with another.
 
-    If the best alignment is against odometry, odometry cannot rule out others either: they are looked for everywhere.
+    If the best alignment contradicts odometry, odometry cannot rule out others either: they are looked for everywhere.
 
     Args:
         T_guess: (4, 4) of the level frames, by odometry; along a direction that is open, the result stays there.

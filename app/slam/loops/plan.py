@@ -1,4 +1,4 @@
-"""Where one submap lies on another, without a good guess: their plans are compared at every shift and turn.
+"""Align submaps without a good guess: compare their plans at every shift and turn.
 
 A plan is a raster of what stands upright: the taller, the more it counts. Ground fits anywhere; it only shows that
 nothing stands there. The shifts at which two plans agree best are found at once, by a circular correlation for each

@@ -42,7 +42,7 @@ class PoseGraph:
         return tuple(self._steps)
 
     def follow(self, steps: Sequence[Step]) -> tuple[Closing, ...]:
-        """Do these steps from the start; those that are the same objects as before are not done again.
+        """Apply these steps from the start; leading steps that are the same objects as before are not repeated.
 
         Returns:
             All factors among them that the solver failed with; `do` says what became of each.

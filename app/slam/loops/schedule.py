@@ -1,9 +1,9 @@
-"""When what was found takes effect.
+"""Decide when the loops that were found take effect.
 
 The client looks for loops beside the frames, at its own speed. What it finds with a keyframe takes effect
 `loops.latency` frames after it, no sooner and no later, so the poses shown never depend on the speed of the machine.
 A frame waits only if an answer is late, and never before the session is long enough for a loop: a client takes seconds
-to start. What the user asks takes effect as soon as it is answered.
+to start. A request of the user takes effect as soon as it is answered.
 """
 
 import contextlib

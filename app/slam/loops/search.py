@@ -1,8 +1,8 @@
-"""The search for loops: what each keyframe of a session brought. The user's edits have no part in it.
+"""The search for loops: what was found with each keyframe of a session. The user's edits play no part in it.
 
 Each keyframe appends to a history; going back means reading less of it. What is found with a keyframe depends only on
-the keyframes up to it, so it is looked for once. The search has a graph of its own, of the loops as they were found,
-which tells it where to look.
+the keyframes up to it, so the search for it runs once. To know where to look, the search has a graph of its own, of the
+loops as they were found.
 """
 
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ class Search:
         self.finished = False
         self._params: list[LoopsParams] = []  # with each keyframe
         self._measured: list[Measured] = []
-        self._loose: dict[int, Measured] = {}  # of keyframes before which odometry slipped
+        self._loose: dict[int, Measured] = {}  # weakened odometry of keyframes before which it slipped
         self._found: list[Found | None] = []  # with each; None until loops were looked for
         self._ends: dict[int, Found] = {}  # found in addition where the session ended, by the number of keyframes
         self.graph = Graph(np.eye(4), 0)
@@ -68,7 +68,7 @@ class Search:
 
     @property
     def measured(self) -> Sequence[Measured]:
-        """Of the first `len` keyframes. Once a slip of odometry is seen, the graph may bend there."""
+        """Of the first `len` keyframes. Where a slip of odometry was detected, the graph may bend."""
         seen = len(self) - slips.REACH
         return [self._loose.get(k, one) if k <= seen else one for k, one in enumerate(self._measured[: len(self)])]
 

@@ -22,11 +22,11 @@ NAMED = 5
 NEIGHBOURHOOD_M = 15.0
 """Loops whose ends are farther apart than this along the trajectory, on either side, are not compared."""
 SAME = 2 * LOOP_HUBER
-"""Standard deviations up to which two loops near each other measured the same; there Huber's loss halves the pull."""
+"""Standard deviations up to which two nearby loops count as the same; there Huber's loss halves the pull."""
 AGREE = 3.0
 """Standard deviations up to which two loops agree."""
 OUTVOTING, STRETCH_M = 2, 4.0
-"""To outvote odometry, so many times as many must agree, and the newer ends of all must stretch over this way."""
+"""To outvote odometry, this many times as many loops must agree, and their newer ends must span this distance."""
 NO_NEWS = 1.0
 """The same limit beyond a submap's length. It is strict, as the covariances of loops are generous."""
 
