@@ -30,7 +30,7 @@ class Turned:
     Attributes:
         R_imu_lidar: (3, 3). late: s, to be added to the IMU's stamps. bias: (3,) rad/s of the gyroscope.
         covariance: (7, 7) of rotation (rad, LiDAR frame), `late`, and bias.
-        before, after: (n, 3) rad, what the LiDAR's turns differ from the IMU's as given, and as
+        before, after: (n, 3) rad, differences between the LiDAR's turns and the IMU's as given, and as
             fitted; attitudes within windows of a second.
     """
 

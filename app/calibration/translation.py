@@ -32,7 +32,7 @@ class Moved:
     Attributes:
         p_imu_lidar: (3,) m. bias: (3,) m/s² of the accelerometer. gravity: (3,) m/s² in the world, at the begin.
         covariance: (6, 6) of position and bias.
-        before, after: (n, 3) m, what the LiDAR's positions differ from those of the IMU: as given, and as fitted.
+        before, after: (n, 3) m, differences of the LiDAR's positions from those of the IMU: as given, and as fitted.
     """
 
     p_imu_lidar: F64
@@ -60,7 +60,7 @@ def fit_translation(track: Track, inertial: Inertial, turned: Turned, given: F64
     q, _ = np.linalg.qr(free)
 
     def rest(a: F64) -> F64:
-        """What no begin and no velocity explains."""
+        """The part that no initial position and no velocity explains."""
         return np.asarray(a - q @ (np.swapaxes(q, 1, 2) @ a))
 
     design, falls, target = rest(design), rest(falls), rest(target[:, :, None])[:, :, 0]

@@ -84,7 +84,7 @@ def params_yaml(calibration: Calibration) -> str:
 
 
 def write_beside(calibration: Calibration, *, replace: bool = False) -> Path:
-    """Keep what was found beside the recording, where `run`, `serve` and `info` read it.
+    """Store what was found beside the recording, where `run`, `serve` and `info` read it.
 
     Args:
         replace: a file that a person wrote, too. Its other parameters stay, and it is kept as `.old`.

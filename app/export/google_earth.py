@@ -1,4 +1,4 @@
-"""KMZ for Google Earth: the walk, the map from above laid over the ground, and the keyframes with their times."""
+"""KMZ for Google Earth: the trajectory, the map from above on the ground, and the keyframes with their times."""
 
 import io
 import zipfile

@@ -56,7 +56,7 @@ def rasterise(read: Callable[[], Iterable[Block]], where: GeoReference | None, c
     """Count the chosen points of a map.
 
     Args:
-        read: gives the points from the first on. where: on Earth the raster shall lie; None: in the map.
+        read: gives the points, from the start on each call. where: the raster's place on Earth; None: in the map.
         cell: m.
 
     Raises:

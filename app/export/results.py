@@ -45,8 +45,8 @@ class Results:
 
     Attributes:
         loops: None if loops were not searched. report: what report.json holds; complete once it is written.
-        choice: of points. where: on Earth the map is, if that is known. found: how fixes or points lie on it, if it is
-            these results that they were laid on. problem: why they could not be, in a sentence.
+        choice: of points. where: the map's place on Earth, if known. found: how fixes or points fit it, if these
+            results were georeferenced. problem: why they could not be, in a sentence.
         marks: what was measured, each a name and its spots: keyframe and (x, y, z) m in its IMU frame.
         notes: taken in the session, each the index of a frame and a text.
         progress: called with the share of the points that a file has got, 0-1, for each file.

@@ -60,7 +60,7 @@ def of_box(read: Callable[[], Iterable[Block]], box: Box | None, where: GeoRefer
     """What lies in the box, from its front; chainage begins at its left side.
 
     Args:
-        read: gives the points from the first on. where: on Earth heights are known; None: they are those of the map.
+        read: gives the points, from the start on each call. where: the map's place on Earth; None: heights of the map.
 
     Raises:
         HemislamError: no box is chosen, or nothing is in it.

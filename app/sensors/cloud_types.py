@@ -214,7 +214,7 @@ def stamped(probes: list[Probe]) -> list[Probe]:
 
 
 def valid_points(xyz: F32, time: Column | None = None) -> tuple[F32, npt.NDArray[np.intp], int]:
-    """Points that can be a return (nearer than `FARTHEST_M`, with a time), their indices, and how many others are none.
+    """Points that can be a return (nearer than `FARTHEST_M`, with a time), their indices, and how many others cannot.
 
     Points that are NaN or all zero are not counted: drivers put them where nothing came back.
     """

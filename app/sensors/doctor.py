@@ -123,7 +123,7 @@ class _Census:
 
 
 def _not_mappable(path: Path, params: Params, why: str) -> tuple[Finding, ...]:
-    """What can be said of a recording that cannot be mapped: why, its topics, and how its clouds are read."""
+    """The findings of a recording that cannot be mapped: why, its topics, and how its clouds are read."""
     with Source(path) as source:
         findings = [Finding("use", "needs you", why), _topics(source.topics, (source.end_ns - source.start_ns) / 1e9)]
         with suppress(HemislamError):

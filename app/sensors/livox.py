@@ -1,4 +1,4 @@
-"""`CustomMsg` of livox_ros_driver and livox_ros_driver2, read and written as bytes; an object a point is too slow."""
+"""`CustomMsg` of livox_ros_driver and livox_ros_driver2, read and written as bytes: objects per point are slow."""
 
 import struct
 from dataclasses import dataclass

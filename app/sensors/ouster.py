@@ -76,7 +76,7 @@ _PROFILES = {
 
 @dataclass(frozen=True)
 class Metadata:
-    """What an Ouster states of itself.
+    """What an Ouster states about itself.
 
     Attributes:
         name: of the product. profile: of its packets. columns: of a packet. width: columns of a turn.
@@ -149,7 +149,7 @@ class Metadata:
 
 
 def metadata_beside(capture: Path) -> Metadata | None:
-    """That of the .json that has the capture's name, or NAME_0; or the longest name that the capture's begins with."""
+    """The .json with the capture's name, or NAME_0; else the one with the longest name that the capture's begins with."""
     named = (capture.stem, f"{capture.stem}_0")
     beside = [
         path for path in capture.parent.glob("*.json") if path.stem in named or capture.stem.startswith(path.stem)

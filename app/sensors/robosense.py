@@ -44,7 +44,7 @@ class Model:
         firing_offsets_ns: (c,) firing time of each channel inside its block.
         rx, rz: m, lever of the laser: a point is d * direction + (rx cos a, -rx sin a, rz) with
             the BLOCK's azimuth a.
-        elevations_deg: (c,) nominal, by channel. mark: with which its packets begin. blocks: of a packet.
+        elevations_deg: (c,) nominal, by channel. mark: the bytes that its packets begin with. blocks: of a packet.
         part: channels that follow one azimuth in a packet. counted: bits of a distance; others are a flag.
         index_at, index_bytes: where a packet's number is.
     """

@@ -31,10 +31,10 @@ MAX_HELD = 10_000
 
 GYRO, ACCEL = slice(0, 3), slice(3, 6)
 SPIKE_FLOOR = ((GYRO, 0.5), (ACCEL, 3.0))
-"""rad/s, m/s^2: what differs less from its neighbours is never a spike."""
+"""rad/s, m/s^2: a sample that differs less from its neighbours is never a spike."""
 STUCK_SAMPLES = 200
 SPIKE_TO_NEIGHBOURS, SPIKE_TO_USUAL = 4.0, 10.0
-"""A spike is off the way between its neighbours by this many times their difference, and what is usual."""
+"""A spike deviates from the line between its neighbours by this many times their difference and the usual deviation."""
 
 
 @dataclass(slots=True)
@@ -78,7 +78,7 @@ class Sequencer:
     _suspect: tuple[int, tuple[float, ...]] | None = None
     """A sample stamped far ahead of the one before: a wrong stamp, unless the next one goes on from there."""
     _usual: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    """How far samples usually are from the way between their neighbours: rad/s, m/s^2."""
+    """How far samples usually are from the line between their neighbours: rad/s, m/s^2."""
     _begun: bool = False
     _same: list[int] = field(default_factory=lambda: [0] * 6)
     """For how many samples each axis has read the same number."""
@@ -171,7 +171,7 @@ class Sequencer:
         for n, (part, floor) in enumerate(SPIKE_FLOOR):
             first, second, third = values[before][part], values[this][part], values[after][part]
             off, apart = math.dist(first, second) + math.dist(second, third), math.dist(first, third)
-            off = (off - apart) / 2  # 0 on the way from one neighbour to the other, however fast
+            off = (off - apart) / 2  # 0 on the line from one neighbour to the other, however steep
             if off > max(floor, SPIKE_TO_NEIGHBOURS * apart, SPIKE_TO_USUAL * self._usual[n]):
                 spike = True
             else:

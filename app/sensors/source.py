@@ -108,7 +108,7 @@ class RosbagsStream:
         self._links.cleanup()
 
     def _deserialised(self, raw: bytes, kind: str) -> Any:
-        """Standard types are read as they are defined, whatever the file says of them."""
+        """Read standard types as they are defined, whatever the file states about them."""
         encoding = "cdr" if self._reader.is2 else "ros1"
         if self._standard.knows(kind, encoding):
             return self._standard.read(raw, kind, encoding)

@@ -1,4 +1,4 @@
-"""When each point was measured: which field says it, in which unit, counted from what.
+"""When each point was measured: in which field, in which unit, counted from what.
 
 A wrong answer here does not crash anything; it bends every scan, and the map drifts silently. So each choice is checked
 against what must hold: a scan lasts about as long as the interval to the next one, and no point was measured after its

@@ -1,7 +1,7 @@
-"""Calibrate: how the LiDAR sits on the IMU by the open recording, found in a process of its own, applied by a click.
+"""Calibrate: find the LiDAR's pose on the IMU from the open recording, in a process of its own, and apply it.
 
-It begins by itself where the mounting is not known, and after a run in doubt. What it finds where nothing is known is
-applied at once, unless the user changed something in the meantime.
+It begins automatically where the mounting is not known, and after a doubtful run. If no mounting was given, the result
+is applied at once, unless the user changed something in the meantime.
 """
 
 from dataclasses import dataclass

@@ -97,7 +97,7 @@ class ClipPanel:
         return replace(view, clip=clip.hiding)
 
     def draw(self, current: Snapshot) -> None:
-        """Show what the session keeps; while a handle is held, the box as it is then."""
+        """Show the box of the session; while a handle is held, the box as dragged."""
         clip = current.clip
         if clip != self._shown:
             self._shown, self._dragged = clip, None
@@ -124,7 +124,7 @@ class ClipPanel:
             notify_error(client, error)
 
     def _whole(self) -> Box:
-        """Around all of the map but a few far points. Raises HemislamError: there is none yet."""
+        """The box around all of the map but a few far points. Raises HemislamError: there is no map yet."""
         points = self._around()
         if not len(points):
             raise HemislamError("There is no map yet that could be clipped; play the recording first.")

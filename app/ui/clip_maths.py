@@ -1,4 +1,4 @@
-"""Handles of a clip box: where they are, and what becomes of the box when one is moved. Boxes along a line."""
+"""Handles of a clip box: where they are, and how moving one changes the box. Also boxes along a line."""
 
 from typing import Final
 

@@ -11,7 +11,7 @@ from app.slam.types import F64
 from app.ui.measure_maths import around
 
 _AROUND_M: Final = 0.6
-"""Planes are looked for so far around a spot."""
+"""Planes are looked for within this distance of a spot."""
 _MOVED_M: Final = 0.4
 """Largest distance that a spot is moved."""
 _THICK_M: Final = 0.02
@@ -99,5 +99,5 @@ def _fitted(points: F64) -> tuple[F64, float]:
 
 
 def _near(points: F64, found: list[tuple[F64, float]]) -> npt.NDArray[np.bool_]:
-    """(n, k) which of (n, 3) points are of which plane."""
+    """(n, k), which of (n, 3) points belong to which plane."""
     return np.stack([np.abs(points @ normal - height) < _THICK_M for normal, height in found], axis=1)

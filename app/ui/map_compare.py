@@ -22,7 +22,7 @@ from app.ui.widgets import Changes, Page, View, by_user, dialog, notify_error, p
 
 _BINS: Final = 41
 _LEAST_M: Final = 0.005
-"""The colours spread over at least so much to either side."""
+"""The colours cover at least this distance on either side."""
 _WHAT: Final = "How far each point of the map lies in front of the surface of another map, or behind it."
 _OLD: Final = "The map has changed since; what has no distance yet is grey. Compare again."
 
@@ -86,7 +86,7 @@ class MapComparePanel:
                 self._found.content = told(self._comparison, self._name, [_OLD] if old else [])
 
     def close(self) -> None:
-        """End what is under way."""
+        """Stop the comparison that is running, if any."""
         child, self._child = self._child, None
         if child is not None:
             child.close(0.0)

@@ -19,7 +19,7 @@ _INK: Final = {False: (236, 240, 244), True: (24, 32, 42)}
 _SMOOTH_M: Final = 1.5
 _STEP_M: Final = 0.1
 _AHEAD_M: Final = 4.0
-"""Where a flight looks: so far along the path."""
+"""Where a flight looks: this far ahead along the path."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

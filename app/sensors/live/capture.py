@@ -206,7 +206,7 @@ class CaptureStream:
         return tuple(found)
 
     def _device_findings(self) -> list[Finding]:
-        """What the sensor states of itself."""
+        """What the sensor states about itself."""
         if not self._device.has_angles:
             return [Finding("sensor", "fine", self._model)]
         device = self._devices[0][1] if self._devices else None

@@ -147,7 +147,7 @@ def _turn(scan: Scan, calibration: ChannelAngles, model: Model, rate_hz: int) ->
     step = 360.0 * rate_hz * model.block_ns * 1e-9
     x, y = scan.points[:, 0].astype(np.float64), scan.points[:, 1].astype(np.float64)
     flat = np.hypot(x, y)
-    # Near the zenith the azimuth says little, and the lever matters much.
+    # Near the zenith the azimuth is uncertain, and the lever matters.
     good = (calibration.elevations_deg[channel] < 60.0) & (flat > 0.5)
     if not good.any():
         good = np.ones(len(x), bool)

@@ -30,7 +30,7 @@ _LATE = 64
 
 @dataclass(frozen=True, slots=True)
 class _Head:
-    """What a packet of measurements states of itself: who sent it, when (None: without a date), and its number."""
+    """What a packet of measurements states about itself: who sent it, when (None: without a date), and its number."""
 
     sensor: Model | Livox
     stamp_ns: int | None

@@ -41,7 +41,7 @@ class Imperfections:
         lost: share of IMU samples that are missing. jitter: s, spread of their stamps. late: s by which the IMU's
             clock is late [USB and serial links].
         companions: people ahead of, behind and in front of the operator, 1-3 m away; at most 3.
-        hand: how many times the usual motion of the hand; 0: once.
+        hand: factor on the usual motion of the hand; 0 counts as 1.
     """
 
     elevation: float = 0.0
@@ -156,7 +156,7 @@ class Unit:
 
 
 def livelier(walker: Walker, times: float) -> Walker:
-    """The same walker with a hand that moves so many times as much; 0: once."""
+    """The same walker with a hand that moves `hand` times as much; 0 counts as 1."""
     moved = {name: getattr(walker, name) * (times or 1.0) for name in ("bob", "sway", "pitch", "roll", "yaw")}
     return replace(walker, **moved)
 
@@ -190,5 +190,5 @@ def _direction(rng: np.random.Generator) -> F64:
 
 
 def _matrix(scale: float, skew: float, rng: np.random.Generator) -> F64:
-    """What an IMU's axes make of a true vector: scale errors on the diagonal, misalignment beside it."""
+    """The matrix that maps a true vector to an IMU's axes: scale errors on the diagonal, misalignment beside it."""
     return np.asarray(np.eye(3) + np.where(np.eye(3) > 0, scale, skew) * rng.normal(size=(3, 3)))

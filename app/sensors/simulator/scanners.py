@@ -23,7 +23,7 @@ _RATE_HZ = 10
 _RING_DEG = 2.0
 _MID360_RATE_HZ = 200_000
 _MID360_BLOCK = 20
-"""Firings within which the motion is taken for straight: 0.1 ms."""
+"""Firings within which the motion is taken as straight: 0.1 ms."""
 _MID360_LASERS = 4
 
 

@@ -111,9 +111,7 @@ def _edit(entry: object) -> LoopEdit:
             f" {_AT_ONCE}`; or `override: fix 12`."
         )
     (verb,) = verbs
-    entry = {
-        name: value for name, value in entry.items() if name != "since"
-    }  # older files hold it; it said nothing new
+    entry = {name: value for name, value in entry.items() if name != "since"}  # older files hold it; it added nothing
     known = _names(_VERBS[verb])
     if unknown := sorted(str(name) for name in entry.keys() - {verb, *known}):
         raise HemislamError(f"{verb} has no {unknown[0]}; it takes {' and '.join(known) or 'nothing else'}.")

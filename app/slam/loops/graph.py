@@ -86,7 +86,7 @@ def optimum(poses: F64, factors: Sequence[Closing]) -> F64:
 
 
 def failure(factor: Closing) -> str:
-    """What to say of a factor that the solver failed with."""
+    """The notice about a factor that the solver failed with."""
     if isinstance(factor, PositionPrior):
         return f"The solver failed with the position of keyframe {factor.keyframe}; it is left out."
     if factor.robust:

@@ -30,14 +30,14 @@ _HELD = 1e-6
 """Standard deviation (rad, m) with which the first pose is held."""
 _FIRST = np.full(6, _HELD)
 _FREE = np.repeat((np.radians(1.0), 100.0), 3)
-"""If position priors say where it is."""
+"""The same if position priors determine the position."""
 
 
 def optimise(first: F64, factors: Sequence[Closing], start: Sequence[F64] | F64, *, free: bool = False) -> F64:
     """(n, 4, 4) the optimum of all factors at once, by Levenberg-Marquardt from (n, 4, 4) `start`.
 
     Args:
-        free: the first pose is not held but by a degree; position priors say where it is.
+        free: the first pose is held to a degree of rotation only; position priors determine the rest.
 
     Raises:
         ArithmeticError: the solver failed.

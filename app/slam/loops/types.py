@@ -38,7 +38,7 @@ class Origin(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What speaks for and against one candidate; nan where it was not measured.
+    """The evidence for and against one candidate; nan where it was not measured.
 
     Attributes:
         context_distance: of the two Scan Contexts at the best column shift, 0 (same) to 1.
@@ -69,7 +69,7 @@ class Evidence:
         return self.alternative_m < float("inf")
 
     def against_odometry(self, most_sigmas: float) -> str:
-        """What odometry says, in words."""
+        """What odometry predicts, in words."""
         return (
             f"odometry rules it out: {self.mahalanobis:.1f} σ (most {most_sigmas:g} σ, one being {self.gate_m:.2f} m)"
         )

@@ -22,8 +22,8 @@ SURE_M = 0.1
 OPEN_M = 10.0
 """Standard deviation of a registration along a direction that nothing holds."""
 FLOOR_M, FLOOR_YAW, FLOOR_TILT = 0.04, np.radians(0.5), np.radians(1.5)
-"""Least standard deviations of a registration, however many points it has. An error of the mounting tilts clouds to
-another side at another heading; gravity, in the odometry, knows better."""
+"""Least standard deviations of a registration, however many points it has. A mounting error tilts clouds differently at
+different headings, so odometry, which observes gravity, is better in roll and pitch."""
 NEAR_M = 5.0
 """Places farther apart are not tied: an error of 1 degree in the mounting moves one by 0.1 m as seen from the other."""
 POINT_M, INDEPENDENT = 0.1, 0.05
@@ -67,7 +67,7 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
 def _place(
     older: KeyframeId, newer: KeyframeId, detector: Detector, expectation: Expectation, params: LoopsParams
 ) -> Placement:
-    """Where the newer place lies on the older one, searched as far as odometry might be off."""
+    """The alignment of the newer place with the older one, searched as far as odometry may be off."""
 
     def deviation(T_level: F64) -> float:
         return expectation.mahalanobis(older, _imu(detector, older, newer, T_level))
@@ -80,7 +80,7 @@ def _place(
 
 
 def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
-    """A loop that the user proposes, as registered from its guess; without one, as odometry and structure have it."""
+    """A loop that the user proposes, registered from its guess; without one, from where odometry and structure put it."""
     older, newer = edit.older, edit.newer
     poses = detector.poses
     T_older_newer = np.array(edit.guess) if edit.guess else lie.inverse(poses[older]) @ poses[newer]

@@ -1,8 +1,8 @@
-"""Verification: register one submap to another and measure what speaks for the result.
+"""Verification: register one submap to another and measure the evidence for the result.
 
 Point to plane, between points whose surroundings are flat in both submaps and face the same way: the two sides of a
-wall, seen on the way there and on the way back, are often nearer to each other than a guess is wrong. small_gicp finds
-the neighbours, on one thread, so that the result is the same every time.
+wall, seen on the way there and on the way back, are often nearer to each other than the error of a guess. small_gicp
+finds the neighbours, on one thread, so that the result is the same every time.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ PARTNER_M = 0.3
 COMMON_M = 15.0
 """Overlap is judged on points this near to both keyframes: there both submaps are dense."""
 LEAST_UPRIGHT = 50
-"""So few points that stand upright near both keyframes say nothing."""
+"""With fewer upright points than this near both keyframes, overlap is not evidence."""
 DISTURBANCE_M = 0.4
 """How far the test for sliding pushes the result along its weakest direction."""
 
@@ -68,7 +68,7 @@ class Prepared:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How well a source submap lies on a target.
+    """How well a source submap fits a target.
 
     Attributes:
         T_target_source: (4, 4), level frames. overlap: 0-1. residuals: (k,) m, point to plane.
@@ -93,7 +93,7 @@ class Fit:
 
     @property
     def directions(self) -> F64:
-        """(3, 3) unit, target's axes, one a row: of translation, those that the points say least about first."""
+        """(3, 3) unit, target's axes, one a row: directions of translation, least constrained by the points first."""
         return np.asarray(np.linalg.eigh(self._translation())[1].T)
 
     def _translation(self) -> F64:

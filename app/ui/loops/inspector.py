@@ -1,4 +1,4 @@
-"""Everything about one loop: its numbers, its contexts, its residuals, and both submaps laid over each other."""
+"""Everything about one loop: its numbers, its contexts, its residuals, and both submaps superimposed."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ def without_ceiling(points: F32) -> F32:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairing:
-    """Two clouds to be laid over each other, each in a frame of its own.
+    """Two clouds to be superimposed, each in a frame of its own.
 
     Attributes:
         older, newer: (n, 3). T_map_older: (4, 4) of the older cloud's frame.
@@ -177,7 +177,7 @@ class Inspector:
         self._residuals.scales = {"x": {"time": False}, "y": {"range": (0.0, float(outline[1].max()))}}
 
     def draw_scene(self, snapshot: Snapshot, chosen: Pair | None, view: View) -> None:
-        """Lay the submaps into the scene, as far between the two poses as the slider says."""
+        """Place the submaps in the scene, as far between the two poses as the slider is."""
         detail, poses = _detail(snapshot, chosen), poses_of(snapshot)
         if detail is None or chosen is None or chosen[1] >= len(poses):
             self._pairing = None
