@@ -149,7 +149,7 @@ class Metadata:
 
 
 def metadata_beside(capture: Path) -> Metadata | None:
-    """The .json with the capture's name, or NAME_0; else the one with the longest name that the capture's begins with."""
+    """That of the .json with the capture's name, or NAME_0; else of the longest name that the capture's begins with."""
     named = (capture.stem, f"{capture.stem}_0")
     beside = [
         path for path in capture.parent.glob("*.json") if path.stem in named or capture.stem.startswith(path.stem)

@@ -178,7 +178,7 @@ class CaptureStream:
         following = [*samples[1:, 0].tolist(), None]
         for (stamp, log_ns), after in zip(samples.tolist(), following, strict=False):
             if imu.jumps(stamp, log_ns) and (after is None or abs(after - stamp) > JUMP_NS):
-                continue  # one wrong stamp, not a clock that was set
+                continue  # a single wrong stamp, not a clock that was set
             shift = imu.map(stamp, log_ns, lidar) - stamp
             if not self._imu_shifts or abs(shift - self._imu_shifts[-1][1]) > 10_000:
                 self._imu_shifts.append((log_ns, shift))

@@ -170,7 +170,7 @@ class LiveClient:
         return state
 
     def kept(self) -> None:
-        """Say that nobody will ask again for the scans up to this place."""
+        """State that nobody will ask for the scans up to this place again."""
         self._ask("kept", self.place)
 
     def close(self) -> None:

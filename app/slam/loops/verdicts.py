@@ -80,7 +80,7 @@ def _place(
 
 
 def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
-    """A loop that the user proposes, registered from its guess; without one, from where odometry and structure put it."""
+    """A loop that the user proposes, registered from its guess, or else from where odometry and structure put it."""
     older, newer = edit.older, edit.newer
     poses = detector.poses
     T_older_newer = np.array(edit.guess) if edit.guess else lie.inverse(poses[older]) @ poses[newer]
