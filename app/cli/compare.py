@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from app.cli.options import progress_bar
+from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
     from app.evaluation.cloud_distance import Comparison
@@ -39,6 +40,8 @@ def compare(
     from app.evaluation import cloud_distance
     from app.evaluation.map_comparison import read_map, sentences
 
+    if out is not None:
+        _check(out, map_, other)
     points, sensors = read_map(map_)
     with progress_bar("Comparing", total=1.0, bar_format="{desc}: {percentage:3.0f}% |{bar}| {elapsed}") as show:
         found = cloud_distance.compare(points, sensors, read_map(other)[0], reach=reach, fit=fit, progress=show)
@@ -49,6 +52,14 @@ def compare(
     if out is not None:
         _write(out, points, found)
         typer.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+
+
+def _check(out: Path, *maps: Path) -> None:
+    """Refuse, before the work, what cannot be written or would replace what is compared."""
+    if out.is_dir() or not out.parent.is_dir():
+        raise HemislamError(f"{out} cannot be written; choose a file in a folder that exists as --out.")
+    if out.resolve() in {(path / "map.ply" if path.is_dir() else path).resolve() for path in maps}:
+        raise HemislamError(f"{out} is a map to compare; choose another file as --out.")
 
 
 def _write(path: Path, points: "F64", found: "Comparison") -> None:

@@ -143,6 +143,10 @@ def compare(
             own.edge, RADII_M, reach, LEAST, out[part],
         )  # fmt: skip
         progress(min((begin + _BATCH) / len(cores), 1.0))
+    if np.isnan(out[:, 0]).all():
+        raise HemislamError(
+            f"No surface of one map lies within {reach:g} m of the other; they are apart or too sparse."
+        )
     about = np.eye(4)
     about[:3, :3], about[:3, 3] = T[:3, :3], T[:3, 3] + origin - T[:3, :3] @ origin
     return Comparison(out[core_of, 0], out[core_of, 1], about)

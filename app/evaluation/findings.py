@@ -95,7 +95,8 @@ def _mishaps(recordings: Sequence[Evaluated]) -> list[Claim]:
                 found.append(f"{who}: lost in {run['lost']} of {run['frames']} frames.")
             if run.get("dropped"):
                 found.append(f"{who}: {sum(run['dropped'].values())} scans were dropped.")
-    for text, names in missing.items():
+    for sentence, names in missing.items():
+        text = sentence.rstrip(".")
         found.append(f"{text}." if len(names) == len(recordings) else f"{', '.join(names)}: {text}.")
     return [Claim(text, np.inf) for text in found]
 

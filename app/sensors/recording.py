@@ -17,6 +17,7 @@ from app.sensors.navsat import fix_of, navsat_topic
 from app.sensors.pointcloud import decode, read_scan
 from app.sensors.presets import preset_for
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu, usable_types
+from app.sensors.rings import line_findings
 from app.sensors.ros import stamp_ns
 from app.sensors.sequencer import Sequencer
 from app.sensors.source import Mark, Source
@@ -104,6 +105,7 @@ class Recording:
             *overlap_finding(np.array(scan_times, np.int64), self.lidar_topic),
             *probe_findings,
             *cloud_findings,
+            *line_findings(scans, self.has_lines, params.sensor),
             *imu_findings,
         )
 

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from app.sensors.cloud_types import CloudMessage, CloudType, Probe
 from app.sensors.findings import Finding
-from app.slam.types import F32, F64, I64, U16
+from app.slam.sections import SensorParams
+from app.slam.types import F32, F64, I64, U16, Scan
 
 _ENOUGH = 50_000
 """Points that suffice to separate the lines."""
@@ -95,6 +96,17 @@ def settle_rings(probes: list[Probe], kind: CloudType, names: dict[str, str]) ->
         text = f"{why}; {lines} scan lines were separated by their elevation"
         return Rings(bounds=bounds, centre=centre), Finding("ring order", "corrected", text)
     return _settle_steps(points, f"{why}, and no scan lines can be told apart")
+
+
+def line_findings(scans: list[Scan], has_lines: bool, params: SensorParams) -> list[Finding]:
+    """Corrections of scan lines that are not as many as the lines of a recording's first scans."""
+    found, lines = [], 1 + max(int(scan.ring.max()) for scan in scans if len(scan)) if has_lines else 0
+    for name in ("elevation_corrections", "range_corrections"):
+        if (given := len(getattr(params, name).split())) not in (0, lines):
+            there = f"the LiDAR has {lines} scan lines" if has_lines else "the LiDAR has no scan lines"
+            text = f"`sensor.{name}` holds {given} numbers, but {there}; take those of this LiDAR, or none"
+            found.append(Finding("scan lines", "needs you", text, f'--set sensor.{name}=""'))
+    return found
 
 
 def _settle_steps(points: F32, why: str) -> tuple[Rings, Finding]:

@@ -234,9 +234,13 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
         offset: Annotated[int, Query(ge=0)],
         size: Annotated[int, Query(ge=1)],
         piece: Annotated[bytes, Body(media_type="application/octet-stream")],
+        copy: Annotated[str, Query(pattern="^[0-9a-z]{0,16}$")] = "",
     ) -> None:
-        """Copy a recording into the first folder, piece by piece: `offset` bytes of `size` came before this one."""
-        receive(folders, name, offset, size, piece)
+        """Copy a recording into the first folder, piece by piece: `offset` bytes of `size` came before this one.
+
+        `copy` is the same for all pieces and another one for every copy.
+        """
+        receive(folders, name, offset, size, piece, copy)
 
     @router.delete("/recordings/{name}", status_code=204)
     def discard_upload(name: str) -> None:

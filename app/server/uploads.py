@@ -1,5 +1,6 @@
 """Recordings that are dropped on the page: they arrive piece by piece, each no longer than any other request."""
 
+import glob
 import shutil
 from pathlib import Path
 from typing import Final
@@ -15,11 +16,12 @@ _LEFT_FREE: Final = 1 << 30
 """Bytes of the disk that uploads leave free."""
 
 
-def receive(folders: Folders, name: str, offset: int, size: int, piece: bytes) -> None:
+def receive(folders: Folders, name: str, offset: int, size: int, piece: bytes, copy: str = "") -> None:
     """Append a piece of a file to it in the first folder. With its last piece it gets its name.
 
     Args:
         offset: bytes that came before. size: of the whole file, bytes.
+        copy: letters that tell this copy from others of the same name. The one that begins last goes on.
 
     Raises:
         HemislamError: the name or the size cannot be taken, a piece is missing, or it cannot be written.
@@ -29,15 +31,15 @@ def receive(folders: Folders, name: str, offset: int, size: int, piece: bytes) -
         raise HemislamError(f"{name} is in {there.parent} already; open it there, or rename the one that you drop.")
     if offset + len(piece) > size:
         raise HemislamError(f"{name} has grown while it was copied; drop it again when it is complete.")
-    part = _part(there)
+    part = _part(there, copy)
     try:
         if offset == 0:
             if shutil.disk_usage(there.parent).free < size + _LEFT_FREE:
                 raise HemislamError(f"{name} does not fit on the disk of {there.parent}; make room there.")
-            part.unlink(missing_ok=True)
+            discard(folders, name)
+        elif not part.exists() or part.stat().st_size != offset:
+            raise HemislamError(f"A piece of {name} is missing; drop it again.")
         with part.open("ab") as file:
-            if file.tell() != offset:
-                raise HemislamError(f"A piece of {name} is missing; drop it again.")
             file.write(piece)
         if offset + len(piece) == size:
             part.rename(there)
@@ -47,7 +49,9 @@ def receive(folders: Folders, name: str, offset: int, size: int, piece: bytes) -
 
 def discard(folders: Folders, name: str) -> None:
     """Remove the pieces of a file that did not arrive as a whole. Raises HemislamError as `receive` does."""
-    _part(_place(folders, name)).unlink(missing_ok=True)
+    there = _place(folders, name)
+    for part in there.parent.glob(f".{glob.escape(name)}.*.part"):
+        part.unlink(missing_ok=True)
 
 
 def _place(folders: Folders, name: str) -> Path:
@@ -60,6 +64,6 @@ def _place(folders: Folders, name: str) -> Path:
     return folders.roots[0] / name
 
 
-def _part(there: Path) -> Path:
+def _part(there: Path, copy: str) -> Path:
     """Where a file is until it is complete; names that begin with a dot are not listed."""
-    return there.with_name(f".{there.name}.part")
+    return there.with_name(f".{there.name}.{copy}.part")

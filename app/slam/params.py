@@ -147,6 +147,8 @@ class Leaf:
             return "one of " + ", ".join(self.choices)
         if isinstance(self.default, bool):
             return "true or false"
+        if isinstance(self.default, str) and self.unit:
+            return "numbers with spaces between, in quotes, such as '0.01 -0.02'"
         if isinstance(self.default, str):
             return f"a text ({self.meaning.removesuffix('.')})"
         limits = f"from {self.minimum:g} to {self.maximum:g} {self.unit}".rstrip()

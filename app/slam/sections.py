@@ -16,7 +16,7 @@ Effect = Literal["now", "frame", "restart"]
 Metres = Annotated[float, Field(ge=-100, le=100)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 AxesName = Annotated[str, Field(pattern=r"^-?(x-?(y-?z|z-?y)|y-?(x-?z|z-?x)|z-?(x-?y|y-?x))$")]
-PerLine = Annotated[str, Field(pattern=r"^ *(-?\d+(\.\d*)?( +|$))*$", max_length=4000)]
+PerLine = Annotated[str, Field(pattern=r"^ *(-?\d{1,2}(\.\d*)?( +|$))*$", max_length=4000)]
 
 
 def _param(

@@ -59,6 +59,21 @@ def test_what_is_no_map_is_refused(results: Path, hemislam: Call, tmp_path: Path
     assert "cannot be read" in hemislam("compare", tmp_path, results).refused()
     away = write(tmp_path / "away.ply", exact(10) + 50.0)
     assert "do not lie on each other" in hemislam("compare", results, away).refused()
+    few = write(tmp_path / "few.ply", exact(3))
+    assert "too sparse" in hemislam("compare", results, few).refused()
+
+
+def test_a_comparison_replaces_no_map_and_needs_a_folder_that_exists(
+    results: Path, hemislam: Call, tmp_path: Path
+) -> None:
+    other = write(tmp_path / "other.ply", exact(10))
+    for out, says in (
+        (other, "a map to compare"),
+        (results / "map.ply", "a map to compare"),
+        (tmp_path / "nowhere" / "apart.ply", "cannot be written"),
+        (tmp_path, "cannot be written"),
+    ):
+        assert says in hemislam("compare", results, other, "--out", out).refused()
 
 
 @pytest.fixture(scope="module")

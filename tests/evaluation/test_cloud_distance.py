@@ -58,7 +58,8 @@ def test_what_the_other_map_does_not_show_has_no_distance() -> None:
     found = from_above(points, other[other[:, 0] < 2.0])
     missing = np.isnan(found.distance)
     assert missing[points[:, 0] > 2.5].all() and not missing[points[:, 0] < 1.9].any()
-    assert np.isnan(from_above(floor(0.9), floor(0.0)).distance).all(), "beyond reach"
+    with pytest.raises(HemislamError, match=r"within 0\.5 m"):
+        from_above(floor(0.9), floor(0.0))
     assert from_above(floor(0.9), floor(0.0), reach=1.2).median == pytest.approx(0.9, abs=1e-3)
 
 

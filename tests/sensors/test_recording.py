@@ -207,3 +207,16 @@ def test_the_recordings_of_others_read_whole(shared_data: Path, name: str, count
     assert "of the last point" in findings["header stamp"].text
     assert "one turn in 0.100" in findings["rotation"].text
     assert findings["mount"].verdict == "needs you"
+
+
+@pytest.mark.parametrize(
+    ("given", "is_told"), [("0.1 " * 8, False), ("", False), ("0.1 -0.1", True), ("0.1 " * 9, True)]
+)
+def test_corrections_of_another_lidars_lines_are_told(tmp_path: Path, given: str, is_told: bool) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=3, columns=12))
+    params = Params().with_values({"sensor.range_corrections": given})
+    with open_recording(path, params) as recording:
+        told_of = [finding for finding in recording.findings if finding.subject == "scan lines"]
+    assert bool(told_of) == is_told
+    if is_told:
+        assert f"holds {len(given.split())} numbers, but the LiDAR has 8 scan lines" in told_of[0].text

@@ -16,9 +16,11 @@ PIECE = 1000
 WALK = bytes(range(256)) * 10
 
 
-def put(site: Site, name: str, offset: int, piece: bytes, size: int = len(WALK), **headers: str) -> httpx.Response:
+def put(
+    site: Site, name: str, offset: int, piece: bytes, size: int = len(WALK), copy: str = "", **headers: str
+) -> httpx.Response:
     kind = {"Content-Type": "application/octet-stream", **headers}
-    params = {"offset": offset, "size": size}
+    params = {"offset": offset, "size": size, "copy": copy}
     return httpx.put(site.url(f"/api/recordings/{name}"), params=params, content=piece, headers=kind)
 
 
@@ -57,6 +59,15 @@ def test_a_missing_piece_is_told_and_the_copy_begins_anew(site: Site) -> None:
     assert "grown" in put(site, "gap.mcap", PIECE, WALK).json()["detail"]
     assert put(site, "gap.mcap", 0, WALK).status_code == 204
     assert (site.folder / "gap.mcap").read_bytes() == WALK
+
+
+def test_two_pages_that_copy_files_of_one_name_never_mix_them(site: Site) -> None:
+    other = WALK[::-1]
+    put(site, "both.mcap", 0, WALK[:PIECE], copy="a")
+    put(site, "both.mcap", 0, other[:PIECE], copy="b")
+    assert "missing" in put(site, "both.mcap", PIECE, WALK[PIECE:], copy="a").json()["detail"]
+    assert put(site, "both.mcap", PIECE, other[PIECE:], copy="b").status_code == 204
+    assert (site.folder / "both.mcap").read_bytes() == other
 
 
 def test_a_copy_that_is_given_up_leaves_nothing(site: Site) -> None:

@@ -26,6 +26,7 @@ if (!window.hemislamDrop) {
   const copy = async (file) => {
     show('<span></span><progress max="100"></progress><button class="hs-button">Cancel</button>', true);
     const bar = box.querySelector('progress');
+    const key = Math.random().toString(36).slice(2, 12);
     let going = true;
     box.querySelector('span').textContent = `Copying ${file.name} …`;
     box.querySelector('button').onclick = () => { going = false; };
@@ -35,7 +36,7 @@ if (!window.hemislamDrop) {
         throw new Error(`${file.name} was not copied.`);
       }
       const piece = file.slice(at, at + PIECE);
-      await ask(`/${encodeURIComponent(file.name)}?offset=${at}&size=${file.size}`,
+      await ask(`/${encodeURIComponent(file.name)}?offset=${at}&size=${file.size}&copy=${key}`,
         {method: 'PUT', body: await piece.arrayBuffer(), headers: {'Content-Type': 'application/octet-stream'}});
       bar.value = 100 * (at + piece.size) / file.size;
     }
