@@ -1,8 +1,8 @@
-"""How far one map lies in front of another, along the surface's normal, and how small a distance could be told.
+"""How far one map lies in front of another, along the surface's normal, and the smallest distance that is not chance.
 
 After M3C2: Lague, Brodu, Leroux 2013, "Accurate 3D comparison of complex topography with terrestrial laser scanner".
-Other than there, each point has the smallest scale at which its surroundings are a plane, and of the other map only the
-layer of points counts that is nearest: behind a thin wall there is often another surface.
+Unlike there, each point has the smallest scale at which its surroundings are a plane, and only the nearest layer of the
+other map counts: behind a thin wall there is often another surface.
 """
 
 from collections.abc import Callable
@@ -18,12 +18,12 @@ from app.slam.kernels import cells
 from app.slam.types import F32, F64, I64
 
 THIN_M: Final = 0.01
-"""Maps that are read are thinned to this: a wider voxel would pull means towards the middle of voxels."""
+"""Maps are thinned to this when read: a wider voxel would pull means towards the middle of voxels."""
 CORE_M: Final = 0.1
 """Distances are measured once in each voxel of this size."""
 RADII_M: Final = np.array([0.1, 0.2, 0.4])
 LEAST: Final = 5
-"""Points that a mean needs."""
+"""Fewest points that a mean is computed from."""
 REACH_M: Final = 0.5
 """Farther surfaces are not the same one."""
 _FIT_VOXEL_M: Final = 0.2
@@ -84,7 +84,7 @@ class Comparison:
 
     @property
     def changed(self) -> float:
-        """Share of those whose distance is no chance."""
+        """Share of those whose distance is more than chance."""
         return float(np.count_nonzero(np.abs(self.distance) > self.detectable)) / max(len(self.known), 1)
 
     @property

@@ -25,7 +25,7 @@ _OF_A_GRID_M: Final = 20_000.0
 """Coordinates beyond this are those of a grid on Earth: no walk is so long."""
 _ABOVE_M: Final = 100.0
 _READ: Final = 0.3
-"""Share of the work that reading the other map is."""
+"""Share of the work that goes into reading the other map."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +44,7 @@ class MapsToCompare:
 
     Attributes:
         other: a map (PLY, LAS, LAZ), or, if `by_truth`, the file of the true trajectory.
-        where: on Earth the map is, for other maps in coordinates of a grid. fit, reach: as `compare` has them.
+        where: on Earth the map is, for other maps in coordinates of a grid. fit, reach: as in `compare`.
     """
 
     scans: tuple[KeyframePoints, ...]
@@ -106,7 +106,7 @@ def read_map(path: Path) -> tuple[F64, F64]:
 
 
 def sentences(found: Comparison, name: str) -> list[str]:
-    """What a comparison with a map of this name says beside its distances."""
+    """What a comparison with a map of this name found besides distances, in sentences."""
     moved = float(np.linalg.norm(found.T[:3, 3]))
     turned = float(np.degrees(np.linalg.norm(lie.log(found.T[:3, :3]))))
     return [

@@ -133,7 +133,7 @@ class KeyframeStore:
             IndexError: there never were so many, or others have been put in their place since.
         """
         if not self._ends:
-            return  # a new engine goes on from another one's checkpoint: the map before is with that one
+            return  # a new engine continues from another engine's checkpoint, which still holds the earlier map
         if not 0 <= count <= len(self._ends):
             raise IndexError(f"{count} of {len(self._ends)} keyframes")
         self._count = count

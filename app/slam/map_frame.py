@@ -32,7 +32,7 @@ class MapFrame:
         return self.at(len(self.T_map_odom))
 
     def over(self, frame: "MapFrame") -> "MapFrame":
-        """These corrections of the map that another one's lead to."""
+        """These corrections applied after those of another frame, which lead from odometry to this one."""
         if not len(self.T_map_odom):
             return frame
         count = max(len(self.T_map_odom), len(frame.T_map_odom))

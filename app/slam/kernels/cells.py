@@ -1,4 +1,4 @@
-"""Points in a cone; points sorted by cubes: how many are around a point, and how far two clouds are apart there."""
+"""Points in a cone; points sorted by cubes: the number around a point, and the distance of two clouds there."""
 
 import math
 
@@ -10,7 +10,7 @@ from app.slam.kernels.small import plane_of
 HALF = 1 << 20
 """Cubes are counted from -HALF to HALF along each axis, so that three numbers fit into one key."""
 MOST = 4096
-"""Points of a cloud that a mean is made of."""
+"""Most points of a cloud that a mean is computed from."""
 
 
 @njit(cache=True, nogil=True)
@@ -149,7 +149,7 @@ def _heights(points, keys, starts, edge, x, y, z, normal, radius, reach, out):
 
 @njit(cache=True)
 def _layer(heights, n, at, window):
-    """Of the heights around `at`: number, mean and variance. The mean moves a few times to the middle of its layer."""
+    """Number, mean and variance of the heights around `at`; a few steps move `at` to the middle of its layer."""
     count, mean, var = 0, at, 0.0
     for _ in range(4):
         count, s, ss = 0, 0.0, 0.0
@@ -171,7 +171,7 @@ def _layer(heights, n, at, window):
 def distances(
     cores, sensors, own, own_keys, own_starts, other, other_keys, other_starts, edge, radii, reach, least, out
 ):
-    """How far the own cloud lies in front of the other one at the cores (n, 3) f32, m.
+    """How far our own cloud lies in front of the other one at the cores (n, 3) f32, m.
 
     sensors (n, 3) f32: the sides from which the surface is seen. own, other (k, 3) f32, sorted into cubes as in
     `count_around`. radii (r,): scales, ascending; the first at which the own cloud is a plane is taken, else the last.
