@@ -34,7 +34,7 @@ check: $(VENV)/.installed-dev ## Check format, lint, types and the direction of 
 docs: $(VENV)/.installed-dev ## Build the documentation as a site in build/site/.
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-pictures: $(VENV)/.installed-dev ## Make every picture of docs/ and the README anew; needs chromium.
+pictures: $(VENV)/.installed-dev ## Make every picture of docs/ and the README again; needs chromium.
 	$(BIN)/python docs/pictures.py
 
 bench: $(VENV)/.installed-dev ## Time the engine stage by stage and the page; adds to benchmarks/results.csv.

@@ -57,7 +57,7 @@ def georeference(
 ) -> None:
     """Georeference a map by satellite fixes or control points.
 
-    Fixes only rotate the map about the vertical and shift it; with --factors they bend it, too. The offset of the
+    Fixes rotate and shift the map and correct its tilt; with --factors they bend it, too. The offset of the
     receiver's clock is estimated by comparing the motion, and so is the lever arm if it is not given and the motion
     determines it. Fixes that contradict the others are rejected and listed.
 

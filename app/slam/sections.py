@@ -164,7 +164,7 @@ class ImuParams(Section):
     start_duration: float = _on_restart(
         1.0, "Time at rest that the start waits for, to measure biases and gravity.", (0.1, 10, 0.1), "s"
     )
-    learn_clock: bool = _next_frame(True, "Learn how late the IMU's clock is, and move its stamps by that.")
+    learn_clock: bool = _next_frame(True, "Learn the offset of the IMU's clock and correct its stamps.")
     max_gap: float = _next_frame(
         0.1, "A longer gap between IMU samples is reported and bridged with a wide covariance.", (0.005, 5, 0.005), "s"
     )
@@ -199,7 +199,7 @@ class FilterParams(Section):
         1.0, "Map points farther than this from a point are not its neighbours.", (0.2, 5, 0.1), "m"
     )
     estimate_extrinsics: bool = _next_frame(False, "Estimate the LiDAR's pose on the IMU while mapping.")
-    learn_lines: bool = _next_frame(True, "Learn each scan line's errors of range and elevation, and take them off.")
+    learn_lines: bool = _next_frame(True, "Learn each scan line's range and elevation errors and correct them.")
 
 
 class MapParams(Section):
