@@ -267,7 +267,8 @@ class LoopSchedule:
         if self._at_end:
             counts = range(count, count + (count % EVERY == 0))
         for moment in (self._wanted, *map(Moment, counts)):
-            if moment != self._shown and moment not in self._states and moment not in outstanding:
+            unknown = moment != self._shown and moment not in self._states and moment not in outstanding
+            if unknown and moment >= self._wanted:  # an earlier one would not be stored, and be asked for again
                 self._ask(Ask(Target(moment.count, self._edits, moment.finished)))
 
     def _ask_for_user(self, request: UserRequest) -> None:

@@ -41,6 +41,7 @@ class Worker:
 
     def send(self, request: Request) -> None:
         self.requests.append(request)
+        assert len(self.requests) < 10_000, "questions never end"
         if isinstance(request, AddKeyframe):
             index = request.keyframe.index
             assert index <= len(self.params), "keyframes come in their order"

@@ -144,13 +144,16 @@ def test_a_session_that_never_goes_back_keeps_no_past_states(session: HeldSessio
 
 
 @pytest.mark.parametrize("speed", [0, 1, 100])
-def test_if_only_results_are_wanted_no_frame_waits_for_a_slow_search_and_they_are_the_same(speed: int) -> None:
+@pytest.mark.parametrize("frames", [100, 70])  # 34 keyframes; 24, after which a state is asked for
+def test_if_only_results_are_wanted_no_frame_waits_for_a_slow_search_and_they_are_the_same(
+    frames: int, speed: int
+) -> None:
     others = []
     for only_results in (False, True):
         session = HeldSession()
         if only_results:
             session.loops.only_results()
-        for _ in range(100):
+        for _ in range(frames):
             session.worker.answered = speed
             session.step()
             if only_results:
