@@ -31,6 +31,8 @@ from app.slam.provenance import hash_input
 CONNECT_S = 15.0
 LOOK_S = 0.5
 """How often it is looked whether workers have come or gone."""
+TAKE_S = 20.0
+"""How long a worker may take to hand over the files of a run. One that is dead never does."""
 PIECE = 16 << 20
 """Bytes of a recording that are sent at a time."""
 MOST_DEATHS = 3
@@ -116,9 +118,9 @@ class Cluster:
                 news.wait(LOOK_S)
                 news.clear()
                 for worker, (job, future) in list(running.items()):
-                    if future.done():
+                    if future.done() and (error := _taken(job, future)) is not None:
                         del running[worker]
-                        yield job, _taken(job, future)
+                        yield job, error
 
     @contextlib.contextmanager
     def _client(self) -> Iterator[Any]:
@@ -198,13 +200,19 @@ def _checked(client: Any, workers: dict[str, Any]) -> list[str]:
     return good
 
 
-def _taken(job: Job, future: Any) -> str:
-    """Write what a worker gave. Returns why there is nothing, "" if there is. Raises _Gone."""
+def _taken(job: Job, future: Any) -> str | None:
+    """Write what a worker gave. Raises _Gone.
+
+    Returns:
+        "" if there is something, why there is nothing, or None: the worker died before it handed the files over.
+    """
     if future.status == "cancelled":
         raise _Gone("The Dask scheduler is gone; start it and its workers again.")
     try:
-        files = future.result()
+        files = future.result(timeout=TAKE_S)
     except Exception as error:  # whatever went wrong there; Dask raises what the worker raised
+        if isinstance(error, TimeoutError) and future.status != "error":
+            return None
         return f"The worker failed: {str(error) or type(error).__name__}"
     if isinstance(files, str):
         return files
