@@ -88,7 +88,7 @@ class Looks:
         return self._above
 
     def point_size(self, least: float) -> float:
-        """m: of points that are large enough to see for whoever is nearest. It grows in steps, from `least`."""
+        """Point size in m, at least `least`, that the browser nearest to the map can see. It grows in steps."""
         pixels = [_pixel_m(client.camera) for client in self._server.get_clients().values()]
         wanted = _POINT_PX * min(pixels, default=0.0)
         return float(least * _STEP ** round(np.log(max(wanted / least, 1.0)) / np.log(_STEP)))

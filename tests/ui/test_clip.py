@@ -159,7 +159,7 @@ def test_the_profile_takes_the_place_of_the_map_and_gives_it_back(server: viser.
 
 # --- the panel -----------------------------------------------------------------------------------
 class Bench:
-    """A panel on the house, and an engine that does what it is told."""
+    """The clip panel on a map of a house, and a fake engine that applies the commands it receives."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.chunks, self.poses = house()
