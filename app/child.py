@@ -166,6 +166,13 @@ class Child(Link):
         except LinkClosed:
             raise ChildDied(self._title, self._exit_code()) from None
 
+    def news(self) -> Any:
+        """The next message if one has come, else None; if the child has died, why, in words."""
+        try:
+            return self.receive(0.0)
+        except ChildDied as death:
+            return str(death)
+
     def close(self, timeout: float | None = None) -> None:
         """Ask the child to end; kill it if it has not ended after the time (s; None: its grace), or at once if 0."""
         super().close()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from app.calibration.by_itself import is_mounting_unknown
-from app.child import Child, ChildDied, Link
+from app.child import Child, Link
 from app.server.protocol import LIVE, Restart, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
 from app.slam.errors import HemislamError
@@ -71,11 +71,7 @@ class CalibrationPanel:
         if not self._tried and not self._button.disabled and _helps(snapshot):
             self._begin(asked=False)
         while self._child is not None:
-            try:
-                message = self._child.receive(0.0)
-            except ChildDied as error:
-                message = str(error)
-            if message is None:
+            if (message := self._child.news()) is None:
                 return
             self._show(message)
 

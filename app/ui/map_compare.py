@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import viser
 
-from app.child import Child, ChildDied
+from app.child import Child
 from app.evaluation.cloud_distance import REACH_M, Comparison
 from app.evaluation.map_comparison import KeyframePoints, MapsToCompare, find, sentences
 from app.export.read_points import CLOUDS
@@ -120,10 +120,7 @@ class MapComparePanel:
 
     def _receive(self) -> None:
         while (child := self._child) is not None:
-            try:
-                message = child.receive(0.0)
-            except ChildDied as death:
-                message = str(death)
+            message = child.news()
             if child is not self._child:
                 return  # stopped meanwhile
             match message:

@@ -6,7 +6,7 @@ from typing import Any, Final, get_args
 
 import viser
 
-from app.child import Child, ChildDied
+from app.child import Child
 from app.mapping.painted import marks
 from app.server.fork import Workspace
 from app.server.protocol import LIVE, Snapshot
@@ -138,10 +138,7 @@ class TunePanel:
 
     def _receive(self) -> None:
         while (child := self._child) is not None:
-            try:
-                message = child.receive(0.0)
-            except ChildDied as death:
-                message = str(death)
+            message = child.news()
             if child is not self._child:
                 return  # stopped meanwhile
             match message:

@@ -23,7 +23,7 @@ class Process:
     def __init__(self, main: Any, *args: Any, **_: Any) -> None:
         self.arguments, self.messages, self.closed = args, [], False
 
-    def receive(self, timeout: float | None = None) -> Any:
+    def news(self) -> Any:
         return self.messages.pop(0) if self.messages else None
 
     def close(self, timeout: float | None = None) -> None:
