@@ -210,6 +210,17 @@ def test_how_it_died_is_said_in_a_sentence(deed: Callable[[Child], None], how: s
     child.close()
 
 
+def test_news_are_none_a_message_or_the_reason_of_death_in_words() -> None:
+    child = echoing()
+    assert child.receive(TIMEOUT_S) == "hello"
+    assert child.news() is None
+    os.kill(child.pid, signal.SIGKILL)
+    deadline = time.monotonic() + TIMEOUT_S
+    while (news := child.news()) is None:
+        assert time.monotonic() < deadline
+    assert news == "The echo ended unexpectedly (signal 9, SIGKILL)."
+
+
 def test_a_dead_child_leaves_no_thread_behind() -> None:
     before = threading.active_count()
     child = Child(hang, name="hang", title="The child")
