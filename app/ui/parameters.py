@@ -1,13 +1,16 @@
 """The parameter panel, generated from the one declaration (`app.slam.params.leaves`).
 
-A number has a slider over its range, or a box where the range has too many steps for a slider. M, α, σ and the voxel
-size come first, the others in a folder per section.
+A number has a slider over its range, and a vector one for each component. Where a range spans decades, the slider
+offers round values, and a box above it takes any other. M, α, σ and the voxel size come first, the others in a folder
+per section.
 
 Browsers and the engine may both change a value. What a user set is sent as a command; the snapshot's value flows back,
 except into a control that was touched a moment ago: an older snapshot must not move the slider under the hand.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final
 
 import viser
@@ -25,9 +28,13 @@ PRIMARY: Final = ("ground.scan_lines", "ground.alpha", "ground.sigma", "ground.v
 
 MARK: Final[dict[Effect, str]] = {"now": "", "frame": " ▸", "restart": " ↻"}
 _MOST_STEPS: Final = 2000
-"""Of a slider. The IMU's noise spans decades: its usual values would share the first few pixels."""
+"""Of a slider with even steps. The IMU's noise spans decades: its usual values would share the first few pixels."""
 _DIGITS: Final = 9
 """Most digits after the point that a box shows and takes."""
+_COMPONENTS: Final = {
+    "sensor.translation": ("translation x", "translation y", "translation z"),
+    "sensor.rotation": ("roll", "pitch", "yaw"),
+}
 _TYPING_S: Final = 0.5
 """A text is sent after this long without a change, and a slider that does not act at once after this long at rest."""
 _MOST_UNDONE: Final = 50
@@ -45,45 +52,90 @@ TITLES: Final = {
     "keyframe": "Keyframes",
 }
 
-Control = (
-    viser.GuiSliderHandle[Any]
-    | viser.GuiNumberHandle[Any]
-    | viser.GuiCheckboxHandle
-    | viser.GuiDropdownHandle[str]
-    | viser.GuiTextHandle
-    | viser.GuiVector3Handle
-)
+
+@dataclass(frozen=True, slots=True)
+class Widget:
+    """A widget of a parameter.
+
+    Attributes:
+        handle: viser's. shown: what it shows of a parameter's value. meant: the parameter's new value, from what the
+            widget shows and the present value.
+    """
+
+    handle: Any
+    shown: Callable[[Any], Any] = lambda value: value
+    meant: Callable[[Any, Any], Any] = lambda shown, _: shown
+
+    def show(self, value: Any) -> None:
+        show(self.handle, self.shown(value))
 
 
-def label(leaf: Leaf) -> str:
-    name = leaf.name.replace("_", " ")
+def label(leaf: Leaf, name: str = "") -> str:
+    """Name, unit, and when a change takes effect. name: in place of the parameter's own."""
+    name = name or leaf.name.replace("_", " ")
     if leaf.path in PRIMARY:
         name = leaf.symbol if leaf.symbol == "voxel" else f"{leaf.symbol} {name if leaf.symbol == 'M' else ''}".strip()
     unit = {"deg": "°"}.get(leaf.unit, leaf.unit)
     return f"{name} ({unit}){MARK[leaf.effect]}" if unit else f"{name}{MARK[leaf.effect]}"
 
 
-def add_control(gui: viser.GuiApi, leaf: Leaf, value: Any) -> Control:
-    control = _control(gui, leaf, value, label(leaf), leaf.help)
-    if not isinstance(leaf.default, int) and hasattr(control, "precision"):
-        control.precision = _DIGITS
-    return control
-
-
-def _control(gui: viser.GuiApi, leaf: Leaf, value: Any, text: str, hint: str) -> Control:
+def add_widgets(gui: viser.GuiApi, leaf: Leaf, value: Any) -> list[Widget]:
+    """The widgets of a parameter; the first takes any value of it, or of a component."""
+    text, hint = label(leaf), leaf.help
     if leaf.choices:
-        return gui.add_dropdown(text, leaf.choices, initial_value=value, hint=hint)
+        return [Widget(gui.add_dropdown(text, leaf.choices, initial_value=value, hint=hint))]
     if isinstance(leaf.default, bool):
-        return gui.add_checkbox(text, value, hint=hint)
+        return [Widget(gui.add_checkbox(text, value, hint=hint))]
     if isinstance(leaf.default, str):
-        return gui.add_text(text, value, hint=hint)
+        return [Widget(gui.add_text(text, value, hint=hint))]
     if isinstance(leaf.default, tuple):
-        return gui.add_vector3(text, value, step=leaf.step, hint=hint)
+        return [_component(gui, leaf, value, *entry) for entry in enumerate(_COMPONENTS[leaf.path])]
+    assert leaf.minimum is not None and leaf.maximum is not None and leaf.step is not None
+    if leaf.maximum - leaf.minimum <= _MOST_STEPS * leaf.step:
+        return [Widget(_slider(gui, leaf, value, text))]
+    box = gui.add_number(text, value, step=leaf.step, hint=hint)  # the engine says what is out of range
+    if not isinstance(leaf.default, int):
+        box.precision = _DIGITS
+    stops = round_values(leaf)
+    marks = ((0, f"{stops[0]:g}"), (len(stops) - 1, f"{stops[-1]:g}"))
+    at = _nearest(stops, value)
+    # Without a label, so that `viser_adapter.css` hides the slider's own box, which would show a place among the stops.
+    slider = gui.add_slider("", 0, len(stops) - 1, 1, at, hint=hint, marks=marks)
+    return [Widget(box), Widget(slider, lambda value: _nearest(stops, value), lambda place, _: stops[place])]
+
+
+def _slider(gui: viser.GuiApi, leaf: Leaf, value: Any, text: str) -> viser.GuiSliderHandle[Any]:
+    kind: Any = int if isinstance(leaf.default, int) else float
+    slider = gui.add_slider(text, kind(leaf.minimum), kind(leaf.maximum), kind(leaf.step), value, hint=leaf.help)
+    if kind is float:
+        slider.precision = _DIGITS
+    return slider
+
+
+def _component(gui: viser.GuiApi, leaf: Leaf, value: tuple[float, ...], index: int, name: str) -> Widget:
+    """A slider for one number of a vector."""
+    return Widget(
+        _slider(gui, leaf, value[index], label(leaf, name)),
+        lambda vector: vector[index],
+        lambda number, vector: (*vector[:index], number, *vector[index + 1 :]),
+    )
+
+
+def round_values(leaf: Leaf) -> tuple[float, ...]:
+    """1, 2 and 5 times the powers of ten within the range, on either side of zero, ascending."""
+    assert leaf.minimum is not None and leaf.maximum is not None and leaf.step is not None
     kind = type(leaf.default)
-    low, high, step = (None if limit is None else kind(limit) for limit in (leaf.minimum, leaf.maximum, leaf.step))
-    if low is not None and high is not None and step is not None and high - low <= _MOST_STEPS * step:
-        return gui.add_slider(text, low, high, step, value, hint=hint)
-    return gui.add_number(text, value, step=step, hint=hint)  # the engine says what is out of range
+    least = leaf.minimum if leaf.minimum > 0 else leaf.step
+    sizes = [float(f"{digit}e{power}") for power in range(-9, 10) for digit in (1, 2, 5)]
+    values = [*(-size for size in reversed(sizes)), 0.0, *sizes]
+    return tuple(kind(v) for v in values if leaf.minimum <= v <= leaf.maximum and (not v or abs(v) >= least))
+
+
+def _nearest(ascending: tuple[float, ...], value: float) -> int:
+    """The place of the value that is nearest, or of the smaller of the two around it."""
+    place = min(bisect_left(ascending, value), len(ascending) - 1)
+    before = max(place - 1, 0)
+    return place if ascending[place] - value < value - ascending[before] else before
 
 
 class ParameterHistory:
@@ -122,9 +174,10 @@ class ParameterPanel:
         gui = self._gui = page.gui
         self._send = page.send
         self._now = page.now
+        self._params = params
         self._edits: dict[str, Edit] = {}
         self._engine = 0
-        self._controls: dict[str, Control] = {}
+        self._widgets: dict[str, list[Widget]] = {}
         self._resets: dict[str, viser.GuiButtonGroupHandle] = {}
         self._sections: dict[str, dict[str, Leaf]] = {}
         for leaf in leaves():
@@ -141,12 +194,12 @@ class ParameterPanel:
         self._restart = gui.add_button("Restart now", icon=viser.Icon.REFRESH, color="orange", visible=False)
         self._restart.on_click(lambda _: self._send(Restart()))
         for path in PRIMARY:
-            self._add(self._sections["primary"][path.partition(".")[2]], params)
+            self._add(self._sections["primary"][path.partition(".")[2]])
         self._add_reset("primary")
         for section in Params.model_fields:
             with gui.add_folder(TITLES.get(section, section.title()), expand_by_default=False):
                 for leaf in self._sections[section].values():
-                    self._add(leaf, params)
+                    self._add(leaf)
                 self._add_reset(section)
         gui.add_html(panel("quiet", "▸ acts from the next frame · ↻ acts on restart"))
 
@@ -161,10 +214,10 @@ class ParameterPanel:
                 self._send(SetParams({path: edit.value}))
             elif edit.sent and now - edit.at >= _HOLD_S and snapshot.progress is None:
                 self._edits.pop(path, None)
-        for path, control in self._controls.items():
-            value = snapshot.params.value(path)
-            if path not in self._edits:
-                show(control, value)
+        self._params = snapshot.params
+        for path in self._widgets.keys() - self._edits.keys():
+            for widget in self._widgets[path]:
+                widget.show(snapshot.params.value(path))
         self._history.see(snapshot.params, now)
         for button, verb, by in ((self._undo, "Undo", -1), (self._redo, "Redo", 1)):
             names = self._history.change(by)
@@ -184,22 +237,31 @@ class ParameterPanel:
 
     def fit_lines(self, lines: int) -> None:
         """End the slider of M at the number of scan lines that the open recording has."""
-        slider = self._controls["ground.scan_lines"]
-        if isinstance(slider, viser.GuiSliderHandle) and lines >= slider.value:
+        slider = self._widgets["ground.scan_lines"][0].handle
+        if lines >= slider.value:
             slider.max = lines
 
-    def _add(self, leaf: Leaf, params: Params) -> None:
-        control = add_control(self._gui, leaf, params.value(leaf.path))
+    def _add(self, leaf: Leaf) -> None:
+        path = leaf.path
+        self._widgets[path] = widgets = add_widgets(self._gui, leaf, self._params.value(path))
         # The four primary sliders answer while they are dragged. The other sliders have boxes to type into as well.
-        at_once = leaf.path in PRIMARY or isinstance(control, viser.GuiCheckboxHandle | viser.GuiDropdownHandle)
-        self._controls[leaf.path] = control
+        at_once = path in PRIMARY or isinstance(widgets[0].handle, viser.GuiCheckboxHandle | viser.GuiDropdownHandle)
 
-        def changed(value: Any, _: viser.ClientHandle) -> None:
-            self._edits[leaf.path] = Edit(value, self._now(), sent=at_once)
-            if at_once:
-                self._send(SetParams({leaf.path: value}))
+        def set_by(widget: Widget) -> Callable[[Any, viser.ClientHandle], None]:
+            def changed(shown: Any, _: viser.ClientHandle) -> None:
+                edit = self._edits.get(path)
+                value = widget.meant(shown, edit.value if edit is not None else self._params.value(path))
+                self._edits[path] = Edit(value, self._now(), sent=at_once)
+                for other in widgets:
+                    if other is not widget:
+                        other.show(value)
+                if at_once:
+                    self._send(SetParams({path: value}))
 
-        control.on_update(as_set(changed))
+            return changed
+
+        for widget in widgets:
+            widget.handle.on_update(as_set(set_by(widget)))
 
     def _add_reset(self, group: str) -> None:
         """A button for each parameter of the group that is not at its default, and one for all."""

@@ -52,15 +52,16 @@ def test_a_number_is_taken_when_its_box_is_left_with_all_its_digits(bench: Bench
     bench.page.keyboard.press("Tab")
     bench.eventually(lambda: set_params(bench) == [{"ground.sigma": 0.0255}])
     bench.page.get_by_text("Sensor", exact=True).click()
-    for name, values in (("translation .m", (0.0175, 0.0276, -0.1083)), ("rotation .°", (1.2345, -0.5, 90.0))):
-        three = boxes(bench, name)
-        expect(three).to_have_count(3)
-        for box, value in zip(three.all(), values, strict=True):
-            type_over(bench, box, str(value))
+    for names, values in (
+        (("translation x", "translation y", "translation z"), (0.0175, 0.0276, -0.1083)),
+        (("roll", "pitch", "yaw"), (1.2345, -0.5, 90.0)),
+    ):
+        for name, value in zip(names, values, strict=True):
+            type_over(bench, boxes(bench, name), str(value))
             bench.page.keyboard.press("Tab")
         bench.eventually(lambda values=values: values in set_params(bench)[-1].values())
         bench.page.wait_for_timeout(1500)
-        assert [float(box.input_value()) for box in three.all()] == list(values)
+        assert [float(boxes(bench, name).input_value()) for name in names] == list(values)
     bench.page.get_by_text("Sensor", exact=True).click()
 
 
@@ -79,3 +80,17 @@ def test_escape_restores_the_number_and_one_out_of_range_is_not_taken(bench: Ben
     expect(alpha).to_have_value("40")
     bench.page.wait_for_timeout(800)
     assert set_params(bench) == []
+
+
+def test_a_slider_over_decades_shows_its_number_in_the_box_above_alone(bench: Bench) -> None:
+    bench.page.get_by_text("IMU", exact=True).click()
+    unnamed = bench.page.locator(".mantine-Flex-root", has=bench.page.locator("> div > * > label:empty"))
+    row = unnamed.filter(visible=True).first
+    slider, own_box = row.locator("[role=slider]"), row.locator("input.mantine-NumberInput-input")
+    expect(slider).to_be_visible()
+    expect(own_box).to_be_hidden()
+    slider.focus()
+    bench.page.keyboard.press("End")
+    expect(boxes(bench, "gyro noise")).to_have_value("1")
+    bench.eventually(lambda: set_params(bench)[-1:] == [{"imu.gyro_noise": 1.0}])
+    bench.page.get_by_text("IMU", exact=True).click()

@@ -27,7 +27,10 @@ class Parameters:
         self.params = Params()
 
     def control(self, path: str) -> Any:
-        return self.panel._controls[path]
+        return self.panel._widgets[path][0].handle
+
+    def widgets(self, path: str) -> list[Any]:
+        return [widget.handle for widget in self.panel._widgets[path]]
 
     def tick(self, seconds: float = 0.0, **changes: Any) -> None:
         self.clock.now += seconds
@@ -39,30 +42,70 @@ def parameters(server: viser.ViserServer) -> Parameters:
     return Parameters(server)
 
 
-def test_every_parameter_has_a_control_that_shows_its_default(parameters: Parameters) -> None:
-    assert set(parameters.panel._controls) == {leaf.path for leaf in leaves()}
+def test_every_parameter_has_widgets_that_show_its_default(parameters: Parameters) -> None:
+    assert set(parameters.panel._widgets) == {leaf.path for leaf in leaves()}
     for leaf in leaves():
-        assert parameters.control(leaf.path).value == leaf.default
-        assert parameters.control(leaf.path).hint == leaf.help
+        first, *others = parameters.panel._widgets[leaf.path]
+        assert first.meant(first.handle.value, leaf.default) == leaf.default
+        assert {widget.handle.hint for widget in (first, *others)} == {leaf.help}
 
 
 def test_the_papers_four_come_first(parameters: Parameters) -> None:
-    orders = {path: control.order for path, control in parameters.panel._controls.items()}
+    orders = {path: widgets[0].handle.order for path, widgets in parameters.panel._widgets.items()}
     assert set(sorted(orders, key=lambda path: orders[path])[:4]) == set(PRIMARY)
 
 
-def test_numbers_have_a_slider_over_their_range_or_a_box_where_it_is_too_wide(parameters: Parameters) -> None:
-    boxes = set()
+def test_every_number_has_a_slider_over_its_whole_range(parameters: Parameters) -> None:
+    long = set()
     for leaf in leaves():
-        if type(leaf.default) in (int, float):
-            control = parameters.control(leaf.path)
-            assert control.precision == (0 if isinstance(leaf.default, int) else 9), "its box shows what was typed"
-            if isinstance(control, viser.GuiSliderHandle):
-                assert (control.min, control.max, control.step) == (leaf.minimum, leaf.maximum, leaf.step)
-            else:
-                boxes.add(leaf.path)
+        number = leaf.default[0] if isinstance(leaf.default, tuple) else leaf.default
+        if type(number) not in (int, float):
+            continue
+        widgets = parameters.widgets(leaf.path)
+        sliders = [widget for widget in widgets if isinstance(widget, viser.GuiSliderHandle)]
+        assert widgets[0].precision == (0 if isinstance(number, int) else 9), "its box shows what was typed"
+        if widgets[0] in sliders:
+            assert len(sliders) == (3 if isinstance(leaf.default, tuple) else 1)
+            assert {(one.min, one.max, one.step) for one in sliders} == {(leaf.minimum, leaf.maximum, leaf.step)}
+        else:
+            assert len(sliders) == 1
+            long.add(leaf.path)
     noise = {f"imu.{name}" for name in ("gyro_noise", "accel_noise", "gyro_bias_walk", "accel_bias_walk")}
-    assert boxes == noise | {"recording.imu_time_offset", "loops.window"}
+    assert long == noise | {"recording.imu_time_offset", "loops.window"}
+
+
+def test_a_slider_over_decades_has_round_values_and_a_box_for_all_others(parameters: Parameters) -> None:
+    box, slider = parameters.widgets("imu.gyro_noise")
+    places = range(slider.min, slider.max + 1)
+    values = []
+    for place in places:
+        user_sets(slider, place)
+        values.append(box.value)
+    assert values[:4] == [1e-6, 2e-6, 5e-6, 1e-5]
+    assert values[-1] == 1.0
+    parameters.tick(0.6)
+    assert parameters.sent == [SetParams({"imu.gyro_noise": 1.0})]
+    user_sets(box, 0.0021)
+    assert values[slider.value] == 0.002
+
+
+def test_a_clock_offset_has_round_values_on_either_side_of_zero(parameters: Parameters) -> None:
+    box, slider = parameters.widgets("recording.imu_time_offset")
+    assert slider.value * 2 == slider.max, "0 lies in the middle"
+    user_sets(slider, slider.value - 1)
+    assert box.value == -0.001
+
+
+def test_the_sliders_of_a_vector_change_one_number_each(parameters: Parameters) -> None:
+    parameters.params = Params().with_values({"sensor.rotation": (1.0, 2.0, 3.0)})
+    parameters.tick()
+    roll, pitch, yaw = parameters.widgets("sensor.rotation")
+    assert [roll.value, pitch.value, yaw.value] == [1.0, 2.0, 3.0]
+    assert [one.label.split()[0] for one in (roll, pitch, yaw)] == ["roll", "pitch", "yaw"]
+    user_sets(pitch, -20.0)
+    user_sets(yaw, 90.0)
+    parameters.tick(0.6)
+    assert parameters.sent == [SetParams({"sensor.rotation": (1.0, -20.0, 90.0)})]
 
 
 @pytest.mark.parametrize(("path", "mark"), [("ground.alpha", ""), ("filter.point_noise", "▸"), ("imu.gravity", "↻")])
@@ -93,7 +136,7 @@ def test_a_snapshot_s_values_are_shown_and_not_sent_back(parameters: Parameters)
     parameters.tick()
     assert parameters.control("ground.alpha").value == 12.0
     assert parameters.control("imu.max_gap").value == 0.3
-    assert parameters.control("sensor.translation").value == (1, 2, 3)
+    assert [one.value for one in parameters.widgets("sensor.translation")] == [1, 2, 3]
     assert parameters.sent == []
 
 
