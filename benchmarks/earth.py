@@ -51,7 +51,7 @@ def measure(scene: str, *, imperfect: bool) -> list[Line]:
     truth, fixes = read_tum(beside), recorded_fixes(path)
     lines = []
     for factors in (False, True):
-        laid, _ = lay(session.results(), Survey(lever=LEVER, factors=factors))
+        laid = lay(session.results(), Survey(lever=LEVER, factors=factors))
         lines += compare(laid, truth, fixes, f"{name}, {'as factors' if factors else 'align only'}")
     session.close()
     return lines

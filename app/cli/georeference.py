@@ -122,7 +122,7 @@ def _bent(
     from app.export.results import BY_RUN, save_results
     from app.mapping.earth import bent
 
-    after, _ = bent(read_results(results), fixes, found, overridden)
+    after = bent(read_results(results), fixes, found, overridden)
     assert after.found is not None
     files = [one for one in BY_RUN if one.name in ("trajectory.tum", "map.ply")]
     save_results(out, after, files, replace=replace)

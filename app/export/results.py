@@ -44,7 +44,9 @@ class Results:
     """What the result files are written from.
 
     Attributes:
-        loops: None if loops were not searched. report: what report.json holds; complete once it is written.
+        loops: None if loops were not searched. adjustment: of the map that they give: levels it, by
+            `levelled_deg`, and bends it to fixes.
+        report: what report.json holds; complete once it is written.
         choice: of points. where: the map's place on Earth, if known. found: how fixes or points fit it, if these
             results were georeferenced. problem: why they could not be, in a sentence.
         marks: what was measured, each a name and its spots: keyframe and (x, y, z) m in its IMU frame.
@@ -56,6 +58,8 @@ class Results:
     keyframes: Keyframes
     info: RunInfo
     loops: LoopResults | None = None
+    adjustment: MapFrame = field(default_factory=MapFrame)
+    levelled_deg: float = 0.0
     report: dict[str, Any] = field(default_factory=dict)
     choice: Choice = EVERYTHING
     where: GeoReference | None = None
@@ -69,7 +73,8 @@ class Results:
 
     @property
     def frame(self) -> MapFrame:
-        return self.loops.frame if self.loops else MapFrame()
+        """Where odometry lies in the map."""
+        return self.adjustment.over(self.loops.frame if self.loops else MapFrame())
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -161,6 +166,7 @@ def _write_graph(path: Path, results: Results) -> None:
 def _write_report(path: Path, results: Results) -> None:
     loops, info = results.loops, results.info
     made = report.make_report(results.log, results.trajectory, info) | {"map": results.report.get("map")}
+    made["levelled_deg"] = round(results.levelled_deg, 4)
     if results.found is not None or results.problem:
         made["georeference"] = ledger.report(results.found) if results.found else {"problem": results.problem}
     made["loops"] = {verdict.value: loops.count(verdict) for verdict in Verdict} if loops else None

@@ -25,11 +25,8 @@ FIX, POINT = "fix ", "point "
 """What an edit names begins with one of them."""
 
 
-def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> tuple[Results, MapFrame]:
+def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> Results:
     """The results where they are on Earth, with how fixes or points lie on them.
-
-    Returns:
-        Also what bends the map, T_bent_map at its keyframes; nothing unless that was asked for.
 
     Raises:
         HemislamError: the survey cannot be read, or leaves open where the map lies.
@@ -39,7 +36,7 @@ def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> tup
     overridden = {edit.what: edit.accepted for edit in edits if isinstance(edit, Override)}
     if survey.control:
         found = _by_points(results, survey, _named(overridden, POINT))
-        return replace(results, where=found.reference, found=found), MapFrame()
+        return replace(results, where=found.reference, found=found)
     fixes, told = fixes_of(results.info.recording, survey.gnss, int(results.trajectory.stamps_ns[0]))
     of_fixes = _named(overridden, FIX)
     found = align(
@@ -53,18 +50,18 @@ def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> tup
     )
     if survey.factors:
         return bent(results, fixes, found, of_fixes)
-    return replace(results, where=found.reference, found=found), MapFrame()
+    return replace(results, where=found.reference, found=found)
 
 
 def lay_if_possible(results: Results, survey: Survey | None, edits: Sequence[LoopEdit] = ()) -> Results:
     """As `lay`; where that fails, the results as they are, with the reason."""
     try:
-        return results if survey is None else lay(results, survey, edits)[0]
+        return results if survey is None else lay(results, survey, edits)
     except HemislamError as error:
         return replace(results, problem=str(error))
 
 
-def bent(results: Results, fixes: Fixes, found: Alignment, overridden: Mapping[str, bool]) -> tuple[Results, MapFrame]:
+def bent(results: Results, fixes: Fixes, found: Alignment, overridden: Mapping[str, bool]) -> Results:
     """As `lay`, with fixes that lie on the results as `found`."""
     loops = results.loops
     if loops is None or not loops.g2o:
@@ -78,9 +75,8 @@ def bent(results: Results, fixes: Fixes, found: Alignment, overridden: Mapping[s
     every = range(len(results.keyframes))
     stamps_ns = loops.stamps_ns if len(loops.stamps_ns) else np.array([results.keyframes[k].stamp_ns for k in every])
     corrections, found = bend(results.trajectory, stamps_ns, graph, fixes, found, overridden)
-    by_fixes = MapFrame(stamps_ns, corrections)
-    again = replace(loops, frame=by_fixes.over(loops.frame))
-    return replace(results, loops=again, where=found.reference, found=found), by_fixes
+    adjustment = MapFrame(stamps_ns, corrections).over(results.adjustment)
+    return replace(results, adjustment=adjustment, where=found.reference, found=found)
 
 
 def fixes_of(recording: Path, gnss: Path | None, near_ns: int) -> tuple[Fixes, str]:

@@ -19,6 +19,7 @@ from app.mapping.labels import LabelledKeyframes
 from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
 from app.mapping.truth import compared
 from app.sensors.findings import Finding
+from app.slam import lie
 from app.slam.engine import Engine
 from app.slam.errors import HemislamError
 from app.slam.frames import Frame
@@ -56,7 +57,8 @@ class Session:
         params: for frames not yet processed; set them with `choose`.
         history: parameters by the frame from which they apply, ascending.
         ended: the feed has no more to give. keyframes: with the labels that the user gave them.
-        survey: what the results are georeferenced by; None: nothing. by_fixes: what bent the map then.
+        survey: what the results are georeferenced by; None: nothing.
+        adjustment: of the map by that and by gravity, as it is shown.
 
     Raises:
         HemislamError: the truth cannot be read.
@@ -83,7 +85,7 @@ class Session:
         self.frames: Log[Frame] = Log()
         self.keyframes = LabelledKeyframes(engine.keyframes)
         self.survey: Survey | None = None
-        self.by_fixes = _NO_LOOPS
+        self.adjustment = _NO_LOOPS
         self._shown = _NO_LOOPS, _NO_LOOPS, _NO_LOOPS
         self.checkpoints = checkpoints
         self._waiting: Measurement | None = None
@@ -189,9 +191,9 @@ class Session:
 
     @property
     def shown_frame(self) -> MapFrame:
-        """The same, bent by fixes as far as is known."""
-        if self._shown[0] is not self.map_frame or self._shown[1] is not self.by_fixes:
-            self._shown = self.map_frame, self.by_fixes, self.by_fixes.over(self.map_frame)
+        """The same with the adjustment."""
+        if self._shown[0] is not self.map_frame or self._shown[1] is not self.adjustment:
+            self._shown = self.map_frame, self.adjustment, self.adjustment.over(self.map_frame)
         return self._shown[2]
 
     # --- parameters and edits --------------------------------------------------------------------
@@ -338,7 +340,10 @@ class Session:
         made_from = RunInfo(
             info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped, calibration
         )
-        results = Results(self.log, self.keyframes.now(), made_from, self.loops.results() if self.loops else None)
+        loops = self.loops.results() if self.loops else None
+        results = Results(self.log, self.keyframes.now(), made_from, loops)
+        results.adjustment = self.levelling(loops.frame if loops else _NO_LOOPS)
+        results.levelled_deg = float(np.degrees(np.linalg.norm(lie.log(results.adjustment.newest[:3, :3]))))
         if state is not None:
             measures = state.measures
             results.marks = tuple((one.name, tuple((spot.keyframe, spot.at) for spot in one.spots)) for one in measures)
@@ -381,7 +386,11 @@ class Session:
 
         return self._saves.submit(write)
 
-    def lay_on_earth(self) -> "Future[tuple[Results, MapFrame]]":
+    def levelling(self, frame: MapFrame) -> MapFrame:
+        """What levels the map by gravity, which is known better now than at the start."""
+        return MapFrame.levelling(frame.newest[:3, :3] @ self.engine.g_odom)
+
+    def lay_on_earth(self) -> "Future[Results]":
         """Find where the map as it is now lies by the survey, in a thread of its own; as `lay`."""
         assert self.survey is not None
         return self._saves.submit(lay, self.results(), self.survey, self.edits.done)

@@ -1,4 +1,4 @@
-"""Georeferences the map of the open session whenever it has changed and the session is paused."""
+"""Levels and georeferences the map of the open session whenever it has changed and the session is paused."""
 
 import logging
 from concurrent.futures import Future
@@ -22,7 +22,7 @@ class Laying:
         self._page = page
         self._laid: tuple[object, ...] = (None, None, (), -1, None)  # what the newest was begun with
         self._begun_with: Survey | None = None
-        self._under_way: Future[tuple[Results, MapFrame]] | None = None
+        self._under_way: Future[Results] | None = None
 
     def update(self, session: Session, *, still: bool) -> bool:
         """Show what has come, and begin anew where that is called for. Returns whether work is under way.
@@ -41,29 +41,29 @@ class Laying:
         now = session, session.survey, words, session.frame, session.map_frame
         chosen = self._laid[0] is not session or self._laid[1:3] != now[1:3]
         moved = self._laid[3] != session.frame or self._laid[4] is not session.map_frame
-        if session.frame < 0 or not (chosen or (moved and still and session.survey is not None)):
+        if session.frame < 0 or not (chosen or (moved and still)):
             return False
         self._laid = now
         if session.survey is None:
-            self._show(session, Earth(), MapFrame())
+            self._show(session, Earth(), session.levelling(session.map_frame))
             return False
         self._under_way, self._begun_with = session.lay_on_earth(), session.survey
         return True
 
-    def _take(self, session: Session, laid: Future[tuple[Results, MapFrame]], survey: Survey | None) -> None:
+    def _take(self, session: Session, laid: Future[Results], survey: Survey | None) -> None:
         if self._laid[0] is not session:
             return
-        error = laid.exception()
+        error, level = laid.exception(), session.levelling(session.map_frame)
         if error is None:
-            results, by_fixes = laid.result()
-            self._show(session, Earth(survey, results.found), by_fixes)
+            results = laid.result()
+            self._show(session, Earth(survey, results.found), results.adjustment)
             return
         if not isinstance(error, HemislamError):
             log.error("The map could not be georeferenced", exc_info=error)
-        self._show(session, Earth(survey, problem=str(error) or type(error).__name__), MapFrame())
+        self._show(session, Earth(survey, problem=str(error) or type(error).__name__), level)
 
-    def _show(self, session: Session, earth: Earth, by_fixes: MapFrame) -> None:
-        if len(by_fixes.T_map_odom) or len(session.by_fixes.T_map_odom):
-            session.by_fixes = by_fixes
+    def _show(self, session: Session, earth: Earth, adjustment: MapFrame) -> None:
+        if len(adjustment.T_map_odom) or len(session.adjustment.T_map_odom):
+            session.adjustment = adjustment
             self._page.map_moved(session)
         self._page.put(earth=earth, urgent=True)

@@ -165,6 +165,12 @@ class Engine:
         )
         return result
 
+    @property
+    def g_odom(self) -> F64:
+        """(3,) m/s^2, gravity as estimated by now; before the start is over, straight down."""
+        belief = self._progress.belief
+        return np.array([0.0, 0.0, -self.params.imu.gravity]) if belief is None else belief.state.g_odom
+
     def relabel(self, result: StepResult) -> StepResult:
         """The same frame with its ground segmented by the present parameters. Changes nothing else."""
         cloud, p = result.cloud, self.params.ground

@@ -21,6 +21,13 @@ class MapFrame:
     stamps_ns: I64 = field(default_factory=lambda: np.empty(0, np.int64))
     T_map_odom: F64 = field(default_factory=lambda: np.empty((0, 4, 4)))
 
+    @classmethod
+    def levelling(cls, g_map: F64) -> "MapFrame":
+        """The turn about the origin, not in heading, that makes gravity, (3,) in the map so far, point along -z."""
+        down = np.array([0.0, 0.0, -1.0])
+        turn = lie.transform(lie.between(g_map, down), np.zeros(3))
+        return cls(np.zeros(1, np.int64), turn[None]) if np.cross(g_map, down).any() else cls()
+
     def at(self, keyframe: int) -> F64:
         """(4, 4) T_map_odom at a keyframe."""
         count = len(self.T_map_odom)

@@ -15,7 +15,7 @@ from app.slam.engine import Engine
 from app.slam.metrics import GroundScore, interpolate
 from app.slam.params import Params
 from app.slam.trajectory import Trajectory, read_tum
-from app.slam.types import NON_GROUND, FrameStatus, Measurement
+from app.slam.types import F64, NON_GROUND, FrameStatus, Measurement
 
 H2LID_MOUNT = Params().merged(PRESETS["h2lid-mount"])
 
@@ -28,7 +28,7 @@ class Pass:
         estimate: poses of all frames. score: of the ground labels. statuses: how many frames each.
         found: frames with a ground plane. overhead: points over the sensor that were labelled ground but are none,
             and nearest_overhead, the nearest of them, m.
-        converged: registrations that converged.
+        converged: registrations that converged. g_odom: m/s^2, gravity as estimated at the end.
     """
 
     estimate: Trajectory
@@ -39,6 +39,7 @@ class Pass:
     overhead: int = 0
     nearest_overhead: float = float("inf")
     converged: int = 0
+    g_odom: F64 = field(default_factory=lambda: np.zeros(3))
 
 
 def process(path: Path, truth_path: Path, params: Params) -> Pass:
@@ -66,6 +67,7 @@ def process(path: Path, truth_path: Path, params: Params) -> Pass:
                 outcome.overhead += int(np.sum(over))
                 ranges = np.linalg.norm(r.cloud.points[over], axis=1)
                 outcome.nearest_overhead = min([outcome.nearest_overhead, *ranges.tolist()])
+    outcome.g_odom = engine.g_odom
     engine.close()
     outcome.estimate = Trajectory.from_poses(stamps, np.array(poses))
     return outcome

@@ -6,10 +6,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from app.slam.metrics import ate
-from app.slam.types import FrameStatus
+from app.slam.map_frame import MapFrame
+from app.slam.metrics import ate, interpolate
+from app.slam.types import F64, FrameStatus
 
 from .conftest import Pass
 
@@ -33,6 +35,22 @@ def test_it_has_not_become_worse_than_it_was(passed: Passed, name: str, metres: 
     error = ate(passed(name).estimate, passed(name).truth)
     assert error.position.rmse <= metres
     assert error.rotation.rmse <= degrees
+
+
+@pytest.mark.parametrize("name", ["hall", "outdoor"])
+def test_the_results_are_level(passed: Passed, name: str) -> None:
+    """The accelerometer's bias tilts the start by 0.16 degrees; by the end the filter knows which way is down."""
+    outcome = passed(name)
+    truth, _ = interpolate(outcome.truth, outcome.estimate.stamps_ns)
+    T_truth_odom = (truth.rotations * outcome.estimate.rotations.inv()).mean()
+    up = T_truth_odom.apply(MapFrame.levelling(outcome.g_odom).newest[:3, :3].T @ [0, 0, 1])
+    assert tilt(T_truth_odom.apply([0, 0, 1])) > 0.1
+    assert tilt(up) < 0.05
+
+
+def tilt(up: F64) -> float:
+    """Degrees from the vertical."""
+    return float(np.degrees(np.arccos(up[2] / np.linalg.norm(up))))
 
 
 def test_a_real_sensor_of_another_kind_agrees_with_its_reference(passed: Passed) -> None:

@@ -38,3 +38,14 @@ def test_a_piece_of_a_trajectory_lies_where_it_does_in_the_whole() -> None:
     frame = MapFrame(ODOMETRY.stamps_ns[KEYFRAMES], lie.exp_se3(RNG.normal(0, 0.1, (10, 6))))
     piece = Trajectory(ODOMETRY.stamps_ns[37:], ODOMETRY.positions[37:], ODOMETRY.quaternions[37:])
     np.testing.assert_array_equal(frame.trajectory(piece).positions, frame.trajectory(ODOMETRY).positions[37:])
+
+
+def test_levelling_turns_gravity_down_and_keeps_the_heading() -> None:
+    g_map = np.array([0.03, -0.05, -9.8])
+    R = MapFrame.levelling(g_map).newest[:3, :3]
+    np.testing.assert_allclose(R @ g_map, [0, 0, -np.linalg.norm(g_map)], atol=1e-12)
+    assert abs(Rotation.from_matrix(R).as_rotvec()[2]) < 1e-12
+
+
+def test_a_level_map_stays_as_it_is() -> None:
+    assert not len(MapFrame.levelling(np.array([0.0, 0.0, -9.81])).T_map_odom)
