@@ -47,6 +47,14 @@ def test_a_walk_in_a_room_is_followed_to_a_centimetre(first: tuple[Any, Path], w
     assert report["ground"]["f1"] > 0.9
 
 
+def test_the_map_is_turned_as_far_as_the_report_says_and_its_heading_stays(first: tuple[Any, Path]) -> None:
+    level, odometry = (read_tum(first[1] / name).rotations for name in ("trajectory.tum", "trajectory_odometry.tum"))
+    turn = (level * odometry.inv()).mean().as_rotvec(degrees=True)
+    reported = json.loads((first[1] / "report.json").read_text())["levelled_deg"]
+    assert np.linalg.norm(turn) == pytest.approx(reported, abs=0.001)
+    assert 0.001 < reported < 1 and abs(turn[2]) < 0.001
+
+
 def test_truth_beside_the_recording_is_used_and_named(first: tuple[Any, Path]) -> None:
     assert "walk_truth.tum" in first[0].out
     assert "ATE" in first[0].out
