@@ -97,7 +97,8 @@ def run(
             raise stop or HemislamError(_nothing_processed(session))
         if calibrate and not told and doubts(session.log):
             told = look_for_mounting(recording, params)
-        save(session, folder, stop, replace=force, calibration=told)
+        session.calibration = told
+        save(session, folder, stop, replace=force)
     finally:
         session.close()
 
@@ -111,7 +112,7 @@ def prepare(session: "Session") -> None:
 
 def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
     """The parameters, with the mounting found in the recording if none is given; and that, in a sentence."""
-    from app.calibration.by_itself import advice, contradicted, is_mounting_unknown
+    from app.calibration.on_opening import advice, contradicted, is_mounting_unknown
 
     if not is_mounting_unknown(params):
         return params, ""
@@ -125,18 +126,15 @@ def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
 
 def look_for_mounting(recording: Path, params: "Params") -> str:
     """What the recording shows about its mounting if the parameters differ, in a sentence; "" if nothing."""
-    from app.calibration.by_itself import advice, contradicted
+    from app.calibration.on_opening import advice, contradicted
 
     with progress_bar("Looking for the cause") as show:
         found = contradicted(recording, params, show)
     return advice(found, used=False) if found else ""
 
 
-def save(session: "Session", folder: Path, stop: BaseException | None, *, replace: bool, calibration: str = "") -> None:
+def save(session: "Session", folder: Path, stop: BaseException | None, *, replace: bool) -> None:
     """Write the results and sum them up.
-
-    Args:
-        calibration: what the recording shows about its mounting, in a sentence.
 
     Raises:
         BaseException: `stop`, what ended the run early, once the frames so far are saved.
@@ -144,7 +142,7 @@ def save(session: "Session", folder: Path, stop: BaseException | None, *, replac
     from app.slam.report import summarise
 
     stopped = "" if stop is None else str(stop) or type(stop).__name__
-    report = session.save(folder, replace=replace, stopped=stopped, calibration=calibration).result()
+    report = session.save(folder, replace=replace, stopped=stopped).result()
     typer.echo(summarise(report, folder))
     if problem := report.get("georeference", {}).get("problem"):
         typer.echo(problem)

@@ -138,9 +138,7 @@ def serve(
             open_recording(opened, params).close()
         from app.ui.workbench import Workbench
 
-        return Workbench(
-            viser, engine, folders, point_budget=point_budget, results=Path("runs"), calibrate=calibrate and not session
-        )
+        return Workbench(viser, engine, folders, point_budget=point_budget, results=Path("runs"), calibrate=calibrate)
 
     with (
         TemporaryDirectory(prefix="hemislam-") as folder_live,

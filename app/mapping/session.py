@@ -57,6 +57,7 @@ class Session:
         params: for frames not yet processed; set them with `choose`.
         history: parameters by the frame from which they apply, ascending.
         ended: the feed has no more to give. keyframes: with the labels that the user gave them.
+        calibration: what the recording shows about its sensors, in a sentence, for the report; "" if nothing.
         survey: what the results are georeferenced by; None: nothing.
         adjustment: of the map by that and by gravity, as it is shown.
 
@@ -85,6 +86,7 @@ class Session:
         self.frames: Log[Frame] = Log()
         self.keyframes = LabelledKeyframes(engine.keyframes)
         self.survey: Survey | None = None
+        self.calibration = ""
         self.adjustment = _NO_LOOPS
         self._shown = _NO_LOOPS, _NO_LOOPS, _NO_LOOPS
         self.checkpoints = checkpoints
@@ -222,7 +224,7 @@ class Session:
         if state.edits or state.undone:
             self.edit_loops(state.edits, state.undone)
         self.history, self.planned, self.keyframes.edits = state.history, saved.known, state.labels
-        self.survey = state.survey
+        self.survey, self.calibration = state.survey, state.calibration
 
     @property
     def edits(self) -> Edits:
@@ -330,7 +332,7 @@ class Session:
         ours = self.map_frame.trajectory(self.log.odometry)
         return compared(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns, ours.positions)[1]
 
-    def results(self, stopped: str = "", calibration: str = "", state: State | None = None) -> Results:
+    def results(self, stopped: str = "", state: State | None = None) -> Results:
         """What result files are written from: the frames so far, with all loops, in effect or not. As `save`.
 
         Args:
@@ -338,7 +340,7 @@ class Session:
         """
         info = self.feed.info
         made_from = RunInfo(
-            info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped, calibration
+            info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped, self.calibration
         )
         loops = self.loops.results() if self.loops else None
         results = Results(self.log, self.keyframes.now(), made_from, loops)
@@ -360,7 +362,6 @@ class Session:
         progress: Callable[[float], None] = lambda share: None,
         replace: bool = True,
         stopped: str = "",
-        calibration: str = "",
     ) -> "Future[dict[str, Any]]":
         """Write the results of the frames so far in a thread of its own, with all loops, in effect or not.
 
@@ -368,12 +369,11 @@ class Session:
             session: to be written beside the files of a run. formats: of `EXPORTS`, instead of the files of a run.
             choice: of points. progress: called with the share that is written, 0-1, in that thread.
             replace: overwrite older results. stopped: why the session ended early, if it did.
-            calibration: what the recording shows about its mounting, in a sentence.
 
         Returns:
             The content of report.json, or HemislamError if the folder cannot be written to.
         """
-        results = self.results(stopped, calibration, session.state if session is not None else None)
+        results = self.results(stopped, session.state if session is not None else None)
         results.choice, results.progress = choice, progress
         survey, edits = self.survey, self.edits.done
 

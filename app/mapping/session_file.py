@@ -166,6 +166,7 @@ class State:
     views: where cameras stood that the user kept, and what they looked at, (x, y, z) each, m, in the map.
     measures: what was measured in the map. survey: what it is georeferenced by.
     painted: points marked as ground or not. clip: what of the map is shown.
+    calibration: what the recording shows about its sensors, in a sentence; "" if nothing.
     """
 
     params: _Params
@@ -182,6 +183,7 @@ class State:
     survey: Survey | None = None
     painted: tuple[_Stroke, ...] = ()
     clip: Clip = WHOLE
+    calibration: str = ""
 
 
 _OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)

@@ -175,6 +175,10 @@ class Controller:
             case protocol.CompareWith(trajectory):
                 self._need_session().compare_with(trajectory)
                 self._page.put(recording=opened_recording(self._need_session()), urgent=True)
+            case protocol.Calibrated(text):
+                self._need_session().calibration = text
+                if text:
+                    self._page.notice("warning", text)
             case protocol.Restart():
                 self._open_soon(self._need_session().feed.info.path, self._reopen)
             case protocol.Save(folder, formats, choice):
@@ -294,6 +298,7 @@ class Controller:
             breakpoints=self._player.breakpoints,
             speed=self._page.transport.speed,
             labels=session.keyframes.edits,
+            calibration=session.calibration,
             **kept_in(self._kept),
         )
 
@@ -324,9 +329,11 @@ class Controller:
             self._resume(path)
             return
         base = base or (self._resolve(path) if self._resolve else self._params)
-        changed = self._base.changed(self._params).items()
-        params = base.with_values({name: value for name, value in changed if not name.startswith(_OF_THE_DEVICE)})
+        before, changed = self._player.session, self._base.changed(self._params).items()
+        again = before is not None and before.feed.info.path == path
+        params = base.with_values({n: value for n, value in changed if again or not n.startswith(_OF_THE_DEVICE)})
         session = self._open_session(path, truth, params, None)
+        session.calibration = before.calibration if before is not None and again else ""
         self._base, self._params = base, params
         self._player.halt()
         self._take(session)
@@ -337,7 +344,7 @@ class Controller:
         self._of_before = 0
         info, edits = before.feed.info, before.edits
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
-        session.survey = before.survey
+        session.survey, session.calibration = before.survey, before.calibration
         self._take(session)
         self._keep(**kept_in(kept))
         if session.loops is not None and edits != Edits():
@@ -367,6 +374,7 @@ class Controller:
         self._begin_file(session)
         self._loops.clear()
         self._player.take(session)
+        self._page.put(resumed=saved is not None)
         if session.frame < 0:  # else it goes on where a process that died was
             state = saved.state if saved is not None else State(self._params)
             self._keep(**kept_in(state))

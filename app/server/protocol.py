@@ -151,6 +151,12 @@ class CompareWith(Command, frozen=True):
     path: Path | None
 
 
+class Calibrated(Command, frozen=True):
+    """Keep for the report what the recording shows about its sensors, in a sentence; "": nothing."""
+
+    text: str
+
+
 class Restart(Command, frozen=True):
     """Start the present recording again with the present parameters, the loop edits and the notes."""
 
@@ -355,7 +361,7 @@ class Snapshot:
         notices: the newest 50. saved: the newest 10.
         live: state of the live source; None for a recording.
         earth: as the map was when the session last stood still.
-        session_file: keeps this session; opening it continues the session.
+        session_file: keeps this session; opening it continues the session. resumed: that was done.
     """
 
     session: int = 0
@@ -383,6 +389,7 @@ class Snapshot:
     saved: tuple[Saved, ...] = ()
     engine_alive: bool = True
     session_file: Path | None = None
+    resumed: bool = False
     live: LiveState | None = None
     earth: Earth = Earth()
 

@@ -1,16 +1,16 @@
 """Calibrate: find the LiDAR's pose on the IMU from the open recording, in a process of its own, and apply it.
 
 It begins automatically where the mounting is not known, and after a doubtful run. If no mounting was given, the result
-is applied at once, unless the user changed something in the meantime.
+is applied at once, unless the user changed something in the meantime. A session that is continued keeps its parameters.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.calibration.by_itself import is_mounting_unknown
+from app.calibration.on_opening import is_mounting_unknown
 from app.child import Child, Link
-from app.server.protocol import LIVE, Restart, SetParams, Snapshot
+from app.server.protocol import LIVE, Calibrated, Restart, Seek, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -42,11 +42,11 @@ class CalibrationPanel:
     """A button, then the progress, then what was found with its uncertainty and a button that applies or undoes it.
 
     Args:
-        by_itself: begin without being asked where that helps.
+        unasked: begin without being asked where that helps.
     """
 
-    def __init__(self, page: Page, *, by_itself: bool = False) -> None:
-        self._page, self._by_itself = page, by_itself
+    def __init__(self, page: Page, *, unasked: bool = False) -> None:
+        self._page, self._unasked = page, unasked
         gui = page.gui
         self._button = gui.add_button("Calibrate", hint=_EXPLAINED, disabled=True)
         self._progress = gui.add_progress_bar(0.0, visible=False)
@@ -57,19 +57,25 @@ class CalibrationPanel:
         self._apply.on_click(lambda _: self._use())
         self._child: Child | None = None
         self._values: dict[str, Any] = {}
+        self._sentence = ""  # for the report, once the values are applied
         self._given = Params()
         self._of: Path | None = None
         self._asked = self._tried = False
+        self._told: set[int] = set()  # browsers that know what is being looked for
+        self._heard = 0  # the newest notice when this recording was opened
 
     def draw(self, snapshot: Snapshot) -> None:
         recording = snapshot.recording.path if snapshot.recording else None
         if recording != self._of:  # what was found belongs to another one
             self.close()
-            self._of, self._values, self._tried = recording, {}, not self._by_itself
+            self._of, self._values, self._tried = recording, {}, not self._unasked
             self._html.visible = self._apply.visible = self._plot.visible = False
+            self._heard = max((notice.number for notice in snapshot.notices), default=0)
         self._button.disabled = self._child is not None or recording is None or recording == LIVE
-        if not self._tried and not self._button.disabled and _helps(snapshot):
+        if not self._tried and not self._button.disabled and (_is_unknown(snapshot) or self._is_in_doubt(snapshot)):
             self._begin(asked=False)
+        if self._child is not None and not self._asked and _is_unknown(snapshot):
+            self._announce()
         while self._child is not None:
             if (message := self._child.news()) is None:
                 return
@@ -92,38 +98,57 @@ class CalibrationPanel:
         self._html.content, self._html.visible = panel("calibration", rows), True
         self._plot.content, self._plot.visible = found.plot, bool(found.plot)
         self._offer("Apply", "Set these parameters and read the recording again.")
+        self._sentence = ""
+        if found.contradiction and found.values:
+            self._sentence = f"{found.contradiction}; this was found in the recording and is used."
         if not self._asked and found.contradiction:
             self._tell(found.contradiction)
 
     def _tell(self, contradiction: str) -> None:
         """Say what was found unasked, and use it where nothing else is known."""
         snapshot = self._page.snapshot()
-        use = is_mounting_unknown(snapshot.params) and snapshot.params == self._given and not _has_edits(snapshot)
-        where = "See Calibration under Recording"
-        text = f"{contradiction}. {where}; Undo is there, too." if use else f"{contradiction}. {where} to apply it."
-        for client in self._page.server.get_clients().values():
-            client.add_notification("Calibrated" if use else "Calibration", text, auto_close_seconds=None)
-        if use:
+        if _is_unknown(snapshot) and snapshot.params == self._given and not _has_edits(snapshot):
             self._use()
+        else:
+            self._page.send(Calibrated(f"{contradiction}. To apply it, see Calibration under Recording."))
+
+    def _is_in_doubt(self, snapshot: Snapshot) -> bool:
+        return any(one.number > self._heard and one.text.startswith(IN_DOUBT) for one in snapshot.notices)
+
+    def _announce(self) -> None:
+        """Say in each browser why the map may look wrong."""
+        for number, client in self._page.server.get_clients().items():
+            if number not in self._told:
+                self._told.add(number)
+                client.add_notification(
+                    "Looking for the pose of the LiDAR on the IMU",
+                    "None is given. The map may look wrong until it is found; then it is made again.",
+                    auto_close_seconds=20.0,
+                )
 
     def _begin(self, *, asked: bool = True) -> None:
         snapshot = self._page.snapshot()
         if self._child is not None or snapshot.recording is None or self._button.disabled:
             return
         self._asked, self._tried, self._given = asked, True, snapshot.params
+        self._told.clear()
         self._progress.value = 0.0  # type: ignore[misc]  # as above
         self._progress.visible, self._apply.visible = True, False
         arguments = (snapshot.recording.path, snapshot.params)
         self._child = Child(find, *arguments, name="calibrate", title="Calibration", fork=True)
 
     def _use(self) -> None:
-        """Set what was found; or, once that is done, what was there before."""
+        """Set what was found; or, once that is done, what was there before. Then go on from the same frame."""
         if not self._values:
             return
-        params, undoing = self._page.snapshot().params, self._apply.label == "Undo"
+        snapshot, undoing = self._page.snapshot(), self._apply.label == "Undo"
+        params, transport = snapshot.params, snapshot.transport
         before = {path: params.value(path) for path in self._values}
         self._page.send(SetParams(dict(self._values)))
         self._page.send(Restart())
+        self._page.send(Calibrated("" if undoing else self._sentence))
+        if transport.frame > 0:
+            self._page.send(Seek(transport.frame + transport.finished))
         self._values = before
         if undoing:
             self._offer("Apply", "Set what was found again.")
@@ -135,10 +160,9 @@ class CalibrationPanel:
         self._apply.visible = bool(self._values)
 
 
-def _helps(snapshot: Snapshot) -> bool:
-    """Whether a calibration is likely to mend something."""
-    in_doubt = any(notice.text.startswith(IN_DOUBT) for notice in snapshot.notices)
-    return in_doubt or is_mounting_unknown(snapshot.params)
+def _is_unknown(snapshot: Snapshot) -> bool:
+    """Whether nobody has said where the LiDAR is on the IMU."""
+    return is_mounting_unknown(snapshot.params) and not snapshot.resumed
 
 
 def _has_edits(snapshot: Snapshot) -> bool:

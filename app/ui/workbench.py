@@ -139,7 +139,7 @@ class Workbench:
             self._live = LivePanel(gui)
             self._doctor = DoctorPanel(page)
             with gui.add_folder("Calibration", expand_by_default=False):
-                self._calibration = CalibrationPanel(page, by_itself=calibrate)
+                self._calibration = CalibrationPanel(page, unasked=calibrate)
             with gui.add_folder("Georeference", expand_by_default=False):
                 self._georeference = GeoreferencePanel(page, folders, self._measure)
             with gui.add_folder("Notes"):

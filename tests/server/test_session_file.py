@@ -41,6 +41,7 @@ from app.sensors.presets import resolve_params
 from app.server.controller import MOST_NOTES, Controller
 from app.server.protocol import (
     AddNote,
+    Calibrated,
     DropMeasure,
     KeepMeasure,
     KeepView,
@@ -186,6 +187,8 @@ VIEW = ((1.0, 2.0, 30.5), (0.0, 0.0, 0.0))
 CLIP = Clip(Box((-1.0, -2.0, 0.25), (3.0, 2.0, 2.5), 30.0), on=True, slab=0.5)
 DOOR = Measure("door", (Spot(1, (0.5, 0.25, -1.0)), Spot(2, (0.5, 0.25, 1.125))))
 
+TURNED = "The LiDAR seems to be rotated by 90°, 0°, 0° on the IMU."
+
 
 def walk_about(bench: Kept) -> Snapshot:
     """On, back, other parameters, on, and one last wish that no frame has seen yet."""
@@ -193,7 +196,7 @@ def walk_about(bench: Kept) -> Snapshot:
     bench.do(Seek(80), Seek(70), AddNote("a turn"), KeepView(VIEW))
     wrong = Measure("wrong", DOOR.spots[:1])
     bench.do(KeepMeasure(wrong), KeepMeasure(replace(DOOR, name="")), DropMeasure(wrong), SetClip(CLIP))
-    bench.do(RenameMeasure(replace(DOOR, name=""), DOOR.name))
+    bench.do(RenameMeasure(replace(DOOR, name=""), DOOR.name), Calibrated(TURNED))
     return bench.do(StepFrame(2), SetParams({"ground.alpha": 35.0}))
 
 
@@ -209,6 +212,9 @@ def test_a_reopened_session_is_where_it_was_and_goes_on_the_same(tmp_path: Path)
     assert again.views == there.views == (VIEW,)
     assert again.measures == there.measures == (DOOR,)
     assert again.clip == there.clip == CLIP
+    assert again.resumed and not there.resumed
+    assert second.controller._player.session is not None
+    assert second.controller._player.session.results().info.calibration == TURNED
     assert again.result is not None and there.result is not None
     np.testing.assert_array_equal(again.result.cloud.labels, there.result.cloud.labels, "relabelled by the last wish")
     third = Kept(tmp_path, second.session_file)  # the one reopened is kept as well

@@ -16,6 +16,7 @@ from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import Note, read_session
 from app.server.protocol import (
     AddNote,
+    Calibrated,
     Command,
     CompareWith,
     OpenRecording,
@@ -65,6 +66,16 @@ def test_another_recording_brings_its_own_device_but_keeps_what_was_tuned() -> N
     assert snapshot.params.sensor.translation == (1.0, 0.0, 0.0)
     assert snapshot.params.ground.alpha == 33
     assert snapshot.pending_restart == ()
+
+
+def test_the_same_recording_opened_again_keeps_its_calibration() -> None:
+    bench = Bench(resolve=lambda path: Params())
+    bench.do(SetParams({"sensor.translation": (0.0, 0.0, 5.0)}), Calibrated("The LiDAR seems to be at 5 m."))
+    for again in (OpenRecording(Path("walk-60.mcap")), Restart()):
+        assert bench.do(again).params.sensor.translation == (0.0, 0.0, 5.0)
+        assert bench.sessions[-1].results().info.calibration == "The LiDAR seems to be at 5 m."
+    bench.do(OpenRecording(Path("walk-30.mcap")))
+    assert bench.sessions[-1].results().info.calibration == ""
 
 
 def test_a_recording_damaged_in_the_middle_keeps_what_was_read() -> None:

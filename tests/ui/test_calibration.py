@@ -7,7 +7,18 @@ from typing import Any
 import pytest
 import viser
 
-from app.server.protocol import Command, Note, Notice, OpenedRecording, Restart, SetParams, Snapshot
+from app.server.protocol import (
+    Calibrated,
+    Command,
+    Note,
+    Notice,
+    OpenedRecording,
+    Restart,
+    Seek,
+    SetParams,
+    Snapshot,
+    Transport,
+)
 from app.slam.params import Params
 from app.ui import calibration
 from app.ui.calibration import CalibrationPanel, FoundMounting
@@ -31,10 +42,10 @@ class Process:
 
 
 class Calibrating:
-    def __init__(self, server: viser.ViserServer, *, by_itself: bool = False) -> None:
+    def __init__(self, server: viser.ViserServer, *, unasked: bool = False) -> None:
         self.sent: list[Command] = []
         self.now = OPEN
-        self.panel = CalibrationPanel(page_of(server, self.sent.append, lambda: self.now), by_itself=by_itself)
+        self.panel = CalibrationPanel(page_of(server, self.sent.append, lambda: self.now), unasked=unasked)
 
     def draw(self, now: Snapshot) -> None:
         self.now = now
@@ -67,9 +78,9 @@ def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> 
     assert process.closed and not panel._progress.visible and panel._apply.visible
     assert "roll 70.00 ± 0.05 &lt;deg&gt;" in panel._html.content and page.sent == []
     user_clicks(panel._apply)
-    assert page.sent == [SetParams(FOUND), Restart()] and panel._plot.content == "<svg/>"
+    assert page.sent == [SetParams(FOUND), Restart(), Calibrated("")] and panel._plot.content == "<svg/>"
     user_clicks(panel._apply)
-    assert page.sent[2:] == [SetParams({"sensor.rotation": (0.0, 0.0, 0.0)}), Restart()]
+    assert page.sent[3:] == [SetParams({"sensor.rotation": (0.0, 0.0, 0.0)}), Restart(), Calibrated("")]
 
 
 def test_what_cannot_be_reported_is_said_and_nothing_is_offered(page: Calibrating) -> None:
@@ -97,18 +108,21 @@ def test_without_a_recording_there_is_nothing_to_calibrate(server: viser.ViserSe
 
 TOLD = FoundMounting([("position", "unknown")], FOUND, "", "The LiDAR seems to be turned by 70°, -50°, 104° on the IMU")
 
+ADVICE = Calibrated(f"{TOLD.contradiction}. To apply it, see Calibration under Recording.")
+
 
 @pytest.fixture
 def unasked(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> Calibrating:
     monkeypatch.setattr(calibration, "Child", Process)
-    return Calibrating(server, by_itself=True)
+    return Calibrating(server, unasked=True)
 
 
 def test_an_unknown_mounting_is_found_and_used_on_opening_and_undone_by_a_click(unasked: Calibrating) -> None:
     unasked.draw(OPEN)
     unasked.process().messages.append(TOLD)
     unasked.draw(OPEN)
-    assert unasked.sent == [SetParams(FOUND), Restart()] and unasked.panel._apply.label == "Undo"
+    told = Calibrated(f"{TOLD.contradiction}; this was found in the recording and is used.")
+    assert unasked.sent == [SetParams(FOUND), Restart(), told] and unasked.panel._apply.label == "Undo"
     assert "turned by 70°" in unasked.panel._html.content
     unasked.draw(replace(OPEN, params=Params().with_values(FOUND)))
     unasked.draw(OPEN)
@@ -119,7 +133,7 @@ def test_what_somebody_made_in_the_meantime_is_not_restarted(unasked: Calibratin
     unasked.draw(OPEN)
     unasked.process().messages.append(TOLD)
     unasked.draw(replace(OPEN, notes=(Note(3, "a door"),)))
-    assert unasked.sent == [] and unasked.panel._apply.label == "Apply" and unasked.panel._apply.visible
+    assert unasked.sent == [ADVICE] and unasked.panel._apply.label == "Apply" and unasked.panel._apply.visible
 
 
 def test_a_given_mounting_is_questioned_only_by_a_run_in_doubt_and_never_replaced_unasked(unasked: Calibrating) -> None:
@@ -130,4 +144,26 @@ def test_a_given_mounting_is_questioned_only_by_a_run_in_doubt_and_never_replace
     unasked.draw(doubtful)
     unasked.process().messages.append(TOLD)
     unasked.draw(doubtful)
-    assert unasked.sent == [] and unasked.panel._apply.visible and unasked.panel._apply.label == "Apply"
+    assert unasked.sent == [ADVICE] and unasked.panel._apply.visible and unasked.panel._apply.label == "Apply"
+
+
+@pytest.mark.parametrize("finished", [False, True])
+def test_what_is_applied_goes_on_from_the_frame_that_was_shown(page: Calibrating, finished: bool) -> None:
+    page.now = replace(OPEN, transport=Transport(frame=299, finished=finished))
+    user_clicks(page.panel._button)
+    page.process().messages.append(TOLD)
+    page.draw(page.now)
+    user_clicks(page.panel._apply)
+    assert page.sent[-1] == Seek(300 if finished else 299)
+
+
+def test_a_session_that_is_continued_keeps_its_parameters(unasked: Calibrating) -> None:
+    unasked.draw(replace(OPEN, resumed=True))
+    assert unasked.process() is None and unasked.sent == []
+
+
+def test_a_doubt_about_an_earlier_recording_says_nothing_about_this_one(unasked: Calibrating) -> None:
+    before = (Notice(7, "warning", "This run is doubtful. It moves at up to 20 m/s."),)
+    given = replace(OPEN, params=Params().with_values({"sensor.rotation": [0, 0, 90]}), notices=before)
+    unasked.draw(given)
+    assert unasked.process() is None

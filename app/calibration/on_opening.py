@@ -1,4 +1,4 @@
-"""Automatic calibration: where the mounting is not known, or a run is in doubt."""
+"""Calibration without being asked: of a recording without a mounting when it is opened, and after a doubtful run."""
 
 from pathlib import Path
 
