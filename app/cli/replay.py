@@ -52,7 +52,7 @@ def repeat(path: Path, *, to_end: bool = False) -> "Iterator[tuple[Session, Base
     Raises:
         HemislamError: it cannot be read or repeated, or ended before its first frame.
     """
-    from app.cli.run import prepare, process
+    from app.cli.run import compile_behind_bar, process
     from app.mapping.opening import open_session
     from app.mapping.session_file import read_session
 
@@ -64,7 +64,7 @@ def repeat(path: Path, *, to_end: bool = False) -> "Iterator[tuple[Session, Base
     part = opened.start_s, opened.duration_s
     session = open_session(opened.recording, saved.first_params, *part, truth=truth, read_ahead=True)
     try:
-        prepare(session)
+        compile_behind_bar()
         session.resume(saved)
         session.go_to(saved.frame)
         stop = process(session, until=None if to_end or saved.ended else saved.frame)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyproj
 from scipy.spatial.transform import Rotation
 
 from app.sensors.navsat import NAVSAT, fix_of
@@ -237,5 +236,7 @@ def _east_north_up(fixes: F64) -> F64:
     """Geodetic (n, 3) degrees, degrees, m on WGS84 to metres east, north, up of the first."""
     latitude, longitude, height = fixes[0].tolist()
     local = f"+proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={height!r}"
+    import pyproj
+
     pipeline = pyproj.Transformer.from_pipeline(f"+proj=pipeline +step +proj=cart +ellps=WGS84 +step {local}")
     return np.column_stack(pipeline.transform(fixes[:, 1], fixes[:, 0], fixes[:, 2]))

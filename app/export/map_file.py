@@ -30,7 +30,7 @@ def write(path: Path, blocks: Iterable[Block]) -> int:
     with path.open("wb") as file:
         file.write(header(VERTEX, 0, _COMMENT, keyframe=KEYFRAME))
         for block in blocks:
-            file.write(_vertices(block).tobytes())
+            file.write(_vertices(block).data)
             T = block.T_map_lidar
             pose = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
             keyframes.append((len(block), *divmod(block.stamp_ns, 1_000_000_000), *pose))

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from app.export.points import Block
 from app.georeference.reference import GeoReference
@@ -104,6 +103,8 @@ def _floor(
     if not count.any():
         raise HemislamError("No point of the map is ground, and a plan starts from the ground; tune the ground first.")
     unseen = count == 0
+    from scipy import ndimage  # every run imports this module, and few draw a plan
+
     nearest = ndimage.distance_transform_edt(unseen, return_distances=False, return_indices=True)  # type: ignore[attr-defined]  # no types
     mean = total / np.maximum(count, 1)
     return np.asarray(mean[tuple(nearest)])

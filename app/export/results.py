@@ -7,10 +7,11 @@ import importlib.util
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,6 @@ from app.export.points import EVERYTHING, Block, Choice, blocks
 from app.export.raster import CELL, Raster, rasterise
 from app.export.section import Slab, of_box, of_path
 from app.georeference import ledger, reference
-from app.georeference.align import Alignment
 from app.georeference.reference import GeoReference
 from app.slam import report
 from app.slam.errors import HemislamError
@@ -28,9 +28,13 @@ from app.slam.loops.files import LoopResults, loops_csv
 from app.slam.loops.types import Verdict
 from app.slam.map_frame import MapFrame
 from app.slam.ply import Keyframes
+from app.slam.provenance import hash_input
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import Trajectory, stamp_text, write_tum
 from app.slam.types import F64, I64, TIMINGS
+
+if TYPE_CHECKING:  # every run imports this module, and few need the solver
+    from app.georeference.align import Alignment
 
 EXTRAS = {"e57": ("pye57",), "plan": ("ezdxf", "rasterio")}
 """Modules that the extras of the package install."""
@@ -63,11 +67,12 @@ class Results:
     report: dict[str, Any] = field(default_factory=dict)
     choice: Choice = EVERYTHING
     where: GeoReference | None = None
-    found: Alignment | None = None
+    found: "Alignment | None" = None
     problem: str = ""
     marks: tuple[MapMark, ...] = ()
     notes: tuple[tuple[int, str], ...] = ()
     progress: Callable[[float], None] = lambda share: None
+    _sha256: Future[str | None] = field(default_factory=Future, init=False, repr=False)
     _rasters: dict[tuple[bool, float], Raster] = field(default_factory=dict, init=False, repr=False)
     _sections: dict[str, Slab] = field(default_factory=dict, init=False, repr=False)
 
@@ -165,8 +170,8 @@ def _write_graph(path: Path, results: Results) -> None:
 
 def _write_report(path: Path, results: Results) -> None:
     loops, info = results.loops, results.info
-    made = report.make_report(results.log, results.trajectory, info) | {"map": results.report.get("map")}
-    made["levelled_deg"] = round(results.levelled_deg, 4)
+    made = report.make_report(results.log, results.trajectory, info, results._sha256.result())
+    made |= {"map": results.report.get("map"), "levelled_deg": round(results.levelled_deg, 4)}
     if results.found is not None or results.problem:
         made["georeference"] = ledger.report(results.found) if results.found else {"problem": results.problem}
     made["loops"] = {verdict.value: loops.count(verdict) for verdict in Verdict} if loops else None
@@ -274,7 +279,10 @@ def save_results(
         unknown = f"{lost[0]} needs a georeferenced map; use Georeference in the page, or `hemislam georeference`."
         raise HemislamError(results.problem or unknown)
     parts, show = {export.name: folder / f".{export.name}.part" for export in written}, results.progress
+    beside = ThreadPoolExecutor(1, "hash")
     try:
+        if "report.json" in parts:
+            results._sha256 = beside.submit(hash_input, results.info.recording)
         for number, export in enumerate(written):
             results.progress = _progress_of(number, len(written), show)
             export.write(parts[export.name], results)
@@ -291,6 +299,7 @@ def save_results(
     except OSError as error:
         raise HemislamError(f"Results cannot be written to {folder}: {error.strerror or error}.") from error
     finally:
+        beside.shutdown()
         results.progress = show
         for part in parts.values():
             part.unlink(missing_ok=True)

@@ -2,11 +2,12 @@
 
 import math
 from functools import lru_cache
-
-import pyproj
-from pyproj.exceptions import CRSError, ProjError
+from typing import TYPE_CHECKING
 
 from app.slam.errors import HemislamError
+
+if TYPE_CHECKING:  # imported where it is used: most runs need no coordinate system
+    import pyproj
 
 WGS84 = "EPSG:4979"
 """Latitude, longitude and height above the ellipsoid, as GNSS gives them."""
@@ -15,15 +16,17 @@ EARTH_M = 6_371_000.0
 
 
 @lru_cache(maxsize=32)
-def projected(name: str) -> pyproj.CRS:
+def projected(name: str) -> "pyproj.CRS":
     """A coordinate system by "EPSG:code" or WKT.
 
     Raises:
         HemislamError: there is none, or it is not a plane grid in metres.
     """
+    import pyproj
+
     try:
         crs = pyproj.CRS.from_user_input(name)
-    except CRSError:
+    except pyproj.exceptions.CRSError:
         raise HemislamError(f"{name} names no coordinate system; give one as EPSG:32632.") from None
     if not crs.is_projected:
         raise HemislamError(f"{name} ({crs.name}) is not a plane grid; give a projected one such as EPSG:32632.")
@@ -33,8 +36,10 @@ def projected(name: str) -> pyproj.CRS:
 
 
 @lru_cache(maxsize=32)
-def transformer(source: str, target: str) -> pyproj.Transformer:
+def transformer(source: str, target: str) -> "pyproj.Transformer":
     """From one system to another; longitude before latitude, easting before northing. It leaves heights alone."""
+    import pyproj
+
     first, second = (pyproj.CRS.from_user_input(name).to_2d() for name in (source, target))
     return pyproj.Transformer.from_crs(first, second, always_xy=True)
 
@@ -68,8 +73,10 @@ def check_place(name: str, latitude: float, longitude: float) -> None:
 
 def grid_scale(name: str, latitude: float, longitude: float, height: float) -> float:
     """Metres of the grid per metre on the ground at a place in degrees and m, such as 0.9996 in the middle of UTM."""
+    import pyproj
+
     try:
         factors = pyproj.Proj(projected(name)).get_factors(longitude, latitude)
-    except ProjError:
+    except pyproj.exceptions.ProjError:
         return 1.0
     return float(math.sqrt(factors.areal_scale) * EARTH_M / (EARTH_M + height))

@@ -1,19 +1,21 @@
 """What became of each fix or control point: as a table, as CSV, and in sentences."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from app.georeference import crs, reference
-from app.georeference.align import Alignment
 from app.slam.text_files import csv_text
+
+if TYPE_CHECKING:  # every run imports this module, and few need the solver
+    from app.georeference.align import Alignment
 
 COLUMNS = (
     "name", "east_m", "north_m", "height_m", "d_east_m", "d_north_m", "d_height_m", "sigmas", "verdict",
 )  # fmt: skip
 
 
-def residuals_csv(alignment: Alignment) -> str:
+def residuals_csv(alignment: "Alignment") -> str:
     """One line a fix: its place in the grid, measured minus map, and whether it counts."""
     rows = []
     for name, place, off, sigmas, used in _rows(alignment):
@@ -22,24 +24,24 @@ def residuals_csv(alignment: Alignment) -> str:
     return csv_text(COLUMNS, *rows)
 
 
-def files(alignment: Alignment) -> dict[str, str]:
+def files(alignment: "Alignment") -> dict[str, str]:
     """What is written beside the results: texts by name of the file."""
     return {reference.FILE: alignment.reference.to_json(), reference.RESIDUALS: residuals_csv(alignment)}
 
 
-def report(alignment: Alignment) -> dict[str, Any]:
+def report(alignment: "Alignment") -> dict[str, Any]:
     """What report.json says of it."""
     rms = dict(zip(("east_m", "north_m", "height_m"), alignment.rms.tolist(), strict=True))
     counts = {"used": int(alignment.used.sum()), "of": len(alignment.used)}
     return {"crs": alignment.reference.crs, "height": alignment.reference.height, "rms": rms, **counts}
 
 
-def summary(alignment: Alignment, what: str) -> list[str]:
+def summary(alignment: "Alignment", what: str) -> list[str]:
     """The result in lines; `what` was measured: "fixes" or "control points"."""
     return [f"{name:<19}{text}" if name else text for name, text in in_rows(alignment, what)]
 
 
-def in_rows(alignment: Alignment, what: str) -> list[tuple[str, str]]:
+def in_rows(alignment: "Alignment", what: str) -> list[tuple[str, str]]:
     """As `summary`, names and texts apart."""
     where, used = alignment.reference, int(alignment.used.sum())
     east, north, height = where.origin
@@ -63,7 +65,7 @@ def in_rows(alignment: Alignment, what: str) -> list[tuple[str, str]]:
     return [*rows, *(("", note) for note in alignment.notes)]
 
 
-def table(alignment: Alignment, *, only_rejected: bool = False) -> list[str]:
+def table(alignment: "Alignment", *, only_rejected: bool = False) -> list[str]:
     """The residuals in lines, m."""
     lines = ["name          dE       dN       dH"]
     for name, _, off, sigmas, used in _rows(alignment):
@@ -74,12 +76,12 @@ def table(alignment: Alignment, *, only_rejected: bool = False) -> list[str]:
     return lines
 
 
-def _rows(alignment: Alignment) -> list[tuple[str, list[float], list[float], float, bool]]:
+def _rows(alignment: "Alignment") -> list[tuple[str, list[float], list[float], float, bool]]:
     columns = (alignment.grid, alignment.residuals, alignment.distances, alignment.used)
     return list(zip(alignment.names, *(column.tolist() for column in columns), strict=True))
 
 
-def _bearing(alignment: Alignment) -> float:
+def _bearing(alignment: "Alignment") -> float:
     """Of the map's x axis, degrees clockwise from grid north, 0 to 360."""
     (east, *_), (north, *_), _ = alignment.reference.rotation
     return float(np.degrees(np.arctan2(east, north)) % 360.0)

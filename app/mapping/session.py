@@ -13,7 +13,6 @@ from app.export.points import EVERYTHING, Choice
 from app.export.results import BY_RUN, Results, of_formats, save_results
 from app.georeference.survey import Survey
 from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
-from app.mapping.earth import lay, lay_if_possible
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelledKeyframes
 from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
@@ -378,7 +377,11 @@ class Session:
         survey, edits = self.survey, self.edits.done
 
         def write() -> dict[str, Any]:
-            laid = lay_if_possible(results, survey, edits)
+            laid = results
+            if survey is not None:
+                from app.mapping.earth import lay_if_possible  # few sessions need its solvers
+
+                laid = lay_if_possible(results, survey, edits)
             report = save_results(folder, laid, of_formats(formats) if formats else BY_RUN, replace=replace)
             if session is not None and not formats:
                 write_session(folder / f"session{SUFFIX}", session)
@@ -392,6 +395,8 @@ class Session:
 
     def lay_on_earth(self) -> "Future[Results]":
         """Find where the map as it is now lies by the survey, in a thread of its own; as `lay`."""
+        from app.mapping.earth import lay
+
         assert self.survey is not None
         return self._saves.submit(lay, self.results(), self.survey, self.edits.done)
 

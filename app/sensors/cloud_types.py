@@ -68,9 +68,8 @@ class CloudMessage:
         offsets = [self.fields.get(name, (-1, np.dtype("V1"))) for name in "xyz"]
         first, dtype = offsets[0]
         if dtype == np.dtype("<f4") and len(self) and offsets == [(first + 4 * i, dtype) for i in range(3)]:
-            strides = (self.row_step, self.point_step, 4)
-            view: F32 = np.ndarray((self.height, self.width, 3), dtype, self.data.data, first, strides)
-            return view.reshape(-1, 3)
+            view = np.ndarray((self.height, self.width), "V12", self.data.data, first, (self.row_step, self.point_step))
+            return view.flatten().view(dtype).reshape(-1, 3)  # each point at once: packed numbers are slow to read
         return np.stack([self.column(name).astype(np.float32) for name in "xyz"], axis=1)
 
 
@@ -218,10 +217,15 @@ def valid_points(xyz: F32, time: Column | None = None) -> tuple[F32, npt.NDArray
 
     Points that are NaN or all zero are not counted: drivers put them where nothing came back.
     """
-    x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
+    x, y, z = xyz.T
     farthest = np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(z))  # NaN if any of them is
     valid = (farthest < FARTHEST_M) & (farthest > 0)
     if time is not None and time.dtype.kind == "f":
         valid &= np.abs(time) < LATEST
     index = np.flatnonzero(valid)
-    return xyz.take(index, axis=0), index, int(np.count_nonzero(farthest > 0)) - len(index)
+    return values_at(xyz, index), index, int(np.count_nonzero(farthest > 0)) - len(index)
+
+
+def values_at(column: Column, index: npt.NDArray[np.intp]) -> Column:
+    """The values at these places, ascending and each once; the column itself if it has no others."""
+    return column if len(index) == len(column) else column.take(index, axis=0)

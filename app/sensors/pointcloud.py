@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from app.sensors.azimuth import Spin
-from app.sensors.cloud_types import POINT_CLOUD_2, CloudError, CloudMessage, CloudType, valid_points
+from app.sensors.cloud_types import POINT_CLOUD_2, CloudError, CloudMessage, CloudType, valid_points, values_at
 from app.sensors.rings import Rings
 from app.sensors.ros import stamp_ns
 from app.sensors.timing import Timing, exact_ns
@@ -67,7 +67,7 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
         assert layout.spin is not None
         base_ns, times_ns = 0, layout.spin.times_ns(points, ring)
     else:
-        base_ns, times_ns = exact_ns(time.take(index), timing.unit_ns)
+        base_ns, times_ns = exact_ns(values_at(time, index), timing.unit_ns)
     earliest, latest = int(times_ns.min()), int(times_ns.max())
     if latest - earliest > np.iinfo(np.int32).max:
         raise CloudError("its points are more than 2 s apart, too long for one scan")
@@ -84,11 +84,13 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
         raise CloudError("its time is in no calendar")
     offsets_ns = (times_ns - earliest).astype(np.int32)
     intensity = (
-        cloud.column(layout.intensity_field).take(index).astype(np.float32)
+        values_at(cloud.column(layout.intensity_field), index).astype(np.float32)
         if layout.intensity_field
         else np.zeros(len(points), np.float32)
     )
-    ground = (cloud.column(layout.ground_field).take(index) != 0).astype(np.uint8) if layout.ground_field else None
+    ground = None
+    if layout.ground_field:
+        ground = (values_at(cloud.column(layout.ground_field), index) != 0).astype(np.uint8)
     for array in (points, offsets_ns, intensity, ring, ground):
         if array is not None:
             array.setflags(write=False)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from app.sensors.cloud_types import CloudMessage, CloudType, Probe
+from app.sensors.cloud_types import CloudMessage, CloudType, Probe, values_at
 from app.sensors.findings import Finding
 from app.slam.sections import SensorParams
 from app.slam.types import F32, F64, I64, U16, Scan
@@ -47,7 +47,7 @@ class Rings:
     def of(self, cloud: CloudMessage, points: F32, index: npt.NDArray[np.intp]) -> U16:
         """(n,) uint16 ring of the kept points, whose places in the message are `index`."""
         if self.field is not None:
-            raw = cloud.column(self.field).take(index).astype(np.uint16)
+            raw = values_at(cloud.column(self.field), index).astype(np.uint16)
         elif self.place is not None:
             step, lines = self.place
             raw = (index // step % lines).astype(np.uint16)

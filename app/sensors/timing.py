@@ -254,8 +254,9 @@ def exact_ns(time: npt.NDArray[Any], unit_ns: int) -> tuple[int, I64]:
     if time.dtype.kind == "f":
         values = time.astype(np.float64)
         whole = float(np.floor(values.min()))
-        after = np.minimum((values - whole) * unit_ns, MOST_NS)
-        return int(whole) * unit_ns, np.rint(after).astype(np.int64)
+        values -= whole
+        values *= unit_ns
+        return int(whole) * unit_ns, np.rint(np.minimum(values, MOST_NS, out=values), out=values).astype(np.int64)
     least = time.min()
     after = np.minimum((time - least).astype(np.uint64), MOST_NS // unit_ns)
     return int(least) * unit_ns, after.astype(np.int64) * unit_ns

@@ -10,7 +10,7 @@ from app import __version__
 from app.slam.doubts import doubts
 from app.slam.errors import HemislamError
 from app.slam.metrics import compare
-from app.slam.provenance import describe_machine, hash_input, peak_memory_mb
+from app.slam.provenance import describe_machine, peak_memory_mb
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64, TIMINGS, FrameStatus
@@ -19,8 +19,12 @@ MOST_NOTED = 5
 """Different notices that the summary lists; report.json has them all."""
 
 
-def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo) -> dict[str, Any]:
-    """What report.json holds of a trajectory; numbers that do not exist are NaN or None."""
+def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo, sha256: str | None) -> dict[str, Any]:
+    """What report.json holds of a trajectory; numbers that do not exist are NaN or None.
+
+    Args:
+        sha256: of the recording, as `hash_input`.
+    """
     score = log.ground_score
     return {
         "hemislam": __version__,
@@ -29,7 +33,7 @@ def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo) -> dict[str,
         "calibration": info.calibration or None,
         "recording": {
             "path": str(info.recording),
-            "sha256": hash_input(info.recording),
+            "sha256": sha256,
             "start_s": info.start_s,
             "duration_s": info.duration_s,
         },

@@ -4,8 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from app.slam import ground, iekf, imu, start
+from app.slam import channels, ground, iekf, imu, start
 from app.slam.engine import Engine
+from app.slam.lines import LineErrors
 from app.slam.local_map import LocalMap
 from app.slam.params import Params
 from app.slam.sections import MapParams
@@ -24,6 +25,8 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     floor = np.stack([u.ravel(), v.ravel(), np.full(u.size, -1.3)], axis=1).astype(np.float32)
     n = len(floor)
     scan = Scan(0, floor, np.arange(n, dtype=np.int32), np.zeros(n, np.float32), np.zeros(n, np.uint16))
+    for array in (scan.points, scan.offsets_ns, scan.ring):
+        array.setflags(write=False)  # as the engine meets them
     samples = ImuSamples(np.array([0, 5_000_000]), np.zeros((2, 3)), np.tile([0.0, 0.0, 9.81], (2, 1)))
     belief = start.standing(samples, 0, params)
     local_map, grid = LocalMap(MapParams(max_voxels=1000)), VoxelGrid()
@@ -32,24 +35,24 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     predicted, path = imu.propagate(belief, samples, 5_000_000, params.imu)
     progress("deskew", 0.25)
     points = imu.deskew(scan, path, predicted.state)
+    imu.deskew(channels.bent(scan, np.zeros(1), np.zeros(1)), path, predicted.state)
     progress("ground segmentation", 0.28)
     surface = ground.segment(points, scan.ring, np.array([0.0, 0.0, -1.0]), params.ground)
     progress("downsampling", 0.3)
     grid.downsample(points, 0.3, chosen=surface.labels)
     progress("local map", 0.32)
-    local_map.insert(floor, np.array([100.0, 0.0, 0.0]), params.map)
+    local_map.insert(points, np.array([100.0, 0.0, 0.0]), params.map)
     progress("registration", 0.35)
     posterior, _ = iekf.update(predicted, points, local_map, params.filter)
     iekf.boxminus(posterior.state, predicted.state)
+    LineErrors.unknown().learnt(posterior, points, scan.ring, 1.0, local_map, params.filter)
     progress("a whole frame", 0.9)
     _run_frames(scan, samples, params)
     progress("done", 1.0)
 
 
 def _run_frames(scan: Scan, samples: ImuSamples, params: Params) -> None:
-    """Arrays as the engine meets them: read-only, and writable copies once some points are out of range."""
-    for array in (scan.points, scan.offsets_ns, scan.ring):
-        array.setflags(write=False)
+    """With arrays that are read-only, and with writable copies once some points are out of range."""
     engine = Engine(params)
     for farthest in (params.sensor.max_range, 4.0):
         engine.params = params.with_values({"sensor.max_range": farthest})

@@ -11,7 +11,7 @@ PRIME_X, PRIME_Y, PRIME_Z = 73856093, 19349669, 83492791
 """Teschner et al. 2003, "Optimized spatial hashing"."""
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True)
 def in_range(points, nearest, farthest, keep):
     """keep (n,) bool, out: nearest <= |p| <= farthest, for points (n, 3) f32 in m. Returns the number kept."""
     n = len(points)
@@ -28,7 +28,7 @@ def in_range(points, nearest, farthest, keep):
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def correct(points, ring, elevations, ranges, out):
     """Raise and lengthen each beam as its scan line asks for; lines beyond the tables stay as they are.
 
@@ -49,7 +49,7 @@ def correct(points, ring, elevations, ranges, out):
         out[j, 0], out[j, 1], out[j, 2] = x * longer, y * longer, z * longer
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def centroids(points, chosen, voxel, table, stamp, generation, cells, sums, order, out):
     """Replace the chosen points of each voxel by their centroid; copy the others unchanged.
 

@@ -13,7 +13,7 @@ _LEAST_POINTS, _LEAST_CELLS, _TRIALS = 3, 8, 200
 """Points that make a cell, cells that make a floor, and planes that are tried."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def steep_seeds(points, ring, lines, down, cos_alpha, labels):
     """Mark the seeds of the paper: label 2 for points on the outermost `lines` present, within the angle alpha of down.
 
@@ -35,7 +35,7 @@ def steep_seeds(points, ring, lines, down, cos_alpha, labels):
     return count, steep
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def flat_seeds(points, ring, lines, down, sigma, cos_slope, labels):
     """Mark seeds where nothing is seen near straight down: points of flat polar cells that share the lowest plane.
 
@@ -120,7 +120,7 @@ def flat_seeds(points, ring, lines, down, sigma, cos_slope, labels):
     return seeds
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def moments(points, labels, sums):
     """Add up the first and second moments of the seeds (label 2) about the first of them.
 
@@ -160,7 +160,7 @@ def _last_line(ring, lines):
     return last
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True)
 def label(points, centroid, normal, sigma, labels):
     """Paper eq. 2-3: a point p is ground if |(mu - p) . n| < sigma |p|. Seeds that are ground stay seeds.
 

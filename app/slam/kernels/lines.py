@@ -7,7 +7,7 @@ from numba import njit
 from app.slam.kernels.registration import EDGE_ON, RESIDUAL_HUBER
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def observe(points, rings, world, R, normals, centers, variances, gate, errors, information, moment):
     """Add the distances of points to planes to the normal equations of their lines' errors.
 

@@ -27,7 +27,7 @@ MOST_HITS = 4
 """Hits that count. A point that went on following the scans would let the map drift with them."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def insert(points, voxel, spacing, table, cells, counts, store, used):
     """Add points that are not within `spacing` of a point in their own voxel. Returns (used, refused).
 
@@ -82,7 +82,7 @@ def insert(points, voxel, spacing, table, cells, counts, store, used):
     return used, refused
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def evict(center, radius, voxel, table, cells, counts, store, used):
     """Drop voxels whose centre is farther than `radius` m from `center` (3,), and rebuild the table. Returns used."""
     mask = len(table) - 1
@@ -226,7 +226,7 @@ def _is_flat(near, order, n, x, y, z, normal, flat):
     return True
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def planes(queries, voxel, reach, first, flat, tilts, noise, table, cells, counts, store, normals, centers, variances):
     """Planes through the nearest map points of each query, one for each of the falling `tilts` (k,) rad.
 

@@ -104,7 +104,7 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
     return n
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def deskew(points, offsets_ns, shift, knot_t, knot_T, out):
     """Move each point by the pose at its time: out_j = knot(offsets_ns_j * 1e-9 + shift) points_j.
 

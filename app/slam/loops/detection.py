@@ -31,6 +31,8 @@ KEPT_PREPARED = 8
 """Submaps that stay in memory, ready for registration: the newer one, and older ones, which are often met again."""
 KEPT_SUBMAPS = 1
 """Submaps that stay in memory otherwise: the one just described is needed again."""
+KEPT_PIECES = 2 * slips.REACH
+"""Clouds on one side of a step: what was after one is before another, `slips.REACH` steps later."""
 _NUMBERS = np.empty(0, np.float32)
 _NO_POINTS = Cloud(_NUMBERS, np.empty(0, np.uint8), _NUMBERS, np.empty(0, np.uint16), np.empty(0, np.int32))
 
@@ -65,7 +67,7 @@ class Detector:
         self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS)
         self._around = lru_cache(KEPT_SUBMAPS)(lambda *key: self._submaps.around(key[0], self._poses, *key[1:]))
         self._prepared = lru_cache(KEPT_PREPARED)(lambda *key: verification.prepare(self._around(*key)))
-        self._pieces = lru_cache(slips.REACH + 2)(self._piece)
+        self._pieces = lru_cache(KEPT_PIECES)(self._piece)
         self._slips: dict[tuple[int, int], F64 | None] = {}
         self._heads: list[Keyframe] = []
         self._poses = np.empty((0, 4, 4))
