@@ -38,20 +38,25 @@ def export(
     slab: Annotated[
         float, typer.Option("--slab", metavar="METRES", help="Width of the slab along the walk that a profile shows.")
     ] = 1.0,
+    moving: Annotated[
+        bool,
+        typer.Option("--moving/--no-moving", help="Points on what moves, marked in las, laz, ply and pcd; or none."),
+    ] = True,
 ) -> None:
     """Write a map in the formats of other programs.
 
     A session is repeated first. Coordinates are those of the map or, if the results hold a
-    georeference.json, of its coordinate system where the format has one.
+    georeference.json, of its coordinate system where the format has one. Points on what moves are
+    marked in las, laz, ply and pcd; the other formats leave them out.
 
     \b
     Formats:
       tum         trajectory.tum           poses with stamps
       g2o         graph.g2o                the pose graph of the keyframes
       ply         map.ply                  points and keyframes
-      las, laz    map.las, map.laz         LAS 1.4: time, intensity, ring, ground
+      las, laz    map.las, map.laz         LAS 1.4: time, intensity, ring, ground, moving
       e57         map.e57                  one scan with its pose per keyframe
-      pcd         map.pcd                  intensity ring ground time
+      pcd         map.pcd                  intensity ring ground moving time
       kitti       trajectory.kitti         poses as rows of 12 numbers
       csv         trajectory.csv           poses with easting, northing, height if known
       gpx         trajectory.gpx           the walk as a GPX track
@@ -77,7 +82,7 @@ def export(
     from app.export.results import of_formats
 
     exports = of_formats([name.strip() for name in formats.split(",") if name.strip()])
-    choice = Choice(thin, _box(box), slab)
+    choice = Choice(thin, _box(box), slab, moving)
     if source.is_dir():
         results, folder = read_results(source), out or source / "export"
         if folder.resolve() == source.resolve():

@@ -22,7 +22,7 @@ def write(path: Path, results: "Results") -> None:
     try:
         file = _Writer(str(path), results.where)
         try:
-            for block in results.blocks():
+            for block in results.still_blocks():
                 if len(block):
                     _add(file, block, results.where)
         finally:

@@ -57,7 +57,7 @@ def _document(results: "Results", raster: Raster) -> ElementTree.Element:
     folder = _add(document, "Folder")
     _add(folder, "name", "Keyframes")
     _add(folder, "visibility", "0")
-    for block in results.blocks():
+    for block in results.still_blocks():
         mark = _add(folder, "Placemark")
         _add(mark, "name", str(block.keyframe))
         _add(mark, "visibility", "0")

@@ -12,7 +12,7 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 from app import __version__
 from app.export.points import GPS_MINUS_UNIX_S, Block
 from app.georeference.reference import GeoReference
-from app.slam.types import F64, NON_GROUND
+from app.slam.types import F64, MOVING
 
 if TYPE_CHECKING:
     from app.export.results import Results
@@ -21,7 +21,10 @@ SCALE = 0.001
 """m."""
 BATCH = 1_000_000
 """Points that are compressed at once: lazrs gives each core chunks of 50,000."""
-OTHER, GROUND_CLASS = 1, 2
+OTHER, GROUND_CLASS, MOVING_CLASS = 1, 2, 18
+"""18 is "high noise": viewers and filters can leave it out by its class."""
+CLASSES = np.array([OTHER, GROUND_CLASS, GROUND_CLASS, MOVING_CLASS], np.uint8)
+"""By label."""
 ADJUSTED_S = GPS_MINUS_UNIX_S - 1_000_000_000
 """From Unix time to "adjusted standard GPS time"."""
 
@@ -78,7 +81,7 @@ def _record(block: Block, header: laspy.LasHeader, where: GeoReference | None) -
     array["X"], array["Y"], array["Z"] = np.rint((points - header.offsets) / SCALE).T
     array["intensity"] = np.clip(np.rint(block.intensity), 0, 65535)
     array["bit_fields"] = 0x11  # the only return of its pulse
-    array["classification"] = np.where(block.labels == NON_GROUND, OTHER, GROUND_CLASS)
+    array["classification"] = CLASSES[np.minimum(block.labels, MOVING)]
     array["user_data"] = np.minimum(block.ring, 255)
     array["point_source_id"] = block.keyframe % 65536
     array["gps_time"] = block.stamps_ns * 1e-9 + ADJUSTED_S

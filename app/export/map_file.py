@@ -10,10 +10,19 @@ from scipy.spatial.transform import Rotation
 from app.export.points import Block, as_cloud
 from app.slam.errors import HemislamError
 from app.slam.ply import header
-from app.slam.types import GROUND, NON_GROUND, Keyframe
+from app.slam.types import GROUND, MOVING, NON_GROUND, Keyframe, is_ground
 
 VERTEX = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ground", "u1"), ("ring", "<u2"), ("time", "<f8")]
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("intensity", "<f4"),
+        ("ground", "u1"),
+        ("moving", "u1"),
+        ("ring", "<u2"),
+        ("time", "<f8"),
+    ]
 )
 """m in the map; seconds as in the trajectory."""
 KEYFRAME = np.dtype(
@@ -24,9 +33,11 @@ KEYFRAME = np.dtype(
 _COMMENT = "hemislam map, metres, z up"
 
 
-def write(path: Path, blocks: Iterable[Block]) -> int:
-    """Write points and keyframes, and return the number of points; it enters the header at the end."""
-    keyframes, count = [], 0
+def write(path: Path, blocks: Iterable[Block]) -> tuple[int, int]:
+    """Write points and keyframes. Returns how many points there are, which enters the header at the end, and how many
+    of them are on what moves.
+    """
+    keyframes, count, moving = [], 0, 0
     with path.open("wb") as file:
         file.write(header(VERTEX, 0, _COMMENT, keyframe=KEYFRAME))
         for block in blocks:
@@ -35,17 +46,18 @@ def write(path: Path, blocks: Iterable[Block]) -> int:
             pose = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
             keyframes.append((len(block), *divmod(block.stamp_ns, 1_000_000_000), *pose))
             count += len(block)
+            moving += int(np.count_nonzero(block.labels == MOVING))
         file.write(np.array(keyframes, KEYFRAME).tobytes())
         file.seek(0)
         file.write(header(VERTEX, count, _COMMENT, keyframe=KEYFRAME, keyframes=len(keyframes)))
-    return count
+    return count, moving
 
 
 def _vertices(block: Block) -> np.ndarray:
     vertices = np.empty(len(block), dtype=VERTEX)
     vertices["x"], vertices["y"], vertices["z"] = block.points.T
     vertices["intensity"], vertices["ring"] = block.intensity, block.ring
-    vertices["ground"] = block.labels != NON_GROUND
+    vertices["ground"], vertices["moving"] = is_ground(block.labels), block.labels == MOVING
     vertices["time"] = block.stamps_ns * 1e-9
     return vertices
 
@@ -98,7 +110,9 @@ class MapFile:
             T,
             np.stack([vertices["x"], vertices["y"], vertices["z"]], axis=1).astype(np.float64),
             stamp_ns + offsets_ns,
-            np.where(vertices["ground"] > 0, GROUND, NON_GROUND).astype(np.uint8),
+            np.where(vertices["moving"] > 0, MOVING, np.where(vertices["ground"] > 0, GROUND, NON_GROUND)).astype(
+                np.uint8
+            ),
             vertices["intensity"],
             vertices["ring"],
         )

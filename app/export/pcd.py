@@ -6,13 +6,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from app.slam.ply import pcd_header
-from app.slam.types import NON_GROUND
+from app.slam.types import MOVING, is_ground
 
 if TYPE_CHECKING:
     from app.export.results import Results
 
 POINT = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("ground", "u1"), ("time", "<f8")]
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("intensity", "<f4"),
+        ("ring", "<u2"),
+        ("ground", "u1"),
+        ("moving", "u1"),
+        ("time", "<f8"),
+    ]
 )
 _COMMENT = "hemislam map, metres, z up"
 
@@ -26,7 +35,8 @@ def write(path: Path, results: "Results") -> None:
             points = np.empty(len(block), POINT)
             points["x"], points["y"], points["z"] = block.points.T
             points["intensity"], points["ring"] = block.intensity, block.ring
-            points["ground"], points["time"] = block.labels != NON_GROUND, block.stamps_ns * 1e-9
+            points["ground"], points["moving"] = is_ground(block.labels), block.labels == MOVING
+            points["time"] = block.stamps_ns * 1e-9
             file.write(points.tobytes())
             count += len(points)
         file.seek(0)

@@ -15,7 +15,7 @@ from app.slam.errors import HemislamError
 from app.slam.kernels.clouds import first_in_voxels
 from app.slam.map_frame import MapFrame
 from app.slam.ply import Keyframes
-from app.slam.types import F32, F64, I64, U8, U16, Cloud, Keyframe
+from app.slam.types import F32, F64, I64, MOVING, U8, U16, Cloud, Keyframe
 
 GPS_MINUS_UNIX_S = -315_964_800 + 18
 """From Unix to GPS time, with the leap seconds since 2017."""
@@ -29,11 +29,13 @@ class Choice:
         thin: m, edge of the voxels of which only the first point is taken; 0: all points.
         box: in which they lie; None: everywhere.
         slab: m, width of the slab along the walked path that a profile shows.
+        moving: also those on what moves.
     """
 
     thin: float = 0.0
     box: Box | None = None
     slab: float = 1.0
+    moving: bool = True
 
     def __post_init__(self) -> None:
         if not (self.thin == 0 or 0.001 <= self.thin <= 100):
@@ -78,6 +80,8 @@ def blocks(keyframes: Keyframes, frame: MapFrame, choice: Choice) -> Iterator[Bl
     voxels = Voxels(choice.thin) if choice.thin else None
     for index in range(len(keyframes)):
         block = _block(keyframes[index], frame.at(index))
+        if not choice.moving:
+            block = block.chosen(block.labels != MOVING)
         if choice.box is not None:
             block = block.chosen(choice.box.holds(block.points))
         yield block if voxels is None else block.chosen(voxels.new(block.points))

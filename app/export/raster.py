@@ -10,7 +10,7 @@ import numpy.typing as npt
 from app.export.points import Block
 from app.georeference.reference import GeoReference
 from app.slam.errors import HemislamError
-from app.slam.types import F64, NON_GROUND, U8
+from app.slam.types import F64, U8, Mask, is_ground
 
 CELL = 0.05
 """m, edge of a cell of all but huge maps."""
@@ -77,16 +77,16 @@ def rasterise(read: Callable[[], Iterable[Block]], where: GeoReference | None, c
     for points, labels in _points(read, where):
         rows, columns = _cells(points, origin, cell)
         above = points[:, 2] - floor[rows // COARSE, columns // COARSE]
-        is_ground = labels != NON_GROUND
-        kinds = (
+        on_ground = is_ground(labels)
+        kinds: tuple[slice | Mask, ...] = (
             slice(None),
-            is_ground,
-            ~is_ground & (above > WALL_FROM) & (above < WALL_TO),
-            ~is_ground & (above > SLICE_FROM) & (above < SLICE_TO),
+            on_ground,
+            ~on_ground & (above > WALL_FROM) & (above < WALL_TO),
+            ~on_ground & (above > SLICE_FROM) & (above < SLICE_TO),
         )
         for count, which in zip(counts.values(), kinds, strict=True):
             np.add.at(count, (rows[which], columns[which]), 1)
-        np.add.at(height_sum, (rows[is_ground], columns[is_ground]), points[is_ground, 2] - origin[2])
+        np.add.at(height_sum, (rows[on_ground], columns[on_ground]), points[on_ground, 2] - origin[2])
     return Raster(origin, cell, height_sum=height_sum, **counts)
 
 
@@ -96,7 +96,7 @@ def _floor(
     """(rows, columns) of coarse squares: mean height of the ground, m; where none was seen, of the nearest one."""
     total, count = np.zeros((2, shape[0] // COARSE, shape[1] // COARSE))
     for points, labels in _points(read, where):
-        points = points[labels != NON_GROUND]
+        points = points[is_ground(labels)]
         place = _cells(points, origin, cell * COARSE)
         np.add.at(total, place, points[:, 2])
         np.add.at(count, place, 1)

@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,7 +88,14 @@ class Results:
 
     def blocks(self) -> Iterator[Block]:
         """The chosen points in the map, keyframe by keyframe. Only one of them is held at a time."""
-        for number, block in enumerate(blocks(self.keyframes, self.frame, self.choice), 1):
+        return self._blocks(self.choice)
+
+    def still_blocks(self) -> Iterator[Block]:
+        """The same without points on what moves, for files that cannot mark them."""
+        return self._blocks(replace(self.choice, moving=False))
+
+    def _blocks(self, choice: Choice) -> Iterator[Block]:
+        for number, block in enumerate(blocks(self.keyframes, self.frame, choice), 1):
             yield block
             self.progress(number / len(self.keyframes))
 
@@ -96,16 +103,16 @@ class Results:
         """The map from above, counted once for all files that show it."""
         key = on_earth and self.where is not None, cell
         if key not in self._rasters:
-            self._rasters[key] = rasterise(self.blocks, self.where if on_earth else None, cell)
+            self._rasters[key] = rasterise(self.still_blocks, self.where if on_earth else None, cell)
         return self._rasters[key]
 
     def section(self, kind: str) -> Slab:
         """A slab of the map from its side, counted once for all files that show it. kind: section or profile."""
         if kind not in self._sections:
             self._sections[kind] = (
-                of_box(self.blocks, self.choice.box, self.where)
+                of_box(self.still_blocks, self.choice.box, self.where)
                 if kind == "section"
-                else of_path(self.blocks, self.trajectory.positions, self.choice.slab / 2, self.where)
+                else of_path(self.still_blocks, self.trajectory.positions, self.choice.slab / 2, self.where)
             )
         return self._sections[kind]
 
@@ -154,8 +161,8 @@ def _drawn(kind: str, suffix: str) -> Export:
 
 
 def _write_map(path: Path, results: Results) -> None:
-    points = map_file.write(path, results.blocks())
-    results.report["map"] = {"keyframes": len(results.keyframes), "points": points}
+    points, moving = map_file.write(path, results.blocks())
+    results.report["map"] = {"keyframes": len(results.keyframes), "points": points, "moving": moving}
 
 
 def _write_loops(path: Path, results: Results) -> None:
@@ -204,12 +211,12 @@ EXPORTS = (
             timings_csv(results.log.stamps_ns, results.log.timings_ms), encoding="utf-8"
         ),
     ),
-    Export("map.ply", "the map: x y z intensity ground ring time; keyframes", _write_map, format="ply"),
+    Export("map.ply", "the map: x y z intensity ground moving ring time; keyframes", _write_map, format="ply"),
     Export("report.json", "parameters, counts of frames, ground share, errors against truth", _write_report),
-    _wanted("las", "map.las", "the map as LAS 1.4: time, intensity, ring, ground", "las.write_las"),
+    _wanted("las", "map.las", "the map as LAS 1.4: time, intensity, ring, ground, moving", "las.write_las"),
     _wanted("laz", "map.laz", "the same, compressed", "las.write_laz"),
     _wanted("e57", "map.e57", "the map as E57: one scan with its pose per keyframe", "e57.write", "e57"),
-    _wanted("pcd", "map.pcd", "the map as PCD: intensity ring ground time", "pcd.write"),
+    _wanted("pcd", "map.pcd", "the map as PCD: intensity ring ground moving time", "pcd.write"),
     _wanted("kitti", "trajectory.kitti", "poses as rows of 12 numbers, without stamps", "paths.write_kitti"),
     _wanted("csv", "trajectory.csv", "poses with easting, northing, height if known", "paths.write_csv"),
     _wanted("gpx", "trajectory.gpx", "the walk as a GPX track", "paths.write_gpx", on_earth=True),

@@ -13,7 +13,7 @@ from app.export.points import Block
 from app.georeference.reference import GeoReference
 from app.slam.errors import HemislamError
 from app.slam.kernels.clouds import passages
-from app.slam.types import F64, NON_GROUND, U8
+from app.slam.types import F64, U8, is_ground
 
 CELL: Final = 0.02
 """m, of all but huge sections."""
@@ -141,7 +141,7 @@ def _counted(read: Callable[[], Iterable[Block]], laid: Laid) -> Slab:
     for at, labels in _parts(read, laid):
         columns, rows = ((at - origin) / cell).astype(np.int64).T
         np.add.at(points, (rows, columns), 1)
-        np.add.at(ground, (rows, columns), labels != NON_GROUND)
+        np.add.at(ground, (rows, columns), is_ground(labels))
         np.add.at(sums, (rows, columns), (at - origin - np.column_stack([columns, rows]) * cell).astype(np.float32))
     return Slab(origin, cell, points, ground, sums)
 

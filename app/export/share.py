@@ -43,9 +43,9 @@ def write(path: Path, results: "Results") -> None:
 
 def _sample(results: "Results") -> tuple[F32, F64]:
     """(n, 3) m, a fair sample of the chosen points, and (k, 3) the keyframes' positions."""
-    total, rng = sum(len(block) for block in results.blocks()), np.random.default_rng(0)
+    total, rng = sum(len(block) for block in results.still_blocks()), np.random.default_rng(0)
     taken, keyframes = [np.empty((0, 3), np.float32)], []
-    for block in results.blocks():
+    for block in results.still_blocks():
         which = rng.random(len(block)) * total < MOST_POINTS
         taken.append(block.points[which].astype(np.float32))
         keyframes.append(block.T_map_lidar[:3, 3])

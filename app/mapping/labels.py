@@ -1,7 +1,7 @@
 """Labels of points as a layer over keyframes, which are immutable.
 
-The base of the layer is what the engine found. Edits lie over it as a list, and the newest edit of a keyframe counts.
-So labels can be changed after the fact, by the user or by a later step, and undo is a shorter list.
+The base is what the engine found. Over it lie the points that move (`app.mapping.moving`), and over these the user's
+edits as a list: the newest edit of a keyframe counts, and undo is a shorter list.
 """
 
 from collections.abc import Sequence
@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from app.mapping.moving import MovingPoints
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.ply import Keyframes
-from app.slam.types import U8, Keyframe
+from app.slam.types import MOVING, U8, Keyframe, Mask
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +33,24 @@ class LabelEdit:
 
 
 class LabelledKeyframes:
-    """Keyframes with edited labels.
+    """Keyframes with the labels of all layers.
+
+    Args:
+        count: of keyframes, if no others are to be seen. moving: finds the points that move; None: nothing does.
 
     Attributes:
         edits: those in force, oldest first.
     """
 
-    def __init__(self, keyframes: Keyframes, edits: tuple[LabelEdit, ...] = (), count: int | None = None) -> None:
-        self._keyframes, self.edits, self._count = keyframes, edits, count
+    def __init__(
+        self,
+        keyframes: Keyframes,
+        edits: tuple[LabelEdit, ...] = (),
+        moving: MovingPoints | None = None,
+        count: int | None = None,
+    ) -> None:
+        self._keyframes, self.edits, self._moving, self._count = keyframes, edits, moving, count
+        self._params = moving.params if moving is not None else None
 
     def __len__(self) -> int:
         return len(self._keyframes) if self._count is None else self._count
@@ -49,13 +60,36 @@ class LabelledKeyframes:
             raise IndexError(f"keyframe {index} of {len(self)}")
         keyframe = self._keyframes[index]
         labels = next((edit.labels for edit in reversed(self.edits) if edit.keyframe == index), b"")
-        if len(labels) != len(keyframe.cloud):  # there are none, or another version of the engine kept other points
+        if len(labels) == len(keyframe.cloud):  # else there are none, or the engine's version kept other points then
+            return replace(keyframe, cloud=replace(keyframe.cloud, labels=np.frombuffer(labels, np.uint8)))
+        moves = self._moves(keyframe)
+        if moves is None or not moves.any():
             return keyframe
-        return replace(keyframe, cloud=replace(keyframe.cloud, labels=np.frombuffer(labels, np.uint8)))
+        return replace(keyframe, cloud=replace(keyframe.cloud, labels=np.where(moves, MOVING, keyframe.cloud.labels)))
+
+    def _moves(self, keyframe: Keyframe) -> Mask | None:
+        if self._moving is None:
+            return None
+        if self._count is None or self._params is None:
+            return self._moving.known(keyframe.index)
+        return self._moving.find(keyframe, self._count, self._params)
 
     def now(self) -> "LabelledKeyframes":
-        """The present ones with their present labels, which do not change any more."""
-        return LabelledKeyframes(self._keyframes, self.edits, len(self))
+        """The present ones with their present labels, which do not change any more.
+
+        Which points move is found when a keyframe is read, if it is not known by then.
+        """
+        return LabelledKeyframes(self._keyframes, self.edits, self._moving, len(self))
+
+    def find_moving(self, *, last: bool) -> tuple[int, bool] | None:
+        """As `MovingPoints.next`, for the keyframes that are there."""
+        return self._moving.next(len(self), last=last) if self._moving is not None else None
+
+    def forget_after(self, count: int) -> None:
+        """All but the first `count` keyframes will be others."""
+        self.edits = tuple(edit for edit in self.edits if edit.keyframe < count)
+        if self._moving is not None:
+            self._moving.forget_after(count)
 
     def edit(self, keyframe: int, labels: U8 | Sequence[int] | int) -> None:
         """Change a keyframe's labels. Raises HemislamError: as `LabelEdit.of`, or there is no such keyframe."""

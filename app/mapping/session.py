@@ -15,6 +15,7 @@ from app.georeference.survey import Survey
 from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelledKeyframes
+from app.mapping.moving import MovingPoints
 from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
 from app.mapping.truth import compared
 from app.sensors.findings import Finding
@@ -55,7 +56,7 @@ class Session:
         heading: frames up to this one are repeated as they were, see `go_to`.
         params: for frames not yet processed; set them with `choose`.
         history: parameters by the frame from which they apply, ascending.
-        ended: the feed has no more to give. keyframes: with the labels that the user gave them.
+        ended: the feed has no more to give. keyframes: with all layers of labels.
         calibration: what the recording shows about its sensors, in a sentence, for the report; "" if nothing.
         survey: what the results are georeferenced by; None: nothing.
         adjustment: of the map by that and by gravity, as it is shown.
@@ -83,7 +84,8 @@ class Session:
         self.history: tuple[tuple[int, Params], ...] = ()
         self.ended = False
         self.frames: Log[Frame] = Log()
-        self.keyframes = LabelledKeyframes(engine.keyframes)
+        self._moving = MovingPoints(engine.keyframes, engine.params.moving)
+        self.keyframes = LabelledKeyframes(engine.keyframes, moving=self._moving)
         self.survey: Survey | None = None
         self.calibration = ""
         self.adjustment = _NO_LOOPS
@@ -205,6 +207,7 @@ class Session:
         if usable != self.params:
             self._forget_after(max(self.frame, self.heading))
             self.params = self.engine.params = usable
+            self._moving.choose(usable.moving)
 
     def params_of(self, frame: int) -> Params | None:
         """Those in force at a known or planned frame; of a later one, those of the last."""
@@ -288,7 +291,7 @@ class Session:
         """What comes after a frame will be different."""
         self.frames.truncate(frame + 1)
         count = sum(one.keyframe for one in self.frames)
-        self.keyframes.edits = tuple(edit for edit in self.keyframes.edits if edit.keyframe < count)
+        self.keyframes.forget_after(count)
         self.planned, self.heading = min(self.planned, frame), min(self.heading, frame)
         self.history = tuple(entry for entry in self.history if entry[0] <= frame)
         if self.loops:

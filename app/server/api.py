@@ -32,7 +32,7 @@ from app.server.worker import RunningEngine
 from app.slam.loops.edits import Accept, Add, LoopEdit, Reject, SetWeight, Solve
 from app.slam.params import Params
 from app.slam.trajectory import truth_beside
-from app.slam.types import NON_GROUND, SEED
+from app.slam.types import MOVING, NON_GROUND
 
 EXPORT_TIMEOUT_S = 600.0
 MOST_EXPORTS = 4
@@ -60,10 +60,10 @@ Index = Annotated[int, Field(ge=0, lt=10**12)]  # session files hold no longer n
 Count = Annotated[int, Field(ge=1)]
 Weight = Annotated[float, Field(gt=0, description="Divides the loop's covariance.")]
 Registered = Annotated[bool, Field(description="Register the two submaps; false ties them where the graph has them.")]
-Label = Annotated[int, Field(ge=NON_GROUND, le=SEED)]
+Label = Annotated[int, Field(ge=NON_GROUND, le=MOVING)]
 Labels = Annotated[
     Label | tuple[Label, ...],
-    Field(description="For all points of the keyframe, or one for each: 0 not ground, 1 ground, 2 a seed of it."),
+    Field(description="For all points of the keyframe, or one for each: 0 not ground, 1 ground, 2 a seed, 3 moving."),
 ]
 PAIR = {"older": (Index, ...), "newer": (Index, ...)}
 

@@ -187,10 +187,10 @@ class Publisher:
         self.result = result
         self.put(result=result, urgent=True)
 
-    def show_again(self, keyframe: int) -> None:
+    def show_again(self, keyframe: int, *, urgent: bool = True) -> None:
         """A keyframe has other labels now."""
         self._again.add(keyframe)
-        self.urgent = True
+        self.urgent |= urgent
 
     def saved(self, saved: Saved) -> None:
         self._saved = (*self._saved, saved)[-SAVED_KEPT:]

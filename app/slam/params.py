@@ -18,6 +18,7 @@ from app.slam.sections import (
     KeyframeParams,
     LoopsParams,
     MapParams,
+    MovingParams,
     RecordingParams,
     ScanParams,
     Section,
@@ -40,6 +41,7 @@ class Params(Section):
     filter: FilterParams = FilterParams()
     map: MapParams = MapParams()
     keyframe: KeyframeParams = KeyframeParams()
+    moving: MovingParams = MovingParams()
     loops: LoopsParams = LoopsParams()
 
     def merged(self, tree: Mapping[str, Any]) -> "Params":

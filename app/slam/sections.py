@@ -223,6 +223,15 @@ class KeyframeParams(Section):
     angle: float = _next_frame(15.0, "Angle turned after which a frame is kept.", (1, 180, 1), "deg")
 
 
+class MovingParams(Section):
+    """Points on what moves, found in keyframes that others see through. The frames are not affected."""
+
+    enabled: bool = _at_once(True, "Label points on what moves.")
+    seen_through: int = _at_once(
+        2, "A point moves if at least this many of the keyframes around its own see through its place.", (1, 10, 1)
+    )
+
+
 class LoopsParams(Section):
     """Loop closure and the pose graph (paper 2.4, eq. 8)."""
 

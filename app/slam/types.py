@@ -25,8 +25,14 @@ from app.slam.arrays import Mask as Mask
 from app.slam.arrays import Vector as Vector
 from app.slam.loops.types import LoopEdge
 
-NON_GROUND, GROUND, SEED = 0, 1, 2
-"""Point labels. A seed is a ground point that also helped to fit the plane."""
+NON_GROUND, GROUND, SEED, MOVING = 0, 1, 2, 3
+"""Point labels. A seed is a ground point that also helped to fit the plane. Only keyframes have moving points, and only
+once the keyframes around them are there (`app.mapping.labels`)."""
+
+
+def is_ground(labels: U8) -> Mask:
+    """(n,) whether labels (n,) are GROUND or SEED."""
+    return np.isin(labels, (GROUND, SEED))
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +160,7 @@ class Cloud:
 
     Attributes:
         points: (n, 3) float32, metres, LiDAR frame at the scan's end.
-        labels: (n,) uint8 of NON_GROUND, GROUND, SEED.
+        labels: (n,) uint8 of NON_GROUND, GROUND, SEED, MOVING.
         intensity: (n,) float32. ring: (n,) uint16. offsets_ns: (n,) int32, as in `Scan`.
     """
 

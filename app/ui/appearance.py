@@ -13,6 +13,7 @@ _ACCENTS: Final = {False: (38, 166, 154), True: (13, 110, 102)}
 """On a dark and on a light background."""
 _LAYERS: Final = (
     ("map", "map", "Points of the keyframes."),
+    ("moving", "moving things", "Points on people and whatever else moved, found once later keyframes see through."),
     ("scan", "scan", "Points of the newest frame."),
     ("wedge", "seed wedge", "Where seeds are looked for: within α of straight down, on the M outermost lines."),
     ("plane", "ground plane", "The plane through the seeds."),
@@ -114,9 +115,10 @@ class AppearancePanel:
             show(self._follow, False)
             client.add_notification("Follow is off", "So the view stays here. F follows the sensor again.")
 
-    def draw(self, view: View, limits: Limits | None, points: int, budget: int) -> None:
-        """Explain the colours as drawn and say how many points the page holds."""
+    def draw(self, view: View, limits: Limits | None, points: int, moving: int, budget: int) -> None:
+        """Explain the colours as drawn and say how many points the page holds, and how many are on what moves."""
         self._limits = limits
         self._legend.content = panel("legend", legend(view.colour_by, limits, view.ends), view.grid)
         words = f"{points:,} map points in the page, at most {budget:,}: of a larger map, more of what is near."
-        self._count.content = panel("note", f"{words} The engine keeps the whole map.")
+        about = f" {moving:,} points on what moves are {'shown' if view.moving else 'hidden'}." if moving else ""
+        self._count.content = panel("note", f"{words} The engine keeps the whole map.{about}")

@@ -17,7 +17,7 @@ from app.export.box import Box
 from app.server.chunks import VOXEL_M, voxel_of_level
 from app.server.protocol import Chunk
 from app.server.setup import POINT_BUDGET
-from app.slam.types import F32, F64, I64, NON_GROUND, U8
+from app.slam.types import F32, F64, I64, MOVING, U8, is_ground
 from app.ui.colours import BY_POSE, INTENSITY, MODES, Limits, PointSet, chosen_ends, colours, grown
 from app.ui.detail import parts
 from app.ui.geometry import STILL_M
@@ -95,6 +95,11 @@ class MapChunks:
     def points(self) -> int:
         return sum(drawn.count for drawn in self._drawn)
 
+    @property
+    def moving(self) -> int:
+        """Points on what moves, shown or not."""
+        return sum(int(np.count_nonzero(drawn.chunk.labels == MOVING)) for drawn in self._drawn)
+
     def clear(self, start_ns: int, duration_s: float) -> None:
         """Remove everything for a new session."""
         self._keep(0)
@@ -120,7 +125,7 @@ class MapChunks:
         ends = chosen_ends(self._limits, view.colour_by, view.ends)
         seen, used = self._view, (ends.get(view.colour_by), ends.get(INTENSITY))
         recolour = (view.colour_by, view.numbers, used) != (seen.colour_by, seen.numbers, self._coloured)
-        cut = (view.ceilings, view.clip) != (seen.ceilings, seen.clip)
+        cut = (view.ceilings, view.moving, view.clip) != (seen.ceilings, seen.moving, seen.clip)
         self._view, self._coloured = view, used
         parts = self._parts(chunks, known, eyes)
         for index, (drawn, chunk) in enumerate(zip(self._drawn, chunks, strict=True)):
@@ -208,7 +213,8 @@ class MapChunks:
 
     def _chosen(self, drawn: _Drawn, T_map_imu: F64) -> Chosen:
         T_map_lidar = T_map_imu @ drawn.chunk.T_imu_lidar
-        return shown_points(drawn.chunk, T_map_lidar, self._view.ceilings, self._view.clip, drawn.part)
+        view = self._view
+        return shown_points(drawn.chunk, T_map_lidar, view.ceilings, view.clip, drawn.part, moving=view.moving)
 
     def _shows_others(self, drawn: _Drawn, index: int) -> bool:
         """Whether other points of it are to be shown than those that were sent."""
@@ -252,14 +258,22 @@ class MapChunks:
 
 
 def shown_points(
-    chunk: Chunk, T_map_lidar: F64, ceilings: bool, clip: Box | None = None, part: int | None = None
+    chunk: Chunk,
+    T_map_lidar: F64,
+    ceilings: bool,
+    clip: Box | None = None,
+    part: int | None = None,
+    *,
+    moving: bool = True,
 ) -> Chosen:
     """The points of a chunk that are drawn: with or without the ceiling above them, only those in the box.
 
     Args:
-        part: of how many from the first on; None: of all.
+        part: of how many from the first on; None: of all. moving: with those on what moves.
     """
     mask = None if ceilings else below_ceiling(chunk.points, chunk.labels, T_map_lidar[2, :3])
+    if not moving and (moves := chunk.labels == MOVING).any():
+        mask = ~moves if mask is None else mask & ~moves
     if clip is not None:
         inside = clip.holds(chunk.points @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3])
         mask = inside if mask is None else mask & inside
@@ -301,4 +315,4 @@ def below_ceiling(points: F32, labels: U8, up: F64) -> npt.NDArray[np.bool_] | N
     ceiling = float(np.median(overhead))
     if ceiling > _HIGHEST_M or float(np.median(np.abs(overhead - ceiling))) > _FLATNESS_M:
         return None
-    return np.asarray((height < ceiling - _MARGIN_M) | (labels != NON_GROUND))
+    return np.asarray((height < ceiling - _MARGIN_M) | is_ground(labels))

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from app.slam.types import F32, F64, GROUND, NON_GROUND, SEED, U8, U16
+from app.slam.types import F32, F64, GROUND, MOVING, NON_GROUND, SEED, U8, U16
 from app.ui.html import panel
 
 Rgb = tuple[int, int, int]
@@ -16,10 +16,11 @@ LABEL_COLOURS: Final[dict[int, Rgb]] = {
     NON_GROUND: (136, 148, 168),
     GROUND: (52, 199, 170),
     SEED: (255, 205, 80),
+    MOVING: (214, 62, 104),
 }
-"""Blue-grey, teal and amber: every kind of colour vision tells them apart, and so does lightness alone."""
+"""Blue-grey, teal, amber and crimson: every kind of colour vision tells them apart, and so does lightness alone."""
 
-LABEL_NAMES: Final[dict[int, str]] = {GROUND: "ground", NON_GROUND: "not ground", SEED: "seed"}
+LABEL_NAMES: Final[dict[int, str]] = {GROUND: "ground", NON_GROUND: "not ground", SEED: "seed", MOVING: "moving"}
 
 _ANCHORS: Final[dict[str, str]] = {
     # Evenly spaced colours of matplotlib's maps (CC0, van der Walt and Smith), which are uniform in CAM02-UCS.
@@ -47,7 +48,7 @@ TABLES: Final[dict[str, U8]] = {name: _table(anchors) for name, anchors in _ANCH
 
 NOTHING: Final[Rgb] = (92, 100, 114)
 """Of points without a number."""
-_LABEL_TABLE: Final[U8] = np.array([LABEL_COLOURS[label] for label in range(3)], dtype=np.uint8)
+_LABEL_TABLE: Final[U8] = np.array([LABEL_COLOURS[label] for label in range(len(LABEL_COLOURS))], dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +126,8 @@ LOOK: Final = "height × intensity"
 """The usual mode: colour by height, brightness by intensity, and the labels as a tint."""
 BY_POSE: Final = (HEIGHT, LOOK)
 """The modes whose colours change when a pose does."""
-_TINT: Final = 0.35
+_TINTS: Final = np.array([0.0, 0.35, 0.35, 0.8])
+"""How much of its label's colour a point takes."""
 _DIMMEST: Final = 0.75
 """Brightness of the least intensity."""
 
@@ -167,17 +169,20 @@ def colours(cloud: PointSet, by: str, limits: Mapping[str, Limits]) -> U8:
 
 
 def _tinted(values: U8, labels: U8, cloud: PointSet, limits: Limits) -> U8:
-    """(n, 3) colours by height, as bright as their intensity; ground and seeds with a tint of their labels' colours."""
+    """(n, 3) colours by height, as bright as their intensity, with a tint of their labels' colours."""
     share = np.clip((cloud.intensity - limits.low) / (limits.high - limits.low), 0.0, 1.0)
     found = values * (_DIMMEST + (1 - _DIMMEST) * np.nan_to_num(share))[:, None]
-    tint = np.where(cloud.labels == NON_GROUND, 0.0, _TINT)[:, None]
+    tint = _TINTS[_known(cloud.labels)][:, None]
     return np.asarray(found + tint * (labels - found), dtype=np.uint8)
 
 
 def label_colours(labels: U8) -> U8:
     """(n,) labels -> (n, 3) colours. Labels unknown to this version are drawn as not ground."""
-    known = np.where(labels < len(_LABEL_TABLE), labels, NON_GROUND)
-    return _LABEL_TABLE[known]
+    return _LABEL_TABLE[_known(labels)]
+
+
+def _known(labels: U8) -> U8:
+    return np.where(labels < len(_LABEL_TABLE), labels, np.uint8(NON_GROUND))
 
 
 def value_colours(values: npt.ArrayLike, limits: Limits, table: U8) -> U8:

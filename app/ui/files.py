@@ -224,6 +224,9 @@ class FilesPanel:
             boxed = gui.add_checkbox(
                 "inside the clip box", clip.on, visible=clip.box is not None, hint="Only points that are in it."
             )
+            moving = gui.add_checkbox(
+                "with what moves", True, hint="Marked in PLY, PCD, LAS and LAZ; the other formats leave it out."
+            )
             problem = gui.add_html("", visible=False)
             save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
 
@@ -235,7 +238,7 @@ class FilesPanel:
                 return
             formats = (_FORMATS[files.value],) if files.value in _FORMATS else ()
             try:
-                choice = Choice(thin.value, clip.box if boxed.value else None, clip.slab)
+                choice = Choice(thin.value, clip.box if boxed.value else None, clip.slab, moving.value)
             except HemislamError as error:
                 problem.content, problem.visible = panel("text", str(error)), True
                 return

@@ -74,7 +74,7 @@ class MeasurePanel:
         poses = poses_of(current)
         kind = self._kind
         if click is not None and kind != STOP and view.map:
-            spot = meet(current.chunks, poses, *click, ceilings=view.ceilings, clip=view.clip)
+            spot = meet(current.chunks, poses, *click, ceilings=view.ceilings, moving=view.moving, clip=view.clip)
             if spot is not None and self._snap.value:
                 spot = snapped(current.chunks, poses, spot)
             if spot is not None and self._kind == kind:  # meanwhile the user may have chosen another

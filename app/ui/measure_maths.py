@@ -12,7 +12,7 @@ from app.mapping.session_file import Measure, Spot
 from app.server.protocol import Chunk
 from app.slam.kernels.cells import in_cone
 from app.slam.text_files import csv_text
-from app.slam.types import F32, F64, NON_GROUND
+from app.slam.types import F32, F64, is_ground
 from app.ui.chunks import as_mask, shown_points
 
 _GAP_M: Final = 0.2
@@ -56,13 +56,14 @@ def meet(
     width: float,
     *,
     ceilings: bool,
+    moving: bool = True,
     clip: Box | None = None,
 ) -> Spot | None:
     """The visible point that a click means: of those at the front, the one nearest to its ray; None if it meets none.
 
     Args:
         poses: (k, 4, 4) T_map_imu of the chunks' keyframes. origin, direction: (3,) of the ray, in the map.
-        width: rad, how far beside the ray a point may be seen. ceilings: whether they are shown.
+        width: rad, how far beside the ray a point may be seen. ceilings, moving: whether they are shown.
         clip: outside which points are hidden.
     """
     most = max((len(chunk.points) for chunk in chunks), default=0)
@@ -73,7 +74,7 @@ def meet(
         eye, ahead = T[:3, :3].T @ (origin - T[:3, 3]), T[:3, :3].T @ direction / np.linalg.norm(direction)
         count = in_cone(chunk.points, eye, ahead, width, hits, along, off)
         if count:
-            seen = as_mask(shown_points(chunk, T, ceilings, clip), len(chunk.points))[hits[:count]]
+            seen = as_mask(shown_points(chunk, T, ceilings, clip, moving=moving), len(chunk.points))[hits[:count]]
             found.append((along[:count][seen], off[:count][seen], chunk, chunk.points[hits[:count][seen]]))
     every = np.sort(np.concatenate([np.empty(0), *(along for along, *_ in found)]))
     if not len(every):
@@ -124,7 +125,7 @@ def height(place: F64, chunks: tuple[Chunk, ...], poses: F64) -> float:
 
 def _ground(chunk: Chunk, T_map_imu: F64) -> npt.NDArray[np.floating]:
     T = T_map_imu @ chunk.T_imu_lidar
-    return np.asarray(chunk.points[chunk.labels != NON_GROUND] @ T[:3, :3].T + T[:3, 3])
+    return np.asarray(chunk.points[is_ground(chunk.labels)] @ T[:3, :3].T + T[:3, 3])
 
 
 def around(chunks: tuple[Chunk, ...], poses: F64, place: F64, radius: float) -> F64:

@@ -75,6 +75,10 @@ class Scene:
     def points(self) -> int:
         return self._chunks.points
 
+    @property
+    def moving(self) -> int:
+        return self._chunks.moving
+
     def sample(self) -> F64:
         """(n, 3) some points of the map."""
         return self._chunks.sample()

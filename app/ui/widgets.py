@@ -34,7 +34,8 @@ class View:
 
     Attributes:
         colour_by: a name of `app.ui.colours.COLOUR_BY`. point_size: m. follow: keep the sensor in the middle.
-        ceilings: show points above the ceiling too. map, scan, wedge, plane, path, grid, notes: whether shown.
+        ceilings, moving: show points above the ceiling too, and those on what moves.
+        map, scan, wedge, plane, path, grid, notes: whether shown.
         light: a light background. tuning: the map stands back behind the present scan.
         ends: of the colour map, where the user chose them. clip: outside which points are hidden.
         slab: m, how wide the profile along the walk is that is shown instead of the map; 0: none is.
@@ -45,6 +46,7 @@ class View:
     point_size: float = 0.04
     follow: bool = False
     ceilings: bool = False
+    moving: bool = False
     map: bool = True
     scan: bool = True
     wedge: bool = True

@@ -217,4 +217,4 @@ class Workbench:
             self._drawn = current
         if self._legend_due(current, view):
             limits = self._scene.limits(view.colour_by)
-            self._appearance.draw(view, limits, self._scene.points, self._budget)
+            self._appearance.draw(view, limits, self._scene.points, self._scene.moving, self._budget)

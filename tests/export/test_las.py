@@ -6,6 +6,7 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
+from pypcd4 import PointCloud
 from test_results import START_NS, keyframe, logged
 
 from app.export.points import Choice, blocks
@@ -15,7 +16,7 @@ from app.slam.errors import HemislamError
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.run_log import RunInfo
-from app.slam.types import GROUND, NON_GROUND
+from app.slam.types import GROUND, MOVING, NON_GROUND, SEED
 
 UTM = GeoReference("EPSG:32632", (456_789.25, 5_432_100.5, 312.0), ((0.6, -0.8, 0), (0.8, 0.6, 0), (0, 0, 1)))
 
@@ -75,3 +76,17 @@ def test_progress_ends_at_one_and_a_name_that_is_no_format_is_refused(tmp_path: 
     assert shares == sorted(shares) and shares[-1] == 1.0, "a page reads the points twice"
     with pytest.raises(HemislamError, match="no format lax; choose from tum"):
         of_formats(["laz", "lax"])
+
+
+def test_what_moves_is_class_18_and_left_out_if_asked(tmp_path: Path) -> None:
+    labels = [NON_GROUND, GROUND, SEED, MOVING]
+    results = Results(
+        logged(), [keyframe(0, [[k, 0, 0] for k in range(4)], labels)], RunInfo(Path("walk.mcap"), Params())
+    )
+    save_results(tmp_path, results, of_formats(["las", "pcd"]))
+    assert laspy.read(tmp_path / "map.las").classification.tolist() == [1, 2, 2, 18]
+    cloud = PointCloud.from_path(tmp_path / "map.pcd")
+    assert cloud.pc_data["ground"].tolist() == [0, 1, 1, 0] and cloud.pc_data["moving"].tolist() == [0, 0, 0, 1]
+    results.choice = Choice(moving=False)
+    save_results(tmp_path, results, of_formats(["las"]), replace=True)
+    assert laspy.read(tmp_path / "map.las").classification.tolist() == [1, 2, 2]

@@ -21,7 +21,7 @@ from app.georeference.reference import GeoReference
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.run_log import RunInfo
-from app.slam.types import GROUND, NON_GROUND
+from app.slam.types import GROUND, MOVING, NON_GROUND
 
 LOW, HIGH, FLOOR = (-3.0, -2.0), (3.0, 2.0), -1.2
 """m: where the walls and the floor of the room are."""
@@ -109,3 +109,17 @@ def test_a_plan_needs_ground_and_points(tmp_path: Path) -> None:
     results.choice = Choice(box=Box((90.0, 90, 90), (91, 91, 91)))
     with pytest.raises(HemislamError, match="no points to draw"):
         save_results(tmp_path, results, of_formats(["terrain"]))
+
+
+def test_a_person_who_walked_past_is_in_no_plan(tmp_path: Path) -> None:
+    still = room()
+    save_results(tmp_path, still, of_formats(["occupancy", "floor", "density"]))
+    expected = {name: (tmp_path / name).read_bytes() for name in ("occupancy.pgm", "floor.png", "density.tif")}
+    heights = FLOOR + np.arange(0.1, 1.8, 0.02)
+    body = np.array([(x, y, z) for x in (-1.5, -1.4) for y in (-1.0, -0.9) for z in heights])
+    passing = keyframe(1, body.tolist(), [MOVING] * len(body))
+    T = passing.T_odom_imu @ passing.T_imu_lidar
+    passing.cloud.points[:] = (body - T[:3, 3]) @ T[:3, :3]
+    results = Results(logged(), [still.keyframes[0], passing], still.info)
+    save_results(tmp_path, results, of_formats(["occupancy", "floor", "density"]), replace=True)
+    assert {name: (tmp_path / name).read_bytes() for name in expected} == expected

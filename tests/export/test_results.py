@@ -216,9 +216,9 @@ def test_the_map_holds_every_keyframe_where_loops_place_it(tmp_path: Path) -> No
     keyframes = [keyframe(0, [[1, 0, 0], [0, 2, 0]], [GROUND, NON_GROUND]), keyframe(1, [[1, 0, 0]], [SEED])]
     T_map_odom = np.tile(np.eye(4), (2, 1, 1))
     T_map_odom[:, 1, 3] = 100.0, 200.0
-    count = write(tmp_path / "map.ply", blocks(keyframes, MapFrame(np.array([0, 1]), T_map_odom), Choice()))
+    count, moving = write(tmp_path / "map.ply", blocks(keyframes, MapFrame(np.array([0, 1]), T_map_odom), Choice()))
     points = read_ply(tmp_path / "map.ply")
-    assert count == len(points) == 3
+    assert count == len(points) == 3 and moving == 0
     np.testing.assert_allclose(
         np.stack([points["x"], points["y"], points["z"]], axis=1), [[0, 101, 0.5], [-2, 100, 0.5], [10, 201, 0.5]]
     )

@@ -37,7 +37,7 @@ from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.params import Params
 
 SAMPLE = next((Path(__file__).resolve().parents[2] / "sample_data").glob("*.mcap"))
-FILES = ("trajectory.tum", "trajectory_odometry.tum", "loops.csv", "graph.g2o")
+FILES = ("trajectory.tum", "trajectory_odometry.tum", "loops.csv", "graph.g2o", "map.ply")
 START_S = 0.0
 """All of it: it ends where it began, and its loops are found at the end."""
 
@@ -122,7 +122,7 @@ def test_a_session_with_detours_edits_other_parameters_and_a_fork_is_replayed_to
     assert opened is not None
     middle = opened.frames // 2
     workbench.do(Seek(middle), SetParams({"filter.max_iterations": 3}), EditLoop(Add(0, 5, register=False)))
-    workbench.do(StepFrame(30), Seek(middle - 30), SetParams({"ground.sigma": 0.05}))
+    workbench.do(StepFrame(30), Seek(middle - 30), SetParams({"ground.sigma": 0.05, "moving.seen_through": 4}))
     found = [edge.pair for edge in accepted(workbench.do(Play())) if edge.pair != (0, 5)]
     assert found, "else there is nothing to edit"
     workbench.do(EditLoop(Reject(*found[0])), UndoLoop(), EditLoop(Reject(*found[-1])))

@@ -20,6 +20,7 @@ from app.server.setup import Setup
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import (
+    F64,
     GROUND,
     NON_GROUND,
     STAGES,
@@ -120,6 +121,10 @@ class FakeEngine:
         self.steps_with: list[Params] = []
         self._fails_at = fails_at
         self._index, self._memory = 0, 0.1
+
+    @property
+    def g_odom(self) -> F64:
+        return np.array([0.0, 0.0, -9.81])
 
     def close(self) -> None:
         self.keyframes.close()

@@ -10,6 +10,7 @@ from app.export.box import Box
 from app.server import chunks as server_chunks
 from app.server.chunks import within_budget
 from app.server.protocol import Seek, SetParams, Snapshot, StepFrame
+from app.slam.types import MOVING
 from app.ui.chunks import MapChunks
 from app.ui.colours import COLOUR_BY, LABEL_COLOURS, Limits
 from app.ui.scene import Scene
@@ -367,3 +368,18 @@ def test_without_a_plane_neither_disc_nor_ground_is_shown(drawn: Drawn, server: 
     drawn.draw(result=replace(result, index=99, ground=replace(result.ground, found=False)))
     plane = server.scene.get_handle_by_name("/map/sensor/lidar/plane")
     assert plane is not None and not plane.visible
+
+
+def test_people_are_not_in_the_map_unless_they_are_asked_for(drawn: Drawn, server: viser.ViserServer) -> None:
+    first, *rest = drawn.engine.snapshot.chunks
+    labels = first.labels.copy()
+    labels[:50] = MOVING
+    chunks = (replace(first, labels=labels), *rest)
+    drawn.draw(View(ceilings=True), chunks=chunks)
+    node = chunk_nodes(server)["/map/keyframes/0"]
+    assert np.array_equal(node.points, first.points[50:].astype(np.float16)) and drawn.scene.moving == 50
+    drawn.draw(View(ceilings=True, moving=True, colour_by="label"), chunks=chunks)
+    node = chunk_nodes(server)["/map/keyframes/0"]
+    assert len(node.points) == len(labels)
+    crimson = LABEL_COLOURS[MOVING]
+    assert (node.colors[:50].astype(int) <= crimson).all() and node.colors[0].argmax() == 0
