@@ -136,8 +136,10 @@ def test_a_scanner_held_upright_finds_the_ground_far_out(tilt: float) -> None:
     assert true[labelled].mean() > 0.9  # the foot of a wall is in a cell with the wall, which is none of the ground
 
 
-def test_a_scanner_held_upright_in_a_room_too_small_to_see_the_floor_labels_none() -> None:
-    scan, R = upright(Scene(box(-3.0, -3.0, -1.3, 5.0, 3.0, 1.4)))
+@pytest.mark.parametrize("wall", [3.0, 0.9])
+def test_a_scanner_held_upright_in_a_room_too_small_to_see_the_floor_labels_none(wall: float) -> None:
+    """Of a wall 0.9 m away, only 11 cm are below the scanner."""
+    scan, R = upright(Scene(box(-5.0, -wall, -1.3, 5.0, wall, 1.4)))
     result = segment(scan, R)
     assert scan.truth_ground is not None and not scan.truth_ground.any()
     assert not result.found and not result.labels.any()

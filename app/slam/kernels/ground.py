@@ -9,6 +9,11 @@ SECTORS, REACH, STEP = 72, 40, 1.0
 """Polar cells of 5 degrees and 1 m, out to 40 m."""
 _STEP_M = 0.2
 """Heights in one cell of the ground differ by less."""
+_HEAD_M = 0.5
+"""Points up to this height above the scanner show a wall too: what a near one has below it is low and looks flat."""
+_FOOT_M, _FOOT_SIGMA, _ROUGH_SIGMA = 0.05, 0.25, 2.0
+"""At a wall, ground is lower than this above the lowest point there, and nearer to the plane than so many sigma. A flat
+cell is ground up to so many sigma from it: far from the scanner, real ground is no plane."""
 _LEAST_POINTS, _LEAST_CELLS, _TRIALS = 3, 8, 200
 """Points that make a cell, cells that make a floor, and planes that are tried."""
 
@@ -39,9 +44,9 @@ def steep_seeds(points, ring, lines, down, cos_alpha, labels):
 def flat_seeds(points, ring, lines, down, sigma, cos_slope, labels):
     """Mark seeds where nothing is seen near straight down: points of flat polar cells that share the lowest plane.
 
-    A cell of points below the scanner is flat if their heights differ by less than a step, which a wall's do
-    not. Of planes through three flat cells, less steep than the slope, the one counts that most cells lie on and fewest
-    below. Points that cannot be ground, in a cell with a wall, get label 3.
+    A cell is flat if its heights differ by less than a step, which a wall's do not. Of planes through three flat
+    cells, less steep than the slope, the one counts that most cells lie on and fewest below. Points that cannot be
+    ground, such as those on a wall, get label 3; other points of flat cells near the plane are ground and get label 4.
 
     Arguments as `steep_seeds`; sigma m/m; cos_slope of the steepest plane. Returns the number of seeds.
     """
@@ -59,18 +64,22 @@ def flat_seeds(points, ring, lines, down, sigma, cos_slope, labels):
     for j in range(len(points)):
         p = points[j].astype(np.float64)
         height = -(p @ down)
-        if height >= 0.0:
+        if height >= _HEAD_M:
             continue
         u, v = p @ ahead, p @ across
         reach = int(math.hypot(u, v) / STEP)
         if reach >= REACH:
             continue
         sector = int((math.atan2(v, u) + math.pi) * (SECTORS / (2 * math.pi))) % SECTORS
-        c = cell[j] = sector * REACH + reach
+        c = sector * REACH + reach
+        highest[c] = max(highest[c], height)
+        if height >= 0.0:
+            continue
+        cell[j] = c
         count[c] += 1
         low[c] += ring[j] < last
         mean[c] += p
-        lowest[c], highest[c] = min(lowest[c], height), max(highest[c], height)
+        lowest[c] = min(lowest[c], height)
     flat = np.empty(SECTORS * REACH, np.int64)
     wall = np.zeros(SECTORS * REACH, np.bool_)
     cells = 0
@@ -106,17 +115,24 @@ def flat_seeds(points, ring, lines, down, sigma, cos_slope, labels):
             best, chosen, plane = score, corner[0].copy(), normal
     if best < 0.5 * _LEAST_CELLS:
         return 0
-    on = np.zeros(SECTORS * REACH, np.bool_)
-    for k in range(cells):
-        p = mean[flat[k]]
-        on[flat[k]] = abs((p - chosen) @ plane) < sigma * np.linalg.norm(p)
+    seeding = np.zeros(SECTORS * REACH, np.bool_)
+    seeding[flat[:cells]] = True
     seeds = 0
     for j in range(len(points)):
-        if cell[j] < 0 or wall[cell[j]]:
+        c = cell[j]
+        if c < 0:
             labels[j] = 3
-        elif on[cell[j]]:
+            continue
+        p = points[j].astype(np.float64) if wall[c] else mean[c]
+        off = abs((p - chosen) @ plane) / (sigma * np.linalg.norm(p))
+        if wall[c]:
+            if off > _FOOT_SIGMA or -(p @ down) > lowest[c] + _FOOT_M:
+                labels[j] = 3
+        elif seeding[c] and off < 1.0:
             labels[j] = 2
             seeds += 1
+        elif off < _ROUGH_SIGMA:
+            labels[j] = 4
     return seeds
 
 
@@ -165,14 +181,17 @@ def label(points, centroid, normal, sigma, labels):
     """Paper eq. 2-3: a point p is ground if |(mu - p) . n| < sigma |p|. Seeds that are ground stay seeds.
 
     points (n, 3) f32 m; centroid mu (3,) m; normal n (3,) unit; sigma m/m; labels (n,) u8, in and out: label 3 is no
-    ground. Returns the number of ground points.
+    ground, label 4 is ground. Returns the number of ground points.
     """
     count = 0
     for j in prange(len(points)):
         x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
         d = (centroid[0] - x) * normal[0] + (centroid[1] - y) * normal[1] + (centroid[2] - z) * normal[2]
         ground = abs(d) < sigma * math.sqrt(x * x + y * y + z * z)
-        if not ground or labels[j] == 3:
+        if labels[j] == 4:
+            ground = True
+            labels[j] = 1
+        elif not ground or labels[j] == 3:
             ground = False
             labels[j] = 0
         elif labels[j] == 0:
