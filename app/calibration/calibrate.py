@@ -115,7 +115,8 @@ class Calibration:
             place = ", ".join(f"{x:.2f}" for x in self.moved.p_imu_lidar)
             parts.append(f"it seems to be at {place} m on the IMU")
         if "recording.imu_time_offset" in found and abs(self.turned.late) > 5 * LARGEST_OFFSET:
-            parts.append(f"the IMU's clock seems to be off by {self.turned.late * 1e3:+.0f} ms")
+            late = -self.turned.late * 1e3
+            parts.append(f"the IMU's clock seems to be {abs(late):.0f} ms {'late' if late > 0 else 'early'}")
         text = ", and ".join(parts)
         return text[:1].upper() + text[1:]
 

@@ -1,6 +1,7 @@
 """Moves the open session through its frames: playing at a pace, stepping and seeking, both ways."""
 
 import logging
+import re
 import time
 from collections import deque
 from collections.abc import Callable
@@ -25,6 +26,8 @@ LONGEST_LAG_S = 0.5
 LONG_SEEK = 20
 """Frames to process on the way to a frame, from which on progress is shown."""
 ONLY_ON = "A live source cannot go back; record it, then open the recording."
+FIRST_DOUBT = 100
+"""Frames after which a run is first checked for doubts; then after twice as many, and so on, and at the end."""
 _WARNINGS = ("disconnected", "silent", "jump", "recording", "units", "restarted")
 """Kinds of `Status` that are a warning, not only news."""
 
@@ -91,6 +94,7 @@ class Player:
         self.page_behind = self.relabelling = False
         self._target: SeekTarget | None = None
         self._moment: CheckedFrame | None = None  # the frame that the page shows
+        self._doubted: set[str] = set()  # reasons that were told, without their numbers
 
     # --- what is asked for -----------------------------------------------------------------------
     def take(self, session: Session) -> None:
@@ -98,6 +102,7 @@ class Player:
         self.session = session
         self.relabelling = self.page_behind = False
         self._moment = None
+        self._doubted = set()
         self._page.opened(session)
         self._pacer.release()
         self._target = SeekTarget(0, -1) if session.frame < 0 else None
@@ -219,8 +224,7 @@ class Player:
         if entry is None:
             self.halt()
             self._page.show(finished=True)
-            for doubt in doubts(session.log):
-                self._page.notice("warning", f"{IN_DOUBT} {doubt}")
+            self._doubt(session)
             return None
         if isinstance(entry, Quiet):
             if entry.status is not None:
@@ -248,8 +252,19 @@ class Player:
             self._page.frame(session, result)
             self._page.show(frames_per_second=self._pacer.tick(), urgent=False)
             self._passed(session, result, played=target is None)
+            checks, rest = divmod(session.frame, FIRST_DOUBT)
+            if not rest and checks.bit_count() == 1:
+                self._doubt(session)
         self._arrive(session)
         return 0.0
+
+    def _doubt(self, session: Session) -> None:
+        """Say why the run cannot be right, each reason once."""
+        for doubt in doubts(session.log):
+            reason = re.sub(r"[\d.]+", "#", doubt)
+            if reason not in self._doubted:
+                self._doubted.add(reason)
+                self._page.notice("warning", f"{IN_DOUBT} {doubt}")
 
     def _passed(self, session: Session, result: StepResult, *, played: bool) -> None:
         """Pause where a breakpoint holds, unless the frame is only passed by a seek."""

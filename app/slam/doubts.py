@@ -21,6 +21,8 @@ TAKEN_BACK, NOISE = 0.07, 0.05
 """Share of the velocity's change by the IMU that the scans may take back, beside NOISE m/s. A clean sensor leaves 0.01
 to 0.02, one with all the errors that data sheets admit 0.05; exchanged axes, a mounting off by 5 deg or a clock off by
 20 ms leave 0.07 to 0.4."""
+LATE_S = 0.01
+"""How late or early the IMU's clock may seem to be: data sheets and links admit 6 ms, and the estimate is off by 1."""
 
 
 def doubts(log: RunLog) -> tuple[str, ...]:
@@ -40,7 +42,17 @@ def doubts(log: RunLog) -> tuple[str, ...]:
     if dropped > MOST_DROPPED * (total + dropped):
         reason, _ = log.dropped.most_common(1)[0]
         found.append(f"{dropped} of {total + dropped} scans were dropped, mostly because {reason}.")
-    return (*found, *_of_imu(log))
+    return (*found, *_of_clock(log), *_of_imu(log))
+
+
+def _of_clock(log: RunLog) -> list[str]:
+    late = float(log.readout("clock_late_s")[-1]) if len(log) else 0.0
+    if not abs(late) > LATE_S:
+        return []
+    return [
+        f"The IMU's clock seems to be about {abs(late) * 1e3:.0f} ms {'late' if late > 0 else 'early'}; "
+        "`hemislam calibrate` finds by how much."
+    ]
 
 
 def _of_imu(log: RunLog) -> list[str]:

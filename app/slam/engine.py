@@ -158,6 +158,7 @@ class Engine:
             notices=tuple(notices),
             truth_ground=scan.truth_ground,
             imu_gap_s=float(np.diff(samples.stamps_ns).max(initial=0)) * 1e-9,
+            clock_late_s=clock.late,
         )
         T_odom_keyframe = before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu
         self._progress = EngineProgress(

@@ -292,6 +292,7 @@ class StepResult:
         notices: what a user should know about this frame, in sentences.
         imu_gap_s: longest time between the IMU samples that cover it.
         dropped: scans dropped between the frame before and this one.
+        clock_late_s: how late the IMU's clock is, as estimated so far.
     """
 
     index: int
@@ -312,6 +313,7 @@ class StepResult:
     truth_ground: U8 | None = None
     imu_gap_s: float = 0.0
     dropped: int = 0
+    clock_late_s: float = 0.0
 
     @property
     def T_map_imu(self) -> F64:

@@ -9,6 +9,7 @@ import server_fakes as fakes
 from session_bench import Bench, last_notice
 
 from app.mapping.session import Session
+from app.server import player
 from app.server.protocol import (
     AddNote,
     Command,
@@ -282,3 +283,14 @@ def test_a_comparison_on_the_way_back_waits_for_no_frame_that_is_forgotten() -> 
     bench.controller.handle(CompareWith(None))
     assert bench.settle().transport.frame == 25
     assert len(bench.do(StepFrame(3)).series["stamp_s"]) == 29
+
+
+def test_a_doubt_is_told_while_it_plays_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(player, "doubts", lambda log: (f"It moves at {len(log)} m/s.",) if len(log) > 150 else ())
+    bench = Bench("walk-250.mcap")
+    bench.do(Seek(190))
+    assert not [notice for notice in bench.see().notices if "doubtful" in notice.text]
+    bench.do(Seek(240))
+    bench.do(SetSpeed(math.inf), Play())
+    told = [notice.text for notice in bench.see().notices if "doubtful" in notice.text]
+    assert told == ["This run is doubtful. It moves at 201 m/s."]

@@ -69,3 +69,9 @@ def test_scans_that_contradict_the_imu_in_every_frame_are_reported() -> None:
 
 def test_a_cart_that_hardly_changes_its_velocity_raises_no_doubt() -> None:
     assert doubts(log(WALK, predicted_change=0.004, correction=0.003)) == ()
+
+
+@pytest.mark.parametrize(("late", "told"), [(0.006, ""), (0.053, "53 ms late"), (-0.02, "20 ms early")])
+def test_a_clock_that_is_far_off_is_reported_though_it_was_corrected(late: float, told: str) -> None:
+    found = doubts(log(WALK, clock_late_s=late))
+    assert len(found) == bool(told) and all(told in doubt and "hemislam calibrate" in doubt for doubt in found)

@@ -321,6 +321,7 @@ class FakeEngine:
             "degeneracy": result.registration.eigenvalues[0],
             "imu_gap_s": result.imu_gap_s,
             "dropped": result.dropped,
+            "clock_late_s": result.clock_late_s,
             "total_ms": result.timings_ms["total"],
             "distance": 0.08 * frame,
             "error_m": error,
