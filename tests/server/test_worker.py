@@ -153,7 +153,9 @@ from app.server.worker import EngineProcess
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job is started to ignore it
     engine = EngineProcess(Setup(recording=Path("walk-300.mcap")), main=fakes.fake_main)
+    until = time.monotonic() + {patience}
     while engine.snapshot.transport.frame < 0:
+        assert time.monotonic() < until, engine.snapshot.notices
         time.sleep(0.01)
     try:
         print(engine.pid, flush=True)
@@ -169,7 +171,7 @@ def parent(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """A process in a terminal session of its own, and the id of its engine's process."""
     script = tmp_path / "parent.py"
     root = Path(__file__).resolve().parents[2]
-    script.write_text(PARENT.format(path=[str(root), str(Path(__file__).parent)]))
+    script.write_text(PARENT.format(path=[str(root), str(Path(__file__).parent)], patience=PATIENCE_S))
     process = subprocess.Popen(
         [sys.executable, str(script)],
         stdout=subprocess.PIPE,
