@@ -13,6 +13,7 @@ import numpy as np
 from app.calibration.excerpt import Excerpt
 from app.calibration.guide import Guide
 from app.slam import lie
+from app.slam.iekf import enough_planes
 from app.slam.kernels import motion
 from app.slam.kernels.registration import EDGE_ON, REPEATED, RESIDUAL_HUBER
 from app.slam.local_map import LocalMap
@@ -24,8 +25,6 @@ MATCHED = 1000
 GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
 GUIDED_GATES = (2.0, 1.0, 1.0)
 """Of the residuals in each iteration, times the filter's gate; wide at first, since nothing predicts the motion."""
-ENOUGH = 0.45
-"""Share of the points that good planes must be found for; else poor ones count too."""
 LEAST_PLANES = 30
 KNOTS = 11
 """Poses of the LiDAR within a scan; linear in between."""
@@ -186,11 +185,13 @@ def _laid(scan: Scan, prior: _Motion, path: _Path, local_map: LocalMap, params: 
     chosen = slice(None, None, -(-len(scan) // MATCHED))
     ago = (scan.offsets_ns[chosen] * 1e-9 + path.back[0])[:, None]  # <= 0
     residual = float("nan")
+    speed = float(np.linalg.norm(prior.velocity))
     for gate in GATES if path.turned is None else GUIDED_GATES:
         points = path.deskewed(scan, here)[chosen].astype(np.float64)
         world = points @ here.R.T + here.p
         good, poor = local_map.planes(np.ascontiguousarray(world), params)
-        planes = good if np.count_nonzero(good.variances >= 0) > ENOUGH * len(points) else poor
+        enough = np.count_nonzero(good.variances >= 0) >= enough_planes(len(points), speed)
+        planes = good if enough else poor
         found = np.flatnonzero(planes.variances >= 0)  # nothing was written elsewhere
         at, spread = planes.normals[found], np.sqrt(planes.variances[found])
         off = np.sum(at * (world[found] - planes.centers[found]), axis=1)

@@ -61,6 +61,11 @@ def _unpacked(x: F64, stamp_ns: int) -> NavState:
     return NavState(stamp_ns, R.reshape(3, 3), p, v, bg, ba, g, R_il.reshape(3, 3), p_il)
 
 
+def enough_planes(points: int, speed: float) -> float:
+    """How many good planes are enough for so many points at this speed (m/s); with fewer, poor ones are used too."""
+    return max(ENOUGH_PLANES, ENOUGH_SHARE * points) if speed > WALKING else ENOUGH_PLANES
+
+
 def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams) -> tuple[Belief, Registration]:
     """Fuse one scan: minimise eq. 7 from the predicted belief.
 
@@ -81,8 +86,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
     planes: Planes | None = None
     since_search = np.zeros(DIM)
     converged, iteration, poor = False, 0, False
-    walking = np.linalg.norm(prior.state.v_odom_imu) > WALKING
-    enough = max(ENOUGH_PLANES, ENOUGH_SHARE * n) if walking else ENOUGH_PLANES
+    enough = enough_planes(n, float(np.linalg.norm(prior.state.v_odom_imu)))
 
     for iteration in range(1, params.max_iterations + 1):
         R, p, R_il, p_il = x[0:9].reshape(3, 3), x[9:12], x[24:33].reshape(3, 3), x[33:36]

@@ -17,6 +17,7 @@ from app.__main__ import cli
 from app.calibration.calibrate import calibrate_excerpt
 from app.calibration.excerpt import Excerpt, read_excerpt
 from app.calibration.lines import Lines
+from app.calibration.odometry import track
 from app.calibration.words import WALK, as_json, params_yaml, table, write_beside
 from app.evaluation.calibration_plot import residual_plot
 from app.sensors.presets import calibrated_beside, resolve_params, sidecar
@@ -24,6 +25,7 @@ from app.sensors.recording import open_recording
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.params import Params
+from app.slam.trajectory import read_tum
 from tests.calibration.rehearsal import MID360, TURN, known
 
 
@@ -54,6 +56,17 @@ def test_reading_skips_the_rest_at_the_start(excerpt: Excerpt, shared_data: Path
     with open_recording(shared_data / "hall_mid360.mcap", Params()) as recording:
         assert 1.5 < (excerpt.scans[0].end_ns - recording.start_ns) * 1e-9 < 3.0
     assert all(a.end_ns < b.end_ns for a, b in zip(excerpt.scans, excerpt.scans[1:], strict=False))
+
+
+def test_the_scans_alone_give_the_turns_of_the_first_steps_outdoors(shared_data: Path) -> None:
+    """A map seen from one place is full of poor planes along the scan lines, which would hold the LiDAR there."""
+    path = shared_data / "outdoor_bpearl.mcap"
+    with open_recording(path, Params()) as recording:
+        walk = read_excerpt(recording, Params(), 9.0)
+    way, truth = track(walk), read_tum(path.with_name("outdoor_bpearl_truth.tum"))
+    turned = Rotation.from_quat(truth.quaternions[np.searchsorted(truth.stamps_ns, walk.ends_ns - 1_000_000)])
+    off = (turned[0].inv() * turned).inv() * Rotation.from_matrix(way.rotations)
+    assert np.degrees(off.magnitude().max()) < 1.0
 
 
 def test_what_was_found_is_kept_beside_the_recording_and_undone_by_deleting_it(tmp_path: Path) -> None:
