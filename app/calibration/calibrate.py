@@ -131,9 +131,11 @@ def calibrate(
         duration_s: only so much of it. progress: called with the fraction done, 0-1.
 
     Raises:
-        HemislamError: the recording cannot be read, or is too short.
+        HemislamError: the recording cannot be read, has no IMU, or is too short.
     """
     with open_recording(path, params) as recording:
+        if not recording.imu_topic:
+            raise HemislamError(f"{path} has no IMU, so there is nothing to calibrate.")
         excerpt = read_excerpt(recording, params, duration_s, lambda done: progress(READING * done))
     try:
         return calibrate_excerpt(path, params, excerpt, progress)

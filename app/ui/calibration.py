@@ -10,6 +10,7 @@ from typing import Any
 
 from app.calibration.on_opening import is_mounting_unknown
 from app.child import Child, Link
+from app.sensors.recording import NO_IMU
 from app.server.protocol import LIVE, Calibrated, Restart, Seek, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
 from app.slam.errors import HemislamError
@@ -161,8 +162,9 @@ class CalibrationPanel:
 
 
 def _is_unknown(snapshot: Snapshot) -> bool:
-    """Whether nobody has said where the LiDAR is on the IMU."""
-    return is_mounting_unknown(snapshot.params) and not snapshot.resumed
+    """Whether there is an IMU, and nobody has said where the LiDAR is on it."""
+    has_imu = snapshot.recording is not None and NO_IMU not in snapshot.recording.findings
+    return has_imu and is_mounting_unknown(snapshot.params) and not snapshot.resumed
 
 
 def _has_edits(snapshot: Snapshot) -> bool:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from app.__main__ import cli
-from app.calibration.calibrate import calibrate_excerpt
+from app.calibration.calibrate import calibrate, calibrate_excerpt
 from app.calibration.excerpt import Excerpt, read_excerpt
 from app.calibration.lines import Lines
 from app.calibration.odometry import track
@@ -27,6 +27,7 @@ from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.trajectory import read_tum
 from tests.calibration.rehearsal import MID360, TURN, known
+from tests.sensors import rig
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +123,12 @@ def test_numbers_for_programs_are_json_and_the_plot_is_an_image(tmp_path: Path) 
 def test_a_recording_that_is_too_short_is_refused_in_a_sentence(shared_data: Path) -> None:
     result = CliRunner().invoke(cli, ["calibrate", str(shared_data / "hall_mid360.mcap"), "--duration", "5"])
     assert result.exit_code == 2 and "needs at least 50 scans" in result.output
+
+
+def test_a_recording_without_an_imu_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    alone = [entry for entry in rig.walk(turns=60, columns=4) if entry[0] == "/points"]
+    with pytest.raises(HemislamError, match="has no IMU, so there is nothing to calibrate"):
+        calibrate(rig.write(tmp_path / "walk", alone), Params())
 
 
 def test_errors_of_scan_lines_are_told_drawn_and_kept(tmp_path: Path) -> None:

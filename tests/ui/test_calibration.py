@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import viser
 
+from app.sensors.recording import NO_IMU
 from app.server.protocol import (
     Calibrated,
     Command,
@@ -155,6 +156,12 @@ def test_what_is_applied_goes_on_from_the_frame_that_was_shown(page: Calibrating
     page.draw(page.now)
     user_clicks(page.panel._apply)
     assert page.sent[-1] == Seek(300 if finished else 299)
+
+
+def test_without_an_imu_there_is_no_mounting_to_look_for(unasked: Calibrating) -> None:
+    assert OPEN.recording is not None
+    unasked.draw(replace(OPEN, recording=replace(OPEN.recording, findings=(NO_IMU,))))
+    assert unasked.process() is None
 
 
 def test_a_session_that_is_continued_keeps_its_parameters(unasked: Calibrating) -> None:
