@@ -98,13 +98,14 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
     total, points = report["timings_ms"]["total"], report["map"]
     counts = f"{frames['processed']} processed, {frames['dropped']} dropped, {frames['lost']} lost"
     share = 100 * (ground["share"] or 0)
+    moving = f", {points['moving']:,} moving" if points["moving"] else ""
     lines = [
         ("frames", f"{counts}; {report['distance_m']:.1f} m walked"),
         (
             "frame time",
             f"{total['median']:.1f} ms (median), {total['p95']:.1f} ms (95 %), {total['max']:.1f} ms (max)",
         ),
-        ("map", f"{points['points']:,} points in {points['keyframes']} keyframes; {share:.0f} % ground"),
+        ("map", f"{points['points']:,} points in {points['keyframes']} keyframes; {share:.0f} % ground{moving}"),
     ]
     if loops:
         lines.append(
