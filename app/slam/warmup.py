@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from app.slam import channels, ground, iekf, imu, start
+from app.slam import channels, ground, iekf, imu, moving, start
 from app.slam.engine import Engine
 from app.slam.lines import LineErrors
 from app.slam.local_map import LocalMap
 from app.slam.params import Params
 from app.slam.sections import MapParams
-from app.slam.types import ImuSamples, Scan
+from app.slam.types import Cloud, ImuSamples, Keyframe, Scan
 from app.slam.voxel import VoxelGrid
 
 
@@ -48,6 +48,9 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     LineErrors.unknown().learnt(posterior, points, scan.ring, 1.0, local_map, params.filter)
     progress("a whole frame", 0.9)
     _run_frames(scan, samples, params)
+    cloud = Cloud(points.copy(), surface.labels.copy(), scan.intensity, scan.ring, scan.offsets_ns)
+    keyframe = Keyframe(0, 0, 0, np.eye(4), np.eye(4), np.eye(6), cloud)
+    moving.find(keyframe, [moving.sight(keyframe)], params.moving)
     progress("done", 1.0)
 
 

@@ -120,5 +120,5 @@ class AppearancePanel:
         self._limits = limits
         self._legend.content = panel("legend", legend(view.colour_by, limits, view.ends), view.grid)
         words = f"{points:,} map points in the page, at most {budget:,}: of a larger map, more of what is near."
-        about = f" {moving:,} points on what moves are {'shown' if view.moving else 'hidden'}." if moving else ""
+        about = f" {moving:,} points on moving things are {'shown' if view.moving else 'hidden'}." if moving else ""
         self._count.content = panel("note", f"{words} The engine keeps the whole map.{about}")
