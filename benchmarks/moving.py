@@ -30,7 +30,7 @@ from benchmarks.record import Line
 
 SEEDS = (1, 2, 3)
 SCENES = ("corridor", "outdoor")
-DURATION_S, RATE_HZ, EVERY_BLOCK = 20.0, 10, 4
+DURATION_S, RATE_HZ, EVERY_BLOCK = 30.0, 10, 4
 ON, OFF, REACH = 0.08, 0.25, 20.0
 DEVICE = SCANNERS["bpearl"]
 _O3D: Any = open3d  # its stubs know no arrays

@@ -51,7 +51,7 @@ def run(
       loops.csv                every loop candidate: verdict, measurements and reason
       graph.g2o                the pose graph of the keyframes
       timings.csv              milliseconds of each stage in each frame, without reading the file
-      map.ply                  the map: x y z intensity ground ring time; keyframes
+      map.ply                  the map: x y z intensity ground moving ring time; keyframes
       report.json              parameters, counts of frames, ground share, errors against truth
 
     \b
