@@ -14,7 +14,8 @@ from session_bench import Bench, last_notice
 from app.mapping.painted import Stroke
 from app.mapping.session_file import State
 from app.server.protocol import EditLabels, Paint, Restart, Seek, SetParams, UndoLabels, UndoPaint
-from app.slam.types import GROUND, NON_GROUND
+from app.slam import moving
+from app.slam.types import GROUND, MOVING, NON_GROUND
 
 
 def test_changed_labels_are_shown_and_taken_back() -> None:
@@ -28,6 +29,19 @@ def test_changed_labels_are_shown_and_taken_back() -> None:
     undone = bench.do(UndoLabels(), UndoLabels(), UndoLabels())
     assert all(np.array_equal(one.labels, other.labels) for one, other in zip(before, undone.chunks, strict=True))
     assert "no edit of labels to undo" in last_notice(undone)
+
+
+def test_what_moves_is_shown_once_it_is_found_and_no_more_when_that_is_switched_off(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(moving, "find", lambda keyframe, *_: np.arange(len(keyframe.cloud)) >= 0)
+    bench = Bench()
+    found = bench.do(Seek(20)).chunks
+    assert len(found) == 5 and all((chunk.labels == MOVING).all() for chunk in found)
+    edited = bench.do(EditLabels(1, GROUND)).chunks
+    assert (edited[1].labels == GROUND).all(), "the user has the last word"
+    off = bench.do(SetParams({"moving.enabled": False})).chunks
+    assert [(chunk.labels == MOVING).any() for chunk in off] == [False] * 5 and (off[1].labels == GROUND).all()
 
 
 def test_labels_that_do_not_fit_are_refused() -> None:
