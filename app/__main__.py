@@ -84,7 +84,7 @@ def hemislam(
 
     \b
     Try:
-      hemislam serve sample_data/museum.mcap      watch the map grow in the browser
+      hemislam serve sample_data/cloister.mcap      watch the map grow in the browser
       hemislam info walk.bag                      what is in a recording, and what is wrong with it
       hemislam run walk.bag --preset h2lid        trajectory, map and report, without a browser
 
@@ -155,7 +155,7 @@ def simulate(
     out: Annotated[
         Path, typer.Option("--out", metavar="FILE.mcap", help="The recording to write; with --suite a folder.")
     ],
-    scene: Annotated[str | None, typer.Argument(metavar="SCENE", help="corridor, room, outdoor, museum, ...")] = None,
+    scene: Annotated[str | None, typer.Argument(metavar="SCENE", help="corridor, outdoor, cloister, ...")] = None,
     suite: Annotated[
         str | None, typer.Option("--suite", metavar="paper", help="Simulated versions of the paper's six sequences.")
     ] = None,

@@ -19,11 +19,11 @@ from app.ui.colours import LABEL_COLOURS
 from benchmarks.client import Client, listening
 from benchmarks.record import Line
 
-SAMPLE = Path(__file__).resolve().parents[1] / "sample_data" / "museum.mcap"
+SAMPLE = Path(__file__).resolve().parents[1] / "sample_data" / "cloister.mcap"
 SCAN = "/map/sensor/lidar/scan"
 SETTLED = 60
 """A frame after which every process has started."""
-TRIALS = 15  # within the fifty seconds of the sample
+TRIALS = 15  # within the 84 seconds of the sample
 SOME_GROUND = 0.05
 """The least share of ground points while ground is looked for."""
 
@@ -51,7 +51,7 @@ def _relabelling(server: httpx.Client, page: Client) -> Line:
         if not after or not before or before[-1] < SOME_GROUND:
             raise RuntimeError("the points did not change their colour")
         delays.append(1e3 * (after[0] - begin))
-    return Line.of("parameter to relabelled points at the WebSocket", "museum, playing", "ms", delays)
+    return Line.of("parameter to relabelled points at the WebSocket", "cloister, playing", "ms", delays)
 
 
 def _ground_shares(page: Client, first: int) -> Iterator[tuple[float, float]]:
@@ -81,7 +81,7 @@ def _replay(server: httpx.Client) -> Line:
         time.sleep(0.1)
     rate = (now - first) / (time.perf_counter() - begin)
     seconds_a_frame = state["recording"]["duration_s"] / state["recording"]["frames"]
-    return Line.of("replay with a page open", "museum", "x real time", [rate * seconds_a_frame])
+    return Line.of("replay with a page open", "cloister", "x real time", [rate * seconds_a_frame])
 
 
 def _state(server: httpx.Client) -> Any:

@@ -19,7 +19,7 @@ import httpx
 from playwright.sync_api import Browser, Page, sync_playwright
 
 ROOT = Path(__file__).resolve().parents[1]
-SAMPLE, IMAGES = ROOT / "sample_data" / "museum.mcap", ROOT / "docs" / "images"
+SAMPLE, IMAGES = ROOT / "sample_data" / "cloister.mcap", ROOT / "docs" / "images"
 ARGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 QUIET = ".mantine-Notification-root{display:none!important}"
 """viser warns of drawing in software."""

@@ -1,6 +1,6 @@
 """Loops and the pose graph without a page: process a recording, reject its first loop, and compare both trajectories.
 
-python examples/loops_headless.py sample_data/museum.mcap
+python examples/loops_headless.py sample_data/cloister.mcap
 """
 
 import sys

@@ -1,6 +1,6 @@
 """A recording, frame by frame: what the doctor found, then each scan with its IMU samples.
 
-python examples/read_frames.py sample_data/museum.mcap
+python examples/read_frames.py sample_data/cloister.mcap
 """
 
 import sys

@@ -1,6 +1,6 @@
 """The workbench, controlled over REST: play to a frame, change a parameter, save the trajectory.
 
-hemislam serve sample_data/museum.mcap --paused --no-browser
+hemislam serve sample_data/cloister.mcap --paused --no-browser
 python examples/rest_client.py http://127.0.0.1:8080
 """
 

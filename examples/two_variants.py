@@ -1,6 +1,6 @@
 """An evaluation of two variants on one recording, with a report in FOLDER.
 
-python examples/two_variants.py sample_data/museum.mcap FOLDER
+python examples/two_variants.py sample_data/cloister.mcap FOLDER
 """
 
 import sys

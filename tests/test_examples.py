@@ -16,7 +16,7 @@ from app.slam.types import Measurement
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
-SAMPLE = ROOT / "sample_data" / "museum.mcap"
+SAMPLE = ROOT / "sample_data" / "cloister.mcap"
 ENV = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 

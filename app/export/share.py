@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import viser
 
+from app.export.ceilings import below_ceiling
 from app.export.paths import name_of, utc_text
+from app.export.point_sizes import with_point_sizes
 from app.slam.types import F32, F64, U8
 
 if TYPE_CHECKING:
@@ -36,17 +38,20 @@ def write(path: Path, results: "Results") -> None:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
     name = html.escape(name_of(results.info.recording))
-    page = page.replace("<title>Viser</title>", f"<title>{name}</title>", 1)
+    page = with_point_sizes(page).replace("<title>Viser</title>", f"<title>{name}</title>", 1)
     before, end, after = page.rpartition("</body>")
     path.write_text(before + _overlay(name, len(points), results) + end + after, encoding="utf-8")
 
 
 def _sample(results: "Results") -> tuple[F32, F64]:
-    """(n, 3) m, a fair sample of the chosen points, and (k, 3) the keyframes' positions."""
+    """(n, 3) m, a fair sample of the chosen points below ceilings, and (k, 3) the keyframes' positions."""
     total, rng = sum(len(block) for block in results.still_blocks()), np.random.default_rng(0)
     taken, keyframes = [np.empty((0, 3), np.float32)], []
     for block in results.still_blocks():
         which = rng.random(len(block)) * total < MOST_POINTS
+        up, above = block.T_map_lidar[2, :3], block.points - block.T_map_lidar[:3, 3]
+        below = below_ceiling((above @ block.T_map_lidar[:3, :3]).astype(np.float32), block.labels, up)
+        which &= below if below is not None else True
         taken.append(block.points[which].astype(np.float32))
         keyframes.append(block.T_map_lidar[:3, 3])
     return np.concatenate(taken), np.reshape(keyframes, (-1, 3))

@@ -22,6 +22,8 @@ import viser._messages
 import viser.infra
 import websockets.asyncio.server
 
+from app.export.point_sizes import with_point_sizes
+
 KEY_HEADER: Final = "X-Hemislam-Key"
 
 MOST_AT_ONCE: Final = 32
@@ -124,8 +126,8 @@ def is_readable(kind: str, raw: bytes) -> bool:
 
 
 def page_html() -> str:
-    """viser's page under our title."""
-    return CLIENT.read_text(encoding="utf-8").replace(TITLE, "<title>hemislam</title>", 1)
+    """viser's page under our title, with our sizes of points."""
+    return with_point_sizes(CLIENT.read_text(encoding="utf-8")).replace(TITLE, "<title>hemislam</title>", 1)
 
 
 def viewer_html(page: str) -> str:

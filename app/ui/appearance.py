@@ -57,7 +57,7 @@ class AppearancePanel:
             15.0,
             0.5,
             100 * default.point_size,
-            hint="Diameter of points from nearby; from afar they grow to stay visible.",
+            hint="Diameter of points, which are drawn at least 1.5 and at most 12 pixels wide.",
         )
         with gui.add_folder("Layers", expand_by_default=True):
             self._ceilings = gui.add_dropdown(
@@ -78,7 +78,7 @@ class AppearancePanel:
     def view(self) -> View:
         return View(
             colour_by=self._colour_by.value,
-            point_size=self._looks.point_size(self._point_size.value / 100),
+            point_size=self._point_size.value / 100,
             follow=self._follow.value,
             light=self._light.value,
             ends=self._ends.get(self._colour_by.value),

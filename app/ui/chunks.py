@@ -14,10 +14,11 @@ import numpy.typing as npt
 import viser
 
 from app.export.box import Box
+from app.export.ceilings import below_ceiling
 from app.server.chunks import VOXEL_M, voxel_of_level
 from app.server.protocol import Chunk
 from app.server.setup import POINT_BUDGET
-from app.slam.types import F32, F64, I64, MOVING, U8, is_ground
+from app.slam.types import F32, F64, I64, MOVING, U8
 from app.ui.colours import BY_POSE, INTENSITY, MODES, Limits, PointSet, chosen_ends, colours, grown
 from app.ui.detail import parts
 from app.ui.geometry import STILL_M
@@ -27,12 +28,6 @@ from app.ui.widgets import View
 
 _STILL: Final[F32] = np.array([5e-5, 5e-5, 5e-5, STILL_M], np.float32)
 """Largest change of a pose's rotation and position (m) that is not sent: each loop moves most of the map by less."""
-_CONE: Final = float(np.cos(np.radians(35.0)))
-_HIGHEST_M: Final = 8.0
-_LEAST_SHARE: Final = 0.004
-_FLATNESS_M: Final = 0.12
-"""Most median deviation of the points overhead from their median height: treetops are rougher."""
-_MARGIN_M: Final = 0.25
 _SIZE_BY_GAP: Final = 0.5
 _GAP_BY_SHARE: Final = 0.25
 """How gaps grow with the number of points left out: by its square root, but other keyframes fill half of them."""
@@ -298,21 +293,3 @@ def _same(drawn: Chunk, chunk: Chunk) -> bool:
     return (drawn.index, drawn.frame, drawn.stamp_ns) == (chunk.index, chunk.frame, chunk.stamp_ns) and (
         drawn.level + drawn.joined <= chunk.level + chunk.joined
     )
-
-
-def below_ceiling(points: F32, labels: U8, up: F64) -> npt.NDArray[np.bool_] | None:
-    """Which points stay when the ceiling above a keyframe is hidden; None where nothing flat is overhead.
-
-    Points labelled ground always stay: a ceiling mistaken for ground must be visible.
-
-    Args:
-        points: (n, 3) m, LiDAR frame. labels: (n,). up: (3,) unit, LiDAR frame.
-    """
-    height = points @ up.astype(np.float32)
-    overhead = height[height > _CONE * np.linalg.norm(points, axis=1)]
-    if len(overhead) < max(30.0, _LEAST_SHARE * len(points)):
-        return None
-    ceiling = float(np.median(overhead))
-    if ceiling > _HIGHEST_M or float(np.median(np.abs(overhead - ceiling))) > _FLATNESS_M:
-        return None
-    return np.asarray((height < ceiling - _MARGIN_M) | is_ground(labels))

@@ -1,4 +1,4 @@
-"""What depends on where browsers look from: the scale bar and compass of each, ceilings, the size of points."""
+"""What depends on where browsers look from: the scale bar and compass of each, and ceilings."""
 
 from typing import Final
 
@@ -13,9 +13,6 @@ _LONGEST: Final = 0.16
 """Of a bar, as a share of the picture's height."""
 _STEPS: Final = (1.0, 2.0, 5.0, 10.0)
 
-_POINT_PX: Final = 1.5
-"""Least diameter of points in the middle of the picture: from afar surfaces stay closed."""
-_STEP: Final = 1.25
 _SHOWN_DEG, _HIDDEN_DEG = 12.0, 22.0
 """Ceilings come back where one looks down by less than the first, and go where it is more than the second."""
 
@@ -86,15 +83,3 @@ class Looks:
         if slopes:
             self._above = max(slopes) > (_SHOWN_DEG if self._above else _HIDDEN_DEG)
         return self._above
-
-    def point_size(self, least: float) -> float:
-        """Point size in m, at least `least`, that the browser nearest to the map can see. It grows in steps."""
-        pixels = [_pixel_m(client.camera) for client in self._server.get_clients().values()]
-        wanted = _POINT_PX * min(pixels, default=0.0)
-        return float(least * _STEP ** round(np.log(max(wanted / least, 1.0)) / np.log(_STEP)))
-
-
-def _pixel_m(camera: viser.CameraHandle) -> float:
-    """Of a picture's pixel, at the distance of what is looked at."""
-    distance = float(np.linalg.norm(np.array(camera.position) - camera.look_at))
-    return 2 * distance * float(np.tan(camera.fov / 2)) / float(max(camera.image_height, 1))

@@ -9,7 +9,18 @@ from hypothesis.strategies import SearchStrategy
 
 Json = Any
 
-WORDS = ("", ".", "..", "/", "/etc/passwd", "museum.mcap", "museum_truth.tum", "museum.params.yaml", "\0", "\ud800")
+WORDS = (
+    "",
+    ".",
+    "..",
+    "/",
+    "/etc/passwd",
+    "cloister.mcap",
+    "cloister_truth.tum",
+    "cloister.params.yaml",
+    "\0",
+    "\ud800",
+)
 ODD: SearchStrategy[Json] = st.sampled_from(
     [None, True, -1, 0, 2**31, 2**63, 2**64, -(10**400), 1e308, 1e-320, -0.0, float("nan"), float("inf"), *WORDS,
      "9" * 5000, "é" * 1500, [], {}, [[]], {"": None}, [0] * 500]

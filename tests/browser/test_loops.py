@@ -45,9 +45,11 @@ def test_chips_rows_and_heads_of_the_table_can_be_clicked(bench: Bench) -> None:
     expect(page.get_by_text("keyframes 12–89")).to_have_count(0)
 
 
-def test_an_arch_can_be_clicked_in_the_scene(bench: Bench) -> None:
+def test_a_click_on_an_arch_shows_the_loop_whatever_tab_is_open(bench: Bench) -> None:
     page, poses = bench.page, bench.engine.snapshot.keyframe_poses
     assert poses is not None
+    page.get_by_role("tab", name="Parameters").click()
+    expect(page.get_by_text("accepted 6")).to_be_hidden()
     # the knob above the middle, through a camera that looks straight down at the middle of the canvas
     middle = poses[list(GOOD), :3, 3].mean(axis=0)
     knob = middle + np.array([0.0, 0.0, 0.7 + 0.12 * np.linalg.norm(np.diff(poses[list(GOOD), :3, 3], axis=0))])

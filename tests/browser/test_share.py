@@ -15,6 +15,7 @@ from PIL import Image
 from playwright.sync_api import Browser
 
 from app.export import share
+from app.export.point_sizes import LEAST_PX, MOST_PX, VISERS
 from app.export.results import Results
 from app.slam.frames import READOUTS, Frame
 from app.slam.params import Params
@@ -51,6 +52,13 @@ def test_a_shared_page_opens_from_the_disk_without_a_complaint(chromium: Browser
     print(f"shown after {time.monotonic() - begin:.1f} s")
     if "SHARE_PICTURE" in os.environ:
         page.screenshot(path=Path(os.environ["SHARE_PICTURE"]))
+    sized = page.evaluate(
+        "(line) => { const gl = document.createElement('canvas').getContext('webgl2');"
+        " const shader = gl.createShader(gl.VERTEX_SHADER); gl.shaderSource(shader, line);"
+        " return gl.getShaderSource(shader); }",
+        VISERS,
+    )
+    assert sized == f"gl_PointSize = clamp(scale / -world_pos.z, {LEAST_PX:.2f}, {MOST_PX:.2f});"
     assert "plaza" in page.title() and page.get_by_text("200,000 points").is_visible()
     of_the_renderer = ("THREE.Clock: ", "GL Driver Message", "Canvas2D: Multiple readback")
     assert not [text for text in said if not text.startswith(of_the_renderer) and "GL Driver" not in text]

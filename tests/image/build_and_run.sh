@@ -55,7 +55,7 @@ run() {
 served() {
   local out="$folder/serve.txt" pid address=""
   run "$1" timeout --signal=INT --preserve-status 30 \
-    hemislam serve sample_data/museum.mcap --port 0 --no-browser --paused >"$out" 2>&1 &
+    hemislam serve sample_data/cloister.mcap --port 0 --no-browser --paused >"$out" 2>&1 &
   pid=$!
   while [ -z "$address" ] && kill -0 "$pid" 2>/dev/null; do
     sleep 0.2
@@ -79,9 +79,9 @@ for user in "" 12345; do
   name=${user:-hemislam}
   container=$(buildah from --pull=never hemislam-test)
   say "as $name: info"
-  run "$user" hemislam info sample_data/museum.mcap
+  run "$user" hemislam info sample_data/cloister.mcap
   say "as $name: run"
-  run "$user" hemislam run sample_data/museum.mcap --duration 10 --out "runs/image-test-$name"
+  run "$user" hemislam run sample_data/cloister.mcap --duration 10 --out "runs/image-test-$name"
   run "$user" test -s "runs/image-test-$name/trajectory.tum"
   say "as $name: serve"
   served "$user"

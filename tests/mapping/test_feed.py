@@ -9,7 +9,7 @@ from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import Measurement
 
-SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "museum.mcap"
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "cloister.mcap"
 
 
 def read(path: Path, *, read_ahead: bool) -> tuple[list[bytes], str]:

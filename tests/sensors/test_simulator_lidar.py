@@ -1,9 +1,9 @@
 """The simulated RS-Bpearl's firings, ranges, labels and moving bodies.
 
 Tests app/sensors/robosense.py, app/sensors/simulator/lidar.py, app/sensors/simulator/mesh.py,
-app/sensors/simulator/raycast.py, app/sensors/simulator/scenes/museum.py, app/sensors/simulator/scenes/offices.py,
-app/sensors/simulator/scenes/outdoors.py, app/sensors/simulator/scenes/props.py,
-app/sensors/simulator/scenes/rooms.py.
+app/sensors/simulator/raycast.py, app/sensors/simulator/scenes/cloister.py, app/sensors/simulator/scenes/museum.py,
+app/sensors/simulator/scenes/offices.py, app/sensors/simulator/scenes/outdoors.py,
+app/sensors/simulator/scenes/props.py, app/sensors/simulator/scenes/rooms.py.
 """
 
 import numpy as np

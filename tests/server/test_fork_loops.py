@@ -15,14 +15,15 @@ from app.server.worker import EngineProcess
 from app.slam.loops.edits import SetWeight
 from app.slam.loops.types import Pair, Verdict
 
-BEFORE, LAST = 490, 498
+LENGTH_S, BEFORE, LAST = 41.0, 401, 409
 
 
 @pytest.fixture(scope="module")
 def walked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workspace]:
-    """A near the end of the recording that ships, where its loops are, and B from there on."""
+    """A where the recording that ships has its first loops, and B from there on."""
     params = resolve_params(SAMPLE, None, None, [])
-    setup = Setup(SAMPLE, params=params, speed=math.inf, session_folder=tmp_path_factory.mktemp("kept"))
+    folder = tmp_path_factory.mktemp("kept")
+    setup = Setup(SAMPLE, params=params, duration_s=LENGTH_S, speed=math.inf, session_folder=folder)
     workspace = Workspace(EngineProcess(setup), setup, EngineProcess)
     until(lambda: workspace.snapshot, lambda s: s.transport.frame == 0)
     workspace.send(Seek(BEFORE))

@@ -10,12 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_rewind import SAMPLE, Bench, open_whole
+from test_rewind import SAMPLE, Bench
 from typer.testing import CliRunner
 
 from app.__main__ import cli
 from app.export.results import BY_RUN
+from app.mapping.checkpoints import DEFAULT_BYTES
 from app.mapping.loops import LoopProcess, RestartingLoops
+from app.mapping.opening import open_session
+from app.mapping.session import Session
 from app.sensors.presets import resolve_params
 from app.server.protocol import (
     AddNote,
@@ -35,21 +38,25 @@ from app.server.protocol import (
 from app.slam.loops import edit_files
 from app.slam.loops.edits import Accept, Reject, SetWeight
 from app.slam.loops.types import LoopEdge, Verdict
+from app.slam.params import Params
 
 FILES = ("trajectory.tum", *(export.name for export in BY_RUN if export.of_loops))
-DRIFTING = (
-    "filter.max_points=100", "filter.plane_tilt=20", "map.spacing=0.6", "map.points_per_voxel=10", "map.radius=12",
-    "sensor.max_range=12",
-)  # fmt: skip
-"""So little of each scan that odometry drifts by a decimetre and loops have something to correct."""
-LAST = 498
+LENGTH_S, LAST = 41.0, 409
+"""So far the walk has come back once, through a passage in which odometry drifts by 0.4 m, and its last frame."""
+
+LEVELLED = 0.01
+"""rad, m: what levelling by gravity may turn the map."""
+
+
+def open_lap(path: Path, truth: Path | None, params: Params, part: object = None, /) -> Session:
+    return open_session(path, params, 0.0, LENGTH_S, truth=truth, checkpoint_bytes=DEFAULT_BYTES)
 
 
 class Walk(Bench):
-    """The whole recording, walked to its end."""
+    """The first lap of the sample, walked to its end."""
 
     def __init__(self) -> None:
-        super().__init__(resolve_params(SAMPLE, None, None, list(DRIFTING)), open_whole, SAMPLE)
+        super().__init__(resolve_params(SAMPLE, None, None, []), open_lap, SAMPLE)
 
     def settle(self) -> None:
         """Until nothing is awaited any more, of the loops' process neither."""
@@ -88,12 +95,12 @@ def test_the_walk_ends_where_it_began_and_that_is_found(walk: Walk) -> None:
     snapshot = walk.end()
     assert len(accepted(snapshot)) >= 3
     assert all(edge.newer - edge.older > 50 for edge in accepted(snapshot))
-    assert not np.array_equal(snapshot.result.T_map_odom, np.eye(4))
+    assert 0.2 < np.linalg.norm(snapshot.result.T_map_odom[:3, 3]) < 1.0, "the sample's loops move the map visibly"
 
 
 def test_back_and_on_again_gives_the_same_files(walk: Walk, files: dict[str, bytes], tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
-    for frame in [*rng.integers(0, LAST, 4).tolist(), 480, 5]:
+    for frame in [*rng.integers(0, LAST, 4).tolist(), LAST - 18, 5]:
         snapshot = walk.do(Seek(frame))
         assert snapshot.trajectory is not None and len(snapshot.trajectory) == frame + 1
         assert all(edge.decided_at < len(snapshot.chunks) for edge in snapshot.loops.edges)
@@ -119,7 +126,7 @@ def test_playing_again_from_the_end_or_restarting_keeps_the_edits(
 def test_before_a_loop_is_found_the_map_is_where_odometry_has_it(walk: Walk) -> None:
     early = walk.do(Seek(200))
     assert not accepted(early)
-    np.testing.assert_array_equal(early.result.T_map_odom, np.eye(4))
+    np.testing.assert_allclose(early.result.T_map_odom, np.eye(4), atol=LEVELLED)
     walk.end()
 
 
@@ -132,10 +139,10 @@ def test_all_rejected_leaves_odometry_and_undone_leaves_nothing(
     assert not accepted(after) and len(after.loops.undo) == len(loops)
     kept = after.chunks[: len(before.chunks)]  # clouds of a restarted walk may still come
     assert kept and all(map(operator.is_, kept, before.chunks)), "the map stays as fine"
-    np.testing.assert_array_equal(after.result.T_map_odom, np.eye(4))
+    np.testing.assert_allclose(after.result.T_map_odom, np.eye(4), atol=LEVELLED)
     assert after.trajectory is not None and before.trajectory is not None
     moved = np.linalg.norm(after.trajectory - before.trajectory, axis=1)
-    assert moved.max() > 1e-4
+    assert moved.max() > 0.2
     back = walk.do(*(UndoLoop() for _ in loops))
     assert len(accepted(back)) == len(loops) and len(back.loops.redo) == len(loops)
     assert walk.saved(tmp_path / "undone") == files
@@ -155,10 +162,8 @@ def test_the_file_of_what_was_done_in_the_page_repeats_it_headless(walk: Walk, t
     path.write_text(edit_files.write(snapshot.loops.undo) + "- accept: [1, 2]\n")
     ours = walk.saved(tmp_path / "page")
     walk.do(UndoLoop(), UndoLoop())
-    settings = [word for setting in DRIFTING for word in ("--set", setting)]
-    result = CliRunner().invoke(
-        cli, ["run", str(SAMPLE), "--loops", str(path), "--out", str(tmp_path / "headless"), *settings]
-    )
+    words = ["run", str(SAMPLE), "--duration", str(LENGTH_S), "--loops", str(path), "--out", str(tmp_path / "headless")]
+    result = CliRunner().invoke(cli, words)
     assert result.exit_code == 0, result.output
     assert "Accept 1-2 has no effect" in result.output
     assert {name: (tmp_path / "headless" / name).read_bytes() for name in FILES} == ours

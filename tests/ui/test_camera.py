@@ -225,15 +225,3 @@ def test_ceilings_go_where_one_looks_from_above_and_come_back_inside() -> None:
         server.browsers[1] = Browser(9 * back)
         seen.append(looks.from_above)
     assert seen == [True, True, False, False, True], "not to and fro in between"
-
-
-def test_points_grow_with_the_distance_of_the_nearest_browser_so_that_they_stay_visible() -> None:
-    server = Server()
-    looks = Looks(server)  # type: ignore[arg-type]
-    assert looks.point_size(0.04) == 0.04
-    for distance, pixels in ((1.0, 34.0), (100.0, 1.5), (400.0, 1.5)):
-        server.browsers[1] = Browser(np.array([0.0, 0.0, distance]))
-        pixel = 2 * distance * np.tan(FOV / 2) / 1000
-        assert looks.point_size(0.04) == pytest.approx(pixels * pixel, rel=0.13)
-    server.browsers[2] = Browser(np.array([0.0, 0.0, 1.0]))
-    assert looks.point_size(0.04) == 0.04, "else it would be full of discs"

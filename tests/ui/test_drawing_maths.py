@@ -1,6 +1,6 @@
 """The pure parts of the page: colours, thinning, ceilings and the shapes that explain a scan.
 
-Tests app/ui/colours.py, app/ui/geometry.py, app/ui/nodes.py, app/ui/sensor.py.
+Tests app/export/ceilings.py, app/ui/colours.py, app/ui/geometry.py, app/ui/nodes.py, app/ui/sensor.py.
 """
 
 import numpy as np
@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from app.export.ceilings import below_ceiling
 from app.slam.types import GROUND, NON_GROUND
-from app.ui.chunks import below_ceiling
 from app.ui.colours import HEIGHT, MODES, NOTHING, TABLES, Limits, grown, label_colours, value_colours
 from app.ui.geometry import field_of_view, foot, ring_elevations, rotation_to, seed_wedge, wxyz
 from app.ui.nodes import BLOCK, segments

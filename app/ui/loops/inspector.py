@@ -7,13 +7,13 @@ from typing import Final
 import numpy as np
 import viser
 
+from app.export.ceilings import below_ceiling
 from app.server.protocol import Snapshot
 from app.slam import lie
 from app.slam.loops.scan_context import YAWS
 from app.slam.loops.types import LoopDetail, LoopEdge, Pair
 from app.slam.sections import LoopsParams
 from app.slam.types import F32, F64, NON_GROUND, U8
-from app.ui.chunks import below_ceiling
 from app.ui.colours import TABLES
 from app.ui.html import heading, panel
 from app.ui.loops.words import NEWER, OLDER, evidence

@@ -55,6 +55,7 @@ class LoopsPanel:
         self._send, self._snapshot = page.send, page.snapshot
         self._chosen: Pair | None = None
         self._coming: Pair | None = None
+        self._opener: viser.GuiHtmlHandle | None = None  # what showed this tab last, in one browser
         self._session = -1
         self._asked: tuple[object, ...] = ()
         self._shown: frozenset[str] = frozenset(KINDS) - {"rejected"}
@@ -181,6 +182,9 @@ class LoopsPanel:
             self._add_loop.pick(origin, direction)
         elif (pair := self._edges.pick(origin, direction)) is not None:
             self.choose(pair)
+            if self._opener is not None:
+                self._opener.remove()
+            self._opener = event.client.gui.add_html(panel("open_tab", "Loops"))
 
     def _step(self, by: int) -> None:
         """To the next loop in the table's order, or back."""

@@ -5,8 +5,8 @@ if (!window.hemislamTour) {
     ['.hs-track', '', 'Go anywhere', 'Drag the track. Marks show loops, notes and trouble; Diagnostics says what it was.'],
     ['[role=slider][aria-valuenow]:not(input)', 'Parameters', 'Tune the ground', 'Move M, α or σ: the present frame is labelled again '
       + 'at once. Teal is ground, amber are the seeds it was found from.'],
-    ['', 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click a row to see both sides and '
-      + 'why it was accepted or refused; change that, and undo it.'],
+    ['', 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click its green knob or its row to '
+      + 'see both sides and why it was accepted or refused; change that, and undo it.'],
     ['', 'Help', 'That is all', 'Every number says on hover what it is. This tour and all keys are under Help.'],
   ];
   const seen = () => { try { localStorage.setItem('hemislam-tour', 'seen'); } catch { /* private window */ } };

@@ -23,18 +23,18 @@ from app.slam.params import Params
 from app.slam.types import Measurement, Scan
 from tests.sensors.live import ports
 
-MUSEUM = Path(__file__).resolve().parents[3] / "sample_data" / "museum.mcap"
+SAMPLE = Path(__file__).resolve().parents[3] / "sample_data" / "cloister.mcap"
 SECONDS = 2.5
 
 
 @pytest.fixture(scope="module")
 def params() -> Params:
-    return resolve_params(MUSEUM, None, None, [])
+    return resolve_params(SAMPLE, None, None, [])
 
 
 @pytest.fixture(scope="module")
 def filed(params: Params) -> list[Measurement]:
-    with open_recording(MUSEUM, params) as recording:
+    with open_recording(SAMPLE, params) as recording:
         return [m for m in recording.measurements(0, SECONDS) if isinstance(m, Measurement)]
 
 
@@ -43,7 +43,7 @@ def feeding(params: Params, to: str, imu_to: str | None = None, speed: float = 1
     stop = threading.Event()
     thread = threading.Thread(
         target=feed,
-        args=(MUSEUM, params, parse_address(to), parse_address(imu_to) if imu_to else None),
+        args=(SAMPLE, params, parse_address(to), parse_address(imu_to) if imu_to else None),
         kwargs={"pace": Pace(speed, stop), "duration_s": SECONDS, "wait_s": 20.0},
     )
     thread.start()
@@ -131,6 +131,6 @@ def test_a_denser_lidars_scan_is_no_mid360s() -> None:
 def test_no_client_or_no_address_for_the_imu_is_refused(params: Params) -> None:
     (port,) = ports.free(1)
     with pytest.raises(HemislamError, match="No client subscribed"):
-        feed(MUSEUM, params, parse_address(f"foxglove://127.0.0.1:{port}"), wait_s=0.1)
+        feed(SAMPLE, params, parse_address(f"foxglove://127.0.0.1:{port}"), wait_s=0.1)
     with pytest.raises(HemislamError, match="--imu-to"):
-        feed(MUSEUM, params, parse_address("rsbpearl://127.0.0.1:1,2"), pace=Pace(math.inf))
+        feed(SAMPLE, params, parse_address("rsbpearl://127.0.0.1:1,2"), pace=Pace(math.inf))

@@ -11,14 +11,14 @@ from typer.testing import CliRunner
 from app.__main__ import cli
 from tests.sensors.live import ports
 
-MUSEUM = str(Path(__file__).resolve().parents[3] / "sample_data" / "museum.mcap")
+SAMPLE = str(Path(__file__).resolve().parents[3] / "sample_data" / "cloister.mcap")
 
 
 def test_it_plays_packets_whether_or_not_anybody_listens() -> None:
     one, two, three = ports.free(3)
     to, beside = f"rsbpearl://127.0.0.1:{one},{two}", f"imu-udp://127.0.0.1:{three}"
     done = CliRunner().invoke(
-        cli, ["feed", MUSEUM, "--to", to, "--imu-to", beside, "--speed", "0", "--duration", "0.5"]
+        cli, ["feed", SAMPLE, "--to", to, "--imu-to", beside, "--speed", "0", "--duration", "0.5"]
     )
     assert done.exit_code == 0, done.output
     assert "packets sent" in done.output
@@ -35,6 +35,6 @@ def test_it_plays_packets_whether_or_not_anybody_listens() -> None:
     ],
 )
 def test_what_cannot_be_is_refused(arguments: list[str], words: str) -> None:
-    done = CliRunner().invoke(cli, ["feed", MUSEUM, *arguments])
+    done = CliRunner().invoke(cli, ["feed", SAMPLE, *arguments])
     assert done.exit_code == 2
     assert words in done.output

@@ -18,7 +18,7 @@ from app.slam.params import Params
 from app.slam.types import F64, Measurement, Scan
 from tests.sensors.live import sensor
 
-MUSEUM = Path(__file__).resolve().parents[3] / "sample_data" / "museum.mcap"
+SAMPLE = Path(__file__).resolve().parents[3] / "sample_data" / "cloister.mcap"
 COUNT = np.radians(0.01)
 """rad, the packets' unit of azimuth."""
 CORRECTED = [(round(e - 0.5, 2), round(-0.03 - 0.02 * c, 2)) for c, e in enumerate(sensor.ELEVATIONS)]
@@ -153,9 +153,9 @@ def test_a_unit_with_the_nominal_angles_keeps_them_in_any_scene(sight: str) -> N
     assert fit_angles(scans).same(NOMINAL)
 
 
-@pytest.mark.parametrize("name", ["museum", "hall_bpearl", "outdoor_bpearl"])
+@pytest.mark.parametrize("name", ["cloister", "hall_bpearl", "outdoor_bpearl"])
 def test_played_out_as_packets_no_recording_is_turned_or_bent(name: str, shared_data: Path) -> None:
-    path = MUSEUM if name == "museum" else shared_data / f"{name}.mcap"
+    path = SAMPLE if name == "cloister" else shared_data / f"{name}.mcap"
     assembler, decoder = Assembler(), Decoder()
     with open_recording(path, Params()) as recording:
         truth = [m.scan for m in recording.measurements(0, 1.5) if isinstance(m, Measurement)]

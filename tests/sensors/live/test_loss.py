@@ -13,19 +13,19 @@ from app.slam.params import Params
 from app.slam.types import Measurement
 from tests.sensors.live import captures
 
-MUSEUM = Path(__file__).resolve().parents[3] / "sample_data" / "museum.mcap"
+SAMPLE = Path(__file__).resolve().parents[3] / "sample_data" / "cloister.mcap"
 SECONDS = 8.0
 PORTS = (6699, 7788, 6700)
 
 
 @pytest.fixture(scope="module")
 def params() -> Params:
-    return resolve_params(MUSEUM, None, None, [])
+    return resolve_params(SAMPLE, None, None, [])
 
 
 @pytest.fixture(scope="module")
 def sent(params: Params) -> list[captures.Entry]:
-    with open_recording(MUSEUM, params) as recording:
+    with open_recording(SAMPLE, params) as recording:
         return [(one.time_ns, PORTS[one.stream], one.data) for one in packets_of(recording, SECONDS)]
 
 

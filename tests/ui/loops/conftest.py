@@ -42,7 +42,9 @@ class Page:
         return self.server.scene._handle_from_node_name.get(name)
 
     def click_scene(self, origin: np.ndarray, towards: np.ndarray) -> None:
-        event: Any = SimpleNamespace(ray_origin=tuple(origin), ray_direction=tuple(towards - origin))
+        event: Any = SimpleNamespace(
+            client=self.server, ray_origin=tuple(origin), ray_direction=tuple(towards - origin)
+        )
         self.loops._clicked(event)
 
     def says(self, *html: str) -> bool:
