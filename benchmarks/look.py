@@ -12,7 +12,8 @@ import viser
 
 from app.evaluation.cloud_distance import compare
 from app.server.folders import Folders
-from app.server.protocol import Chunk, Command, KeepMeasure, Snapshot
+from app.server.keeping import KeepMeasure
+from app.server.protocol import Chunk, Command, Snapshot
 from app.slam.types import F64
 from app.ui.measure import POINT
 from app.ui.workbench import Workbench

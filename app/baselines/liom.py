@@ -13,7 +13,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from app.baselines.features import extract
-from app.baselines.matching import FeatureMap, PoseFit, moved, register
+from app.baselines.matching import FeatureMap, PoseFit, register
 from app.baselines.mounting import mounting
 from app.slam import lie, start
 from app.slam.errors import HemislamError
@@ -68,7 +68,7 @@ class Liom:
         T_last_now = lie.inverse(self._state.pose().matrix()) @ state.pose().matrix()
         motion = lie.inverse(self._T_imu_lidar) @ T_last_now @ self._T_imu_lidar
         features = extract(scan, self._params.sensor.min_range, self._params.sensor.max_range).seen_at_end(motion)
-        edges, planes = (moved(self._T_imu_lidar, part.points) for part in (features.edge_map, features.plane_map))
+        edges, planes = (lie.moved(self._T_imu_lidar, part.points) for part in (features.edge_map, features.plane_map))
         edges, planes = self._map.thinned(edges, planes)
         self._smooth(summed, state, scan.end_ns, self._relative(edges, planes, state.pose().matrix()))
         self._window.append((edges, planes))
@@ -124,7 +124,7 @@ class Liom:
         parts = []
         for k, clouds in enumerate(self._window, first):
             T = T_first_odom @ estimate.atPose3(X(k)).matrix()
-            parts.append([moved(T, cloud) for cloud in clouds])
+            parts.append([lie.moved(T, cloud) for cloud in clouds])
         all_edges, all_planes = (np.concatenate(clouds) for clouds in zip(*parts, strict=True))
         local.insert(all_edges, all_planes, np.zeros(3))
         return first, register(T_first_odom @ T_odom_imu, partial(local.pairs, edges, planes), ROUNDS)
@@ -156,7 +156,7 @@ class Liom:
         """Their section III.D: register to the map, without roll and pitch."""
         T = register(self._T_map_odom @ T_odom_imu, partial(self._map.pairs, edges, planes), ROUNDS, UPRIGHT).T
         self._T_map_odom = T @ lie.inverse(T_odom_imu)
-        self._map.insert(moved(T, edges), moved(T, planes), T[:3, 3])
+        self._map.insert(lie.moved(T, edges), lie.moved(T, planes), T[:3, 3])
 
 
 def _in_body(fit: PoseFit) -> F64:

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from app.baselines.features import Features, extract
-from app.baselines.matching import FeatureMap, LastScan, moved, register
+from app.baselines.matching import FeatureMap, LastScan, register
 from app.baselines.mounting import levelled, mounting
 from app.slam import lie
 from app.slam.params import Params
@@ -62,5 +62,5 @@ class Loam:
         """Section VI: register the undistorted scan to the map from T_map_lidar on, and add it there."""
         edges, planes = self._map.thinned(features.edge_map.points, features.plane_map.points)
         T = register(T, partial(self._map.pairs, edges, planes), MAP_ROUNDS).T
-        self._map.insert(moved(T, edges), moved(T, planes), T[:3, 3])
+        self._map.insert(lie.moved(T, edges), lie.moved(T, planes), T[:3, 3])
         return T

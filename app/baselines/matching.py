@@ -69,11 +69,6 @@ def joined(*parts: Pairs) -> Pairs:
     return Pairs(*(np.concatenate([getattr(part, name) for part in parts]) for name in Pairs.__slots__))
 
 
-def moved(T: F64, points: F64) -> F64:
-    """(n, 3) points under T_fixed_moving."""
-    return points @ T[:3, :3].T + T[:3, 3]
-
-
 def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> PoseFit:
     """Gauss-Newton steps from `T` with Huber's weights; directions that the pairs leave open stay as they are.
 
@@ -139,7 +134,7 @@ class LastScan:
 
     def _on_edges(self, features: FeaturePoints, T: F64) -> Pairs:
         """A line through the nearest edge point and the nearest one of a scan line beside it."""
-        near, beside, _, found = self._edges.neighbours(moved(T, features.points))
+        near, beside, _, found = self._edges.neighbours(lie.moved(T, features.points))
         along = beside - near
         length = np.linalg.norm(along, axis=1)
         found &= (length > 1e-3) & (length < REACH_M)
@@ -147,7 +142,7 @@ class LastScan:
 
     def _on_planes(self, features: FeaturePoints, T: F64) -> Pairs:
         """A plane through the nearest point, one beside it on its scan line, and one of another scan line."""
-        near, beside, along, found = self._planes.neighbours(moved(T, features.points))
+        near, beside, along, found = self._planes.neighbours(lie.moved(T, features.points))
         normals = np.cross(beside - near, along - near)
         lengths = np.linalg.norm(normals, axis=1)
         spans = np.linalg.norm(beside - near, axis=1) * np.linalg.norm(along - near, axis=1)
@@ -236,7 +231,7 @@ class FeatureMap:
         tree = self._trees[index]
         if tree is None or not len(points):
             return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3))
-        distance, near = tree.query(moved(T, points), k=NEIGHBOURS, distance_upper_bound=REACH_M)
+        distance, near = tree.query(lie.moved(T, points), k=NEIGHBOURS, distance_upper_bound=REACH_M)
         whole = np.isfinite(distance[:, -1])
         patches = self._clouds[index][near[whole]].astype(np.float64)
         means = patches.mean(axis=1)

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 import small_gicp
 
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.kernels import cells
 from app.slam.types import F32, F64, I64
@@ -127,7 +128,7 @@ def compare(
     origin = np.round(np.median(points, axis=0))
     mine, theirs = (points - origin).astype(np.float32), (other - origin).astype(np.float32)
     T = _fitted(mine, theirs) if fit else np.eye(4)
-    theirs = (theirs @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    theirs = lie.moved(T, theirs).astype(np.float32)
     low, high = mine.min(axis=0) - reach - 1, mine.max(axis=0) + reach + 1
     theirs = theirs[((theirs > low) & (theirs < high)).all(axis=1)]
     if not len(theirs):

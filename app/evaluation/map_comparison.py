@@ -84,7 +84,7 @@ def placed(scans: "tuple[KeyframePoints, ...] | list[KeyframePoints]", poses: F6
     points, sensors = [np.empty((0, 3))], [np.empty((0, 3))]
     for scan, T_map_imu in zip(scans, poses, strict=True):
         T = T_map_imu @ scan.T_imu_lidar
-        points.append(scan.points @ T[:3, :3].T + T[:3, 3])
+        points.append(lie.moved(T, scan.points))
         sensors.append(np.broadcast_to(T[:3, 3], scan.points.shape))
     return np.concatenate(points), np.concatenate(sensors)
 

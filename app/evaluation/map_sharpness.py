@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
+from app.slam import lie
 from app.slam.types import F64, I64, Keyframe
 
 MAX_RANGE_M = 20.0
@@ -72,7 +73,7 @@ def collect(keyframes: Iterable[Keyframe], poses: F64) -> MapPoints:
             continue
         count = min(POINTS_PER_KEYFRAME, len(near))
         T = T_map_imu @ keyframe.T_imu_lidar
-        points = near[np.arange(count) * len(near) // count].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        points = lie.moved(T, near[np.arange(count) * len(near) // count].astype(np.float64))
         extra = np.tile([*T[:3, 3], keyframe.stamp_ns * 1e-9, walked], (count, 1))
         parts.append(np.hstack([points, extra]))
     table = np.vstack(parts) if parts else np.zeros((0, 8))

@@ -10,6 +10,7 @@ import numpy as np
 from app.evaluation.job import Job, finished
 from app.evaluation.truth import TruePoses
 from app.evaluation.truth_match import Matched, match
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.metrics import GroundScore, ate, compare, drift, paired, walked_m
 from app.slam.report import spread
@@ -186,7 +187,7 @@ def _accuracy(estimate: Trajectory, matched: Matched) -> Accuracy:
     errors = compare(estimate, truth, rotations=matched.has_rotation)
     ours, theirs = paired(estimate, truth)
     T = ate(estimate, truth).T_truth_estimate
-    aligned = ours.positions @ T[:3, :3].T + T[:3, 3]
+    aligned = lie.moved(T, ours.positions)
     return Accuracy(
         errors=errors | ratios(errors) | {"ate_after_start_m": _later(estimate, truth)},
         times_s=(ours.stamps_ns - estimate.stamps_ns[0]) * 1e-9,

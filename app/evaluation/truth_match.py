@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from app.evaluation.truth import TruePoses
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.metrics import alignment_doubt, interpolate, umeyama
 from app.slam.trajectory import Trajectory
@@ -112,7 +113,7 @@ def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) ->
         return there, True, ""  # the metrics report it
     ours = estimate.chosen(usable)
     T = umeyama(ours.positions, theirs.positions)
-    left = ours.positions @ T[:3, :3].T + T[:3, 3] - theirs.positions
+    left = lie.moved(T, ours.positions) - theirs.positions
     if doubt := alignment_doubt(theirs.positions, float(np.sqrt((left**2).sum(axis=1).mean()))):
         if not certainly:
             return there, True, ""

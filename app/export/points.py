@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.export.box import Box
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.kernels.clouds import first_in_voxels
 from app.slam.map_frame import MapFrame
@@ -90,7 +91,7 @@ def blocks(keyframes: Keyframes, frame: MapFrame, choice: Choice) -> Iterator[Bl
 def _block(keyframe: Keyframe, T_map_odom: F64) -> Block:
     cloud = keyframe.cloud
     T = T_map_odom @ keyframe.T_odom_imu @ keyframe.T_imu_lidar
-    points = cloud.points.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+    points = lie.moved(T, cloud.points.astype(np.float64))
     begin_ns = keyframe.stamp_ns - int(cloud.offsets_ns.max(initial=0))
     stamps_ns = begin_ns + cloud.offsets_ns.astype(np.int64)
     return Block(keyframe.index, keyframe.stamp_ns, T, points, stamps_ns, cloud.labels, cloud.intensity, cloud.ring)

@@ -13,6 +13,7 @@ import viser
 from app.export.ceilings import below_ceiling
 from app.export.paths import name_of, utc_text
 from app.export.point_sizes import with_point_sizes
+from app.slam import lie
 from app.slam.types import F32, F64, U8
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def marked(results: "Results") -> list[tuple[str, F64]]:
     for name, spots in results.marks:
         if all(0 <= index < len(results.keyframes) for index, _ in spots):
             poses = [results.frame.at(index) @ results.keyframes[index].T_odom_imu for index, _ in spots]
-            at = np.array([T[:3, :3] @ place + T[:3, 3] for T, (_, place) in zip(poses, spots, strict=True)])
+            at = np.array([lie.moved(T, place) for T, (_, place) in zip(poses, spots, strict=True)])
             length = f" {np.linalg.norm(at[1] - at[0]):.3f} m" if len(at) == 2 else ""
             found.append((name + length, at))
     return found

@@ -15,21 +15,18 @@ from typing import Any
 
 import numpy as np
 from scipy import optimize
-from scipy.interpolate import make_interp_spline
-from scipy.spatial.transform import Rotation, Slerp
 
-from app.georeference import crs
 from app.georeference.fixes import Fixes
+from app.georeference.ground import Ground
+from app.georeference.path import SEARCH_S, PathOverTime
 from app.georeference.reference import ELLIPSOIDAL, GeoReference
 from app.slam import lie
 from app.slam.arrays import F64, Mask, Vector
 from app.slam.errors import HemislamError
 from app.slam.trajectory import Trajectory
 
-SEARCH_S, COARSE_S = 10.0, 0.2
-"""The clocks' offset is looked for this far on either side, first in such steps."""
-GAP_S = 1.0
-"""Between poses further apart than this, the place of the antenna is not known."""
+COARSE_S = 0.2
+"""Steps in which the clocks' offset is first looked for, over `SEARCH_S` on either side."""
 MOST_SIGMAS = 4.03
 """Of the distance of a sound fix: 99.9 % of a Gaussian in three directions are nearer."""
 MEDIAN_SIGMAS = 1.538
@@ -76,42 +73,6 @@ class Alignment:
     def rms(self) -> F64:
         """(3,) m to the east, north and up, of what counts."""
         return np.asarray(np.sqrt((self.residuals[self.used] ** 2).mean(axis=0)))
-
-
-class PathOverTime:
-    """Where the IMU was between the poses of a trajectory (4 or more); times in s since the first pose."""
-
-    def __init__(self, trajectory: Trajectory) -> None:
-        self.start_ns = int(trajectory.stamps_ns[0])
-        self._times = (trajectory.stamps_ns - self.start_ns) * 1e-9
-        self._places = make_interp_spline(self._times, trajectory.positions, k=3)
-        self._turns = Slerp(self._times, trajectory.rotations)
-
-    def known(self, t: F64) -> Mask:
-        """(n,) whether there are poses near these times."""
-        after = np.clip(np.searchsorted(self._times, t), 1, len(self._times) - 1)
-        near = self._times[after] - self._times[after - 1] < GAP_S
-        return np.asarray(near & (t >= self._times[0]) & (t <= self._times[-1]))
-
-    def within_search(self, t: F64) -> Mask:
-        """(n,) whether the clocks' offset may bring these times into the walk."""
-        return np.asarray((t >= self._times[0] - SEARCH_S) & (t <= self._times[-1] + SEARCH_S))
-
-    def poses(self, t: F64) -> F64:
-        """(n, 4, 4) T_map_imu."""
-        inside = np.clip(t, self._times[0], self._times[-1])
-        T = np.tile(np.eye(4), (len(t), 1, 1))
-        T[:, :3, :3], T[:, :3, 3] = self._turns(inside).as_matrix(), self._places(inside)
-        return T
-
-    def antenna(self, t: F64, lever: F64) -> F64:
-        """(n, 3) m in the map, of a point `lever` (3,) in the IMU frame."""
-        inside = np.clip(t, self._times[0], self._times[-1])
-        places = np.asarray(self._places(inside))
-        if not lever.any():
-            return places
-        turns: Rotation = self._turns(inside)
-        return np.asarray(places + turns.apply(lever))
 
 
 def align(
@@ -200,48 +161,6 @@ def align(
 def as_told(overridden: Mapping[str, bool], names: Sequence[str]) -> F64:
     """(n,) 1 or 0 where the user says that what has this name counts or does not, nan elsewhere."""
     return np.array([float(overridden.get(name, np.nan)) for name in names], np.float64)
-
-
-@dataclass(frozen=True, slots=True)
-class Ground:
-    """Places in metres as they are on the ground, near one another, rather than in a grid far away.
-
-    Attributes:
-        name: of the grid. grid: (n, 3) easting, northing, height, m. centre: (3,) of the grid, whole metres.
-        scale: of the grid there. places: (n, 3) m east, north, up of the centre.
-    """
-
-    name: str
-    grid: F64
-    centre: F64
-    scale: float
-    places: F64
-
-    @classmethod
-    def of(cls, fixes: Fixes, name: str = "") -> "Ground":
-        """Raises HemislamError: the grid is not made for the place, or is none."""
-        middle = [float(np.median(column)) for column in (fixes.latitude, fixes.longitude, fixes.height)]
-        name = name or crs.utm(middle[0], middle[1])
-        crs.check_place(name, middle[0], middle[1])
-        flat = crs.transformer(crs.WGS84, name).transform(fixes.longitude, fixes.latitude)
-        return cls.in_grid(np.column_stack([*flat, fixes.height]), name)
-
-    @classmethod
-    def in_grid(cls, grid: F64, name: str) -> "Ground":
-        """Of (n, 3) easting, northing and height."""
-        centre = np.round(np.median(grid, axis=0))
-        longitude, latitude = crs.transformer(name, crs.WGS84).transform(*centre[:2])
-        if not np.isfinite(longitude + latitude):
-            raise HemislamError(f"{name} has no place at E {centre[0]:.0f}, N {centre[1]:.0f}; check the grid.")
-        crs.check_place(name, latitude, longitude)
-        scale = crs.grid_scale(name, latitude, longitude, float(centre[2]))
-        return cls(name, grid, centre, scale, (grid - centre) / [scale, scale, 1.0])
-
-    def reference(self, R_ground_map: F64, shift: F64, height: str) -> GeoReference:
-        """Where a map lies whose origin is at `shift` (3,) m from the centre."""
-        east, north, up = (self.centre + shift * [self.scale, self.scale, 1.0]).tolist()
-        first, second, third = (tuple(map(float, row)) for row in R_ground_map)
-        return GeoReference(self.name, (east, north, up), (first, second, third), self.scale, height)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, PathOverTime, as_told, offset_by_parts
+from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, as_told, offset_by_parts
 from app.georeference.fixes import Fixes
+from app.georeference.path import PathOverTime
 from app.slam import lie
 from app.slam.arrays import F64, I64, Mask
 from app.slam.errors import HemislamError

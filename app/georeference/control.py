@@ -6,8 +6,9 @@ from types import MappingProxyType
 import numpy as np
 
 from app.georeference import crs
-from app.georeference.align import Alignment, Ground
+from app.georeference.align import Alignment
 from app.georeference.fixes import Fixes
+from app.georeference.ground import Ground
 from app.georeference.reference import ELLIPSOIDAL
 from app.georeference.tables import NamedColumns
 from app.slam.arrays import F64, Mask

@@ -16,6 +16,7 @@ from app.georeference.reference import ELLIPSOIDAL
 from app.georeference.survey import Survey
 from app.georeference.tables import read_fixes, table_of
 from app.sensors.navsat import recorded_fixes
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import LoopEdit, Override
 from app.slam.loops.solvers import read_g2o
@@ -98,7 +99,7 @@ def _by_points(results: Results, survey: Survey, overridden: Mapping[str, bool])
     for pick in survey.picks:
         if pick.keyframe < len(results.keyframes):
             T = results.frame.at(pick.keyframe) @ results.keyframes[pick.keyframe].T_odom_imu
-            picked[pick.name] = T[:3, :3] @ pick.at + T[:3, 3]
+            picked[pick.name] = lie.moved(T, pick.at)
     return lay_on_control(table, picked, grid=survey.crs, height=survey.height or ELLIPSOIDAL, overridden=overridden)
 
 

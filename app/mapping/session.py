@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from app.export.points import EVERYTHING, Choice
-from app.export.results import BY_RUN, Results, of_formats, save_results
+from app.export.results import Results
 from app.georeference.survey import Survey
 from app.mapping.checkpoints import NEAR, Checkpoint, Checkpoints
 from app.mapping.feed import Feed, Quiet
 from app.mapping.labels import LabelledKeyframes
 from app.mapping.moving import MovingPoints
-from app.mapping.session_file import SUFFIX, Opened, SavedSession, State, size_of, write_session
+from app.mapping.saving import write_all
+from app.mapping.session_file import Opened, SavedSession, State, size_of
 from app.mapping.truth import compared
 from app.sensors.findings import Finding
 from app.slam import lie
@@ -377,20 +378,9 @@ class Session:
         """
         results = self.results(stopped, session.state if session is not None else None)
         results.choice, results.progress = choice, progress
-        survey, edits = self.survey, self.edits.done
-
-        def write() -> dict[str, Any]:
-            laid = results
-            if survey is not None:
-                from app.mapping.earth import lay_if_possible  # few sessions need its solvers
-
-                laid = lay_if_possible(results, survey, edits)
-            report = save_results(folder, laid, of_formats(formats) if formats else BY_RUN, replace=replace)
-            if session is not None and not formats:
-                write_session(folder / f"session{SUFFIX}", session)
-            return report
-
-        return self._saves.submit(write)
+        return self._saves.submit(
+            write_all, folder, results, self.survey, self.edits.done, session, formats, replace=replace
+        )
 
     def levelling(self, frame: MapFrame) -> MapFrame:
         """What levels the map by gravity, which is known better now than at the start."""

@@ -34,17 +34,16 @@ from pydantic import (
 )
 
 from app import __version__
-from app.export.box import Box
 from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
+from app.mapping.kept import Kept
 from app.mapping.labels import LabelEdit
-from app.mapping.painted import Stroke, entry_of, marks, read_json, stroke_of
+from app.mapping.painted import marks, read_json
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import edit_files
 from app.slam.loops.edits import LoopEdit
 from app.slam.params import Params
-from app.slam.types import Vector
 
 log = logging.getLogger(__name__)
 
@@ -52,14 +51,6 @@ SUFFIX = ".hemislam"
 FORMAT = 2
 MOST_POINTS = 1 << 24
 """Of a keyframe: far more than any scan has."""
-
-
-@dataclass(frozen=True, slots=True)
-class Note:
-    """A remark of the user, or what was done with forks."""
-
-    frame: int
-    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,53 +91,7 @@ _LabelEdit = Annotated[
         lambda edit: (edit.keyframe.session, edit.keyframe.index, b64encode(zlib.compress(edit.labels)).decode())
     ),
 ]
-_Stroke = Annotated[Stroke, PlainValidator(stroke_of), PlainSerializer(entry_of)]
 _Path = Annotated[Path, PlainSerializer(lambda path: str(path.resolve()))]
-_Note = Annotated[
-    Note, PlainValidator(lambda entry: Note(*entry)), PlainSerializer(lambda note: (note.frame, note.text))
-]
-KeptView = tuple[Vector, Vector]
-
-
-@dataclass(frozen=True, slots=True)
-class Spot:
-    """A place on what a keyframe saw, so that it moves with the map. at: (x, y, z), m, in the keyframe's IMU frame."""
-
-    keyframe: int
-    at: Vector
-
-
-@dataclass(frozen=True, slots=True)
-class Measure:
-    """A named annotation: of one spot its coordinates, of two their distance, of three the angle at the second."""
-
-    name: str
-    spots: tuple[Spot, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Clip:
-    """What of the map is shown, and what exports may be limited to.
-
-    Attributes:
-        box: None: none was chosen yet. on: whether what is outside it is hidden.
-        unrolled: the map is shown as a profile along the walked path. slab: m, how wide that is.
-    """
-
-    box: Box | None = None
-    on: bool = False
-    unrolled: bool = False
-    slab: Annotated[float, Field(ge=0.01, le=100)] = 1.0
-
-    @property
-    def hiding(self) -> Box | None:
-        """The box outside which points are hidden, if there is one."""
-        return self.box if self.on else None
-
-
-WHOLE = Clip()
-
-
 Speed = Annotated[
     float,
     Field(ge=0.1),
@@ -158,14 +103,11 @@ Speed = Annotated[
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class State(Kept):
     """Attributes:
     params: as chosen now. history: parameters by the frame from which they apply, ascending.
     edits: of loops, in force. undone: those that can be redone, the next one last. labels: edits of labels.
-    truth: trajectory to compare with. notes: in the order in which they were made. speed: to play at.
-    views: where cameras stood that the user kept, and what they looked at, (x, y, z) each, m, in the map.
-    measures: what was measured in the map. survey: what it is georeferenced by.
-    painted: points marked as ground or not. clip: what of the map is shown.
+    truth: trajectory to compare with. speed: to play at. survey: what the map is georeferenced by.
     calibration: what the recording shows about its sensors, in a sentence; "" if nothing.
     """
 
@@ -174,15 +116,10 @@ class State:
     edits: _Edits = ()
     undone: _Edits = ()
     truth: _Path | None = None
-    notes: tuple[_Note, ...] = ()
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     speed: Speed = 1.0
     labels: tuple[_LabelEdit, ...] = ()
-    views: tuple[KeptView, ...] = ()
-    measures: tuple[Measure, ...] = ()
     survey: Survey | None = None
-    painted: tuple[_Stroke, ...] = ()
-    clip: Clip = WHOLE
     calibration: str = ""
 
 

@@ -4,6 +4,7 @@ from contextlib import suppress
 
 import numpy as np
 
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.metrics import places_at, umeyama
 from app.slam.types import F64, I64
@@ -30,5 +31,5 @@ def compared(truth_stamps_ns: I64, truth_positions: F64, stamps_ns: I64, positio
             T_map_truth = umeyama(there[known], positions[known])
     if T_map_truth is None:
         return None, np.full(len(positions), np.nan)
-    laid = there @ T_map_truth[:3, :3].T + T_map_truth[:3, 3]
+    laid = lie.moved(T_map_truth, there)
     return T_map_truth, np.linalg.norm(laid - positions, axis=1)

@@ -25,6 +25,7 @@ from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import SUFFIX, Speed
 from app.server import protocol
 from app.server.folders import Folders
+from app.server.keeping import AddNote, EditNote
 from app.server.protocol import Command
 from app.server.uploads import discard, receive
 from app.server.views import LoopsState, StateView, loops_state, state_view
@@ -205,17 +206,17 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
     @router.post("/notes", status_code=202)
     def add_note(body: NoteBody) -> None:
         """Add a note on the current frame to the session; the state lists them."""
-        _send(engine, protocol.AddNote(body.text))
+        _send(engine, AddNote(body.text))
 
     @router.put("/notes/{place}", status_code=202)
     def edit_note(place: Index, body: NoteBody) -> None:
         """Replace the text of the note with this place in the state's list."""
-        _send(engine, protocol.EditNote(place, _note(engine, place), body.text))
+        _send(engine, EditNote(place, _note(engine, place), body.text))
 
     @router.delete("/notes/{place}", status_code=202)
     def delete_note(place: Index) -> None:
         """Delete the note with this place in the state's list."""
-        _send(engine, protocol.EditNote(place, _note(engine, place), ""))
+        _send(engine, EditNote(place, _note(engine, place), ""))
 
     @router.get("/recordings")
     def recordings() -> list[str]:

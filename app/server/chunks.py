@@ -95,7 +95,7 @@ def _joined(chunk: Chunk, after: Chunk, poses: F64) -> Chunk:
     """The chunk `after` with the points of `chunk`, placed by the present poses, thinned to the level of `after`."""
     T_map_lidar, T_map_after = (poses[one.index] @ one.T_imu_lidar for one in (chunk, after))
     T = lie.inverse(T_map_after) @ T_map_lidar
-    moved = replace(chunk, points=(chunk.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+    moved = replace(chunk, points=lie.moved(T, chunk.points).astype(np.float32))
     both: dict[str, Any] = {name: np.concatenate((getattr(moved, name), getattr(after, name))) for name in _BY_POINT}
     joined = replace(after, joined=chunk.joined + after.joined + 1, **both)
     order = np.random.default_rng(after.index).permutation(len(joined.points))

@@ -6,15 +6,15 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from app.mapping.breakpoints import Breakpoints
+from app.mapping.kept import NOTHING_KEPT, Kept
 from app.mapping.session import EFFECT, Session
 from app.mapping.session_file import (
     SUFFIX,
-    Note,
     SavedSession,
     SessionWriter,
     State,
@@ -22,12 +22,12 @@ from app.mapping.session_file import (
     read_session,
 )
 from app.server import protocol
+from app.server.keeping import KeptCommand, changed
 from app.server.laying import Laying
 from app.server.loop_commands import LoopCommands
 from app.server.player import Player
 from app.server.protocol import Command
 from app.server.publisher import Publisher, opened_recording
-from app.server.setup import NOTHING_KEPT, Kept, kept_in
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Edits
 from app.slam.params import Params
@@ -37,26 +37,14 @@ log = logging.getLogger(__name__)
 _OF_THE_DEVICE = ("recording.", "sensor.")
 POLL_S = 0.02
 """How often to look for results of other threads and processes."""
-MOST_NOTES = 1000
-"""Every page and every REST answer holds all of them."""
-
-MOST_VIEWS = 6
-MOST_MEASURES = 200
-"""Older ones are left out."""
-
 _AT_ONCE = protocol.OpenRecording | protocol.Restart | protocol.SetSpeed | protocol.SetBreakpoints
 """Commands that do not wait for the session that is being opened."""
-_OF_LABELS = protocol.EditLabels | protocol.UndoLabels
 _FOR_THE_FRAME = (
     protocol.LoopCommand
-    | _OF_LABELS
-    | protocol.AddNote
-    | protocol.KeepView
-    | protocol.KeepMeasure
-    | protocol.SetClip
+    | KeptCommand
+    | protocol.EditLabels
+    | protocol.UndoLabels
     | protocol.LayOnEarth
-    | protocol.Paint
-    | protocol.UndoPaint
     | protocol.CompareWith
     | protocol.Save
 )
@@ -140,32 +128,10 @@ class Controller:
                 self._player.seek(self._need_session(), frame)
             case protocol.SetBreakpoints(breakpoints):
                 self._set_breakpoints(breakpoints)
-            case protocol.AddNote(text) if text.strip():
-                if len(self._kept.notes) >= MOST_NOTES:
-                    raise HemislamError(f"A session holds at most {MOST_NOTES:,} notes; this one was not added.")
-                self._keep(notes=(*self._kept.notes, Note(self._need_session().frame, text.strip())))
-            case protocol.EditNote(place, before, text) if (
-                0 <= place < len(notes := self._kept.notes) and notes[place].text == before
-            ):
-                changed = (Note(notes[place].frame, text.strip()),) if text.strip() else ()
-                self._keep(notes=(*notes[:place], *changed, *notes[place + 1 :]))
-            case protocol.KeepView(view):
-                self._keep(views=(*self._kept.views, view)[-MOST_VIEWS:])
-            case protocol.KeepMeasure(measure):
-                self._keep(measures=(*self._kept.measures, measure)[-MOST_MEASURES:])
-            case protocol.RenameMeasure(measure, name):
-                renamed = replace(measure, name=name)
-                self._keep(measures=tuple(renamed if kept == measure else kept for kept in self._kept.measures))
-            case protocol.DropMeasure(measure):
-                self._keep(measures=tuple(kept for kept in self._kept.measures if kept != measure))
-            case protocol.SetClip(clip):
-                self._keep(clip=clip)
+            case KeptCommand():
+                self._keep(changed(self._kept, command, self._need_session().frame))
             case protocol.LayOnEarth(survey):
                 self._need_session().survey = survey
-            case protocol.Paint(stroke):
-                self._keep(painted=(*self._kept.painted, stroke))
-            case protocol.UndoPaint():
-                self._keep(painted=self._kept.painted[:-1])
             case protocol.SetParams(values):
                 self._set_params(self._params.with_values(values))
             case protocol.LoadParams(text):
@@ -225,10 +191,11 @@ class Controller:
             self._shown_share = shown
             self._page.put(progress=shown, urgent=True)
 
-    def _keep(self, **changes: Any) -> None:
-        """Replace fields of `Kept`."""
-        self._kept = replace(self._kept, **changes)
-        self._page.put(**changes, urgent=True)
+    def _keep(self, kept: Kept) -> None:
+        before, self._kept = self._kept, kept
+        names = (field.name for field in fields(Kept))
+        others = {name: value for name in names if (value := getattr(kept, name)) is not getattr(before, name)}
+        self._page.put(**others, urgent=bool(others))
 
     def _show_params(self) -> None:
         """Show the parameters, and which of them wait for a restart."""
@@ -308,7 +275,7 @@ class Controller:
             speed=self._page.transport.speed,
             labels=session.keyframes.edits,
             calibration=session.calibration,
-            **kept_in(self._kept),
+            **{field.name: getattr(self._kept, field.name) for field in fields(Kept)},
         )
 
     # --- opening ---------------------------------------------------------------------------------
@@ -355,7 +322,7 @@ class Controller:
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
         session.survey, session.calibration = before.survey, before.calibration
         self._take(session)
-        self._keep(**kept_in(kept))
+        self._keep(kept)
         if session.loops is not None and edits != Edits():
             session.edit_loops(edits.done, edits.undone)
 
@@ -386,7 +353,7 @@ class Controller:
         self._page.put(resumed=saved is not None)
         if session.frame < 0:  # else it goes on where a process that died was
             state = saved.state if saved is not None else State(self._params)
-            self._keep(**kept_in(state))
+            self._keep(Kept.of(state))
         self._resuming = None
         if saved is not None:
             # This process may die on the way there.

@@ -24,7 +24,8 @@ from app.mapping.session_file import (
     session_files,
     write_session,
 )
-from app.server.protocol import AddNote, Command, CompareWith, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
+from app.server.keeping import AddNote
+from app.server.protocol import Command, CompareWith, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
 from app.server.setup import Setup
 from app.server.worker import RunningEngine
 from app.slam.errors import HemislamError

@@ -15,8 +15,8 @@ from app.export.points import EVERYTHING, Choice
 from app.georeference.align import Alignment
 from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.painted import Stroke
-from app.mapping.session_file import WHOLE, Clip, KeptView, Measure, Note, Speed
+from app.mapping.kept import Kept
+from app.mapping.session_file import Speed
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
 from app.slam.frames import READOUTS, Frame
@@ -70,54 +70,6 @@ class SetBreakpoints(Command, frozen=True):
     """Pause at frames where one of these holds, from now on."""
 
     breakpoints: Breakpoints
-
-
-class AddNote(Command, frozen=True):
-    """Keep a note on the present frame in the session."""
-
-    text: str
-
-
-class EditNote(Command, frozen=True):
-    """Replace the text of the note with this place in `Snapshot.notes`; an empty text deletes it.
-
-    before: its text until now. If another page has changed it meanwhile, nothing happens.
-    """
-
-    place: int
-    before: str
-    text: str
-
-
-class KeepView(Command, frozen=True):
-    """Keep in the session where a camera stands and what it looks at."""
-
-    view: KeptView
-
-
-class KeepMeasure(Command, frozen=True):
-    """Keep in the session what was measured."""
-
-    measure: Measure
-
-
-class RenameMeasure(Command, frozen=True):
-    """Give a measure of the session another name."""
-
-    measure: Measure
-    name: str
-
-
-class SetClip(Command, frozen=True):
-    """Show only a part of the map, or all of it."""
-
-    clip: Clip
-
-
-class DropMeasure(Command, frozen=True):
-    """Delete a measure from the session."""
-
-    measure: Measure
 
 
 class LayOnEarth(Command, frozen=True):
@@ -182,16 +134,6 @@ class EditLabels(Command, frozen=True):
 
 class UndoLabels(Command, frozen=True):
     """Take the last `EditLabels` back."""
-
-
-class Paint(Command, frozen=True):
-    """Mark points of a frame as ground or not, over what was marked before."""
-
-    stroke: Stroke
-
-
-class UndoPaint(Command, frozen=True):
-    """Take the last `Paint` back."""
 
 
 class LoopCommand(Command, frozen=True):
@@ -346,7 +288,7 @@ class Earth:
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class Snapshot(Kept):
     """All that the page draws, as one immutable value.
 
     Attributes:
@@ -357,7 +299,6 @@ class Snapshot:
         trajectory: (n, 3) m, positions of the IMU in the map. corrections: of odometry, by loops.
         series: (n,) arrays by SERIES name.
         T_map_truth: (4, 4), aligns the truth with the trajectory; None until the trajectory determines it.
-        notes, views, measures, painted: in the order in which they were made. clip: what of the map is shown.
         notices: the newest 50. saved: the newest 10.
         live: state of the live source; None for a recording.
         earth: as the map was when the session last stood still.
@@ -379,11 +320,6 @@ class Snapshot:
     series: dict[str, F64] = field(default_factory=dict)
     T_map_truth: F64 | None = None
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
-    notes: tuple[Note, ...] = ()
-    views: tuple[KeptView, ...] = ()
-    measures: tuple[Measure, ...] = ()
-    painted: tuple[Stroke, ...] = ()
-    clip: Clip = WHOLE
     progress: Progress | None = None
     notices: tuple[Notice, ...] = ()
     saved: tuple[Saved, ...] = ()

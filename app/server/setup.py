@@ -1,13 +1,12 @@
 """What an engine's process is started with."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.painted import Stroke
-from app.mapping.session_file import WHOLE, Clip, KeptView, Measure, Note
+from app.mapping.kept import NOTHING_KEPT, Kept
 from app.slam.params import Params
 
 if TYPE_CHECKING:
@@ -17,25 +16,6 @@ POINT_BUDGET = 3_000_000
 """Most map points that a page draws."""
 HELD = 7
 """So many times as many are held for pages, so that each can show in detail what it looks at: 400 MB."""
-
-
-@dataclass(frozen=True, slots=True)
-class Kept:
-    """What the user made beside the map. `State` and `Snapshot` have fields of the same names."""
-
-    notes: tuple[Note, ...] = ()
-    views: tuple[KeptView, ...] = ()
-    measures: tuple[Measure, ...] = ()
-    painted: tuple[Stroke, ...] = ()
-    clip: Clip = WHOLE
-
-
-def kept_in(source: Any) -> dict[str, Any]:
-    """The fields of `Kept` by name, as a `Kept`, `State` or `Snapshot` has them."""
-    return {field.name: getattr(source, field.name) for field in fields(Kept)}
-
-
-NOTHING_KEPT = Kept()
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +29,7 @@ class Setup:
         live: source of scans if `recording` is `app.server.protocol.LIVE`. live_folder: keeps what a process that takes
             over needs. revive: this process takes over.
         session, notices, frames, chunks: how many there were before, if this process takes over.
-        kept: as of `Controller`.
+        kept: by a live session that another process began.
     """
 
     recording: Path | None = None

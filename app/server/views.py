@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
-from app.mapping.session_file import Note
+from app.mapping.kept import Note
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
 from app.server.protocol import LoopsView, Notice, Progress, Snapshot, Transport

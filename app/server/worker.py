@@ -10,9 +10,10 @@ from dataclasses import replace
 from typing import Any, Final, Protocol
 
 from app.child import Child, ChildDied, Link, RestartLimit
+from app.mapping.kept import Kept
 from app.server.fold import Fold
 from app.server.protocol import ACKNOWLEDGED, LIVE, Command, Notice, OpenRecording, Progress, Restart, Snapshot
-from app.server.setup import HELD, Kept, Setup, kept_in
+from app.server.setup import HELD, Setup
 
 MOST_RESTARTS: Final = 25
 """Deaths of the engine's process after which it is started again without being asked."""
@@ -147,7 +148,7 @@ class EngineProcess:
             breakpoints=last.breakpoints,
             session=last.session,
             notices=_number(last),
-            kept=Kept(**kept_in(last)),
+            kept=Kept.of(last),
         )
 
     def _edit(self, **values: Any) -> None:

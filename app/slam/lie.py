@@ -5,6 +5,8 @@ the right: `R = R_hat @ exp(d)`, so that `d` is expressed in the body frame (Sol
 "A micro Lie theory"). Near zero the Taylor expansions are written out.
 """
 
+from typing import Any
+
 import numpy as np
 
 from app.slam.types import F64
@@ -108,6 +110,11 @@ def transform(R: F64, p: F64) -> F64:
     T[:3, :3] = R
     T[:3, 3] = p
     return T
+
+
+def moved(T: F64, points: Any) -> Any:
+    """(3,) or (n, 3) points of one frame in another, by the (3 or 4, 4) transform between them."""
+    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def inverse(T: F64) -> F64:

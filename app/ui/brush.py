@@ -9,7 +9,8 @@ import numpy.typing as npt
 import viser
 
 from app.mapping.painted import SUFFIX, UNMARKED, Stroke, marks, read_json, to_json
-from app.server.protocol import Paint, Seek, Snapshot, UndoPaint
+from app.server.keeping import Paint, UndoPaint
+from app.server.protocol import Seek, Snapshot
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.types import GROUND, NON_GROUND, U8, StepResult
@@ -117,14 +118,14 @@ class BrushPanel:
             return
         T = lie.inverse(result.T_map_imu @ result.state.T_imu_lidar)
         points = result.cloud.points
-        index = nearest_to_ray(points, T[:3, :3] @ ray[0] + T[:3, 3], T[:3, :3] @ ray[1])
+        index = nearest_to_ray(points, lie.moved(T, ray[0]), T[:3, :3] @ ray[1])
         if index is not None:
             self._paint(result, np.linalg.norm(points - points[index], axis=1) <= self._radius.value)
 
     def _drag(self, event: viser.SceneRectSelectEvent) -> None:
         if (result := self._frame()) is not None:
             T = result.T_map_imu @ result.state.T_imu_lidar
-            seen = self._page.in_picture(event.client, result.cloud.points @ T[:3, :3].T + T[:3, 3])
+            seen = self._page.in_picture(event.client, lie.moved(T, result.cloud.points))
             low, high = np.array(event.screen_min), np.array(event.screen_max)
             self._paint(result, np.asarray(((seen >= low) & (seen <= high)).all(axis=1)))
 

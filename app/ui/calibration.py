@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from app.calibration.on_opening import is_mounting_unknown
-from app.child import Child, Link
+from app.child import Link
 from app.sensors.recording import NO_IMU
 from app.server.protocol import LIVE, Calibrated, Restart, Seek, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
 from app.slam.errors import HemislamError
 from app.slam.params import Params
+from app.ui.background import Background
 from app.ui.html import panel
 from app.ui.widgets import Page
 
@@ -56,7 +57,7 @@ class CalibrationPanel:
         self._plot = gui.add_html("", visible=False)
         self._button.on_click(lambda _: self._begin())
         self._apply.on_click(lambda _: self._use())
-        self._child: Child | None = None
+        self._work = Background("calibrate", "Calibration")
         self._values: dict[str, Any] = {}
         self._sentence = ""  # for the report, once the values are applied
         self._given = Params()
@@ -72,21 +73,18 @@ class CalibrationPanel:
             self._of, self._values, self._tried = recording, {}, not self._unasked
             self._html.visible = self._apply.visible = self._plot.visible = False
             self._heard = max((notice.number for notice in snapshot.notices), default=0)
-        self._button.disabled = self._child is not None or recording is None or recording == LIVE
+        self._button.disabled = self._work.running or recording is None or recording == LIVE
         if not self._tried and not self._button.disabled and (_is_unknown(snapshot) or self._is_in_doubt(snapshot)):
             self._begin(asked=False)
-        if self._child is not None and not self._asked and _is_unknown(snapshot):
+        if self._work.running and not self._asked and _is_unknown(snapshot):
             self._announce()
-        while self._child is not None:
-            if (message := self._child.news()) is None:
-                return
+        for message in self._work.messages():
             self._show(message)
 
     def close(self) -> None:
         """End what is under way."""
-        if self._child is not None:
-            self._child.close(0.0)
-        self._child, self._progress.visible = None, False
+        self._work.stop()
+        self._progress.visible = False
 
     def _show(self, message: Any) -> None:
         if isinstance(message, float):
@@ -129,14 +127,13 @@ class CalibrationPanel:
 
     def _begin(self, *, asked: bool = True) -> None:
         snapshot = self._page.snapshot()
-        if self._child is not None or snapshot.recording is None or self._button.disabled:
+        if self._work.running or snapshot.recording is None or self._button.disabled:
             return
         self._asked, self._tried, self._given = asked, True, snapshot.params
         self._told.clear()
         self._progress.value = 0.0  # type: ignore[misc]  # as above
         self._progress.visible, self._apply.visible = True, False
-        arguments = (snapshot.recording.path, snapshot.params)
-        self._child = Child(find, *arguments, name="calibrate", title="Calibration", fork=True)
+        self._work.begin(find, snapshot.recording.path, snapshot.params)
 
     def _use(self) -> None:
         """Set what was found; or, once that is done, what was there before. Then go on from the same frame."""

@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 import viser
 
-from app.server.protocol import KeepView, Snapshot
+from app.server.keeping import KeepView
+from app.server.protocol import Snapshot
 from app.slam.types import F64
 from app.ui.widgets import Changes, Page, by_user, show
 

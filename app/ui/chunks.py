@@ -18,6 +18,7 @@ from app.export.ceilings import below_ceiling
 from app.server.chunks import VOXEL_M, voxel_of_level
 from app.server.protocol import Chunk
 from app.server.setup import POINT_BUDGET
+from app.slam import lie
 from app.slam.types import F32, F64, I64, MOVING, U8
 from app.ui.colours import BY_POSE, INTENSITY, MODES, Limits, PointSet, chosen_ends, colours, grown
 from app.ui.detail import parts
@@ -182,13 +183,13 @@ class MapChunks:
         for drawn, T in zip(self._drawn, self._T_map_imu, strict=False):
             cloud = self._shown(drawn, T)
             T_map_lidar = cloud.T_map_lidar
-            yield cloud.points @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3], self._colours(cloud)
+            yield lie.moved(T_map_lidar, cloud.points), self._colours(cloud)
 
     def sample(self) -> F64:
         """(m, 3) some points of all keyframes, in the map."""
         every = zip(self._drawn, self._T_map_imu, strict=False)
         some = [(T @ drawn.chunk.T_imu_lidar, drawn.chunk.points[:_SAMPLE]) for drawn, T in every]
-        return np.concatenate([np.empty((0, 3)), *(points @ T[:3, :3].T + T[:3, 3] for T, points in some)])
+        return np.concatenate([np.empty((0, 3)), *(lie.moved(T, points) for T, points in some)])
 
     def _cloud(self, chunk: Chunk, T_map_imu: F64, shown: Chosen = slice(None), light: F32 | None = None) -> PointSet:
         return PointSet(
@@ -270,7 +271,7 @@ def shown_points(
     if not moving and (moves := chunk.labels == MOVING).any():
         mask = ~moves if mask is None else mask & ~moves
     if clip is not None:
-        inside = clip.holds(chunk.points @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3])
+        inside = clip.holds(lie.moved(T_map_lidar, chunk.points))
         mask = inside if mask is None else mask & inside
     if mask is None or not len(mask):
         return slice(part)

@@ -9,8 +9,9 @@ import viser
 
 from app.export.box import Box
 from app.export.section import strides
-from app.mapping.session_file import Clip, Spot
-from app.server.protocol import SetClip, Snapshot
+from app.mapping.kept import Clip, Spot
+from app.server.keeping import SetClip
+from app.server.protocol import Snapshot
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.types import F64
@@ -183,9 +184,7 @@ class ClipPanel:
             self._first = spot
             return
         poses = poses_of(current)
-        first, second = (
-            poses[one.keyframe][:3, :3] @ one.at + poses[one.keyframe][:3, 3] for one in (self._first, spot)
-        )
+        first, second = (lie.moved(poses[one.keyframe], one.at) for one in (self._first, spot))
         self._first = None
         whole = self._whole()
         box = along_line(first, second, current.clip.slab, whole.low[2], whole.high[2])

@@ -5,8 +5,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from app.mapping.session_file import Spot
+from app.mapping.kept import Spot
 from app.server.protocol import Chunk
+from app.slam import lie
 from app.slam.types import F64
 from app.ui.measure_maths import around
 
@@ -30,7 +31,7 @@ def snapped(chunks: tuple[Chunk, ...], poses: F64, spot: Spot) -> Spot:
         poses: (k, 4, 4) T_map_imu of the chunks' keyframes.
     """
     T = poses[spot.keyframe]
-    at = T[:3, :3] @ spot.at + T[:3, 3]
+    at = lie.moved(T, spot.at)
     x, y, z = (T[:3, :3].T @ (at + meeting(around(chunks, poses, at, _AROUND_M) - at) - T[:3, 3])).tolist()
     return Spot(spot.keyframe, (x, y, z))
 

@@ -10,7 +10,7 @@ import viser
 from app.georeference.align import Alignment
 from app.georeference.ledger import in_rows
 from app.georeference.survey import Pick, Survey
-from app.mapping.session_file import Spot
+from app.mapping.kept import Spot
 from app.server.folders import Folders
 from app.server.protocol import EditLoop, LayOnEarth, RedoLoop, Snapshot, UndoLoop
 from app.slam.errors import HemislamError
@@ -183,8 +183,7 @@ class GeoreferencePanel:
                 at = centre_of_sphere(current.chunks, poses, spot, self._radius.value)
             survey = self.survey()
         except HemislamError as error:
-            for client in self._page.server.get_clients().values():
-                notify_error(client, error)
+            self._page.notify_error(error)
             return
         if survey is None:
             return

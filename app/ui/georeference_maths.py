@@ -9,8 +9,9 @@ from app.georeference.align import Alignment
 from app.georeference.control import CONTROL
 from app.georeference.tables import table_of
 from app.mapping.earth import FIX, POINT
-from app.mapping.session_file import Spot
+from app.mapping.kept import Spot
 from app.server.protocol import Chunk, Snapshot
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Override
 from app.slam.types import F32, F64
@@ -87,7 +88,7 @@ def centre_of_sphere(chunks: tuple[Chunk, ...], poses: F64, spot: Spot, radius: 
         HemislamError: what is there is no such sphere.
     """
     T = poses[spot.keyframe]
-    at = T[:3, :3] @ spot.at + T[:3, 3]
+    at = lie.moved(T, spot.at)
     points = around(chunks, poses, at, 2.5 * radius)
     behind = at + radius * (at - T[:3, 3]) / np.linalg.norm(at - T[:3, 3])
 

@@ -8,17 +8,17 @@ from typing import Final
 import numpy as np
 import viser
 
-from app.child import Child
 from app.evaluation.cloud_distance import REACH_M, Comparison
 from app.evaluation.map_comparison import KeyframePoints, MapsToCompare, find, sentences
 from app.export.read_points import CLOUDS
 from app.server.folders import Folders
 from app.server.protocol import Chunk, Snapshot
+from app.ui.background import Background
 from app.ui.colours import DENSITY, DISTANCE, MODES, TABLES, Limits, value_colours
 from app.ui.files import FileList
 from app.ui.html import Tile, number, panel
 from app.ui.map_numbers import Density, MapNumbers
-from app.ui.widgets import Changes, Page, View, by_user, dialog, notify_error, poses_of
+from app.ui.widgets import Changes, Page, View, by_user, dialog, poses_of
 
 _BINS: Final = 41
 _LEAST_M: Final = 0.005
@@ -37,7 +37,7 @@ class MapComparePanel:
     def __init__(self, page: Page, folders: Folders, results: Path, colour_by: Callable[[str], None]) -> None:
         gui = page.gui
         self._page, self._folders, self._results, self._colour_by = page, folders, results, colour_by
-        self._child: Child | None = None
+        self._work = Background("compare", "The comparison")
         self._chunks: tuple[Chunk, ...] = ()  # that were compared last
         self._name, self._share = "", 0.0
         self._comparison: Comparison | None = None
@@ -74,7 +74,7 @@ class MapComparePanel:
 
     def draw(self, current: Snapshot) -> None:
         self._receive()
-        running, recording = self._child is not None, current.recording
+        running, recording = self._work.running, current.recording
         self._choose.disabled = self._truth.disabled = running or not current.chunks
         self._truth.visible = recording is not None and recording.truth is not None
         self._progress.visible = self._stop.visible = running
@@ -87,9 +87,7 @@ class MapComparePanel:
 
     def close(self) -> None:
         """Stop the comparison that is running, if any."""
-        child, self._child = self._child, None
-        if child is not None:
-            child.close(0.0)
+        self._work.stop()
 
     def _browse(self, client: viser.ClientHandle) -> None:
         folders = Folders([*self._folders.roots, *([self._results] if self._results.is_dir() else [])])
@@ -104,7 +102,7 @@ class MapComparePanel:
 
     def _begin(self, other: Path, *, by_truth: bool = False) -> None:
         current = self._page.snapshot()
-        if self._child is not None or not current.chunks:
+        if self._work.running or not current.chunks:
             return
         poses, found = poses_of(current), current.earth.found
         scans = tuple(
@@ -116,16 +114,11 @@ class MapComparePanel:
             scans, other, by_truth, where, self._fit.value and not by_truth, float(self._reach.value)
         )
         self._chunks, self._name, self._share = current.chunks, "the truth" if by_truth else other.name, 0.0
-        self._child = Child(find, wanted, name="compare", title="The comparison", fork=True, grace_s=0.0)
+        self._work.begin(find, wanted)
 
     def _receive(self) -> None:
-        while (child := self._child) is not None:
-            message = child.news()
-            if child is not self._child:
-                return  # stopped meanwhile
+        for message in self._work.messages():
             match message:
-                case None:
-                    return
                 case float():
                     self._share = message
                 case Comparison():
@@ -135,8 +128,7 @@ class MapComparePanel:
                     self._colour_by(DISTANCE)
                 case sentence:
                     self.close()
-                    for client in self._page.server.get_clients().values():
-                        notify_error(client, sentence)
+                    self._page.notify_error(sentence)
 
 
 def _limits(found: Comparison) -> Limits:

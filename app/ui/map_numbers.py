@@ -9,6 +9,7 @@ import numpy as np
 
 from app.evaluation.cloud_distance import density
 from app.server.protocol import Chunk
+from app.slam import lie
 from app.slam.types import F32, F64
 from app.ui.colours import Limits
 
@@ -65,7 +66,7 @@ class Density:
     def _count(self, chunks: tuple[Chunk, ...], poses: F64) -> None:
         begin = self._now()
         T = (poses[[chunk.index for chunk in chunks]] @ [chunk.T_imu_lidar for chunk in chunks]).astype(np.float32)
-        placed = [chunk.points @ t[:3, :3].T + t[:3, 3] for chunk, t in zip(chunks, T, strict=True)]
+        placed = [lie.moved(t, chunk.points) for chunk, t in zip(chunks, T, strict=True)]
         counts = density(np.concatenate(placed), _EDGE_M)
         high = float(np.percentile(counts, _SHARE)) if len(counts) else 1.0
         self._found = MapNumbers.split(chunks, counts, Limits(0.0, max(high, 1.0)))

@@ -8,8 +8,9 @@ import numpy as np
 import viser
 
 from app.georeference.reference import GeoReference
-from app.mapping.session_file import Measure, Spot
-from app.server.protocol import DropMeasure, KeepMeasure, RenameMeasure, Snapshot
+from app.mapping.kept import Measure, Spot
+from app.server.keeping import DropMeasure, KeepMeasure, RenameMeasure
+from app.server.protocol import Snapshot
 from app.slam.types import F64
 from app.ui.corners import snapped
 from app.ui.html import panel

@@ -8,8 +8,9 @@ import numpy.typing as npt
 
 from app.export.box import Box
 from app.georeference.reference import GeoReference
-from app.mapping.session_file import Measure, Spot
+from app.mapping.kept import Measure, Spot
 from app.server.protocol import Chunk
+from app.slam import lie
 from app.slam.kernels.cells import in_cone
 from app.slam.text_files import csv_text
 from app.slam.types import F32, F64, is_ground
@@ -83,7 +84,7 @@ def meet(
     best = [np.where(along <= front, off, np.inf) for along, off, *_ in found]
     which = int(np.argmin([one.min(initial=np.inf) for one in best]))
     chunk, points = found[which][2:]
-    x, y, z = (chunk.T_imu_lidar[:3, :3] @ points[np.argmin(best[which])] + chunk.T_imu_lidar[:3, 3]).tolist()
+    x, y, z = lie.moved(chunk.T_imu_lidar, points[np.argmin(best[which])]).tolist()
     return Spot(chunk.index, (x, y, z))
 
 
@@ -95,7 +96,7 @@ def places(measure: Measure, poses: F64) -> F64 | None:
     """
     if any(not 0 <= spot.keyframe < len(poses) for spot in measure.spots):
         return None
-    return np.array([poses[spot.keyframe][:3, :3] @ spot.at + poses[spot.keyframe][:3, 3] for spot in measure.spots])
+    return np.array([lie.moved(poses[spot.keyframe], spot.at) for spot in measure.spots])
 
 
 def numbers(at: F64, chunks: tuple[Chunk, ...], poses: F64) -> Numbers:
@@ -125,7 +126,7 @@ def height(place: F64, chunks: tuple[Chunk, ...], poses: F64) -> float:
 
 def _ground(chunk: Chunk, T_map_imu: F64) -> npt.NDArray[np.floating]:
     T = T_map_imu @ chunk.T_imu_lidar
-    return np.asarray(chunk.points[is_ground(chunk.labels)] @ T[:3, :3].T + T[:3, 3])
+    return np.asarray(lie.moved(T, chunk.points[is_ground(chunk.labels)]))
 
 
 def around(chunks: tuple[Chunk, ...], poses: F64, place: F64, radius: float) -> F64:
@@ -135,7 +136,7 @@ def around(chunks: tuple[Chunk, ...], poses: F64, place: F64, radius: float) -> 
         T = poses[chunk.index] @ chunk.T_imu_lidar
         own = (place - T[:3, 3]) @ T[:3, :3]
         near = np.linalg.norm(chunk.points - own, axis=1) < radius
-        found.append(chunk.points[near] @ T[:3, :3].T + T[:3, 3])
+        found.append(lie.moved(T, chunk.points[near]))
     return np.concatenate(found)
 
 

@@ -6,8 +6,9 @@ from typing import Final
 import numpy as np
 import viser
 
-from app.mapping.session_file import Note
-from app.server.protocol import AddNote, EditNote, Seek, Snapshot
+from app.mapping.kept import Note
+from app.server.keeping import AddNote, EditNote
+from app.server.protocol import Seek, Snapshot
 from app.slam.types import F64
 from app.ui.html import panel
 from app.ui.nodes import add_exact_points

@@ -7,6 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter1d  # type: ignore[attr-defined]
 
+from app.slam.metrics import walked_m
 from app.slam.types import F64, U8
 from app.ui.camera import FOV
 from app.ui.colours import Key
@@ -71,11 +72,11 @@ def flight(path: F64, count: int, behind: float, above: float) -> list[Station]:
     Args:
         behind, above: m, how far the camera stays behind the path and over it.
     """
-    walked = _walked(path)
+    walked = walked_m(path)
     even = np.arange(0.0, max(walked[-1], _STEP_M), _STEP_M)
     smooth = np.column_stack([np.interp(even, walked, path[:, axis]) for axis in range(3)])
     smooth = gaussian_filter1d(smooth, _SMOOTH_M / _STEP_M, axis=0, mode="nearest")
-    flown = _walked(smooth)
+    flown = walked_m(smooth)
     first, last = (smooth[place] for place in (min(len(smooth) - 1, 20), -min(len(smooth), 21)))
     begin, end = first - smooth[0], smooth[-1] - last
 
@@ -88,11 +89,6 @@ def flight(path: F64, count: int, behind: float, above: float) -> list[Station]:
     along = np.linspace(0.0, flown[-1], count)
     eyes, aims = at(along - behind) + np.array([0.0, 0.0, above]), at(along + _AHEAD_M)
     return [Station(eye, wxyz(looking(aim - eye))) for eye, aim in zip(eyes, aims, strict=True)]
-
-
-def _walked(path: F64) -> F64:
-    """(n,) m, the length of a path of (n, 3) m up to each of its places."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
 
 
 def _unit(vector: F64) -> F64:

@@ -7,6 +7,7 @@ import numpy as np
 import viser
 
 from app.export.box import Box
+from app.slam import lie
 from app.slam.params import Params
 from app.slam.types import F64, GROUND, SEED, StepResult
 from app.ui.colours import LABEL, LABEL_COLOURS, LOOK, Limits, PointSet, colours
@@ -74,7 +75,7 @@ class SensorScene:
         T_map_lidar = result.T_map_imu @ result.state.T_imu_lidar
         cloud, shown = result.cloud, np.arange(len(result.cloud))[shown_of(len(result.cloud))]
         if view.clip is not None:
-            shown = shown[view.clip.holds(cloud.points[shown] @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3])]
+            shown = shown[view.clip.holds(lie.moved(T_map_lidar, cloud.points[shown]))]
         another = previous is None or previous.index != result.index or previous.stamp_ns != result.stamp_ns
         cut, self._clip = view.clip != self._clip, view.clip
         if len(shown):  # the page cannot draw a cloud without points: it is hidden instead

@@ -89,7 +89,7 @@ class StudyScene:
         matches, i = result.registration.matches, picked.match
         if matches is not None and i >= 0 and matches.normals[i].any():
             T = lie.inverse(result.state.T_odom_imu @ result.state.T_imu_lidar)
-            center, normal = T[:3, :3] @ matches.centers[i] + T[:3, 3], T[:3, :3] @ matches.normals[i]
+            center, normal = lie.moved(T, matches.centers[i]), T[:3, :3] @ matches.normals[i]
             self._plane("map_patch", center, normal, radius, _MAP)
 
     def _plane(self, name: str, center: F64, normal: F64, radius: float, colour: tuple[int, int, int]) -> None:

@@ -6,7 +6,6 @@ from typing import Any, Final, get_args
 
 import viser
 
-from app.child import Child
 from app.mapping.painted import marks
 from app.server.fork import Workspace
 from app.server.protocol import LIVE, Snapshot
@@ -15,6 +14,7 @@ from app.tuning.objectives import OBJECTIVES
 from app.tuning.process import Ended, Tried, Wanted, find
 from app.tuning.trial import SearchMethod, advice
 from app.ui import tune_maths as maths
+from app.ui.background import Background
 from app.ui.compare import Sides
 from app.ui.html import panel
 from app.ui.viser_adapter import Bridge
@@ -43,7 +43,7 @@ class TunePanel:
     def __init__(self, page: Page, forks: Workspace, sides: Sides, folder: Path) -> None:
         gui = page.gui
         self._page, self._forks, self._sides, self._folder = page, forks, sides, folder
-        self._child: Child | None = None
+        self._work = Background("tune", "The search")
         self._wanted: Wanted | None = None  # by the search that was started last
         self._found, self._chosen = Tried(), -1
         self._runs: list[tuple[float, int]] = []  # when how many runs had ended, since the last that took no time
@@ -83,7 +83,7 @@ class TunePanel:
             self._wanted, self._found, self._chosen = None, Tried(), -1
         problem = self._problem(snapshot)
         self._receive()
-        running = self._child is not None
+        running = self._work.running
         self._start.visible, self._start.disabled = not running, bool(problem)
         self._stop.visible = self._progress.visible = running
         self._go_on.visible = not running and self._wanted is not None and not self._found.finished
@@ -99,9 +99,7 @@ class TunePanel:
 
     def close(self) -> None:
         """End what is under way; its finished runs stay."""
-        child, self._child = self._child, None
-        if child is not None:
-            child.close(0.0)
+        self._work.stop()
 
     @staticmethod
     def _problem(snapshot: Snapshot) -> str:
@@ -116,7 +114,7 @@ class TunePanel:
         if wanted is None:
             return _EMPTY
         told = f"{len(found.trials)} of {wanted.trials + 1} trials"
-        if self._child is not None:
+        if self._work.running:
             return (
                 f"{told} · {self._left(wanted)}" if self._runs else "The first trial runs with the parameters as given."
             )
@@ -137,13 +135,8 @@ class TunePanel:
         return [OBJECTIVES[name] for name in self._wanted.objectives] if self._wanted else []
 
     def _receive(self) -> None:
-        while (child := self._child) is not None:
-            message = child.news()
-            if child is not self._child:
-                return  # stopped meanwhile
+        for message in self._work.messages():
             match message:
-                case None:
-                    return
                 case Ended(runs, ran):
                     self._runs = [*(self._runs if ran else ()), (self._page.now(), runs)]
                 case Tried():
@@ -152,12 +145,11 @@ class TunePanel:
                         self.close()
                 case sentence:
                     self.close()
-                    for client in self._page.server.get_clients().values():
-                        notify_error(client, sentence)
+                    self._page.notify_error(sentence)
 
     def _begin(self, client: viser.ClientHandle) -> None:
         snapshot = self._page.snapshot()
-        if self._child is not None or snapshot.recording is None or snapshot.recording.path == LIVE:
+        if self._work.running or snapshot.recording is None or snapshot.recording.path == LIVE:
             return
         marked = marks(snapshot.painted)
         names = dict.fromkeys(_TITLES[title] for title in (self._first.value, self._second.value) if title != _NONE)
@@ -197,9 +189,9 @@ class TunePanel:
 
     def _run(self) -> None:
         """Begin, or go on: a search finds the runs that were finished before."""
-        if self._wanted is not None and self._child is None:
+        if self._wanted is not None and not self._work.running:
             self._found, self._runs, self._chosen = Tried(), [], -1
-            self._child = Child(find, self._wanted, name="tune", title="The search", fork=True, grace_s=0.0)
+            self._work.begin(find, self._wanted)
 
     def _clicked(self, word: str, client: viser.ClientHandle) -> None:
         """What the plots send: "trial 12". Opens it beside the present parameters; B's are then on the sliders."""

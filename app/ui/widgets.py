@@ -104,6 +104,11 @@ class Page:
         depth = np.where(seen[:, 2] > 0, seen[:, 2], np.nan) * np.tan(camera.fov / 2)
         return np.asarray(seen[:, :2] / np.stack((depth * camera.aspect, depth), axis=1) / 2 + 0.5)
 
+    def notify_error(self, error: object) -> None:
+        """Show every browser why something failed."""
+        for client in self.server.get_clients().values():
+            notify_error(client, error)
+
 
 def poses_of(snapshot: Snapshot) -> F64:
     """(k, 4, 4) T_map_imu of the keyframes."""

@@ -7,18 +7,9 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from app.export.box import Box
-from app.mapping.session_file import Clip
-from app.server.protocol import (
-    CompareWith,
-    KeepMeasure,
-    OpenRecording,
-    Pause,
-    Play,
-    Seek,
-    SetClip,
-    SetParams,
-    StepFrame,
-)
+from app.mapping.kept import Clip
+from app.server.keeping import KeepMeasure, SetClip
+from app.server.protocol import CompareWith, OpenRecording, Pause, Play, Seek, SetParams, StepFrame
 from app.ui.clip_maths import FACES, handle
 from tests.browser.conftest import Bench, new_page
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.export.map_file import MapFile
-from app.mapping.session_file import Measure
+from app.mapping.kept import Measure
 from app.server.chunks import thinned
 from app.slam.ply import header
 from app.ui.corners import meeting, snapped

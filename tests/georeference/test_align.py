@@ -1,4 +1,7 @@
-"""Lay a walk on satellite fixes. Oracle: the curve that both were made of."""
+"""Lay a walk on satellite fixes. Oracle: the curve that both were made of.
+
+Tests app/georeference/align.py, app/georeference/ground.py, app/georeference/path.py.
+"""
 
 from dataclasses import replace
 

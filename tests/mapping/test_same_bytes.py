@@ -1,6 +1,6 @@
 """The workbench, `replay` of its session and `run` write the same bytes, also of loops that only the end brings.
 
-Tests app/mapping/opening.py.
+Tests app/mapping/opening.py, app/mapping/saving.py.
 """
 
 import math

@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 import server_fakes as fakes
 
+from app.mapping.kept import Note
 from app.mapping.opening import open_session
-from app.mapping.session_file import Note, Opened, SessionWriter, State, read_session
+from app.mapping.session_file import Opened, SessionWriter, State, read_session
 from app.sensors.presets import resolve_params
 from app.server.fork import Workspace, follow, forked
+from app.server.keeping import AddNote
 from app.server.protocol import (
     SERIES,
-    AddNote,
     Command,
     OpenRecording,
     Pause,

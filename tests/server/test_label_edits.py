@@ -13,7 +13,8 @@ from session_bench import Bench, last_notice
 
 from app.mapping.painted import Stroke
 from app.mapping.session_file import State
-from app.server.protocol import EditLabels, Paint, Restart, Seek, SetParams, UndoLabels, UndoPaint
+from app.server.keeping import Paint, UndoPaint
+from app.server.protocol import EditLabels, Restart, Seek, SetParams, UndoLabels
 from app.slam import moving
 from app.slam.types import GROUND, MOVING, NON_GROUND
 

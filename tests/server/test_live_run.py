@@ -20,7 +20,8 @@ from app.sensors.live.feed import Pace, feed
 from app.sensors.live.process import LiveClient, LiveProcess
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
-from app.server.protocol import LIVE, AddNote, Pause, Seek, Snapshot, StepFrame
+from app.server.keeping import AddNote
+from app.server.protocol import LIVE, Pause, Seek, Snapshot, StepFrame
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.params import Params

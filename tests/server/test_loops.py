@@ -20,8 +20,8 @@ from app.mapping.loops import LoopProcess, RestartingLoops
 from app.mapping.opening import open_session
 from app.mapping.session import Session
 from app.sensors.presets import resolve_params
+from app.server.keeping import AddNote
 from app.server.protocol import (
-    AddNote,
     EditLoop,
     InspectLoop,
     Pause,

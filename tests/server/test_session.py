@@ -10,11 +10,10 @@ from session_bench import Bench, last_notice
 
 from app.mapping.session import Session
 from app.server import player
+from app.server.keeping import AddNote, EditNote
 from app.server.protocol import (
-    AddNote,
     Command,
     CompareWith,
-    EditNote,
     LoadParams,
     Pause,
     Play,

@@ -1,6 +1,7 @@
 """A session is a file: reopened it is where it was, repeated headless it gives the same, killed it loses a moment.
 
-Tests app/server/controller.py, app/server/loop_commands.py, app/server/player.py.
+Tests app/mapping/kept.py, app/server/controller.py, app/server/keeping.py, app/server/loop_commands.py,
+app/server/player.py.
 """
 
 import errno
@@ -21,16 +22,13 @@ from typer.testing import CliRunner
 from app.__main__ import cli
 from app.export.box import Box
 from app.mapping.breakpoints import Breakpoints
+from app.mapping.kept import Clip, Measure, Note, Spot
 from app.mapping.session import Session
 from app.mapping.session_file import (
     SUFFIX,
-    Clip,
-    Measure,
-    Note,
     Opened,
     SavedSession,
     SessionWriter,
-    Spot,
     State,
     new_path,
     read_session,
@@ -38,20 +36,15 @@ from app.mapping.session_file import (
     write_session,
 )
 from app.sensors.presets import resolve_params
-from app.server.controller import MOST_NOTES, Controller
+from app.server.controller import Controller
+from app.server.keeping import MOST_NOTES, AddNote, DropMeasure, KeepMeasure, KeepView, RenameMeasure, SetClip
 from app.server.protocol import (
-    AddNote,
     Calibrated,
-    DropMeasure,
-    KeepMeasure,
-    KeepView,
     OpenRecording,
     Pause,
     Play,
-    RenameMeasure,
     Save,
     Seek,
-    SetClip,
     SetParams,
     SetSpeed,
     Snapshot,
@@ -77,9 +70,9 @@ def saved(tmp_path: Path) -> SavedSession:
         (Accept(1, 20), Add(2, 30, None, False)),
         (Reject(3, 9),),
         tmp_path / "truth.tum",
-        (Note(12, 'the "door" opens\nand closes'),),
-        Breakpoints(no_ground=True, residual=0.05),
-        math.inf,
+        notes=(Note(12, 'the "door" opens\nand closes'),),
+        breakpoints=Breakpoints(no_ground=True, residual=0.05),
+        speed=math.inf,
     )
     return SavedSession(Opened(recording, 2.0, 30.0, 5), state, 41, ended=True)
 

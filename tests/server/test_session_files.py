@@ -13,9 +13,10 @@ from session_bench import Bench, last_notice
 
 from app.export.points import Choice
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.session_file import Note, read_session
+from app.mapping.kept import Note
+from app.mapping.session_file import read_session
+from app.server.keeping import AddNote
 from app.server.protocol import (
-    AddNote,
     Calibrated,
     Command,
     CompareWith,

@@ -134,3 +134,14 @@ def test_between_almost_opposite_directions_is_still_a_rotation(a: np.ndarray, o
 def test_roll_pitch_yaw_compose_as_documented(rpy: tuple[float, float, float]) -> None:
     expected = Rotation.from_euler("ZYX", rpy[::-1], degrees=True).as_matrix()
     np.testing.assert_allclose(lie.from_rpy_degrees(rpy), expected, atol=TIGHT)
+
+
+@given(rotvecs(), st.integers(0, 2**32))
+def test_points_are_moved_as_scipy_turns_them_then_by_the_translation(v: np.ndarray, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, shift = rng.normal(size=(5, 3)), rng.normal(size=3)
+    expected = Rotation.from_rotvec(v).apply(points) + shift
+    T = lie.transform(lie.exp(v), shift)
+    np.testing.assert_allclose(lie.moved(T, points), expected, atol=TIGHT)
+    np.testing.assert_allclose(lie.moved(T, points[0]), expected[0], atol=TIGHT)
+    np.testing.assert_allclose(lie.moved(lie.inverse(T), lie.moved(T, points)), points, atol=TIGHT)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from app.sensors.doctor import Finding
+from app.server.keeping import SetClip
 from app.server.protocol import (
     SERIES,
     Chunk,
@@ -26,7 +27,6 @@ from app.server.protocol import (
     Restart,
     Seek,
     SetBreakpoints,
-    SetClip,
     SetParams,
     SetSpeed,
     Snapshot,

@@ -9,7 +9,8 @@ import pytest
 import viser
 
 from app.mapping.painted import UNMARKED, marks
-from app.server.protocol import Command, Paint, Play, Seek, StepFrame, UndoPaint
+from app.server.keeping import Paint, UndoPaint
+from app.server.protocol import Command, Play, Seek, StepFrame
 from app.slam import lie
 from app.slam.types import GROUND, NON_GROUND, StepResult
 from app.ui.brush import BrushPanel

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 import viser
 
+from app.mapping.kept import Note
 from app.sensors.recording import NO_IMU
 from app.server.protocol import (
     Calibrated,
     Command,
-    Note,
     Notice,
     OpenedRecording,
     Restart,
@@ -21,7 +21,7 @@ from app.server.protocol import (
     Transport,
 )
 from app.slam.params import Params
-from app.ui import calibration
+from app.ui import background
 from app.ui.calibration import CalibrationPanel, FoundMounting
 from tests.ui.conftest import page_of, user_clicks
 
@@ -53,12 +53,12 @@ class Calibrating:
         self.panel.draw(now)
 
     def process(self) -> Any:
-        return self.panel._child
+        return self.panel._work._child
 
 
 @pytest.fixture
 def page(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> Calibrating:
-    monkeypatch.setattr(calibration, "Child", Process)
+    monkeypatch.setattr(background, "Child", Process)
     page = Calibrating(server)
     page.draw(OPEN)
     return page
@@ -114,7 +114,7 @@ ADVICE = Calibrated(f"{TOLD.contradiction}. To apply it, see Calibration under R
 
 @pytest.fixture
 def unasked(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> Calibrating:
-    monkeypatch.setattr(calibration, "Child", Process)
+    monkeypatch.setattr(background, "Child", Process)
     return Calibrating(server, unasked=True)
 
 

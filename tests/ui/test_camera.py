@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import viser
 
-from app.server.protocol import Command, KeepView, Snapshot
+from app.server.keeping import KeepView
+from app.server.protocol import Command, Snapshot
 from app.slam import lie
 from app.ui.camera import FOV, FRONT, NOTHING, SIDE, TOP, CameraPanel, Framing, Picture, Stand, whole
 from app.ui.colours import INTENSITY, LOOK, Limits, PointSet, colours

@@ -12,8 +12,9 @@ import pytest
 import viser
 
 from app.export.box import Box
-from app.mapping.session_file import Clip, Spot
-from app.server.protocol import Chunk, Command, SetClip, Snapshot
+from app.mapping.kept import Clip, Spot
+from app.server.keeping import SetClip
+from app.server.protocol import Chunk, Command, Snapshot
 from app.slam import lie
 from app.slam.types import NON_GROUND
 from app.ui.chunks import MapChunks

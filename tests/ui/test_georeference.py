@@ -11,7 +11,7 @@ import viser
 from app.georeference.align import Alignment
 from app.georeference.reference import GeoReference
 from app.georeference.survey import Survey
-from app.mapping.session_file import Measure, Spot
+from app.mapping.kept import Measure, Spot
 from app.server.folders import Folders
 from app.server.protocol import Chunk, Command, Earth, EditLoop, LayOnEarth, LoopsView, RedoLoop, Snapshot, UndoLoop
 from app.slam import lie

@@ -1,4 +1,7 @@
-"""Distance to another map and density, in colours. Tests app/ui/map_compare.py, app/ui/map_numbers.py."""
+"""Distance to another map and density, in colours.
+
+Tests app/ui/background.py, app/ui/map_compare.py, app/ui/map_numbers.py.
+"""
 
 import time
 from dataclasses import replace
@@ -12,7 +15,7 @@ import viser
 from app.evaluation.cloud_distance import Comparison
 from app.server.folders import Folders
 from app.server.protocol import Chunk, OpenedRecording, Snapshot
-from app.ui import map_compare
+from app.ui import background
 from app.ui.chunks import MapChunks
 from app.ui.colours import DENSITY, DISTANCE, NOTHING, Limits, key
 from app.ui.map_compare import MapComparePanel, told
@@ -49,7 +52,7 @@ class Comparing:
 
     @property
     def process(self) -> Any:
-        return self.panel._child
+        return self.panel._work._child
 
     def draw(self, *messages: Any) -> None:
         if messages:
@@ -59,7 +62,7 @@ class Comparing:
 
 @pytest.fixture
 def comparing(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Comparing:
-    monkeypatch.setattr(map_compare, "Child", Process)
+    monkeypatch.setattr(background, "Child", Process)
     return Comparing(server, tmp_path)
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import viser
 
-from app.mapping.session_file import Measure, Spot
-from app.server.protocol import Chunk, Command, DropMeasure, KeepMeasure, Snapshot
+from app.mapping.kept import Measure, Spot
+from app.server.keeping import DropMeasure, KeepMeasure
+from app.server.protocol import Chunk, Command, Snapshot
 from app.slam import lie
 from app.slam.types import NON_GROUND
 from app.ui.measure import ANGLE, DISTANCE, POINT, STOP, MeasurePanel

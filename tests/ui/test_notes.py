@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import viser
 
-from app.mapping.session_file import Note
-from app.server.protocol import AddNote, Command, EditNote, Seek, Snapshot
+from app.mapping.kept import Note
+from app.server.keeping import AddNote, EditNote
+from app.server.protocol import Command, Seek, Snapshot
 from app.ui.notes import _SHOWN_NOTES, NotesPanel
 from app.ui.widgets import View
 from tests.ui.conftest import BusyThreads, Wire, browser_sends, page_of, user_clicks, user_sets

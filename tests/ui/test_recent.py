@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import viser
 
-from app.mapping.session_file import Note, Opened, SavedSession, State, write_session
+from app.mapping.kept import Note
+from app.mapping.session_file import Opened, SavedSession, State, write_session
 from app.server.folders import Folders
 from app.server.protocol import Command, OpenedRecording, OpenRecording, Snapshot, Transport
 from app.slam.loops.edits import Reject

@@ -12,7 +12,7 @@ from app.server.protocol import OpenedRecording, Snapshot, StepFrame, Transport
 from app.tuning.objectives import OBJECTIVES
 from app.tuning.process import Ended, Tried
 from app.tuning.trial import Trial
-from app.ui import tune
+from app.ui import background, tune
 from app.ui import tune_maths as maths
 from app.ui.compare import Sides
 from app.ui.tune import TunePanel
@@ -52,7 +52,7 @@ class Tuning:
 
     @property
     def process(self) -> Any:
-        return self.panel._child
+        return self.panel._work._child
 
     def says(self, words: str) -> bool:
         return words in self.panel._why.content
@@ -60,7 +60,7 @@ class Tuning:
 
 @pytest.fixture
 def tuning(server: viser.ViserServer, engine: FakeEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tuning:
-    monkeypatch.setattr(tune, "Child", Process)
+    monkeypatch.setattr(background, "Child", Process)
     monkeypatch.setattr(tune, "notify_error", lambda client, error: told.append(str(error)))
     told.clear()
     return Tuning(server, engine, tmp_path)

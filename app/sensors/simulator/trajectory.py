@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
+from app.slam.metrics import walked_m
 from app.slam.types import F64, I64, ImuSamples
 
 GRAVITY = 9.81
@@ -205,16 +206,11 @@ def _unrolled(path: F64, closed: bool, length: float) -> tuple[F64, F64]:
         lap = np.vstack([line, line[:1]])
         lap_length = float(np.linalg.norm(np.diff(lap, axis=0), axis=1).sum())
         line = np.vstack([line] * (int(length / lap_length) + 2))
-    return line, arc_lengths(line)
-
-
-def arc_lengths(line: F64) -> F64:
-    """(n,) m along a polyline, at each of its vertices."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    return line, walked_m(line)
 
 
 def places_at(lengths: F64, arc: F64, line: F64) -> F64:
-    """(k, 2) places on a polyline at these arc lengths; `arc` is `arc_lengths(line)`."""
+    """(k, 2) places on a polyline at these arc lengths; `arc` is `walked_m(line)`."""
     return np.column_stack([np.interp(lengths, arc, line[:, axis]) for axis in (0, 1)])
 
 

@@ -72,7 +72,7 @@ def _plan(prepared: Prepared, yaw: float, position: F64) -> F64:
 
 def _on_ground(target: Prepared, source: Prepared, T: F64) -> F64:
     """The same, raised or lowered until the source's ground lies on the target's."""
-    below, above = target.points[target.level], _moved(source.points[source.level], T)
+    below, above = target.points[target.level], lie.moved(T, source.points[source.level])
     there, here = _cells(below), _cells(above)
     count = np.bincount(there, minlength=CELLS * CELLS)
     height = np.bincount(there, below[:, 2], CELLS * CELLS)
@@ -85,10 +85,6 @@ def _on_ground(target: Prepared, source: Prepared, T: F64) -> F64:
 def _cells(points: F64) -> I64:
     index = np.floor(points[:, :2] / CELL_M).astype(np.int64) % CELLS
     return np.asarray(index[:, 0] * CELLS + index[:, 1])
-
-
-def _moved(points: F64, T: F64) -> F64:
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 
 def _upright(yaw: float, position: F64) -> F64:

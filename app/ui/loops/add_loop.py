@@ -45,7 +45,7 @@ def surroundings(chunks: tuple[Chunk, ...], poses: F64, index: int, ceilings: bo
     for chunk in near:
         T = poses[chunk.index] @ chunk.T_imu_lidar
         points = chunk.points[shown_points(chunk, T, ceilings)][:share]
-        parts.append(points @ T[:3, :3].T + T[:3, 3] - poses[index][:3, 3])
+        parts.append(lie.moved(T, points) - poses[index][:3, 3])
     return np.concatenate(parts).astype(np.float32)
 
 

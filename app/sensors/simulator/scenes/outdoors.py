@@ -14,7 +14,8 @@ from app.sensors.simulator.mesh import MeshBuilder
 from app.sensors.simulator.raycast import Mover, SimulatedScene
 from app.sensors.simulator.scenes import props
 from app.sensors.simulator.scenes.props import Corners, Point, on_ground
-from app.sensors.simulator.trajectory import arc_lengths, places_at
+from app.sensors.simulator.trajectory import places_at
+from app.slam.metrics import walked_m
 from app.slam.types import F64
 
 _ASPHALT, _GRASS = 0.18, 0.42
@@ -195,7 +196,7 @@ def _people(rng: np.random.Generator, places: F64, headings: F64, height: Callab
 def _along(path: F64, closed: bool, step: float) -> tuple[F64, F64]:
     """Places every `step` m of the path and the heading there."""
     line = np.vstack([path, path[:1]]) if closed else path
-    arc = arc_lengths(line)
+    arc = walked_m(line)
     s = np.arange(0.0, arc[-1], step)
     places = places_at(s, arc, line)
     ahead = places_at(np.minimum(s + 0.5, arc[-1]), arc, line) - places

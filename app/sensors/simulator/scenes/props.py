@@ -11,7 +11,7 @@ from scipy.interpolate import make_interp_spline
 
 from app.sensors.simulator.mesh import Mesh, MeshBuilder, Triple, band_faces
 from app.sensors.simulator.raycast import Mover
-from app.sensors.simulator.trajectory import arc_lengths
+from app.slam.metrics import walked_m
 from app.slam.types import F64
 
 Point = tuple[float, float]
@@ -194,7 +194,7 @@ def pedestrian(
     """A person who walks round a closed polygon without end, `start` metres along it at time 0."""
     path = _rounded(np.array(corners, np.float64))
     loop = np.vstack([path, path[:1]])
-    arc = arc_lengths(loop)
+    arc = walked_m(loop)
     curve = make_interp_spline(arc, loop, k=3, bc_type="periodic")
     tangent = curve.derivative()
 

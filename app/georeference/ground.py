@@ -1,0 +1,53 @@
+"""Metres on the ground around a place, where a grid's own metres are stretched and its numbers are large."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.georeference import crs
+from app.georeference.fixes import Fixes
+from app.georeference.reference import GeoReference
+from app.slam.arrays import F64
+from app.slam.errors import HemislamError
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """Places in metres as they are on the ground, near one another, rather than in a grid far away.
+
+    Attributes:
+        name: of the grid. grid: (n, 3) easting, northing, height, m. centre: (3,) of the grid, whole metres.
+        scale: of the grid there. places: (n, 3) m east, north, up of the centre.
+    """
+
+    name: str
+    grid: F64
+    centre: F64
+    scale: float
+    places: F64
+
+    @classmethod
+    def of(cls, fixes: Fixes, name: str = "") -> "Ground":
+        """Raises HemislamError: the grid is not made for the place, or is none."""
+        middle = [float(np.median(column)) for column in (fixes.latitude, fixes.longitude, fixes.height)]
+        name = name or crs.utm(middle[0], middle[1])
+        crs.check_place(name, middle[0], middle[1])
+        flat = crs.transformer(crs.WGS84, name).transform(fixes.longitude, fixes.latitude)
+        return cls.in_grid(np.column_stack([*flat, fixes.height]), name)
+
+    @classmethod
+    def in_grid(cls, grid: F64, name: str) -> "Ground":
+        """Of (n, 3) easting, northing and height."""
+        centre = np.round(np.median(grid, axis=0))
+        longitude, latitude = crs.transformer(name, crs.WGS84).transform(*centre[:2])
+        if not np.isfinite(longitude + latitude):
+            raise HemislamError(f"{name} has no place at E {centre[0]:.0f}, N {centre[1]:.0f}; check the grid.")
+        crs.check_place(name, latitude, longitude)
+        scale = crs.grid_scale(name, latitude, longitude, float(centre[2]))
+        return cls(name, grid, centre, scale, (grid - centre) / [scale, scale, 1.0])
+
+    def reference(self, R_ground_map: F64, shift: F64, height: str) -> GeoReference:
+        """Where a map lies whose origin is at `shift` (3,) m from the centre."""
+        east, north, up = (self.centre + shift * [self.scale, self.scale, 1.0]).tolist()
+        first, second, third = (tuple(map(float, row)) for row in R_ground_map)
+        return GeoReference(self.name, (east, north, up), (first, second, third), self.scale, height)  # type: ignore[arg-type]

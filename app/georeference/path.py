@@ -1,0 +1,49 @@
+"""The path of the IMU, and of an antenna on it, at any time between the poses of a trajectory."""
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation, Slerp
+
+from app.slam.arrays import F64, Mask
+from app.slam.trajectory import Trajectory
+
+SEARCH_S = 10.0
+"""Fixes may be stamped this much too early or too late."""
+GAP_S = 1.0
+"""Between poses further apart than this, the place of the antenna is not known."""
+
+
+class PathOverTime:
+    """Where the IMU was between the poses of a trajectory (4 or more); times in s since the first pose."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.start_ns = int(trajectory.stamps_ns[0])
+        self._times = (trajectory.stamps_ns - self.start_ns) * 1e-9
+        self._places = make_interp_spline(self._times, trajectory.positions, k=3)
+        self._turns = Slerp(self._times, trajectory.rotations)
+
+    def known(self, t: F64) -> Mask:
+        """(n,) whether there are poses near these times."""
+        after = np.clip(np.searchsorted(self._times, t), 1, len(self._times) - 1)
+        near = self._times[after] - self._times[after - 1] < GAP_S
+        return np.asarray(near & (t >= self._times[0]) & (t <= self._times[-1]))
+
+    def within_search(self, t: F64) -> Mask:
+        """(n,) whether the clocks' offset may bring these times into the walk."""
+        return np.asarray((t >= self._times[0] - SEARCH_S) & (t <= self._times[-1] + SEARCH_S))
+
+    def poses(self, t: F64) -> F64:
+        """(n, 4, 4) T_map_imu."""
+        inside = np.clip(t, self._times[0], self._times[-1])
+        T = np.tile(np.eye(4), (len(t), 1, 1))
+        T[:, :3, :3], T[:, :3, 3] = self._turns(inside).as_matrix(), self._places(inside)
+        return T
+
+    def antenna(self, t: F64, lever: F64) -> F64:
+        """(n, 3) m in the map, of a point `lever` (3,) in the IMU frame."""
+        inside = np.clip(t, self._times[0], self._times[-1])
+        places = np.asarray(self._places(inside))
+        if not lever.any():
+            return places
+        turns: Rotation = self._turns(inside)
+        return np.asarray(places + turns.apply(lever))

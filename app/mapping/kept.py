@@ -1,0 +1,89 @@
+"""What the user makes beside the map and a session keeps: notes, views, measures, marks of the brush, the clip box."""
+
+from dataclasses import dataclass, fields
+from typing import Annotated
+
+from pydantic import Field, PlainSerializer, PlainValidator
+
+from app.export.box import Box
+from app.mapping.painted import Stroke, entry_of, stroke_of
+from app.slam.types import Vector
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A remark of the user, or what was done with forks."""
+
+    frame: int
+    text: str
+
+
+KeptView = tuple[Vector, Vector]
+"""Where a camera stands and what it looks at, (x, y, z) each, m, in the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A place on what a keyframe saw, so that it moves with the map. at: (x, y, z), m, in the keyframe's IMU frame."""
+
+    keyframe: int
+    at: Vector
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """A named annotation: of one spot its coordinates, of two their distance, of three the angle at the second."""
+
+    name: str
+    spots: tuple[Spot, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """What of the map is shown, and what exports may be limited to.
+
+    Attributes:
+        box: None: none was chosen yet. on: whether what is outside it is hidden.
+        unrolled: the map is shown as a profile along the walked path. slab: m, how wide that is.
+    """
+
+    box: Box | None = None
+    on: bool = False
+    unrolled: bool = False
+    slab: Annotated[float, Field(ge=0.01, le=100)] = 1.0
+
+    @property
+    def hiding(self) -> Box | None:
+        """The box outside which points are hidden, if there is one."""
+        return self.box if self.on else None
+
+
+WHOLE = Clip()
+_Note = Annotated[
+    Note, PlainValidator(lambda entry: Note(*entry)), PlainSerializer(lambda note: (note.frame, note.text))
+]
+_Stroke = Annotated[Stroke, PlainValidator(stroke_of), PlainSerializer(entry_of)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kept:
+    """All of it.
+
+    Attributes:
+        notes, views, measures, painted: in the order in which they were made. painted: points marked as ground or not.
+        clip: what of the map is shown.
+    """
+
+    notes: tuple[_Note, ...] = ()
+    views: tuple[KeptView, ...] = ()
+    measures: tuple[Measure, ...] = ()
+    painted: tuple[_Stroke, ...] = ()
+    clip: Clip = WHOLE
+
+    @classmethod
+    def of(cls, whole: "Kept") -> "Kept":
+        """This part of a value that holds more."""
+        return Kept(**{field.name: getattr(whole, field.name) for field in fields(Kept)})
+
+
+NOTHING_KEPT = Kept()

@@ -1,0 +1,31 @@
+"""Writes what came of a session: the files of a run, or those in other formats."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from app.export.results import BY_RUN, Results, of_formats, save_results
+from app.georeference.survey import Survey
+from app.mapping.session_file import SUFFIX, SavedSession, write_session
+from app.slam.loops.edits import LoopEdit
+
+
+def write_all(
+    folder: Path,
+    results: Results,
+    survey: Survey | None,
+    edits: Sequence[LoopEdit],
+    session: SavedSession | None,
+    formats: Sequence[str],
+    *,
+    replace: bool,
+) -> dict[str, Any]:
+    """Write the results, georeferenced if that is possible; as `Session.save`."""
+    if survey is not None:
+        from app.mapping.earth import lay_if_possible  # few sessions need its solvers
+
+        results = lay_if_possible(results, survey, edits)
+    report = save_results(folder, results, of_formats(formats) if formats else BY_RUN, replace=replace)
+    if session is not None and not formats:
+        write_session(folder / f"session{SUFFIX}", session)
+    return report

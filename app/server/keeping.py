@@ -1,0 +1,106 @@
+"""Commands that change what a session keeps beside the map, and what each of them makes of it."""
+
+from dataclasses import replace
+from typing import Final
+
+from app.mapping.kept import Clip, Kept, KeptView, Measure, Note
+from app.mapping.painted import Stroke
+from app.server.protocol import Command
+from app.slam.errors import HemislamError
+
+MOST_NOTES: Final = 1000
+"""Every page and every REST answer holds all of them."""
+MOST_VIEWS: Final = 6
+MOST_MEASURES: Final = 200
+"""Older ones are left out."""
+
+
+class KeptCommand(Command, frozen=True):
+    """A change of what the session keeps beside the map."""
+
+
+class AddNote(KeptCommand, frozen=True):
+    """Keep a note on the present frame in the session."""
+
+    text: str
+
+
+class EditNote(KeptCommand, frozen=True):
+    """Replace the text of the note with this place in `Snapshot.notes`; an empty text deletes it.
+
+    before: its text until now. If another page has changed it meanwhile, nothing happens.
+    """
+
+    place: int
+    before: str
+    text: str
+
+
+class KeepView(KeptCommand, frozen=True):
+    """Keep in the session where a camera stands and what it looks at."""
+
+    view: KeptView
+
+
+class KeepMeasure(KeptCommand, frozen=True):
+    """Keep in the session what was measured."""
+
+    measure: Measure
+
+
+class RenameMeasure(KeptCommand, frozen=True):
+    """Give a measure of the session another name."""
+
+    measure: Measure
+    name: str
+
+
+class SetClip(KeptCommand, frozen=True):
+    """Show only a part of the map, or all of it."""
+
+    clip: Clip
+
+
+class DropMeasure(KeptCommand, frozen=True):
+    """Delete a measure from the session."""
+
+    measure: Measure
+
+
+class Paint(KeptCommand, frozen=True):
+    """Mark points of a frame as ground or not, over what was marked before."""
+
+    stroke: Stroke
+
+
+class UndoPaint(KeptCommand, frozen=True):
+    """Take the last `Paint` back."""
+
+
+def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
+    """The same after a command, given at a frame. Raises HemislamError: there are too many notes."""
+    notes, measures = kept.notes, kept.measures
+    match command:
+        case AddNote(text) if text.strip():
+            if len(notes) >= MOST_NOTES:
+                raise HemislamError(f"A session holds at most {MOST_NOTES:,} notes; this one was not added.")
+            return replace(kept, notes=(*notes, Note(frame, text.strip())))
+        case EditNote(place, before, text) if 0 <= place < len(notes) and notes[place].text == before:
+            now = (Note(notes[place].frame, text.strip()),) if text.strip() else ()
+            return replace(kept, notes=(*notes[:place], *now, *notes[place + 1 :]))
+        case KeepView(view):
+            return replace(kept, views=(*kept.views, view)[-MOST_VIEWS:])
+        case KeepMeasure(measure):
+            return replace(kept, measures=(*measures, measure)[-MOST_MEASURES:])
+        case RenameMeasure(measure, name):
+            renamed = replace(measure, name=name)
+            return replace(kept, measures=tuple(renamed if one == measure else one for one in measures))
+        case DropMeasure(measure):
+            return replace(kept, measures=tuple(one for one in measures if one != measure))
+        case SetClip(clip):
+            return replace(kept, clip=clip)
+        case Paint(stroke):
+            return replace(kept, painted=(*kept.painted, stroke))
+        case UndoPaint():
+            return replace(kept, painted=kept.painted[:-1])
+    return kept
