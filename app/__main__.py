@@ -139,8 +139,8 @@ def info(
         typer.echo(f"{finding.verdict:<9}  {finding.subject:<{width}}  {finding.text}")
         if finding.option:
             typer.echo(f"{'':<9}  {'':<{width}}  -> {finding.option}")
-    if calibrate and is_mounting_unknown(params) and (told := look_for_mounting(recording, params)):
-        typer.echo(told)
+    if calibrate and is_mounting_unknown(params) and (advised := look_for_mounting(recording, params)):
+        typer.echo(advised)
     waiting = sum(finding.verdict == "needs you" for finding in findings)
     typer.echo(
         f"{waiting} of {len(findings)} findings need your attention." if waiting else "Nothing needs your attention."

@@ -10,7 +10,7 @@ from app.cli.run import process
 from app.export.results import Results
 from app.georeference.fixes import Fixes
 from app.georeference.survey import Survey
-from app.mapping.earth import lay
+from app.mapping.earth import georeference
 from app.mapping.opening import open_session
 from app.sensors.navsat import recorded_fixes
 from app.sensors.presets import resolve_params
@@ -51,17 +51,17 @@ def measure(scene: str, *, imperfect: bool) -> list[Line]:
     truth, fixes = read_tum(beside), recorded_fixes(path)
     lines = []
     for factors in (False, True):
-        laid = lay(session.results(), Survey(lever=LEVER, factors=factors))
-        lines += compare(laid, truth, fixes, f"{name}, {'as factors' if factors else 'align only'}")
+        results = georeference(session.results(), Survey(lever=LEVER, factors=factors))
+        lines += compare(results, truth, fixes, f"{name}, {'as factors' if factors else 'align only'}")
     session.close()
     return lines
 
 
-def compare(laid: Results, truth: Trajectory, fixes: Fixes, on: str) -> list[Line]:
+def compare(results: Results, truth: Trajectory, fixes: Fixes, on: str) -> list[Line]:
     """Offset, points of the map and names of wild fixes against the truth."""
-    found = laid.found
-    assert found is not None and laid.where is not None
-    off = np.concatenate([_off(laid, truth, index) for index in range(len(laid.keyframes))])
+    found = results.found
+    assert found is not None and results.where is not None
+    off = np.concatenate([_off(results, truth, index) for index in range(len(results.keyframes))])
     wild = _wild(fixes, truth)
     left_out = {name for name, used in zip(found.names, found.used, strict=True) if not used}
     told = set(found.names)
@@ -75,16 +75,16 @@ def compare(laid: Results, truth: Trajectory, fixes: Fixes, on: str) -> list[Lin
     ]
 
 
-def _off(laid: Results, truth: Trajectory, index: int) -> F64:
+def _off(results: Results, truth: Trajectory, index: int) -> F64:
     """(n,) m, how far each point of a keyframe is from where it truly is."""
-    keyframe = laid.keyframes[index]
+    keyframe = results.keyframes[index]
     there, inside = interpolate(truth, np.array([keyframe.stamp_ns]))
-    if not inside.all() or laid.where is None:
+    if not inside.all() or results.where is None:
         return np.empty(0)
     (T_scene_imu,) = there.poses
     own = keyframe.cloud.points.astype(np.float64) @ keyframe.T_imu_lidar[:3, :3].T + keyframe.T_imu_lidar[:3, 3]
-    T_map_imu = laid.frame.at(index) @ keyframe.T_odom_imu
-    ours = laid.where.to_crs(own @ T_map_imu[:3, :3].T + T_map_imu[:3, 3])
+    T_map_imu = results.frame.at(index) @ keyframe.T_odom_imu
+    ours = results.where.to_crs(own @ T_map_imu[:3, :3].T + T_map_imu[:3, 3])
     true = GNSS.reference.to_crs(own @ T_scene_imu[:3, :3].T + T_scene_imu[:3, 3])
     return np.asarray(np.linalg.norm(ours - true, axis=1))
 

@@ -22,7 +22,8 @@ NEIGHBOURS = 6
 REACH_M = 1.2
 """Neighbours farther away do not belong to a point."""
 LINE, PLANE = 5.0, 0.15
-"""Variances of neighbours: along a line, at least so many times those across; across a plane, at most that share."""
+"""The variance of neighbours along a line is at least this many times that across it; across a plane, at most that
+share of the others."""
 SPREAD = 0.02
 """Least share of the variance along a plane's longer axis that the shorter one has: a scan line makes no plane."""
 THICK_M = 0.06

@@ -128,7 +128,7 @@ def calibrate(
     `sensor.translation` are not used.
 
     Args:
-        duration_s: only so much of it. progress: called with the fraction done, 0-1.
+        duration_s: how much of it to use. progress: called with the fraction done, 0-1.
 
     Raises:
         HemislamError: the recording cannot be read, has no IMU, or is too short.

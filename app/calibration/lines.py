@@ -26,7 +26,7 @@ from app.slam.types import F64, I64, U16
 WINDOW, CUBE, EVERY = 60, 1.0, 4
 """Scans of a window; m, edge of a cube; of how many points one is used."""
 FEWEST, THICKEST, FLAT = 15, 0.05, 3.0
-"""A plane has so many points, is no thicker (m), and is wider than thick by this factor."""
+"""A plane has at least this many points, is at most this thick (m), and is wider than thick by this factor."""
 OUTLIER = 3.0
 """Standard deviations from its plane beyond which a point is left out."""
 WIDEST = np.radians(0.3), 0.03
@@ -36,7 +36,7 @@ COMMON = np.radians(1e-3), 1e-4
 LOOSE = 1.0
 """rad, m: the same for the scans' poses."""
 SURE, LEAST = 3.0, (np.radians(0.03), 0.003)
-"""Corrections are worth applying if their RMS is so many times their uncertainty, and more than rad or m."""
+"""Corrections are worth applying if their RMS exceeds this many times their uncertainty, and these values (rad, m)."""
 DIGITS = 3, 4
 """Of a correction in deg, and in m."""
 
@@ -72,9 +72,9 @@ class Lines:
         values = {}
         names, scales = ("elevation_corrections", "range_corrections"), (np.degrees(1.0), 1.0)
         for k, line in enumerate((self.elevations, self.ranges)):
-            told = self.sigmas[k] < 0.5 * WIDEST[k]  # a line that saw nothing does not count
-            size = float(np.sqrt(np.mean(line[told] ** 2))) if told.any() else 0.0
-            if size > max(LEAST[k], SURE * float(np.median(self.sigmas[k][told])) if told.any() else 0.0):
+            known = self.sigmas[k] < 0.5 * WIDEST[k]  # a line that saw nothing does not count
+            size = float(np.sqrt(np.mean(line[known] ** 2))) if known.any() else 0.0
+            if size > max(LEAST[k], SURE * float(np.median(self.sigmas[k][known])) if known.any() else 0.0):
                 values[f"sensor.{names[k]}"] = channels.text(line * scales[k], DIGITS[k])
         return values
 

@@ -96,7 +96,7 @@ def track(
     for k, scan in enumerate(excerpt.scans[1:], 1):
         here = _predicted(here, float(times[k - 1]), float(times[k]), guide, _changes(excerpt, scan.end_ns))
         path = _Path.of(scan, float(times[k]), here.R, guide)
-        here, residual = _laid(scan, here, path, local_map, params)
+        here, residual = _fitted(scan, here, path, local_map, params)
         if not (np.isfinite(here.p).all() and np.isfinite(here.R).all()):
             raise np.linalg.LinAlgError("the odometry gave no finite pose")
         points = path.deskewed(scan, here)
@@ -179,7 +179,9 @@ def _predicted(last: _Motion, begin: float, end: float, guide: Guide | None, cha
     return _Motion(R, last.p + last.velocity * dt + shift, last.rate, velocity, F @ last.P @ F.T + Q)
 
 
-def _laid(scan: Scan, prior: _Motion, path: _Path, local_map: LocalMap, params: FilterParams) -> tuple[_Motion, float]:
+def _fitted(
+    scan: Scan, prior: _Motion, path: _Path, local_map: LocalMap, params: FilterParams
+) -> tuple[_Motion, float]:
     """The motion given the scan, and its residual: iterated least squares from the prior; nan without planes."""
     here, information = prior, np.linalg.inv(prior.P)
     chosen = slice(None, None, -(-len(scan) // MATCHED))

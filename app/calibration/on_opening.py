@@ -14,7 +14,7 @@ def is_mounting_unknown(params: Params) -> bool:
 
 
 def contradicted(path: Path, params: Params, progress: Report = lambda fraction: None) -> Calibration | None:
-    """The calibration, if mounting or clock differ from the parameters; None if not, or if that remains unknown."""
+    """The calibration, if mounting or clock differ from the parameters; None if they do not, or if that is unknown."""
     try:
         found = calibrate(path, params, USED_S, progress)
     except HemislamError:  # such as too short a recording; opening it reports what is wrong with it

@@ -18,7 +18,7 @@ FAR = np.radians(1.5)
 WIDEST = np.array([3.0, 3.0, 3.0, 1.0, 1.0, 1.0, 1.0])
 """Standard deviations of rotation (rad), offset (s) and bias (rad/s) where nothing determines them."""
 STEPS, SLIPPED = 20, 3.0
-"""Most steps of the fit. Windows whose differences are so many times the usual ones are errors of the odometry."""
+"""Most steps of the fit; windows whose differences exceed this many times the usual ones are errors of the odometry."""
 WINDOW = 10
 """Scans over which attitudes are compared: a second. The gyroscope's noise grows with it, the odometry's does not."""
 

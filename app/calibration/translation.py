@@ -22,7 +22,7 @@ the odometry drifts."""
 WIDEST = np.array([10.0, 10.0, 10.0, BIAS, BIAS, BIAS])
 """Standard deviations of position (m) and bias (m/s²) where nothing determines them."""
 HUBER = 1.5
-"""Windows whose residuals are so many times the usual count for less."""
+"""Windows whose residuals exceed this many times the usual ones count for less."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,7 +77,7 @@ def georeference(
     """
     from app.georeference import ledger
     from app.georeference.align import align
-    from app.georeference.control import CONTROL, PICKS, lay_on_control, read_picks
+    from app.georeference.control import CONTROL, PICKS, align_with_points, read_picks
     from app.georeference.tables import read_table
     from app.mapping.earth import fixes_of
     from app.slam.trajectory import read_tum
@@ -93,13 +93,13 @@ def georeference(
     trajectory = read_tum(results / "trajectory.tum")
     if control is not None and picks is not None:
         picked = read_picks(read_table(picks, *PICKS))
-        found = lay_on_control(read_table(control, *CONTROL), picked, grid=crs, height=height or "ellipsoidal")
+        found = align_with_points(read_table(control, *CONTROL), picked, grid=crs, height=height or "ellipsoidal")
         lines = [*ledger.summary(found, "control points"), "", *ledger.table(found)]
     else:
         recording = results if gnss is not None else _recording_of(results)
-        fixes, told = fixes_of(recording, gnss, int(trajectory.stamps_ns[0]))
+        fixes, heights = fixes_of(recording, gnss, int(trajectory.stamps_ns[0]))
         overridden = {str(fix): fix in (accept or []) for fix in (*(accept or []), *(reject or []))}
-        found = align(trajectory, fixes, grid=crs, height=height or told, lever=lever_arm, overridden=overridden)
+        found = align(trajectory, fixes, grid=crs, height=height or heights, lever=lever_arm, overridden=overridden)
         if unknown := sorted(set(overridden) - set(found.names)):
             raise HemislamError(
                 f"There is no fix {unknown[0]} within the time of the trajectory; gnss_residuals.csv lists all."

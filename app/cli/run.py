@@ -74,7 +74,7 @@ def run(
 
     say_calibrated(recording)
     edits = _read_edits(loops) if loops else ()
-    params, told = settle_mounting(recording, params) if calibrate else (params, "")
+    params, advised = settle_mounting(recording, params) if calibrate else (params, "")
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
     session = open_session(
@@ -107,9 +107,9 @@ def run(
             with contextlib.suppress(OSError):
                 folder.rmdir()  # only if it is empty
             raise stop or HemislamError(_nothing_processed(session))
-        if calibrate and not told and doubts(session.log):
-            told = look_for_mounting(recording, params)
-        session.calibration = told
+        if calibrate and not advised and doubts(session.log):
+            advised = look_for_mounting(recording, params)
+        session.calibration = advised
         save(session, folder, stop, replace=force)
     finally:
         session.close()
@@ -125,8 +125,8 @@ def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
         found = contradicted(recording, params, show)
     if found is None:
         return params, ""
-    typer.echo(told := advice(found, used=True))
-    return params.with_values(found.found()), told
+    typer.echo(advised := advice(found, used=True))
+    return params.with_values(found.found()), advised
 
 
 def look_for_mounting(recording: Path, params: "Params") -> str:

@@ -144,7 +144,7 @@ def tune(
         def progress(so_far: Sequence[Trial], _: object) -> None:
             bar.update(len(so_far) - bar.n)
             if best := front(so_far, wanted):
-                bar.set_postfix_str(f"best {wanted[0].told(best[0].scores[0])}")
+                bar.set_postfix_str(f"best {wanted[0].text(best[0].scores[0])}")
 
         done, checked = find(
             runs, dimensions, wanted, part, rest, out, how=search, trials=trials, seed=seed, progress=progress
@@ -154,10 +154,10 @@ def tune(
         raise HemislamError(f"No trial gave a result: {done[0].error or 'no run has a value for the objective'}")
     for label, shown in (("as given", done[:1]), ("best", best[:5]), ("held back", checked)):
         for trial in shown:
-            told = ", ".join(f"{one.title} {one.told(v)}" for one, v in zip(wanted, trial.scores, strict=True))
-            typer.echo(f"{label:<10} {told}  ({trial.name}){' ' + trial.error if trial.error else ''}")
-    if told := advice(checked, wanted):
-        typer.echo(told)
+            scores = ", ".join(f"{one.title} {one.text(v)}" for one, v in zip(wanted, trial.scores, strict=True))
+            typer.echo(f"{label:<10} {scores}  ({trial.name}){' ' + trial.error if trial.error else ''}")
+    if words := advice(checked, wanted):
+        typer.echo(words)
     failed = [trial for trial in done if trial.error]
     if failed:
         typer.echo(f"{len(failed)} of {len(done)} trials failed; the first: {failed[0].error}")

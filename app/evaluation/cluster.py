@@ -36,7 +36,7 @@ TAKE_S = 20.0
 PIECE = 16 << 20
 """Bytes of a recording that are sent at a time."""
 MOST_DEATHS = 3
-"""A job that so many workers died of is not tried again."""
+"""A job during which this many workers died is not tried again."""
 
 
 class _Gone(Exception):
@@ -103,7 +103,7 @@ class Cluster:
                     job, _ = running.pop(worker)
                     deaths[job.folder] += 1
                     if deaths[job.folder] == MOST_DEATHS:
-                        yield job, f"{MOST_DEATHS} workers died of it; they may have too little memory."
+                        yield job, f"{MOST_DEATHS} workers died while running it; they may have too little memory."
                     else:
                         waiting.appendleft(job)
                 free = sorted(there.keys() - running.keys())[: len(waiting)]
@@ -194,8 +194,10 @@ def _checked(client: Any, workers: dict[str, Any]) -> list[str]:
         if isinstance(version, ModuleNotFoundError):
             raise HemislamError(f"Worker {worker} has no hemislam ({version}); install version {__version__} there.")
         if version != (__version__, code_digest()):
-            told = f"version {version[0]}" if isinstance(version, tuple) and version[0] != __version__ else "other code"
-            raise HemislamError(f"Worker {worker} has {told}, and this is {__version__}; install the same on all.")
+            other = (
+                f"version {version[0]}" if isinstance(version, tuple) and version[0] != __version__ else "other code"
+            )
+            raise HemislamError(f"Worker {worker} has {other}, and this is {__version__}; install the same on all.")
         good.append(worker)
     return good
 

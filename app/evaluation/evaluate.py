@@ -108,7 +108,7 @@ def _measured(subject: Subject, sha256: str, outcomes: list[Outcome]) -> Evaluat
 
 
 def _described(truth: TruePoses) -> str:
-    """What it is. A lever arm that was taken off is in the notes."""
+    """The truth in words. The notes say whether a lever arm was removed."""
     point = "" if any(truth.lever) else " of a point taken as the IMU's own (no lever arm)"
     return f"{truth.source}: {truth.kind}, {len(truth)} poses{point}."
 

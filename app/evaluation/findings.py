@@ -11,7 +11,7 @@ from app.evaluation.variants import PAPER
 LIKE, LIKE_IN_TIME = 0.02, 0.05
 """Two values that differ by less than this share count as equal; run times differ by more from run to run."""
 MOST_TOLD = 5
-"""So many sentences stand at the top of a report."""
+"""Number of sentences at the top of a report."""
 MOST_NAMED = 4
 """Most recordings that are named when they differ; of more, only the number is given."""
 CHANCE = 2.0
@@ -66,12 +66,12 @@ def _own(recordings: Sequence[Evaluated]) -> list[Claim]:
         if name == base:
             continue
         compared = [(metric, _difference(recordings, name, base, metric)) for metric in _OWN_METRICS]
-        told = [(metric, difference) for metric, difference in compared if difference is not None and difference.size]
-        if not told:
+        sure = [(metric, difference) for metric, difference in compared if difference is not None and difference.size]
+        if not sure:
             alike.append(name)
             continue
-        words = "; ".join(f"the mean {metric.name} {difference.words}" for metric, difference in told)
-        size = max(difference.size for _, difference in told)
+        words = "; ".join(f"the mean {metric.name} {difference.words}" for metric, difference in sure)
+        size = max(difference.size for _, difference in sure)
         found.append(Claim(f"{name} against {base} ({outcomes[name].meaning or 'as given'}): {words}.", size, own=True))
     if alike:
         found.append(Claim(f"{', '.join(alike)}: no difference from {base} that may not be chance.", 0.0, own=True))
@@ -170,8 +170,8 @@ def _difference(recordings: Sequence[Evaluated], name: str, base: str, metric: _
         where = ", ".join(worse) if len(worse) <= MOST_NAMED else f"{len(worse)} of them"
         where = "all" if len(worse) == len(pairs) else where
         rest = f"; it rises on {where}" if worse else ""
-    told = verdict != _SAME and "chance" not in certainty
-    return _Difference(words, abs(ours - theirs) / max(abs(theirs), 1e-9) if told else 0.0, against, rest)
+    certain = verdict != _SAME and "chance" not in certainty
+    return _Difference(words, abs(ours - theirs) / max(abs(theirs), 1e-9) if certain else 0.0, against, rest)
 
 
 def _claim(name: str, base: str, what: str, difference: _Difference, metric: _Metric) -> str:

@@ -19,8 +19,8 @@ from app.slam.params import Params
 
 FORMAT = 3
 LEAD_S = 5.0
-"""A part that begins in the middle of a recording is entered so much earlier. What comes before it does not count: a
-start while walking has no rest to level by, and is wrong by more centimetres than any parameter changes."""
+"""Reading begins this much before a part in the middle of a recording, and what comes before the part does not count.
+A start while walking has no rest to level by: its error is larger than the effect of any parameter."""
 GROUND_RANGES_M = (0.0, 5.0, 10.0, 20.0, 40.0, 100.0)
 RUN_FILES = ("trajectory.tum", "timings.csv", "crops.npz", "run.json")
 

@@ -22,7 +22,7 @@ from app.slam.trajectory import Trajectory
 from app.slam.types import F32, F64
 
 _OF_A_GRID_M: Final = 20_000.0
-"""Coordinates beyond this are those of a grid on Earth: no walk is so long."""
+"""Coordinates beyond this are those of a grid on Earth, since no walk reaches that far."""
 _ABOVE_M: Final = 100.0
 _READ: Final = 0.3
 """Share of the work that goes into reading the other map."""
@@ -106,7 +106,7 @@ def read_map(path: Path) -> tuple[F64, F64]:
 
 
 def sentences(found: Comparison, name: str) -> list[str]:
-    """What a comparison with a map of this name found besides distances, in sentences."""
+    """What a comparison with the map `name` found besides distances, in sentences."""
     moved = float(np.linalg.norm(found.T[:3, 3]))
     turned = float(np.degrees(np.linalg.norm(lie.log(found.T[:3, :3]))))
     return [

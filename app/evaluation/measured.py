@@ -1,4 +1,4 @@
-"""What a finished run achieved: its files read back and measured against the truth."""
+"""Reads the files of a finished run and measures them against the truth."""
 
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -68,7 +68,7 @@ class Outcome:
 
     @cached_property
     def results(self) -> dict[str, Any]:
-        """What results.json holds of it. Tables and findings read it by `value`."""
+        """Its entry in results.json. Tables and findings read it by `value`."""
         run, scores = self.run or {}, self.ground or []
         return {
             "variant": self.name,

@@ -17,7 +17,7 @@ def machines(recordings: Sequence[Evaluated]) -> list[str]:
 
 def parameters(recordings: Sequence[Evaluated]) -> list[tuple[str, str]]:
     """Every parameter of this engine's runs by its dotted name; where they differ, each value with whose it is."""
-    told = []
+    found = []
     for leaf in leaves():
 
         def value(run: dict[str, Any], section: str = leaf.section, name: str = leaf.name) -> str:
@@ -26,8 +26,8 @@ def parameters(recordings: Sequence[Evaluated]) -> list[tuple[str, str]]:
 
         values = _by_text(recordings, value, of_engine=True)
         text = "; ".join(f"{value}{_of(who)}" for value, who in values)
-        told.append((leaf.path, f"{text} {leaf.unit}".strip()))
-    return told
+        found.append((leaf.path, f"{text} {leaf.unit}".strip()))
+    return found
 
 
 def _machine(run: dict[str, Any]) -> str:

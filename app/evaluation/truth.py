@@ -16,7 +16,7 @@ from app.slam.types import F64, I64
 from app.slam.user_text import as_numbers, read_rows
 
 JUMP_M, JUMP_M_S, JUMP_TIMES = 1.0, 15.0, 5.0
-"""A step over both limits, and so many times faster than those around it, is a jump of the frame, not a motion."""
+"""A step over both limits that is this many times faster than its neighbours is a jump of the frame, not motion."""
 GNSS_COLUMNS = 13
 H2LID_LEVER = (-0.034, -0.283, 0.342)
 """m from the IMU to the GNSS antenna; x right, y forward, z up (README of the data set)."""

@@ -1,6 +1,6 @@
 """The points of a map as a stream, one keyframe at a time, so that memory does not grow with the map.
 
-Only thinning remembers something of the whole map: its voxels.
+Only thinning keeps something of the whole map: its occupied voxels.
 """
 
 import math

@@ -314,7 +314,7 @@ def save_results(
 
 
 def _progress_of(file: int, files: int, show: Callable[[float], None]) -> Callable[[float], None]:
-    """How far all files are. It never goes back, although some read the points several times."""
+    """Progress over all files. It never goes back, although some files read the points several times."""
     most = 0.0
 
     def tell(share: float) -> None:

@@ -23,7 +23,7 @@ MOST_COLUMNS: Final = 20_000
 STRIDE: Final = 0.5
 """m, length of a step along the path: a shorter one would follow the walker's sway."""
 
-Laid = Callable[[Block], tuple[F64, U8]]
+Placed = Callable[[Block], tuple[F64, U8]]
 """Gives (n, 2) chainage and height of the points in the slab, m, and their labels."""
 
 
@@ -68,11 +68,11 @@ def of_box(read: Callable[[], Iterable[Block]], box: Box | None, where: GeoRefer
     if box is None:
         raise HemislamError("A section shows what lies in a box; choose one in the page, or by --box.")
 
-    def laid(block: Block) -> tuple[F64, U8]:
+    def placed(block: Block) -> tuple[F64, U8]:
         chainage = box.own(block.points)[:, 0] + box.size[0] / 2
         return np.column_stack([chainage, heights(block.points, where)]), block.labels
 
-    return _counted(read, laid)
+    return _counted(read, placed)
 
 
 def of_path(read: Callable[[], Iterable[Block]], positions: F64, half: float, where: GeoReference | None) -> Slab:
@@ -83,11 +83,11 @@ def of_path(read: Callable[[], Iterable[Block]], positions: F64, half: float, wh
     """
     path = strides(positions[:, :2])
 
-    def laid(block: Block) -> tuple[F64, U8]:
+    def placed(block: Block) -> tuple[F64, U8]:
         which, along, _ = along_path(block.points[:, :2], path, half)
         return np.column_stack([along, heights(block.points, where)[which]]), block.labels[which]
 
-    return _counted(read, laid)
+    return _counted(read, placed)
 
 
 def strides(positions: F64) -> F64:
@@ -126,9 +126,9 @@ def heights(points: F64, where: GeoReference | None) -> F64:
     return points[:, 2] if where is None else where.to_crs(points)[:, 2]
 
 
-def _counted(read: Callable[[], Iterable[Block]], laid: Laid) -> Slab:
+def _counted(read: Callable[[], Iterable[Block]], placed: Placed) -> Slab:
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for at, _ in _parts(read, laid):
+    for at, _ in _parts(read, placed):
         low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
     if not np.isfinite(low).all():
         raise HemislamError("There are no points in the slab; choose a wider one, or another box.")
@@ -138,7 +138,7 @@ def _counted(read: Callable[[], Iterable[Block]], laid: Laid) -> Slab:
     origin = np.floor(low / cell) * cell
     shape = (int(size[1]), int(size[0]))
     points, ground, sums = np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros((*shape, 2), np.float32)
-    for at, labels in _parts(read, laid):
+    for at, labels in _parts(read, placed):
         columns, rows = ((at - origin) / cell).astype(np.int64).T
         np.add.at(points, (rows, columns), 1)
         np.add.at(ground, (rows, columns), is_ground(labels))
@@ -146,8 +146,8 @@ def _counted(read: Callable[[], Iterable[Block]], laid: Laid) -> Slab:
     return Slab(origin, cell, points, ground, sums)
 
 
-def _parts(read: Callable[[], Iterable[Block]], laid: Laid) -> Iterator[tuple[F64, U8]]:
+def _parts(read: Callable[[], Iterable[Block]], placed: Placed) -> Iterator[tuple[F64, U8]]:
     for block in read():
-        at, labels = laid(block)
+        at, labels = placed(block)
         if len(at):
             yield at, labels

@@ -107,7 +107,7 @@ def _is_ground(section: Slab) -> np.ndarray:
 
 
 def _many(section: Slab) -> float:
-    """So many points of a cell are drawn black."""
+    """A cell with this many points is drawn black."""
     return max(4.0, float(np.percentile(section.points[section.points > 0], 90)))
 
 

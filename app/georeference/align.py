@@ -28,11 +28,11 @@ from app.slam.trajectory import Trajectory
 COARSE_S = 0.2
 """Steps in which the clocks' offset is first looked for, over `SEARCH_S` on either side."""
 MOST_SIGMAS = 4.03
-"""Of the distance of a sound fix: 99.9 % of a Gaussian in three directions are nearer."""
+"""Standard deviations within which 99.9 % of sound fixes lie (a Gaussian in three directions)."""
 MEDIAN_SIGMAS = 1.538
-"""Half of them are nearer than this."""
+"""The same for half of them."""
 LEVEL = np.radians(0.5)
-"""Standard deviation of the map's tilt before fixes tell it: that of an accelerometer biased by 0.09 m/s²."""
+"""Standard deviation of the map's tilt before any fix: that of an accelerometer biased by 0.09 m/s²."""
 WORST_YAW, WORST_OFFSET_S, WORST_LEVER_M = np.radians(10.0), 0.1, 0.1
 """What is less certain than this (standard deviation) is not taken from the fixes."""
 FEWEST = 8
@@ -117,7 +117,7 @@ def align(
         seconds[known],
         ground.places[known],
         fixes.sigmas[known],
-        as_told(overridden, names),
+        overrides_of(overridden, names),
         arm,
         offset if offset_s is None else None,
         lever is None,
@@ -158,8 +158,8 @@ def align(
     )
 
 
-def as_told(overridden: Mapping[str, bool], names: Sequence[str]) -> F64:
-    """(n,) 1 or 0 where the user says that what has this name counts or does not, nan elsewhere."""
+def overrides_of(overridden: Mapping[str, bool], names: Sequence[str]) -> F64:
+    """(n,) 1 where the user counts what has this name, 0 where they leave it out, nan elsewhere."""
     return np.array([float(overridden.get(name, np.nan)) for name in names], np.float64)
 
 
@@ -184,7 +184,7 @@ class _Problem:
     """What is known: (n,) times, (n, 3) places on the ground and their sigmas.
 
     Attributes:
-        told: (n,) 1 or 0 where the user says that a fix counts or does not, nan elsewhere.
+        overrides: (n,) 1 or 0 where the user says that a fix counts or does not, nan elsewhere.
         lever: m, IMU frame, as given. offset: s, to start from; None: there is none.
         lever_free: whether the lever arm is to be found instead.
     """
@@ -193,7 +193,7 @@ class _Problem:
     seconds: F64
     places: F64
     sigmas: F64
-    told: F64
+    overrides: F64
     lever: F64
     offset: float | None
     lever_free: bool
@@ -201,11 +201,11 @@ class _Problem:
     def solve(self) -> _Solved:
         """All unknowns at once, first robustly, then by the fixes that agree."""
         late, free = self.offset is not None, self.lever_free
-        some = self.told != 0
+        some = self.overrides != 0
         antenna = self.path.antenna(self.seconds[some] - (self.offset or 0.0), self.lever)
-        yaw, shift, _ = _laid(antenna, self.places[some])
+        yaw, shift, _ = _aligned(antenna, self.places[some])
         start = np.r_[yaw, shift, 0.0, 0.0, [self.offset] * late, [0.0] * (3 * free)].astype(np.float64)
-        x, used = _robust(self._errors, start, self.told)
+        x, used = _robust(self._errors, start, self.overrides)
         R, shift, offset, arm = self._model(x)
         errors = self._errors(x)
         J = _jacobian(lambda x: _with_level(self._errors(x)[used], x), x)
@@ -250,9 +250,9 @@ def _deviations(J: F64) -> F64:
     return np.asarray(np.sqrt((vectors**2 / values).sum(axis=1)) / lengths)
 
 
-def _robust(errors: Callable[[F64], F64], start: F64, told: F64) -> tuple[F64, Mask]:
-    """The optimum by what agrees or the user insists on, and which that is. errors: (n, 3) whitened. told: (n,)."""
-    used = np.asarray(told != 0)
+def _robust(errors: Callable[[F64], F64], start: F64, overrides: F64) -> tuple[F64, Mask]:
+    """The optimum by the fixes that agree or that the user counts, and which these are. errors: (n, 3) whitened."""
+    used = np.asarray(overrides != 0)
     if used.sum() < FEWEST:
         raise HemislamError(f"Only {used.sum()} fixes are left, {FEWEST} are needed; accept some of them again.")
     first = _least_squares(lambda x: _with_level(errors(x)[used], x), start, loss="cauchy", f_scale=2.0, x_scale="jac")
@@ -260,7 +260,7 @@ def _robust(errors: Callable[[F64], F64], start: F64, told: F64) -> tuple[F64, M
     for _ in range(10):
         distances = np.linalg.norm(errors(x), axis=1)
         scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
-        agree = ((distances < MOST_SIGMAS * scale) | (told == 1)) & (told != 0)
+        agree = ((distances < MOST_SIGMAS * scale) | (overrides == 1)) & (overrides != 0)
         if agree.sum() < 3:
             break
         x = np.asarray(_least_squares(lambda x, w=agree: _with_level(errors(x)[w], x), x, x_scale="jac").x)
@@ -285,7 +285,7 @@ def _coarse(path: PathOverTime, seconds: F64, places: F64, lever: F64, *, search
         t = seconds[few] - offset
         inside = path.known(t)
         if inside.sum() >= FEWEST and inside.sum() >= 0.5 * path.known(seconds[few]).sum():
-            _, _, off = _laid(path.antenna(t[inside], lever), places[few][inside])
+            _, _, off = _aligned(path.antenna(t[inside], lever), places[few][inside])
             best = min(best, (float(off.mean()), offset, float(np.median(off))))
     if not np.isfinite(best[0]):
         raise _too_few(path, seconds)
@@ -300,7 +300,7 @@ def _too_few(path: PathOverTime, seconds: F64) -> HemislamError:
 
 
 def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> float:
-    """The clocks' offset (s) near that of an alignment, by stretches of PART_S that are each laid on their own.
+    """The clocks' offset (s) near that of an alignment, by stretches of PART_S each aligned separately.
 
     Drift over the whole walk looks like an offset; within a stretch there is little of it.
     """
@@ -315,8 +315,8 @@ def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> f
         return found.offset_s
 
     def cost(offset: float) -> float:
-        laid = (_laid(path.antenna(seconds[part] - offset, arm) @ R.T, places[part]) for part in parts)
-        return sum(float(off.sum()) for _, _, off in laid)
+        aligned = (_aligned(path.antenna(seconds[part] - offset, arm) @ R.T, places[part]) for part in parts)
+        return sum(float(off.sum()) for _, _, off in aligned)
 
     around = found.offset_s + np.linspace(-1.0, 1.0, 41)
     best = float(around[np.argmin([cost(offset) for offset in around.tolist()])])
@@ -324,8 +324,8 @@ def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> f
     return float(exact.x)
 
 
-def _laid(points: F64, places: F64) -> tuple[float, F64, F64]:
-    """The yaw (rad) and shift (3,) that lay points (n, 3) on places with the smallest sum of distances.
+def _aligned(points: F64, places: F64) -> tuple[float, F64, F64]:
+    """The yaw (rad) and shift (3,) that move points (n, 3) onto places with the smallest sum of distances.
 
     Returns also how far each is off, m (n,). By reweighted least squares (Weiszfeld), so that a few wrong ones do not
     matter.

@@ -2,8 +2,8 @@
 
     g = T_map_imu @ (T_keyframe_then @ lever)        the antenna, carried to the time of the fix by odometry
 
-Fixes that do not fit even a bent map are rejected; the user's word on a fix overrides that. The fixes also tell how
-stiff the graph is: those of some stretches must predict those of the others.
+Fixes that do not fit even a bent map are rejected, unless the user counts them. The fixes also determine how stiff the
+graph is: those of some stretches must predict those of the others.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, as_told, offset_by_parts
+from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, offset_by_parts, overrides_of
 from app.georeference.fixes import Fixes
 from app.georeference.path import PathOverTime
 from app.slam import lie
@@ -53,10 +53,10 @@ def bend(
     before = PathOverTime(trajectory).poses((keyframe_stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
     if np.isfinite(found.offset_sigma_s):
         offset_s = offset_by_parts(trajectory, fixes, found)
-        told = f"Clock offset, estimated in stretches of the trajectory: {offset_s * 1e3:.1f} ms."
-        found = replace(found, offset_s=offset_s, offset_sigma_s=float("nan"), notes=(*found.notes, told))
+        note = f"Clock offset, estimated in stretches of the trajectory: {offset_s * 1e3:.1f} ms."
+        found = replace(found, offset_s=offset_s, offset_sigma_s=float("nan"), notes=(*found.notes, note))
     priors = _priors(trajectory, keyframe_stamps_ns, before, fixes, found)
-    word = as_told(overridden, found.names)
+    word = overrides_of(overridden, found.names)
     held, barred = np.asarray(word == 1.0), np.asarray(word == 0.0)
     chosen = [replace(prior, robust=True) for prior, no in zip(priors, barred, strict=True) if not no]
     stretches = [int(name) - 1 for name, no in zip(found.names, barred, strict=True) if not no]

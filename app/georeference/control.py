@@ -22,7 +22,7 @@ LEAST_WIDTH = 0.02
 """Of control points beside the line through them, as a share of their length along it."""
 
 
-def lay_on_control(
+def align_with_points(
     control: NamedColumns,
     picked: Mapping[str, F64],
     *,

@@ -13,7 +13,7 @@ from app.slam.errors import HemislamError
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """Places in metres as they are on the ground, near one another, rather than in a grid far away.
+    """Places in true metres on the ground, counted from a point near them.
 
     Attributes:
         name: of the grid. grid: (n, 3) easting, northing, height, m. centre: (3,) of the grid, whole metres.

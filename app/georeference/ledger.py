@@ -1,4 +1,4 @@
-"""What became of each fix or control point: as a table, as CSV, and in sentences."""
+"""The residual of each fix or control point, and whether it counts: as a table, as CSV, and in sentences."""
 
 from typing import TYPE_CHECKING, Any
 

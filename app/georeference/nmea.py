@@ -63,11 +63,11 @@ class Sentences:
 
     def _day(self, day: datetime, time: str) -> None:
         at = round(_seconds(time) * 1e9)
-        told = round(day.replace(tzinfo=UTC).timestamp()) * 1_000_000_000 + at
-        off = round((told - _nearest(at * 1e-9, self.near_ns)) / (_DAY_S * 1e9)) * round(_DAY_S * 1e9)
+        stamp_ns = round(day.replace(tzinfo=UTC).timestamp()) * 1_000_000_000 + at
+        off = round((stamp_ns - _nearest(at * 1e-9, self.near_ns)) / (_DAY_S * 1e9)) * round(_DAY_S * 1e9)
         if off:  # the day was guessed so far
             self._stamps = [stamp + off for stamp in self._stamps]
-        self.near_ns = told
+        self.near_ns = stamp_ns
 
 
 def read(lines: Iterable[str], source: str, near_ns: int) -> tuple[Fixes, bool]:

@@ -10,7 +10,7 @@ from app.slam.trajectory import Trajectory
 SEARCH_S = 10.0
 """Fixes may be stamped this much too early or too late."""
 GAP_S = 1.0
-"""Between poses further apart than this, the place of the antenna is not known."""
+"""Between poses farther apart than this, the place of the antenna is not known."""
 
 
 class PathOverTime:

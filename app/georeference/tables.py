@@ -17,7 +17,7 @@ from app.slam.errors import HemislamError
 
 GEOID = "orthometric (geoid of the receiver)"
 LEAP_S, WEEK_S, GPS_EPOCH_S = 18, 604_800, 315_964_800
-"""GPS time is ahead of UTC by so many leap seconds since 2017; a GPS week; when the first one began."""
+"""Leap seconds by which GPS time is ahead of UTC since 2017; seconds of a GPS week; when the first week began."""
 MOST_S = 4e9
 """More seconds are milliseconds."""
 

@@ -18,7 +18,7 @@ DEFAULT_BYTES = 1 << 30
 EVERY = 10
 """Frames between two checkpoints. One takes a tenth to a half of a frame's time."""
 NEAR = 24
-"""So many frames before the target of a seek get a checkpoint each, so that stepping back is immediate."""
+"""Each of this many frames before the target of a seek gets a checkpoint, so that stepping back is immediate."""
 DENSE = 16_000
 """Up to this distance from the present, checkpoints stay `EVERY` frames apart; at twice the distance, twice as far."""
 DISK_SHARE = 4

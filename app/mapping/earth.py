@@ -10,7 +10,7 @@ import numpy as np
 from app.export.results import Results
 from app.georeference.align import Alignment, align
 from app.georeference.bend import bend
-from app.georeference.control import CONTROL, lay_on_control
+from app.georeference.control import CONTROL, align_with_points
 from app.georeference.fixes import Fixes
 from app.georeference.reference import ELLIPSOIDAL
 from app.georeference.survey import Survey
@@ -26,7 +26,7 @@ FIX, POINT = "fix ", "point "
 """What an edit names begins with one of them."""
 
 
-def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> Results:
+def georeference(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> Results:
     """The results where they are on Earth, with how fixes or points lie on them.
 
     Raises:
@@ -38,13 +38,13 @@ def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> Res
     if survey.control:
         found = _by_points(results, survey, _named(overridden, POINT))
         return replace(results, where=found.reference, found=found)
-    fixes, told = fixes_of(results.info.recording, survey.gnss, int(results.trajectory.stamps_ns[0]))
+    fixes, heights = fixes_of(results.info.recording, survey.gnss, int(results.trajectory.stamps_ns[0]))
     of_fixes = _named(overridden, FIX)
     found = align(
         results.trajectory,
         fixes,
         grid=survey.crs,
-        height=survey.height or told,
+        height=survey.height or heights,
         lever=survey.lever,
         offset_s=survey.offset_s,
         overridden=of_fixes,
@@ -54,16 +54,16 @@ def lay(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> Res
     return replace(results, where=found.reference, found=found)
 
 
-def lay_if_possible(results: Results, survey: Survey | None, edits: Sequence[LoopEdit] = ()) -> Results:
-    """As `lay`; where that fails, the results as they are, with the reason."""
+def georeference_if_possible(results: Results, survey: Survey | None, edits: Sequence[LoopEdit] = ()) -> Results:
+    """As `georeference`; where that fails, the results as they are, with the reason."""
     try:
-        return results if survey is None else lay(results, survey, edits)
+        return results if survey is None else georeference(results, survey, edits)
     except HemislamError as error:
         return replace(results, problem=str(error))
 
 
 def bent(results: Results, fixes: Fixes, found: Alignment, overridden: Mapping[str, bool]) -> Results:
-    """As `lay`, with fixes that lie on the results as `found`."""
+    """As `georeference`, with fixes that lie on the results as `found`."""
     loops = results.loops
     if loops is None or not loops.g2o:
         raise HemislamError(
@@ -100,7 +100,7 @@ def _by_points(results: Results, survey: Survey, overridden: Mapping[str, bool])
         if pick.keyframe < len(results.keyframes):
             T = results.frame.at(pick.keyframe) @ results.keyframes[pick.keyframe].T_odom_imu
             picked[pick.name] = lie.moved(T, pick.at)
-    return lay_on_control(table, picked, grid=survey.crs, height=survey.height or ELLIPSOIDAL, overridden=overridden)
+    return align_with_points(table, picked, grid=survey.crs, height=survey.height or ELLIPSOIDAL, overridden=overridden)
 
 
 def _named(overridden: Mapping[str, bool], kind: str) -> dict[str, bool]:

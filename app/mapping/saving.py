@@ -22,9 +22,9 @@ def write_all(
 ) -> dict[str, Any]:
     """Write the results, georeferenced if that is possible; as `Session.save`."""
     if survey is not None:
-        from app.mapping.earth import lay_if_possible  # few sessions need its solvers
+        from app.mapping.earth import georeference_if_possible  # few sessions need its solvers
 
-        results = lay_if_possible(results, survey, edits)
+        results = georeference_if_possible(results, survey, edits)
     report = save_results(folder, results, of_formats(formats) if formats else BY_RUN, replace=replace)
     if session is not None and not formats:
         write_session(folder / f"session{SUFFIX}", session)

@@ -190,7 +190,7 @@ class Session:
 
     @property
     def map_frame(self) -> MapFrame:
-        """Where loops lay odometry in the map, at the newest frame."""
+        """Where loops georeference odometry in the map, at the newest frame."""
         return self.loops.frame if self.loops else _NO_LOOPS
 
     @property
@@ -386,12 +386,12 @@ class Session:
         """What levels the map by gravity, which is known better now than at the start."""
         return MapFrame.levelling(frame.newest[:3, :3] @ self.engine.g_odom)
 
-    def lay_on_earth(self) -> "Future[Results]":
-        """Find where the map as it is now lies by the survey, in a thread of its own; as `lay`."""
-        from app.mapping.earth import lay
+    def georeference(self) -> "Future[Results]":
+        """Find where the map as it is now lies by the survey, in a thread of its own; as `earth.georeference`."""
+        from app.mapping.earth import georeference
 
         assert self.survey is not None
-        return self._saves.submit(lay, self.results(), self.survey, self.edits.done)
+        return self._saves.submit(georeference, self.results(), self.survey, self.edits.done)
 
     def finish_saves(self) -> None:
         """Wait until no save is under way."""

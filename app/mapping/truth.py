@@ -31,5 +31,5 @@ def compared(truth_stamps_ns: I64, truth_positions: F64, stamps_ns: I64, positio
             T_map_truth = umeyama(there[known], positions[known])
     if T_map_truth is None:
         return None, np.full(len(positions), np.nan)
-    laid = lie.moved(T_map_truth, there)
-    return T_map_truth, np.linalg.norm(laid - positions, axis=1)
+    aligned = lie.moved(T_map_truth, there)
+    return T_map_truth, np.linalg.norm(aligned - positions, axis=1)

@@ -91,7 +91,7 @@ def preset_for(kind: str, probe: Probe) -> str:
 
 
 CALIBRATED = "# Written by `hemislam calibrate`"
-"""How a parameter file begins that nobody wrote by hand."""
+"""First line of a parameter file that hemislam wrote."""
 
 
 def sidecar(recording: Path) -> Path:
@@ -100,7 +100,7 @@ def sidecar(recording: Path) -> Path:
 
 
 def calibrated_beside(recording: Path) -> str:
-    """That a calibration is used that lies beside a recording, in a sentence; "" if none does."""
+    """A sentence that names the calibration beside a recording that is in use; "" if there is none."""
     path = sidecar(recording)
     try:
         with path.open(encoding="utf-8") as file:

@@ -128,7 +128,7 @@ def _unstamped(topic: str) -> Finding:
 
 
 def _readable(entries: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
-    """What comes before a damage, if anything does; reading the recording reports it later."""
+    """Everything before a damaged place; reading the recording reports the damage later."""
     some = False
     try:
         for entry in entries:

@@ -191,7 +191,7 @@ class Recording:
         return [probe for probe, _ in decoded], [scan for _, scan in decoded]
 
     def nothing_usable(self, reasons: Counter[str], start_s: float, duration_s: float | None) -> str:
-        """Why a reading gave no measurement, in a sentence; `reasons` of the scans that were left out."""
+        """Why no measurement could be read, in a sentence; `reasons` of the scans that were left out."""
         if not reasons:
             until = "" if duration_s is None else f" and before {start_s + duration_s:g} s"
             return f"{self.path} has no scan after {start_s:g} s{until}; it lasts {self.duration_s:.1f} s."

@@ -39,7 +39,7 @@ SPIKE_TO_NEIGHBOURS, SPIKE_TO_USUAL = 4.0, 10.0
 
 @dataclass(slots=True)
 class Counts:
-    """What the sequencer met so far."""
+    """What the sequencer has counted."""
 
     imu_duplicates: int = 0
     imu_back_steps: int = 0
@@ -60,7 +60,7 @@ class Sequencer:
         limits: `max_gap`: a longer interval between IMU samples is a gap: reported, and a scan that lies mostly
             inside it is dropped. `max_rate`, `max_acceleration`: samples beyond are refused.
         without_imu: there is no IMU: scans go out as they come, without samples.
-        counts: what was met so far.
+        counts: gaps, repeated samples and the like.
     """
 
     limits: ImuParams

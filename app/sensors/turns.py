@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 LATE = 4
-"""Packets of the next turn after which no more of this one are waited for."""
+"""After this many packets of the next turn, packets of this one are no longer waited for."""
 
 
 class Turns:
@@ -34,7 +34,7 @@ class Turns:
             yield self._end(first)
 
     def rest(self) -> Iterator[list[bytes]]:
-        """What is left when no more packets come."""
+        """The turns that remain when no more packets come."""
         while self._open:
             some = next(iter(self._open))
             yield self._end(min(self._open, key=lambda other: _ahead(other, some)))

@@ -22,8 +22,8 @@ from app.mapping.session_file import (
     read_session,
 )
 from app.server import protocol
+from app.server.georeferencing import Georeferencing
 from app.server.keeping import KeptCommand, changed
-from app.server.laying import Laying
 from app.server.loop_commands import LoopCommands
 from app.server.player import Player
 from app.server.protocol import Command
@@ -44,7 +44,7 @@ _FOR_THE_FRAME = (
     | KeptCommand
     | protocol.EditLabels
     | protocol.UndoLabels
-    | protocol.LayOnEarth
+    | protocol.Georeference
     | protocol.CompareWith
     | protocol.Save
 )
@@ -78,7 +78,7 @@ class Controller:
     ) -> None:
         self._page = page
         self._loops, self._player, self._writer = LoopCommands(page), Player(page, clock), SessionWriter()
-        self._laying = Laying(page)
+        self._laying = Georeferencing(page)
         self._saves: deque[tuple[Path, Future[Any]]] = deque()
         self._share = 0.0  # of a save that is written
         self._shown_share: protocol.Progress | None = None
@@ -130,7 +130,7 @@ class Controller:
                 self._set_breakpoints(breakpoints)
             case KeptCommand():
                 self._keep(changed(self._kept, command, self._need_session().frame))
-            case protocol.LayOnEarth(survey):
+            case protocol.Georeference(survey):
                 self._need_session().survey = survey
             case protocol.SetParams(values):
                 self._set_params(self._params.with_values(values))

@@ -72,7 +72,7 @@ class SetBreakpoints(Command, frozen=True):
     breakpoints: Breakpoints
 
 
-class LayOnEarth(Command, frozen=True):
+class Georeference(Command, frozen=True):
     """Georeference the map by these fixes or control points from now on; None: no longer."""
 
     survey: Survey | None

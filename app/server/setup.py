@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 POINT_BUDGET = 3_000_000
 """Most map points that a page draws."""
 HELD = 7
-"""So many times as many are held for pages, so that each can show in detail what it looks at: 400 MB."""
+"""The server holds this many times as many, 400 MB, so that each page can show in detail what it looks at."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ FASTEST = 10.0
 HARDEST = 60.0
 """m/s^2 between three frames, lasting a tenth of a second: over 5 g, a fall onto the floor."""
 LEAP, LEAP_TIMES = 0.5, 4.0
-"""m; a leap is a step between two frames longer than this, and so many times the usual one around it."""
+"""A leap is a step between two frames that is longer than this (m) and than this many times the usual step there."""
 MOST_LOST, MOST_DROPPED = 0.1, 0.5
 """Shares of the frames that may be lost, and of the scans that may be dropped."""
 WALKING = 0.1

@@ -130,7 +130,7 @@ class KeyframeStore:
         mixes keyframes of two different runs.
 
         Raises:
-            IndexError: there never were so many, or others have been put in their place since.
+            IndexError: there is no such keyframe, or another one has replaced it since.
         """
         if not self._ends:
             return  # a new engine continues from another engine's checkpoint, which still holds the earlier map

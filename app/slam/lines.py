@@ -27,7 +27,7 @@ USUAL = np.array([0.01, np.radians(0.12)])
 DOUBT = np.array([0.003, np.radians(0.03)])
 """m, rad: apparent errors caused by the map's own inexactness. A scanner with no larger ones is left uncorrected."""
 POINTS = 500
-"""Points of a scan that are looked up (every k-th): so few that two rarely meet the same patch of the map."""
+"""Points of a scan that are looked up (every k-th). They are few, so that two rarely meet the same patch of the map."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ class Objective:
     greatest: bool = False
     needs_truth: bool = False
 
-    def told(self, value: float | None) -> str:
+    def text(self, value: float | None) -> str:
         """A value with its unit."""
         return "none" if value is None else f"{value:.4g} {self.unit}".rstrip()
 

@@ -53,7 +53,7 @@ class Tried:
 
     Attributes:
         best: numbers of the trials that no other one beats.
-        importance: share of each parameter in what moves the first objective.
+        importance: share of each parameter in the variation of the first objective.
         held_back: trials run again on a part that the search has not seen. finished: no more will come.
     """
 

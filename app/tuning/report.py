@@ -87,7 +87,7 @@ def pictures(study: optuna.Study, objectives: Sequence[Objective]) -> dict[str, 
 
 
 def importances(study: optuna.Study, index: int, objective: Objective) -> dict[str, float]:
-    """Share of each parameter in what moves the objective with this index, the greatest first; none while unknown."""
+    """Share of each parameter in the variation of the objective with this index, largest first; none while unknown."""
     from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 
     sign = -1.0 if objective.greatest else 1.0  # importance is for low values

@@ -1,4 +1,4 @@
-"""A setting that was tried, and which of many no other one beats."""
+"""Settings that were tried, and the best of them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

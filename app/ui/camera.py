@@ -24,9 +24,9 @@ _SOME: Final = 20_000
 """Points that say where the map is."""
 _BAR_PX: Final = 80
 _WIDE_PX: Final = 577
-"""What the transport covers of the scene's lower edge, on pages at least so wide."""
+"""Height of the scene's lower edge that the transport covers, on pages of at least this width."""
 _FAR: Final = 10.0
-"""What lies behind the map by so many distances is drawn too."""
+"""Things are drawn up to this many times as far away as the middle of the map."""
 FIT, PLAN, TOP, FRONT, SIDE = "fit", "plan", "top", "front", "side"
 _WAYS: Final[dict[str, tuple[float, float, float]]] = {
     FIT: (-0.55, -0.55, 0.75),
@@ -39,7 +39,7 @@ _WAYS: Final[dict[str, tuple[float, float, float]]] = {
 _EASE: Final = 0.2
 """Share of the way to the newest extent of the map that cameras go per drawing, so that they glide as it grows."""
 _ARRIVED: Final = 0.01
-"""So near, as a share of the distance to the map, cameras rest."""
+"""A camera that is nearer to its goal than this share of the distance to the map has arrived."""
 _PUT: Final = 300
 """Places of cameras that are remembered: a slow browser says late where its camera was put."""
 _FOLLOWED_FROM_M: Final = 25.0

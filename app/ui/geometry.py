@@ -64,7 +64,7 @@ def seed_wedge(elevations: F64, down: F64, alpha: float, reach: float, samples: 
         elevations: (m,) rad, of the outermost lines. down: (3,) unit. samples: points along an arc.
 
     Returns:
-        None when no line comes so near to straight down.
+        None when no line comes that near to straight down.
     """
     arcs = []
     for elevation in np.sort(elevations[np.isfinite(elevations)]):

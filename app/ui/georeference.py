@@ -12,7 +12,7 @@ from app.georeference.ledger import in_rows
 from app.georeference.survey import Pick, Survey
 from app.mapping.kept import Spot
 from app.server.folders import Folders
-from app.server.protocol import EditLoop, LayOnEarth, RedoLoop, Snapshot, UndoLoop
+from app.server.protocol import EditLoop, Georeference, RedoLoop, Snapshot, UndoLoop
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Override
 from app.ui.files import FileList
@@ -112,7 +112,7 @@ class GeoreferencePanel:
 
     def _send(self, client: viser.ClientHandle) -> None:
         try:
-            self._page.send(LayOnEarth(self.survey()))
+            self._page.send(Georeference(self.survey()))
         except HemislamError as error:
             notify_error(client, error)
 
@@ -188,7 +188,7 @@ class GeoreferencePanel:
         if survey is None:
             return
         others = tuple(pick for pick in survey.picks if pick.name != name)
-        self._page.send(LayOnEarth(replace(survey, picks=(*others, Pick(name, spot.keyframe, at)))))
+        self._page.send(Georeference(replace(survey, picks=(*others, Pick(name, spot.keyframe, at)))))
         left = [one for one in self._name.options if one not in {pick.name for pick in others} | {name}]
         if left:
             show(self._name, left[0])
@@ -232,7 +232,7 @@ class GeoreferencePanel:
                 self._page.send(RedoLoop())
             case ["drop", name] if earth.survey is not None:
                 left = tuple(pick for pick in earth.survey.picks if pick.name != name)
-                self._page.send(LayOnEarth(replace(earth.survey, picks=left)))
+                self._page.send(Georeference(replace(earth.survey, picks=left)))
             case ["override", what] if earth.found is not None:
                 used = dict(zip(earth.found.names, earth.found.used.tolist(), strict=True))
                 if (name := what.partition(" ")[2]) in used:
@@ -244,11 +244,11 @@ def _result(current: Snapshot) -> str:
     earth, loops = current.earth, current.loops
     assert earth.survey is not None
     found, undo = earth.found, [describe_edit(edits[-1]) if edits else "" for edits in (loops.undo, loops.redo)]
-    told, rows, remark = [], [], ""
+    lines, rows, remark = [], [], ""
     if found is not None:
         what = "control points" if earth.survey.control else "fixes"
-        told, rows = in_rows(found, what), rows_of(found, current)
+        lines, rows = in_rows(found, what), rows_of(found, current)
         if len(found.names) > len(rows):
             remark = f"{len(rows)} of {len(found.names):,}; those left out and the largest residuals come first."
     picked = [pick.name for pick in earth.survey.picks] if earth.survey.control else []
-    return panel("georeference.result", earth.problem, told, rows, remark, picked, undo)
+    return panel("georeference.result", earth.problem, lines, rows, remark, picked, undo)

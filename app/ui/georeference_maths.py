@@ -20,7 +20,7 @@ from app.ui.measure_maths import around
 _least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
 MOST_ROWS: Final = 100
 _NEAR_M, _FEWEST, _WORST_M = 0.03, 12, 0.01
-"""Points so near a sphere are its own; so many are needed, and they must fit so well (RMS)."""
+"""Largest distance (m) of a point of a sphere from it; how many are needed; and their largest RMS distance (m)."""
 
 
 class Row(NamedTuple):
@@ -38,15 +38,15 @@ def rows_of(found: Alignment, current: Snapshot) -> list[Row]:
     survey = current.earth.survey
     kind = POINT if survey is not None and survey.control else FIX
     edited = {edit.what for edit in current.loops.undo if isinstance(edit, Override)}
-    told = np.array([kind + name in edited for name in found.names])
+    overridden = np.array([kind + name in edited for name in found.names])
     length = np.linalg.norm(found.residuals, axis=1)
-    order = np.lexsort((-length, found.used & ~told))
+    order = np.lexsort((-length, found.used & ~overridden))
     return [
         Row(
             found.names[k],
             f"override {kind}{found.names[k]}",
             bool(found.used[k]),
-            bool(told[k]),
+            bool(overridden[k]),
             (*(f"{value:+.3f}" for value in found.residuals[k]), f"{found.distances[k]:.1f}"),
         )
         for k in order[:MOST_ROWS].tolist()

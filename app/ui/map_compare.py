@@ -83,7 +83,7 @@ class MapComparePanel:
             self._progress.value = 100 * self._share  # type: ignore[misc]  # mypy overlooks viser's setter
             self._found.visible = self._comparison is not None
             if self._comparison is not None:
-                self._found.content = told(self._comparison, self._name, [_OLD] if old else [])
+                self._found.content = summary(self._comparison, self._name, [_OLD] if old else [])
 
     def close(self) -> None:
         """Stop the comparison that is running, if any."""
@@ -137,7 +137,7 @@ def _limits(found: Comparison) -> Limits:
     return Limits(-end, end)
 
 
-def told(found: Comparison, name: str, notes: list[str]) -> str:
+def summary(found: Comparison, name: str, notes: list[str]) -> str:
     """A comparison in numbers, and a histogram of its distances in the colours of the map."""
     limits = _limits(found)
     counts, edges = np.histogram(np.clip(found.known, limits.low, limits.high), _BINS, (limits.low, limits.high))

@@ -14,7 +14,7 @@ from app.slam.types import F32, F64
 from app.ui.colours import Limits
 
 _WAITS: Final = 3.0
-"""Counting begins again only after so many times as long as it took."""
+"""Between two counts, this many times as long as the last one took passes."""
 _EDGE_M: Final = 0.25
 _SHARE: Final = 98.0
 """Percent of the counts that the colours spread over."""

@@ -22,7 +22,7 @@ from app.ui.widgets import ROOT, Changes, Page, View, by_user, dialog, poses_of
 POINT, DISTANCE, ANGLE, STOP, PICK = "point", "distance", "angle", "stop", "pick"
 _SPOTS: Final = {POINT: 1, DISTANCE: 2, ANGLE: 3}
 _WIDTH: Final = 0.01
-"""So far beside a click, as a share of the picture's height, a point may be."""
+"""Largest distance of a point from a click, as a share of the picture's height."""
 _COLOUR: Final = (255, 205, 80)
 _SIZE_M: Final = 0.08
 

@@ -19,9 +19,9 @@ from app.ui.chunks import as_mask, shown_points
 _GAP_M: Final = 0.2
 """Points that a click meets are of one surface as long as each lies no farther behind the one before it."""
 _AROUND_M: Final = (0.3, 1.0)
-"""Where ground is looked for below a point: so far beside it, or else so far."""
+"""Ground below a point is looked for within the first of these distances beside it, or else within the second."""
 _FLOOR_M: Final = 0.3
-"""Ground points up to so far below the highest are of the same floor."""
+"""Ground points at most this far below the highest belong to the same floor."""
 _KEYFRAMES: Final = 20
 """Nearest ones, among whose points the ground is looked for."""
 COLUMNS: Final = (

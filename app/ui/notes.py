@@ -23,7 +23,7 @@ _PIN_COLOUR: Final = (255, 190, 60)
 _PIN_M: Final = 0.16
 _REACH_PX: Final = 14.0
 _LETTER_PX: Final = 6.0
-"""A click so near to a pin, or on its text to the right of it, is meant for it."""
+"""A click within this distance of a pin, or on its text to the right of it, is meant for it."""
 
 
 class NotesPanel:

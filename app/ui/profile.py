@@ -15,7 +15,7 @@ from app.ui.nodes import add_exact_points
 from app.ui.widgets import Changes, View
 
 _PERIOD_S: Final = 1.0
-"""A map that grows is unrolled so often."""
+"""The profile of a growing map is drawn again after this time at the earliest."""
 
 
 def unrolled(parts: Iterable[tuple[F64, U8]], path: F64, slab: float) -> tuple[F64, U8]:

@@ -30,7 +30,7 @@ _GRID: Final = {False: ((42, 48, 58), (62, 72, 88)), True: ((214, 220, 228), (18
 """Colours of its cells and of every fifth line, on a dark and on a light background."""
 _EYE_STEP_M: Final = 1.0
 _FRAMED_AGAIN: Final = 1.05
-"""The view of the whole map is chosen again when it has so many times as many keyframes."""
+"""The view of the whole map is chosen again when the number of keyframes has grown by this factor."""
 
 
 class Scene:

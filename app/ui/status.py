@@ -99,7 +99,7 @@ def findings_html(findings: tuple[Finding, ...], params: Params) -> str:
         change = "" if after in (None, params) else "Settle it" if needed else "Use this instead"
         rows[finding.verdict].append((finding, *_LOOKS[finding.verdict], change))
     fine = rows.pop("fine")
-    return panel("findings", [row for told in rows.values() for row in told], fine)
+    return panel("findings", [row for unsettled in rows.values() for row in unsettled], fine)
 
 
 def verdicts(findings: tuple[Finding, ...]) -> tuple[str, str] | None:

@@ -100,7 +100,7 @@ def study_legend(result: StepResult | None, by: str) -> str:
 # --- the ground threshold ------------------------------------------------------------------------
 MOST_POINTS: Final = 1200
 HEADROOM: Final = 3.0
-"""Points up to so many thresholds above the plane are plotted; walls and ceilings would flatten the rest."""
+"""Points up to this many thresholds from the plane are plotted; walls and ceilings would flatten the rest."""
 _LEAST_M: Final = 2.0
 
 

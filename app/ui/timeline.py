@@ -135,7 +135,7 @@ class History:
         self._truth, self.present = truth, count - 1
 
     def columns(self, most: int = COLUMNS) -> "Columns":
-        """Everything, thinned to at most so many columns of equally many frames."""
+        """Everything, thinned to at most `most` columns of equally many frames."""
         count = min(self.total, most)
         starts = np.arange(count) * self.total // count
         loops: dict[str, list[int]] = {verdict: [0] * count for verdict in Verdict}

@@ -113,14 +113,14 @@ class TunePanel:
         wanted, found = self._wanted, self._found
         if wanted is None:
             return _EMPTY
-        told = f"{len(found.trials)} of {wanted.trials + 1} trials"
+        done = f"{len(found.trials)} of {wanted.trials + 1} trials"
         if self._work.running:
             return (
-                f"{told} · {self._left(wanted)}" if self._runs else "The first trial runs with the parameters as given."
+                f"{done} · {self._left(wanted)}" if self._runs else "The first trial runs with the parameters as given."
             )
         if not found.finished:
-            return f"{told} · stopped"
-        return " ".join((f"{told} · saved in {wanted.folder}", advice(found.held_back, self._objectives())))
+            return f"{done} · stopped"
+        return " ".join((f"{done} · saved in {wanted.folder}", advice(found.held_back, self._objectives())))
 
     def _left(self, wanted: Wanted) -> str:
         """By the pace of the newest runs."""

@@ -46,8 +46,8 @@ class Dot(NamedTuple):
 
 def words(trial: Trial, objectives: Sequence[Objective]) -> str:
     """A trial in a line, as the page shows it on hover."""
-    told = ", ".join(f"{one.title} {one.told(value)}" for one, value in zip(objectives, trial.scores, strict=True))
-    return f"trial {trial.number}: {told} · {trial.name}"
+    scores = ", ".join(f"{one.title} {one.text(value)}" for one, value in zip(objectives, trial.scores, strict=True))
+    return f"trial {trial.number}: {scores} · {trial.name}"
 
 
 def number_axis(name: str, values: Sequence[float]) -> Axis:
@@ -59,7 +59,7 @@ def number_axis(name: str, values: Sequence[float]) -> Axis:
     def share(value: float) -> float:
         return (by(min(max(value, low), high)) - begin) / span if span else 0.5
 
-    # so many digits that the ends differ in three
+    # enough digits to tell the two ends apart by three
     digits = max(4, 3 + math.ceil(math.log10(max(abs(low), abs(high)) / (high - low)))) if span else 4
     return Axis(name, f"{low:.{digits}g}", f"{high:.{digits}g}", share)
 
@@ -184,10 +184,10 @@ def _best(found: Tried, objectives: Sequence[Objective], chosen: int) -> str:
         heads += [f"{head}, held back" for head in heads]
     rows = []
     for trial in shown:
-        scores = [one.told(value) for one, value in zip(objectives, trial.scores, strict=True)]
+        scores = [one.text(value) for one, value in zip(objectives, trial.scores, strict=True)]
         if held:
             again = held.get(trial.number, (None,) * len(objectives))
-            scores += ["" if value is None else one.told(value) for one, value in zip(objectives, again, strict=True)]
+            scores += ["" if value is None else one.text(value) for one, value in zip(objectives, again, strict=True)]
         rows.append(
             {
                 "number": trial.number,

@@ -51,7 +51,7 @@ from app.ui.widgets import PANEL_PERIOD_S, SCENE_PERIOD_S, Changes, Page, View
 log = logging.getLogger(__name__)
 
 _TUNING_S: Final = 4.0
-"""So long after a parameter was changed the map stands back behind the present scan."""
+"""After a change of a parameter the map stands back behind the present scan for this long."""
 _TICK_S: Final = 0.04
 """How long the drawing thread waits for a snapshot before it looks at the page's own controls."""
 

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from app.georeference.align import Alignment
-from app.georeference.control import CONTROL, PICKS, lay_on_control, read_picks
+from app.georeference.control import CONTROL, PICKS, align_with_points, read_picks
 from app.georeference.tables import read_table
 from app.slam.errors import HemislamError
 from tests.georeference.walks import TRUTH
@@ -29,7 +29,7 @@ def written(folder: Path, points: dict[str, tuple[float, ...]], *, noise: float 
 
 
 def laid(control: Path, picks: Path, **options: Any) -> Alignment:
-    return lay_on_control(read_table(control, *CONTROL), read_picks(read_table(picks, *PICKS)), **options)
+    return align_with_points(read_table(control, *CONTROL), read_picks(read_table(picks, *PICKS)), **options)
 
 
 def test_four_points_give_the_transform_of_an_independent_least_squares(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from app.georeference.reference import GeoReference
 from app.georeference.survey import Survey
 from app.mapping.kept import Measure, Spot
 from app.server.folders import Folders
-from app.server.protocol import Chunk, Command, Earth, EditLoop, LayOnEarth, LoopsView, RedoLoop, Snapshot, UndoLoop
+from app.server.protocol import Chunk, Command, Earth, EditLoop, Georeference, LoopsView, RedoLoop, Snapshot, UndoLoop
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Override
@@ -59,7 +59,7 @@ class Paging:
     def lay(self) -> Survey | None:
         user_clicks(self.panel._lay)
         command = self.sent.pop()
-        assert isinstance(command, LayOnEarth)
+        assert isinstance(command, Georeference)
         return command.survey
 
     def click(self, x: float, y: float) -> None:
@@ -148,7 +148,7 @@ def test_points_are_picked_one_after_the_other_by_clicks_on_the_map(paging: Pagi
         assert paging.measure.picking
         paging.click(0.5 * k, 0.2)
         (command,) = paging.sent
-        assert isinstance(command, LayOnEarth) and command.survey is not None
+        assert isinstance(command, Georeference) and command.survey is not None
         pick = command.survey.picks[-1]
         at = POSES[pick.keyframe] @ (*pick.at, 1.0)
         assert pick.name == name and at[:3] == pytest.approx([0.5 * k, 0.2, 0.0], abs=0.1)
@@ -158,7 +158,7 @@ def test_points_are_picked_one_after_the_other_by_clicks_on_the_map(paging: Pagi
     assert "drop P1" in panel._html.content
     panel._act("drop P1", None)  # type: ignore[arg-type]
     (command,) = paging.sent
-    assert isinstance(command, LayOnEarth) and [pick.name for pick in command.survey.picks] == ["P2"]  # type: ignore[union-attr]
+    assert isinstance(command, Georeference) and [pick.name for pick in command.survey.picks] == ["P2"]  # type: ignore[union-attr]
 
 
 def sphere(centre: np.ndarray, radius: float, points: int = 400) -> Chunk:

@@ -18,7 +18,7 @@ from app.server.protocol import Chunk, OpenedRecording, Snapshot
 from app.ui import background
 from app.ui.chunks import MapChunks
 from app.ui.colours import DENSITY, DISTANCE, NOTHING, Limits, key
-from app.ui.map_compare import MapComparePanel, told
+from app.ui.map_compare import MapComparePanel, summary
 from app.ui.map_numbers import Density, MapNumbers
 from app.ui.widgets import View
 from tests.ui.conftest import SOMEONE, clouds, page_of, user_clicks
@@ -103,11 +103,11 @@ def test_a_map_that_has_changed_since_is_said_to_be_old(comparing: Comparing) ->
 
 
 def test_a_comparison_is_reported_in_numbers() -> None:
-    html = told(FOUND, "other.laz", [])
+    html = summary(FOUND, "other.laz", [])
     assert "43 % differ by more than chance" in html, "40 of 70 are 1 cm, less than could be told"
     assert "12 % have no counterpart" in html and "other.laz" in html and html.count("<rect") == 41
     nothing = Comparison(np.full(3, np.nan, np.float32), np.full(3, np.nan, np.float32), np.eye(4))
-    assert "100 % have no counterpart" in told(nothing, "b", [])
+    assert "100 % have no counterpart" in summary(nothing, "b", [])
 
 
 def test_points_without_a_number_are_grey_and_others_follow_the_colour_bar(server: viser.ViserServer) -> None:

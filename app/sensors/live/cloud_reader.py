@@ -5,6 +5,7 @@ from typing import Any
 from app.sensors.cloud_types import CloudError, CloudType, Probe, stamped
 from app.sensors.findings import Finding
 from app.sensors.layout import settle_cloud
+from app.sensors.live.intake import Intake
 from app.sensors.pointcloud import CloudLayout, read_scan
 from app.sensors.probe import PROBED_CLOUDS
 from app.sensors.ros import stamp_ns
@@ -13,7 +14,7 @@ from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan
 
 _GIVE_UP = 100
-"""So many clouds without a usable point are reported."""
+"""After this many clouds without a usable point, the user is told."""
 
 
 class CloudReader:
@@ -30,6 +31,7 @@ class CloudReader:
         self._fields: dict[str, Any] = {}
         self._waiting: list[tuple[Any, Probe, int]] = []
         self._unusable = 0
+        self._told = ""
 
     def add(self, message: Any, log_ns: int, arrival_ns: int) -> list[tuple[Scan | DroppedScan, int]]:
         """The scans that this message completes, each with its arrival: none at first, then those that waited.
@@ -62,6 +64,21 @@ class CloudReader:
             return [(DroppedScan(cloud.stamp_ns, "none of its points is a return"), arrival_ns)]
         self._waiting.append((message, probe, arrival_ns))
         return self._settle() if len(self._waiting) == PROBED_CLOUDS else []
+
+    def taken(self, message: Any, log_ns: int, arrival_ns: int, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
+        """As `add`. How clouds are read, and why they cannot be, is reported to the intake instead."""
+        known = self.findings
+        try:
+            found = self.add(message, log_ns, arrival_ns)
+        except HemislamError as error:
+            intake.counters.unreadable += 1
+            if str(error) != self._told:
+                self._told = str(error)
+                intake.put_status("configuration", "LiDAR", self._told)
+            return []
+        if self.findings is not known:
+            intake.put_findings(self.findings)
+        return found
 
     def _settle(self) -> list[tuple[Scan | DroppedScan, int]]:
         waiting, self._waiting = self._waiting, []

@@ -21,7 +21,6 @@ from app.sensors.live.cloud_reader import CloudReader
 from app.sensors.live.intake import Intake
 from app.sensors.probe import usable_types
 from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type, stamp_ns
-from app.slam.errors import HemislamError
 from app.slam.params import Params
 
 SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
@@ -162,16 +161,9 @@ class FoxgloveReceiver:
             return
         intake.counters.packets += 1
         assert self._reader is not None
-        known = self._reader.findings
-        try:
-            for scan, arrival_ns in self._reader.add(message, log_ns, arrival):
-                intake.counters.frames += 1
-                intake.put_scan(scan, arrival_ns)
-        except HemislamError as error:
-            intake.counters.unreadable += 1
-            self._tell("configuration", str(error), intake)
-        if self._reader.findings is not known:
-            intake.put_findings(self._reader.findings)
+        for scan, arrival_ns in self._reader.taken(message, log_ns, arrival, intake):
+            intake.counters.frames += 1
+            intake.put_scan(scan, arrival_ns)
 
     def _tell(self, kind: Literal["disconnected", "configuration"], text: str, intake: Intake) -> None:
         """Report it once, however often it happens."""

@@ -117,7 +117,7 @@ def _read_airy(datagram: bytes) -> list[ImuSample]:
 
 
 def _airy_units(accel_range: int, gyro_range: int) -> tuple[float, float]:
-    """m/s^2 and rad/s of a count. The ranges: 2 g and 250 deg/s, doubled so many times."""
+    """m/s^2 and rad/s of a count. A range of k stands for 2 g, or 250 deg/s, doubled k times."""
     accel, gyro = 2 * STANDARD_GRAVITY * 2**accel_range, math.radians(250.0) * 2**gyro_range
     return accel / _COUNTS, gyro / _COUNTS
 

@@ -24,7 +24,7 @@ def decode_blocks(
         nominal: 0.01 deg from block to block, signed. turn_ns: of a revolution.
         cos_e ... sin_h: (c,) of elevation and horizontal correction. share: (c,) of the block's
             duration at which a channel fires. rings: (c,) u16. step_m: m per count.
-        blocks: of a packet, each of so many parts of so many channels. counted: bits of a distance.
+        blocks, parts, part: blocks of a packet, parts of a block, channels of a part. counted: bits of a distance.
         least, most: counts outside are no return.
         points (m, 3) f32, times (m,) i64 after the base, intensity (m,) f32, ring (m,) u16: filled.
     """

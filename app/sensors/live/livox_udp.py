@@ -21,7 +21,7 @@ POINTS_PORT, IMU_PORT = 56301, 56401
 SCAN_NS = 100_000_000
 """A scan is what came in such a part of a second, counted from whole seconds."""
 SLOT_NS, SLOTS = 5_000, 96
-"""The sensor fires 200,000 times a second, and sends so many firings at once."""
+"""Time between two firings, 200,000 a second, and firings in a packet."""
 _MOST_LOST = 0.1
 """Share of points that may fall into the firing of another: stamps are rounded."""
 FARTHEST_M = 100.0

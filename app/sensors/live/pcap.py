@@ -14,7 +14,7 @@ NEXT_MAGIC = b"\x0a\x0d\x0d\x0a"
 MAX_RECORD = 1 << 22
 _FAR_NS = 1 << 62
 _FRAGMENTS_KEPT = 64
-"""So many datagrams may wait for missing fragments; then the oldest is given up."""
+"""Datagrams that may wait for missing fragments; beyond that, the oldest is given up."""
 
 _TAGS = (0x8100, 0x88A8, 0x9100)
 _IP = (b"\x08\x00", b"\x86\xdd")

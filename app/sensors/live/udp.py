@@ -127,7 +127,7 @@ class PacketReceiver:
         self._known_angles = angles is not None or not device.has_angles
         self._sensor: Peer | None = None
         self._heard_s = 0.0
-        self._told_another, self._told = False, ""
+        self._told_another = False
 
     def __call__(self, intake: Intake, stop: threading.Event) -> None:
         self._assembler.counters = self._order.counters = intake.counters
@@ -230,18 +230,7 @@ class PacketReceiver:
     def _scans(self, frame: Revolution, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
         """Those that can be given now, each with its arrival."""
         if self._decoder is None:
-            known = self._clouds.findings
-            try:
-                found = self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns)
-            except HemislamError as error:
-                intake.counters.unreadable += 1
-                if str(error) != self._told:
-                    self._told = str(error)
-                    intake.put_status("configuration", "LiDAR", self._told)
-                return []
-            if self._clouds.findings is not known:
-                intake.put_findings(self._clouds.findings)
-            return found
+            return self._clouds.taken(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns, intake)
         scan = self._decoder.decode(frame)
         intake.counters.bad_blocks = self._decoder.bad_blocks
         return [(scan, frame.arrival_ns)]

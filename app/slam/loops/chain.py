@@ -43,7 +43,7 @@ class Chain:
         covariance = self._steps(first, np.full(second - first, second))[1].sum(axis=0)
         return lie.inverse(poses[first]) @ poses[second], (covariance + covariance.T) / 2
 
-    def laid(self, ends: I64, T_ends: F64, stop: int) -> F64:
+    def bent(self, ends: I64, T_ends: F64, stop: int) -> F64:
         """The most likely poses from ends[0] to before `stop`, if those of the ends are known.
 
         Args:

@@ -8,7 +8,7 @@ import numpy as np
 from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.drift import Drift
-from app.slam.loops.support import laid
+from app.slam.loops.support import transported
 from app.slam.loops.types import FactorResidual, LoopEdge, Pair
 from app.slam.types import F64, Keyframe
 
@@ -118,7 +118,7 @@ def loop_factors(
             first = by_pair[edge.repeats] if edge.repeats and not window else edge
             T, covariance = edge.T_older_newer, edge.covariance
             if first is not edge:
-                (T,), (covariance,) = laid([edge], first, T_odom_imu)
+                (T,), (covariance,) = transported([edge], first, T_odom_imu)
             factors.append(Factor(first.older, first.newer, T, covariance / edge.weight, True, edge.pair))
     return factors
 

@@ -1,4 +1,4 @@
-"""What is written about loops beside the other results of a run."""
+"""The result files about loops."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class LoopResults:
-    """What loops made of a session.
+    """The results of the loop search in a session.
 
     Attributes:
         frame: where odometry lies in the map. stamps_ns: (k,) of keyframes.

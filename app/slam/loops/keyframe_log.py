@@ -58,7 +58,7 @@ class KeyframeLog(Log[KeyframeEntry]):
 
 
 class Follower:
-    """Sends one back end the keyframes of a log that it lacks. A new back end lacks all."""
+    """Sends one back end the keyframes of a log that it does not have yet; a new back end has none."""
 
     def __init__(self, log: KeyframeLog) -> None:
         self._log, self._cursor = log, Cursor()

@@ -65,7 +65,7 @@ class TryOut:
 
 @dataclass(frozen=True, slots=True)
 class Inspect:
-    """All there is about two keyframes, a candidate or not. The answer is a `LoopDetail`."""
+    """All that is known of two keyframes, a candidate or not. The answer is a `LoopDetail`."""
 
     older: KeyframeId
     newer: KeyframeId
@@ -73,7 +73,7 @@ class Inspect:
 
 @dataclass(frozen=True, slots=True)
 class AskResiduals:
-    """How far is every factor of the graph from being met? The answer is their `FactorResidual`s, odometry first."""
+    """The residuals of all factors of the graph. The answer is their `FactorResidual`s, odometry first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ class LoopState:
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """What a question that leads to no other state has for an answer."""
+    """The answer to a question that changes no state."""
 
     question: Question
     value: Preview | LoopDetail | tuple[FactorResidual, ...] | str

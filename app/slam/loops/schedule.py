@@ -41,7 +41,7 @@ from app.slam.types import Keyframe
 UserRequest = Question | Callable[[Edits], Edits]
 """What the user asks, or makes of the edits: `Edits.undo`, for example, which may raise HemislamError."""
 EVERY: Final = 8
-"""Keyframes after which a state is asked for if no frame needs one: so many travel together."""
+"""A state is asked for after this many keyframes, which are sent together, if no frame needs one earlier."""
 MOST_AHEAD: Final = 8
 """Questions without an answer at which frames wait all the same, so that keyframes do not pile up in memory."""
 STATES: Final = 512
@@ -221,12 +221,12 @@ class LoopSchedule:
         return sum(edge.verdict is Verdict.ACCEPTED for edge in self.edges)
 
     def take_notices(self) -> list[str]:
-        """What the user should know, in sentences, since the last call."""
+        """Notices for the user since the last call."""
         taken, self._notices = self._notices, []
         return taken
 
     def take_alarms(self) -> list[str]:
-        """What went wrong with the work itself since the last call; it is no part of the session."""
+        """Failures of the loop search itself since the last call, in sentences; a session file does not keep them."""
         return self._client.take_alarms()
 
     def take_answers(self) -> list[Answer]:
@@ -362,7 +362,7 @@ class LoopSchedule:
         self._states, self._shown = {}, None
 
     def _without_loops(self, moment: Moment) -> LoopState:
-        """The answer where there cannot be any, so that nobody waits for it."""
+        """The answer where no loop is possible, so that nobody waits for one."""
         odometry = np.tile(np.eye(4), (moment.count, 1, 1))
         return LoopState(moment.count, moment.finished, odometry, (), (), self._edits.undone)
 

@@ -131,7 +131,7 @@ class Incremental:
             ends = np.array(self._tied)
             T_ends = _matrices(self._isam.calculateEstimate())
             self._poses = Rows((4, 4), np.float64)
-            self._poses.extend(self._chain.laid(ends, T_ends, self.count - len(self._ahead)))
+            self._poses.extend(self._chain.bent(ends, T_ends, self.count - len(self._ahead)))
             for pose in self._ahead:
                 self._poses.append(pose)
         return self._poses.view()
@@ -182,7 +182,7 @@ class Incremental:
         at = bisect_left(self._tied, key)
         ends = self._tied[at - 1 : at + 1]
         T_ends = np.array([_estimate(self._isam, end) for end in ends])
-        return np.asarray(self._chain.laid(np.array(ends), T_ends, max(key, ends[-1]) + 1)[key - ends[0]])
+        return np.asarray(self._chain.bent(np.array(ends), T_ends, max(key, ends[-1]) + 1)[key - ends[0]])
 
 
 class _Mean:

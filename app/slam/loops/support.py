@@ -91,12 +91,13 @@ def settle(
 
 
 def _agree(edge: LoopEdge, others: Sequence[LoopEdge], poses: F64, ways: F64, drift: Drift) -> npt.NDArray[np.bool_]:
-    """Which of the others agree with a loop: going round by both leads back, within what they and odometry err by.
+    """Which of the others agree with a loop: the cycle of both and the odometry between their ends closes within its
+    uncertainty.
 
     Args:
         poses: (k, 4, 4) by odometry. ways: (n,) m along the trajectory between the older ends, plus between the newer.
     """
-    T, covariances = laid(others, edge, poses)
+    T, covariances = transported(others, edge, poses)
     walked = np.array([drift.rotation] * 3 + [drift.translation] * 3) * ways[:, None]
     return _off(edge, T, covariances + np.eye(6) * walked[:, None, :] ** 2) < AGREE
 
@@ -139,7 +140,7 @@ def _placed(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_m
     ties = [other for other in counting if other.repeats is None]
     found = (tie for tie in ties if tie.origin is Origin.DETECTED)
     around = sorted((tie for tie in found if _apart(edge, tie) <= 2 * half), key=partial(_apart, edge))
-    same = _off(edge, *laid(around, edge, T_odom_imu)) <= SAME if around else np.empty(0)
+    same = _off(edge, *transported(around, edge, T_odom_imu)) <= SAME if around else np.empty(0)
     if same.any():
         return replace(edge, repeats=around[int(same.argmax())].pair)
     last = min(ties, key=lambda tie: abs(edge.newer - tie.newer), default=edge)
@@ -151,7 +152,7 @@ def _placed(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_m
     return edge
 
 
-def laid(edges: Sequence[LoopEdge], first: LoopEdge, T_odom_imu: F64) -> tuple[F64, F64]:
+def transported(edges: Sequence[LoopEdge], first: LoopEdge, T_odom_imu: F64) -> tuple[F64, F64]:
     """Loops' measurements, transported by odometry to the keyframes of one nearby: T (n, 4, 4), covariances (n, 6, 6).
 
     Args:

@@ -144,7 +144,7 @@ class LoopEdge:
 
 
 class LoopChange(NamedTuple):
-    """What leads from one state of the loops to another: candidates that are new or differ, and those that are gone."""
+    """The difference between two states of the loops: candidates that are new or changed, and those that are gone."""
 
     changed: tuple[LoopEdge, ...]
     gone: tuple[Pair, ...]
@@ -168,7 +168,7 @@ def changed_by(change: LoopChange, before: Iterable[LoopEdge]) -> tuple[LoopEdge
 # --- what the inspector and the files show -------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class FactorResidual:
-    """How far one factor of the graph is from being met.
+    """The residual of one factor of the graph.
 
     Attributes:
         pair: keyframes. loop: or odometry. rotation: deg. translation: m.

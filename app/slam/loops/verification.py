@@ -114,7 +114,7 @@ def prepare(submap: Submap) -> Prepared:
 
 
 def _thinned(which: Mask, most: int) -> I64:
-    """Indices of at most so many of them, evenly."""
+    """Evenly spread indices of some of them, at most this many."""
     indices = np.flatnonzero(which)
     return indices[:: max(1, -(-len(indices) // most))]
 

@@ -79,8 +79,8 @@ class AddLoopPanel:
     """Widgets in the caller's container.
 
     Args:
-        propose: takes the edit to be tried. fly: moves a browser's camera to a place (3,) of the map, so many metres
-            away from it.
+        propose: takes the edit to be tried. fly: moves a browser's camera to look at a place (3,) of the map from
+            this many metres away.
     """
 
     def __init__(

@@ -105,8 +105,8 @@ class Proposal:
 
     def _problem(self, snapshot: Snapshot) -> str:
         """The engine's newest error since the edit was proposed."""
-        told = [n.text for n in snapshot.notices if n.number > self._last_notice and n.level == "error"]
-        return told[-1] if told else ""
+        errors = [n.text for n in snapshot.notices if n.number > self._last_notice and n.level == "error"]
+        return errors[-1] if errors else ""
 
 
 class VerdictPanel:

@@ -115,7 +115,7 @@ class Inspector:
         )
         self._go.on_click(by_user(act))
         self._waiting = gui.add_html(panel("quiet", "Waiting for the submaps …"))
-        self._laid = gui.add_slider(
+        self._share = gui.add_slider(
             "submaps",
             0.0,
             1.0,
@@ -136,7 +136,7 @@ class Inspector:
         self._residuals_title = gui.add_html(heading("Points over their distance to the other submap's surface, mm"))
         self._residuals = chart(gui, (np.zeros(1),) * 3, [line | {"fill": "#40b8f080"}, limit])
         self._detailed = (
-            self._laid,
+            self._share,
             self._alone,
             self._legend,
             self._contexts_title,
@@ -189,7 +189,7 @@ class Inspector:
             older, newer = both if view.ceilings else map(without_ceiling, both)
             self._clouds = detail, view.ceilings, older, newer
         self._pairing = Pairing(*self._clouds[2:], T_map_older)
-        T_map_newer = T_map_older @ on_the_way(detail.T_guess, detail.T_registered, self._laid.value)
+        T_map_newer = T_map_older @ on_the_way(detail.T_guess, detail.T_registered, self._share.value)
         self._overlay.draw(self._pairing, T_map_newer, max(view.point_size, _LEAST_POINT_M))
 
 

@@ -54,17 +54,17 @@ def test_poses_between_known_ones_are_those_that_need_the_least_error_of_the_ste
         )
 
     best = chain.poses[1:6] @ lie.exp_se3(least_squares(errors, np.zeros(30), xtol=1e-14, ftol=1e-14).x.reshape(-1, 6))
-    laid = chain.laid(np.array([0, 6]), np.array([first, last]), 7)
-    assert np.abs(laid[1:6] - chain.poses[1:6]).max() > 0.02
-    np.testing.assert_allclose(laid[1:6], best, atol=1e-3)
-    np.testing.assert_array_equal(laid[[0, 6]], [first, last])
+    bent = chain.bent(np.array([0, 6]), np.array([first, last]), 7)
+    assert np.abs(bent[1:6] - chain.poses[1:6]).max() > 0.02
+    np.testing.assert_allclose(bent[1:6], best, atol=1e-3)
+    np.testing.assert_array_equal(bent[[0, 6]], [first, last])
 
 
 def test_ends_that_odometry_meets_leave_every_pose_where_it_has_it() -> None:
     chain, _, _ = walk(30, seed=4)
     moved = lie.exp_se3(np.array([0.3, -1.0, 2.0, 5.0, 6.0, -7.0]))
     ends = np.array([3, 4, 11, 25])
-    np.testing.assert_allclose(chain.laid(ends, moved @ chain.poses[ends], 30), moved @ chain.poses[3:], atol=1e-9)
+    np.testing.assert_allclose(chain.bent(ends, moved @ chain.poses[ends], 30), moved @ chain.poses[3:], atol=1e-9)
 
 
 def test_stretches_do_not_know_of_one_another() -> None:
@@ -72,10 +72,10 @@ def test_stretches_do_not_know_of_one_another() -> None:
     rng = np.random.default_rng(6)
     ends = np.array([0, 7, 8, 20])
     T_ends = chain.poses[ends] @ lie.exp_se3(rng.normal(scale=0.02, size=(4, 6)))
-    together = chain.laid(ends, T_ends, 30)
+    together = chain.bent(ends, T_ends, 30)
     for at in range(3):
         first, last = ends[at], ends[at + 1]
-        alone = chain.laid(ends[at : at + 2], T_ends[at : at + 2], int(last) + 1)
+        alone = chain.bent(ends[at : at + 2], T_ends[at : at + 2], int(last) + 1)
         np.testing.assert_allclose(together[first : last + 1], alone, atol=1e-9)
-    beyond = chain.laid(ends[3:], T_ends[3:], 30)
+    beyond = chain.bent(ends[3:], T_ends[3:], 30)
     np.testing.assert_array_equal(together[20:], beyond)

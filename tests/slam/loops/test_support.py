@@ -12,7 +12,7 @@ from app.slam.loops.drift import Drift
 from app.slam.loops.edits import Add, Reject, SetWeight, lay_over
 from app.slam.loops.factors import Factor, loop_factors
 from app.slam.loops.solvers import optimise
-from app.slam.loops.support import laid, placed, settle
+from app.slam.loops.support import placed, settle, transported
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.loops.verdicts import FLOOR_M, FLOOR_YAW
 from app.slam.sections import LoopsParams
@@ -106,12 +106,12 @@ def test_a_loop_laid_on_other_keyframes_errs_there_by_what_its_error_becomes() -
     half = rng.normal(0.0, 0.1, (6, 6))
     ends = {"older": 1, "newer": 6, "decided_at": 6}
     edge = replace(loop(40), **ends, T_older_newer=lie.exp_se3(rng.normal(0.0, 1.0, 6)), covariance=half @ half.T)
-    (T,), (covariance,) = laid([edge], replace(edge, older=0, newer=7), poses)
+    (T,), (covariance,) = transported([edge], replace(edge, older=0, newer=7), poses)
     errors = 1e-6 * np.linalg.cholesky(edge.covariance).T  # their squares add up to the covariance
     there = []
     for error in errors:
         off = replace(edge, T_older_newer=edge.T_older_newer @ lie.exp_se3(error))
-        there.append(lie.log_se3(lie.inverse(T) @ laid([off], replace(off, older=0, newer=7), poses)[0][0]))
+        there.append(lie.log_se3(lie.inverse(T) @ transported([off], replace(off, older=0, newer=7), poses)[0][0]))
     np.testing.assert_allclose(1e12 * np.transpose(there) @ there, covariance, atol=1e-3 * np.abs(covariance).max())
     own = lie.inverse(poses[0]) @ poses[1] @ edge.T_older_newer @ lie.inverse(poses[6]) @ poses[7]
     np.testing.assert_allclose(T, own, atol=1e-12)

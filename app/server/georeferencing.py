@@ -15,12 +15,12 @@ from app.slam.map_frame import MapFrame
 log = logging.getLogger(__name__)
 
 
-class Laying:
+class Georeferencing:
     """Begins the work in a thread of the session and takes in what comes of it; one thread calls `update`."""
 
     def __init__(self, page: Publisher) -> None:
         self._page = page
-        self._laid: tuple[object, ...] = (None, None, (), -1, None)  # what the newest was begun with
+        self._begun_from: tuple[object, ...] = (None, None, (), -1, None)  # what the newest was begun with
         self._begun_with: Survey | None = None
         self._under_way: Future[Results] | None = None
 
@@ -37,25 +37,25 @@ class Laying:
             self._under_way = None
         if session.loops is not None and not session.loops.idle:
             return False
-        words = tuple(edit for edit in session.edits.done if isinstance(edit, Override))
-        now = session, session.survey, words, session.frame, session.map_frame
-        chosen = self._laid[0] is not session or self._laid[1:3] != now[1:3]
-        moved = self._laid[3] != session.frame or self._laid[4] is not session.map_frame
+        overrides = tuple(edit for edit in session.edits.done if isinstance(edit, Override))
+        now = session, session.survey, overrides, session.frame, session.map_frame
+        chosen = self._begun_from[0] is not session or self._begun_from[1:3] != now[1:3]
+        moved = self._begun_from[3] != session.frame or self._begun_from[4] is not session.map_frame
         if session.frame < 0 or not (chosen or (moved and still)):
             return False
-        self._laid = now
+        self._begun_from = now
         if session.survey is None:
             self._show(session, Earth(), session.levelling(session.map_frame))
             return False
-        self._under_way, self._begun_with = session.lay_on_earth(), session.survey
+        self._under_way, self._begun_with = session.georeference(), session.survey
         return True
 
-    def _take(self, session: Session, laid: Future[Results], survey: Survey | None) -> None:
-        if self._laid[0] is not session:
+    def _take(self, session: Session, work: Future[Results], survey: Survey | None) -> None:
+        if self._begun_from[0] is not session:
             return
-        error, level = laid.exception(), session.levelling(session.map_frame)
+        error, level = work.exception(), session.levelling(session.map_frame)
         if error is None:
-            results = laid.result()
+            results = work.result()
             self._show(session, Earth(survey, results.found), results.adjustment)
             return
         if not isinstance(error, HemislamError):

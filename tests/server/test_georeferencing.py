@@ -1,4 +1,4 @@
-"""A session that is laid on Earth. Oracle: where the simulator put its scene. Tests app/server/laying.py,
+"""A session that is laid on Earth. Oracle: where the simulator put its scene. Tests app/server/georeferencing.py,
 app/mapping/earth.py and app/georeference/survey.py.
 """
 
@@ -28,7 +28,7 @@ from app.sensors.presets import resolve_params
 from app.sensors.simulator.gnss import Gnss
 from app.sensors.simulator.simulate import simulate
 from app.server.controller import Controller
-from app.server.protocol import EditLoop, LayOnEarth, RedoLoop, Save, Seek, Snapshot, UndoLoop
+from app.server.protocol import EditLoop, Georeference, RedoLoop, Save, Seek, Snapshot, UndoLoop
 from app.slam import lie
 from app.slam.loops.edits import Override
 from app.slam.trajectory import read_tum
@@ -95,7 +95,7 @@ def verdicts(now: Snapshot) -> dict[str, bool]:
 def test_a_map_is_georeferenced_by_the_fixes_of_its_recording_and_again_when_it_has_grown(
     bench: Laid, walk: Path
 ) -> None:
-    bench.do(Seek(50), LayOnEarth(Survey(lever=LEVER)))
+    bench.do(Seek(50), Georeference(Survey(lever=LEVER)))
     fewer = len(verdicts(bench.see()))
     bench.do(Seek(200))
     assert len(verdicts(bench.see())) > fewer + 10
@@ -103,7 +103,7 @@ def test_a_map_is_georeferenced_by_the_fixes_of_its_recording_and_again_when_it_
 
 
 def test_a_fix_is_overridden_and_that_is_undone_as_a_loop_is(bench: Laid) -> None:
-    bench.do(LayOnEarth(Survey(lever=LEVER)))
+    bench.do(Georeference(Survey(lever=LEVER)))
     assert verdicts(bench.see())["30"]
     assert not verdicts(bench.do(EditLoop(Override("fix 30", accepted=False))))["30"]
     assert bench.see().loops.undo[-1] == Override("fix 30", accepted=False)
@@ -112,14 +112,14 @@ def test_a_fix_is_overridden_and_that_is_undone_as_a_loop_is(bench: Laid) -> Non
 
 
 def test_fixes_bend_the_map_in_the_page_and_in_what_is_saved(bench: Laid, walk: Path, tmp_path: Path) -> None:
-    straight = bench.do(LayOnEarth(Survey(lever=LEVER))).keyframe_poses
-    bent = bench.do(LayOnEarth(Survey(lever=LEVER, factors=True))).keyframe_poses
+    straight = bench.do(Georeference(Survey(lever=LEVER))).keyframe_poses
+    bent = bench.do(Georeference(Survey(lever=LEVER, factors=True))).keyframe_poses
     assert straight is not None and bent is not None
     moved = np.linalg.norm(bent[:, :3, 3] - straight[:, :3, 3], axis=1)
     assert 1e-4 < moved.max() < 0.2 and np.sqrt((off(bench, walk) ** 2).mean()) < 0.05
     saved = MapFile(bench.save(tmp_path / "bent") / "map.ply")
     np.testing.assert_allclose([saved[k].T_odom_imu[:3, 3] for k in (0, 5)], (bent @ T_imu_lidar(bench))[[0, 5], :3, 3])
-    np.testing.assert_array_equal(bench.do(LayOnEarth(None)).keyframe_poses, straight)
+    np.testing.assert_array_equal(bench.do(Georeference(None)).keyframe_poses, straight)
 
 
 def T_imu_lidar(bench: Laid) -> F64:
@@ -128,7 +128,7 @@ def T_imu_lidar(bench: Laid) -> F64:
 
 def test_a_session_file_repeats_the_georeference_to_the_same_bytes(bench: Laid, tmp_path: Path) -> None:
     survey = Survey(lever=LEVER, crs="EPSG:25832", factors=True)
-    bench.do(LayOnEarth(survey), EditLoop(Override("fix 30", accepted=False)))
+    bench.do(Georeference(survey), EditLoop(Override("fix 30", accepted=False)))
     page = bench.save(tmp_path / "page")
     session = page / "session.hemislam"
     assert read_session(session).state.survey == survey
@@ -147,7 +147,7 @@ def test_a_session_file_repeats_the_georeference_to_the_same_bytes(bench: Laid, 
 def test_every_format_of_the_page_is_where_the_map_was_georeferenced_and_what_is_in_the_box(
     bench: Laid, tmp_path: Path
 ) -> None:
-    found = bench.do(LayOnEarth(Survey(lever=LEVER))).earth.found
+    found = bench.do(Georeference(Survey(lever=LEVER))).earth.found
     assert found is not None
     box = Box((-1.0, -2.0, -3.0), (2.0, 1.0, 3.0), 20.0)
     bench.do(Save(tmp_path / "page", ("gpx", "kmz", "laz"), Choice(0.1, box)))
@@ -163,7 +163,7 @@ def test_every_format_of_the_page_is_where_the_map_was_georeferenced_and_what_is
     expected = found.reference.to_geographic(np.asarray(trajectory[:1], np.float64))[0, :2]
     np.testing.assert_allclose([float(first.get(k, "nan")) for k in ("lat", "lon")], expected, atol=1e-7)
     assert (tmp_path / "page" / "map.kmz").exists()
-    bench.do(LayOnEarth(None), Save(tmp_path / "nowhere", ("gpx",)))
+    bench.do(Georeference(None), Save(tmp_path / "nowhere", ("gpx",)))
     assert (
         "needs a georeferenced map" in bench.see().saved[-1].error
         and not (tmp_path / "nowhere" / "trajectory.gpx").exists()
@@ -173,7 +173,7 @@ def test_every_format_of_the_page_is_where_the_map_was_georeferenced_and_what_is
 def test_three_points_picked_on_the_map_georeference_it_and_with_two_the_page_says_what_is_undetermined(
     bench: Laid, walk: Path
 ) -> None:
-    now = bench.do(LayOnEarth(None))
+    now = bench.do(Georeference(None))
     true = GeoReference.from_json(walk.with_name("walk_georeference.json").read_text())
     assert now.keyframe_poses is not None
     places = np.array([[0.0, 0.0, 0.0], [4.0, 0.5, 1.0], [0.5, 3.0, 0.2]])
@@ -181,12 +181,12 @@ def test_three_points_picked_on_the_map_georeference_it_and_with_two_the_page_sa
     picks = tuple(Pick(f"P{k}", 3, tuple(at)) for k, at in enumerate(local[:3].T.tolist()))
     rows = [f"P{k},{e!r},{n!r},{h!r}\n" for k, (e, n, h) in enumerate(true.to_crs(places).tolist())]
     survey = Survey(control="name,E,N,H\n" + "".join(rows), crs=true.crs, picks=picks)
-    found = bench.do(LayOnEarth(survey)).earth.found
+    found = bench.do(Georeference(survey)).earth.found
     assert found is not None and found.rms.max() < 1e-6
     np.testing.assert_allclose(found.reference.origin, true.origin, atol=1e-6)
-    two = bench.do(LayOnEarth(replace(survey, picks=picks[:2]))).earth
+    two = bench.do(Georeference(replace(survey, picks=picks[:2]))).earth
     assert two.found is None and "only P0 and P1 are: the map's rotation about" in two.problem
-    left = bench.do(LayOnEarth(survey), EditLoop(Override("point P2", accepted=False))).earth
+    left = bench.do(Georeference(survey), EditLoop(Override("point P2", accepted=False))).earth
     assert "only P0 and P1" in left.problem
     bench.do(UndoLoop())
 
@@ -194,12 +194,12 @@ def test_three_points_picked_on_the_map_georeference_it_and_with_two_the_page_sa
 def test_a_map_that_cannot_be_georeferenced_is_saved_all_the_same_and_the_report_says_why(
     bench: Laid, tmp_path: Path
 ) -> None:
-    bench.do(LayOnEarth(Survey(gnss=tmp_path / "gone.csv")))
+    bench.do(Georeference(Survey(gnss=tmp_path / "gone.csv")))
     assert "gone.csv" in bench.see().earth.problem
     folder = bench.save(tmp_path / "results")
     assert "gone.csv" in json.loads((folder / "report.json").read_text())["georeference"]["problem"]
     assert not (folder / reference.FILE).exists()
-    bench.do(LayOnEarth(None))
+    bench.do(Georeference(None))
 
 
 def test_a_session_file_of_before_opens_without_a_georeference(bench: Laid, tmp_path: Path) -> None:
