@@ -1,4 +1,5 @@
 """Where on Earth a map is: coordinate systems (`crs`), GNSS `fixes`, `control` points, and the resulting transform.
 
-`align` fits a trajectory to fixes, `bend` lets fixes correct the pose graph, `reference` is the result.
+`align` fits a trajectory (`path`) to fixes in metres on the `ground`, and `bend` lets fixes correct the pose graph.
+`reference` is the result.
 """
