@@ -98,12 +98,14 @@ def _export_session(source: Path, out: Path | None, exports: "tuple[Export, ...]
     from app.cli.run import free_folder
     from app.georeference import reference
     from app.mapping.earth import georeference_if_possible
+    from app.mapping.saving import mark
     from app.mapping.session_file import read_session
 
     with repeat(source) as (session, stop):
         if stop is not None:
             raise stop
-        results = session.results(state=read_session(source).state)
+        results = session.results()
+        mark(results, read_session(source).state)
         results = georeference_if_possible(results, session.survey, session.edits.done)
         results.where = results.where or reference.read(source.parent)
         results.choice = choice

@@ -6,6 +6,7 @@ from typing import Any
 
 from app.export.results import BY_RUN, Results, of_formats, save_results
 from app.georeference.survey import Survey
+from app.mapping.kept import Kept
 from app.mapping.session_file import SUFFIX, SavedSession, write_session
 from app.slam.loops.edits import LoopEdit
 
@@ -21,6 +22,8 @@ def write_all(
     replace: bool,
 ) -> dict[str, Any]:
     """Write the results, georeferenced if that is possible; as `Session.save`."""
+    if session is not None:
+        mark(results, session.state)
     if survey is not None:
         from app.mapping.earth import georeference_if_possible  # few sessions need its solvers
 
@@ -29,3 +32,9 @@ def write_all(
     if session is not None and not formats:
         write_session(folder / f"session{SUFFIX}", session)
     return report
+
+
+def mark(results: Results, kept: Kept) -> None:
+    """Add the measures and notes, which some files show."""
+    results.marks = tuple((one.name, tuple((spot.keyframe, spot.at) for spot in one.spots)) for one in kept.measures)
+    results.notes = tuple((note.frame, note.text) for note in kept.notes)

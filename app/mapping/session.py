@@ -190,7 +190,7 @@ class Session:
 
     @property
     def map_frame(self) -> MapFrame:
-        """Where loops georeference odometry in the map, at the newest frame."""
+        """Where odometry lies in the map by the loops, at the newest frame."""
         return self.loops.frame if self.loops else _NO_LOOPS
 
     @property
@@ -335,12 +335,8 @@ class Session:
         ours = self.map_frame.trajectory(self.log.odometry)
         return compared(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns, ours.positions)[1]
 
-    def results(self, stopped: str = "", state: State | None = None) -> Results:
-        """What result files are written from: the frames so far, with all loops, in effect or not. As `save`.
-
-        Args:
-            state: holds the measures and notes that some files show.
-        """
+    def results(self, stopped: str = "") -> Results:
+        """What result files are written from: the frames so far, with all loops, in effect or not. As `save`."""
         info = self.feed.info
         made_from = RunInfo(
             info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped, self.calibration
@@ -349,10 +345,6 @@ class Session:
         results = Results(self.log, self.keyframes.now(), made_from, loops)
         results.adjustment = self.levelling(loops.frame if loops else _NO_LOOPS)
         results.levelled_deg = float(np.degrees(np.linalg.norm(lie.log(results.adjustment.newest[:3, :3]))))
-        if state is not None:
-            measures = state.measures
-            results.marks = tuple((one.name, tuple((spot.keyframe, spot.at) for spot in one.spots)) for one in measures)
-            results.notes = tuple((note.frame, note.text) for note in state.notes)
         return results
 
     def save(
@@ -376,7 +368,7 @@ class Session:
         Returns:
             The content of report.json, or HemislamError if the folder cannot be written to.
         """
-        results = self.results(stopped, session.state if session is not None else None)
+        results = self.results(stopped)
         results.choice, results.progress = choice, progress
         return self._saves.submit(
             write_all, folder, results, self.survey, self.edits.done, session, formats, replace=replace

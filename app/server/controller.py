@@ -78,7 +78,7 @@ class Controller:
     ) -> None:
         self._page = page
         self._loops, self._player, self._writer = LoopCommands(page), Player(page, clock), SessionWriter()
-        self._laying = Georeferencing(page)
+        self._georeferencing = Georeferencing(page)
         self._saves: deque[tuple[Path, Future[Any]]] = deque()
         self._share = 0.0  # of a save that is written
         self._shown_share: protocol.Progress | None = None
@@ -252,11 +252,11 @@ class Controller:
         labelled = session.keyframes.find_moving(last=self._player.still or session.ended)
         if labelled is not None and labelled[1]:
             self._page.show_again(labelled[0], urgent=False)
-        laying = self._resuming is None and self._laying.update(session, still=self._player.still)
+        at_work = self._resuming is None and self._georeferencing.update(session, still=self._player.still)
         waits = [
             wait,
             saving,
-            POLL_S if loops or laying else None,
+            POLL_S if loops or at_work else None,
             0.0 if labelled else None,
             self._player.look_at_source(session),
         ]

@@ -50,7 +50,7 @@ class PicturesPanel:
         self._height = gui.add_number("height", 1080, min=64, max=_LARGEST, step=1, hint="Pixels.")
         self._explain = gui.add_checkbox("with legend and scale", True)
         shoot = gui.add_button("Take a picture", icon=viser.Icon.CAMERA, color="gray", hint="A PNG of this view.")
-        shoot.on_click(by_user(lambda _, client: self._told(client, self._shoot)))
+        shoot.on_click(by_user(lambda _, client: self._reporting(client, self._shoot)))
         self._way = gui.add_dropdown("fly with", tuple(_WAYS))
         self._seconds = gui.add_number("seconds", 20.0, min=1.0, max=600.0, step=1.0, hint=f"{_RATE} pictures each.")
         self._start = gui.add_button(
@@ -63,7 +63,7 @@ class PicturesPanel:
         self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
         self._where = gui.add_html("", visible=False)
         self._download = gui.add_button("Download the flight", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
-        self._start.on_click(by_user(lambda _, client: self._told(client, self._fly)))
+        self._start.on_click(by_user(lambda _, client: self._reporting(client, self._fly)))
         self._stop.on_click(by_user(lambda _, __: self._stopped.set()))
         self._download.on_click(by_user(lambda _, client: self._send(client)))
 
@@ -148,7 +148,7 @@ class PicturesPanel:
         self._share = 0.0
         self._stopped.clear()
         self._flying = threading.Thread(
-            target=self._told, args=(client, lambda client: self._take(client, stations, file)), daemon=True
+            target=self._reporting, args=(client, lambda client: self._take(client, stations, file)), daemon=True
         )
         self._flying.start()
 
@@ -179,7 +179,7 @@ class PicturesPanel:
             return
         client.send_file_download(self._saved.name, self._saved.read_bytes(), save_immediately=True)
 
-    def _told(self, client: viser.ClientHandle, act: Callable[[viser.ClientHandle], None]) -> None:
+    def _reporting(self, client: viser.ClientHandle, act: Callable[[viser.ClientHandle], None]) -> None:
         """Do something, and report to the browser if it fails."""
         problem = ""
         try:

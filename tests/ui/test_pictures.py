@@ -128,7 +128,7 @@ class Bench:
         self.panel.draw(WALKED)
 
     def do(self, act: Any) -> None:
-        self.panel._told(self.browser, act)  # type: ignore[arg-type]
+        self.panel._reporting(self.browser, act)  # type: ignore[arg-type]
         if self.panel._flying is not None:
             self.panel._flying.join(60)
         self.panel.draw(WALKED)
