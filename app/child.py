@@ -46,7 +46,7 @@ class ChildDied(HemislamError):
     """A child has ended although its owner did not ask it to.
 
     Attributes:
-        how: "signal 9, SIGKILL" or "exit code 1". exit_code: as of `multiprocessing.Process`.
+        how: "signal 9, SIGKILL" or "exit code 1". exit_code: as in `multiprocessing.Process`.
     """
 
     def __init__(self, title: str, exit_code: int) -> None:

@@ -28,9 +28,10 @@ MOST_ACCEL = 200.0
 WINDOW_S, STRIDE_S, SPAN_S, STEPS = 0.5, 0.25, 1.0, 50
 """Accelerations are averaged over a window, about a step of walking, and compared with those one span later."""
 GAP_NS = 1_000_000_000
-CLEARLY, LEAST_ERROR = 0.5, 0.3
-"""Another unit or other axes are proposed if they leave less than this share of the error, which is at least so many
-m/s^2."""
+CLEARLY = 0.5
+"""Another unit or other axes are proposed if they leave less than this share of the error."""
+LEAST_ERROR = 0.3
+"""m/s^2; axes with a smaller error are not questioned."""
 
 
 @dataclass(frozen=True, slots=True)

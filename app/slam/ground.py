@@ -51,7 +51,7 @@ def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundRe
         seeds = kernels.flat_seeds(points, ring, params.scan_lines, down, params.sigma, cos_slope, labels)
     if seeds < MIN_SEEDS:
         labels[:] = NON_GROUND
-        return replace(none, reason=f"only {seeds} seed points; a plane takes {MIN_SEEDS}", seeds=seeds)
+        return replace(none, reason=f"only {seeds} seed points; a plane needs {MIN_SEEDS}", seeds=seeds)
     sums = np.zeros(12)
     kernels.moments(points, labels, sums)
 

@@ -101,7 +101,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
             params.gate, params.estimate_extrinsics, H, b, stats, residuals,
         )  # fmt: skip
         if stats[0] < MIN_INLIERS:
-            reason = f"only {int(stats[0])} of {n} points found a plane in the map; an update takes {MIN_INLIERS}"
+            reason = f"only {int(stats[0])} of {n} points found a plane in the map; an update needs {MIN_INLIERS}"
             matches = _matches(points, residuals, planes)
             nothing = Registration(False, iteration, n, int(stats[0]), float("nan"), np.zeros(6), True, reason, matches)
             return prior, nothing

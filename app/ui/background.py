@@ -7,7 +7,7 @@ from app.child import Child
 
 
 class Background:
-    """One piece of work at a time. A text among its messages says why it failed. name, title: as of `Child`."""
+    """One piece of work at a time. A text among its messages says why it failed. name, title: as in `Child`."""
 
     def __init__(self, name: str, title: str) -> None:
         self._name, self._title = name, title

@@ -101,7 +101,7 @@ class TrajectoryNode:
 
 
 class Truth:
-    """The true path: sent once in the truth's own frame and laid over the map by the node's pose."""
+    """The true path: sent once in the truth's own frame; the node's pose puts it on the map."""
 
     def __init__(self, scene: viser.SceneApi, root: str) -> None:
         self._scene = scene
@@ -110,7 +110,7 @@ class Truth:
         self._loaded: F64 | None = None
 
     def draw(self, positions: F64 | None, T_map_truth: F64 | None, visible: bool) -> None:
-        """Show (m, 3) positions where `T_map_truth` (4, 4) lays them; hidden while that is unknown."""
+        """Show (m, 3) positions where `T_map_truth` (4, 4) puts them; hidden while that is unknown."""
         if positions is not self._loaded:
             self._loaded = positions
             if self._line is not None:

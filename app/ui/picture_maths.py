@@ -81,7 +81,7 @@ def flight(path: F64, count: int, behind: float, above: float) -> list[Station]:
     begin, end = first - smooth[0], smooth[-1] - last
 
     def at(where: F64) -> F64:
-        """(k, 3) places so far along the path, m, which goes on straight at its ends."""
+        """(k, 3) places at these distances, m, along the path, which goes on straight at its ends."""
         inside = np.column_stack([np.interp(where, flown, smooth[:, axis]) for axis in range(3)])
         before, after = np.minimum(where, 0.0)[:, None], np.maximum(where - flown[-1], 0.0)[:, None]
         return np.asarray(inside + before * _unit(begin) + after * _unit(end))

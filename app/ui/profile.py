@@ -19,7 +19,7 @@ _PERIOD_S: Final = 1.0
 
 
 def unrolled(parts: Iterable[tuple[F64, U8]], path: F64, slab: float) -> tuple[F64, U8]:
-    """Points of the map beside a path, laid along it.
+    """Points of the map beside a path, unrolled along it.
 
     Args:
         parts: (n, 3) points and their (n, 3) colours. path: (m, 2) m. slab: m, its width.

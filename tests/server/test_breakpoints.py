@@ -37,7 +37,7 @@ class MoodyEngine(fakes.FakeEngine):
 
 
 def spoilt(result: StepResult) -> StepResult:
-    ground = replace(result.ground, found=False, reason="only 3 seed points; a plane takes 20", planarity=0.4)
+    ground = replace(result.ground, found=False, reason="only 3 seed points; a plane needs 20", planarity=0.4)
     update = replace(result.registration, residual_rms=0.08, degenerate=True)
     return replace(result, ground=ground, registration=update, timings_ms={"total": 130.0})
 
@@ -59,7 +59,7 @@ GOOD = frame()
 @pytest.mark.parametrize(
     ("chosen", "says"),
     [
-        (Breakpoints(no_ground=True), "No ground plane: only 3 seed points; a plane takes 20."),
+        (Breakpoints(no_ground=True), "No ground plane: only 3 seed points; a plane needs 20."),
         (Breakpoints(planarity=0.3), "λ3/λ2 of the seeds is 0.400, over 0.3."),
         (Breakpoints(residual=0.05), "The residual is 80.0 mm, over 50 mm."),
         (Breakpoints(degenerate=True), "Degenerate: this scan leaves one direction unobserved."),
@@ -150,7 +150,7 @@ def test_playing_pauses_there_also_at_full_speed_shows_why_and_play_goes_on() ->
     assert snapshot.breakpoints == NO_GROUND.breakpoints
     assert snapshot.transport.frame == BAD[0] and not snapshot.transport.playing
     assert snapshot.notices[-1].text == (
-        f"Paused at frame {BAD[0]}. No ground plane: only 3 seed points; a plane takes 20."
+        f"Paused at frame {BAD[0]}. No ground plane: only 3 seed points; a plane needs 20."
     )
     assert bench.do(Play()).transport.frame == FRAMES - 1
 

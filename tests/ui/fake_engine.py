@@ -123,7 +123,7 @@ def label(world: World, frame: int, points: np.ndarray, params: Params) -> Groun
     return GroundResult(
         labels=labels,
         found=bool(seeds.sum() >= 20),
-        reason="" if seeds.sum() >= 20 else f"only {seeds.sum()} seed points; a plane takes 20",
+        reason="" if seeds.sum() >= 20 else f"only {seeds.sum()} seed points; a plane needs 20",
         normal=-down,
         centroid=down * world.position(frame)[2],
         down=down,
