@@ -1,4 +1,4 @@
-"""Levels and georeferences the map of the open session whenever it has changed and the session is paused."""
+"""Levels the map of the open session at its end, and georeferences it whenever it is paused and has changed."""
 
 import logging
 from concurrent.futures import Future
@@ -41,11 +41,11 @@ class Georeferencing:
         now = session, session.survey, overrides, session.frame, session.map_frame
         chosen = self._begun_from[0] is not session or self._begun_from[1:3] != now[1:3]
         moved = self._begun_from[3] != session.frame or self._begun_from[4] is not session.map_frame
-        if session.frame < 0 or not (chosen or (moved and still)):
+        if session.frame < 0 or not (chosen or (moved and still and (session.survey is not None or session.ended))):
             return False
         self._begun_from = now
         if session.survey is None:
-            self._show(session, Earth(), session.levelling(session.map_frame))
+            self._show(session, Earth(), _levelling(session))
             return False
         self._under_way, self._begun_with = session.georeference(), session.survey
         return True
@@ -53,17 +53,22 @@ class Georeferencing:
     def _take(self, session: Session, work: Future[Results], survey: Survey | None) -> None:
         if self._begun_from[0] is not session:
             return
-        error, level = work.exception(), session.levelling(session.map_frame)
+        error = work.exception()
         if error is None:
             results = work.result()
             self._show(session, Earth(survey, results.found), results.adjustment)
             return
         if not isinstance(error, HemislamError):
             log.error("The map could not be georeferenced", exc_info=error)
-        self._show(session, Earth(survey, problem=str(error) or type(error).__name__), level)
+        self._show(session, Earth(survey, problem=str(error) or type(error).__name__), _levelling(session))
 
     def _show(self, session: Session, earth: Earth, adjustment: MapFrame) -> None:
         if len(adjustment.T_map_odom) or len(session.adjustment.T_map_odom):
             session.adjustment = adjustment
             self._page.map_moved(session)
         self._page.put(earth=earth, urgent=True)
+
+
+def _levelling(session: Session) -> MapFrame:
+    """By the gravity known at the end. Before, the map would turn a little at every stop."""
+    return session.levelling(session.map_frame) if session.ended else MapFrame()
