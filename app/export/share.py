@@ -86,7 +86,8 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: "Resu
     seen = points if len(points) else np.zeros((1, 3), np.float32)
     low, high = seen.min(axis=0), seen.max(axis=0)
     _add_scale_and_arrow(server, low, high, results)
-    center, size = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) + 1.0
+    most_low, most_high = np.percentile(seen, [1, 99], axis=0)  # a few far points would make the rest small
+    center, size = (most_low + most_high) / 2, float(np.linalg.norm((most_high - most_low)[:2])) + 1.0
     server.initial_camera.position = tuple(center + size * np.array([-0.26, -0.42, 0.45]))
     server.initial_camera.look_at = tuple(center)
 
