@@ -127,7 +127,7 @@ class Engine:
         if registration.inliers and status is FrameStatus.TRACKING and len(samples) and p.imu.learn_clock:
             clock = clock.learnt(samples, predicted.state, posterior.state)
         if not waiting:
-            self._insert(posterior, sampled.points)
+            self._insert(posterior, sampled.points, float(np.nan_to_num(registration.residual_rms)))
         watch.lap("insert")
 
         cloud = Cloud(points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns)
@@ -208,9 +208,9 @@ class Engine:
                 return posterior, replace(registration, predicted_change=change, correction=correction)
         return predicted, replace(_NOT_REGISTERED, used=len(points), reason="the update gave no finite pose")
 
-    def _insert(self, belief: Belief, points: np.ndarray) -> None:
+    def _insert(self, belief: Belief, points: np.ndarray, residual: float) -> None:
         T = (belief.state.T_odom_imu @ belief.state.T_imu_lidar).astype(np.float32)
-        self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map)
+        self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map, residual)
 
     def _keyframe(self, belief: Belief, cloud: Cloud, certainty: Certainty) -> Keyframe:
         state = belief.state

@@ -20,9 +20,10 @@ MAX_KNOT_STEP = 0.0025
 """s; poses in between are interpolated linearly."""
 LONG_GAP = 0.4
 """s, half the time of a step. Over a longer gap the accelerations at both ends do not determine the velocity."""
-CLOCK_ERROR, SCALE_ERROR = 0.006, 0.006
-"""Possible error of the IMU's clock in s, and of its gyroscope's scale as a share. Their effect grows with the motion;
-at rest both are harmless, and only the noise of the data sheet remains."""
+CLOCK_ERROR, TURN_ERROR = 0.006, 0.0134
+"""Possible error of the IMU's clock in s, and of its turns as a share: the gyroscope's scale (0.6 %) and a
+mounting 0.7° off (1.2 %, across the turn). Their effect grows with the motion; at rest both are harmless, and only the
+noise of the data sheet remains."""
 GAP_NOISE = (0.5, 3.0)
 """Noise densities (rad/s/√Hz, m/s²/√Hz) for bridging a gap: those of walking and turning."""
 
@@ -91,7 +92,7 @@ def _unsteady(times: F64, rates: F64, forces: F64) -> F64:
     lasting = max(times[-1] - times[0], 1e-3)
     turn = np.linalg.norm(rates.mean(axis=0))
     jerked = [np.abs(values - values.mean(axis=0)).max() / np.sqrt(lasting) for values in (rates, forces)]
-    return np.hypot(CLOCK_ERROR * np.array(jerked), [SCALE_ERROR * turn * np.sqrt(lasting), 0.0])
+    return np.hypot(CLOCK_ERROR * np.array(jerked), [TURN_ERROR * turn * np.sqrt(lasting), 0.0])
 
 
 def deskew(scan: Scan, path: Path, state: NavState) -> F32:

@@ -10,6 +10,10 @@ from app.slam.kernels import map as kernels
 from app.slam.sections import FilterParams, MapParams
 from app.slam.types import F32, F64, I32, U8
 
+VIEW_M = 50.0
+"""m: walking this far, odometry drifts by as much as points lie off the map's planes."""
+OLD_M = 0.025
+"""m: a surface is old once odometry may have drifted so far since it was last seen."""
 RELAXED = 4.0
 """Tilt allowed to a poor plane, as a multiple of that of a good one."""
 
@@ -20,14 +24,16 @@ class MapState:
 
     Attributes:
         cells: (v, 3) indices of the voxels, in order of insertion. counts: (v,) points in each.
-        points: (sum of counts, 4) x, y, z in m and hits, voxel by voxel. center: (3,) m, the sensor at the last
-            eviction.
+        points: (sum of counts, 5) x, y, z in m, hits, and drift when last seen, voxel by voxel.
+        center: (3,) m, the sensor at the last eviction. way: (4,), the sensor in m where drift was last added, and the
+            variance of odometry's drift up to there, m².
     """
 
     cells: I32
     counts: U8
     points: F32
     center: F64
+    way: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,20 +59,23 @@ class LocalMap:
         self._table = np.full(1 << int(np.ceil(np.log2(2 * size))), -1, dtype=np.int32)
         self._cells = np.zeros((size, 3), dtype=np.int32)
         self._counts = np.zeros(size, dtype=np.uint8)
-        self._store = np.zeros((size, params.points_per_voxel, 4), dtype=np.float32)
+        self._store = np.zeros((size, params.points_per_voxel, 5), dtype=np.float32)
         self._used = 0
         self._center = np.zeros(3)
+        self._way = np.zeros(4)
 
     @property
     def voxels(self) -> int:
         return self._used
 
-    def insert(self, points: F32, position: F64, params: MapParams) -> None:
+    def insert(self, points: F32, position: F64, params: MapParams, residual: float = 0.0) -> None:
         """Add (n, 3) odom points seen from `position` (3,), and drop voxels beyond the radius around it.
 
         When the map is full, the radius shrinks until there is room again, so that what is near the sensor is
-        always mapped.
+        always mapped. residual: RMS of the scan's distances from the map, m.
         """
+        if (step := float(np.linalg.norm(position - self._way[:3]))) > 1.0:  # a swaying hand does not walk
+            self._way = np.r_[position, self._way[3] + step / VIEW_M * residual**2]
         if np.linalg.norm(position - self._center) > 0.1 * params.radius:
             self._evict(position, params.radius)
         self._used, refused = self._insert(points, params)
@@ -79,8 +88,9 @@ class LocalMap:
 
     def _insert(self, points: F32, params: MapParams) -> tuple[int, int]:
         used, refused = kernels.insert(
-            points, self._voxel, params.spacing, self._table, self._cells, self._counts, self._store, self._used
-        )
+            points, self._voxel, params.spacing, self._way[3], self._way[3] - OLD_M**2,
+            self._table, self._cells, self._counts, self._store, self._used,
+        )  # fmt: skip
         return int(used), int(refused)
 
     def _evict(self, center: F64, radius: float) -> None:
@@ -99,7 +109,8 @@ class LocalMap:
         reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(params.plane_tilt)
         kernels.planes(
             queries, self._voxel, reach, params.neighbours, params.plane_threshold, np.array([RELAXED * tilt, tilt]),
-            params.point_noise, self._table, self._cells, self._counts, self._store, normals, centers, variances,
+            params.point_noise, self._way[3] - OLD_M**2, self._table, self._cells, self._counts, self._store,
+            normals, centers, variances,
         )  # fmt: skip
         poor, good = (Planes(*parts) for parts in zip(normals, centers, variances, strict=True))
         return good, poor
@@ -107,13 +118,13 @@ class LocalMap:
     def checkpoint(self) -> MapState:
         n = self._used
         points = self._store[:n][self._taken(n)]
-        return MapState(self._cells[:n].copy(), self._counts[:n].copy(), points, self._center.copy())
+        return MapState(self._cells[:n].copy(), self._counts[:n].copy(), points, self._center.copy(), self._way.copy())
 
     def restore(self, state: MapState) -> None:
         n = len(state.cells)
         self._cells[:n], self._counts[:n] = state.cells, state.counts
         self._store[:n][self._taken(n)] = state.points
-        self._used = n
+        self._used, self._way = n, np.array(state.way)
         self._evict(np.array(state.center), math.inf)  # drops nothing; it rebuilds the hash table
 
     def _taken(self, n: int) -> npt.NDArray[np.bool_]:

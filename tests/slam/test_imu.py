@@ -365,6 +365,6 @@ def test_at_rest_the_noise_is_that_of_the_data_sheet_and_motion_adds_what_a_late
         grown.append(np.sqrt(after.covariance[2, 2]))
     sheet = ImuParams().gyro_noise * np.sqrt(0.1)
     assert grown[0] == pytest.approx(sheet, rel=0.01)
-    assert grown[1] == pytest.approx(np.hypot(sheet, imu.SCALE_ERROR * 0.1), rel=0.01)
+    assert grown[1] == pytest.approx(np.hypot(sheet, imu.TURN_ERROR * 0.1), rel=0.01)
     farthest = imu.CLOCK_ERROR * 1.0  # the rate is at most 1 rad/s from its mean
-    assert grown[2] == pytest.approx(np.sqrt(sheet**2 + farthest**2 + (imu.SCALE_ERROR * 0.1) ** 2), rel=0.01)
+    assert grown[2] == pytest.approx(np.sqrt(sheet**2 + farthest**2 + (imu.TURN_ERROR * 0.1) ** 2), rel=0.01)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from app.slam.kernels.map import BINS, LEAST_SCATTER, MOST, MOST_HITS, SHARED, SURE_TILT
+from app.slam.kernels.map import BINS, LEAST_SCATTER, MOST, MOST_HITS, OLD, SHARED, SURE_TILT
 from app.slam.local_map import RELAXED, LocalMap, MapState, Planes
 from app.slam.sections import FilterParams, MapParams
 
@@ -226,6 +226,53 @@ def test_neighbours_are_not_looked_for_beyond_a_voxels_edge() -> None:
     far, near = (local_map.planes(queries, FilterParams(neighbour_distance=d))[0] for d in (5.0, SMALL.voxel_size))
     assert equal(far, near)
     assert np.any(near.variances >= 0)
+
+
+# --- old ground ----------------------------------------------------------------------------------
+def floor_at(height: float, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-3, 3, (6000, 2)), np.full(6000, height) + rng.normal(scale=0.002, size=6000)])
+
+
+def gone_round(local_map: LocalMap, residual: float = 0.04) -> LocalMap:
+    """60 m away and back to HERE, with nothing in sight."""
+    for x in np.r_[np.arange(0, 30, 1.5), np.arange(30, 0, -1.5), 0.0]:
+        local_map.insert(np.empty((0, 3), np.float32), np.array([x, 0, 0]), SMALL, residual)
+    return local_map
+
+
+QUERIES = np.column_stack([np.random.default_rng(9).uniform(-2, 2, (200, 2)), np.full(200, 0.33)])
+
+
+def test_a_surface_seen_anew_is_not_mixed_with_the_old_one() -> None:
+    """The same floor, 6 cm higher after a long way round: drift, not thickness."""
+    local_map = gone_round(filled(floor_at(0.30, 1)))
+    for seed in (2, 3, 4):
+        local_map.insert(floor_at(0.36, seed).astype(np.float32), HERE, SMALL)
+    planes = local_map.planes(QUERIES, FilterParams())[0]
+    np.testing.assert_allclose(planes.centers[:, 2], 0.36, atol=0.005)
+
+
+def test_old_surfaces_pull_less_where_nothing_new_is_seen() -> None:
+    fresh, local_map = filled(floor_at(0.30, 1)), gone_round(filled(floor_at(0.30, 1)))
+    before, old = (m.planes(QUERIES, FilterParams())[0] for m in (fresh, local_map))
+    assert np.array_equal(before.centers, old.centers)
+    np.testing.assert_allclose(old.variances, OLD * before.variances)
+
+
+def test_where_scans_fit_the_map_exactly_nothing_grows_old() -> None:
+    fresh, local_map = filled(floor_at(0.30, 1)), gone_round(filled(floor_at(0.30, 1)), residual=0.01)
+    assert equal(local_map.planes(QUERIES, FilterParams())[0], fresh.planes(QUERIES, FilterParams())[0])
+
+
+def test_what_stays_in_view_never_grows_old() -> None:
+    local_map, seen = LocalMap(SMALL), floor_at(0.30, 1).astype(np.float32)
+    for x in np.arange(0, 60, 1.5):
+        local_map.insert(seen, np.array([x, 0, 0]), SMALL, 0.04)
+    fresh = filled(floor_at(0.30, 1))
+    assert len(stored(local_map)) < 1.3 * len(stored(fresh))
+    now, then = (m.planes(QUERIES, FilterParams())[0].variances for m in (local_map, fresh))
+    np.testing.assert_allclose(now, then, rtol=0.1)
 
 
 # --- bounds --------------------------------------------------------------------------------------

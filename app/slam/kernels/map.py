@@ -28,15 +28,17 @@ MOST_HITS = 4
 
 
 @njit(cache=True, nogil=True)
-def insert(points, voxel, spacing, table, cells, counts, store, used):
+def insert(points, voxel, spacing, now, old, table, cells, counts, store, used):
     """Add points that are not within `spacing` of a point in their own voxel. Returns (used, refused).
 
     A point within `spacing` is another hit of the nearest there, which becomes the mean of its first MOST_HITS. So
-    noise averages out.
+    noise averages out. If the nearest was last seen before `old`, the point takes its place: a mean of both would
+    mix the surface as it is seen now with where odometry put it then.
 
-    points (n, 3) f32 m, odom; voxel, spacing m. In and out: table (2^k,) i32, slot by hash or -1; cells (v, 3) i32,
-    voxel indices; counts (v,) u8; store (v, m, 4) f32: x, y, z in m, hits. The first `used` slots are taken. A full
-    voxel takes no more points, a full store no new voxel; `refused` counts the points that needed one.
+    points (n, 3) f32 m, odom; voxel, spacing m; now, old: drift, m². In and out: table (2^k,) i32, slot by hash or -1;
+    cells (v, 3) i32, voxel indices; counts (v,) u8; store (v, m, 5) f32: x, y, z in m, hits, drift when last seen.
+    The first `used` slots are taken. A full voxel takes no more points, a full store no new voxel; `refused` counts the
+    points that needed one.
     """
     mask = len(table) - 1
     inverse, near2 = 1.0 / voxel, spacing * spacing
@@ -57,6 +59,7 @@ def insert(points, voxel, spacing, table, cells, counts, store, used):
                 table[h] = k
                 cells[k, 0], cells[k, 1], cells[k, 2] = a, b, c
                 store[k, 0, 0], store[k, 0, 1], store[k, 0, 2], store[k, 0, 3] = x, y, z, 1.0
+                store[k, 0, 4] = now
                 counts[k] = 1
                 break
             if cells[k, 0] == a and cells[k, 1] == b and cells[k, 2] == c:
@@ -67,16 +70,19 @@ def insert(points, voxel, spacing, table, cells, counts, store, used):
                     d2 = dx * dx + dy * dy + dz * dz
                     if d2 < nearest:
                         nearest, at = d2, i
-                if at >= 0:
+                if at >= 0 and store[k, at, 4] >= old:
                     hits = store[k, at, 3] + np.float32(1.0)
                     if hits <= MOST_HITS:
                         store[k, at, 0] += (x - store[k, at, 0]) / hits
                         store[k, at, 1] += (y - store[k, at, 1]) / hits
                         store[k, at, 2] += (z - store[k, at, 2]) / hits
                         store[k, at, 3] = hits
-                elif n < room:
-                    store[k, n, 0], store[k, n, 1], store[k, n, 2], store[k, n, 3] = x, y, z, 1.0
-                    counts[k] = n + 1
+                    store[k, at, 4] = now
+                elif at >= 0 or n < room:
+                    place = n if at < 0 else at
+                    counts[k] = max(n, place + 1)
+                    store[k, place, 0], store[k, place, 1], store[k, place, 2] = x, y, z
+                    store[k, place, 3], store[k, place, 4] = 1.0, now
                 break
             h = (h + 1) & mask
     return used, refused
@@ -100,7 +106,7 @@ def evict(center, radius, voxel, table, cells, counts, store, used):
             for i in range(3):
                 cells[kept, i] = cells[k, i]
             for i in range(n):
-                for c in range(4):
+                for c in range(5):
                     store[kept, i, c] = store[k, i, c]
         kept += 1
     table[:] = -1
@@ -123,6 +129,8 @@ LEAST_SCATTER = 2.0
 SHARED = 4.0
 """Weight of a plane's variance beside the point's own: points on the same patch share its error, so it does not
 average out between them."""
+OLD = 4.0
+"""Weight of an old plane's variance: odometry has drifted since, and the pose is to return to it smoothly."""
 
 
 @njit(cache=True, inline="always")
@@ -132,11 +140,12 @@ def _outside(u, cell):
 
 
 @njit(cache=True, error_model="numpy")
-def _nearest(x, y, z, voxel, reach2, table, cells, counts, store, near, bins, begin, order):
-    """Map points within reach of (x, y, z) m, ranked by distance up to the width of a bin. Returns their number n.
+def _nearest(x, y, z, voxel, reach2, old, table, cells, counts, store, near, bins, begin, order):
+    """Map points within reach of (x, y, z) m, ranked by distance up to the width of a bin, the present ones first.
 
-    reach2 m². Out: near (m, 3) f64, offsets in m as found; order (n,) i32, their ranking. Scratch: bins (m,) i32,
-    begin (BINS + 2,) i32. The inner loop has no branch: points out of reach fall into a last bin of their own.
+    reach2 m²; old: drift, before which a point was last seen if it is old. Returns the numbers of present points
+    and of all. Out: near (m, 3) f64, offsets in m as found; order (m,) i32, their ranking. Scratch: bins (m,) i32,
+    begin (2 BINS + 2,) i32. The inner loop has no branch: points out of reach fall into a last bin of their own.
     """
     ux, uy, uz = x / voxel, y / voxel, z / voxel
     a0, b0, c0 = math.floor(ux), math.floor(uy), math.floor(uz)
@@ -157,18 +166,19 @@ def _nearest(x, y, z, voxel, reach2, table, cells, counts, store, near, bins, be
                 for i in range(counts[k]):
                     ex, ey, ez = store[k, i, 0] - x, store[k, i, 1] - y, store[k, i, 2] - z
                     at = min(int((ex * ex + ey * ey + ez * ez) * scale), BINS)
+                    at += BINS if at == BINS or store[k, i, 4] < old else 0
                     near[m, 0], near[m, 1], near[m, 2] = ex, ey, ez
                     bins[m] = at
                     begin[at + 1] += 1
                     m += 1
-    for i in range(BINS):
+    for i in range(2 * BINS):
         begin[i + 1] += begin[i]
-    n = begin[BINS]
+    present, n = begin[BINS], begin[2 * BINS]
     for i in range(m):
         at = bins[i]
         order[begin[at]] = i
         begin[at] += 1
-    return n
+    return present, n
 
 
 @njit(cache=True, error_model="numpy")
@@ -227,13 +237,17 @@ def _is_flat(near, order, n, x, y, z, normal, flat):
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def planes(queries, voxel, reach, first, flat, tilts, noise, table, cells, counts, store, normals, centers, variances):
+def planes(
+    queries, voxel, reach, first, flat, tilts, noise, old, table, cells, counts, store, normals, centers, variances
+):
     """Planes through the nearest map points of each query, one for each of the falling `tilts` (k,) rad.
 
     The `first` nearest points within `reach` m are tried first. The normal of a plane through k points of scatter s is
     uncertain by s / sqrt(k l2) rad. While that exceeds the tilt (neighbours on one scan line do not determine the
     surface across it), the patch is widened to twice as many points, up to MOST. The plane is accepted once it is
     certain enough and every neighbour lies within `flat` m of it.
+
+    Points last seen before drift was `old` m² are used only where the present ones give no plane, and never with these.
 
     queries (n, 3) f64 m, odom; noise: of a point, m; the map as in `insert`. Out: normals (k, n, 3) unit, centers
     (k, n, 3) m, variances (k, n): of a point's distance from its plane in m², negative where there is no plane.
@@ -244,14 +258,21 @@ def planes(queries, voxel, reach, first, flat, tilts, noise, table, cells, count
         near = np.empty((room, 3))
         bins = np.empty(room, np.int32)
         order = np.empty(room, np.int32)
-        begin = np.empty(BINS + 2, np.int32)
+        begin = np.empty(2 * BINS + 2, np.int32)
         normal = np.empty(3)
         for j in range(chunk * total // CHUNKS, (chunk + 1) * total // CHUNKS):
             x, y, z = queries[j, 0], queries[j, 1], queries[j, 2]
-            n = min(
-                _nearest(x, y, z, voxel, reach * reach, table, cells, counts, store, near, bins, begin, order), MOST
+            present, n = _nearest(
+                x, y, z, voxel, reach * reach, old, table, cells, counts, store, near, bins, begin, order
             )
-            _fit(near, order, n, first, flat, tilts, noise, normal, j, normals, centers, variances)
+            _fit(near, order, min(present, MOST), first, flat, tilts, noise, normal, j, normals, centers, variances)
+            if variances[0, j] < 0.0 and n > present:
+                _fit(
+                    near, order[present:], min(n - present, MOST), first, flat, tilts, noise, normal, j,
+                    normals, centers, variances,
+                )  # fmt: skip
+                for i in range(len(tilts)):
+                    variances[i, j] *= OLD
             for i in range(len(tilts)):
                 centers[i, j, 0] += x
                 centers[i, j, 1] += y
