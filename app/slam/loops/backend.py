@@ -62,6 +62,7 @@ class LoopBackend:
     def add(self, keyframe: Keyframe, params: LoopsParams, priors: tuple[PositionPrior, ...] = ()) -> None:
         """As `Search.add`."""
         self._state = None
+        self._made = {key: edge for key, edge in self._made.items() if key[1] < keyframe.index}
         self._search.add(keyframe, params, priors)
         if len(self) < 2:
             self._begin()

@@ -1,5 +1,7 @@
 """The user's commands over what was found: given, undone, waiting, replayed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -193,6 +195,23 @@ def test_a_loop_by_hand_waits_again_when_its_keyframe_is_forgotten(walked: Walke
     for keyframe in walked.keyframes[100:110]:
         backend.add(keyframe, PARAMS)
     assert (3, 100) in {edge.pair for edge in backend.edges}
+
+
+def test_a_loop_by_hand_is_measured_again_where_the_walk_goes_on_differently(walked: Walked) -> None:
+    begin, one_way = walked.keyframes[:8], walked.keyframes[8:16]
+    aside = lie.transform(np.eye(3), np.array([0.0, 0.2, 0.1]))
+    another = tuple(replace(keyframe, T_odom_imu=keyframe.T_odom_imu @ aside) for keyframe in one_way)
+    edits = Edits((Add(0, 5, rows(np.eye(4)), register=False),))
+    backends = [drive(begin + way, PARAMS) for way in (one_way, another)]
+    for backend in backends:
+        backend.load(edits)
+    there, fresh = ({edge.pair: edge for edge in backend.edges}[0, 5].evidence for backend in backends)
+    assert there != fresh
+    backends[0].go_to(8)
+    for keyframe in another:
+        backends[0].add(keyframe, PARAMS)
+    backends[0].finish()
+    assert {edge.pair: edge for edge in backends[0].edges}[0, 5].evidence == fresh
 
 
 def test_with_every_loop_rejected_the_map_is_the_odometry(walked: Walked, backend: LoopBackend) -> None:
