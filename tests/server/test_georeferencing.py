@@ -4,6 +4,7 @@ app/mapping/earth.py and app/georeference/survey.py.
 
 import csv
 import json
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -58,8 +59,8 @@ class Laid(Bench):
         return Controller(self.page, self.params, opener, session_folder=self.folder, clock=lambda: 0.0)
 
     def settle(self) -> None:
-        while self.controller.work() is not None:
-            pass
+        while (wait := self.controller.work()) is not None:
+            time.sleep(wait)
 
     def save(self, folder: Path) -> Path:
         self.do(Save(folder))
