@@ -54,7 +54,7 @@ class Site:
 
     def begin(self) -> None:
         self.scheduler = self.start("scheduler", "--port", str(self.port), "--no-dashboard")
-        self.workers = [self.worker() for _ in range(3)]
+        self.workers = [self.worker() for _ in range(2)]
 
     def stop(self) -> None:
         for process in (*self.workers, self.scheduler):
