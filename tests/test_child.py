@@ -229,7 +229,7 @@ def test_a_dead_child_leaves_no_thread_behind() -> None:
     with pytest.raises(ChildDied):
         child.receive(TIMEOUT_S)
     child.flush()
-    assert threading.active_count() == before
+    assert threading.active_count() <= before  # a thread of an earlier test may end meanwhile
 
 
 def test_children_started_at_the_same_time_leave_the_script_in_its_place() -> None:

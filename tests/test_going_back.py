@@ -24,13 +24,20 @@ LOOP_BACK_END = {f"slam/loops/{name}.py" for name in ("backend", "detection", "s
 """What is derived from keyframes and edits. It is brought to another number of keyframes by `backend.py` alone."""
 
 
+LAYERS = {
+    "mapping/labels.py": "the user's labels, keyframe by keyframe",
+    "mapping/moving.py": "what was found to move, keyframe by keyframe",
+}
+"""Values of keyframes that only the session drops, once the keyframes will be others."""
+
+
 def test_only_a_few_files_know_how_to_go_back() -> None:
     found = {}
     for path in sorted(APP.rglob("*.py")):
         names = [node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
         if going_back := [name for name in names if GOES_BACK.fullmatch(name)]:
             found[path.relative_to(APP).as_posix()] = going_back
-    allowed = KNOW | ONE_VALUE.keys() | STORES.keys() | LOOP_BACK_END
+    allowed = KNOW | ONE_VALUE.keys() | STORES.keys() | LAYERS.keys() | LOOP_BACK_END
     assert not {path: names for path, names in found.items() if path not in allowed}, (
         "follow a cursor instead (app/slam/log.py)"
     )

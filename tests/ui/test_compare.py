@@ -157,11 +157,11 @@ def test_a_fork_is_asked_for_and_what_is_set_next_is_set_in_it(page: Page) -> No
     page.both_at(20)
     assert page.panel._what.visible and not page.panel._fork.visible and page.sides._choice.value == "B"
     assert "B · wide &lt;b&gt;" in page.panel._status.content and "forked at 20" in page.panel._status.content
-    user_sets(page.workbench._parameters._controls["ground.alpha"], 33.0)
+    user_sets(page.workbench._parameters._widgets["ground.alpha"][0].handle, 33.0)
     assert page.b.sent[-1] == SetParams({"ground.alpha": 33.0})
     assert not any(isinstance(command, SetParams) for command in page.engine.sent)
     page.draw(5.0)
-    control = page.workbench._parameters._controls["ground.alpha"]
+    control = page.workbench._parameters._widgets["ground.alpha"][0].handle
     assert control.value == 33.0
     user_sets(page.sides._choice, "A")
     page.draw(5.0)
@@ -175,7 +175,7 @@ def test_a_value_typed_for_b_is_never_sent_to_a(page: Page) -> None:
     page.both_at(20)
     user_sets(page.sides._choice, "B")
     page.draw()
-    user_sets(page.workbench._parameters._controls["map.spacing"], 0.33)
+    user_sets(page.workbench._parameters._widgets["map.spacing"][0].handle, 0.33)
     page.forks.discard()
     page.workbench._parameters._now = lambda: time.monotonic() + 10
     page.draw()
@@ -277,7 +277,7 @@ def test_keep_says_where_the_file_is_and_errors_are_shown(page: Page, tmp_path: 
     page.draw()
     assert page.panel._fork.visible and page.sides._choice.visible is False
     assert "no fork" in chooses(page.panel._what, "discard").told[0]
-    user_sets(page.workbench._parameters._controls["ground.alpha"], 31.0)
+    user_sets(page.workbench._parameters._widgets["ground.alpha"][0].handle, 31.0)
     assert page.engine.sent[-1] == SetParams({"ground.alpha": 31.0}), "without a fork all is A's"
 
 

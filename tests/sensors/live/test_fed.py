@@ -94,7 +94,7 @@ def test_as_packets_the_same_but_for_the_packets_steps(
     assert len(recorded) >= len(ports.measurements(events))
     for live, again in zip(ports.measurements(events), recorded, strict=False):
         np.testing.assert_array_equal(again.scan.points, live.scan.points)
-        assert abs(again.scan.stamp_ns - live.scan.stamp_ns) < 300  # f64 seconds, as drivers have it
+        assert abs(again.scan.stamp_ns - live.scan.stamp_ns) < 480  # f64 seconds, as drivers have them: twice 238 ns
         np.testing.assert_array_equal(again.imu.accel, live.imu.accel)
         np.testing.assert_array_equal(again.imu.stamps_ns, live.imu.stamps_ns)
 

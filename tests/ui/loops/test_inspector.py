@@ -23,7 +23,7 @@ def test_the_submaps_lie_on_each_other_as_registered_and_apart_where_the_graph_h
     page.choose(GOOD)
     older = cKDTree(in_map(page, OLDER))
     fitted = np.median(older.query(in_map(page, NEWER))[0])
-    user_sets(page.loops._inspector._laid, 0.0)
+    user_sets(page.loops._inspector._share, 0.0)
     page.draw()
     apart = np.median(older.query(in_map(page, NEWER))[0])
     assert fitted < 0.03 and apart > 3 * fitted
@@ -41,7 +41,7 @@ def test_the_older_submap_lies_where_the_map_has_its_keyframe(page: Page) -> Non
 def test_moving_the_slider_sends_a_pose_and_no_points(page: Page, wire: Wire) -> None:
     page.choose(GOOD)
     wire.clear()
-    user_sets(page.loops._inspector._laid, 0.5)
+    user_sets(page.loops._inspector._share, 0.5)
     page.draw(0.01)
     assert wire.nodes("PointCloudMessage") == []
     assert NEWER in wire.nodes("SetPositionMessage")
