@@ -185,4 +185,4 @@ def test_played_out_as_packets_no_recording_is_turned_or_bent(name: str, shared_
     assert abs(np.polyfit(place, azimuth, 1)[0] * 2 * np.pi) < 0.4 * COUNT
     for one in np.flatnonzero(np.bincount(ring) > 300):
         off = elevation[ring == one]
-        assert abs(np.median(off)) < (0.15 if len(off) > 1000 else 0.5) * COUNT  # few returns fix half a unit
+        assert abs(np.median(off)) < (0.15 if len(off) > 1000 else 0.5) * COUNT  # of few returns, to half a unit
