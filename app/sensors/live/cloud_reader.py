@@ -14,7 +14,7 @@ from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan
 
 _GIVE_UP = 100
-"""After this many clouds without a usable point, the user is told."""
+"""Number of clouds without a usable point after which reading fails with an error."""
 
 
 class CloudReader:
