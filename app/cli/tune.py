@@ -86,7 +86,7 @@ def tune(
 
     \b
     Writes into DIR:
-      best.params.yaml  the best setting; use it with --config
+      best.params.yaml  the setting that also wins on the part held back, if any; use it with --config
       tuning.html       the best settings and the plots, in one file
       trials.csv        every trial
       tuning.json       the best settings with all parameters, input hashes and the machine
@@ -147,7 +147,17 @@ def tune(
                 bar.set_postfix_str(f"best {wanted[0].text(best[0].scores[0])}")
 
         done, checked = find(
-            runs, dimensions, wanted, part, rest, out, how=search, trials=trials, seed=seed, progress=progress
+            runs,
+            dimensions,
+            wanted,
+            part,
+            rest,
+            out,
+            given=subjects[0].params,
+            how=search,
+            trials=trials,
+            seed=seed,
+            progress=progress,
         )
     best = front(done, wanted)
     if not best:
@@ -156,7 +166,7 @@ def tune(
         for trial in shown:
             scores = ", ".join(f"{one.title} {one.text(v)}" for one, v in zip(wanted, trial.scores, strict=True))
             typer.echo(f"{label:<10} {scores}  ({trial.name}){' ' + trial.error if trial.error else ''}")
-    if words := advice(checked, wanted):
+    if words := advice(done, checked, wanted):
         typer.echo(words)
     failed = [trial for trial in done if trial.error]
     if failed:

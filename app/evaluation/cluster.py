@@ -9,7 +9,6 @@ time, and each is asked for its version and the recording before it gets work.
 
 import contextlib
 import os
-import shutil
 import tempfile
 import threading
 import time
@@ -290,20 +289,36 @@ def _found(job: Job, url: str) -> Path:
     """Where this worker has the recording; fetched from the URL if need be.
 
     Raises:
-        HemislamError: there is none with the right content. OSError: it cannot be fetched.
+        HemislamError: there is none with the right content, or it cannot be fetched.
     """
     if _is_it(job.recording, job.sha256):
         return job.recording
     copy = _copy_of(job)
     if url and not _is_it(copy, job.sha256):
-        import fsspec
-
-        with fsspec.open(f"{url.rstrip('/')}/{job.recording.name}") as source, _part_of(job).open("wb") as file:
-            shutil.copyfileobj(source, file, PIECE)
-        _settle(job)
+        _fetch(f"{url.rstrip('/')}/{job.recording.name}", job)
     if not _is_it(copy, job.sha256):
         raise HemislamError(f"The worker has no {job.recording.name} with the same content as here.")
     return copy
+
+
+def _fetch(address: str, job: Job) -> None:
+    """Copy a recording from an address of fsspec.
+
+    Raises:
+        HemislamError: it cannot be copied.
+    """
+    from fsspec.core import url_to_fs
+
+    part = _part_of(job)
+    try:
+        system, path = url_to_fs(address)
+        system.get_file(path, str(part))  # also from servers that give files as a whole only
+    except Exception as error:  # each kind of address has its own
+        part.unlink(missing_ok=True)
+        # fsspec says "not found" where, say, a certificate is not trusted
+        why = error.__cause__ or ("it is not there" if isinstance(error, FileNotFoundError) else error)
+        raise HemislamError(f"The worker cannot fetch {address}: {str(why) or type(why).__name__}") from None
+    _settle(job)
 
 
 def _keep(job: Job, files: dict[str, bytes]) -> None:

@@ -19,8 +19,8 @@ from app.slam.params import Params
 
 FORMAT = 3
 LEAD_S = 5.0
-"""Reading begins this much before a part in the middle of a recording, and what comes before the part does not count.
-A start while walking has no rest to level by: its error is larger than the effect of any parameter."""
+"""Reading usually begins this much before a part in the middle of a recording, and what comes before the part does not
+count. A start while walking has no rest to level by: its error is larger than the effect of any parameter."""
 GROUND_RANGES_M = (0.0, 5.0, 10.0, 20.0, 40.0, 100.0)
 RUN_FILES = ("trajectory.tum", "timings.csv", "crops.npz", "run.json")
 
@@ -45,6 +45,7 @@ class Job:
     recording: its path, sha256: of its bytes. name: of the recording in tables. variant: its name.
     params: as run. folder: for the results. threads: for the kernels. code: `code_digest()`.
     start_s, duration_s: the part of the recording that counts, after its first scan; None: to the end.
+    lead_s: how much earlier reading begins, at most.
     baseline: name of the system that is run in place of the engine; "" for the engine.
     marks: (stamp of a frame, a byte for each point of its cloud as in `app.mapping.painted`), in place of the
         recording's labels of ground.
@@ -59,6 +60,7 @@ class Job:
     threads: int = 1
     start_s: float = 0.0
     duration_s: float | None = None
+    lead_s: float = LEAD_S
     code: str = field(default_factory=code_digest)
     baseline: str = ""
     marks: tuple[tuple[int, bytes], ...] = ()
@@ -72,7 +74,7 @@ class Job:
             "code": self.code,
             "input": self.sha256,
             "parameters": self.params.model_dump(mode="json"),
-            "part": [self.start_s, self.duration_s],
+            "part": [*self.read, self.start_s],
             "baseline": [self.baseline, find_system(self.baseline).version()] if self.baseline else None,
             "marks": [[stamp, hashlib.sha256(labels).hexdigest()] for stamp, labels in self.marks],
         }
@@ -82,7 +84,7 @@ class Job:
     @property
     def read(self) -> tuple[float, float | None]:
         """Start and length of what is read, the part with its lead, s."""
-        lead = min(LEAD_S, self.start_s)
+        lead = min(self.lead_s, self.start_s)
         return self.start_s - lead, None if self.duration_s is None else self.duration_s + lead
 
     def begin_ns(self, info: FeedInfo) -> int:

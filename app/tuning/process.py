@@ -109,6 +109,15 @@ def _find(owner: Link, wanted: Wanted) -> None:
         threads=1,
     )
     _, checked = tune(
-        runs, dimensions, objectives, part, rest, wanted.folder, how=wanted.how, trials=wanted.trials, progress=progress
+        runs,
+        dimensions,
+        objectives,
+        part,
+        rest,
+        wanted.folder,
+        given=wanted.params,
+        how=wanted.how,
+        trials=wanted.trials,
+        progress=progress,
     )
     owner.send(replace(latest, held_back=checked, finished=True))

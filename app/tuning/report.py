@@ -15,7 +15,7 @@ from app.slam.params import nested
 from app.slam.provenance import describe_machine
 from app.slam.text_files import csv_text, write_texts
 from app.tuning.objectives import Objective
-from app.tuning.trial import Trial, advice, front
+from app.tuning.trial import Trial, advice, front, proposal
 
 BEST = "best.params.yaml"
 
@@ -37,7 +37,7 @@ def write_results(
     Raises:
         HemislamError: the folder cannot be written to.
     """
-    best = front(trials, objectives)
+    best, proposed = front(trials, objectives), proposal(trials, held_back, objectives)
     texts = {
         "trials.csv": _csv(trials, objectives),
         "tuning.json": json.dumps(
@@ -54,8 +54,8 @@ def write_results(
         + "\n",
         "tuning.html": _html(trials, best, held_back, objectives, study),
     }
-    if best:
-        texts[BEST] = yaml.safe_dump(nested(best[0].values), sort_keys=False)  # fits every recording
+    if proposed is not None:
+        texts[BEST] = yaml.safe_dump(nested(proposed.values), sort_keys=False)  # fits every recording
     write_texts(folder, texts)
 
 
@@ -132,7 +132,7 @@ def _html(
         trials=trials,
         best=best,
         held_back=held_back,
-        advice=advice(held_back, objectives),
+        advice=advice(trials, held_back, objectives),
         objectives=objectives,
         figures=figures,
     )

@@ -41,6 +41,13 @@ class Dimension:
             return FloatDistribution(self.low, self.high, log=True)
         return FloatDistribution(self.low, self.high)
 
+    def value_in(self, params: Params) -> Any:
+        return getattr(getattr(params, self.leaf.section), self.leaf.name)
+
+    def holds(self, value: Any) -> bool:
+        """Whether the value lies in the range."""
+        return isinstance(self.distribution, CategoricalDistribution) or self.low <= value <= self.high
+
     def rounded(self, value: Any) -> Any:
         """The value on the parameter's own step, so that the same setting is never run twice."""
         step = self.leaf.step

@@ -53,8 +53,28 @@ def front(trials: Sequence[Trial], objectives: Sequence[Objective]) -> list[Tria
     return sorted(best, key=lambda trial: costs[trial.number])
 
 
-def advice(held_back: Sequence[Trial], objectives: Sequence[Objective]) -> str:
-    """A sentence if no setting beats the parameters as given on the part held back; else ""."""
-    if [trial.number for trial in front(held_back, objectives)] != [0]:
+def beats(trial: Trial, other: Trial, objectives: Sequence[Objective]) -> bool:
+    """Whether it is better in an objective and worse in none."""
+    return front((other, trial), objectives) == [trial]
+
+
+def proposal(trials: Sequence[Trial], held_back: Sequence[Trial], objectives: Sequence[Objective]) -> Trial | None:
+    """The setting to use; None if no trial has a result.
+
+    On the part held back it must beat the parameters as given, or these stay. Without that part it is the best trial.
+    """
+    if not held_back:
+        return next(iter(front(trials, objectives)), None)
+    given = held_back[0]
+    better = (trial for trial in front(held_back, objectives) if beats(trial, given, objectives))
+    return next(better, given)
+
+
+def advice(trials: Sequence[Trial], held_back: Sequence[Trial], objectives: Sequence[Objective]) -> str:
+    """In a sentence, what was found on the part held back; "" without one."""
+    best = proposal(trials, held_back, objectives)
+    if not held_back or best is None:
         return ""
+    if best.number:
+        return f"Trial {best.number} is also better than the parameters as given on the part held back."
     return "On the part held back nothing is better than the parameters as given: keep them."

@@ -13,14 +13,15 @@ from typing import Any
 import optuna
 
 from app.evaluation.evaluate import Subject
-from app.evaluation.job import RUN_FILES, Job
+from app.evaluation.job import LEAD_S, RUN_FILES, Job
 from app.evaluation.measured import Outcome, load, measure
 from app.evaluation.runner import RunJobs
+from app.slam.params import Params
 from app.slam.provenance import sha256_of
 from app.tuning.objectives import Objective, score
 from app.tuning.report import write_results
 from app.tuning.space import Dimension, grid
-from app.tuning.trial import SearchMethod, Trial, front
+from app.tuning.trial import SearchMethod, Trial, beats, front
 
 BATCH = 8
 """Trials between two looks at the results; the same for any number of processes, so that trials repeat."""
@@ -30,16 +31,25 @@ MOST_CHECKED = 5
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Of each recording, in seconds after its first scan. duration_s: None for all the rest."""
+    """Of each recording, in seconds after its first scan.
+
+    Attributes:
+        duration_s: None for all the rest. lead_s: as `Job` has it.
+    """
 
     start_s: float = 0.0
     duration_s: float | None = None
+    lead_s: float = LEAD_S
 
     def next(self, duration_s: float | None = None) -> "Part | None":
-        """The part right after it, as long if nothing else is said; None if it goes to the end."""
+        """The part right after it, as long if nothing else is said; None if it goes to the end.
+
+        Reading begins where it begins for this part: a start just before the next one may fall on a place where the
+        scanner sees too little to find its speed, and all settings would then be lost alike.
+        """
         if self.duration_s is None:
             return None
-        return Part(self.start_s + self.duration_s, duration_s or self.duration_s)
+        return Part(self.start_s + self.duration_s, duration_s or self.duration_s, self.duration_s + self.lead_s)
 
 
 class Runs:
@@ -97,6 +107,7 @@ class Runs:
                 threads=self._threads,
                 start_s=part.start_s,
                 duration_s=part.duration_s,
+                lead_s=part.lead_s,
                 marks=subject.marks,
             )
 
@@ -130,6 +141,7 @@ def tune(
     rest: Part | None,
     folder: Path,
     *,
+    given: Params,
     how: SearchMethod = "bayes",
     trials: int = 100,
     seed: int = 0,
@@ -143,7 +155,9 @@ def tune(
     Raises:
         HemislamError: a grid has more points than trials, or the folder cannot be written to.
     """
-    done, study = search(runs, dimensions, objectives, part, how=how, trials=trials, seed=seed, progress=progress)
+    done, study = search(
+        runs, dimensions, objectives, part, given=given, how=how, trials=trials, seed=seed, progress=progress
+    )
     checked = check(runs, done, objectives, rest)
     write_results(folder, done, checked, objectives, study, runs.asked(how, trials, seed, part))
     return done, checked
@@ -155,12 +169,16 @@ def search(
     objectives: Sequence[Objective],
     part: Part,
     *,
+    given: Params,
     how: SearchMethod = "bayes",
     trials: int = 100,
     seed: int = 0,
     progress: OnTrials = lambda so_far, study: None,
 ) -> tuple[list[Trial], optuna.Study]:
     """Try the parameters as given and then `trials` settings.
+
+    Args:
+        given: the parameters as given, of the first recording; the search learns from them as from any trial.
 
     Raises:
         HemislamError: a grid has more points than trials.
@@ -169,6 +187,15 @@ def search(
     study = optuna.create_study(directions=["maximize" if one.greatest else "minimize" for one in objectives])
     ((scores, error),) = runs.score([{}], part)
     done = [Trial(0, {}, scores, error)]
+    values = {one.path: one.value_in(given) for one in dimensions}
+    if done[0].complete and all(one.holds(values[one.path]) for one in dimensions):
+        study.add_trial(
+            optuna.trial.create_trial(
+                params=values,
+                distributions={one.path: one.distribution for one in dimensions},
+                values=[value for value in scores if value is not None],
+            )
+        )
     progress(done, study)
     for batch in _batches(study, dimensions, how, trials, seed):
         settings = [setting for _, setting in batch]
@@ -185,10 +212,11 @@ def search(
 
 def check(runs: Runs, trials: Sequence[Trial], objectives: Sequence[Objective], rest: Part | None) -> tuple[Trial, ...]:
     """The parameters as given and the best settings, on a part that the search has not seen; nothing without either."""
-    best = front(trials, objectives)[:MOST_CHECKED]
-    if rest is None or not best:
+    best = [trial for trial in front(trials, objectives) if trial.number]
+    best.sort(key=lambda trial: not beats(trial, trials[0], objectives))  # those first that give nothing up
+    if rest is None or not trials[0].complete:
         return ()
-    chosen = [trials[0], *(trial for trial in best if trial.number)]
+    chosen = [trials[0], *best[:MOST_CHECKED]]
     results = runs.score([trial.values for trial in chosen], rest)
     return tuple(
         Trial(one.number, one.values, scores, error) for one, (scores, error) in zip(chosen, results, strict=True)

@@ -120,7 +120,9 @@ class TunePanel:
             )
         if not found.finished:
             return f"{done} · stopped"
-        return " ".join((f"{done} · saved in {wanted.folder}", advice(found.held_back, self._objectives())))
+        return " ".join(
+            (f"{done} · saved in {wanted.folder}", advice(found.trials, found.held_back, self._objectives()))
+        )
 
     def _left(self, wanted: Wanted) -> str:
         """By the pace of the newest runs."""

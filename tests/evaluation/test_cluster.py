@@ -54,7 +54,7 @@ class Site:
 
     def begin(self) -> None:
         self.scheduler = self.start("scheduler", "--port", str(self.port), "--no-dashboard")
-        self.workers = [self.worker() for _ in range(2)]
+        self.workers = [self.worker() for _ in range(3)]
 
     def stop(self) -> None:
         for process in (*self.workers, self.scheduler):
@@ -144,6 +144,11 @@ def test_a_worker_fetches_a_recording_from_a_url(
     cluster._copy_of(gone).write_bytes(data[:1000])
     with pytest.raises(HemislamError, match="same content"):
         cluster._found(gone, "")
+    with pytest.raises(HemislamError, match="it is not there"):
+        cluster._found(gone, f"{tmp_path.as_uri()}/elsewhere")
+    with pytest.raises(HemislamError, match="Protocol not known"):
+        cluster._found(gone, "cloud9://walks")
+    assert not list(tmp_path.glob("**/*.part-*")), "nothing is left half fetched"
 
 
 def test_a_recording_that_cannot_be_used_costs_its_own_run_only(site: Site, recording: Path, tmp_path: Path) -> None:

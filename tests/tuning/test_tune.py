@@ -20,10 +20,10 @@ from typer.testing import CliRunner
 from app.__main__ import cli
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.tuning.objectives import OBJECTIVES
+from app.tuning.objectives import OBJECTIVES, Objective
 from app.tuning.process import Ended, Tried, Wanted, find
 from app.tuning.space import grid, parse_dimensions
-from app.tuning.trial import Trial, advice, front
+from app.tuning.trial import Trial, advice, front, proposal
 from app.tuning.tune import Part, search
 from tests.cli.conftest import write_walk
 
@@ -55,6 +55,7 @@ def found(how: Any, trials: int = 60, seed: int = 0) -> tuple[list[Trial], Bowl]
         parse_dimensions("ground.alpha,ground.sigma"),
         (ATE,),
         Part(),
+        given=Params(),
         how=how,
         trials=trials,
         seed=seed,
@@ -92,12 +93,37 @@ def test_the_front_holds_what_no_other_trial_beats() -> None:
     assert [trial.number for trial in front(trials, (ATE, F1))] == [2, 1]
 
 
-def test_what_is_better_only_where_it_was_searched_is_not_recommended() -> None:
+def test_a_setting_is_proposed_only_if_it_is_better_on_the_part_held_back() -> None:
     given, worse, better = (Trial(number, {}, (score,)) for number, score in ((0, 1.0), (7, 1.2), (8, 0.9)))
-    assert "keep them" in advice((given, worse), (ATE,))
-    assert "keep them" in advice((given, Trial(7, {}, (1.0,))), (ATE,)), "as good is not better"
-    assert advice((given, better), (ATE,)) == advice((), (ATE,)) == ""
-    assert advice((given, worse), (F1,)) == "", "a greater F1 is better"
+    as_good = Trial(7, {}, (1.0,))
+
+    def proposed(*held_back: Trial, by: Objective = ATE) -> Trial | None:
+        assert ("keep them" in advice((given,), held_back, (by,))) == (proposal((given,), held_back, (by,)) == given)
+        return proposal((given,), held_back, (by,))
+
+    assert proposed(given, worse) == proposed(given, as_good) == given
+    assert proposed(given, better) == better
+    assert proposed(given, worse, by=F1) == worse, "a greater F1 is better"
+    assert proposal((given, better), (), (ATE,)) == better and advice((given, better), (), (ATE,)) == ""
+
+
+def test_what_gives_up_one_objective_for_another_is_not_proposed() -> None:
+    given, other = Trial(0, {}, (1.0, 0.8)), Trial(5, {}, (0.5, 0.7))
+    assert proposal((given, other), (given, other), (ATE, F1)) == given
+
+
+def test_the_search_learns_from_the_parameters_as_given() -> None:
+    done, study = search(Bowl(), parse_dimensions("ground.alpha"), (ATE,), Part(), given=Params(), trials=4)  # type: ignore[arg-type]
+    assert study.trials[0].params == {"ground.alpha": Params().ground.alpha}
+    assert study.trials[0].values == list(done[0].scores)
+    _, narrow = search(Bowl(), parse_dimensions("ground.alpha=50:60"), (ATE,), Part(), given=Params(), trials=4)  # type: ignore[arg-type]
+    assert len(narrow.trials) == 4, "what is given lies outside the range"
+
+
+def test_the_part_held_back_is_reached_without_a_start_in_between() -> None:
+    rest = Part(30.0, 20.0).next()
+    assert rest is not None and (rest.start_s, rest.duration_s) == (50.0, 20.0)
+    assert rest.start_s - rest.lead_s == 30.0 - Part(30.0, 20.0).lead_s
 
 
 def test_ranges_come_from_the_declaration_or_are_narrowed() -> None:
