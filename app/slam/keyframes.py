@@ -27,10 +27,15 @@ _HEAD = np.dtype(
         ("points", "<i8"),
     ]
 )
-_POINT = np.dtype(
-    [("points", "<f4", 3), ("labels", "u1"), ("intensity", "<f4"), ("ring", "<u2"), ("offsets_ns", "<i4")]
-)
-"""One point of a `Cloud`; the names are its attributes."""
+_COLUMNS = {
+    "points": np.dtype(("<f4", 3)),
+    "intensity": np.dtype("<f4"),
+    "offsets_ns": np.dtype("<i4"),
+    "ring": np.dtype("<u2"),
+    "labels": np.dtype("u1"),
+}
+"""What follows a head, column by column; the names are attributes of `Cloud`."""
+_POINT_BYTES = sum(column.itemsize for column in _COLUMNS.values())
 
 
 def is_due(T_odom_last: F64 | None, T_odom_imu: F64, params: KeyframeParams) -> bool:
@@ -68,7 +73,7 @@ class KeyframeStore:
         end = 0
         while end + _HEAD.itemsize <= size:
             raw = os.pread(self._file.fileno(), _HEAD.itemsize, end)
-            end += _HEAD.itemsize + int(np.frombuffer(raw, dtype=_HEAD)[0]["points"]) * _POINT.itemsize
+            end += _HEAD.itemsize + int(np.frombuffer(raw, dtype=_HEAD)[0]["points"]) * _POINT_BYTES
             if end > size:
                 return
             self._ends.append(end)
@@ -82,7 +87,10 @@ class KeyframeStore:
         begin = self._ends[index - 1] if index else 0
         raw = os.pread(self._file.fileno(), self._ends[index] - begin, begin)
         head = np.frombuffer(raw, dtype=_HEAD, count=1)[0]
-        data = np.frombuffer(raw, dtype=_POINT, offset=_HEAD.itemsize)
+        columns, at, points = {}, _HEAD.itemsize, int(head["points"])
+        for name, column in _COLUMNS.items():
+            columns[name] = np.frombuffer(raw, column, points, at)
+            at += points * column.itemsize
         return Keyframe(
             index=index,
             frame=int(head["frame"]),
@@ -90,7 +98,7 @@ class KeyframeStore:
             T_odom_imu=head["T_odom_imu"].copy(),
             T_imu_lidar=head["T_imu_lidar"].copy(),
             covariance=head["covariance"].copy(),
-            cloud=Cloud(**{name: np.ascontiguousarray(data[name]) for name in _POINT.names or ()}),
+            cloud=Cloud(**columns),
         )
 
     def when(self, index: int) -> tuple[int, int]:
@@ -108,13 +116,12 @@ class KeyframeStore:
         for name in ("frame", "stamp_ns", "T_odom_imu", "T_imu_lidar", "covariance"):
             head[name] = getattr(keyframe, name)
         head["points"] = len(cloud)
-        data = np.empty(len(cloud), dtype=_POINT)
-        for name in _POINT.names or ():
-            data[name] = getattr(cloud, name)
         begin = self._ends[self._count - 1] if self._count else 0
-        end = begin + head.nbytes + data.nbytes
+        end = begin + head.nbytes + len(cloud) * _POINT_BYTES
         self._file.seek(begin)
-        self._file.write(head.tobytes() + data.tobytes())
+        self._file.write(head.tobytes())
+        for name, column in _COLUMNS.items():
+            self._file.write(np.ascontiguousarray(getattr(cloud, name), column.base).data)
         self._file.flush()
         if self._count == len(self._ends) or self._ends[self._count] != end:  # else what follows is still whole
             del self._ends[self._count :]

@@ -48,7 +48,9 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     LineErrors.unknown().learnt(posterior, points, scan.ring, 1.0, local_map, params.filter)
     progress("a whole frame", 0.9)
     _run_frames(scan, samples, params)
-    cloud = Cloud(points.copy(), surface.labels.copy(), scan.intensity, scan.ring, scan.offsets_ns)
+    points.setflags(write=False)  # as the store of keyframes gives them
+    surface.labels.setflags(write=False)
+    cloud = Cloud(points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns)
     keyframe = Keyframe(0, 0, 0, np.eye(4), np.eye(4), np.eye(6), cloud)
     moving.find(keyframe, [moving.sight(keyframe)], params.moving)
     progress("done", 1.0)
