@@ -147,6 +147,8 @@ def save(session: "Session", folder: Path, stop: BaseException | None, *, replac
     from app.slam.report import summarise
 
     stopped = "" if stop is None else str(stop) or type(stop).__name__
+    while session.keyframes.find_moving(last=True):
+        pass  # the loop search is at the last keyframes meanwhile
     report = session.save(folder, replace=replace, stopped=stopped).result()
     typer.echo(summarise(report, folder))
     if problem := report.get("georeference", {}).get("problem"):
