@@ -32,7 +32,7 @@ once the keyframes around them are there (`app.mapping.labels`)."""
 
 def is_ground(labels: U8) -> Mask:
     """(n,) whether labels (n,) are GROUND or SEED."""
-    return np.isin(labels, (GROUND, SEED))
+    return np.asarray((labels == GROUND) | (labels == SEED))
 
 
 @dataclass(frozen=True, slots=True)

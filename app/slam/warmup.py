@@ -6,6 +6,7 @@ import numpy as np
 
 from app.slam import channels, ground, iekf, imu, moving, start
 from app.slam.engine import Engine
+from app.slam.kernels import clouds
 from app.slam.lines import LineErrors
 from app.slam.local_map import LocalMap
 from app.slam.params import Params
@@ -52,6 +53,7 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     surface.labels.setflags(write=False)
     cloud = Cloud(points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns)
     keyframe = Keyframe(0, 0, 0, np.eye(4), np.eye(4), np.eye(6), cloud)
+    clouds.moved(points, np.eye(4), np.empty((n, 3)))
     moving.find(keyframe, [moving.sight(keyframe)], params.moving)
     progress("done", 1.0)
 

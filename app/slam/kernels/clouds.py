@@ -29,6 +29,15 @@ def in_range(points, nearest, farthest, keep):
 
 
 @njit(cache=True, nogil=True)
+def moved(points, T, out):
+    """Points (n, 3) f32 m of one frame in another, by T (4, 4) f64 between them. Out: out (n, 3) f64 m."""
+    for j in range(len(points)):
+        x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
+        for i in range(3):
+            out[j, i] = T[i, 0] * x + T[i, 1] * y + T[i, 2] * z + T[i, 3]
+
+
+@njit(cache=True, nogil=True)
 def correct(points, ring, elevations, ranges, out):
     """Raise and lengthen each beam as its scan line asks for; lines beyond the tables stay as they are.
 
