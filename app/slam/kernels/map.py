@@ -140,18 +140,19 @@ def _outside(u, cell):
 
 
 @njit(cache=True, error_model="numpy")
-def _nearest(x, y, z, voxel, reach2, old, table, cells, counts, store, near, bins, begin, order):
+def _nearest(x, y, z, voxel, reach2, old, table, cells, counts, places, room, spots, bins, begin, order):
     """Map points within reach of (x, y, z) m, ranked by distance up to the width of a bin, the present ones first.
 
-    reach2 m²; old: drift, before which a point was last seen if it is old. Returns the numbers of present points
-    and of all. Out: near (m, 3) f64, offsets in m as found; order (m,) i32, their ranking. Scratch: bins (m,) i32,
-    begin (2 BINS + 2,) i32. The inner loop has no branch: points out of reach fall into a last bin of their own.
+    reach2 m²; places (v * room, 5): the store, flat; old: drift, before which a point was last seen if it is old.
+    Returns the numbers of present points and of all. Out: order (m,) i32, their rows in `places`, ranked. Scratch:
+    spots, bins (m,) i32, begin (2 BINS + 1,) i32. The inner loop has no branch: the next point overwrites one that is
+    out of reach.
     """
     ux, uy, uz = x / voxel, y / voxel, z / voxel
     a0, b0, c0 = math.floor(ux), math.floor(uy), math.floor(uz)
     scale = BINS / reach2
     begin[:] = 0
-    m = 0
+    m = np.uint64(0)  # unsigned indices are not checked for counting from the end
     for a in range(a0 - 1, a0 + 2):
         ox = _outside(ux, a) * voxel
         for b in range(b0 - 1, b0 + 2):
@@ -163,27 +164,28 @@ def _nearest(x, y, z, voxel, reach2, old, table, cells, counts, store, near, bin
                 k = _find(table, cells, a, b, c)
                 if k < 0:
                     continue
-                for i in range(counts[k]):
-                    ex, ey, ez = store[k, i, 0] - x, store[k, i, 1] - y, store[k, i, 2] - z
-                    at = min(int((ex * ex + ey * ey + ez * ez) * scale), BINS)
-                    at += BINS if at == BINS or store[k, i, 4] < old else 0
-                    near[m, 0], near[m, 1], near[m, 2] = ex, ey, ez
-                    bins[m] = at
-                    begin[at + 1] += 1
-                    m += 1
+                row = np.uint64(k * room)
+                for i in range(row, row + np.uint64(counts[k])):
+                    ex, ey, ez = places[i, 0] - x, places[i, 1] - y, places[i, 2] - z
+                    at = int((ex * ex + ey * ey + ez * ez) * scale)
+                    spots[m] = i
+                    bins[m] = at + (BINS if places[i, 4] < old else 0)
+                    m += np.uint64(at < BINS)
+    for i in range(m):
+        begin[bins[i] + 1] += 1
     for i in range(2 * BINS):
         begin[i + 1] += begin[i]
-    present, n = begin[BINS], begin[2 * BINS]
+    present = begin[BINS]
     for i in range(m):
         at = bins[i]
-        order[begin[at]] = i
+        order[begin[at]] = spots[i]
         begin[at] += 1
-    return present, n
+    return present, np.int64(m)
 
 
 @njit(cache=True, error_model="numpy")
-def _fit(near, order, n, first, flat, tilts, noise, normal, j, normals, centers, variances):
-    """Planes through the nearest of n ranked offsets, one for each of `tilts` (`planes` says how many points).
+def _fit(x, y, z, places, order, n, first, flat, tilts, noise, normal, j, normals, centers, variances):
+    """Planes through the nearest of n ranked points around (x, y, z), one for each of `tilts` (see `planes`).
 
     Out, in row j of each tilt: normals, unit; centers, m, relative to the query; variances, m² or -1. Scratch: normal.
     """
@@ -193,7 +195,7 @@ def _fit(near, order, n, first, flat, tilts, noise, normal, j, normals, centers,
     while take <= n:
         for i in range(done, take):
             k = order[i]
-            ex, ey, ez = near[k, 0], near[k, 1], near[k, 2]
+            ex, ey, ez = places[k, 0] - x, places[k, 1] - y, places[k, 2] - z
             sx += ex
             sy += ey
             sz += ez
@@ -214,7 +216,7 @@ def _fit(near, order, n, first, flat, tilts, noise, normal, j, normals, centers,
         begin = level
         while level < len(tilts) and scatter < tilts[level] * tilts[level] * take * l2:
             level += 1
-        if level > begin and _is_flat(near, order, take, mx, my, mz, normal, flat):
+        if level > begin and _is_flat(x, y, z, places, order, take, mx, my, mz, normal, flat):
             doubt = max(1.0, scatter / (SURE_TILT * SURE_TILT * take * l2))
             for i in range(begin, level):
                 normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = normal[0], normal[1], normal[2]
@@ -226,11 +228,11 @@ def _fit(near, order, n, first, flat, tilts, noise, normal, j, normals, centers,
 
 
 @njit(cache=True, inline="always")
-def _is_flat(near, order, n, x, y, z, normal, flat):
-    """Whether the nearest n offsets lie within `flat` m of the plane through (x, y, z)."""
+def _is_flat(x, y, z, places, order, n, mx, my, mz, normal, flat):
+    """Whether the nearest n points lie within `flat` m of the plane at (mx, my, mz) from (x, y, z)."""
     for i in range(n):
         k = order[i]
-        ex, ey, ez = near[k, 0] - x, near[k, 1] - y, near[k, 2] - z
+        ex, ey, ez = places[k, 0] - x - mx, places[k, 1] - y - my, places[k, 2] - z - mz
         if abs(ex * normal[0] + ey * normal[1] + ez * normal[2]) > flat:
             return False
     return True
@@ -252,23 +254,24 @@ def planes(
     queries (n, 3) f64 m, odom; noise: of a point, m; the map as in `insert`. Out: normals (k, n, 3) unit, centers
     (k, n, 3) m, variances (k, n): of a point's distance from its plane in m², negative where there is no plane.
     """
-    total = len(queries)
+    total, room = len(queries), store.shape[1]
+    places = store.reshape(-1, 5)
     for chunk in prange(CHUNKS):
-        room = 27 * store.shape[1]
-        near = np.empty((room, 3))
-        bins = np.empty(room, np.int32)
-        order = np.empty(room, np.int32)
-        begin = np.empty(2 * BINS + 2, np.int32)
+        spots, bins, order = np.empty(27 * room, np.int32), np.empty(27 * room, np.int32), np.empty(27 * room, np.int32)
+        begin = np.empty(2 * BINS + 1, np.int32)
         normal = np.empty(3)
         for j in range(chunk * total // CHUNKS, (chunk + 1) * total // CHUNKS):
             x, y, z = queries[j, 0], queries[j, 1], queries[j, 2]
             present, n = _nearest(
-                x, y, z, voxel, reach * reach, old, table, cells, counts, store, near, bins, begin, order
+                x, y, z, voxel, reach * reach, old, table, cells, counts, places, room, spots, bins, begin, order
             )
-            _fit(near, order, min(present, MOST), first, flat, tilts, noise, normal, j, normals, centers, variances)
+            _fit(
+                x, y, z, places, order, min(present, MOST), first, flat, tilts, noise, normal, j,
+                normals, centers, variances,
+            )  # fmt: skip
             if variances[0, j] < 0.0 and n > present:
                 _fit(
-                    near, order[present:], min(n - present, MOST), first, flat, tilts, noise, normal, j,
+                    x, y, z, places, order[present:], min(n - present, MOST), first, flat, tilts, noise, normal, j,
                     normals, centers, variances,
                 )  # fmt: skip
                 for i in range(len(tilts)):
