@@ -36,6 +36,18 @@ class Subject:
     marks: tuple[tuple[int, bytes], ...] = ()
 
 
+def check_subject(subject: Subject) -> str:
+    """The hash of its recording.
+
+    Raises:
+        HemislamError: the recording cannot be used, or its truth is from another time.
+    """
+    with open_recording(subject.recording, subject.params) as recording:
+        if subject.truth is not None:
+            check_overlap(subject.truth, recording.start_ns, recording.duration_s)
+    return sha256_of(subject.recording)
+
+
 def evaluate(
     subjects: Sequence[Subject],
     variants: Sequence[Variant],
@@ -61,10 +73,7 @@ def evaluate(
     jobs: dict[tuple[str, str], Job] = {}
     hashes: dict[str, str] = {}
     for subject in subjects:
-        with open_recording(subject.recording, subject.params) as recording:
-            if subject.truth is not None:
-                check_overlap(subject.truth, recording.start_ns, recording.duration_s)
-        hashes[subject.name] = digest = sha256_of(subject.recording)
+        hashes[subject.name] = digest = check_subject(subject)
         for variant in variants:
             jobs[subject.name, variant.name] = Job(
                 recording=subject.recording,

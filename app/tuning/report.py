@@ -47,6 +47,7 @@ def write_results(
                 **inputs,
                 "best": [_entry(trial, objectives) for trial in best],
                 "held_back": [_entry(trial, objectives) for trial in held_back],
+                "proposed": proposed.number if proposed else None,
             },
             indent=2,
             ensure_ascii=False,

@@ -12,12 +12,11 @@ from typing import Any
 
 import optuna
 
-from app.evaluation.evaluate import Subject
+from app.evaluation.evaluate import Subject, check_subject
 from app.evaluation.job import LEAD_S, RUN_FILES, Job
 from app.evaluation.measured import Outcome, load, measure
 from app.evaluation.runner import RunJobs
 from app.slam.params import Params
-from app.slam.provenance import sha256_of
 from app.tuning.objectives import Objective, score
 from app.tuning.report import write_results
 from app.tuning.space import Dimension, grid
@@ -57,6 +56,9 @@ class Runs:
 
     Args:
         folder: for runs. known: folders of runs that were finished before, by key. run, threads: as `evaluate`.
+
+    Raises:
+        HemislamError: a recording cannot be used.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class Runs:
     ) -> None:
         self._subjects, self._objectives, self._folder = subjects, objectives, folder
         self._known, self._run, self._threads = known, run, threads
-        self.hashes = [sha256_of(subject.recording) for subject in subjects]
+        self.hashes = [check_subject(subject) for subject in subjects]
 
     def asked(self, how: SearchMethod, trials: int, seed: int, part: Part) -> dict[str, Any]:
         """What a search was asked for, as its report keeps it."""
