@@ -242,6 +242,12 @@ def test_an_objective_without_truth_is_refused(recording: Path, tmp_path: Path) 
     assert "needs true poses" in result.output
 
 
+def test_a_recording_that_is_not_there_is_named(tmp_path: Path) -> None:
+    result = tune(tmp_path / "gone.mcap", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "There is no recording" in result.output
+
+
 def test_without_a_part_to_search_on_nothing_is_held_back(recording: Path, tmp_path: Path) -> None:
     result = CliRunner().invoke(cli, ["tune", str(recording), "--out", str(tmp_path / "out"), "--held-back", "5"])
     assert result.exit_code == 2
