@@ -1,8 +1,11 @@
-"""A KMZ as Google Earth reads it: order and names of KML 2.2, and places that pyproj confirms."""
+"""A KMZ as Google Earth reads it: valid by the schema of KML 2.2, and at places that pyproj confirms."""
 
+import importlib
+import importlib.resources
 import io
 import zipfile
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,12 +19,6 @@ from app.export.results import of_formats, save_results
 from app.slam.errors import HemislamError
 
 KML, GX = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
-ORDER = {
-    "Placemark": ("name", "visibility", "TimeStamp", "styleUrl", "Point", "LineString"),
-    "GroundOverlay": ("name", "color", "Icon", "LatLonQuad"),
-    "LineString": ("tessellate", "coordinates"),
-}
-"""Children in the order that the schema of KML 2.2 (OGC 07-147r2) prescribes."""
 
 
 def places(element: ElementTree.Element | None) -> np.ndarray:
@@ -39,10 +36,6 @@ def test_walk_picture_and_keyframes_lie_where_they_are(tmp_path: Path) -> None:
         assert file.namelist() == ["doc.kml", "map.png"], "doc.kml comes first"
         root = ElementTree.fromstring(file.read("doc.kml"))
         picture = np.asarray(Image.open(io.BytesIO(file.read("map.png"))))
-    for name, order in ORDER.items():
-        for element in root.iter(f"{KML}{name}"):
-            children = [child.tag.split("}")[1] for child in element]
-            assert children == sorted(children, key=order.index), name
     expected = UTM.to_crs(results.trajectory.positions)[:, :2]
     np.testing.assert_allclose(places(root.find(f".//{KML}LineString/{KML}coordinates")), expected, atol=1e-3)
     sensor = UTM.to_crs(next(results.blocks()).T_map_lidar[None, :3, 3])[:, :2]
@@ -53,6 +46,20 @@ def test_walk_picture_and_keyframes_lie_where_they_are(tmp_path: Path) -> None:
     corner = UTM.to_crs(np.array([[-3.0, -2.0, 0.0]]))[0, :2]
     column, row = ((corner - lower_left) / (upper_right - lower_left) * picture.shape[1::-1]).astype(int)
     assert picture[::-1][row, column, 3] > 100 and picture[0, 0, 3] == 0, "walls show, the outside is transparent"
+
+
+def test_the_document_is_valid_kml(tmp_path: Path) -> None:
+    """By the schemas of OGC KML 2.2 and of Google's extensions to it, which pykml carries."""
+    save_results(tmp_path, room(UTM), of_formats(["kmz"]))
+    etree: Any = importlib.import_module("lxml.etree")
+    with importlib.resources.as_file(importlib.resources.files("pykml") / "schemas") as schemas:
+        schema = etree.XMLSchema(etree.parse(str(schemas / "kml22gx.xsd")))
+    with zipfile.ZipFile(tmp_path / "map.kmz") as file:
+        document = etree.fromstring(file.read("doc.kml"))
+    schema.assertValid(document)
+    placemark = document.find(f".//{KML}Placemark")
+    placemark.append(placemark.find(f"{KML}name"))  # it must come first
+    assert not schema.validate(document)
 
 
 def test_a_kmz_needs_a_place(tmp_path: Path) -> None:
