@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from app.slam import lie
 from app.slam.metrics import GroundScore
@@ -65,7 +64,7 @@ class Frame:
             stamp_ns=result.stamp_ns,
             keyframe=result.keyframe is not None,
             position=T_odom_imu[:3, 3].copy(),
-            quaternion=Rotation.from_matrix(T_odom_imu[:3, :3]).as_quat(),
+            quaternion=lie.quaternion(T_odom_imu[:3, :3]),
             readouts=_readouts(result),
             status=result.status,
             notices=result.notices,

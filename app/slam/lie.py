@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from app.slam.kernels import small
 from app.slam.types import F64
 
 _SMALL = 1e-8
@@ -51,21 +52,10 @@ def log(R: F64) -> F64:
 
 def quaternion(R: F64) -> F64:
     """(..., 3, 3) rotations to (..., 4) unit quaternions x, y, z, w with w >= 0 (Shepperd's method)."""
-    R = np.asarray(R, dtype=np.float64)
-    m = R.reshape(-1, 3, 3)
-    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    # 4 q_i^2 for i = x, y, z, w; the largest one is divided by, so no precision is lost
-    squares = np.stack([1 + 2 * m[:, i, i] - trace for i in range(3)] + [1 + trace], axis=1)
-    products = np.empty((len(m), 4, 4))
-    for i in range(4):
-        products[:, i, i] = squares[:, i]
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        products[:, i, j] = products[:, j, i] = m[:, i, j] + m[:, j, i]
-        products[:, k, 3] = products[:, 3, k] = m[:, j, i] - m[:, i, j]
-    rows = products[np.arange(len(m)), np.argmax(squares, axis=1)]
-    q = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    q = np.where(q[:, 3:] < 0, -q, q)
-    return np.asarray(q.reshape(*R.shape[:-2], 4))
+    matrices = np.array(R, dtype=np.float64).reshape(-1, 3, 3)  # a copy, so that all callers share one kernel
+    out = np.empty((len(matrices), 4))
+    small.quaternions(matrices, out)
+    return out.reshape(*np.shape(R)[:-2], 4)
 
 
 def matrix(q: F64) -> F64:

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 from numba import njit
 
 CHUNKS = 32
@@ -28,6 +29,34 @@ def rotation(wx, wy, wz, out):
     out[0, 0], out[0, 1], out[0, 2] = 1.0 - b * (wy * wy + wz * wz), b * wx * wy - a * wz, b * wx * wz + a * wy
     out[1, 0], out[1, 1], out[1, 2] = b * wx * wy + a * wz, 1.0 - b * (wx * wx + wz * wz), b * wy * wz - a * wx
     out[2, 0], out[2, 1], out[2, 2] = b * wx * wz - a * wy, b * wy * wz + a * wx, 1.0 - b * (wx * wx + wy * wy)
+
+
+@njit(cache=True)
+def quaternions(R, out):
+    """Rotations R (n, 3, 3) f64 to out (n, 4) f64: x, y, z, w, with w >= 0.
+
+    Shepperd's method: the largest one is divided by, so no precision is lost.
+    """
+    row = np.empty(4)
+    for n in range(len(R)):
+        m = R[n]
+        trace = m[0, 0] + m[1, 1] + m[2, 2]
+        largest, square = 3, 1 + trace  # 4 q² of it
+        for i in range(2, -1, -1):
+            if 1 + 2 * m[i, i] - trace >= square:
+                largest, square = i, 1 + 2 * m[i, i] - trace
+        row[largest] = square
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            if largest == 3:
+                row[i] = m[k, j] - m[j, k]
+            elif largest == i:
+                row[j], row[k] = m[i, j] + m[j, i], m[i, k] + m[k, i]
+                row[3] = m[k, j] - m[j, k]
+        size = math.sqrt(row[0] * row[0] + row[1] * row[1] + row[2] * row[2] + row[3] * row[3])
+        sign = -1.0 if row[3] < 0 else 1.0
+        for i in range(4):
+            out[n, i] = sign * (row[i] / size)
 
 
 @njit(cache=True)
