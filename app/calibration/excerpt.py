@@ -113,10 +113,4 @@ def _thinned(scan: Scan, params: Params, grid: VoxelGrid) -> Scan:
     first = within[grid.downsample(np.ascontiguousarray(scan.points[within]), VOXEL).source]
     late = np.argmax(scan.offsets_ns) if len(scan) else 0
     kept = np.unique(np.append(first, late)) if len(first) else first  # the last point gives the scan's end
-    return Scan(
-        scan.stamp_ns,
-        np.ascontiguousarray(scan.points[kept]),
-        np.ascontiguousarray(scan.offsets_ns[kept]),
-        scan.intensity[kept],
-        scan.ring[kept],
-    )
+    return scan.part(kept)

@@ -6,6 +6,7 @@ import numpy as np
 
 from app.calibration.inertial import Inertial
 from app.slam import lie
+from app.slam.coast import Course
 from app.slam.types import F64
 
 STEP_S = 0.005
@@ -46,11 +47,16 @@ class Guide:
             gravity,
         )
 
-    def turned(self, end: float, back: F64) -> F64:
-        """(k, 3, 3) rotations R_end_then of the LiDAR at the times `end` + `back` (k,) s."""
-        return np.asarray(self.R_imu_lidar.T @ self._turned(end, back)[0] @ self.R_imu_lidar)
+    def course(self, end: float, back: F64, R_world_lidar: F64) -> Course:
+        """How the LiDAR came to its pose at the time `end` s.
 
-    def swayed(self, end: float, back: F64, R_world_lidar: F64) -> tuple[F64, F64]:
+        Args:
+            back: (k,) s, ascending to 0. R_world_lidar: (3, 3) at the first of these times.
+        """
+        turned = np.asarray(self.R_imu_lidar.T @ self._turned(end, back)[0] @ self.R_imu_lidar)
+        return Course(back, turned, *self._swayed(end, back, R_world_lidar @ turned[0].T))
+
+    def _swayed(self, end: float, back: F64, R_world_lidar: F64) -> tuple[F64, F64]:
         """How far (k, 3) m and how fast (k, 3) m/s the LiDAR was off a motion of constant velocity that it had at the
         end; in its frame at the end.
 

@@ -1,23 +1,34 @@
-"""Prediction without an IMU: the device goes on, and turns on, as fast as it did.
+"""The motion by the LiDAR alone: between two scans the device turns and moves on as fast as it did.
 
-The angular velocity is held by the state as the bias of a gyroscope that reads zero, so the filter corrects it as it
-corrects any bias. Gravity is the normal of the floor where one is seen.
+Each point is compared with the map where the device was at the point's own time, so a scan determines rates and not
+only a pose (continuous-time ICP, Dellenbach et al. 2022, "CT-ICP"). The state holds the rate of turn as the bias of a
+gyroscope that reads zero. Gravity is the normal of the floor where one is seen.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.slam import ground, lie
-from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief, Path
+from app.slam import ground, iekf, lie
+from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
+from app.slam.kernels import motion
+from app.slam.kernels.registration import EDGE_ON, REPEATED, RESIDUAL_HUBER
+from app.slam.local_map import LocalMap
 from app.slam.params import Params
-from app.slam.types import F64, NavState, Scan
+from app.slam.sections import FilterParams
+from app.slam.types import F32, F64, NavState, Registration, Scan
 
-PUSHED, TURNED = 1.5, 1.0
-"""m/s², rad/s²: standard deviations of how a walking person's hand accelerates."""
+CHANGES = (1.0, 3.0)
+"""rad/s and m/s²: change of the rate of turn from a scan to the next, and acceleration, of a walking person's hand."""
 FIRST_SPEED, FIRST_RATE = 1.5, 1.0
 """m/s, rad/s: standard deviations before the first two scans are compared."""
 KNOT_S = 0.0025
+GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
+"""Of the residuals in each iteration, times the filter's gate; wide at first, since nothing measures the motion."""
+CONVERGED_ROTATION, CONVERGED_TRANSLATION = 1e-4, 1e-3
+"""rad, m: an increment below these ends the iteration."""
+FREE = slice(0, 12)
+"""Error dimensions that a scan corrects: rotation, position, velocity and rate of turn."""
 UPRIGHT = np.array([[0.0, 0.0, 1.0]])
 FORWARD = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
 """What may be up in the LiDAR frame: of a scanner held upright, and of a hemispherical one that looks forward."""
@@ -25,43 +36,132 @@ BELOW_DEG = -3.0
 """A LiDAR that sees lower than this is one that is held upright."""
 
 
+@dataclass(frozen=True, slots=True)
+class Course:
+    """How the device came to its pose at the end of a scan, seen from there, beside a motion at constant rates.
+
+    Attributes:
+        times: (k,) s before the end, ascending to 0. turned: (k, 3, 3) R_end_then. swayed: (k, 3) m.
+        speeds: (k, 3) m/s, the change of `swayed`.
+    """
+
+    times: F64
+    turned: F64
+    swayed: F64
+    speeds: F64
+
+    @classmethod
+    def steady(cls, begin_ns: int, end_ns: int) -> "Course":
+        """At constant rates."""
+        dt = max((end_ns - begin_ns) * 1e-9, 1e-6)
+        times = np.linspace(-dt, 0.0, int(np.ceil(dt / KNOT_S)) + 1)
+        nothing = np.zeros((len(times), 3))
+        return cls(times, np.tile(np.eye(3), (len(times), 1, 1)), nothing, nothing)
+
+
 def begin(scan: Scan, params: Params) -> Belief:
     """Belief at the first scan's begin; odom's z is the normal of the floor that the scan shows, if it shows one."""
-    R_imu_lidar = lie.from_rpy_degrees(params.sensor.rotation)
-    up = R_imu_lidar @ _up(scan, params)
+    up = lie.from_rpy_degrees(params.sensor.rotation) @ _up(scan, params)
+    return standing(scan.stamp_ns, lie.between(up, np.array([0.0, 0.0, 1.0])), params)
+
+
+def standing(stamp_ns: int, R_odom_imu: F64, params: Params) -> Belief:
+    """Belief at odom's origin, with unknown rates."""
     sigma = np.zeros(DIM)
     sigma[ROT] = sigma[POS] = 1e-4
     sigma[VEL], sigma[BG], sigma[BA], sigma[GRAV] = FIRST_SPEED, FIRST_RATE, 1e-3, 1e-3
     sigma[EXT_ROT] = sigma[EXT_POS] = 1e-6
     state = NavState(
-        stamp_ns=scan.stamp_ns,
-        R_odom_imu=lie.between(up, np.array([0.0, 0.0, 1.0])),
+        stamp_ns=stamp_ns,
+        R_odom_imu=R_odom_imu,
         p_odom_imu=np.zeros(3),
         v_odom_imu=np.zeros(3),
         b_gyro=np.zeros(3),
         b_accel=np.zeros(3),
         g_odom=np.array([0.0, 0.0, -params.imu.gravity]),
-        R_imu_lidar=R_imu_lidar,
+        R_imu_lidar=lie.from_rpy_degrees(params.sensor.rotation),
         p_imu_lidar=np.array(params.sensor.translation, dtype=np.float64),
     )
     return Belief(state, np.diag(sigma**2))
 
 
-def propagate(belief: Belief, end_ns: int) -> tuple[Belief, Path]:
-    """Carry the belief forward to `end_ns` at constant velocity and angular velocity."""
-    state = belief.state
-    dt = max((end_ns - state.stamp_ns) * 1e-9, 1e-6)
-    times = np.linspace(-dt, 0.0, int(np.ceil(dt / KNOT_S)) + 1)
-    rate = -state.b_gyro
-    R = np.stack([state.R_odom_imu @ lie.exp(rate * (t + dt)) for t in times])
-    p = state.p_odom_imu + (times + dt)[:, None] * state.v_odom_imu
+def propagate(belief: Belief, end_ns: int, course: Course, changes: tuple[float, float] = CHANGES) -> Belief:
+    """Carry the belief forward to `end_ns` along the course.
+
+    Args:
+        changes: standard deviations, as CHANGES.
+    """
+    state, dt = belief.state, -float(course.times[0])
+    R = state.R_odom_imu @ course.turned[0].T @ lie.exp(-state.b_gyro * dt)
+    v = state.v_odom_imu - R @ course.speeds[0]
     F, Q = np.eye(DIM), np.zeros((DIM, DIM))
-    F[ROT, ROT], F[ROT, BG], F[POS, VEL] = lie.exp(-rate * dt), -dt * np.eye(3), dt * np.eye(3)
-    for value, change, size, sign in ((ROT, BG, TURNED, -1.0), (POS, VEL, PUSHED, 1.0)):
-        Q[value, value], Q[change, change] = (size * dt**2 / 2) ** 2 * np.eye(3), (size * dt) ** 2 * np.eye(3)
-        Q[value, change] = Q[change, value] = sign * size**2 * dt**3 / 2 * np.eye(3)
-    moved = replace(state, stamp_ns=end_ns, R_odom_imu=R[-1], p_odom_imu=p[-1])
-    return Belief(moved, F @ belief.covariance @ F.T + Q), Path(times, np.concatenate([R, p[:, :, None]], axis=2))
+    F[ROT, ROT], F[ROT, BG], F[POS, VEL] = R.T @ state.R_odom_imu, -dt * np.eye(3), dt * np.eye(3)
+    for pose, rate, change, sign in ((ROT, BG, changes[0], -1.0), (POS, VEL, changes[1] * dt, 1.0)):
+        Q[pose, pose], Q[rate, rate] = change**2 * dt**2 / 3 * np.eye(3), change**2 * np.eye(3)
+        Q[pose, rate] = Q[rate, pose] = sign * change**2 * dt / 2 * np.eye(3)
+    p = state.p_odom_imu + v * dt - R @ course.swayed[0]
+    moved = replace(state, stamp_ns=end_ns, R_odom_imu=R, p_odom_imu=p, v_odom_imu=v)
+    return Belief(moved, F @ belief.covariance @ F.T + Q)
+
+
+def deskew(scan: Scan, state: NavState, course: Course) -> F32:
+    """(n, 3) float32 m, all points in the LiDAR frame at the time of `state`, at its rates."""
+    knots = np.tile(np.eye(4), (len(course.times), 1, 1))
+    knots[:, :3, :3] = course.turned @ lie.exp(-state.b_gyro * course.times[:, None])
+    knots[:, :3, 3] = (state.R_odom_imu.T @ state.v_odom_imu) * course.times[:, None] + course.swayed
+    seen = (lie.inverse(state.T_imu_lidar) @ knots @ state.T_imu_lidar)[:, :3]
+    shift = (scan.stamp_ns - state.stamp_ns) * 1e-9
+    out = np.empty_like(scan.points)
+    motion.deskew(scan.points, scan.offsets_ns, shift, course.times, np.ascontiguousarray(seen), out)
+    return out
+
+
+def update(
+    prior: Belief, scan: Scan, course: Course, local_map: LocalMap, params: FilterParams
+) -> tuple[Belief, Registration]:
+    """Correct pose and rates by one scan: iterated least squares from the prior, as `iekf.update`.
+
+    Args:
+        scan: points as measured; at most `max_points` of them are looked up in the map.
+    """
+    scan = scan.part(slice(None, None, -(-len(scan) // params.max_points) or 1))
+    ago = ((scan.stamp_ns - prior.state.stamp_ns + scan.offsets_ns.astype(np.int64)) * 1e-9)[:, None]  # <= 0
+    information, here = np.linalg.inv(prior.covariance[FREE, FREE]), prior.state
+    enough = iekf.enough_planes(len(scan), float(np.linalg.norm(here.v_odom_imu)))
+    converged, iteration, covariance = False, 0, prior.covariance.copy()
+    for iteration, gate in enumerate(GATES, 1):
+        points = deskew(scan, here, course)
+        arms = points @ here.R_imu_lidar.T + here.p_imu_lidar
+        world = arms @ here.R_odom_imu.T + here.p_odom_imu
+        good, poor = local_map.planes(world, params)
+        planes = good if np.count_nonzero(good.variances >= 0) >= enough else poor
+        found = np.flatnonzero(planes.variances >= 0)  # nothing was written elsewhere
+        at, spread = planes.normals[found], np.sqrt(planes.variances[found])
+        off = np.sum(at * (world[found] - planes.centers[found]), axis=1)
+        normals, reach = at @ here.R_odom_imu, np.linalg.norm(points[found], axis=1)
+        fits = np.abs(off) < gate * params.gate * np.sqrt(reach)
+        fits &= np.abs(np.sum(normals @ here.R_imu_lidar * points[found], axis=1)) > EDGE_ON * reach
+        used, off, spread = found[fits], off[fits], spread[fits]
+        residuals = np.full(len(scan), np.nan)
+        residuals[used] = off
+        stats = np.array([len(used), np.sum(off**2)])
+        if len(used) < iekf.MIN_INLIERS:
+            return prior, iekf.too_few(iteration, len(scan), len(used), iekf.matches(points, residuals, planes))
+        turn, way = np.cross(arms[used], normals[fits]), at[fits]
+        rows = np.hstack([turn, way, ago[used] * way, -ago[used] * turn])
+        weighted = rows.T * (np.minimum(1.0, RESIDUAL_HUBER * spread / np.maximum(np.abs(off), 1e-9)) / spread**2)
+        H = weighted @ rows / REPEATED
+        gradient = weighted @ off / REPEATED + information @ iekf.boxminus(here, prior.state)[FREE]
+        covariance[FREE, FREE] = np.linalg.inv(information + H)
+        step = np.zeros(DIM)
+        step[FREE] = -covariance[FREE, FREE] @ gradient
+        here = iekf.boxplus(here, step)
+        small = np.linalg.norm(step[ROT]) < CONVERGED_ROTATION and np.linalg.norm(step[POS]) < CONVERGED_TRANSLATION
+        if gate == 1.0 and small:
+            converged = True
+            break
+    went = iekf.outcome(points, H[:6, :6], converged, iteration, stats, iekf.matches(points, residuals, planes))
+    return Belief(here, covariance), went
 
 
 def _up(scan: Scan, params: Params) -> F64:

@@ -2,7 +2,9 @@
 
 import contextlib
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from app.slam.keyframes import KeyframeStore
 from app.slam.lines import LineErrors
 from app.slam.local_map import LocalMap, MapState
 from app.slam.params import Params
-from app.slam.types import F32, F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
+from app.slam.types import F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
 from app.slam.voxel import VoxelGrid, spread
 
 
@@ -96,10 +98,13 @@ class Engine:
         if len(samples):
             predicted, path = imu.propagate(belief, samples, end_ns, p.imu)
             predicted = rest.hold(predicted, samples)
+            watch.lap("propagate")
+            points = imu.deskew(scan, path, predicted.state)
         else:
-            predicted, path = coast.propagate(belief, end_ns)
-        watch.lap("propagate")
-        points = imu.deskew(scan, path, predicted.state)
+            course = coast.Course.steady(belief.state.stamp_ns, end_ns)
+            predicted = coast.propagate(belief, end_ns, course)
+            watch.lap("propagate")
+            points = coast.deskew(scan, predicted.state, course)
         watch.lap("deskew")
 
         # paper 2.2: the ground, and only the ground, is thinned before the filter's own scan voxel
@@ -112,10 +117,20 @@ class Engine:
         # paper 2.3, eq. 5-7
         posterior, registration = predicted, _NOT_REGISTERED
         if self._map.voxels:
-            chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
-            posterior, registration = self._update(belief, predicted, chosen)
-            if not len(samples):  # the prediction was no measurement that the scan could contradict
+            if len(samples):
+                chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
+                posterior, registration = self._update(
+                    belief, predicted, partial(iekf.update, predicted, chosen, self._map, p.filter)
+                )
+            else:  # the points themselves, since centroids have no time
+                returns = scan.part(reduced.source[sampled.source])
+                posterior, registration = self._update(
+                    belief, predicted, partial(coast.update, predicted, returns, course, self._map, p.filter)
+                )
+                # the prediction was no measurement that the scan could contradict
                 registration = replace(registration, predicted_change=np.nan, correction=np.nan)
+                points = coast.deskew(scan, posterior.state, course)
+                sampled = replace(sampled, points=points[reduced.source[sampled.source]])
         status = _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 
@@ -196,17 +211,19 @@ class Engine:
         """Give the disk space of the keyframes back."""
         self.keyframes.close()
 
-    def _update(self, last: Belief, predicted: Belief, points: F32) -> tuple[Belief, Registration]:
-        """As `iekf.update`; after a numerical failure, the prediction stands and the frame is lost."""
+    def _update(
+        self, last: Belief, predicted: Belief, update: Callable[[], tuple[Belief, Registration]]
+    ) -> tuple[Belief, Registration]:
+        """What the update gives; after a numerical failure, the prediction stands and the frame is lost."""
         with contextlib.suppress(np.linalg.LinAlgError):
-            posterior, registration = iekf.update(predicted, points, self._map, self.params.filter)
+            posterior, registration = update()
             if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():
                 change, correction = (
                     float(np.linalg.norm(after.v_odom_imu - before.v_odom_imu))
                     for before, after in ((last.state, predicted.state), (predicted.state, posterior.state))
                 )
                 return posterior, replace(registration, predicted_change=change, correction=correction)
-        return predicted, replace(_NOT_REGISTERED, used=len(points), reason="the update gave no finite pose")
+        return predicted, replace(_NOT_REGISTERED, reason="the update gave no finite pose")
 
     def _insert(self, belief: Belief, points: np.ndarray, residual: float) -> None:
         T = (belief.state.T_odom_imu @ belief.state.T_imu_lidar).astype(np.float32)
@@ -250,14 +267,7 @@ def _in_range(scan: Scan, nearest: float, farthest: float) -> Scan:
     keep = np.empty(len(scan), dtype=np.bool_)
     if clouds.in_range(scan.points, nearest, farthest, keep) == len(scan):
         return scan
-    return Scan(
-        scan.stamp_ns,
-        scan.points[keep],
-        scan.offsets_ns[keep],
-        scan.intensity[keep],
-        scan.ring[keep],
-        None if scan.truth_ground is None else scan.truth_ground[keep],
-    )
+    return scan.part(keep)
 
 
 class _Stopwatch:

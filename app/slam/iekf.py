@@ -101,10 +101,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
             params.gate, params.estimate_extrinsics, H, b, stats, residuals,
         )  # fmt: skip
         if stats[0] < MIN_INLIERS:
-            reason = f"only {int(stats[0])} of {n} points found a plane in the map; an update needs {MIN_INLIERS}"
-            matches = _matches(points, residuals, planes)
-            nothing = Registration(False, iteration, n, int(stats[0]), float("nan"), np.zeros(6), True, reason, matches)
-            return prior, nothing
+            return prior, too_few(iteration, n, int(stats[0]), matches(points, residuals, planes))
         here, x = x, np.empty(manifold.SIZE)
         manifold.gauss_newton(here, begin, information, H, b, covariance, step, x)
         since_search += step
@@ -113,21 +110,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
             break
 
     assert planes is not None
-    reach = float(np.sqrt(np.mean(np.sum(points.astype(np.float64) ** 2, axis=1))))
-    scale = np.r_[np.full(3, 1.0 / reach), np.ones(3)]
-    eigenvalues = np.linalg.eigvalsh(H[:6, :6] * np.outer(scale, scale))
-    degenerate = bool(eigenvalues[0] < 1.0 / DEGENERATE_SIGMA**2)
-    registration = Registration(
-        converged=converged,
-        iterations=iteration,
-        used=n,
-        inliers=int(stats[0]),
-        residual_rms=float(np.sqrt(stats[1] / stats[0])),
-        eigenvalues=eigenvalues,
-        degenerate=degenerate,
-        reason="this scan leaves one direction unobserved" if degenerate else "",
-        matches=_matches(points, residuals, planes),
-    )
+    registration = outcome(points, H[:6, :6], converged, iteration, stats, matches(points, residuals, planes))
     posterior = prior.covariance.copy()
     posterior[:free, :free] = covariance
     # states that are not estimated keep their variance, and their correlations shrink with the rest (Schmidt 1966)
@@ -136,15 +119,46 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
     return Belief(_unpacked(x, prior.state.stamp_ns), posterior), registration
 
 
-def _matches(points: F32, residuals: F64, planes: Planes) -> Matches:
+def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Registration:
+    """What an update says that found too few planes."""
+    reason = f"only {inliers} of {used} points found a plane in the map; an update needs {MIN_INLIERS}"
+    return Registration(False, iterations, used, inliers, float("nan"), np.zeros(6), True, reason, matches)
+
+
+def outcome(points: F32, H: F64, converged: bool, iterations: int, stats: F64, matches: Matches) -> Registration:
+    """How an update went.
+
+    Args:
+        points: (n, 3) m, LiDAR frame. H: (6, 6) information of the scan alone on the pose. stats: (2,) inliers, and the
+            sum of their squared distances in m².
+    """
+    reach = float(np.sqrt(np.mean(np.sum(points.astype(np.float64) ** 2, axis=1))))
+    scale = np.r_[np.full(3, 1.0 / reach), np.ones(3)]
+    eigenvalues = np.linalg.eigvalsh(H * np.outer(scale, scale))
+    degenerate = bool(eigenvalues[0] < 1.0 / DEGENERATE_SIGMA**2)
+    return Registration(
+        converged=converged,
+        iterations=iterations,
+        used=len(points),
+        inliers=int(stats[0]),
+        residual_rms=float(np.sqrt(stats[1] / stats[0])),
+        eigenvalues=eigenvalues,
+        degenerate=degenerate,
+        reason="this scan leaves one direction unobserved" if degenerate else "",
+        matches=matches,
+    )
+
+
+def matches(points: F32, residuals: F64, planes: Planes) -> Matches:
+    """By point, what was looked up."""
     found = planes.variances[:, None] >= 0.0  # elsewhere normals and centers were never written
     normals, centers = np.where(found, planes.normals, 0.0), np.where(found, planes.centers, 0.0)
-    matches = Matches(
+    found_at = Matches(
         points.copy(), residuals.astype(np.float32), normals.astype(np.float32), centers.astype(np.float32)
     )
-    for array in (matches.points, matches.residuals, matches.normals, matches.centers):
+    for array in (found_at.points, found_at.residuals, found_at.normals, found_at.centers):
         array.setflags(write=False)
-    return matches
+    return found_at
 
 
 def _over(step: F64, rotation: float, translation: float) -> bool:

@@ -130,10 +130,10 @@ def test_within_a_scan_the_lidar_is_where_its_motion_had_it() -> None:
     velocity = (lidar[-1] - lidar[-2]) / 2e-4
     R_end = R_world_imu[10] @ R
     true = (lidar[:11] - lidar[10] - velocity * back[:, None]) @ R_end
-    ways, _ = guide.swayed(3.0, back, R_end)
+    course = guide.course(3.0, back, R_world_imu[0] @ R)
     assert np.abs(true).max() > 1e-3
-    assert np.abs(ways - true).max() < 2e-4
-    assert np.abs(guide.turned(3.0, back) - R_end.T @ R_world_imu[:11] @ R).max() < 1e-4
+    assert np.abs(course.swayed - true).max() < 2e-4
+    assert np.abs(course.turned - R_end.T @ R_world_imu[:11] @ R).max() < 1e-4
 
 
 @pytest.mark.parametrize("rate", [100, 200, 400])
