@@ -22,7 +22,8 @@ CHANGES = (1.0, 3.0)
 """rad/s and m/s²: change of the rate of turn from a scan to the next, and acceleration, of a walking person's hand."""
 FIRST_SPEED, FIRST_RATE = 1.5, 1.0
 """m/s, rad/s: standard deviations before the first two scans are compared."""
-KNOT_S = 0.0025
+KNOT_S, LONGEST_S = 0.0025, 1.0
+"""How far poses in between are apart, and how long a scan lasts at most: a gap before it needs none."""
 GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
 """Of the residuals in each iteration, times the filter's gate; wide at first, since nothing measures the motion."""
 CONVERGED_ROTATION, CONVERGED_TRANSLATION = 1e-4, 1e-3
@@ -54,7 +55,9 @@ class Course:
     def steady(cls, begin_ns: int, end_ns: int) -> "Course":
         """At constant rates."""
         dt = max((end_ns - begin_ns) * 1e-9, 1e-6)
-        times = np.linspace(-dt, 0.0, int(np.ceil(dt / KNOT_S)) + 1)
+        scan = min(dt, LONGEST_S)
+        times = np.linspace(-scan, 0.0, int(np.ceil(scan / KNOT_S)) + 1)
+        times = np.append(-dt, times) if scan < dt else times
         nothing = np.zeros((len(times), 3))
         return cls(times, np.tile(np.eye(3), (len(times), 1, 1)), nothing, nothing)
 
@@ -124,7 +127,7 @@ def update(
     Args:
         scan: points as measured; at most `max_points` of them are looked up in the map.
     """
-    scan = scan.part(slice(None, None, -(-len(scan) // params.max_points) or 1))
+    scan = scan.part(np.arange(0, len(scan), -(-len(scan) // params.max_points) or 1))
     ago = ((scan.stamp_ns - prior.state.stamp_ns + scan.offsets_ns.astype(np.int64)) * 1e-9)[:, None]  # <= 0
     information, here = np.linalg.inv(prior.covariance[FREE, FREE]), prior.state
     enough = iekf.enough_planes(len(scan), float(np.linalg.norm(here.v_odom_imu)))

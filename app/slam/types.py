@@ -62,8 +62,8 @@ class Scan:
         """Time of the last point. The pose of a frame is the pose at this time."""
         return self.stamp_ns + (int(self.offsets_ns.max()) if self.offsets_ns.size else 0)
 
-    def part(self, which: Mask | I32 | I64 | slice) -> "Scan":
-        """Some of its points; nothing is refused any more."""
+    def part(self, which: Mask | I32 | I64) -> "Scan":
+        """Some of its points, by a mask or by their indices; `refused` is not kept."""
         labels = None if self.truth_ground is None else self.truth_ground[which]
         points, offsets_ns = self.points[which], self.offsets_ns[which]
         return Scan(self.stamp_ns, points, offsets_ns, self.intensity[which], self.ring[which], labels)

@@ -108,6 +108,17 @@ def test_going_back_without_an_imu_repeats_the_walk_to_the_last_bit() -> None:
         assert one.cloud.points.tobytes() == other.cloud.points.tobytes()
 
 
+def test_a_scan_without_points_and_a_day_without_scans_are_survived() -> None:
+    room = [replace(e, imu=NOTHING) for e in measurements(furnished_room(), Walk(FORWARD), Rig(), 12)]
+    engine = Engine(params_for(Rig()))
+    run(engine, iter(room[:10]))
+    empty = engine.step(room[10].scan.part(np.arange(0)), NOTHING)
+    later = replace(room[11].scan, stamp_ns=room[11].scan.stamp_ns + 86_400_000_000_000)
+    for result in (empty, engine.step(later, NOTHING)):
+        assert np.isfinite(result.state.T_odom_imu).all()
+    assert empty.status is FrameStatus.LOST
+
+
 @pytest.mark.parametrize("tilt", [-10.0, 5.0])
 def test_up_is_the_normal_of_the_floor(tilt: float) -> None:
     R_world_lidar = FORWARD @ Rotation.from_euler("y", tilt, degrees=True).as_matrix()
