@@ -44,7 +44,7 @@ def measure(model: Model) -> list[Line]:
 
 
 def _turns(model: Model) -> list[list[bytes]]:
-    blocks = model.blocks_per_turn(10)
+    blocks = 100_000_000 // model.block_ns
     writer = PacketWriter(model)
     rng = np.random.default_rng(0)
     azimuth = np.rint(np.arange(blocks) * 36_000 / blocks).astype(np.uint16)

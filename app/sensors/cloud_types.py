@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.sensors.livox import CUSTOM_MSGS, CustomMsg
-from app.sensors.ros import stamp_ns
+from app.sensors.ros import DATATYPES, stamp_ns
 from app.slam.errors import printable
 from app.slam.types import F32, U8
 
@@ -96,17 +96,13 @@ class CloudType:
         return field.lower() in self.times or "time" in field.lower() or "stamp" in field.lower()
 
 
-_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
-"""PointField.datatype as numpy's; 9 and 10 (64-bit integers) are an extension that some drivers use."""
-
-
 def read_point_cloud_2(message: Any) -> CloudMessage:
     """sensor_msgs/PointCloud2 of ROS 1 or ROS 2: any order, type, padding and byte order of the fields."""
     order = ">" if message.is_bigendian else "<"
     fields = {
-        printable(field.name): (int(field.offset), np.dtype(order + _DATATYPES[field.datatype]))
+        printable(field.name): (int(field.offset), np.dtype(order + DATATYPES[field.datatype]))
         for field in message.fields
-        if field.datatype in _DATATYPES
+        if field.datatype in DATATYPES
     }
     height, width, point_step = int(message.height), int(message.width), int(message.point_step)
     row_step = int(message.row_step)

@@ -8,7 +8,7 @@ import numpy as np
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, Probe, stamped
 from app.sensors.findings import Finding
 from app.sensors.imu_units import ABSURD, ImuProbe
-from app.sensors.ros import IMU, stamp_ns
+from app.sensors.ros import IMU, imu_values, stamp_ns
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
 
@@ -104,10 +104,9 @@ def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProb
     """
     logs, stamps, values = [], [], []
     for _, log_ns, message in _readable(source.messages((topic,))):
-        w, a = message.angular_velocity, message.linear_acceleration
         logs.append(log_ns)
         stamps.append(stamp_ns(message.header.stamp))
-        values.append((w.x, w.y, w.z, a.x, a.y, a.z))
+        values.append(imu_values(message))
         if log_ns - logs[0] > PROBED_IMU_NS:
             break
     has_stamps = len(set(stamps)) > 1

@@ -18,7 +18,7 @@ from app.sensors.pointcloud import decode, read_scan
 from app.sensors.presets import preset_for
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu, usable_types
 from app.sensors.rings import line_findings
-from app.sensors.ros import stamp_ns
+from app.sensors.ros import imu_values, stamp_ns
 from app.sensors.sequencer import Sequencer
 from app.sensors.source import Mark, Source
 from app.slam.errors import HemislamError
@@ -170,9 +170,8 @@ class Recording:
 
     def _imu_entry(self, message: Any, log_ns: int) -> ImuEntry:
         stamp = stamp_ns(message.header.stamp) if self._imu_stamped else log_ns
-        w, a = message.angular_velocity, message.linear_acceleration
         offset = round(self.params.recording.imu_time_offset * 1e9)
-        return ImuEntry(log_ns, stamp + offset, *self._imu_units.apply((w.x, w.y, w.z), (a.x, a.y, a.z)))
+        return ImuEntry(log_ns, stamp + offset, *self._imu_units.apply(*imu_values(message)))
 
     def _decode_probes(self, probes: list[Probe], findings: list[Finding]) -> tuple[list[Probe], list[Scan]]:
         """The probes that make scans, and the scans. Raises HemislamError if none does (a wrong time unit, say)."""

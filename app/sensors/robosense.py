@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from app.slam.types import F64, I64, U16
+from app.slam.types import F64, I64
 
 CHANNELS = 32
 
@@ -24,9 +24,6 @@ ELEVATIONS_DEG: F64 = np.array(
     ]
 )  # fmt: skip
 """(32,) nominal elevation above the base plane by channel; a unit's own are in its DIFOP packet."""
-
-RINGS: U16 = np.argsort(np.argsort(ELEVATIONS_DEG)).astype(np.uint16)
-"""(32,) the driver's `ring` by channel: rank of the elevation, 0 = lowest = outermost cone."""
 
 MIN_RANGE_M, MAX_RANGE_M = 0.1, 100.0
 RATED_RANGE_M, RATED_REFLECTIVITY = 30.0, 0.1
@@ -75,10 +72,6 @@ class Model:
     @property
     def part_bytes(self) -> int:
         return 4 + 3 * self.part
-
-    def blocks_per_turn(self, rate_hz: int) -> int:
-        """Whole blocks in one revolution: 1801 at 10 Hz, 900 at 20 Hz."""
-        return 1_000_000_000 // rate_hz // self.block_ns
 
 
 def _offsets_us(*values: float) -> I64:

@@ -23,7 +23,9 @@ ENCODINGS: Final = {"cdr": "ros2msg", "ros1": "ros1msg"}
 
 
 _ROS2 = get_typestore(Stores.ROS2_HUMBLE)
-_DATATYPES = {"<u4": 6, "<f4": 7, "<f8": 8, "<u2": 4, "|u1": 2, "<i8": 9}
+DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
+"""PointField.datatype as numpy's; 9 and 10 (64-bit integers) are an extension that some drivers use."""
+_DATATYPE_OF = {np.dtype(kind): number for number, kind in DATATYPES.items()}
 
 
 class Deserialiser:
@@ -65,6 +67,12 @@ def stamp_ns(stamp: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
+def imu_values(message: Any) -> tuple[Vector, Vector]:
+    """Angular velocity and acceleration of an Imu, in its own units."""
+    w, a = message.angular_velocity, message.linear_acceleration
+    return (w.x, w.y, w.z), (a.x, a.y, a.z)
+
+
 def new(kind: str, **fields: Any) -> Any:
     """A message of a standard type."""
     return _ROS2.types[kind](**fields)
@@ -97,7 +105,7 @@ def points_message(points: npt.NDArray[Any], stamp_ns: int, frame: str) -> Any:
         height=1,
         width=len(points),
         fields=[
-            new("sensor_msgs/msg/PointField", name=name, offset=at, datatype=_DATATYPES[kind.str], count=1)
+            new("sensor_msgs/msg/PointField", name=name, offset=at, datatype=_DATATYPE_OF[kind], count=1)
             for name, (kind, at, *_) in columns.items()
         ],
         is_bigendian=False,

@@ -226,6 +226,7 @@ def log_delay_ns(clouds: list[Probe]) -> float | None:
 def _without_field(
     clouds: list[Probe], chosen: RecordingParams, period_ns: int, period_known: bool, rejected: list[str]
 ) -> tuple[Timing, list[Finding]]:
+    measured = period_ns
     if chosen.rotation_rate > 0:
         period_ns = round(1e9 / chosen.rotation_rate)
         rate = f"{chosen.rotation_rate:g} revolutions per second, as you set it"
@@ -234,12 +235,11 @@ def _without_field(
     else:
         rate = "10 revolutions per second, assumed"
     why = "; ".join(rejected) or ("as you set it" if chosen.time_field == "none" else "the clouds have no time field")
-    measured, known = scan_period_ns(clouds, 0.0)
-    agrees = not known or 0.9 < period_ns / measured < 1.1
+    agrees = not period_known or 0.9 < period_ns / measured < 1.1
     text = f"derived from the azimuth at {rate} ({why}); times recorded by the driver would be better"
     if not agrees:
         text += f"; but clouds come every {measured / 1e9:.3f} s"
-    verdict: FindingVerdict = "corrected" if agrees and known else "needs you"
+    verdict: FindingVerdict = "corrected" if agrees and period_known else "needs you"
     finding = Finding("point time", verdict, text, "--set recording.rotation_rate=10")
     if chosen.header_stamp == "auto":
         header, stamp_finding = _header_by_delay(clouds, period_ns)

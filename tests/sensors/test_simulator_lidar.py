@@ -9,7 +9,8 @@ app/sensors/simulator/scenes/props.py, app/sensors/simulator/scenes/rooms.py.
 import numpy as np
 import pytest
 
-from app.sensors.robosense import BPEARL, BPV4, RINGS
+from app.sensors.live.difop import ChannelAngles
+from app.sensors.robosense import BPEARL, BPV4
 from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
 from app.sensors.simulator.mesh import Mesh, MeshBuilder
 from app.sensors.simulator.raycast import Mover, Raycaster
@@ -75,7 +76,8 @@ def test_firing_times_are_the_vendors() -> None:
 
 
 def test_rings_rank_the_elevations_from_the_base_plane_up() -> None:
-    assert RINGS[0] == 31 and RINGS[31] == 0 and RINGS[15] == 16
+    rings = ChannelAngles.nominal(BPEARL).rings
+    assert rings[0] == 31 and rings[31] == 0 and rings[15] == 16
     pattern = firing_pattern(every_block=50)
     elevation = np.degrees(np.arcsin(pattern.directions[:, 2]))
     lowest, highest = elevation[pattern.ring == 0], elevation[pattern.ring == 31]

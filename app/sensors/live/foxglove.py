@@ -20,7 +20,7 @@ from app.sensors.cloud_types import CLOUD_TYPES
 from app.sensors.live.cloud_reader import CloudReader
 from app.sensors.live.intake import Intake
 from app.sensors.probe import usable_types
-from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type, stamp_ns
+from app.sensors.ros import ENCODINGS, Deserialiser, imu_values, ros2_type, stamp_ns
 from app.slam.params import Params
 
 SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
@@ -154,10 +154,8 @@ class FoxgloveReceiver:
             intake.counters.unreadable += 1
             return
         if sensor == "imu":
-            w, a = message.angular_velocity, message.linear_acceleration
             intake.counters.imu += 1
-            stamp = stamp_ns(message.header.stamp) or log_ns
-            intake.put_imu(stamp, (w.x, w.y, w.z), (a.x, a.y, a.z), arrival)
+            intake.put_imu(stamp_ns(message.header.stamp) or log_ns, *imu_values(message), arrival)
             return
         intake.counters.packets += 1
         assert self._reader is not None

@@ -20,6 +20,7 @@ from app.sensors.imu_units import ABSURD, AS_RECORDED, ImuProbe, ImuUnits, settl
 from app.sensors.live.clock import JUMP_NS, ClockMap, OffsetEstimate
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Counters, Kind, LiveState, Status
+from app.sensors.recording import ImuEntry, ScanEntry
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan, Vector
@@ -35,24 +36,6 @@ _SETTLE_SCANS = 3
 BUSY, NO_IMU = "the engine was too busy", "no IMU sample came to cover it"
 
 Clock = Literal["auto", "sensor", "host"]
-
-
-@dataclass(frozen=True, slots=True)
-class LiveImu:
-    """One sample: rad/s and m/s^2 in the IMU frame, stamped in the engine's time."""
-
-    stamp_ns: int
-    gyro: Vector
-    accel: Vector
-    arrival_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class LiveScan:
-    """A scan, or a scan that could not be read."""
-
-    scan: Scan | DroppedScan
-    arrival_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +55,7 @@ class Intake:
     """Receiving threads call `put_...`; one reader calls `take`.
 
     For the first second it holds everything back, until it knows the accelerometer's unit and whether the clocks of
-    the two sensors agree.
+    the two sensors agree. The log time of what it holds is that of its arrival.
 
     Attributes:
         counters: shared with the receiving threads. sensor: what the LiDAR reports about itself.
@@ -97,9 +80,9 @@ class Intake:
         self._recorder = recorder
         self._changed = threading.Condition()
         self._scans: deque[Scan] = deque()
-        self._rest: deque[LiveImu | DroppedScan | Status] = deque()
-        self._held: deque[LiveScan | LiveImu] | None = deque()
-        self._suspect: LiveImu | None = None
+        self._rest: deque[ImuEntry | DroppedScan | Status] = deque()
+        self._held: deque[ScanEntry | ImuEntry] | None = deque()
+        self._suspect: ImuEntry | None = None
         self._still_reported = self._unusable_reported = False
         self._maps = {"LiDAR": ClockMap(), "IMU": ClockMap()}
         self._offset = OffsetEstimate()
@@ -116,14 +99,14 @@ class Intake:
             if isinstance(scan, Scan):
                 self._offset.add_scan(scan.end_ns, arrival_ns)
                 self._arrivals["LiDAR"].append(arrival_ns)
-            self._put(LiveScan(scan, arrival_ns))
+            self._put(ScanEntry(arrival_ns, None, scan))
 
     def put_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, arrival_ns: int) -> None:
         with self._changed:
             stamp_ns += round(self._params.recording.imu_time_offset * 1e9)
             self._offset.add_imu(stamp_ns, arrival_ns)
             self._arrivals["IMU"].append(arrival_ns)
-            self._put(LiveImu(stamp_ns, gyro, accel, arrival_ns))
+            self._put(ImuEntry(arrival_ns, stamp_ns, gyro, accel))
 
     def put_status(self, kind: Kind, sensor: Literal["LiDAR", "IMU", "source"], text: str) -> None:
         with self._changed:
@@ -132,14 +115,13 @@ class Intake:
 
     def put_findings(self, findings: list[Finding]) -> None:
         """How clouds are read, where that is not as expected."""
-        for finding in findings:
-            if finding.verdict != "fine":
-                text = f"{finding.subject}: {finding.text} {finding.option}".rstrip()
-                self.put_status("configuration", "LiDAR", text)
+        with self._changed:
+            self._tell_findings("configuration", "LiDAR", findings)
+            self._changed.notify()
 
     # --- the reader ------------------------------------------------------------------------------
 
-    def take(self, timeout_s: float, *, scan: bool) -> tuple[list[LiveImu | DroppedScan | Status], Scan | None]:
+    def take(self, timeout_s: float, *, scan: bool) -> tuple[list[ImuEntry | DroppedScan | Status], Scan | None]:
         """All entries but scans, in the order of arrival, and the oldest scan if wanted; waits this long for any."""
 
         def some() -> bool:
@@ -176,7 +158,7 @@ class Intake:
 
     # --- under the lock --------------------------------------------------------------------------
 
-    def _put(self, entry: LiveScan | LiveImu) -> None:
+    def _put(self, entry: ScanEntry | ImuEntry) -> None:
         if self._held is None:
             self._release(entry)
         else:
@@ -191,20 +173,20 @@ class Intake:
     def _settled(self) -> bool:
         """Decide unit and clock once there are a second of IMU samples and a few scans. Holds 10 s at most."""
         assert self._held is not None
-        while len(self._held) > MAX_HELD or self._held[-1].arrival_ns - self._held[0].arrival_ns > 10 * _SETTLE_NS:
+        while len(self._held) > MAX_HELD or self._held[-1].log_ns - self._held[0].log_ns > 10 * _SETTLE_NS:
             old = self._held.popleft()
-            if isinstance(old, LiveScan):
+            if isinstance(old, ScanEntry):
                 self.counters.dropped += 1
                 self._rest.append(DroppedScan(old.scan.stamp_ns, NO_IMU))
         # Thousands of samples may be held; going through all of them at each scan is enough.
-        if not isinstance(self._held[-1], LiveScan):
+        if not isinstance(self._held[-1], ScanEntry):
             return False
-        samples = [entry for entry in self._held if isinstance(entry, LiveImu)]
-        scans = sum(isinstance(entry, LiveScan) and isinstance(entry.scan, Scan) for entry in self._held)
+        samples = [entry for entry in self._held if isinstance(entry, ImuEntry)]
+        scans = sum(isinstance(entry, ScanEntry) and isinstance(entry.scan, Scan) for entry in self._held)
         if scans < _SETTLE_SCANS or len(samples) < 20:
             return False
         if abs(samples[-1].stamp_ns - samples[0].stamp_ns) < _SETTLE_NS:
-            if not self._still_reported and samples[-1].arrival_ns - samples[0].arrival_ns > 5 * _SETTLE_NS:
+            if not self._still_reported and samples[-1].log_ns - samples[0].log_ns > 5 * _SETTLE_NS:
                 self._still_reported = True
                 self._tell("clocks", "IMU", "the IMU's stamps do not advance; check its driver")
             return False
@@ -222,9 +204,7 @@ class Intake:
                 self._unusable_reported = True
                 self._tell("units", "IMU", str(error))
             return False
-        for finding in findings:
-            if finding.verdict != "fine":
-                self._tell("units", "IMU", f"{finding.subject}: {finding.text} {finding.option}".rstrip())
+        self._tell_findings("units", "IMU", findings)
         self._settle_clock()
         return True
 
@@ -241,11 +221,11 @@ class Intake:
         for clock_map in self._maps.values():
             clock_map.host = self._clock == "host"
 
-    def _release(self, entry: LiveScan | LiveImu) -> None:
+    def _release(self, entry: ScanEntry | ImuEntry) -> None:
         """Stamp it in the engine's time and pass it to the recorder and the reader."""
-        if isinstance(entry, LiveScan):
+        if isinstance(entry, ScanEntry):
             self._release_scan(entry)
-        elif not self._maps["IMU"].jumps(entry.stamp_ns, entry.arrival_ns):
+        elif not self._maps["IMU"].jumps(entry.stamp_ns, entry.log_ns):
             self.counters.strays += self._suspect is not None
             self._suspect = None
             self._release_imu(entry)
@@ -257,22 +237,22 @@ class Intake:
             self.counters.strays += self._suspect is not None
             self._suspect = entry
 
-    def _release_imu(self, entry: LiveImu) -> None:
-        stamp = self._mapped("IMU", entry.stamp_ns, entry.arrival_ns)
+    def _release_imu(self, entry: ImuEntry) -> None:
+        stamp = self._mapped("IMU", entry.stamp_ns, entry.log_ns)
         gyro, accel = self._units.apply(entry.gyro, entry.accel)
         if self._recorder is not None:
-            self._recorder.add_imu(stamp, gyro, accel, entry.arrival_ns)
-        self._rest.append(LiveImu(stamp, gyro, accel, entry.arrival_ns))
+            self._recorder.add_imu(stamp, gyro, accel, entry.log_ns)
+        self._rest.append(ImuEntry(entry.log_ns, stamp, gyro, accel))
 
-    def _release_scan(self, entry: LiveScan) -> None:
+    def _release_scan(self, entry: ScanEntry) -> None:
         scan = entry.scan
         if isinstance(scan, DroppedScan):
             self._rest.append(DroppedScan(scan.stamp_ns + self._maps["LiDAR"].shift_ns, scan.reason))
             return
-        shift = self._mapped("LiDAR", scan.end_ns, entry.arrival_ns) - scan.end_ns
+        shift = self._mapped("LiDAR", scan.end_ns, entry.log_ns) - scan.end_ns
         scan = replace(scan, stamp_ns=scan.stamp_ns + shift) if shift else scan
         if self._recorder is not None:
-            self._recorder.add_scan(scan, entry.arrival_ns)
+            self._recorder.add_scan(scan, entry.log_ns)
         self._scans.append(scan)
 
     def _mapped(self, name: Literal["LiDAR", "IMU"], stamp_ns: int, arrival_ns: int) -> int:
@@ -289,6 +269,11 @@ class Intake:
 
     def _tell(self, kind: Kind, sensor: Literal["LiDAR", "IMU", "source"], text: str) -> None:
         self._rest.append(Status(kind, sensor, text, time.time_ns()))
+
+    def _tell_findings(self, kind: Kind, sensor: Literal["LiDAR", "IMU"], findings: list[Finding]) -> None:
+        for finding in findings:
+            if finding.verdict != "fine":
+                self._tell(kind, sensor, f"{finding.subject}: {finding.text} {finding.option}".rstrip())
 
     def _bound(self) -> None:
         while len(self._scans) > MAX_BACKLOG:

@@ -7,9 +7,10 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.sensors.live.intake import Intake, LiveImu, Receive, Settled
+from app.sensors.live.intake import Intake, Receive, Settled
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Kind, LiveState, Status
+from app.sensors.recording import ImuEntry
 from app.sensors.sequencer import Sequencer
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
@@ -108,7 +109,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         """Pass scans to the sequencer one at a time, so that later ones can still be dropped."""
         rest, scan = self._intake.take(timeout_s, scan=not self._pairing)
         for entry in rest:
-            if isinstance(entry, LiveImu):
+            if isinstance(entry, ImuEntry):
                 self._sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
             else:
                 self._events.append(entry)

@@ -6,13 +6,10 @@ import numpy as np
 
 from app.sensors.robosense import (
     BPEARL,
-    CHANNELS,
-    ELEVATIONS_DEG,
     MAX_RANGE_M,
     MIN_RANGE_M,
     RATED_RANGE_M,
     RATED_REFLECTIVITY,
-    RINGS,
     Model,
 )
 from app.sensors.simulator.imperfections import Unit
@@ -48,19 +45,34 @@ class Pattern:
 
 
 def firing_pattern(model: Model = BPEARL, rate_hz: int = 10, every_block: int = 1) -> Pattern:
-    """An RS-Bpearl's. The sensor turns from azimuth 0 at the revolution's start; only every k-th block fires."""
-    blocks_ns = np.arange(0, model.blocks_per_turn(rate_hz), every_block, dtype=np.int64) * model.block_ns
-    offsets_ns = (blocks_ns[:, None] + model.firing_offsets_ns).ravel()
-    azimuth = 2 * np.pi * rate_hz * 1e-9 * offsets_ns
-    block_azimuth = np.repeat(2 * np.pi * rate_hz * 1e-9 * blocks_ns, CHANNELS)
-    elevation = np.tile(np.deg2rad(ELEVATIONS_DEG), len(blocks_ns))
-    directions = np.column_stack(
-        [np.cos(elevation) * np.cos(azimuth), -np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
-    levers = np.column_stack(
-        [model.rx * np.cos(block_azimuth), -model.rx * np.sin(block_azimuth), np.full(len(azimuth), model.rz)]
-    )
-    return Pattern(offsets_ns, directions, levers, np.tile(RINGS, len(blocks_ns)), blocks_ns, model.block_ns, CHANNELS)
+    """An RS-Bpearl's, whose levers have their block's azimuth; only every k-th block fires."""
+    elevation, still = np.deg2rad(model.elevations_deg), np.zeros(model.channels)
+    pattern = turning(elevation, still, model.firing_offsets_ns, model.block_ns, rate_hz, every_block)
+    azimuth = np.repeat(2 * np.pi * rate_hz * 1e-9 * pattern.blocks_ns, model.channels)
+    return replace(pattern, levers=levers(azimuth, model.rx, model.rz))
+
+
+def turning(
+    elevation: F64, azimuth: F64, firing_ns: I64, block_ns: int, rate_hz: int, every_block: int,
+    radial: float = 0.0, height: float = 0.0,
+) -> Pattern:  # fmt: skip
+    """A head that turns from azimuth 0 at the scan's start, from x towards -y; only every k-th block fires.
+
+    elevation, azimuth: (c,) rad by channel, azimuth beside the head's. firing_ns: (c,) time within a block.
+    radial, height: m, lever of the lasers.
+    """
+    blocks_ns = np.arange(0, 1_000_000_000 // rate_hz // block_ns, every_block, dtype=np.int64) * block_ns
+    offsets_ns = (blocks_ns[:, None] + firing_ns).ravel()
+    head = np.asarray(2 * np.pi * rate_hz * 1e-9 * offsets_ns, np.float64)
+    along, up = head + np.tile(azimuth, len(blocks_ns)), np.tile(elevation, len(blocks_ns))
+    directions = np.column_stack([np.cos(up) * np.cos(along), -np.cos(up) * np.sin(along), np.sin(up)])
+    rings = np.tile(np.argsort(np.argsort(elevation)).astype(np.uint16), len(blocks_ns))
+    return Pattern(offsets_ns, directions, levers(head, radial, height), rings, blocks_ns, block_ns, len(elevation))
+
+
+def levers(azimuth: F64, radial: float, height: float) -> F64:
+    """(n, 3) m, where lasers are at these azimuths (n,) of the head."""
+    return np.column_stack([radial * np.cos(azimuth), -radial * np.sin(azimuth), np.full(len(azimuth), height)])
 
 
 @dataclass(frozen=True, slots=True)

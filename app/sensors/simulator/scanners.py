@@ -10,7 +10,7 @@ import numpy as np
 from app.sensors import robosense, ros
 from app.sensors.presets import PRESETS
 from app.sensors.robosense import AIRY
-from app.sensors.simulator.lidar import P_IMU_LIDAR, Pattern, firing_pattern
+from app.sensors.simulator.lidar import P_IMU_LIDAR, Pattern, firing_pattern, turning
 from app.sensors.simulator.trajectory import GRAVITY, R_BODY_IMU
 from app.slam import lie
 from app.slam.errors import HemislamError
@@ -66,10 +66,8 @@ def _bpearl(rate_hz: int, every_block: int, _: Path | None) -> PatternOfTurn:
 
 def _airy(rate_hz: int, every_block: int, _: Path | None) -> PatternOfTurn:
     """A RoboSense Airy: 96 channels, eight at a time, over a hemisphere."""
-    elevation, us = np.radians(AIRY.elevations_deg), AIRY.firing_offsets_ns / 1000
-    pattern = _turning(
-        elevation, np.zeros(AIRY.channels), us, AIRY.block_ns / 1000, rate_hz, every_block, (AIRY.rx, AIRY.rz)
-    )
+    elevation, still = np.radians(AIRY.elevations_deg), np.zeros(AIRY.channels)
+    pattern = turning(elevation, still, AIRY.firing_offsets_ns, AIRY.block_ns, rate_hz, every_block, AIRY.rx, AIRY.rz)
     return lambda turn: pattern
 
 
@@ -78,28 +76,10 @@ def _jt128(rate_hz: int, every_block: int, tables: Path | None) -> PatternOfTurn
     folder = _tables(tables, "jt128_angles.csv", "jt128_firetimes.csv")
     angles = np.genfromtxt(folder / "jt128_angles.csv", delimiter=",", skip_header=1, max_rows=128)
     us = np.genfromtxt(folder / "jt128_firetimes.csv", delimiter=",", skip_header=1, max_rows=128)[:, 1]
+    firing_ns = np.rint(us * 1000).astype(np.int64)
     elevation, azimuth = np.radians(angles[:, 1:]).T
-    pattern = _turning(elevation, azimuth, us, 1e6 / _RATE_HZ / 900, rate_hz, every_block, (0.0, 0.0))
+    pattern = turning(elevation, azimuth, firing_ns, round(1e9 / _RATE_HZ / 900), rate_hz, every_block)
     return lambda turn: pattern
-
-
-def _turning(
-    elevation: F64, azimuth: F64, us: F64, block_us: float, rate_hz: int, every_block: int, lever: tuple[float, float]
-) -> Pattern:
-    """A head that turns from azimuth 0 at the scan's start, from x towards -y.
-
-    elevation, azimuth: (c,) rad by channel, azimuth beside the head's. us: (c,) firing time within a block.
-    lever: m, radial and height, of the lasers.
-    """
-    block_ns = round(block_us * 1000)
-    blocks_ns = np.arange(0, 1_000_000_000 // rate_hz // block_ns, every_block, dtype=np.int64) * block_ns
-    offsets_ns = (blocks_ns[:, None] + np.rint(us * 1000).astype(np.int64)).ravel()
-    head = 2 * np.pi * rate_hz * 1e-9 * offsets_ns
-    along, up = head + np.tile(azimuth, len(blocks_ns)), np.tile(elevation, len(blocks_ns))
-    directions = np.column_stack([np.cos(up) * np.cos(along), -np.cos(up) * np.sin(along), np.sin(up)])
-    levers = np.column_stack([lever[0] * np.cos(head), -lever[0] * np.sin(head), np.full(len(head), lever[1])])
-    rings = np.tile(np.argsort(np.argsort(elevation)).astype(np.uint16), len(blocks_ns))
-    return Pattern(offsets_ns, directions, levers, rings, blocks_ns, block_ns, len(elevation))
 
 
 def _mid360(rate_hz: int, every_block: int, tables: Path | None) -> PatternOfTurn:
