@@ -8,7 +8,7 @@ import numpy as np
 
 from app.calibration.excerpt import Excerpt
 from app.calibration.guide import Guide
-from app.slam import coast
+from app.slam import coast, lie
 from app.slam.imu import BG, ROT
 from app.slam.local_map import LocalMap
 from app.slam.params import Params
@@ -58,7 +58,7 @@ def track(
     here = coast.standing(excerpt.scans[0].end_ns, np.eye(3), params)
     if guide is not None:  # it gives the turns, so no rate is beside them
         here.covariance[BG, BG] = 1e-12 * np.eye(3)
-    rotations, positions, residuals, deskewed = [np.eye(3)], [np.zeros(3)], [float("nan")], [excerpt.scans[0].points]
+    states, residuals, clouds = [here.state], [float("nan")], [excerpt.scans[0].points]
     local_map.insert(excerpt.scans[0].points, np.zeros(3), params.map)
     for k, scan in enumerate(excerpt.scans[1:], 1):
         last, changes = here.state, _changes(excerpt, scan.end_ns)
@@ -74,14 +74,13 @@ def track(
         if not np.isfinite(state.T_odom_imu).all():
             raise np.linalg.LinAlgError("the odometry gave no finite pose")
         points = coast.deskew(scan, state, course)
-        world = points @ state.R_odom_imu.T.astype(np.float32) + state.p_odom_imu.astype(np.float32)
-        local_map.insert(np.ascontiguousarray(world), state.p_odom_imu, params.map)
-        rotations.append(state.R_odom_imu)
-        positions.append(state.p_odom_imu)
+        local_map.insert(lie.moved(state.T_odom_imu.astype(np.float32), points), state.p_odom_imu, params.map)
+        states.append(state)
         residuals.append(went.residual_rms)
-        deskewed.append(points)
+        clouds.append(points)
         progress(k / (len(excerpt.scans) - 1))
-    return Track(times, np.stack(rotations), np.stack(positions), np.array(residuals), tuple(deskewed))
+    poses = np.stack([state.T_odom_imu for state in states])
+    return Track(times, poses[:, :3, :3], poses[:, :3, 3], np.array(residuals), tuple(clouds))
 
 
 def _changes(excerpt: Excerpt, end_ns: int) -> tuple[float, float]:

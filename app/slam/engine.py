@@ -17,6 +17,7 @@ from app.slam.keyframes import KeyframeStore
 from app.slam.lines import LineErrors
 from app.slam.local_map import LocalMap, MapState
 from app.slam.params import Params
+from app.slam.sections import FilterParams
 from app.slam.types import F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
 from app.slam.voxel import VoxelGrid, spread
 
@@ -49,6 +50,9 @@ class EngineState:
     progress: EngineProgress
     map: MapState
     keyframes: int
+
+
+_Fuse = Callable[[LocalMap, FilterParams], tuple[Belief, Registration]]
 
 
 class Engine:
@@ -119,18 +123,15 @@ class Engine:
         if self._map.voxels:
             if len(samples):
                 chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
-                posterior, registration = self._update(
-                    belief, predicted, partial(iekf.update, predicted, chosen, self._map, p.filter)
-                )
+                posterior, registration = self._update(belief, predicted, partial(iekf.update, predicted, chosen))
             else:  # the points themselves, since centroids have no time
-                returns = scan.part(reduced.source[sampled.source])
-                posterior, registration = self._update(
-                    belief, predicted, partial(coast.update, predicted, returns, course, self._map, p.filter)
-                )
+                source = reduced.source[sampled.source]
+                fuse = partial(coast.update, predicted, scan.part(source), course)
+                posterior, registration = self._update(belief, predicted, fuse)
                 # the prediction was no measurement that the scan could contradict
                 registration = replace(registration, predicted_change=np.nan, correction=np.nan)
                 points = coast.deskew(scan, posterior.state, course)
-                sampled = replace(sampled, points=points[reduced.source[sampled.source]])
+                sampled = replace(sampled, points=points[source])
         status = _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 
@@ -211,12 +212,10 @@ class Engine:
         """Give the disk space of the keyframes back."""
         self.keyframes.close()
 
-    def _update(
-        self, last: Belief, predicted: Belief, update: Callable[[], tuple[Belief, Registration]]
-    ) -> tuple[Belief, Registration]:
-        """What the update gives; after a numerical failure, the prediction stands and the frame is lost."""
+    def _update(self, last: Belief, predicted: Belief, fuse: _Fuse) -> tuple[Belief, Registration]:
+        """What `fuse` gives; after a numerical failure, the prediction stands and the frame is lost."""
         with contextlib.suppress(np.linalg.LinAlgError):
-            posterior, registration = update()
+            posterior, registration = fuse(self._map, self.params.filter)
             if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():
                 change, correction = (
                     float(np.linalg.norm(after.v_odom_imu - before.v_odom_imu))

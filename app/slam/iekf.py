@@ -126,26 +126,15 @@ def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Regis
 
 
 def outcome(points: F32, H: F64, converged: bool, iterations: int, stats: F64, matches: Matches) -> Registration:
-    """How an update went.
-
-    Args:
-        points: (n, 3) m, LiDAR frame. H: (6, 6) information of the scan alone on the pose. stats: (2,) inliers, and the
-            sum of their squared distances in m².
-    """
+    """How an update went; H (6, 6) is the information of the scan alone, stats (2,) inliers and their squares in m²."""
     reach = float(np.sqrt(np.mean(np.sum(points.astype(np.float64) ** 2, axis=1))))
     scale = np.r_[np.full(3, 1.0 / reach), np.ones(3)]
     eigenvalues = np.linalg.eigvalsh(H * np.outer(scale, scale))
     degenerate = bool(eigenvalues[0] < 1.0 / DEGENERATE_SIGMA**2)
+    reason = "this scan leaves one direction unobserved" if degenerate else ""
+    rms = float(np.sqrt(stats[1] / stats[0]))
     return Registration(
-        converged=converged,
-        iterations=iterations,
-        used=len(points),
-        inliers=int(stats[0]),
-        residual_rms=float(np.sqrt(stats[1] / stats[0])),
-        eigenvalues=eigenvalues,
-        degenerate=degenerate,
-        reason="this scan leaves one direction unobserved" if degenerate else "",
-        matches=matches,
+        converged, iterations, len(points), int(stats[0]), rms, eigenvalues, degenerate, reason, matches
     )
 
 
