@@ -2,9 +2,10 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -65,7 +66,7 @@ class OtherEntry:
     samples: Samples
 
 
-class Recording:
+class Recording(AbstractContextManager["Recording"]):
     """An open recording, made by `open_recording`. A context manager.
 
     Attributes:
@@ -200,9 +201,6 @@ class Recording:
 
     def close(self) -> None:
         self._source.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

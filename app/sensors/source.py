@@ -1,11 +1,12 @@
 """Recording files as a stream of messages, and each of their failures as one clear sentence."""
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -122,7 +123,7 @@ class RosbagsStream:
         return link
 
 
-class Source:
+class Source(AbstractContextManager["Source"]):
     """A recording opened for reading: its topics and its messages. A context manager.
 
     Attributes:
@@ -183,9 +184,6 @@ class Source:
 
     def close(self) -> None:
         self._stream.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

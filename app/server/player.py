@@ -94,7 +94,7 @@ class Player:
         self.page_behind = self.relabelling = False
         self._target: SeekTarget | None = None
         self._moment: CheckedFrame | None = None  # the frame that the page shows
-        self._doubted: set[str] = set()  # reasons that were told, without their numbers
+        self._doubted: set[str] = set()  # reasons already reported, without their numbers
 
     # --- what is asked for -----------------------------------------------------------------------
     def take(self, session: Session) -> None:

@@ -3,7 +3,6 @@
 from typing import Any
 
 from app.sensors.cloud_types import CloudError, CloudType, Probe, stamped
-from app.sensors.findings import Finding
 from app.sensors.layout import settle_cloud
 from app.sensors.live.intake import Intake
 from app.sensors.pointcloud import CloudLayout, read_scan
@@ -18,30 +17,35 @@ _GIVE_UP = 100
 
 
 class CloudReader:
-    """Examines the first clouds of a topic before it decodes any, and again if their fields change.
-
-    Attributes:
-        findings: how the clouds are read; replaced each time that was settled.
-    """
+    """Examines the first clouds of a topic before it decodes any, and again if their fields change."""
 
     def __init__(self, params: Params, topic: str, kind: CloudType) -> None:
-        self.findings: list[Finding] = []
         self._params, self._topic, self._kind = params, topic, kind
         self._layout: CloudLayout | None = None
         self._fields: dict[str, Any] = {}
         self._waiting: list[tuple[Any, Probe, int]] = []
         self._unusable = 0
-        self._told = ""
+        self._reported = ""
 
-    def add(self, message: Any, log_ns: int, arrival_ns: int) -> list[tuple[Scan | DroppedScan, int]]:
+    def add(self, message: Any, log_ns: int, arrival_ns: int, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
         """The scans that this message completes, each with its arrival: none at first, then those that waited.
+
+        How clouds are read, and why they cannot be, is reported to the intake.
 
         Args:
             message: deserialised. log_ns: when its sender passed it on.
-
-        Raises:
-            HemislamError: such clouds cannot be read at all, and why.
         """
+        try:
+            return self._read(message, log_ns, arrival_ns, intake)
+        except HemislamError as error:
+            intake.counters.unreadable += 1
+            if str(error) != self._reported:
+                self._reported = str(error)
+                intake.put_status("configuration", "LiDAR", self._reported)
+            return []
+
+    def _read(self, message: Any, log_ns: int, arrival_ns: int, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
+        """Raises HemislamError: such clouds cannot be read at all, and why."""
         if self._layout is not None:
             cloud, scan = read_scan(message, log_ns, self._layout)
             if cloud is None or cloud.fields == self._fields:
@@ -63,26 +67,12 @@ class CloudReader:
                 raise HemislamError(f"None of the clouds on {self._topic} has a usable point; check the LiDAR.")
             return [(DroppedScan(cloud.stamp_ns, "none of its points is a return"), arrival_ns)]
         self._waiting.append((message, probe, arrival_ns))
-        return self._settle() if len(self._waiting) == PROBED_CLOUDS else []
+        return self._settle(intake) if len(self._waiting) == PROBED_CLOUDS else []
 
-    def taken(self, message: Any, log_ns: int, arrival_ns: int, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
-        """As `add`. How clouds are read, and why they cannot be, is reported to the intake instead."""
-        known = self.findings
-        try:
-            found = self.add(message, log_ns, arrival_ns)
-        except HemislamError as error:
-            intake.counters.unreadable += 1
-            if str(error) != self._told:
-                self._told = str(error)
-                intake.put_status("configuration", "LiDAR", self._told)
-            return []
-        if self.findings is not known:
-            intake.put_findings(self.findings)
-        return found
-
-    def _settle(self) -> list[tuple[Scan | DroppedScan, int]]:
+    def _settle(self, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
         waiting, self._waiting = self._waiting, []
         probes = stamped([probe for _, probe, _ in waiting])
-        layout, self.findings = settle_cloud(probes, self._params.recording, self._topic, self._kind)
+        layout, findings = settle_cloud(probes, self._params.recording, self._topic, self._kind)
         self._layout = layout
+        intake.put_findings(findings)
         return [(read_scan(message, probe.log_ns, layout)[1], at) for message, probe, at in waiting]

@@ -159,7 +159,7 @@ class FoxgloveReceiver:
             return
         intake.counters.packets += 1
         assert self._reader is not None
-        for scan, arrival_ns in self._reader.taken(message, log_ns, arrival, intake):
+        for scan, arrival_ns in self._reader.add(message, log_ns, arrival, intake):
             intake.counters.frames += 1
             intake.put_scan(scan, arrival_ns)
 

@@ -56,13 +56,6 @@ def sensor_of(packet: bytes) -> Model | Livox | None:
     return None if head is None else head.sensor
 
 
-def _azimuths(packet: bytes, stamp_ns: int, sensor: Model | Livox) -> tuple[int, ...]:
-    """Of each block, 0.01 deg; of a sensor that does not turn, its place within the time of a scan as if it did."""
-    if isinstance(sensor, Livox):
-        return (stamp_ns % SCAN_NS * TURN // SCAN_NS,)
-    return msop.azimuths_of(packet, sensor)
-
-
 @dataclass(frozen=True, slots=True)
 class Revolution:
     """The packets of one revolution, in order of time.
@@ -198,8 +191,11 @@ class Assembler:
         return []
 
     def _azimuths_at(self, at: int) -> tuple[int, ...]:
-        stamp, _, packet, head = self._pending[at]
-        return _azimuths(packet, stamp, head.sensor)
+        """Of each block, 0.01 deg; of a sensor that does not turn, its place within the time of a scan as if it did."""
+        stamp_ns, _, packet, head = self._pending[at]
+        if isinstance(head.sensor, Livox):
+            return (stamp_ns % SCAN_NS * TURN // SCAN_NS,)
+        return msop.azimuths_of(packet, head.sensor)
 
     def _split(self, at: int, block: int) -> Revolution:
         """End the revolution before this block of the packet `at`; the next one begins there."""

@@ -94,7 +94,7 @@ def read_imu(datagram: bytes) -> list[ImuSample]:
         return _read_airy(datagram)
     if not datagram.startswith(IMU_MAGIC):
         read = livox_udp.read_imu(datagram)
-        return [ImuSample(None, *read)] if read and _finite(read[1] + read[2]) else []
+        return [ImuSample(None, *read)] if read and all(map(math.isfinite, read[1] + read[2])) else []
     if len(datagram) % SAMPLE_BYTES:
         return []
     samples = []
@@ -120,10 +120,6 @@ def _airy_units(accel_range: int, gyro_range: int) -> tuple[float, float]:
     """m/s^2 and rad/s of a count. A range of k stands for 2 g, or 250 deg/s, doubled k times."""
     accel, gyro = 2 * STANDARD_GRAVITY * 2**accel_range, math.radians(250.0) * 2**gyro_range
     return accel / _COUNTS, gyro / _COUNTS
-
-
-def _finite(values: tuple[float, ...]) -> bool:
-    return all(map(math.isfinite, values))
 
 
 _HOLD = 4

@@ -230,7 +230,7 @@ class PacketReceiver:
     def _scans(self, frame: Revolution, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
         """Those that can be given now, each with its arrival."""
         if self._decoder is None:
-            return self._clouds.taken(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns, intake)
+            return self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns, intake)
         scan = self._decoder.decode(frame)
         intake.counters.bad_blocks = self._decoder.bad_blocks
         return [(scan, frame.arrival_ns)]
