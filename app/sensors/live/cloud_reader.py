@@ -60,7 +60,10 @@ class CloudReader:
             self._waiting.clear()
             self._fields = cloud.fields
         if not {"x", "y", "z"} <= cloud.fields.keys():
-            raise HemislamError(f"The clouds on {self._topic} have no x, y, z, but {', '.join(cloud.fields)}.")
+            raise HemislamError(
+                f"The clouds on {self._topic} have no x, y, z, but {', '.join(cloud.fields)}; choose another by "
+                "--lidar-topic."
+            )
         if not len(probe.points):
             self._unusable += 1
             if self._unusable == _GIVE_UP:

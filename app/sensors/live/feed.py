@@ -209,7 +209,7 @@ def _feed_foxglove(
                 if pace.stop.is_set():
                     return 0
                 if time.monotonic() > deadline:
-                    raise HemislamError(f"No client subscribed at ws://{host}:{server.port}.")
+                    raise HemislamError(f"No client subscribed at ws://{host}:{server.port}; start it first.")
             for sent in _paced(_messages_of(source, topics, duration_s), pace):
                 server.publish(sent.stream, sent.time_ns, sent.data)
                 number += 1

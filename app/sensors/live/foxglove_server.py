@@ -42,7 +42,7 @@ class FoxgloveServer(AbstractContextManager["FoxgloveServer"]):
                 close_timeout=1.0,
             )  # fmt: skip
         except OSError as error:
-            raise HemislamError(f"Port {port} on {host} cannot be opened ({error.strerror}).") from None
+            raise HemislamError(f"Port {port} on {host} cannot be opened ({error.strerror}); choose another.") from None
         self.port = int(self._server.socket.getsockname()[1])
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True, name="foxglove-server")
         self._thread.start()

@@ -41,7 +41,7 @@ def _read(packet: bytes) -> _Head | None:
     """None if it holds no measurements."""
     model = msop.model_of(packet)
     if model is not None:
-        return _Head(model, msop.stamp_of(packet), msop.index_of(packet, model))
+        return _Head(model, msop.stamp_of(packet, model), msop.index_of(packet, model))
     header = read_header(packet)
     return _Head(MID360, header.stamp_ns, header.number) if header is not None and is_points(header) else None
 

@@ -43,9 +43,9 @@ def model_of(packet: bytes) -> Model | None:
     return BPV4 if packet[31:33] == _TYPE_BPV4 else BPEARL
 
 
-def stamp_of(packet: bytes) -> int | None:
+def stamp_of(packet: bytes, model: Model) -> int | None:
     """Time of the first block, ns since 1970 by the sensor's clock; None if it shows no date."""
-    if model_of(packet) is not BPEARL:
+    if model is not BPEARL:
         return read_utc(packet[20:30])
     base = _date_ns(packet[20:26])
     if base is None:
