@@ -49,7 +49,7 @@ a shaft)."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
+class _Appearance:
     """What the clouds of a scanner with an IMU of its own look like.
 
     Attributes:
@@ -77,17 +77,19 @@ class _Look:
         )
 
 
-_LOOKS = {
-    "mid360": _Look(CUSTOM_MSGS, frozenset(), (), (-9, 90), (40, 56)),
-    "airy": _Look((POINT_CLOUD_2.name,), frozenset({"ring", "timestamp"}), (96,), (-3, 20), (60, 91)),
-    "jt128": _Look((POINT_CLOUD_2.name,), frozenset({"ring", "timestamp"}), (128,), (-8, 20), (60, 91)),
-    "ouster": _Look((POINT_CLOUD_2.name,), frozenset({"ring", "t", "reflectivity"}), (32, 64, 128), (-90, 0), (0, 91)),
+_APPEARANCES = {
+    "mid360": _Appearance(CUSTOM_MSGS, frozenset(), (), (-9, 90), (40, 56)),
+    "airy": _Appearance((POINT_CLOUD_2.name,), frozenset({"ring", "timestamp"}), (96,), (-3, 20), (60, 91)),
+    "jt128": _Appearance((POINT_CLOUD_2.name,), frozenset({"ring", "timestamp"}), (128,), (-8, 20), (60, 91)),
+    "ouster": _Appearance(
+        (POINT_CLOUD_2.name,), frozenset({"ring", "t", "reflectivity"}), (32, 64, 128), (-90, 0), (0, 91)
+    ),
 }
 
 
 def preset_for(kind: str, probe: Probe) -> str:
     """The preset of the scanner whose clouds are of this type and look like this one; "" if none is known."""
-    return next((name for name, look in _LOOKS.items() if look.fits(kind, probe)), "")
+    return next((name for name, appearance in _APPEARANCES.items() if appearance.fits(kind, probe)), "")
 
 
 CALIBRATED = "# Written by `hemislam calibrate`"

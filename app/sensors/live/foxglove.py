@@ -60,7 +60,7 @@ class FoxgloveReceiver:
         self._channels: dict[int, Channel] = {}
         self._subscribed: dict[int, tuple[Sensor, Channel]] = {}
         self._reader: CloudReader | None = None
-        self._told = ""
+        self._last_status = ""
 
     def __call__(self, intake: Intake, stop: threading.Event) -> None:
         connected = False
@@ -72,7 +72,7 @@ class FoxgloveReceiver:
                 ) as connection:  # fmt: skip
                     intake.counters.reconnects += connected
                     connected = True
-                    self._told = ""
+                    self._last_status = ""
                     intake.put_status("connected", "source", f"connected to {self._url}")
                     self._listen(connection, intake, stop)
             except (OSError, WebSocketException, TimeoutError) as error:
@@ -123,7 +123,7 @@ class FoxgloveReceiver:
         """Subscribe to what is wanted and not subscribed yet. A subscription has its channel's number."""
         missing = []
         for sensor in self._wanted:
-            if any(sensor == known for known, _ in self._subscribed.values()):
+            if any(sensor == other for other, _ in self._subscribed.values()):
                 continue
             kinds, wanted = usable_types(sensor), self._topics[sensor]
             usable = [c for c in self._channels.values() if c.type in kinds and c.encoding in ENCODINGS]
@@ -165,8 +165,8 @@ class FoxgloveReceiver:
 
     def _tell(self, kind: Literal["disconnected", "configuration"], text: str, intake: Intake) -> None:
         """Report it once, however often it happens."""
-        if text != self._told:
-            self._told = text
+        if text != self._last_status:
+            self._last_status = text
             intake.put_status(kind, "source", text)
 
 

@@ -124,10 +124,10 @@ class PacketReceiver:
         self._wait_until_ns: int | None = None
         self._device: Difop | None = None
         self._frames: deque[Revolution] = deque()
-        self._known_angles = angles is not None or not device.has_angles
+        self._angles_settled = angles is not None or not device.has_angles
         self._sensor: Peer | None = None
         self._heard_s = 0.0
-        self._told_another = False
+        self._reported_another = False
 
     def __call__(self, intake: Intake, stop: threading.Event) -> None:
         self._assembler.counters = self._order.counters = intake.counters
@@ -178,17 +178,17 @@ class PacketReceiver:
         Args:
             beside: it is a packet of settings or of the IMU, which a sensor sends from another port.
         """
-        known, now = self._sensor, time.monotonic()
-        if known is None or now - self._heard_s > _REST_NS * 1e-9:
-            known = None if beside else peer
-        elif (peer[0] != known[0]) if beside else (peer != known):
-            if not self._told_another:
-                self._told_another = True
-                text = f"{peer[0]} sends to the port of {known[0]} too; its packets are left out while both send"
+        current, now = self._sensor, time.monotonic()
+        if current is None or now - self._heard_s > _REST_NS * 1e-9:
+            current = None if beside else peer
+        elif (peer[0] != current[0]) if beside else (peer != current):
+            if not self._reported_another:
+                self._reported_another = True
+                text = f"{peer[0]} sends to the port of {current[0]} too; its packets are left out while both send"
                 intake.put_status("configuration", "LiDAR", text)
             return True
         if not beside:
-            self._sensor, self._heard_s = known, now
+            self._sensor, self._heard_s = current, now
         return False
 
     def _configure(self, difop: Difop, now: int, intake: Intake) -> None:
@@ -212,11 +212,11 @@ class PacketReceiver:
         """Decode and hand on; at the start, once the angles are known or their time is up."""
         if not self._frames:
             return
-        if self._device is None and not self._known_angles:
+        if self._device is None and not self._angles_settled:
             self._wait_until_ns = self._wait_until_ns or now + _DEVICE_WAIT_NS
             if now < self._wait_until_ns:
                 return
-            self._known_angles = True
+            self._angles_settled = True
             text = "no DIFOP packet came with this unit's angles; the nominal ones are used until one comes"
             intake.put_status("configuration", "LiDAR", text)
         while self._frames:

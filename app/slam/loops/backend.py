@@ -13,7 +13,7 @@ import numpy as np
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.edits import Add, Edits, LoopEdit, Override, Solve, check, in_words, lay_over, rows
+from app.slam.loops.edits import Add, Edits, LoopEdit, Override, Solve, apply_edits, check, in_words, rows
 from app.slam.loops.factors import Closing, PositionPrior, residuals
 from app.slam.loops.graph import Graph, failure, optimum
 from app.slam.loops.messages import Target
@@ -186,7 +186,7 @@ class LoopBackend:
         if isinstance(edit, Add) and edit.guess is None:
             edit = replace(edit, guess=rows(self._present(edit.older, edit.newer)))
         self._check_made(edit)
-        factors = self._factors(self._edited.sound(self._laid_over((*self.edits.done, edit))))
+        factors = self._factors(self._edited.sound(self._with_edits((*self.edits.done, edit))))
         poses = optimum(self._solved()[0], factors)
         return Preview(poses, residuals(factors, poses))
 
@@ -228,15 +228,15 @@ class LoopBackend:
         """Start the graphs again from another first keyframe."""
         self._edited = Graph(self._odometry[0], self._search.start.window)
 
-    def _laid_over(self, edits: Iterable[LoopEdit]) -> dict[Pair, LoopEdge]:
-        """What was found, as it counts with edits."""
+    def _with_edits(self, edits: Iterable[LoopEdit]) -> dict[Pair, LoopEdge]:
+        """The loops found, with the edits applied."""
         made = {edit: self._make(edit) for edit in edits if isinstance(edit, Add) and edit.newer < len(self)}
-        return lay_over(self._search.found, edits, made)
+        return apply_edits(self._search.found, edits, made)
 
     def _solved(self) -> tuple[F64, dict[Pair, LoopEdge]]:
         """(k, 4, 4) T_map_imu by the incremental solver, and the loops as they count."""
         if self._state is None:
-            edges = self._laid_over(self.edits.done)
+            edges = self._with_edits(self.edits.done)
             graph = self._edited if self.edits.done else self._search.graph
             poses = graph.solve(self._search.measured, edges, self._odometry)
             self._state = poses, graph.sound(edges)

@@ -113,10 +113,10 @@ def rows(T: F64) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(value) for value in row) for row in np.asarray(T))
 
 
-def lay_over(
+def apply_edits(
     found: Mapping[Pair, LoopEdge], edits: Iterable[LoopEdit], made: Mapping[Add, LoopEdge]
 ) -> dict[Pair, LoopEdge]:
-    """What was found, as it counts with the edits.
+    """The loops found, with the edits applied, sorted by pair.
 
     Args:
         made: the loops by hand; an Add without one waits for its keyframes.

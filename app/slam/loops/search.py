@@ -14,7 +14,7 @@ from app.slam.errors import HemislamError
 from app.slam.loops import slips
 from app.slam.loops.detection import Detector
 from app.slam.loops.drift import Drift, Expectation, expect
-from app.slam.loops.edits import lay_over
+from app.slam.loops.edits import apply_edits
 from app.slam.loops.factors import PositionPrior, loosened, odometry_factor
 from app.slam.loops.graph import Graph, Measured
 from app.slam.loops.scan_context import ScanContext
@@ -75,7 +75,7 @@ class Search:
     @property
     def solved(self) -> tuple[F64, dict[Pair, LoopEdge]]:
         """(k, 4, 4) T_map_imu of the first `len` keyframes, and the loops as they count, without any edits."""
-        edges = lay_over(self.found, (), {})
+        edges = apply_edits(self.found, (), {})
         poses = self.graph.solve(self.measured, edges, self.detector.poses)
         return poses, self.graph.sound(edges)
 

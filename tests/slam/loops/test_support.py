@@ -9,7 +9,7 @@ import pytest
 from app.slam import lie
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.drift import Drift
-from app.slam.loops.edits import Add, Reject, SetWeight, lay_over
+from app.slam.loops.edits import Add, Reject, SetWeight, apply_edits
 from app.slam.loops.factors import Factor, loop_factors
 from app.slam.loops.solvers import optimise
 from app.slam.loops.support import placed, settle, transported
@@ -193,11 +193,11 @@ def test_what_was_found_beside_a_loop_by_hand_counts_alone_once_that_is_undone()
     beside = [replace(loop(38), represented_by=made.pair), replace(loop(34), repeats=made.pair)]
     found = {edge.pair: edge for edge in beside}
     add = Add(*made.pair)
-    laid_over = lay_over(found, [add], {add: made})
-    assert laid_over[made.pair] is made
-    assert laid_over[loop(38).pair].represented_by == made.pair and not laid_over[loop(38).pair].counts
-    assert laid_over[loop(34).pair].repeats is None, "the user's word is not to be outvoted"
-    undone = lay_over(found, [], {add: made})
+    edited = apply_edits(found, [add], {add: made})
+    assert edited[made.pair] is made
+    assert edited[loop(38).pair].represented_by == made.pair and not edited[loop(38).pair].counts
+    assert edited[loop(34).pair].repeats is None, "the user's word is not to be outvoted"
+    undone = apply_edits(found, [], {add: made})
     assert all(edge.counts and edge.repeats is None for edge in undone.values())
     assert loop_factors(undone.values(), undone, POSES, window=0)
 
@@ -206,9 +206,9 @@ def test_who_stood_in_for_a_rejected_loop_hands_over_when_that_is_back() -> None
     """What was found meanwhile was placed by it."""
     first, second, third = loop(40), replace(loop(38), represented_by=loop(40).pair), loop(36)
     found = {edge.pair: edge for edge in (first, second, replace(third, represented_by=second.pair))}
-    rejected = lay_over(found, [Reject(*first.pair)], {})
+    rejected = apply_edits(found, [Reject(*first.pair)], {})
     assert rejected[second.pair].counts and rejected[third.pair].represented_by == second.pair
-    back = lay_over(found, [], {})
+    back = apply_edits(found, [], {})
     assert [edge.represented_by for _, edge in sorted(back.items())] == [first.pair, first.pair, None]
 
 
