@@ -86,7 +86,7 @@ def tune(
 
     \b
     Writes into DIR:
-      best.params.yaml  the setting that also wins on the part held back, if any; use it with --config
+      best.params.yaml  the proposed setting; use it with --config
       tuning.html       the best settings and the plots, in one file
       trials.csv        every trial
       tuning.json       the best settings with all parameters, input hashes and the machine

@@ -1,4 +1,4 @@
-"""What a search leaves: trials.csv, tuning.json, the best parameters as YAML, and tuning.html with its plots."""
+"""What a search leaves: trials.csv, tuning.json, the proposed parameters as YAML, and tuning.html with its plots."""
 
 import json
 import warnings
