@@ -126,7 +126,12 @@ def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Regis
 
 
 def outcome(points: F32, H: F64, converged: bool, iterations: int, stats: F64, matches: Matches) -> Registration:
-    """How an update went; H (6, 6) is the information of the scan alone, stats (2,) inliers and their squares in m²."""
+    """How an update went.
+
+    Args:
+        points: (n, 3) m, LiDAR frame. H: (6, 6) information of the scan alone on rotation (rad) and position (m).
+        stats: (2,) number of inliers, and the sum of their squared residuals in m².
+    """
     reach = float(np.sqrt(np.mean(np.sum(points.astype(np.float64) ** 2, axis=1))))
     scale = np.r_[np.full(3, 1.0 / reach), np.ones(3)]
     eigenvalues = np.linalg.eigvalsh(H * np.outer(scale, scale))

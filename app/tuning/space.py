@@ -42,6 +42,7 @@ class Dimension:
         return FloatDistribution(self.low, self.high)
 
     def value_in(self, params: Params) -> Any:
+        """What the parameters hold for this one."""
         return getattr(getattr(params, self.leaf.section), self.leaf.name)
 
     def holds(self, value: Any) -> bool:
