@@ -66,5 +66,5 @@ def test_a_word_on_a_loop_in_b_moves_b_alone_and_undone_leaves_nothing(walked: W
     np.testing.assert_array_equal(a.trajectory, before.trajectory)
     assert np.abs(a.trajectory - b.trajectory).max() > 1e-4
     walked.send_other(UndoLoop())
-    until(lambda: walked.other, lambda s: not s.loops.undo)
+    until(lambda: walked.other, lambda s: not s.loops.undo and np.array_equal(s.trajectory, walked.snapshot.trajectory))
     same(*agreed(walked))
