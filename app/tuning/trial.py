@@ -75,6 +75,8 @@ def advice(trials: Sequence[Trial], held_back: Sequence[Trial], objectives: Sequ
     best = proposal(trials, held_back, objectives)
     if not held_back or best is None:
         return ""
+    if not any(trial.complete for trial in held_back):
+        return "On the part held back no setting gives a result; search on another part of the recording."
     if best.number:
         return f"Trial {best.number} is also better than the parameters as given on the part held back."
     return "On the part held back nothing is better than the parameters as given: keep them."

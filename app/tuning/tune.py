@@ -214,10 +214,10 @@ def search(
 
 def check(runs: Runs, trials: Sequence[Trial], objectives: Sequence[Objective], rest: Part | None) -> tuple[Trial, ...]:
     """The parameters as given and the best settings, on a part that the search has not seen; nothing without either."""
+    if rest is None or not any(trial.complete for trial in trials):
+        return ()
     best = [trial for trial in front(trials, objectives) if trial.number]
     best.sort(key=lambda trial: not beats(trial, trials[0], objectives))  # those first that give nothing up
-    if rest is None or not trials[0].complete:
-        return ()
     chosen = [trials[0], *best[:MOST_CHECKED]]
     results = runs.score([trial.values for trial in chosen], rest)
     return tuple(

@@ -24,7 +24,7 @@ from app.tuning.objectives import OBJECTIVES, Objective
 from app.tuning.process import Ended, Tried, Wanted, find
 from app.tuning.space import grid, parse_dimensions
 from app.tuning.trial import Trial, advice, front, proposal
-from app.tuning.tune import Part, search
+from app.tuning.tune import Part, check, search
 from tests.cli.conftest import write_walk
 
 ATE, F1 = OBJECTIVES["ate"], OBJECTIVES["ground-f1"]
@@ -105,6 +105,20 @@ def test_a_setting_is_proposed_only_if_it_is_better_on_the_part_held_back() -> N
     assert proposed(given, better) == better
     assert proposed(given, worse, by=F1) == worse, "a greater F1 is better"
     assert proposal((given, better), (), (ATE,)) == better and advice((given, better), (), (ATE,)) == ""
+
+
+def test_the_best_are_checked_even_where_the_parameters_as_given_failed() -> None:
+    trials = [Trial(0, {"ground.alpha": 3.0}, (None,), "lost"), Trial(1, {"ground.alpha": 40.0}, (0.0,))]
+    given, best = check(Bowl(), trials, (ATE,), Part(20.0, 20.0))  # type: ignore[arg-type]
+    assert not given.complete and best.complete and proposal(trials, (given, best), (ATE,)) == best
+    assert check(Bowl(), trials[:1], (ATE,), Part(20.0, 20.0)) == (), "no trial gave a result"  # type: ignore[arg-type]
+
+
+def test_when_no_setting_gives_a_result_held_back_the_advice_says_so() -> None:
+    given, other = Trial(0, {}, (1.0,)), Trial(5, {}, (0.5,))
+    failed = (Trial(0, {}, (None,), "lost"), Trial(5, {}, (None,), "lost"))
+    assert proposal((given, other), failed, (ATE,)) == failed[0]
+    assert "no setting gives a result" in advice((given, other), failed, (ATE,))
 
 
 def test_what_gives_up_one_objective_for_another_is_not_proposed() -> None:
