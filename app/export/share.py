@@ -24,17 +24,6 @@ TILE = 16.0
 """m: float16 holds x and y in a tile to 4 mm; z less finely where it is far from the tile's median."""
 STOPS = np.array([[40, 60, 150], [30, 150, 160], [120, 195, 110], [240, 200, 70], [225, 90, 50]], np.float64)
 """Colours from low to high."""
-FEW_FIRST = """<script>{
-  const draw = WebGL2RenderingContext.prototype.drawArrays;
-  let frames = -1;
-  const next = () => ++frames < 8 && requestAnimationFrame(next);
-  WebGL2RenderingContext.prototype.drawArrays = function (mode, first, count) {
-    const points = mode === this.POINTS;
-    if (points && frames < 0) next();
-    draw.call(this, mode, first, points && frames < 8 ? Math.ceil(count / 8) : count);
-  };
-}</script>"""
-"""The first frames draw an eighth of every tile: without a graphics card, a million points take seconds each time."""
 PATH, LOOP, MARK, ARROW = (255, 255, 255), (255, 120, 40), (120, 255, 160), (255, 60, 60)
 
 
@@ -50,8 +39,7 @@ def write(path: Path, results: "Results") -> None:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
     name = html.escape(name_of(results.info.recording))
-    page = with_point_sizes(page).replace("<head>", "<head>" + FEW_FIRST, 1)
-    page = page.replace("<title>Viser</title>", f"<title>{name}</title>", 1)
+    page = with_point_sizes(page).replace("<title>Viser</title>", f"<title>{name}</title>", 1)
     before, end, after = page.rpartition("</body>")
     path.write_text(before + _overlay(name, len(points), results) + end + after, encoding="utf-8")
 
@@ -74,7 +62,11 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: "Resu
     scene, trajectory = server.scene, results.trajectory.positions
     scene.set_up_direction("+z")
     colours = _colours(points[:, 2])
-    for number, (tile, part) in enumerate(tiled(points)):
+    tiles, which = np.unique(np.floor(points[:, :2] / TILE).astype(np.int64), axis=0, return_inverse=True)
+    order = np.argsort(which.ravel(), kind="stable")
+    for number, (tile, part) in enumerate(
+        zip(tiles, np.split(order, np.cumsum(np.bincount(which.ravel()))[:-1]), strict=True)
+    ):
         center = np.append((tile + 0.5) * TILE, np.median(points[part, 2]))
         own = (points[part] - center).astype(np.float32)
         scene.add_point_cloud(
@@ -98,14 +90,6 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: "Resu
     center, size = (most_low + most_high) / 2, float(np.linalg.norm((most_high - most_low)[:2])) + 1.0
     server.initial_camera.position = tuple(center + size * np.array([-0.26, -0.42, 0.45]))
     server.initial_camera.look_at = tuple(center)
-
-
-def tiled(points: F32) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(x, y) and the points' indices of each tile; every eighth point comes first, an even part of the tile."""
-    tiles, which = np.unique(np.floor(points[:, :2] / TILE).astype(np.int64), axis=0, return_inverse=True)
-    order = np.lexsort((np.arange(len(points)) % 8, which.ravel()))
-    ends = np.cumsum(np.bincount(which.ravel()))[:-1]
-    return list(zip(tiles, np.split(order, ends), strict=True))
 
 
 def marked(results: "Results") -> list[tuple[str, F64]]:

@@ -22,22 +22,6 @@ from app.slam.params import Params
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.types import Cloud, Keyframe
 
-COUNT_POINTS = """{
-  const draw = WebGL2RenderingContext.prototype.drawArrays, next = requestAnimationFrame;
-  let now = 0;
-  window.drawn = [];
-  WebGL2RenderingContext.prototype.drawArrays = function (mode, first, count) {
-    if (mode === this.POINTS) now += count;
-    return draw.call(this, mode, first, count);
-  };
-  window.requestAnimationFrame = (call) => next((time) => {
-    now = 0;
-    call(time);
-    if (now) drawn.push(now);
-  });
-}"""
-"""How many points each frame draws, in `drawn`."""
-
 
 def plaza(points: int) -> Results:
     """Two keyframes over a square of 30 m with a wavy floor."""
@@ -57,7 +41,6 @@ def test_a_shared_page_opens_from_the_disk_without_a_complaint(chromium: Browser
     page, said = chromium.new_page(viewport={"width": 800, "height": 600}), list[str]()
     page.on("console", lambda one: said.append(one.text) if one.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: said.append(str(error)))
-    page.add_init_script(COUNT_POINTS)
     begin = time.monotonic()
     page.goto(file.as_uri())
     deadline = time.monotonic() + 60
@@ -66,8 +49,6 @@ def test_a_shared_page_opens_from_the_disk_without_a_complaint(chromium: Browser
         if (np.ptp(picture[100:500, 200:600], axis=2) > 40).mean() > 0.2:
             break
         assert time.monotonic() < deadline, "the map does not show"
-    page.wait_for_function("drawn.at(-1) === 200_000")
-    assert 25_000 <= page.evaluate("drawn[0]") < 25_100, "the first frame draws all points and takes seconds"
     print(f"shown after {time.monotonic() - begin:.1f} s")
     if "SHARE_PICTURE" in os.environ:
         page.screenshot(path=Path(os.environ["SHARE_PICTURE"]))
@@ -82,19 +63,6 @@ def test_a_shared_page_opens_from_the_disk_without_a_complaint(chromium: Browser
     of_the_renderer = ("THREE.Clock: ", "GL Driver Message", "Canvas2D: Multiple readback")
     assert not [text for text in said if not text.startswith(of_the_renderer) and "GL Driver" not in text]
     page.close()
-
-
-def test_the_points_of_the_first_frames_cover_each_tile_like_all_its_points(tmp_path: Path) -> None:
-    points = np.random.default_rng(3).uniform(-15, 15, (80_000, 3)).astype(np.float32)
-    points = points[np.argsort(points[:, 0])]  # as a walk sees one end first
-    tiles = share.tiled(points)
-    assert np.array_equal(np.sort(np.concatenate([part for _, part in tiles])), np.arange(len(points)))
-    for tile, part in tiles:
-        eighth = points[part[: len(part) // 8]]
-        assert (np.floor(points[part, :2] / share.TILE) == tile).all()
-        for share_of in (0.1, 0.5, 0.9):
-            whole, few = (np.quantile(of[:, 0], share_of) for of in (points[part], eighth))
-            assert abs(whole - few) < 1  # m; five times the scatter of so few
 
 
 def test_measures_are_named_with_their_distance_and_notes_stand_where_they_were_taken(tmp_path: Path) -> None:
