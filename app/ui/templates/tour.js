@@ -1,10 +1,10 @@
 // One minute through the page on the first visit: what is spoken of is outlined, Esc or Skip ends it.
 if (!window.hemislamTour) {
   const STEPS = [
-    ['.hs-steps', '', 'Play, or step', 'Space plays and pauses. ← and → go one frame; going back loses nothing.'],
-    ['.hs-track', '', 'Go anywhere', 'Drag the track. Marks show loops, notes and trouble; Diagnostics says what it was.'],
-    ['[role=slider][aria-valuenow]:not(input)', 'Parameters', 'Tune the ground', 'Move M, α or σ: the present frame is labelled again '
-      + 'at once. Teal is ground, amber are the seeds it was found from.'],
+    ['.hs-steps', '', 'Play, or step', 'Space plays and pauses; ← and → step one frame. When you go back, the map and your edits are kept.'],
+    ['.hs-track', '', 'Go anywhere', 'Drag the track. Its marks show loops, notes and trouble; open Diagnostics to see what the trouble was.'],
+    ['[role=slider][aria-valuenow]:not(input)', 'Parameters', 'Tune the ground', 'M, α and σ decide what counts as ground. Move one: '
+      + 'the present frame is labelled again at once. Ground is teal; its plane is first fitted to the amber seed points.'],
     ['', 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click its green knob or its row to '
       + 'see both sides and why it was accepted or refused; change that, and undo it.'],
     ['', 'Help', 'That is all', 'Every number says on hover what it is. This tour and all keys are under Help.'],
