@@ -69,14 +69,14 @@ def track(
             course = guide.course(float(times[k]), course.times, last.R_odom_imu)
             here = coast.propagate(here, scan.end_ns, course, (0.0, changes[1]))
             here.covariance[ROT, ROT] += GYRO**2 * -course.times[0] * np.eye(3)
-        here, went = coast.update(here, scan, course, local_map, params.filter)
+        here, registration = coast.update(here, scan, course, local_map, params.filter)
         state = here.state
         if not np.isfinite(state.T_odom_imu).all():
             raise np.linalg.LinAlgError("the odometry gave no finite pose")
         points = coast.deskew(scan, state, course)
         local_map.insert(lie.moved(state.T_odom_imu.astype(np.float32), points), state.p_odom_imu, params.map)
         states.append(state)
-        residuals.append(went.residual_rms)
+        residuals.append(registration.residual_rms)
         clouds.append(points)
         progress(k / (len(excerpt.scans) - 1))
     poses = np.stack([state.T_odom_imu for state in states])

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from app.export.box import Box
 from app.slam.errors import HemislamError
-from app.slam.kernels.clouds import first_in_voxels, moved
+from app.slam.kernels.clouds import first_in_voxels, transform
 from app.slam.map_frame import MapFrame
 from app.slam.ply import Keyframes
 from app.slam.types import F32, F64, I64, MOVING, U8, U16, Cloud, Keyframe
@@ -91,7 +91,7 @@ def _block(keyframe: Keyframe, T_map_odom: F64) -> Block:
     cloud = keyframe.cloud
     T = T_map_odom @ keyframe.T_odom_imu @ keyframe.T_imu_lidar
     points = np.empty((len(cloud), 3))
-    moved(cloud.points, T, points)
+    transform(cloud.points, T, points)
     begin_ns = keyframe.stamp_ns - int(cloud.offsets_ns.max(initial=0))
     stamps_ns = begin_ns + cloud.offsets_ns.astype(np.int64)
     return Block(keyframe.index, keyframe.stamp_ns, T, points, stamps_ns, cloud.labels, cloud.intensity, cloud.ring)

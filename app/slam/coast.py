@@ -163,8 +163,8 @@ def update(
         if gate == 1.0 and small:
             converged = True
             break
-    went = iekf.outcome(points, H[:6, :6], converged, iteration, stats, iekf.matches(points, residuals, planes))
-    return Belief(here, covariance), went
+    registration = iekf.outcome(points, H[:6, :6], converged, iteration, stats, iekf.matches(points, residuals, planes))
+    return Belief(here, covariance), registration
 
 
 def _up(scan: Scan, params: Params) -> F64:

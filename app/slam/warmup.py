@@ -54,7 +54,7 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     surface.labels.setflags(write=False)
     cloud = Cloud(points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns)
     keyframe = Keyframe(0, 0, 0, np.eye(4), np.eye(4), np.eye(6), cloud)
-    clouds.moved(points, np.eye(4), np.empty((n, 3)))
+    clouds.transform(points, np.eye(4), np.empty((n, 3)))
     moving.find(keyframe, [moving.sight(keyframe)], params.moving)
     progress("done", 1.0)
 

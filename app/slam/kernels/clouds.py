@@ -29,7 +29,7 @@ def in_range(points, nearest, farthest, keep):
 
 
 @njit(cache=True, nogil=True)
-def moved(points, T, out):
+def transform(points, T, out):
     """Points (n, 3) f32 m of one frame in another, by T (4, 4) f64 between them. Out: out (n, 3) f64 m."""
     for j in range(len(points)):
         x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
