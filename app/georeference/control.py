@@ -49,7 +49,10 @@ def align_with_points(
     if not np.isfinite([there, at]).all():
         raise HemislamError(f"A control point of {control.source} lacks a coordinate; fill it in or remove it.")
     _refuse_line(at[used], count)
-    return _fitted(at, Ground.in_grid(there, name), tuple(names), used, height)
+    ground = Ground.in_grid(there, name)
+    _refuse_line(ground.places[used], count)
+    _refuse_mirrored(at[used], ground, used, degrees=not control.has("east"))
+    return _fitted(at, ground, tuple(names), used, height)
 
 
 def read_picks(table: NamedColumns) -> dict[str, F64]:
@@ -91,7 +94,10 @@ def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64
             f"{table.source} holds no control points; its first line must name the columns name, E, N, H, or name,"
             " latitude, longitude, height."
         )
-    return grid, dict(zip(table.columns["name"], numbers, strict=True))
+    names = list(table.columns["name"])
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise HemislamError(f"{table.source} holds control point {twice} more than once; keep one, or rename the other.")
+    return grid, dict(zip(names, numbers, strict=True))
 
 
 def _refuse_line(points: F64, names: list[str]) -> None:
@@ -102,6 +108,21 @@ def _refuse_line(points: F64, names: list[str]) -> None:
             f"The control points {', '.join(names)} lie on one line, so the map can still rotate about it;"
             " pick another one off this line."
         )
+
+
+def _refuse_mirrored(points: F64, ground: Ground, used: Mask, *, degrees: bool) -> None:
+    """Raises HemislamError if the places fit these points of the map only with the map upside down.
+
+    Args:
+        degrees: the places were given as latitude and longitude.
+    """
+    if umeyama(points, ground.places[used])[2, 2] > 0:
+        return
+    cause = "latitude and longitude" if degrees else "easting and northing"
+    raise HemislamError(
+        f"The control points fit only a map that is upside down: {cause} seem to be swapped, or names exchanged;"
+        " check both tables."
+    )
 
 
 def _fitted(points: F64, ground: Ground, names: tuple[str, ...], used: Mask, height: str) -> Alignment:

@@ -74,6 +74,34 @@ def test_a_point_without_its_easting_is_reported_as_such(tmp_path: Path) -> None
         laid(control, picks, grid="EPSG:32632")
 
 
+def test_swapped_columns_or_names_are_told_by_the_map_that_they_turn_over(tmp_path: Path) -> None:
+    _, picks = written(tmp_path, CORNERS)
+    degrees = TRUTH.to_geographic(np.array([*CORNERS.values()])).tolist()
+    swapped = tmp_path / "swapped.csv"
+    swapped.write_text("name,lat,lon,h\n" + "".join(f"{n},{o},{a},{h}\n" for n, (a, o, h) in zip(CORNERS, degrees)))
+    with pytest.raises(HemislamError, match="latitude and longitude seem to be swapped"):
+        laid(swapped, picks)
+    control, picks = written(tmp_path, {name: CORNERS[name] for name in "ABC"})
+    picks.write_text(picks.read_text().replace("A,", "a,").replace("B,", "A,").replace("a,", "B,"))
+    with pytest.raises(HemislamError, match="names exchanged"):
+        laid(control, picks, grid="EPSG:32632")
+
+
+def test_a_point_that_is_given_twice_is_named(tmp_path: Path) -> None:
+    control, picks = written(tmp_path, CORNERS)
+    control.write_text(control.read_text() + "A,691600,5334800,520\n")
+    with pytest.raises(HemislamError, match="holds control point A more than once"):
+        laid(control, picks, grid="EPSG:32632")
+
+
+def test_places_on_one_line_are_refused_wherever_their_points_were_picked(tmp_path: Path) -> None:
+    _, picks = written(tmp_path, CORNERS)
+    control, _ = written(tmp_path, {name: (10.0 * k, 3.0 * k, 0.0) for k, name in enumerate(CORNERS)}, noise=0.0)
+    picks.write_text("name,x,y,z\n" + "".join(f"{name},{x},{y},{z}\n" for name, (x, y, z) in CORNERS.items()))
+    with pytest.raises(HemislamError, match="lie on one line"):
+        laid(control, picks, grid="EPSG:32632")
+
+
 @pytest.mark.parametrize(
     ("points", "grid", "words"),
     [
