@@ -35,6 +35,8 @@ LEVEL = np.radians(0.5)
 """Standard deviation of the map's tilt before any fix: that of an accelerometer biased by 0.09 m/s²."""
 WORST_YAW, WORST_OFFSET_S, WORST_LEVER_M = np.radians(10.0), 0.1, 0.1
 """What is less certain than this (standard deviation) is not taken from the fixes."""
+NOTABLE_SCATTER = 3.0
+"""A user is told of more, as a factor on what the fixes report."""
 FEWEST = 8
 PART_S, FEWEST_IN_PART = 20.0, 5
 COARSE_FIXES = 200
@@ -123,7 +125,8 @@ def align(
         lever is None,
     )
     if (blind := np.isnan(problem.sigmas.sum(axis=1))).any():
-        notes.append("The fixes have no covariance; their scatter about the map is used instead.")
+        which = "The fixes have" if blind.all() else f"{blind.sum()} of {len(blind)} fixes have"
+        notes.append(f"{which} no covariance; their scatter about the map is used instead.")
         problem = replace(problem, sigmas=np.where(blind[:, None], median / MEDIAN_SIGMAS, problem.sigmas))
         scatter = float(np.median(problem.solve().distances)) / MEDIAN_SIGMAS
         problem = replace(problem, sigmas=np.where(blind[:, None], problem.sigmas * scatter, problem.sigmas))
@@ -140,6 +143,13 @@ def align(
     if not solved.yaw_sigma < WORST_YAW:
         raise HemislamError(
             f"The fixes determine the map's heading only to {np.degrees(solved.yaw_sigma):.0f}°; walk farther outdoors."
+        )
+    _refuse_unlike(solved, problem.places)
+    scatter = float(np.median(solved.distances[solved.used])) / MEDIAN_SIGMAS
+    if scatter > NOTABLE_SCATTER:
+        notes.append(
+            f"The fixes are {scatter:,.0f} times as far from the map as they report: the map has drifted, or they are"
+            " less accurate than that."
         )
     reference = ground.reference(solved.rotation, solved.shift, height)
     return Alignment(
@@ -342,6 +352,18 @@ def _aligned(points: F64, places: F64) -> tuple[float, F64, F64]:
         off = np.linalg.norm(places - points @ R.T - shift, axis=1)
         weights = 1.0 / np.maximum(off, 1e-3)
     return yaw, shift, off
+
+
+def _refuse_unlike(solved: _Solved, places: F64) -> None:
+    """Raises HemislamError if the fixes at these places (n, 3) fit the trajectory no better than a point would."""
+    path = (places - solved.residuals)[solved.used]
+    extent = float(np.median(np.linalg.norm(path - np.median(path, axis=0), axis=1)))
+    off = float(np.median(np.linalg.norm(solved.residuals[solved.used], axis=1)))
+    if off > 0.5 * extent:
+        raise HemislamError(
+            f"The fixes do not follow the trajectory: at best, half of them are {off:.1f} m or more off; check that"
+            " they are of this walk, in degrees, and that the receiver had reception."
+        )
 
 
 def _refuse_swapped(path: PathOverTime, seconds: F64, fixes: Fixes, median: float) -> None:

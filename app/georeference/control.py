@@ -96,7 +96,9 @@ def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64
         )
     names = list(table.columns["name"])
     if twice := next((name for name in names if names.count(name) > 1), None):
-        raise HemislamError(f"{table.source} holds control point {twice} more than once; keep one, or rename the other.")
+        raise HemislamError(
+            f"{table.source} holds control point {twice} more than once; keep one, or rename the other."
+        )
     return grid, dict(zip(names, numbers, strict=True))
 
 

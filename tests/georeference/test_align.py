@@ -80,6 +80,30 @@ def test_fixes_without_a_covariance_are_judged_by_their_scatter() -> None:
     assert not verdicts(found, made)[0]
 
 
+def test_fixes_of_which_some_have_no_covariance_are_counted() -> None:
+    made = walked()
+    sigmas = made.fixes.sigmas.copy()
+    sigmas[:100] = np.nan
+    note = align(made.trajectory, replace(made.fixes, sigmas=sigmas), lever=LEVER).notes[0]
+    assert note.startswith("100 of ") and "have no covariance" in note
+
+
+def test_fixes_much_worse_than_they_report_are_said_to_be() -> None:
+    made = walked(noise=0.2, outliers=0.0)
+    proud = replace(made.fixes, sigmas=made.fixes.sigmas / 10)
+    notes = align(made.trajectory, proud, lever=LEVER).notes
+    assert "10 times as far from the map as they report" in notes[-1]
+    assert not align(made.trajectory, made.fixes, lever=LEVER).notes
+
+
+@pytest.mark.parametrize("degrees", [0.0, np.pi / 180])
+def test_a_receiver_that_is_stuck_or_gives_radians_does_not_place_the_map(degrees: float) -> None:
+    made = walked()
+    places = made.fixes.places * [degrees, degrees, 1.0] + [0.0 if degrees else 48.0, 0.0 if degrees else 11.0, 0.0]
+    with pytest.raises(HemislamError, match="do not follow the trajectory"):
+        align(made.trajectory, Fixes.of(made.fixes.stamps_ns, places, made.fixes.sigmas), lever=LEVER)
+
+
 def test_a_straight_walk_with_the_antenna_above_shows_no_lever_arm_and_says_so() -> None:
     made = walked(path=LINE, noise=0.5, outliers=0.0, lever=(0.0, 0.0, 0.0), rate_hz=1.0, duration_s=40.0)
     found = align(made.trajectory, made.fixes)

@@ -78,7 +78,8 @@ def test_swapped_columns_or_names_are_told_by_the_map_that_they_turn_over(tmp_pa
     _, picks = written(tmp_path, CORNERS)
     degrees = TRUTH.to_geographic(np.array([*CORNERS.values()])).tolist()
     swapped = tmp_path / "swapped.csv"
-    swapped.write_text("name,lat,lon,h\n" + "".join(f"{n},{o},{a},{h}\n" for n, (a, o, h) in zip(CORNERS, degrees)))
+    rows = zip(CORNERS, degrees, strict=True)
+    swapped.write_text("name,lat,lon,h\n" + "".join(f"{name},{lon},{lat},{h}\n" for name, (lat, lon, h) in rows))
     with pytest.raises(HemislamError, match="latitude and longitude seem to be swapped"):
         laid(swapped, picks)
     control, picks = written(tmp_path, {name: CORNERS[name] for name in "ABC"})
