@@ -6,7 +6,7 @@
 # Outside 127.0.0.1 the page asks for a token: open the link that is printed. `make image-test` builds and runs this.
 FROM python:3.11-slim
 
-# libgomp1: OpenMP for the kernels. The others: open3d, which only `hemislam simulate` loads.
+# What open3d needs, which only `hemislam simulate` loads.
 RUN apt-get update \
  && apt-get install -y --no-install-recommends make libgomp1 libusb-1.0-0 libegl1 libgl1 \
  && rm -rf /var/lib/apt/lists/*

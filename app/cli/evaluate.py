@@ -155,14 +155,13 @@ def evaluate(
         subjects.append(Subject(name, path, params, truth, tuple(others[name])))
     for variant in chosen:
         variant.applied(subjects[0].params)  # raises for a misspelt parameter before anything runs
-    run, threads = runner(max(1, min(jobs or cores(), len(chosen) * len(subjects))), cluster, cluster_data)
+    run = runner(max(1, min(jobs or cores(), len(chosen) * len(subjects))), cluster, cluster_data)
     compile_behind_bar()
     findings, failures = run_evaluation(
         subjects,
         chosen,
         out,
         run=run,
-        threads=threads,
         start_s=start,
         duration_s=duration,
     )
@@ -174,8 +173,8 @@ def evaluate(
         raise HemislamError(f"{len(failures)} of {len(chosen) * len(subjects)} runs failed; {recording}, {name}: {why}")
 
 
-def runner(parallel: int, address: str | None, url: str, *, quiet: bool = False) -> tuple["RunJobs", int]:
-    """What runs jobs, on this machine or on a cluster, and how many threads each takes.
+def runner(parallel: int, address: str | None, url: str, *, quiet: bool = False) -> "RunJobs":
+    """What runs jobs, on this machine or on a cluster.
 
     Raises:
         HemislamError: Dask is not installed, or an option is there without the one it belongs to.
@@ -186,10 +185,10 @@ def runner(parallel: int, address: str | None, url: str, *, quiet: bool = False)
     if address is None:
         if url:
             raise HemislamError("--cluster-data belongs to --cluster; give both.")
-        return partial(run_jobs, parallel=parallel, quiet=quiet), max(1, cores() // parallel)
+        return partial(run_jobs, parallel=parallel, quiet=quiet)
     if find_spec("distributed") is None:
         raise HemislamError("--cluster needs Dask; install it with `pip install 'hemislam[cluster]'`.")
-    return Cluster(address, url).run_jobs, 1
+    return Cluster(address, url).run_jobs
 
 
 def name_recordings(paths: list[Path]) -> list[str]:

@@ -129,14 +129,13 @@ def tune(
     part = Part(start, duration)
     rest = part.next(held_back) if held_back != 0 and not marks else None
     make_folder(out)
-    run, threads = runner(jobs or (1 if timed else cores()), cluster, cluster_data, quiet=True)
+    run = runner(jobs or (1 if timed else cores()), cluster, cluster_data, quiet=True)
     runs = Runs(
         subjects,
         wanted,
         out / "runs",
         known=known_runs(out.resolve().parent),
         run=run,
-        threads=threads,
     )
     compile_behind_bar()
     with tqdm(total=trials + 1, desc="Tuning", unit=" trials", disable=None) as bar:

@@ -54,14 +54,13 @@ def evaluate(
     folder: Path,
     *,
     run: RunJobs,
-    threads: int,
     start_s: float = 0.0,
     duration_s: float | None = None,
 ) -> tuple[list[str], dict[tuple[str, str], str]]:
     """Run what is not finished and write the report.
 
     Args:
-        folder: for the report and the runs. run: runs the jobs. threads: of each.
+        folder: for the report and the runs. run: runs the jobs.
         start_s, duration_s: the part of each recording to use.
 
     Returns:
@@ -82,7 +81,6 @@ def evaluate(
                 variant=variant.name,
                 params=variant.applied(subject.params),
                 folder=folder / "runs" / subject.name / variant.name,
-                threads=threads,
                 start_s=start_s,
                 duration_s=duration_s,
                 baseline=variant.baseline,

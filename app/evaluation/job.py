@@ -43,7 +43,7 @@ def code_digest() -> str:
 class Job:
     """Attributes:
     recording: its path, sha256: of its bytes. name: of the recording in tables. variant: its name.
-    params: as run. folder: for the results. threads: for the kernels. code: `code_digest()`.
+    params: as run. folder: for the results. code: `code_digest()`.
     start_s, duration_s: the part of the recording that counts, after its first scan; None: to the end.
     lead_s: how much earlier reading begins, at most.
     baseline: name of the system that is run in place of the engine; "" for the engine.
@@ -57,7 +57,6 @@ class Job:
     variant: str
     params: Params
     folder: Path
-    threads: int = 1
     start_s: float = 0.0
     duration_s: float | None = None
     lead_s: float = LEAD_S

@@ -102,7 +102,7 @@ class Outcome:
             **{stage: spread(times) for stage, times in (named if self.staged else named[-1:])},
             "cpu": spread(self.cpu_ms),
             **{f"under_{budget:g}_ms": float(np.mean(self.timings_ms[:, -1] < budget)) for budget in BUDGETS_MS},
-            **{name: self.run[name] for name in ("peak_memory_mb", "threads", "load")},
+            **{name: self.run[name] for name in ("peak_memory_mb", "load")},
         }
 
     @property

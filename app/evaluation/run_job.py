@@ -37,12 +37,9 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
     Raises:
         HemislamError: the recording cannot be used. OSError: the disk is full or fails.
     """
-    import numba
-
     from app.slam.loops.service import InlineLoops
     from app.slam.warmup import compile_kernels
 
-    numba.set_num_threads(min(job.threads, numba.get_num_threads()))
     compile_kernels()
     if job.baseline:
         run_baseline(job, progress)
@@ -125,7 +122,6 @@ def _common(job: Job) -> dict[str, Any]:
         "start_s": job.start_s,
         "duration_s": job.duration_s,
         "peak_memory_mb": peak_memory_mb(),
-        "threads": job.threads,
         "load": os.getloadavg()[0],
         "machine": describe_machine(),
     }

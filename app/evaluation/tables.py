@@ -136,13 +136,12 @@ def runtime(recordings: Sequence[Evaluated]) -> Table:
         Indicator("peak memory (MB)", "runtime_ms/peak_memory_mb", ".0f", ranked=False),
     ]
     times = [time for r in recordings for outcome in r.outcomes if (time := outcome.value("runtime_ms"))]
-    threads = " or ".join(str(number) for number in sorted({time["threads"] for time in times}))
     names = _names(recordings, run=True)
     return Table(
         "Run time per frame",
         names,
         _rows(recordings, names, indicators),
-        f"As the paper's Table 3. All stages of a frame, without reading the file, on {threads} thread(s) per variant."
+        "As the paper's Table 3. All stages of a frame, without reading the file, on one thread."
         " Variants that run side by side share memory and caches, so --jobs 1 gives the quietest times. The machine's"
         f" load was up to {max((time['load'] for time in times), default=0.0):.1f}. Where that is more than its cores,"
         " other work made frames wait, and CPU time is the better measure. CPU time is measured over whole frames, not"

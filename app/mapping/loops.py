@@ -13,7 +13,7 @@ from app.slam.loops.types import LoopChange, LoopEdge, changed_by, difference
 
 NICENESS: Final = 10
 """The frame loop comes first."""
-_ONE_THREAD: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "NUMBA", "OPENBLAS", "MKL")}
+_ONE_THREAD: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 """More threads would compete with the frame loop for the cores."""
 MOST_DEATHS: Final = 3
 """A worker is replaced this many times; after that, loops stay as they are."""

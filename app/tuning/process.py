@@ -106,7 +106,6 @@ def _find(owner: Link, wanted: Wanted) -> None:
         wanted.folder / "runs",
         known=known_runs(wanted.folder.resolve().parent),
         run=partial(run_jobs, parallel=parallel, quiet=True, ended=ended),
-        threads=1,
     )
     _, checked = tune(
         runs,

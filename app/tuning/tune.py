@@ -55,7 +55,7 @@ class Runs:
     """Runs settings on all recordings and scores them.
 
     Args:
-        folder: for runs. known: folders of runs that were finished before, by key. run, threads: as `evaluate`.
+        folder: for runs. known: folders of runs that were finished before, by key. run: as `evaluate`.
 
     Raises:
         HemislamError: a recording cannot be used.
@@ -69,10 +69,9 @@ class Runs:
         *,
         known: Mapping[str, Path],
         run: RunJobs,
-        threads: int,
     ) -> None:
         self._subjects, self._objectives, self._folder = subjects, objectives, folder
-        self._known, self._run, self._threads = known, run, threads
+        self._known, self._run = known, run
         self.hashes = [check_subject(subject) for subject in subjects]
 
     def asked(self, how: SearchMethod, trials: int, seed: int, part: Part) -> dict[str, Any]:
@@ -106,7 +105,6 @@ class Runs:
                 variant=variant,
                 params=subject.params.with_values(values),
                 folder=folder,
-                threads=self._threads,
                 start_s=part.start_s,
                 duration_s=part.duration_s,
                 lead_s=part.lead_s,

@@ -14,7 +14,7 @@ from app.slam.types import TIMINGS
 def column(name: str, ate_m: float, cpu_ms: float) -> Outcome:
     none, error = np.zeros(0), {"rmse": ate_m, "mean": ate_m, "max": ate_m}
     accuracy = Accuracy({"ate_m": error, "ate_after_start_m": ate_m}, none, none, none, np.zeros((0, 3)))
-    run = {"peak_memory_mb": 100.0, "threads": 1, "load": 0.5, "ground": None}
+    run = {"peak_memory_mb": 100.0, "load": 0.5, "ground": None}
     times = np.full((10, len(TIMINGS)), cpu_ms)
     return Outcome(name, run=run, timings_ms=times, cpu_ms=times[:, 0], accuracy=accuracy)
 

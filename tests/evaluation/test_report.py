@@ -53,7 +53,7 @@ def column(name: str, size: float, *, bent: bool = True) -> Outcome:
         drift={5.0: np.array([0.5, 1.0, 2.0])},
     )
     run = {
-        "peak_memory_mb": 100.0, "threads": 1, "load": 0.5, "ground": None,
+        "peak_memory_mb": 100.0, "load": 0.5, "ground": None,
         "parameters": Params().with_values({"scan.voxel_size": size}).model_dump(mode="json"), "hemislam": "1.0",
         "code": "c0de", "machine": dict.fromkeys(("processor", "cores", "system", "python", "numpy", "numba"), "m"),
         "map_sharpness": dict.fromkeys(("entropy", "thickness", "revisit_median", "revisit_p95")),

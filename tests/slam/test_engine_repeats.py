@@ -45,8 +45,8 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
     )
     started = []
     for threads in ("1", "2", "7"):
-        environment = os.environ | {"NUMBA_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
-        environment |= {"OMP_NUM_THREADS": threads, "PYTHONPATH": os.pathsep.join(sys.path)}
+        environment = os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
+        environment |= {"PYTHONPATH": os.pathsep.join(sys.path)}
         command = [sys.executable, "-c", code]
         started.append(subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True))
     prints = {process.communicate(timeout=300)[0] for process in started}

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 SECTORS, REACH, STEP = 72, 40, 1.0
 """Polar cells of 5 degrees and 1 m, out to 40 m."""
@@ -176,7 +176,7 @@ def _last_line(ring, lines):
     return last
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def label(points, centroid, normal, sigma, labels):
     """Paper eq. 2-3: a point p is ground if |(mu - p) . n| < sigma |p|. Seeds that are ground stay seeds.
 
@@ -184,7 +184,7 @@ def label(points, centroid, normal, sigma, labels):
     ground, label 4 is ground. Returns the number of ground points.
     """
     count = 0
-    for j in prange(len(points)):
+    for j in range(len(points)):
         x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
         d = (centroid[0] - x) * normal[0] + (centroid[1] - y) * normal[1] + (centroid[2] - z) * normal[2]
         ground = abs(d) < sigma * math.sqrt(x * x + y * y + z * z)

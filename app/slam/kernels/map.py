@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from app.slam.kernels.clouds import PRIME_X, PRIME_Y, PRIME_Z
-from app.slam.kernels.small import CHUNKS, plane_of
+from app.slam.kernels.small import plane_of
 
 
 @njit(cache=True, inline="always")
@@ -238,7 +238,7 @@ def _is_flat(x, y, z, places, order, n, mx, my, mz, normal, flat):
     return True
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def planes(
     queries, voxel, reach, first, flat, tilts, noise, old, table, cells, counts, store, normals, centers, variances
 ):
@@ -254,29 +254,28 @@ def planes(
     queries (n, 3) f64 m, odom; noise: of a point, m; the map as in `insert`. Out: normals (k, n, 3) unit, centers
     (k, n, 3) m, variances (k, n): of a point's distance from its plane in m², negative where there is no plane.
     """
-    total, room = len(queries), store.shape[1]
+    room = store.shape[1]
     places = store.reshape(-1, 5)
-    for chunk in prange(CHUNKS):
-        spots, bins, order = np.empty(27 * room, np.int32), np.empty(27 * room, np.int32), np.empty(27 * room, np.int32)
-        begin = np.empty(2 * BINS + 1, np.int32)
-        normal = np.empty(3)
-        for j in range(chunk * total // CHUNKS, (chunk + 1) * total // CHUNKS):
-            x, y, z = queries[j, 0], queries[j, 1], queries[j, 2]
-            present, n = _nearest(
-                x, y, z, voxel, reach * reach, old, table, cells, counts, places, room, spots, bins, begin, order
-            )
+    spots, bins, order = np.empty(27 * room, np.int32), np.empty(27 * room, np.int32), np.empty(27 * room, np.int32)
+    begin = np.empty(2 * BINS + 1, np.int32)
+    normal = np.empty(3)
+    for j in range(len(queries)):
+        x, y, z = queries[j, 0], queries[j, 1], queries[j, 2]
+        present, n = _nearest(
+            x, y, z, voxel, reach * reach, old, table, cells, counts, places, room, spots, bins, begin, order
+        )
+        _fit(
+            x, y, z, places, order, min(present, MOST), first, flat, tilts, noise, normal, j,
+            normals, centers, variances,
+        )  # fmt: skip
+        if variances[0, j] < 0.0 and n > present:
             _fit(
-                x, y, z, places, order, min(present, MOST), first, flat, tilts, noise, normal, j,
+                x, y, z, places, order[present:], min(n - present, MOST), first, flat, tilts, noise, normal, j,
                 normals, centers, variances,
             )  # fmt: skip
-            if variances[0, j] < 0.0 and n > present:
-                _fit(
-                    x, y, z, places, order[present:], min(n - present, MOST), first, flat, tilts, noise, normal, j,
-                    normals, centers, variances,
-                )  # fmt: skip
-                for i in range(len(tilts)):
-                    variances[i, j] *= OLD
             for i in range(len(tilts)):
-                centers[i, j, 0] += x
-                centers[i, j, 1] += y
-                centers[i, j, 2] += z
+                variances[i, j] *= OLD
+        for i in range(len(tilts)):
+            centers[i, j, 0] += x
+            centers[i, j, 1] += y
+            centers[i, j, 2] += z

@@ -3,9 +3,7 @@
 import math
 
 import numpy as np
-from numba import njit, prange
-
-from app.slam.kernels.small import CHUNKS
+from numba import njit
 
 REPEATED = 2.0
 """How many times the variance of a distance counts: errors of a calibration and of a patch of the map repeat from
@@ -18,18 +16,18 @@ RESIDUAL_HUBER = 2.0
 a wrong plane could move the pose by millimetres."""
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def to_world(points, R, p, R_il, p_il, out):
     """out (n, 3) f64 m, odom = R (R_il points + p_il) + p, for points (n, 3) f32 m, LiDAR frame."""
     A = R @ R_il
     t = R @ p_il + p
-    for j in prange(len(points)):
+    for j in range(len(points)):
         x, y, z = points[j, 0], points[j, 1], points[j, 2]
         for i in range(3):
             out[j, i] = A[i, 0] * x + A[i, 1] * y + A[i, 2] * z + t[i]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def normal_equations(points, R, p, R_il, p_il, normals, centers, variances, gate, extrinsics, H, b, stats, residuals):
     """Accumulate H^T W H and H^T W z of eq. 5-6 over all points with a plane.
 
@@ -39,65 +37,51 @@ def normal_equations(points, R, p, R_il, p_il, normals, centers, variances, gate
     Out: H (12, 12), b (12,), stats (2,): inliers and their sum of squared distances in m²; residuals (n,) m, signed,
     nan if not used.
     """
-    n = len(points)
-    H_part = np.zeros((CHUNKS, 12, 12))
-    b_part = np.zeros((CHUNKS, 12))
-    s_part = np.zeros((CHUNKS, 2))
-    for chunk in prange(CHUNKS):
-        row = np.zeros(12)
-        columns = 12 if extrinsics else 6
-        for j in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
-            residuals[j] = np.nan
-            if variances[j] < 0.0:
-                continue
-            x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
-            ix = R_il[0, 0] * x + R_il[0, 1] * y + R_il[0, 2] * z + p_il[0]
-            iy = R_il[1, 0] * x + R_il[1, 1] * y + R_il[1, 2] * z + p_il[1]
-            iz = R_il[2, 0] * x + R_il[2, 1] * y + R_il[2, 2] * z + p_il[2]
-            nx, ny, nz = normals[j, 0], normals[j, 1], normals[j, 2]
-            d = (
-                nx * (R[0, 0] * ix + R[0, 1] * iy + R[0, 2] * iz + p[0] - centers[j, 0])
-                + ny * (R[1, 0] * ix + R[1, 1] * iy + R[1, 2] * iz + p[1] - centers[j, 1])
-                + nz * (R[2, 0] * ix + R[2, 1] * iy + R[2, 2] * iz + p[2] - centers[j, 2])
-            )
-            # FAST-LIO2's gate: near points must fit better than far ones
-            reach = math.sqrt(x * x + y * y + z * z)
-            if abs(d) > gate * math.sqrt(reach):
-                continue
-            ax = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz  # R^T n: the normal in the IMU frame
-            ay = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
-            az = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
-            lx = R_il[0, 0] * ax + R_il[1, 0] * ay + R_il[2, 0] * az  # and in the LiDAR frame
-            ly = R_il[0, 1] * ax + R_il[1, 1] * ay + R_il[2, 1] * az
-            lz = R_il[0, 2] * ax + R_il[1, 2] * ay + R_il[2, 2] * az
-            if abs(lx * x + ly * y + lz * z) < EDGE_ON * reach:
-                continue
-            row[0], row[1], row[2] = iy * az - iz * ay, iz * ax - ix * az, ix * ay - iy * ax
-            row[3], row[4], row[5] = nx, ny, nz
-            if extrinsics:
-                row[6], row[7], row[8] = y * lz - z * ly, z * lx - x * lz, x * ly - y * lx
-                row[9], row[10], row[11] = ax, ay, az
-            w = 1.0 / (REPEATED * variances[j])
-            if d * d > RESIDUAL_HUBER * RESIDUAL_HUBER * variances[j]:
-                w *= RESIDUAL_HUBER * math.sqrt(variances[j]) / abs(d)
-            residuals[j] = d
-            s_part[chunk, 0] += 1.0
-            s_part[chunk, 1] += d * d
-            for i in range(columns):
-                wi = w * row[i]
-                b_part[chunk, i] += wi * d
-                for k in range(i, columns):
-                    H_part[chunk, i, k] += wi * row[k]
-    H[:] = 0.0
-    b[:] = 0.0
-    stats[:] = 0.0
-    for chunk in range(CHUNKS):
-        for i in range(12):
-            b[i] += b_part[chunk, i]
-            for k in range(i, 12):
-                H[i, k] += H_part[chunk, i, k]
-        stats[0] += s_part[chunk, 0]
-        stats[1] += s_part[chunk, 1]
+    H[:], b[:], stats[:] = 0.0, 0.0, 0.0
+    row = np.zeros(12)
+    columns = 12 if extrinsics else 6
+    for j in range(len(points)):
+        residuals[j] = np.nan
+        if variances[j] < 0.0:
+            continue
+        x, y, z = float(points[j, 0]), float(points[j, 1]), float(points[j, 2])
+        ix = R_il[0, 0] * x + R_il[0, 1] * y + R_il[0, 2] * z + p_il[0]
+        iy = R_il[1, 0] * x + R_il[1, 1] * y + R_il[1, 2] * z + p_il[1]
+        iz = R_il[2, 0] * x + R_il[2, 1] * y + R_il[2, 2] * z + p_il[2]
+        nx, ny, nz = normals[j, 0], normals[j, 1], normals[j, 2]
+        d = (
+            nx * (R[0, 0] * ix + R[0, 1] * iy + R[0, 2] * iz + p[0] - centers[j, 0])
+            + ny * (R[1, 0] * ix + R[1, 1] * iy + R[1, 2] * iz + p[1] - centers[j, 1])
+            + nz * (R[2, 0] * ix + R[2, 1] * iy + R[2, 2] * iz + p[2] - centers[j, 2])
+        )
+        # FAST-LIO2's gate: near points must fit better than far ones
+        reach = math.sqrt(x * x + y * y + z * z)
+        if abs(d) > gate * math.sqrt(reach):
+            continue
+        ax = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz  # R^T n: the normal in the IMU frame
+        ay = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
+        az = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
+        lx = R_il[0, 0] * ax + R_il[1, 0] * ay + R_il[2, 0] * az  # and in the LiDAR frame
+        ly = R_il[0, 1] * ax + R_il[1, 1] * ay + R_il[2, 1] * az
+        lz = R_il[0, 2] * ax + R_il[1, 2] * ay + R_il[2, 2] * az
+        if abs(lx * x + ly * y + lz * z) < EDGE_ON * reach:
+            continue
+        row[0], row[1], row[2] = iy * az - iz * ay, iz * ax - ix * az, ix * ay - iy * ax
+        row[3], row[4], row[5] = nx, ny, nz
+        if extrinsics:
+            row[6], row[7], row[8] = y * lz - z * ly, z * lx - x * lz, x * ly - y * lx
+            row[9], row[10], row[11] = ax, ay, az
+        w = 1.0 / (REPEATED * variances[j])
+        if d * d > RESIDUAL_HUBER * RESIDUAL_HUBER * variances[j]:
+            w *= RESIDUAL_HUBER * math.sqrt(variances[j]) / abs(d)
+        residuals[j] = d
+        stats[0] += 1.0
+        stats[1] += d * d
+        for i in range(columns):
+            wi = w * row[i]
+            b[i] += wi * d
+            for k in range(i, columns):
+                H[i, k] += wi * row[k]
     for i in range(12):
         for k in range(i):
             H[i, k] = H[k, i]

@@ -5,9 +5,6 @@ import math
 import numpy as np
 from numba import njit
 
-CHUNKS = 32
-"""Number of pieces of a parallel reduction; fixed, so that results do not depend on the number of threads."""
-
 
 @njit(cache=True, inline="always")
 def cross(a, b, out):
