@@ -82,7 +82,7 @@ def _clicks(rng: np.random.Generator) -> list[float]:
         workbench = Workbench(server, engine, Folders([Path(folder)]))
         workbench.start()
         with listening(f"http://127.0.0.1:{server.get_port()}/") as page:
-            _until(lambda: workbench._scene.points > 0)
+            _until(lambda: workbench._scene.chunks.points > 0)
             time.sleep(15.0)  # until the page has all of it
             for number in range(CLICKS):
                 workbench._measure.begin(POINT)

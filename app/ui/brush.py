@@ -16,7 +16,7 @@ from app.slam.errors import HemislamError
 from app.slam.types import GROUND, NON_GROUND, U8, StepResult
 from app.ui.colours import LABEL_COLOURS
 from app.ui.html import panel
-from app.ui.nodes import add_points, place
+from app.ui.nodes import add_points, clear, place
 from app.ui.sensor import SCAN_POINT_SCALE
 from app.ui.study_maths import nearest_to_ray
 from app.ui.viser_adapter import Bridge
@@ -42,7 +42,7 @@ class BrushPanel:
         self._page, self._taken = page, taken
         self._changes = Changes()
         self._mark: int | None = None
-        self._node: viser.SceneNodeHandle | None = None
+        self._nodes: list[viser.SceneNodeHandle] = []
         self._why = gui.add_html("")
         brush = gui.add_button_group(
             "brush", (*_MARKS, _OFF), hint="Pause, then click points of the scan; Shift and drag marks a rectangle."
@@ -95,16 +95,14 @@ class BrushPanel:
         return "Mark ground in a few frames, and Tune finds the parameters that label them best."
 
     def _draw_scene(self, result: StepResult | None, found: U8 | None, size: float) -> None:
-        if self._node is not None:
-            self._node.remove()
-            self._node = None
+        clear(self._nodes)
         if result is None or found is None or len(found) != len(result.cloud):
             return
         shown = np.flatnonzero(found != UNMARKED)
         points, colours = result.cloud.points[shown], _COLOURS[found[shown]]
         node = add_points(self._page.scene, f"{ROOT}/painted", points, colours, _SCALE * SCAN_POINT_SCALE * size)
         place(node, result.T_map_imu @ result.state.T_imu_lidar)
-        self._node = node
+        self._nodes.append(node)
 
     # --- what is marked --------------------------------------------------------------------------
     def _frame(self) -> StepResult | None:

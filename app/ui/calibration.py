@@ -63,7 +63,7 @@ class CalibrationPanel:
         self._given = Params()
         self._of: Path | None = None
         self._asked = self._tried = False
-        self._told: set[int] = set()  # browsers that know what is being looked for
+        self._notified: set[int] = set()  # browsers that know what is being looked for
         self._heard = 0  # the newest notice when this recording was opened
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -101,10 +101,10 @@ class CalibrationPanel:
         if found.contradiction and found.values:
             self._sentence = f"{found.contradiction}; this was found in the recording and is used."
         if not self._asked and found.contradiction:
-            self._tell(found.contradiction)
+            self._use_or_offer(found.contradiction)
 
-    def _tell(self, contradiction: str) -> None:
-        """Say what was found unasked, and use it where nothing else is known."""
+    def _use_or_offer(self, contradiction: str) -> None:
+        """Use what was found unasked where nothing else is known; elsewhere say how to apply it."""
         snapshot = self._page.snapshot()
         if _is_unknown(snapshot) and snapshot.params == self._given and not _has_edits(snapshot):
             self._use()
@@ -117,8 +117,8 @@ class CalibrationPanel:
     def _announce(self) -> None:
         """Say in each browser why the map may look wrong."""
         for number, client in self._page.server.get_clients().items():
-            if number not in self._told:
-                self._told.add(number)
+            if number not in self._notified:
+                self._notified.add(number)
                 client.add_notification(
                     "Looking for the pose of the LiDAR on the IMU",
                     "None is given. The map may look wrong until it is found; then it is made again.",
@@ -130,7 +130,7 @@ class CalibrationPanel:
         if self._work.running or snapshot.recording is None or self._button.disabled:
             return
         self._asked, self._tried, self._given = asked, True, snapshot.params
-        self._told.clear()
+        self._notified.clear()
         self._progress.value = 0.0  # type: ignore[misc]  # as above
         self._progress.visible, self._apply.visible = True, False
         self._work.begin(find, snapshot.recording.path, snapshot.params)

@@ -65,6 +65,7 @@ class MapChunks:
 
     Attributes:
         settled: whether all that was asked for is drawn. partial: whether the map has more points than are drawn.
+        limits: ends of the colour maps as drawn, by mode.
     """
 
     def __init__(self, scene: viser.SceneApi, root: str, budget: int = POINT_BUDGET) -> None:
@@ -76,13 +77,8 @@ class MapChunks:
         self._view = View()
         self._coloured: tuple[Limits | None, Limits | None] = None, None
         self._fixed: dict[str, Limits] = {}
-        self._limits: dict[str, Limits] = {}
+        self.limits: dict[str, Limits] = {}
         self._start_ns = 0
-
-    @property
-    def limits(self) -> dict[str, Limits]:
-        """Ends of the colour maps as drawn, by mode."""
-        return self._limits
 
     def _of_keyframes(self) -> dict[str, Limits]:
         return self._drawn[-1].limits if self._drawn else self._fixed
@@ -101,7 +97,7 @@ class MapChunks:
         self._keep(0)
         self._start_ns = start_ns
         self._fixed = {name: mode.fixed(duration_s) for name, mode in MODES.items() if mode.fixed is not None}
-        self._limits = self._fixed
+        self.limits = self._fixed
 
     def draw(self, chunks: tuple[Chunk, ...], poses: F64, view: View, eyes: F64 = _NO_EYES) -> None:
         """Show these keyframes: remove, add, thin, move and colour those that differ from what is drawn.
@@ -116,9 +112,9 @@ class MapChunks:
         for chunk, T in zip(chunks[known:], self._T_map_imu[known:], strict=True):
             self._drawn.append(_Drawn(chunk, self._grown(chunk, T), light(chunk.points, T @ chunk.T_imu_lidar)))
         limits = self._of_keyframes() | ({view.colour_by: view.numbers.limits} if view.numbers is not None else {})
-        if limits != self._limits:
-            self._limits = limits
-        ends = chosen_ends(self._limits, view.colour_by, view.ends)
+        if limits != self.limits:
+            self.limits = limits
+        ends = chosen_ends(self.limits, view.colour_by, view.ends)
         seen, used = self._view, (ends.get(view.colour_by), ends.get(INTENSITY))
         recolour = (view.colour_by, view.numbers, used) != (seen.colour_by, seen.numbers, self._coloured)
         cut = (view.ceilings, view.moving, view.clip) != (seen.ceilings, seen.moving, seen.clip)

@@ -71,10 +71,7 @@ def seed_wedge(elevations: F64, down: F64, alpha: float, reach: float, samples: 
         found = arc(float(elevation), down, alpha)
         if found is not None:
             azimuth = found[0] + np.linspace(-found[1], found[1], samples)
-            flat = np.cos(elevation)
-            arcs.append(
-                np.column_stack((flat * np.cos(azimuth), flat * np.sin(azimuth), np.full(samples, np.sin(elevation))))
-            )
+            arcs.append(_directions(np.full(samples, elevation), azimuth))
     if not arcs:
         return None
     rims = np.asarray(arcs, dtype=np.float32) * np.float32(reach)  # (m, samples, 3)

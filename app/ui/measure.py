@@ -15,7 +15,7 @@ from app.slam.types import F64
 from app.ui.corners import snapped
 from app.ui.html import panel
 from app.ui.measure_maths import Numbers, as_csv, load, meet, numbers, places, words
-from app.ui.nodes import add_exact_points, add_lines, segments
+from app.ui.nodes import add_exact_points, add_lines, clear, segments
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, by_user, dialog, poses_of
 
@@ -110,9 +110,7 @@ class MeasurePanel:
             self._spots, self._name.value = (), ""  # type: ignore[misc]  # mypy overlooks viser's setter
 
     def _draw_scene(self, begun: F64 | None) -> None:
-        for node in self._nodes:
-            node.remove()
-        self._nodes.clear()
+        clear(self._nodes)
         scene = self._page.scene
         every = [(at, f"{measure.name}: {words(at, found).split(': ')[0]}") for measure, at, found in self._measured]
         for number, (at, text) in enumerate([*every, *([(begun, "")] if begun is not None else [])]):

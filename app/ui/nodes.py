@@ -31,6 +31,12 @@ def place(node: viser.SceneNodeHandle, T: F64) -> None:
     node.wxyz, node.position = wxyz(T[:3, :3]), T[:3, 3]
 
 
+def clear(nodes: list[Any]) -> None:
+    """Remove nodes from the scene, and from the list."""
+    while nodes:
+        nodes.pop().remove()
+
+
 def add_points(
     scene: viser.SceneApi, name: str, points: F32, colours: U8 | Rgb, size: float, T: F64 | None = None,
     *, visible: bool = True,

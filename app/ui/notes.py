@@ -11,7 +11,7 @@ from app.server.keeping import AddNote, EditNote
 from app.server.protocol import Seek, Snapshot
 from app.slam.types import F64
 from app.ui.html import panel
-from app.ui.nodes import add_exact_points
+from app.ui.nodes import add_exact_points, clear
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, by_user, dialog
 
@@ -98,9 +98,7 @@ class Pins:
         if not self._changes(str(pinned), str(where.round(2).tolist())):
             return
         self._pinned, self._where = pinned, where
-        for node in self._nodes:
-            node.remove()
-        self._nodes.clear()
+        clear(self._nodes)
         scene, root = self._page.scene, f"{ROOT}/notes"
         if pinned:
             self._nodes.append(add_exact_points(scene, f"{root}/knobs", where.astype(np.float32), _PIN_COLOUR, _PIN_M))

@@ -225,7 +225,8 @@ class ParameterPanel:
             if names:
                 button.label = f"{verb} {', '.join(_short(name.partition('.')[2]) for name in list(names)[:2])}"
         self._show_resets(snapshot.params)
-        self._show_pending(snapshot.pending_restart)
+        self._pending.visible = self._restart.visible = bool(snapshot.pending_restart)
+        self._pending.content = panel("pending", snapshot.pending_restart)
 
     def _step(self, by: int) -> None:
         """Undo or redo the last change of parameters."""
@@ -287,11 +288,6 @@ class ParameterPanel:
             buttons.visible = bool(changed)
             if changed and buttons.options != options:
                 buttons.options = options
-
-    def _show_pending(self, pending: tuple[str, ...]) -> None:
-        self._pending.visible = self._restart.visible = bool(pending)
-        if pending:
-            self._pending.content = panel("pending", pending)
 
 
 def _short(name: str) -> str:

@@ -32,7 +32,7 @@ class Station:
     fov: float = FOV
 
 
-def composed(rendered: U8, key: Key, *, light: bool, seen_m: float = 0.0, title: str = "") -> Image.Image:
+def composed(rendered: U8, key: Key, *, light: bool, seen_m: float = 0.0) -> Image.Image:
     """A picture with what explains it.
 
     Args:
@@ -45,8 +45,7 @@ def composed(rendered: U8, key: Key, *, light: bool, seen_m: float = 0.0, title:
     unit = max(picture.height / 900, 0.5)
     draw, font, ink = ImageDraw.Draw(picture), ImageFont.load_default(18 * unit), _INK[light]
     margin, low = 24 * unit, picture.height - 24 * unit
-    draw.text((margin, low), title, ink, font, anchor="ls")
-    y = low - (34 * unit if title else 0)
+    y = low
     for rgb, name in reversed(key.names):
         draw.ellipse((margin, y - 14 * unit, margin + 14 * unit, y), rgb)
         draw.text((margin + 22 * unit, y), name, ink, font, anchor="ls")

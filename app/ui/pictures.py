@@ -94,15 +94,16 @@ class PicturesPanel:
         camera, (key, light) = client.camera, self._key()
         rendered = self._rendered(client, None)
         away = float(np.linalg.norm(np.array(camera.position) - camera.look_at))
-        seen_m = 2 * away * float(np.tan(camera.fov / 2))
-        picture = (
-            composed(rendered, key, light=light, seen_m=seen_m)
-            if self._explain.value
-            else composed(rendered, Key(), light=light)
-        )
+        png = self._png(rendered, key, light, 2 * away * float(np.tan(camera.fov / 2)))
+        client.send_file_download(f"{self._name()}.png", png, save_immediately=True)
+
+    def _png(self, rendered: U8, key: Key, light: bool, seen_m: float = 0.0) -> bytes:
+        """With a legend and a scale, if they are wanted. seen_m: as in `composed`."""
+        if not self._explain.value:
+            key, seen_m = Key(), 0.0
         file = io.BytesIO()
-        picture.save(file, "PNG", compress_level=3)
-        client.send_file_download(f"{self._name()}.png", file.getvalue(), save_immediately=True)
+        composed(rendered, key, light=light, seen_m=seen_m).save(file, "PNG", compress_level=3)
+        return file.getvalue()
 
     def _rendered(self, client: viser.ClientHandle, station: Station | None) -> U8:
         """(h, w, 4) what the browser sees from a station, or from where its camera is.
@@ -162,10 +163,7 @@ class PicturesPanel:
                     rendered = self._rendered(client, here)
                     if self._stopped.is_set():
                         return
-                    picture = composed(rendered, key if self._explain.value else Key(), light=light)
-                    png = io.BytesIO()
-                    picture.save(png, "PNG", compress_level=3)
-                    pictures.writestr(f"{number:05d}.png", png.getvalue())
+                    pictures.writestr(f"{number:05d}.png", self._png(rendered, key, light))
                     self._share = number / len(stations)
             part.replace(file)
             self._saved = file

@@ -11,7 +11,7 @@ from app.export.section import along_path, strides
 from app.server.protocol import Snapshot
 from app.slam.errors import HemislamError
 from app.slam.types import F64, U8
-from app.ui.nodes import add_exact_points
+from app.ui.nodes import add_exact_points, clear
 from app.ui.widgets import Changes, View
 
 _PERIOD_S: Final = 1.0
@@ -46,25 +46,21 @@ class ProfileNode:
     ) -> None:
         self._scene, self._root, self._shown = scene, root, shown
         self._changes = Changes(period_s=_PERIOD_S)
-        self._node: viser.PointCloudHandle | None = None
+        self._nodes: list[viser.PointCloudHandle] = []
 
     def draw(self, current: Snapshot, view: View) -> None:
         """Show the profile that the view asks for, if it asks for one and somebody has walked."""
         self._root.visible = not view.slab
         if not view.slab:
-            self._remove()
+            clear(self._nodes)
             self._changes()
         elif self._changes(current.chunks, current.keyframe_poses, view) and current.trajectory is not None:
-            self._remove()
+            clear(self._nodes)
             with contextlib.suppress(HemislamError):  # nobody has walked yet
                 path = strides(current.trajectory[:, :2])
                 points, colours = unrolled(self._shown(), path, view.slab)
                 if len(points):
                     exact = points.astype(np.float32)
-                    self._node = add_exact_points(self._scene, "/profile", exact, colours, view.point_size)
-                    self._node.position = self._root.position
-
-    def _remove(self) -> None:
-        if self._node is not None:
-            self._node.remove()
-            self._node = None
+                    node = add_exact_points(self._scene, "/profile", exact, colours, view.point_size)
+                    node.position = self._root.position
+                    self._nodes.append(node)

@@ -56,11 +56,12 @@ def filter_tiles(result: StepResult) -> list[Tile]:
 def state_tiles(snapshot: Snapshot, result: StepResult) -> list[Tile]:
     state, series = result.state, snapshot.series
     speed = float(np.linalg.norm(state.v_odom_imu))
+    walked = float(series["distance"][-1]) if len(series.get("distance", ())) else np.nan
     gyro, accel = 1000 * state.b_gyro, 1000 * state.b_accel
     gyro_norm, accel_norm = number(float(np.linalg.norm(gyro))), number(float(np.linalg.norm(accel)), 1)
     tiles = [
         Tile("velocity", number(speed), "m/s", _vector(state.v_odom_imu, 2), width="half"),
-        Tile("distance", number(_last(series, "distance"), 1), "m", width="half"),
+        Tile("distance", number(walked, 1), "m", width="half"),
         Tile("gyroscope bias", gyro_norm, "mrad/s", _vector(gyro, 2), width="half"),
         Tile("acceleration bias", accel_norm, "mm/s²", _vector(accel, 1), width="half"),
     ]
@@ -80,11 +81,6 @@ def times_html(snapshot: Snapshot, result: StepResult) -> str:
     ]
     stages = [(STAGE_COLOURS[stage], f"{stage} {number(took.get(stage, np.nan), 1)}") for stage in STAGES]
     return panel("times", tiles, stages)
-
-
-def _last(series: dict[str, F64], name: str) -> float:
-    values = series.get(name)
-    return float(values[-1]) if values is not None and len(values) else float("nan")
 
 
 def _vector(v: F64, digits: int) -> str:

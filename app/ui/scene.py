@@ -14,7 +14,7 @@ from app.server.setup import POINT_BUDGET
 from app.slam.types import F64, StepResult
 from app.ui.camera import Framing
 from app.ui.chunks import MapChunks
-from app.ui.colours import Limits, chosen_ends
+from app.ui.colours import chosen_ends
 from app.ui.nodes import TrajectoryNode, Truth
 from app.ui.profile import ProfileNode
 from app.ui.sensor import SensorScene
@@ -34,7 +34,11 @@ _FRAMED_AGAIN: Final = 1.05
 
 
 class Scene:
-    """Draws snapshots on a viser server, sending differences only."""
+    """Draws snapshots on a viser server, sending differences only.
+
+    Attributes:
+        chunks: the map as drawn. framing: keeps it in the picture.
+    """
 
     def __init__(self, server: viser.ViserServer, budget: int = POINT_BUDGET) -> None:
         scene = server.scene
@@ -58,11 +62,11 @@ class Scene:
         self._session, self._light = -1, False
         self._shown: StepResult | None = None
         self._changes = Changes()
-        self._chunks = MapChunks(scene, f"{ROOT}/keyframes", budget)
+        self.chunks = MapChunks(scene, f"{ROOT}/keyframes", budget)
         self._sensor = SensorScene(scene, f"{ROOT}/sensor")
         self._trajectory = TrajectoryNode(scene, f"{ROOT}/trajectory")
         self._truth = Truth(scene, f"{ROOT}/truth")
-        self._profile = ProfileNode(scene, self._root, self._chunks.shown)
+        self._profile = ProfileNode(scene, self._root, self.chunks.shown)
         self.framing = Framing(server)
         self._framed, self._followed = 0, False
 
@@ -72,44 +76,28 @@ class Scene:
         return np.array(self._root.position)
 
     @property
-    def points(self) -> int:
-        return self._chunks.points
-
-    @property
-    def moving(self) -> int:
-        return self._chunks.moving
-
-    def sample(self) -> F64:
-        """(n, 3) some points of the map."""
-        return self._chunks.sample()
-
-    @property
     def eyes(self) -> frozenset[tuple[float, ...]]:
         """(x, y, z) of every camera in the map, coarsely; none while all of the map is drawn anyway."""
-        if not self._chunks.partial:
+        if not self.chunks.partial:
             return frozenset()
         cameras = (client.camera for client in self._server.get_clients().values())
         places = (np.array(camera.position) - self.offset for camera in cameras)
         return frozenset(tuple(np.round(place / _EYE_STEP_M) * _EYE_STEP_M) for place in places)
 
-    def limits(self, by: str) -> Limits | None:
-        """Ends of a colour map as drawn; None for labels and before there is anything to colour."""
-        return self._chunks.limits.get(by)
-
     def draw(self, current: Snapshot, view: View) -> bool:
         """Bring the scene up to `current`; False if it is to be called again for the rest, even if nothing changes."""
-        limits = self._chunks.limits
+        limits = self.chunks.limits
         with self._server.atomic():
             self._draw_scan(current, view)
         with self._server.atomic():
             poses = poses_of(current)
             eyes = np.array(list(self.eyes)).reshape(-1, 3)
-            self._chunks.draw(current.chunks[: len(poses)], poses, view, eyes)
+            self.chunks.draw(current.chunks[: len(poses)], poses, view, eyes)
             self._profile.draw(current, view)
             self._trajectory.draw(current.trajectory if current.trajectory is not None else np.empty((0, 3)), view.path)
             recording = current.recording
             self._truth.draw(recording.truth_positions if recording else None, current.T_map_truth, view.path)
-        return self._look(current, view) and self._chunks.limits is limits and self._chunks.settled
+        return self._look(current, view) and self.chunks.limits is limits and self.chunks.settled
 
     def _draw_scan(self, current: Snapshot, view: View) -> None:
         """What is measured just now. It does not wait for the map."""
@@ -117,7 +105,7 @@ class Scene:
         start_ns = recording.start_ns if recording else 0
         if current.session != self._session:
             self._session, self._shown, self._framed = current.session, None, 0
-            self._chunks.clear(start_ns, recording.duration_s if recording else 1.0)
+            self.chunks.clear(start_ns, recording.duration_s if recording else 1.0)
             self._sensor.clear()
         self._grid.visible = view.grid
         if view.light != self._light:
@@ -125,7 +113,7 @@ class Scene:
             self._grid.cell_color, self._grid.section_color = _GRID[view.light]
         if result is None:
             return
-        limits = self._chunks.limits
+        limits = self.chunks.limits
         if self._changes(result, current.params, view, limits):
             ends = chosen_ends(limits, view.colour_by, view.ends)
             self._sensor.draw(self._shown, result, current.params, view, ends, start_ns)
@@ -145,7 +133,7 @@ class Scene:
         keyframes = len(current.chunks)
         if current.result is not None and not self._framed <= keyframes < _FRAMED_AGAIN * self._framed + 1:
             first, self._framed = not self._framed, keyframes
-            self.framing.see(self._chunks.sample(), at_once=first)
+            self.framing.see(self.chunks.sample(), at_once=first)
         return view.follow or self.framing.draw(self.offset)
 
     def _follow(self, position: F64, jump: bool) -> None:

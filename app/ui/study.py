@@ -13,7 +13,7 @@ from app.slam.types import F64, StepResult
 from app.ui.colours import LABEL_COLOURS
 from app.ui.geometry import disc, rotation_to
 from app.ui.html import css, heading, panel
-from app.ui.nodes import add_lines, add_points, add_surface, place
+from app.ui.nodes import add_lines, add_points, add_surface, clear, place
 from app.ui.sensor import SCAN_POINT_SCALE, shown_of
 from app.ui.study_maths import (
     AS_MAP,
@@ -71,9 +71,7 @@ class StudyScene:
 
     def draw_picked(self, result: StepResult | None, picked: Picked | None, size: float) -> None:
         """Mark a point, its neighbours, the plane through them and the map's plane nearby."""
-        for mark in self._marks:
-            mark.remove()
-        self._marks.clear()
+        clear(self._marks)
         if result is None or picked is None:
             return
         place(self._lidar, result.T_map_imu @ result.state.T_imu_lidar)

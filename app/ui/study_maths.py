@@ -75,17 +75,12 @@ STUDY_MODES: Final[dict[str, StudyMode]] = {
     ),
 }
 STUDY_BY: Final = (AS_MAP, *STUDY_MODES)
-NOTHING: Final = (110, 118, 130)
-"""Colour of points without a number."""
 
 
 def study_colours(result: StepResult, by: str) -> U8:
     """(n, 3) of the points that a mode shows."""
     mode = STUDY_MODES[by]
-    values = mode.values(result)
-    colours = value_colours(values, mode.limits(result), TABLES[mode.table])
-    colours[np.isnan(values)] = NOTHING
-    return colours
+    return value_colours(mode.values(result), mode.limits(result), TABLES[mode.table])
 
 
 def study_legend(result: StepResult | None, by: str) -> str:

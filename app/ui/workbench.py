@@ -131,7 +131,7 @@ class Workbench:
             with gui.add_folder("Measure"):
                 self._measure = MeasurePanel(page)
             with gui.add_folder("Clip and section", expand_by_default=False):
-                self._clip = ClipPanel(page, self._measure, self._camera, self._scene.sample, files.ask_where)
+                self._clip = ClipPanel(page, self._measure, self._camera, self._scene.chunks.sample, files.ask_where)
             with gui.add_folder("Distance to another map", expand_by_default=False):
                 self._map_compare = MapComparePanel(page, folders, results, self._appearance.colour_by)
         with tabs.add_tab("Recording", viser.Icon.STETHOSCOPE):
@@ -216,5 +216,5 @@ class Workbench:
             self._more += not self._scene.draw(current, view)
             self._drawn = current
         if self._legend_due(current, view):
-            limits = self._scene.limits(view.colour_by)
-            self._appearance.draw(view, limits, self._scene.points, self._scene.moving, self._budget)
+            chunks = self._scene.chunks
+            self._appearance.draw(view, chunks.limits.get(view.colour_by), chunks.points, chunks.moving, self._budget)

@@ -128,9 +128,9 @@ def test_a_frame_draws_each_keyframe_once_and_no_more_points_than_the_page_holds
     bench.engine.send(StepFrame(1))
     bench.eventually(lambda: bool(page.evaluate("window.most && window.most.points > 0")))
     page.wait_for_timeout(2000)
-    most, scene = page.evaluate("window.most"), bench.workbench._scene
+    most, drawn = page.evaluate("window.most"), bench.workbench._scene.chunks
     result = bench.engine.snapshot.result
     keyframes = len(bench.engine.snapshot.chunks)
-    assert scene.points <= most["points"] <= scene.points + len(result.cloud) + 10
+    assert drawn.points <= most["points"] <= drawn.points + len(result.cloud) + 10
     assert keyframes <= most["calls"] <= keyframes + 60, "the rest: scan, path, wedge, plane, grid, labels"
     assert keyframes <= MOST_SHOWN

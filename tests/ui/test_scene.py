@@ -143,8 +143,8 @@ def test_the_map_stays_within_its_budget(server: viser.ViserServer, wire: Wire, 
     for _ in range(20):
         engine.send(StepFrame(6))
         drawn.draw(View(ceilings=True))
-        assert drawn.scene.points <= 6_000
-        assert sum(len(node.points) for node in chunk_nodes(server).values()) == drawn.scene.points
+        assert drawn.scene.chunks.points <= 6_000
+        assert sum(len(node.points) for node in chunk_nodes(server).values()) == drawn.scene.chunks.points
     assert len(chunk_nodes(server)) == len(engine.snapshot.chunks)
     newest, oldest = (chunk_nodes(server)[f"/map/keyframes/{i}"] for i in (len(engine.snapshot.chunks) - 1, 0))
     assert len(newest.points) > 2 * len(oldest.points)
@@ -193,7 +193,7 @@ def test_colouring_sends_colours_only_and_the_legend_knows_its_limits(drawn: Dra
         drawn.draw(View(colour_by=by))
         assert set(wire.updates("/map/keyframes/0")) == {"colors"}
         assert wire.nodes("PointCloudMessage") == []
-        limits = drawn.scene.limits(by)
+        limits = drawn.scene.chunks.limits.get(by)
         assert limits is not None and limits.low < limits.high
 
 
@@ -208,7 +208,7 @@ def test_higher_points_are_lighter_when_coloured_by_height(drawn: Drawn, server:
 
 def test_colours_spread_over_the_chosen_ends_and_saturate_beyond(drawn: Drawn, server: viser.ViserServer) -> None:
     drawn.draw(View(colour_by="height"))
-    all_values = drawn.scene.limits("height")
+    all_values = drawn.scene.chunks.limits.get("height")
     assert all_values is not None
     low, high = all_values.low, all_values.low + 0.4 * (all_values.high - all_values.low)
     drawn.draw(View(colour_by="height", ends=Limits(low, high)))
@@ -219,7 +219,7 @@ def test_colours_spread_over_the_chosen_ends_and_saturate_beyond(drawn: Drawn, s
     beyond = node.colors[height > high + 0.05].astype(int)
     red = beyond.max(axis=1, keepdims=True)
     assert len(beyond) > 10 and np.ptp(beyond / red, axis=0).max() < 0.03, "one colour, lit differently"
-    assert drawn.scene.limits("height") == all_values, "the bar still ends at all values"
+    assert drawn.scene.chunks.limits.get("height") == all_values, "the bar still ends at all values"
 
 
 def test_sessions_that_come_and_go_leave_nothing_behind(drawn: Drawn, wire: Wire, server: viser.ViserServer) -> None:
@@ -245,7 +245,7 @@ def shown(drawn: Drawn, server: viser.ViserServer) -> dict[str, object]:
         if name.startswith("/map/trajectory/") and isinstance(handle, viser.LineSegmentsHandle)
     }
     map_points = {name: (node.points.tobytes(), node.colors.tobytes()) for name, node in chunk_nodes(server).items()}
-    return {"path": path, "map": map_points, "limits": {by: drawn.scene.limits(by) for by in COLOUR_BY}}
+    return {"path": path, "map": map_points, "limits": {by: drawn.scene.chunks.limits.get(by) for by in COLOUR_BY}}
 
 
 @pytest.mark.parametrize("by", ["label", "height"])
@@ -377,7 +377,7 @@ def test_people_are_not_in_the_map_unless_they_are_asked_for(drawn: Drawn, serve
     chunks = (replace(first, labels=labels), *rest)
     drawn.draw(View(ceilings=True), chunks=chunks)
     node = chunk_nodes(server)["/map/keyframes/0"]
-    assert np.array_equal(node.points, first.points[50:].astype(np.float16)) and drawn.scene.moving == 50
+    assert np.array_equal(node.points, first.points[50:].astype(np.float16)) and drawn.scene.chunks.moving == 50
     drawn.draw(View(ceilings=True, moving=True, colour_by="label"), chunks=chunks)
     node = chunk_nodes(server)["/map/keyframes/0"]
     assert len(node.points) == len(labels)

@@ -16,12 +16,12 @@ from app.server.protocol import Seek, SetParams, StepFrame
 from app.slam.params import Params
 from app.slam.study import vertices
 from app.slam.types import Matches, StepResult
+from app.ui.colours import NOTHING
 from app.ui.study import StudyPanel
 from app.ui.study_maths import (
     AS_MAP,
     HEADROOM,
     MOST_POINTS,
-    NOTHING,
     RESIDUAL,
     STUDY_MODES,
     curve,

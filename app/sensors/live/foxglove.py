@@ -77,7 +77,7 @@ class FoxgloveReceiver:
                     self._listen(connection, intake, stop)
             except (OSError, WebSocketException, TimeoutError) as error:
                 text = f"no connection to {self._url} ({_brief(error)}); trying again"
-                self._tell("disconnected", text, intake)
+                self._report("disconnected", text, intake)
             stop.wait(RETRY_S)
 
     def _listen(self, connection: Connection, intake: Intake, stop: threading.Event) -> None:
@@ -89,7 +89,7 @@ class FoxgloveReceiver:
                 message = connection.recv(timeout=0.1)
             except TimeoutError:
                 if not self._channels and time.monotonic() - begun > RETRY_S:
-                    self._tell("configuration", f"{self._url} offers no topic at all; waiting for one", intake)
+                    self._report("configuration", f"{self._url} offers no topic at all; waiting for one", intake)
                 continue
             if isinstance(message, str):
                 if self._note(message):
@@ -144,7 +144,7 @@ class FoxgloveReceiver:
                 self._reader = CloudReader(self._params, found.topic, CLOUD_TYPES[found.type])
                 intake.sensor = f"{found.topic} from {self._url}"
         if missing:
-            self._tell("configuration", f"{self._url} offers {'; '.join(missing)}; waiting for it", intake)
+            self._report("configuration", f"{self._url} offers {'; '.join(missing)}; waiting for it", intake)
 
     def _receive(self, sensor: Sensor, channel: Channel, data: bytes, log_ns: int, intake: Intake) -> None:
         arrival = time.time_ns()
@@ -163,8 +163,8 @@ class FoxgloveReceiver:
             intake.counters.frames += 1
             intake.put_scan(scan, arrival_ns)
 
-    def _tell(self, kind: Literal["disconnected", "configuration"], text: str, intake: Intake) -> None:
-        """Report it once, however often it happens."""
+    def _report(self, kind: Literal["disconnected", "configuration"], text: str, intake: Intake) -> None:
+        """Put news into the intake, once however often it happens."""
         if text != self._last_status:
             self._last_status = text
             intake.put_status(kind, "source", text)

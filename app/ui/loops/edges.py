@@ -14,7 +14,7 @@ from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.geometry import STILL_M
-from app.ui.loops.words import EDITED, KINDS, kind_of, name
+from app.ui.loops.words import EDITED, KINDS, LoopKind, kind_of, name
 from app.ui.nodes import add_exact_points, add_lines
 from app.ui.widgets import Changes
 
@@ -76,10 +76,10 @@ class LoopEdges:
         seen = [edge for edge in there if kind_of(edge).name in shown or edge.pair == chosen]
         lines = arches(seen, poses)
         self._pickable = ([edge.pair for edge in seen], lines)
-        styles = np.array(["chosen" if edge.pair == chosen else _style(edge) for edge in seen], dtype=object)
+        styles = np.array(["chosen" if edge.pair == chosen else _style(kind_of(edge), edge.counts) for edge in seen])
         for kind in KINDS.values():
             for inside, width in ((True, kind.width), (False, kind.out_width)):
-                style = f"{kind.name.replace(' ', '-')}-{'in' if inside else 'out'}"
+                style = _style(kind, inside)
                 self._draw(style, lines[styles == style], kind.colour, width, kind.knob_m)
         label = name(chosen) if chosen is not None else ""
         self._draw("chosen", lines[styles == "chosen"], _CHOSEN, _CHOSEN_WIDTH, KINDS[EDITED].knob_m, label)
@@ -105,19 +105,15 @@ class LoopEdges:
                 node.remove()
             return
         path = f"{self._root}/{style}"
+        legs = np.stack((lines[:, :-1], lines[:, 1:]), axis=2).reshape(-1, 2, 3)
         knobs = np.ascontiguousarray(lines[:, 1])
         self._nodes[style] = [
-            add_lines(self._scene, path, _legs(lines), colour, width),
+            add_lines(self._scene, path, legs, colour, width),
             add_exact_points(self._scene, f"{path}-knobs", knobs, colour, knob_m),
         ]
         if label:
             self._nodes[style].append(self._scene.add_label(f"{path}-label", label, position=lines[0, 1] + _LABEL))
 
 
-def _style(edge: LoopEdge) -> str:
-    return f"{kind_of(edge).name.replace(' ', '-')}-{'in' if edge.counts else 'out'}"
-
-
-def _legs(lines: F32) -> F32:
-    """(n, 3, 3) arches -> (2n, 2, 3) segments."""
-    return np.stack((lines[:, :-1], lines[:, 1:]), axis=2).reshape(-1, 2, 3)
+def _style(kind: LoopKind, inside: bool) -> str:
+    return f"{kind.name}-{'in' if inside else 'out'}"

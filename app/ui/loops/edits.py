@@ -15,7 +15,7 @@ from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.html import panel
 from app.ui.loops.words import describe_edit, forecast, headline
-from app.ui.nodes import add_lines, segments
+from app.ui.nodes import add_lines, clear, segments
 from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, notify_error, poses_of, show
 
 _REST_S: Final = 0.3
@@ -36,9 +36,7 @@ class Ghost:
         """Show (k, 4, 4) poses `tried` beside the present ones; None removes them."""
         if not self._changes(tried, present if tried is not None else None):
             return
-        for node in self._nodes:
-            node.remove()
-        self._nodes.clear()
+        clear(self._nodes)
         if tried is None or len(tried) < 2:
             return
         there = tried[:, :3, 3]
