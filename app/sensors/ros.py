@@ -118,9 +118,7 @@ def points_message(points: npt.NDArray[Any], stamp_ns: int, frame: str) -> Any:
 
 def empty_cloud(stamp_ns: int) -> Any:
     """A PointCloud2 without a point, for a revolution that saw nothing."""
-    points, times = np.empty((0, 3), np.float32), np.empty(0, np.int32)
-    scan = Scan(stamp_ns, points, times, np.empty(0, np.float32), np.empty(0, np.uint16))
-    return cloud_message(scan, exact=True)
+    return points_message(np.empty(0, _point_type("<i8", False)), stamp_ns, "rslidar")
 
 
 def imu_message(stamp_ns: int, gyro: Vector, accel: Vector) -> Any:

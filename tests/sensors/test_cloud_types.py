@@ -10,8 +10,8 @@ from rosbags.typesys import get_types_from_msg
 
 from app.sensors.cloud_types import CLOUD_TYPES, CloudMessage, CloudType
 from app.sensors.doctor import examine
-from app.sensors.live.foxglove import FoxgloveReceiver
-from app.sensors.live.foxglove_server import FoxgloveServer, Offer
+from app.sensors.live.foxglove import Channel, FoxgloveReceiver
+from app.sensors.live.foxglove_server import FoxgloveServer
 from app.sensors.live.intake import Intake
 from app.sensors.recording import open_recording
 from app.sensors.ros import stamp_ns
@@ -107,7 +107,7 @@ def test_a_bridge_that_offers_a_new_type_is_understood(known: None) -> None:
     scans: list[Any] = []
     stop, params = threading.Event(), Params()
     definition = STORE.generate_msgdef(KIND, ros_version=2)[0]
-    with FoxgloveServer("127.0.0.1", 0, [Offer("/points", KIND, definition)]) as server:
+    with FoxgloveServer("127.0.0.1", 0, [Channel(0, "/points", "cdr", KIND, definition)]) as server:
         receiver = FoxgloveReceiver("127.0.0.1", server.port, frozenset({"lidar"}), params)
         thread = threading.Thread(target=receiver, args=(Kept(params), stop))
         thread.start()

@@ -18,7 +18,8 @@ from app.sensors.live import livox_udp
 from app.sensors.live.devices import DEVICES
 from app.sensors.live.difop import ChannelAngles, Difop, read_angles, write_difop
 from app.sensors.live.firings import firings_of, fit_angles, rate_of
-from app.sensors.live.foxglove_server import FoxgloveServer, Offer
+from app.sensors.live.foxglove import Channel
+from app.sensors.live.foxglove_server import FoxgloveServer
 from app.sensors.live.imu_udp import ImuSample, write_airy_imu, write_imu
 from app.sensors.live.livox_udp import Livox, LivoxWriter
 from app.sensors.live.msop import PacketWriter
@@ -72,7 +73,8 @@ class _Sensor:
             writer = LivoxWriter()
             self.add, self.flush = writer.add, writer.flush
             return
-        first = _first_scans(recording)
+        scans = (entry.scan for entry in recording.entries() if isinstance(entry, ScanEntry))
+        first = list(islice((scan for scan in scans if isinstance(scan, Scan)), _FITTED))
         rate = rate_of(first)
         calibration = angles or fit_angles(first, model, rate)
         # A packet's angles have two decimals, the nominal ones four: a receiver without angles uses the nominal ones.
@@ -202,25 +204,24 @@ def _feed_foxglove(
     host, number = to.host or "127.0.0.1", 0
     with Source(path) as source:
         kinds = {topic.name: topic.type for topic in source.topics}
-        offers = [Offer(topic, kinds[topic], ros.definition(kinds[topic])) for topic in topics]
-        with FoxgloveServer(host, to.ports[0], offers) as server:
+        channels = [
+            Channel(i, topic, "cdr", kinds[topic], ros.definition(kinds[topic])) for i, topic in enumerate(topics)
+        ]
+        with FoxgloveServer(host, to.ports[0], channels) as server:
             deadline = time.monotonic() + wait_s
             while not server.wait_for_subscribers(0.2):
                 if pace.stop.is_set():
                     return 0
                 if time.monotonic() > deadline:
                     raise HemislamError(f"No client subscribed at ws://{host}:{server.port}; start it first.")
-            for sent in _paced(_messages_of(source, topics, duration_s), pace):
+            stop_ns = None if duration_s is None else source.start_ns + round(duration_s * 1e9)
+            messages = source.messages(topics, None, stop_ns)
+            sending = (Sent(log_ns, topics.index(topic), ros.serialised(said)) for topic, log_ns, said in messages)
+            for sent in _paced(sending, pace):
                 server.publish(sent.stream, sent.time_ns, sent.data)
                 number += 1
             time.sleep(0.2)  # so that the last message is read before the connection is closed
     return number
-
-
-def _messages_of(source: Source, topics: tuple[str, str], duration_s: float | None) -> Iterator[Sent]:
-    stop_ns = None if duration_s is None else source.start_ns + round(duration_s * 1e9)
-    for topic, log_ns, message in source.messages(topics, None, stop_ns):
-        yield Sent(log_ns, topics.index(topic), ros.serialised(message))
 
 
 def _paced(items: Iterator[Sent], pace: Pace) -> Iterator[Sent]:
@@ -241,8 +242,3 @@ def _paced(items: Iterator[Sent], pace: Pace) -> Iterator[Sent]:
             reported = played
             pace.progress(played)
         yield item
-
-
-def _first_scans(recording: Recording) -> list[Scan]:
-    scans = (entry.scan for entry in recording.entries() if isinstance(entry, ScanEntry))
-    return list(islice((scan for scan in scans if isinstance(scan, Scan)), _FITTED))

@@ -5,22 +5,12 @@ import json
 import threading
 import time
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from app.sensors.live.foxglove import MAX_MESSAGE, MESSAGE, SUBPROTOCOLS
+from app.sensors.live.foxglove import MAX_MESSAGE, MESSAGE, SUBPROTOCOLS, Channel
 from app.slam.errors import HemislamError
-
-
-@dataclass(frozen=True, slots=True)
-class Offer:
-    """A topic to be announced. type: its ROS type. definition: the type's text."""
-
-    topic: str
-    type: str
-    definition: str
 
 
 class FoxgloveServer(AbstractContextManager["FoxgloveServer"]):
@@ -33,8 +23,8 @@ class FoxgloveServer(AbstractContextManager["FoxgloveServer"]):
         HemislamError: the port is taken.
     """
 
-    def __init__(self, host: str, port: int, offers: list[Offer]) -> None:
-        self._offers = offers
+    def __init__(self, host: str, port: int, channels: list[Channel]) -> None:
+        self._channels = channels
         self._clients: dict[ServerConnection, dict[int, int]] = {}  # channel to the number that the client gave it
         try:
             self._server = serve(
@@ -48,7 +38,7 @@ class FoxgloveServer(AbstractContextManager["FoxgloveServer"]):
         self._thread.start()
 
     def publish(self, channel: int, log_ns: int, data: bytes) -> None:
-        """Send to every client that asked for the channel (its place among the offers)."""
+        """Send to every client that asked for the channel, by its id."""
         for connection, subscriptions in list(self._clients.items()):
             if (number := subscriptions.get(channel)) is not None:
                 with contextlib.suppress(ConnectionClosed):  # its thread removes it
@@ -58,7 +48,7 @@ class FoxgloveServer(AbstractContextManager["FoxgloveServer"]):
         """Whether some client has asked for every topic, at the latest after this time."""
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
-            if any(len(subscriptions) == len(self._offers) for subscriptions in list(self._clients.values())):
+            if any(len(subscriptions) == len(self._channels) for subscriptions in list(self._clients.values())):
                 return True
             time.sleep(0.01)
         return False
@@ -77,10 +67,10 @@ class FoxgloveServer(AbstractContextManager["FoxgloveServer"]):
         info = {"op": "serverInfo", "name": "hemislam feed", "capabilities": [], "supportedEncodings": ["cdr"]}
         channels = [
             {
-                "id": number, "topic": offer.topic, "encoding": "cdr", "schemaName": offer.type,
-                "schema": offer.definition, "schemaEncoding": "ros2msg",
+                "id": channel.id, "topic": channel.topic, "encoding": channel.encoding, "schemaName": channel.type,
+                "schema": channel.definition, "schemaEncoding": "ros2msg",
             }
-            for number, offer in enumerate(self._offers)
+            for channel in self._channels
         ]  # fmt: skip
         self._clients[connection] = {}
         try:

@@ -102,21 +102,14 @@ def read_points(packets: U8, shift_ns: int = 0) -> CustomMsg:
     """
     parts, times = [], []
     for row in packets:
-        header = _header_of(row)
-        layout, unit = _MEASURED[header.kind]
-        raw = row[HEADER_BYTES : HEADER_BYTES + header.count * layout.itemsize].view(layout)
+        _, _, duration, count, _, _, kind, _, _, stamp_ns = _HEADER.unpack_from(row)
+        layout, unit = _MEASURED[kind]
+        raw = row[HEADER_BYTES : HEADER_BYTES + count * layout.itemsize].view(layout)
         parts.append((raw["at"] * np.float32(unit), raw["reflectivity"], raw["tag"]))
-        times.append(header.stamp_ns + header.interval_ns * np.arange(header.count, dtype=np.int64))
+        times.append(stamp_ns + duration * 100 // count * np.arange(count, dtype=np.int64))
     xyz, reflectivity, tag = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     xyz[(np.abs(xyz) > FARTHEST_M).any(axis=1)] = 0.0
     return CustomMsg.made(np.concatenate(times) + shift_ns, xyz, reflectivity, tag)
-
-
-def _header_of(row: U8) -> LivoxHeader:
-    """Of a packet that may be padded."""
-    data = row[:HEADER_BYTES].tobytes()
-    _, _, duration, count, number, _, kind, _, _, stamp = _HEADER.unpack(data)
-    return LivoxHeader(duration * 100 // count, count, number, kind, stamp)
 
 
 class LivoxWriter:

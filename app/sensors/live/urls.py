@@ -3,7 +3,7 @@
 import ipaddress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, cast
+from typing import cast
 from urllib.parse import parse_qsl, urlsplit
 
 from app.sensors.live.devices import DEVICES
@@ -15,7 +15,6 @@ from app.sensors.live.source import Known, LiveSource
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 
-Scheme = Literal["rsbpearl", "airy", "mid360", "imu-udp", "foxglove"]
 FOXGLOVE_PORT = 8765
 
 
@@ -49,7 +48,7 @@ class Address:
     options: `clock` (auto, sensor, host); of a RoboSense also `angles` (a CSV).
     """
 
-    scheme: Scheme
+    scheme: str
     host: str
     ports: tuple[int, ...]
     options: dict[str, str] = field(default_factory=dict)
@@ -85,7 +84,7 @@ def parse_address(text: str) -> Address:
         raise HemislamError(f"`{text}`: there is no option `{unknown[0]}`; there are: {known}.")
     if options.get("clock", "auto") not in ("auto", "sensor", "host"):
         raise HemislamError(f"`{text}`: the clock is `auto`, `sensor` or `host`.")
-    return Address(cast(Scheme, scheme), host, ports, options)
+    return Address(scheme, host, ports, options)
 
 
 def _is_host(host: str) -> bool:

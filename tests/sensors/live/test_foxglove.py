@@ -18,7 +18,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.server import Server, ServerConnection, serve
 
-from app.sensors.live.foxglove_server import FoxgloveServer, Offer
+from app.sensors.live.foxglove import Channel
+from app.sensors.live.foxglove_server import FoxgloveServer
 from app.sensors.live.source import Event
 from app.sensors.live.status import Status
 from app.sensors.live.urls import open_live
@@ -173,8 +174,8 @@ def test_topics_are_chosen_by_name_and_missing_ones_are_reported() -> None:
 
 
 def test_our_server_offers_both_names_and_survives_clients_that_leave() -> None:
-    offers = [Offer("/a", "sensor_msgs/msg/Imu", "text"), Offer("/b", "sensor_msgs/msg/Imu", "text")]
-    with FoxgloveServer("127.0.0.1", 0, offers) as server:
+    channels = [Channel(i, name, "cdr", "sensor_msgs/msg/Imu", "text") for i, name in enumerate(("/a", "/b"))]
+    with FoxgloveServer("127.0.0.1", 0, channels) as server:
         for name in ("foxglove.sdk.v1", "foxglove.websocket.v1"):
             with connect(f"ws://127.0.0.1:{server.port}", subprotocols=[name], proxy=None) as client:  # type: ignore[list-item]
                 assert client.subprotocol == name
@@ -191,4 +192,4 @@ def test_our_server_offers_both_names_and_survives_clients_that_leave() -> None:
         time.sleep(0.05)
         server.publish(1, 78, b"to nobody")
         with pytest.raises(HemislamError, match="cannot be opened"):
-            FoxgloveServer("127.0.0.1", server.port, offers)
+            FoxgloveServer("127.0.0.1", server.port, channels)
