@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from app.calibration.calibrate import Calibration
-from app.calibration.lines import Lines
 from app.evaluation.figures import PALETTE, Line, chart
 from app.slam.types import F64
 
@@ -19,13 +18,17 @@ _STYLE = (
 def residual_plot(calibration: Calibration) -> str:
     """How much the LiDAR's turns and ways differ from the IMU's, and how far the points of each scan line are from
     planes."""
-    turned, moved = calibration.turned, calibration.moved
+    turned, moved, lines = calibration.turned, calibration.moved, calibration.lines
+    turns = np.linalg.norm(np.degrees([turned.before, turned.after]), axis=2)
+    ways = np.linalg.norm(np.multiply([moved.before, moved.after], 1e3), axis=2)
     charts = [
-        _chart(np.degrees(turned.before), np.degrees(turned.after), "turning (deg)"),
-        _chart(moved.before * 1e3, moved.after * 1e3, "motion (mm)"),
+        _before_and_after(turns, "scan", "turning (deg): scans against IMU"),
+        _before_and_after(ways, "scan", "motion (mm): scans against IMU"),
     ]
-    if np.isfinite(calibration.lines.after).any():
-        charts.append(_of_lines(calibration.lines))
+    if np.isfinite(lines.after).any():
+        charts.append(
+            _before_and_after(1e3 * np.array([lines.before, lines.after]), "scan line", "points on planes (mm)")
+        )
     return page(charts)
 
 
@@ -40,18 +43,10 @@ def page(charts: Sequence[str]) -> str:
     return head + _STYLE + "".join(placed) + "</svg>\n"
 
 
-def _chart(before: F64, after: F64, label: str) -> str:
-    first, last = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
-    return _before_and_after(first, last, "scan", f"{label}: scans against IMU")
-
-
-def _of_lines(lines: Lines) -> str:
-    return _before_and_after(lines.before * 1e3, lines.after * 1e3, "scan line", "points on planes (mm)")
-
-
-def _before_and_after(before: F64, after: F64, x_label: str, label: str) -> str:
+def _before_and_after(both: F64, x_label: str, label: str) -> str:
+    """both: (2, n)."""
     lines = [
         Line(name, colour, np.flatnonzero(np.isfinite(values)).astype(np.float64), values[np.isfinite(values)])
-        for name, colour, values in (("before", PALETTE[4], before), ("after", PALETTE[0], after))
+        for name, colour, values in zip(("before", "after"), (PALETTE[4], PALETTE[0]), both, strict=True)
     ]
     return str(chart(lines, x_label, f"{label}, red before, blue after", from_zero=True, height=_HEIGHT))

@@ -256,35 +256,30 @@ def pictures(recording: Evaluated, colour: dict[str, str]) -> Pictures:
     there = [outcome for outcome in recording.outcomes if outcome.trajectory is not None]
     legend = [(outcome.name, colour[outcome.name]) for outcome in there]
     legend += [("truth", TRUTH)] if recording.truth_path is not None else []
-    drawn = [_from_above(recording, colour), _from_the_side(recording, colour), *_errors(there, colour)]
-    drawn += _times(there, colour)
-    return Pictures(legend, [figure for figure in drawn if figure is not None], _maps(recording))
+    drawn = [*_paths(recording, colour), *_errors(there, colour), *_times(there, colour)]
+    return Pictures(legend, drawn, _maps(recording))
 
 
-def _from_above(recording: Evaluated, colour: dict[str, str]) -> Figure | None:
-    lines = _paths(recording, colour, 1)
-    return Figure(chart(lines, "x (m)", "y (m)", equal=True, height=420), "From above", []) if lines else None
-
-
-def _from_the_side(recording: Evaluated, colour: dict[str, str]) -> Figure | None:
-    lines = _paths(recording, colour, 2)
-    return Figure(chart(lines, "x (m)", "z (m)", height=200), "From the side, heights enlarged", []) if lines else None
-
-
-def _paths(recording: Evaluated, colour: dict[str, str], axis: int) -> list[Line]:
-    """All trajectories along x and one more axis, in the truth's world if there is one."""
-    lines, path = [], recording.truth_path
+def _paths(recording: Evaluated, colour: dict[str, str]) -> list[Figure]:
+    """All trajectories from above and from the side, in the truth's world if there is one."""
+    paths = []
     for outcome in recording.outcomes:
-        places = None
         if outcome.accuracy is not None:
-            places = outcome.accuracy.aligned
-        elif outcome.trajectory is not None and path is None:
-            places = outcome.trajectory.positions
-        if places is not None:
-            lines.append(Line(outcome.name, colour[outcome.name], places[:, 0], places[:, axis]))
-    if path is not None:
-        lines.append(Line("truth", TRUTH, path[:, 0], path[:, axis], dashed=True))
-    return lines
+            paths.append((outcome.name, colour[outcome.name], outcome.accuracy.aligned, False))
+        elif outcome.trajectory is not None and recording.truth_path is None:
+            paths.append((outcome.name, colour[outcome.name], outcome.trajectory.positions, False))
+    if recording.truth_path is not None:
+        paths.append(("truth", TRUTH, recording.truth_path, True))
+    if not paths:
+        return []
+    above, side = (
+        [Line(name, shade, places[:, 0], places[:, axis], dashed) for name, shade, places, dashed in paths]
+        for axis in (1, 2)
+    )
+    return [
+        Figure(chart(above, "x (m)", "y (m)", equal=True, height=420), "From above", []),
+        Figure(chart(side, "x (m)", "z (m)", height=200), "From the side, heights enlarged", []),
+    ]
 
 
 def _errors(outcomes: list[Outcome], colour: dict[str, str]) -> list[Figure]:

@@ -109,9 +109,8 @@ def all_errors(recordings: Sequence[Evaluated]) -> Table:
             rows.append(_spreads(recording.name, f"{of}, {what} ({shown})", spreads, form))
             if any(ratios):
                 rows.append(_spreads(recording.name, f"{of}, {what} / path length{per_metre}", ratios, ".2e"))
-        rows.append(_row(recording.name, "true path length (m)", lengths, ".2f", ranked=False))
-        poses = _values(recording, names, "accuracy/poses")
-        rows.append(_row(recording.name, "poses compared", poses, ".0f", ranked=False))
+        of_path = Indicator("true path length (m)", "accuracy/distance_m", ".2f", ranked=False)
+        rows += _rows([recording], names, [of_path, Indicator("poses compared", "accuracy/poses", ".0f", ranked=False)])
     return Table(
         "All errors, RMSE / mean / max",
         names,
@@ -212,7 +211,7 @@ def beside_paper(recordings: Sequence[Evaluated]) -> Table:
         ):
             rows += _rows([recording], names, [Indicator(f"{label}, here", path, form)])
             values = [theirs.get(name) if name in run else None for name in names]
-            rows += [_row(recording.name, f"{label}, paper", values, their_form)] if any(values) else []
+            rows += [_row(recording.name, Indicator(f"{label}, paper", "", their_form), values)] if any(values) else []
     return Table("Beside the paper", names, rows, paper.NOT_COMPARABLE)
 
 
@@ -235,32 +234,21 @@ def _rows(recordings: Iterable[Evaluated], names: Sequence[str], indicators: Seq
         found = _values(recording, names, indicator.path)
         values = [None if value is None else indicator.scale * value for value in found]
         if any(value is not None for value in values):
-            rows.append(
-                _row(
-                    recording.name,
-                    indicator.label,
-                    values,
-                    indicator.form,
-                    ranked=indicator.ranked,
-                    like=indicator.like,
-                )
-            )
+            rows.append(_row(recording.name, indicator, values))
     return rows
 
 
-def _row(
-    group: str, label: str, values: Sequence[Number], form: str, *, ranked: bool = True, like: float = LIKE
-) -> TableRow:
+def _row(group: str, indicator: Indicator, values: Sequence[Number]) -> TableRow:
     """Formatted values. Those like the smallest are the best, unless all are."""
-    cells = tuple("–" if value is None else format(value, form) for value in values)
+    cells = tuple("–" if value is None else format(value, indicator.form) for value in values)
     numbers = [value for value in values if value is not None]
-    most = min(numbers) + like * abs(min(numbers)) if ranked and numbers else -np.inf
+    most = min(numbers) + indicator.like * abs(min(numbers)) if indicator.ranked and numbers else -np.inf
     best = tuple(index for index, value in enumerate(values) if value is not None and value <= most)
-    return TableRow(group, label, cells, best if len(best) < len(numbers) else ())
+    return TableRow(group, indicator.label, cells, best if len(best) < len(numbers) else ())
 
 
 def _spreads(group: str, label: str, spreads: Sequence[dict[str, float] | None], form: str) -> TableRow:
     """RMSE, mean and maximum in one cell; ranked by the RMSE."""
-    ranked = _row(group, label, [spread["rmse"] if spread else None for spread in spreads], form)
+    ranked = _row(group, Indicator(label, "", form), [spread["rmse"] if spread else None for spread in spreads])
     cells = (" / ".join(format(spread[kind], form) for kind in _SPREAD) if spread else "–" for spread in spreads)
     return replace(ranked, cells=tuple(cells))

@@ -124,24 +124,17 @@ def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) ->
     R_body_imu = between.mean()
     angle = float(np.degrees(R_body_imu.magnitude()))
     spread = float(np.degrees(np.median((R_body_imu.inv() * between).magnitude())))
-    if not certainly:
-        odd = angle > ODD_AXES_DEG and spread < angle / 3
-        return (
-            there,
-            True,
-            (
-                f"Its orientations differ from ours by a constant {angle:.0f}°. Its axes may not be the IMU's; rotation"
-                " errors and RPE then mean little."
-                if odd
-                else ""
-            ),
+    if certainly:
+        note = (
+            f"Its axes are not the IMU's: the constant rotation between them ({angle:.1f}°) was estimated as the mean"
+            f" over the trajectory (spread {spread:.2f}°) and removed, so rotation errors do not contain it."
         )
-    return (
-        replace(there, quaternions=(there.rotations * R_body_imu).as_quat()),
-        True,
-        f"Its axes are not the IMU's: the constant rotation between them ({angle:.1f}°) was estimated as the mean"
-        f" over the trajectory (spread {spread:.2f}°) and removed, so rotation errors do not contain it.",
+        return replace(there, quaternions=(there.rotations * R_body_imu).as_quat()), True, note
+    note = (
+        f"Its orientations differ from ours by a constant {angle:.0f}°. Its axes may not be the IMU's; rotation"
+        " errors and RPE then mean little."
     )
+    return there, True, note if angle > ODD_AXES_DEG and spread < angle / 3 else ""
 
 
 def _vector(values: F64) -> str:
@@ -222,7 +215,6 @@ def _correlations(a: F64, b: F64, least: int) -> tuple[I64, F64]:
     x = np.where(known_a, a - np.nanmean(a), 0.0)
     y = np.where(known_b, b - np.nanmean(b), 0.0)
     ma, mb = known_a.astype(np.float64), known_b.astype(np.float64)
-
     size = len(a) + len(b) - 1
 
     def over(u: F64, v: F64) -> F64:
