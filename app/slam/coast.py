@@ -53,7 +53,11 @@ class Course:
 
     @classmethod
     def steady(cls, begin_ns: int, end_ns: int) -> "Course":
-        """At constant rates."""
+        """Nothing beside the constant rates: no turn, no sway, at times KNOT_S apart.
+
+        Args:
+            begin_ns, end_ns: of the motion; of one longer than LONGEST_S, the first time is followed by a gap.
+        """
         dt = max((end_ns - begin_ns) * 1e-9, 1e-6)
         scan = min(dt, LONGEST_S)
         times = np.linspace(-scan, 0.0, int(np.ceil(scan / KNOT_S)) + 1)
@@ -69,7 +73,14 @@ def begin(scan: Scan, params: Params) -> Belief:
 
 
 def standing(stamp_ns: int, R_odom_imu: F64, params: Params) -> Belief:
-    """Belief at odom's origin, with unknown rates."""
+    """Belief of a device that rests at odom's origin, as far as is known: speed and rate of turn are wide open.
+
+    Args:
+        R_odom_imu: (3, 3), odom's z up; known to 1e-4 rad.
+
+    Returns:
+        The state, with gravity along -z of odom (m/s²), and its (DIM, DIM) covariance in rad, m, m/s, rad/s.
+    """
     sigma = np.zeros(DIM)
     sigma[ROT] = sigma[POS] = 1e-4
     sigma[VEL], sigma[BG], sigma[BA], sigma[GRAV] = FIRST_SPEED, FIRST_RATE, 1e-3, 1e-3

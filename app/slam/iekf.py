@@ -120,7 +120,11 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
 
 
 def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Registration:
-    """What an update says that found too few planes."""
+    """How an update went that found too few planes to change the state.
+
+    Args:
+        iterations: begun so far. used: points compared with the map. inliers: those that found a plane.
+    """
     reason = f"only {inliers} of {used} points found a plane in the map; an update needs {MIN_INLIERS}"
     return Registration(False, iterations, used, inliers, float("nan"), np.zeros(6), True, reason, matches)
 
