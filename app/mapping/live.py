@@ -4,7 +4,6 @@ import contextlib
 import logging
 import pickle
 import sqlite3
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,8 +17,6 @@ from app.slam.engine import Engine
 from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
 from app.slam.loops.edits import Edits
-from app.slam.loops.keyframe_log import KeyframeLog
-from app.slam.loops.messages import LoopClient
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
@@ -73,12 +70,9 @@ class LiveSession(Session):
 
     Args:
         folder: for what must outlive the process.
-        loops: makes the client that looks for loops; None: odometry alone.
     """
 
-    def __init__(
-        self, feed: LiveFeed, params: Params, folder: Path, loops: Callable[[KeyframeLog], LoopClient] | None
-    ) -> None:
+    def __init__(self, feed: LiveFeed, params: Params, folder: Path) -> None:
         self._live = feed
         self._written = 0  # frames
         self._file = sqlite3.connect(folder / HANDOVER, isolation_level=None)
@@ -86,6 +80,7 @@ class LiveSession(Session):
             "PRAGMA synchronous = OFF; CREATE TABLE IF NOT EXISTS frames (pickled BLOB);"
             "CREATE TABLE IF NOT EXISTS kept (id INTEGER PRIMARY KEY, pickled BLOB)"
         )
+        loops = RestartingLoops if params.loops.enabled else None
         super().__init__(feed, Engine(params, KeyframeStore(folder / KEYFRAMES)), loops=loops)
 
     def _remember(self, *, near: bool = False) -> None:
@@ -130,19 +125,13 @@ class LiveSession(Session):
 
 
 def open_live_session(
-    address: LiveAddress,
-    name: Path,
-    params: Params,
-    folder: Path,
-    *,
-    loops: Callable[[KeyframeLog], LoopClient] = RestartingLoops,
-    take_over: bool = False,
+    address: LiveAddress, name: Path, params: Params, folder: Path, *, take_over: bool = False
 ) -> LiveSession:
     """Map what comes from now on, or go on where a process that died was.
 
     Args:
         name: of the source, in place of a recording's path. folder: for what must outlive the process.
-        loops: makes the client that looks for loops, if `loops.enabled`. take_over: go on, if that is possible.
+        take_over: go on, if that is possible.
 
     Raises:
         HemislamError: the receiving process has ended.
@@ -150,7 +139,7 @@ def open_live_session(
 
     def begin() -> tuple[LiveSession, LiveFeed]:
         feed = LiveFeed(LiveClient(address), name)
-        return LiveSession(feed, params, folder, loops if params.loops.enabled else None), feed
+        return LiveSession(feed, params, folder), feed
 
     def clear() -> None:
         for file in (KEYFRAMES, HANDOVER, f"{HANDOVER}-journal"):

@@ -17,6 +17,7 @@ from app.server.protocol import CompareWith, OpenRecording, Save, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.trajectory import truth_beside
 from app.ui.html import panel
+from app.ui.nodes import clear
 from app.ui.widgets import Changes, Page, by_user, dialog
 
 _MOST_ENTRIES: Final = 60
@@ -275,9 +276,7 @@ class FileList:
 
     def _go(self, folder: Path | None) -> None:
         """List a folder; None lists the roots."""
-        for row in self._rows:
-            row.remove()
-        self._rows.clear()
+        clear(self._rows)
         roots = self._folders.roots
         if folder is None:
             self._here.content = panel("text", "Folders that this server was started with:")
@@ -290,10 +289,9 @@ class FileList:
             entries = self._folders.listing(folder, self._suffixes)
         except HemislamError as error:
             self._text(panel("path", "", str(error)))
-        if folder not in roots:
-            self._button("..", viser.Icon.CORNER_LEFT_UP, partial(self._go, folder.parent))
-        elif len(roots) > 1:
-            self._button("..", viser.Icon.CORNER_LEFT_UP, partial(self._go, None))
+        if folder not in roots or len(roots) > 1:
+            above = None if folder in roots else folder.parent
+            self._button("..", viser.Icon.CORNER_LEFT_UP, partial(self._go, above))
         for entry in entries[:_MOST_ENTRIES]:
             if entry.outside:
                 words = " leads out of these folders. To open it, start hemislam with --folder and the folder it is in."

@@ -42,15 +42,13 @@ _HOLD_S: Final = 1.0
 """A control shows what the user set for this long, whatever older snapshots say."""
 
 TITLES: Final = {
-    "recording": "Recording",
-    "sensor": "Sensor",
     "ground": "Ground, more",
     "scan": "Scan voxel",
     "imu": "IMU",
-    "filter": "Filter",
     "map": "Local map",
     "keyframe": "Keyframes",
 }
+"""Of sections whose own names do not do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +157,7 @@ class ParameterHistory:
         """What leads to the state before (-1) or after (1): values by dotted name; empty if there is none."""
         if not 0 <= self._at + by < len(self._states):
             return {}
-        here, there = self._states[self._at], self._states[self._at + by]
-        return {leaf.path: v for leaf in leaves() if (v := there.value(leaf.path)) != here.value(leaf.path)}
+        return self._states[self._at].changed(self._states[self._at + by])
 
     def go(self, by: int) -> None:
         self._at += by
