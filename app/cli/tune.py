@@ -109,7 +109,7 @@ def tune(
     from app.tuning.report import BEST
     from app.tuning.space import parse_dimensions
     from app.tuning.trial import Trial, advice, front
-    from app.tuning.tune import Part, Runs, known_runs
+    from app.tuning.tune import Part, Runs, Search, known_runs
     from app.tuning.tune import tune as find
 
     dimensions = parse_dimensions(parameters)
@@ -145,19 +145,8 @@ def tune(
             if best := front(so_far, wanted):
                 bar.set_postfix_str(f"best {wanted[0].text(best[0].scores[0])}")
 
-        done, checked = find(
-            runs,
-            dimensions,
-            wanted,
-            part,
-            rest,
-            out,
-            given=subjects[0].params,
-            how=search,
-            trials=trials,
-            seed=seed,
-            progress=progress,
-        )
+        plan = Search(dimensions, wanted, part, subjects[0].params, rest, search, trials, seed)
+        done, checked = find(runs, plan, out, progress)
     best = front(done, wanted)
     if not best:
         raise HemislamError(f"No trial gave a result: {done[0].error or 'no run has a value for the objective'}")

@@ -79,13 +79,16 @@ def _find(owner: Link, wanted: Wanted) -> None:
     from app.tuning.objectives import choose_objectives
     from app.tuning.report import importances
     from app.tuning.space import parse_dimensions
-    from app.tuning.tune import Part, Runs, known_runs, tune
+    from app.tuning.tune import Part, Runs, Search, known_runs, tune
 
     truth = read_truth(str(wanted.truth)) if wanted.truth is not None else None
     subject = Subject(wanted.recording.stem, wanted.recording, wanted.params, truth, marks=wanted.marks)
-    dimensions, objectives = parse_dimensions(wanted.parameters), choose_objectives(wanted.objectives, [subject])
+    objectives = choose_objectives(wanted.objectives, [subject])
     part = Part(wanted.start_s, wanted.duration_s)
     rest = part.next() if not wanted.marks else None  # marks are on the part itself
+    search = Search(
+        parse_dimensions(wanted.parameters), objectives, part, wanted.params, rest, wanted.how, wanted.trials
+    )
     count, latest = 0, Tried()
 
     def ended(ran: bool) -> None:
@@ -107,16 +110,5 @@ def _find(owner: Link, wanted: Wanted) -> None:
         known=known_runs(wanted.folder.resolve().parent),
         run=partial(run_jobs, parallel=parallel, quiet=True, ended=ended),
     )
-    _, checked = tune(
-        runs,
-        dimensions,
-        objectives,
-        part,
-        rest,
-        wanted.folder,
-        given=wanted.params,
-        how=wanted.how,
-        trials=wanted.trials,
-        progress=progress,
-    )
+    _, checked = tune(runs, search, wanted.folder, progress)
     owner.send(replace(latest, held_back=checked, finished=True))

@@ -41,10 +41,6 @@ class Dimension:
             return FloatDistribution(self.low, self.high, log=True)
         return FloatDistribution(self.low, self.high)
 
-    def value_in(self, params: Params) -> Any:
-        """What the parameters hold for this one."""
-        return getattr(getattr(params, self.leaf.section), self.leaf.name)
-
     def holds(self, value: Any) -> bool:
         """Whether the value lies in the range."""
         return isinstance(self.distribution, CategoricalDistribution) or self.low <= value <= self.high

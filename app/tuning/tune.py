@@ -14,7 +14,7 @@ import optuna
 
 from app.evaluation.evaluate import Subject, check_subject
 from app.evaluation.job import LEAD_S, RUN_FILES, Job
-from app.evaluation.measured import Outcome, load, measure
+from app.evaluation.measured import load, measure
 from app.evaluation.runner import RunJobs
 from app.slam.params import Params
 from app.tuning.objectives import Objective, score
@@ -51,6 +51,25 @@ class Part:
         return Part(self.start_s + self.duration_s, duration_s or self.duration_s, self.duration_s + self.lead_s)
 
 
+@dataclass(frozen=True, slots=True)
+class Search:
+    """What is tried.
+
+    Attributes:
+        given: the parameters as given, of the first recording; the search learns from them as from any trial.
+        rest: a part held back, on which the best are checked. trials: settings besides the parameters as given.
+    """
+
+    dimensions: Sequence[Dimension]
+    objectives: Sequence[Objective]
+    part: Part
+    given: Params
+    rest: Part | None = None
+    how: SearchMethod = "bayes"
+    trials: int = 100
+    seed: int = 0
+
+
 class Runs:
     """Runs settings on all recordings and scores them.
 
@@ -74,17 +93,17 @@ class Runs:
         self._known, self._run = known, run
         self.hashes = [check_subject(subject) for subject in subjects]
 
-    def asked(self, how: SearchMethod, trials: int, seed: int, part: Part) -> dict[str, Any]:
+    def asked(self, wanted: Search) -> dict[str, Any]:
         """What a search was asked for, as its report keeps it."""
         return {
             "recordings": [
                 {"path": str(one.recording), "sha256": sha256, "parameters": one.params.model_dump(mode="json")}
                 for one, sha256 in zip(self._subjects, self.hashes, strict=True)
             ],
-            "search": how,
-            "trials": trials,
-            "seed": seed,
-            "part_s": [part.start_s, part.duration_s],
+            "search": wanted.how,
+            "trials": wanted.trials,
+            "seed": wanted.seed,
+            "part_s": [wanted.part.start_s, wanted.part.duration_s],
         }
 
     def score(self, settings: Sequence[Mapping[str, Any]], part: Part) -> list[tuple[tuple[float | None, ...], str]]:
@@ -120,86 +139,52 @@ class Runs:
         failed = [error for job in jobs if (error := errors.get((job.name, job.variant)))]
         if failed:
             return (None,) * len(self._objectives), failed[0]
-        outcomes = [self._outcome(job, subject) for job, subject in zip(jobs, self._subjects, strict=True)]
+        outcomes = [
+            measure([load(job, "")], subject.truth)[0][0] for job, subject in zip(jobs, self._subjects, strict=True)
+        ]
         return tuple(score(objective, outcomes) for objective in self._objectives), ""
-
-    @staticmethod
-    def _outcome(job: Job, subject: Subject) -> Outcome:
-        (outcome,), _, _ = measure([load(job, "")], subject.truth)
-        return outcome
 
 
 OnTrials = Callable[[Sequence[Trial], optuna.Study], None]
 """Called with all trials so far after each batch."""
 
 
-def tune(
-    runs: Runs,
-    dimensions: Sequence[Dimension],
-    objectives: Sequence[Objective],
-    part: Part,
-    rest: Part | None,
-    folder: Path,
-    *,
-    given: Params,
-    how: SearchMethod = "bayes",
-    trials: int = 100,
-    seed: int = 0,
-    progress: OnTrials,
-) -> tuple[list[Trial], tuple[Trial, ...]]:
-    """Search on `part`, check the best on `rest`, and write the files that `write_results` names into `folder`.
+def tune(runs: Runs, wanted: Search, folder: Path, progress: OnTrials) -> tuple[list[Trial], tuple[Trial, ...]]:
+    """Search, check the best on the part held back, and write the files that `write_results` names into `folder`.
 
     Returns:
-        All trials, and those of them that were run again on `rest`.
+        All trials, and those of them that were run again on the part held back.
 
     Raises:
         HemislamError: a grid has more points than trials, or the folder cannot be written to.
     """
-    done, study = search(
-        runs, dimensions, objectives, part, given=given, how=how, trials=trials, seed=seed, progress=progress
-    )
-    checked = check(runs, done, objectives, rest)
-    write_results(folder, done, checked, objectives, study, runs.asked(how, trials, seed, part))
+    done, study = search(runs, wanted, progress)
+    checked = check(runs, done, wanted.objectives, wanted.rest)
+    write_results(folder, done, checked, wanted.objectives, study, runs.asked(wanted))
     return done, checked
 
 
 def search(
-    runs: Runs,
-    dimensions: Sequence[Dimension],
-    objectives: Sequence[Objective],
-    part: Part,
-    *,
-    given: Params,
-    how: SearchMethod = "bayes",
-    trials: int = 100,
-    seed: int = 0,
-    progress: OnTrials = lambda so_far, study: None,
+    runs: Runs, wanted: Search, progress: OnTrials = lambda so_far, study: None
 ) -> tuple[list[Trial], optuna.Study]:
-    """Try the parameters as given and then `trials` settings.
-
-    Args:
-        given: the parameters as given, of the first recording; the search learns from them as from any trial.
-
-    Raises:
-        HemislamError: a grid has more points than trials.
-    """
+    """Try the parameters as given and then the settings. Raises HemislamError as `tune` does for a grid."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    study = optuna.create_study(directions=["maximize" if one.greatest else "minimize" for one in objectives])
-    ((scores, error),) = runs.score([{}], part)
+    study = optuna.create_study(directions=["maximize" if one.greatest else "minimize" for one in wanted.objectives])
+    ((scores, error),) = runs.score([{}], wanted.part)
     done = [Trial(0, {}, scores, error)]
-    values = {one.path: one.value_in(given) for one in dimensions}
-    if done[0].complete and all(one.holds(values[one.path]) for one in dimensions):
+    values = {one.path: wanted.given.value(one.path) for one in wanted.dimensions}
+    if done[0].complete and all(one.holds(values[one.path]) for one in wanted.dimensions):
         study.add_trial(
             optuna.trial.create_trial(
                 params=values,
-                distributions={one.path: one.distribution for one in dimensions},
+                distributions={one.path: one.distribution for one in wanted.dimensions},
                 values=[value for value in scores if value is not None],
             )
         )
     progress(done, study)
-    for batch in _batches(study, dimensions, how, trials, seed):
+    for batch in _batches(study, wanted):
         settings = [setting for _, setting in batch]
-        for (asked, setting), (scores, error) in zip(batch, runs.score(settings, part), strict=True):
+        for (asked, setting), (scores, error) in zip(batch, runs.score(settings, wanted.part), strict=True):
             trial = Trial(len(done), setting, scores, error)
             done.append(trial)
             if trial.complete:
@@ -226,21 +211,19 @@ def check(runs: Runs, trials: Sequence[Trial], objectives: Sequence[Objective], 
 Batch = list[tuple[optuna.trial.Trial, Mapping[str, Any]]]
 
 
-def _batches(
-    study: optuna.Study, dimensions: Sequence[Dimension], how: SearchMethod, trials: int, seed: int
-) -> Iterator[Batch]:
-    distributions = {dimension.path: dimension.distribution for dimension in dimensions}
-    if how == "grid":
-        settings = grid(dimensions, trials)
+def _batches(study: optuna.Study, wanted: Search) -> Iterator[Batch]:
+    distributions = {dimension.path: dimension.distribution for dimension in wanted.dimensions}
+    if wanted.how == "grid":
+        settings = grid(wanted.dimensions, wanted.trials)
         for setting in settings:
             study.enqueue_trial(dict(setting))
         for first in range(0, len(settings), BATCH):
             yield [(study.ask(distributions), setting) for setting in settings[first : first + BATCH]]
         return
-    for first in range(0, trials, BATCH):
-        study.sampler = _sampler(how, seed * 10_000 + first)
-        asked = [study.ask(distributions) for _ in range(min(BATCH, trials - first))]
-        yield [(trial, {one.path: one.rounded(trial.params[one.path]) for one in dimensions}) for trial in asked]
+    for first in range(0, wanted.trials, BATCH):
+        study.sampler = _sampler(wanted.how, wanted.seed * 10_000 + first)
+        asked = [study.ask(distributions) for _ in range(min(BATCH, wanted.trials - first))]
+        yield [(trial, {one.path: one.rounded(trial.params[one.path]) for one in wanted.dimensions}) for trial in asked]
 
 
 def _sampler(how: SearchMethod, seed: int) -> optuna.samplers.BaseSampler:

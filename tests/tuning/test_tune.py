@@ -8,6 +8,7 @@ import csv
 import json
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from app.tuning.objectives import OBJECTIVES, Objective
 from app.tuning.process import Ended, Tried, Wanted, find
 from app.tuning.space import grid, parse_dimensions
 from app.tuning.trial import Trial, advice, front, proposal
-from app.tuning.tune import Part, check, search
+from app.tuning.tune import Part, Search, check, search
 from tests.cli.conftest import write_walk
 
 ATE, F1 = OBJECTIVES["ate"], OBJECTIVES["ground-f1"]
@@ -50,16 +51,10 @@ class Bowl:
 
 def found(how: Any, trials: int = 60, seed: int = 0) -> tuple[list[Trial], Bowl]:
     bowl = Bowl()
-    done, _ = search(
-        bowl,  # type: ignore[arg-type]
-        parse_dimensions("ground.alpha,ground.sigma"),
-        (ATE,),
-        Part(),
-        given=Params(),
-        how=how,
-        trials=trials,
-        seed=seed,
+    wanted = Search(
+        parse_dimensions("ground.alpha,ground.sigma"), (ATE,), Part(), Params(), how=how, trials=trials, seed=seed
     )
+    done, _ = search(bowl, wanted)  # type: ignore[arg-type]
     return done, bowl
 
 
@@ -127,10 +122,11 @@ def test_what_gives_up_one_objective_for_another_is_not_proposed() -> None:
 
 
 def test_the_search_learns_from_the_parameters_as_given() -> None:
-    done, study = search(Bowl(), parse_dimensions("ground.alpha"), (ATE,), Part(), given=Params(), trials=4)  # type: ignore[arg-type]
+    wanted = Search(parse_dimensions("ground.alpha"), (ATE,), Part(), Params(), trials=4)
+    done, study = search(Bowl(), wanted)  # type: ignore[arg-type]
     assert study.trials[0].params == {"ground.alpha": Params().ground.alpha}
     assert study.trials[0].values == list(done[0].scores)
-    _, narrow = search(Bowl(), parse_dimensions("ground.alpha=50:60"), (ATE,), Part(), given=Params(), trials=4)  # type: ignore[arg-type]
+    _, narrow = search(Bowl(), replace(wanted, dimensions=parse_dimensions("ground.alpha=50:60")))  # type: ignore[arg-type]
     assert len(narrow.trials) == 4, "what is given lies outside the range"
 
 
