@@ -1,7 +1,6 @@
 """`hemislam tune`: which parameters fit a sensor and a place."""
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -97,8 +96,6 @@ def tune(
       hemislam tune walk.mcap --objective ground-f1 --labels runs/sessions/walk-20261121-101500.hemislam
       hemislam tune walk.mcap --parameters scan.voxel_size=0.1:0.6 --objective entropy --objective frame-time
     """
-    if find_spec("optuna") is None:
-        raise HemislamError("`hemislam tune` needs Optuna; install it with `pip install 'hemislam[tune]'`.")
     from tqdm import tqdm
 
     from app.cli.run import compile_behind_bar

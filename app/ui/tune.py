@@ -1,6 +1,5 @@
 """Tune: a search for better parameters on the open recording, in a process of its own; a click opens a trial as B."""
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -30,7 +29,6 @@ _EMPTY: Final = (
     "Choose what varies and what is wanted, go to a part of the recording that shows the trouble, and press Start. "
     "Each trial runs that part with other parameters, beside this session."
 )
-_NO_OPTUNA: Final = "Tuning needs Optuna; install it with `pip install 'hemislam[tune]'` and start again."
 
 
 class TunePanel:
@@ -103,8 +101,6 @@ class TunePanel:
 
     @staticmethod
     def _problem(snapshot: Snapshot) -> str:
-        if find_spec("optuna") is None:
-            return _NO_OPTUNA
         if snapshot.recording is None:
             return "Open a recording first, under Recording."
         return "A live source cannot be repeated; record it, then open the recording." if snapshot.live else ""
