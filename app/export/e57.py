@@ -38,6 +38,11 @@ class _Writer(pye57.E57):  # type: ignore[misc] # it has no types
         self._wkt = "" if where is None else where.wkt("WKT1_GDAL")
         super().__init__(path, "w")
 
+    def close(self) -> None:
+        """Once only: after the disk has failed, closing again on deletion would print a second error."""
+        if (image_file := self.__dict__.pop("image_file", None)) is not None:
+            image_file.close()
+
     def write_default_header(self) -> None:
         file, root = self.image_file, self.root
         file.extensionsAdd("", libe57.E57_V1_0_URI)

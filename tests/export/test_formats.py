@@ -105,6 +105,7 @@ def test_what_is_not_installed_is_named_with_the_command(monkeypatch: pytest.Mon
         of_formats(["e57"])
 
 
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("kind", ["las", "laz", "e57", "pcd", "ply", "terrain", "html"])
 def test_a_full_disk_leaves_the_older_file_and_is_said_in_a_sentence(tmp_path: Path, kind: str) -> None:
     (export,) = of_formats([kind])
