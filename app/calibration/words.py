@@ -12,6 +12,7 @@ from app.calibration.lines import Lines
 from app.sensors.presets import CALIBRATED, sidecar
 from app.slam.errors import HemislamError
 from app.slam.params import nested
+from app.slam.report import finite
 from app.slam.user_text import read_yaml
 
 WALK = "not observable: walk a figure of eight, tilting the scanner"
@@ -63,7 +64,7 @@ def as_json(calibration: Calibration) -> dict[str, Any]:
             "elevations_rad": c.lines.elevations.tolist(),
             "ranges_m": c.lines.ranges.tolist(),
             "sigmas": c.lines.sigmas.tolist(),
-            "residuals_m": [_numbers(c.lines.before), _numbers(c.lines.after)],
+            "residuals_m": finite([c.lines.before.tolist(), c.lines.after.tolist()]),
         },
         "sigmas": {name: values.tolist() for name, values in c.sigmas.items()},
         "observed": c.observed,
@@ -136,10 +137,6 @@ def _of_lines(lines: Lines) -> list[tuple[str, str]]:
         ("distance offset of all lines", "not observable: grazing beams show the same"),
         ("scan lines on planes", f"{before:.1f} mm before, {after:.1f} after"),
     ]
-
-
-def _numbers(values: np.ndarray) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def _vector(values: np.ndarray, sigmas: np.ndarray, unit: str) -> str:

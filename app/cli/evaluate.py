@@ -13,7 +13,6 @@ from app.slam.provenance import cores
 
 if TYPE_CHECKING:
     from app.evaluation.runner import RunJobs
-    from app.evaluation.truth import TruePoses
     from app.slam.trajectory import Trajectory
 
 ClusterAddress = Annotated[
@@ -148,11 +147,10 @@ def evaluate(
     names = name_recordings(paths)
     others = _compared(compare or [], names, [variant.name for variant in chosen])
     arm = _lever(lever)
-    subjects = []
-    for path, name, text in zip(paths, names, truth_texts(paths, truths or []), strict=True):
-        truth: TruePoses | None = read_truth(text, path, arm) if text else None
-        params = params_for(path)
-        subjects.append(Subject(name, path, params, truth, tuple(others[name])))
+    subjects = [
+        Subject(name, path, params_for(path), read_truth(text, path, arm) if text else None, tuple(others[name]))
+        for path, name, text in zip(paths, names, truth_texts(paths, truths or []), strict=True)
+    ]
     for variant in chosen:
         variant.applied(subjects[0].params)  # raises for a misspelt parameter before anything runs
     run = runner(max(1, min(jobs or cores(), len(chosen) * len(subjects))), cluster, cluster_data)

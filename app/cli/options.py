@@ -38,6 +38,10 @@ Start = Annotated[
 Duration = Annotated[
     float | None, typer.Option("--duration", min=0, metavar="SECONDS", help="Process only this much of the recording.")
 ]
+RunFolder = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Where to write; else runs/NAME-1, -2, ...")
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace results that DIR already holds.")]
 Imperfect = Annotated[
     bool, typer.Option("--imperfect", help="With the errors of a real scanner, a lively hand, and people nearby.")
 ]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from app.cli.options import Force, RunFolder
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
@@ -17,10 +18,8 @@ def replay(
     session: Annotated[
         Path, typer.Argument(metavar="SESSION", help="A session file that the workbench has written (.hemislam).")
     ],
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Where to write; else runs/NAME-1, -2, ...")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace results that DIR already holds.")] = False,
+    out: RunFolder = None,
+    force: Force = False,
     to_end: Annotated[
         bool, typer.Option("--to-end", help="Go on to the end of the recording with the last parameters.")
     ] = False,

@@ -10,8 +10,10 @@ import typer
 from app.cli.options import (
     Calibrate,
     Duration,
+    Force,
     ParamsFor,
     RecordingPath,
+    RunFolder,
     Start,
     TruthFile,
     progress_bar,
@@ -30,10 +32,8 @@ if TYPE_CHECKING:
 def run(
     recording: RecordingPath,
     params_for: ParamsFor,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Where to write; else runs/NAME-1, -2, ...")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace results that DIR already holds.")] = False,
+    out: RunFolder = None,
+    force: Force = False,
     start: Start = 0.0,
     duration: Duration = None,
     truth: TruthFile = None,

@@ -27,6 +27,7 @@ from app.slam.keyframes import KeyframeStore
 from app.slam.loops.types import Origin, Verdict
 from app.slam.metrics import GroundScore
 from app.slam.provenance import describe_machine, peak_memory_mb
+from app.slam.report import finite
 from app.slam.trajectory import Trajectory, write_tum
 from app.slam.types import F64, TIMINGS, FrameStatus, Keyframe, Measurement, StepResult
 
@@ -178,8 +179,7 @@ def _write(
         return islice(keyframes, before, None)
 
     measured = map_sharpness.measure(map_sharpness.collect(part_of_map(), poses))
-    facts |= {"frames": len(trajectory), "distance_m": trajectory.distance}
-    facts["map_sharpness"] = {name: value if np.isfinite(value) else None for name, value in asdict(measured).items()}
+    facts |= {"frames": len(trajectory), "distance_m": trajectory.distance, "map_sharpness": finite(asdict(measured))}
     timings = timings_csv(trajectory.stamps_ns, times[counted, :-1], {"cpu_ms": times[counted, -1]})
 
     part = job.folder.with_name(f"{job.folder.name}.part-{os.getpid()}")

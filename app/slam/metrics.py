@@ -207,17 +207,17 @@ def rpe(estimate: Trajectory, truth: Trajectory, *, frames: int = 1, metres: flo
     )
 
 
-def drift(estimate: Trajectory, truth: Trajectory, metres: float, every: int = 10) -> F64:
+def drift(estimate: Trajectory, truth: Trajectory, metres: float) -> F64:
     """(n,) per cent of the true path by which the motion over `metres` of it is wrong, as KITTI's (Geiger et al. 2012).
 
-    Every `every`-th pose begins a piece, so pieces overlap. Empty if the path is too short.
+    Every tenth pose begins a piece, so pieces overlap. Empty if the path is too short.
 
     Raises:
         HemislamError: fewer than 3 stamps of the estimate have a truth.
     """
     ours, theirs = paired(estimate, truth)
     walked = walked_m(theirs.positions)
-    i = np.arange(0, len(theirs), every)
+    i = np.arange(0, len(theirs), 10)
     j = np.searchsorted(walked, walked[i] + metres)
     i, j = i[j < len(theirs)], j[j < len(theirs)]
     if not len(i):

@@ -24,15 +24,10 @@ class Downsampled:
 
 
 class VoxelGrid:
-    """Downsamples clouds by centroid. Owns its scratch memory, so that a frame allocates nothing large.
+    """Downsamples clouds by centroid. Owns its scratch memory, so that a frame allocates nothing large."""
 
-    Args:
-        room: points that the scratch memory holds at first; it doubles for larger clouds.
-    """
-
-    def __init__(self, room: int = 1 << 16) -> None:
-        self._generation = 0
-        self._reserve(room)
+    def __init__(self) -> None:
+        self._reserve(1 << 16)
 
     def _reserve(self, n: int) -> None:
         size = 1 << int(np.ceil(np.log2(max(2 * n, 2))))

@@ -14,6 +14,7 @@ from app.slam.types import F32, F64, U16
 
 STILL_M: Final = 1e-3
 """Nothing is drawn again for a move up to this: each loop moves most of the map by hundredths of a millimetre."""
+_ARC_POINTS: Final = 17
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +58,11 @@ def arc(elevation: float, down: F64, alpha: float) -> tuple[float, float] | None
     return centre, float(np.arccos(max(ratio, -1.0)))
 
 
-def seed_wedge(elevations: F64, down: F64, alpha: float, reach: float, samples: int = 17) -> Wedge | None:
+def seed_wedge(elevations: F64, down: F64, alpha: float, reach: float) -> Wedge | None:
     """The sector of the given scan lines within `alpha` (rad) of `down`, `reach` metres long.
 
     Args:
-        elevations: (m,) rad, of the outermost lines. down: (3,) unit. samples: points along an arc.
+        elevations: (m,) rad, of the outermost lines. down: (3,) unit.
 
     Returns:
         None when no line comes that near to straight down.
@@ -70,14 +71,14 @@ def seed_wedge(elevations: F64, down: F64, alpha: float, reach: float, samples: 
     for elevation in np.sort(elevations[np.isfinite(elevations)]):
         found = arc(float(elevation), down, alpha)
         if found is not None:
-            azimuth = found[0] + np.linspace(-found[1], found[1], samples)
-            arcs.append(_directions(np.full(samples, elevation), azimuth))
+            azimuth = found[0] + np.linspace(-found[1], found[1], _ARC_POINTS)
+            arcs.append(_directions(np.full(_ARC_POINTS, elevation), azimuth))
     if not arcs:
         return None
-    rims = np.asarray(arcs, dtype=np.float32) * np.float32(reach)  # (m, samples, 3)
+    rims = np.asarray(arcs, dtype=np.float32) * np.float32(reach)  # (m, _ARC_POINTS, 3)
     m = len(rims)
     vertices = np.concatenate((np.zeros((1, 3), np.float32), rims.reshape(-1, 3)))
-    index = 1 + np.arange(m * samples).reshape(m, samples)
+    index = 1 + np.arange(m * _ARC_POINTS).reshape(m, _ARC_POINTS)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     cap = np.concatenate((np.stack((a, b, d), -1).reshape(-1, 3), np.stack((a, d, c), -1).reshape(-1, 3)))
     fans = [
@@ -90,12 +91,12 @@ def seed_wedge(elevations: F64, down: F64, alpha: float, reach: float, samples: 
     return Wedge(vertices, np.concatenate((cap, *fans)).astype(np.uint32), np.concatenate((along, spokes)))
 
 
-def field_of_view(lowest: float, highest: float, radius: float, meridians: int = 12, samples: int = 48) -> F32:
+def field_of_view(lowest: float, highest: float, radius: float) -> F32:
     """(s, 2, 3) line segments of the dome between two elevations (rad): what the sensor sees."""
-    azimuth = np.linspace(0.0, 2 * np.pi, samples + 1)
+    azimuth = np.linspace(0.0, 2 * np.pi, 49)
     parallels = [_directions(np.full_like(azimuth, e), azimuth) for e in np.linspace(lowest, highest, 4)[:3]]
     climb = np.linspace(lowest, highest, 9)
-    sides = np.arange(meridians) * (2 * np.pi / meridians)
+    sides = np.arange(12) * (2 * np.pi / 12)
     lines = parallels + [_directions(climb, np.full_like(climb, side)) for side in sides]
     segments = [np.stack((line[:-1], line[1:]), axis=1) for line in lines]
     return (np.concatenate(segments) * radius).astype(np.float32)

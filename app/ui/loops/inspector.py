@@ -199,14 +199,14 @@ def _detail(snapshot: Snapshot, pair: Pair | None) -> LoopDetail | None:
 
 
 # --- charts --------------------------------------------------------------------------------------
-def disc(context: F32, turn: float = 0.0, size: int = _DISC) -> U8:
-    """(size, size, 4) a context as seen from above, x to the right and y up; clear outside its radius.
+def disc(context: F32, turn: float = 0.0) -> U8:
+    """(_DISC, _DISC, 4) a context as seen from above, x to the right and y up; clear outside its radius.
 
     Args:
         context: (rings, sectors), nan where never seen. turn: rad, by which it is turned anticlockwise.
     """
     rings, sectors = context.shape
-    at = (np.arange(size) + 0.5) / (size / 2) - 1.0
+    at = (np.arange(_DISC) + 0.5) / (_DISC / 2) - 1.0
     x, y = np.meshgrid(at, -at)
     radius = np.hypot(x, y)
     ring = np.minimum((radius * rings).astype(np.int64), rings - 1)
@@ -215,7 +215,7 @@ def disc(context: F32, turn: float = 0.0, size: int = _DISC) -> U8:
     seen = np.isfinite(values)
     high = max(float(np.nanmax(context)), 1e-6) if np.isfinite(context).any() else 1.0
     colours = TABLES["viridis"][np.clip(np.where(seen, values, 0.0) / high * 255, 0, 255).astype(np.uint8)]
-    image = np.empty((size, size, 4), np.uint8)
+    image = np.empty((_DISC, _DISC, 4), np.uint8)
     image[..., :3] = np.where(seen[..., None], colours, np.array(UNSEEN, np.uint8))
     image[..., 3] = np.where(radius <= 1.0, 255, 0)
     return image

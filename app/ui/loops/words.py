@@ -109,11 +109,11 @@ def evidence(edge: LoopEdge, params: LoopsParams) -> str:
     return panel("tile_grid", tiles)
 
 
-def largest_factors(residuals: tuple[FactorResidual, ...], most: int = _LARGEST) -> str:
+def largest_factors(residuals: tuple[FactorResidual, ...]) -> str:
     """The factors with the largest residuals, largest first; a loop can be clicked."""
     if not residuals:
         return panel("quiet", "Computed whenever a loop is chosen, tried or edited.")
-    largest = _largest_first(residuals)[:most]
+    largest = _largest_first(residuals)[:_LARGEST]
     top = max(largest[0].sigmas, 1e-9)
     rows = [
         (
