@@ -20,7 +20,7 @@ from app.server.protocol import Chunk
 from app.server.setup import POINT_BUDGET
 from app.slam import lie
 from app.slam.types import F32, F64, I64, MOVING, U8
-from app.ui.colours import BY_POSE, INTENSITY, MODES, Limits, PointSet, chosen_ends, colours, grown
+from app.ui.colours import BY_POSE, DIMMED, INTENSITY, MODES, Limits, PointSet, chosen_ends, colours, grown
 from app.ui.detail import parts
 from app.ui.geometry import STILL_M
 from app.ui.nodes import add_points, place
@@ -117,6 +117,7 @@ class MapChunks:
         ends = chosen_ends(self.limits, view.colour_by, view.ends)
         seen, used = self._view, (ends.get(view.colour_by), ends.get(INTENSITY))
         recolour = (view.colour_by, view.numbers, used) != (seen.colour_by, seen.numbers, self._coloured)
+        recolour = recolour and not view.tuning or (view.tuning, view.light) != (seen.tuning, seen.light)
         cut = (view.ceilings, view.moving, view.clip) != (seen.ceilings, seen.moving, seen.clip)
         self._view, self._coloured = view, used
         parts = self._parts(chunks, known, eyes)
@@ -134,8 +135,8 @@ class MapChunks:
                     place(drawn.handle, T @ chunk.T_imu_lidar)
                 if view.map_point_size != seen.map_point_size or view.map != seen.map:
                     drawn.handle.point_size, drawn.handle.visible = self._size(drawn), view.map
-                if recolour or (moved[index] and view.colour_by in BY_POSE):
-                    drawn.handle.colors = self._colours(self._shown(drawn, T))
+                if recolour or (moved[index] and view.colour_by in BY_POSE and not view.tuning):
+                    drawn.handle.colors = self._look(self._shown(drawn, T))
 
     def _parts(self, chunks: tuple[Chunk, ...], known: int, eyes: F64) -> I64:
         """(k,) how many points of each to draw now: less at once, more of known ones little by little."""
@@ -231,7 +232,7 @@ class MapChunks:
             self._scene,
             f"{self._root}/{drawn.chunk.index}",
             cloud.points,
-            self._colours(cloud),
+            self._look(cloud),
             self._size(drawn),
             cloud.T_map_lidar,
             visible=self._view.map,
@@ -243,6 +244,10 @@ class MapChunks:
         gap = voxel_of_level(chunk.level) if chunk.level else VOXEL_M
         gap *= float((len(chunk.points) / max(drawn.part, 1)) ** _GAP_BY_SHARE)
         return self._view.map_point_size * max(1.0, _SIZE_BY_GAP * gap / self._view.point_size)
+
+    def _look(self, cloud: PointSet) -> U8:
+        """(n, 3) colours; one for all, (3,), while the map stands back."""
+        return np.array(DIMMED[self._view.light], np.uint8) if self._view.tuning else self._colours(cloud)
 
     def _colours(self, cloud: PointSet) -> U8:
         by = self._view.colour_by

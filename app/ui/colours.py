@@ -48,6 +48,8 @@ TABLES: Final[dict[str, U8]] = {name: _table(anchors) for name, anchors in _ANCH
 
 NOTHING: Final[Rgb] = (92, 100, 114)
 """Of points without a number."""
+DIMMED: Final[dict[bool, Rgb]] = {False: (52, 57, 66), True: (206, 211, 218)}
+"""Of the map while it stands back behind the scan, on a dark and on a light background."""
 _LABEL_TABLE: Final[U8] = np.array([LABEL_COLOURS[label] for label in range(len(LABEL_COLOURS))], dtype=np.uint8)
 
 

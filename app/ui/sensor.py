@@ -21,6 +21,8 @@ MOST_SCAN_POINTS: Final = 30_000
 _PATCH_RADIUS_M: Final = 2.5
 SCAN_POINT_SCALE: Final = 1.3
 """The current scan has larger points than the map, to stand out."""
+_TUNED_POINT_SCALE: Final = 2.0
+"""While the ground is tuned."""
 
 
 def shown_of(count: int) -> slice:
@@ -87,14 +89,14 @@ class SensorScene:
                 T_map_lidar,
                 (result.stamp_ns - start_ns) * 1e-9,
             )
-            by = LABEL if view.colour_by == LOOK else view.colour_by  # what is tuned stands out from the map
+            by = LABEL if view.tuning or view.colour_by == LOOK else view.colour_by  # what is tuned stands out
             self._scan.colors = colours(points, by, limits)
             if another or cut or view.clip is not None:
                 self._scan.points = points.points.astype(np.float16)
         if another:
             place(self._imu, result.T_map_imu)
             place(self._lidar, result.state.T_imu_lidar)
-        self._scan.point_size = view.point_size * SCAN_POINT_SCALE
+        self._scan.point_size = view.point_size * (_TUNED_POINT_SCALE if view.tuning else SCAN_POINT_SCALE)
         self._scan.visible = view.scan and len(shown) > 0
         self._draw_plane(result, T_map_lidar, view)
         self._draw_wedge(result, params, view)

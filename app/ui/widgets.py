@@ -36,7 +36,7 @@ class View:
         colour_by: a name of `app.ui.colours.COLOUR_BY`. point_size: m. follow: keep the sensor in the middle.
         ceilings, moving: show points above the ceiling too, and those on what moves.
         map, scan, wedge, plane, path, grid, notes: whether shown.
-        light: a light background. tuning: the map stands back behind the present scan.
+        light: a light background. tuning: the map is dimmed behind the present scan, which shows its labels.
         ends: of the colour map, where the user chose them. clip: outside which points are hidden.
         slab: m, how wide the profile along the walk is that is shown instead of the map; 0: none is.
         numbers: those of the points that `colour_by` shows, where they depend on the whole map.

@@ -50,8 +50,8 @@ from app.ui.widgets import PANEL_PERIOD_S, SCENE_PERIOD_S, Changes, Page, View
 
 log = logging.getLogger(__name__)
 
-_TUNING_S: Final = 4.0
-"""After a change of a parameter the map stands back behind the present scan for this long."""
+_TUNING_S: Final = 8.0
+"""After a change of a ground parameter the map is dimmed behind the present scan for this long."""
 _TICK_S: Final = 0.04
 """How long the drawing thread waits for a snapshot before it looks at the page's own controls."""
 
@@ -207,7 +207,7 @@ class Workbench:
     def _draw_scene(self, current: Snapshot, view: View) -> None:
         drawn = self._drawn
         tuned = drawn is None or drawn.params != current.params
-        if tuned and drawn is not None:
+        if drawn is not None and drawn.session == current.session and drawn.params.ground != current.params.ground:
             self._tuned_at = self._now()
         view = replace(view, tuning=self._now() - self._tuned_at < _TUNING_S)
         if self._scene_due(current, view, self._more, self._scene.framing.pictures, self._scene.eyes, at_once=tuned):

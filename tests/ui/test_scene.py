@@ -82,6 +82,29 @@ def test_the_page_shows_the_labels_that_the_engine_gave(drawn: Drawn, server: vi
     assert np.array_equal(scan.colors, expected)
 
 
+@pytest.mark.parametrize("by", ["height", "height × intensity"])
+def test_while_the_ground_is_tuned_the_map_is_dimmed_and_the_scan_shows_its_labels(
+    drawn: Drawn, server: viser.ViserServer, wire: Wire, by: str
+) -> None:
+    drawn.draw(View(colour_by=by))
+    before = {name: node.colors.copy() for name, node in chunk_nodes(server).items()}
+    wire.clear()
+    drawn.draw(View(colour_by=by, tuning=True))
+    for name, node in chunk_nodes(server).items():
+        assert node.colors.shape == (3,) and node.colors.max() < 80, "one dark colour, of three bytes"
+        assert set(wire.updates(name)) <= {"colors", "point_size"}
+    result = drawn.engine.snapshot.result
+    assert result is not None
+    expected = np.array([LABEL_COLOURS[int(label)] for label in result.cloud.labels])
+    assert np.array_equal(clouds(server)[SCAN].colors, expected)
+    drawn.engine.send(StepFrame(8))
+    drawn.draw()
+    drawn.draw(View(colour_by=by))
+    after = chunk_nodes(server)
+    assert len(after) > len(before) and all(node.colors.shape == node.points.shape for node in after.values())
+    assert all(after[name].colors.shape == colors.shape for name, colors in before.items())
+
+
 def test_keyframes_that_a_loop_moves_send_poses_and_no_points(drawn: Drawn, wire: Wire) -> None:
     moved = drawn.engine.snapshot.keyframe_poses.copy()  # type: ignore[union-attr]
     moved[:, 0, 3] += 0.5

@@ -20,7 +20,7 @@ from app.server.protocol import (
 )
 from app.ui.readouts import HISTORY
 from app.ui.workbench import Workbench
-from tests.ui.conftest import Clock, Wire, user_sets
+from tests.ui.conftest import Clock, Wire, clouds, user_sets
 from tests.ui.fake_engine import FakeEngine
 
 
@@ -52,6 +52,24 @@ def test_frames_are_sent_at_the_rate_that_eyes_follow(page: Page, wire: Wire) ->
         page.draw(0.01)
     scans = [m for m in wire.messages if getattr(m, "name", "") == SCAN and "points" in getattr(m, "updates", {})]
     assert 10 <= len(scans) <= 16
+
+
+def test_a_ground_slider_dims_the_map_for_a_while_and_another_does_not(page: Page, server: viser.ViserServer) -> None:
+    def dimmed() -> bool:
+        return clouds(server)["/map/keyframes/0"].colors.ndim == 1
+
+    page.engine.send(StepFrame(3))
+    page.draw(1.0)
+    page.engine.send(SetParams({"filter.point_noise": 0.2}))
+    page.draw(1.0)
+    assert not dimmed()
+    page.engine.send(SetParams({"ground.alpha": 44.0}))
+    page.draw(1.0)
+    assert dimmed()
+    page.draw(5.0)
+    assert dimmed()
+    page.draw(5.0)
+    assert not dimmed()
 
 
 def test_a_moved_slider_is_drawn_at_once_however_recent_the_last_frame(page: Page, wire: Wire) -> None:
