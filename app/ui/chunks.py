@@ -117,7 +117,9 @@ class MapChunks:
         ends = chosen_ends(self.limits, view.colour_by, view.ends)
         seen, used = self._view, (ends.get(view.colour_by), ends.get(INTENSITY))
         recolour = (view.colour_by, view.numbers, used) != (seen.colour_by, seen.numbers, self._coloured)
-        recolour = recolour and not view.tuning or (view.tuning, view.light) != (seen.tuning, seen.light)
+        if view.tuning:
+            recolour = not seen.tuning or view.light != seen.light
+        recolour |= seen.tuning and not view.tuning
         cut = (view.ceilings, view.moving, view.clip) != (seen.ceilings, seen.moving, seen.clip)
         self._view, self._coloured = view, used
         parts = self._parts(chunks, known, eyes)

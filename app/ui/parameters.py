@@ -11,6 +11,7 @@ except into a control that was touched a moment ago: an older snapshot must not 
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import viser
@@ -20,11 +21,18 @@ from app.server.protocol import LoadParams, Restart, SetParams, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.params import Leaf, Params, leaves
 from app.slam.sections import Effect
-from app.ui.html import panel, source
-from app.ui.widgets import Edit, Page, as_set, by_user, dialog, show
+from app.slam.types import GROUND, SEED
+from app.ui.colours import LABEL_COLOURS
+from app.ui.html import heading, number, panel, source
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Edit, Page, as_set, by_user, dialog, show
 
-PRIMARY: Final = ("ground.scan_lines", "ground.alpha", "ground.sigma", "ground.voxel_size")
-"""The paper's parameters, above all others."""
+PRIMARY: Final = {
+    "ground.scan_lines": "M scan lines",
+    "ground.alpha": "α seed angle",
+    "ground.sigma": "σ thickness",
+    "ground.voxel_size": "voxel",
+}
+"""The paper's parameters, above all others, and their names here."""
 
 MARK: Final[dict[Effect, str]] = {"now": "", "frame": " ▸", "restart": " ↻"}
 _MOST_STEPS: Final = 2000
@@ -35,9 +43,12 @@ _COMPONENTS: Final = {
     "sensor.translation": ("translation x", "translation y", "translation z"),
     "sensor.rotation": ("roll", "pitch", "yaw"),
 }
+_COLOURS: Final = LABEL_COLOURS[GROUND], LABEL_COLOURS[SEED]
 _TYPING_S: Final = 0.5
 """A text is sent after this long without a change, and a slider that does not act at once after this long at rest."""
 _MOST_UNDONE: Final = 50
+_DRAG_S: Final = 3.0
+"""Changes of the same parameters that follow each other faster are one: a slow drag."""
 _HOLD_S: Final = 1.0
 """A control shows what the user set for this long, whatever older snapshots say."""
 
@@ -68,11 +79,14 @@ class Widget:
         show(self.handle, self.shown(value))
 
 
+def spoken(leaf: Leaf) -> str:
+    """The name of a parameter on labels and buttons."""
+    return PRIMARY.get(leaf.path, leaf.name.replace("_", " "))
+
+
 def label(leaf: Leaf, name: str = "") -> str:
     """Name, unit, and when a change takes effect. name: in place of the parameter's own."""
-    name = name or leaf.name.replace("_", " ")
-    if leaf.path in PRIMARY:
-        name = leaf.symbol if leaf.symbol == "voxel" else f"{leaf.symbol} {name if leaf.symbol == 'M' else ''}".strip()
+    name = name or spoken(leaf)
     unit = {"deg": "°"}.get(leaf.unit, leaf.unit)
     return f"{name} ({unit}){MARK[leaf.effect]}" if unit else f"{name}{MARK[leaf.effect]}"
 
@@ -95,10 +109,9 @@ def add_widgets(gui: viser.GuiApi, leaf: Leaf, value: Any) -> list[Widget]:
     if not isinstance(leaf.default, int):
         box.precision = _DIGITS
     stops = round_values(leaf)
-    marks = ((0, f"{stops[0]:g}"), (len(stops) - 1, f"{stops[-1]:g}"))
     at = _nearest(stops, value)
     # Without a label, so that `viser_adapter.css` hides the slider's own box, which would show a place among the stops.
-    slider = gui.add_slider("", 0, len(stops) - 1, 1, at, hint=hint, marks=marks)
+    slider = gui.add_slider("", 0, len(stops) - 1, 1, at, hint=hint)
     return [Widget(box), Widget(slider, lambda value: _nearest(stops, value), lambda place, _: stops[place])]
 
 
@@ -137,21 +150,27 @@ def _nearest(ascending: tuple[float, ...], value: float) -> int:
 
 
 class ParameterHistory:
-    """The parameters as they were after each change; changes that follow each other closely are one."""
+    """The parameters as they were after each change; a drag is one change, however slow."""
 
     def __init__(self) -> None:
         self._states: list[Params] = []
         self._at = -1
-        self._changed_at = -_HOLD_S
+        self._changed: set[str] = set()  # paths, last
+        self._changed_at = -_DRAG_S
 
     def see(self, params: Params, now: float) -> None:
         """Take in the present parameters, wherever a change came from."""
         if self._at >= 0 and params == self._states[self._at]:
             return
-        merged = self._at > 0 and now - self._changed_at < _HOLD_S
+        changed = set(self._states[self._at].changed(params)) if self._states else set()
+        merged = self._at > 0 and changed == self._changed and now - self._changed_at < _DRAG_S
         del self._states[self._at + (0 if merged else 1) :]
-        self._states = [*self._states, params][-_MOST_UNDONE:]
-        self._at, self._changed_at = len(self._states) - 1, now
+        self._changed, self._changed_at = changed, now
+        if self._states and self._states[-1] == params:  # dragged back to where it was
+            self._changed_at = -_DRAG_S
+        else:
+            self._states = [*self._states, params][-_MOST_UNDONE:]
+        self._at = len(self._states) - 1
 
     def change(self, by: int) -> dict[str, Any]:
         """What leads to the state before (-1) or after (1): values by dotted name; empty if there is none."""
@@ -161,7 +180,7 @@ class ParameterHistory:
 
     def go(self, by: int) -> None:
         self._at += by
-        self._changed_at = -_HOLD_S
+        self._changed_at = -_DRAG_S
 
 
 class ParameterPanel:
@@ -180,19 +199,26 @@ class ParameterPanel:
         for leaf in leaves():
             group = "primary" if leaf.path in PRIMARY else leaf.section
             self._sections.setdefault(group, {})[leaf.name] = leaf
+        self._names = {leaf.path: spoken(leaf) for leaf in leaves()}
         self._history = ParameterHistory()
+        self._opened = params
+        self._recording: Path | None = None
+        gui.add_html(heading("Ground segmentation"))
+        for path in PRIMARY:
+            self._add(self._sections["primary"][path.partition(".")[2]])
+        self._ground = gui.add_html("")
+        self._ground_changes = Changes(page.now, PANEL_PERIOD_S)
+        # Below the sliders and always there, so that nothing moves under the mouse.
         self._undo, self._redo = (
-            gui.add_button(name, icon=icon, color="gray", visible=False)
+            gui.add_button(name, icon=icon, color="gray", disabled=True)
             for name, icon in (("Undo", viser.Icon.ARROW_BACK_UP), ("Redo", viser.Icon.ARROW_FORWARD_UP))
         )
         self._undo.on_click(by_user(lambda _, __: self._step(-1)))
         self._redo.on_click(by_user(lambda _, __: self._step(1)))
+        self._add_reset("primary")
         self._pending = gui.add_html("", visible=False)
         self._restart = gui.add_button("Restart now", icon=viser.Icon.REFRESH, color="orange", visible=False)
         self._restart.on_click(lambda _: self._send(Restart()))
-        for path in PRIMARY:
-            self._add(self._sections["primary"][path.partition(".")[2]])
-        self._add_reset("primary")
         for section in Params.model_fields:
             with gui.add_folder(TITLES.get(section, section.title()), expand_by_default=False):
                 for leaf in self._sections[section].values():
@@ -218,12 +244,23 @@ class ParameterPanel:
         self._history.see(snapshot.params, now)
         for button, verb, by in ((self._undo, "Undo", -1), (self._redo, "Redo", 1)):
             names = self._history.change(by)
-            button.visible = bool(names)
-            if names:
-                button.label = f"{verb} {', '.join(_short(name.partition('.')[2]) for name in list(names)[:2])}"
+            button.disabled = not names
+            button.label = f"{verb} {', '.join(self._names[name] for name in list(names)[:2])}".strip()
+        if (recording := snapshot.recording.path if snapshot.recording else None) != self._recording:
+            self._recording, self._opened = recording, snapshot.params
         self._show_resets(snapshot.params)
+        self._show_ground(snapshot)
         self._pending.visible = self._restart.visible = bool(snapshot.pending_restart)
         self._pending.content = panel("pending", snapshot.pending_restart)
+
+    def _show_ground(self, snapshot: Snapshot) -> None:
+        """What the four sliders made of the present scan."""
+        result = snapshot.result
+        if self._ground_changes(result, at_once=not snapshot.transport.playing):
+            ground = result.ground if result is not None else None
+            numbers = (number(100 * ground.share, 1), f"{ground.seeds:,}") if ground is not None else ("–", "–")
+            why = ground.reason if ground is not None and not ground.found else ""
+            self._ground.content = panel("ground_now", _COLOURS, *numbers, why)
 
     def _step(self, by: int) -> None:
         """Undo or redo the last change of parameters."""
@@ -262,14 +299,16 @@ class ParameterPanel:
             widget.handle.on_update(as_set(set_by(widget)))
 
     def _add_reset(self, group: str) -> None:
-        """A button for each parameter of the group that is not at its default, and one for all."""
-        buttons = self._gui.add_button_group("reset", ("all",), visible=False, hint="Back to the default value.")
+        """A button for each parameter of the group that was changed since the recording was opened, and one for all."""
+        buttons = self._gui.add_button_group(
+            "reset", ("all",), visible=False, hint="Back to the value it had when the recording was opened."
+        )
         self._resets[group] = buttons
 
         def reset(chosen: str, _: viser.ClientHandle) -> None:
             of_group = self._sections[group]
-            leafs = of_group.values() if chosen == "all" else [of_group[n] for n in of_group if _short(n) == chosen]
-            values = {leaf.path: leaf.default for leaf in leafs}
+            leafs = [leaf for leaf in of_group.values() if chosen in ("all", spoken(leaf))]
+            values = {leaf.path: self._opened.value(leaf.path) for leaf in leafs}
             for path in values:
                 self._edits.pop(path, None)
             self._send(SetParams(values))
@@ -278,17 +317,12 @@ class ParameterPanel:
 
     def _show_resets(self, params: Params) -> None:
         for group, buttons in self._resets.items():
-            changed = [
-                _short(leaf.name) for leaf in self._sections[group].values() if params.value(leaf.path) != leaf.default
-            ]
+            leafs = self._sections[group].values()
+            changed = [spoken(leaf) for leaf in leafs if params.value(leaf.path) != self._opened.value(leaf.path)]
             options = (*changed, "all") if len(changed) != 1 else (changed[0],)
             buttons.visible = bool(changed)
             if changed and buttons.options != options:
                 buttons.options = options
-
-
-def _short(name: str) -> str:
-    return name.replace("_", " ")
 
 
 def add_yaml_buttons(page: Page, params: Callable[[], Params]) -> None:

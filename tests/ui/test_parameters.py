@@ -1,5 +1,6 @@
 """The parameter panel: what a person sets becomes a command, what the engine says is shown, and neither echoes."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,10 +12,12 @@ from app.server.protocol import (
     Restart,
     SetParams,
     Snapshot,
+    StepFrame,
 )
 from app.slam.params import Params, leaves
 from app.ui.parameters import PRIMARY, ParameterHistory, ParameterPanel
 from tests.ui.conftest import BusyThreads, Clock, browser_sends, page_of, user_clicks, user_sets
+from tests.ui.fake_engine import FakeEngine
 
 
 class Parameters:
@@ -158,20 +161,49 @@ def test_a_value_that_the_engine_refused_goes_back(parameters: Parameters) -> No
     assert alpha.value == Params().ground.alpha
 
 
-def test_changed_parameters_can_be_reset_one_by_one_or_all(parameters: Parameters) -> None:
+def test_changed_parameters_can_be_reset_one_by_one_or_all(parameters: Parameters, engine: FakeEngine) -> None:
     resets = parameters.panel._resets["primary"]
-    parameters.tick()
-    assert not resets.visible
-    parameters.params = Params().with_values({"ground.alpha": 12.0, "ground.sigma": 0.1})
-    parameters.tick()
-    assert resets.visible and resets.options == ("alpha", "sigma", "all")
-    user_sets(resets, "sigma")
+    recording = engine.snapshot.recording
+    parameters.params = Params().with_values({"ground.voxel_size": 0.3})  # as its own parameters have it
+    parameters.tick(recording=recording)
+    assert not resets.visible, "the user changed nothing"
+    opened = parameters.params
+    parameters.params = opened.with_values({"ground.alpha": 12.0, "ground.sigma": 0.1})
+    parameters.tick(recording=recording)
+    assert resets.visible and resets.options == ("α seed angle", "σ thickness", "all")
+    user_sets(resets, "σ thickness")
     assert parameters.sent == [SetParams({"ground.sigma": Params().ground.sigma})]
     parameters.sent.clear()
     user_sets(resets, "all")
     (command,) = parameters.sent
     assert isinstance(command, SetParams)
-    assert command.values == {path: Params().value(path) for path in PRIMARY}
+    assert command.values == {path: opened.value(path) for path in PRIMARY}
+
+
+def test_what_the_ground_sliders_made_of_the_scan_stands_below_them(parameters: Parameters, engine: FakeEngine) -> None:
+    engine.send(StepFrame())
+    result = engine.snapshot.result
+    assert result is not None
+    parameters.tick(result=result)
+    assert f"<b>{100 * result.ground.share:.1f}</b> % ground" in parameters.panel._ground.content
+    ground = replace(result.ground, found=False, reason="only 2 seed points")
+    parameters.tick(result=replace(result, ground=ground))
+    assert "No ground plane: only 2 seed points." in parameters.panel._ground.content
+
+
+def test_each_ground_slider_says_that_it_is_about_the_ground(parameters: Parameters) -> None:
+    assert all("ground" in parameters.control(path).hint for path in PRIMARY)
+
+
+def test_undo_and_redo_are_below_the_sliders_and_never_come_or_go(parameters: Parameters) -> None:
+    panel = parameters.panel
+    assert panel._undo.order > max(parameters.control(path).order for path in PRIMARY)
+    parameters.tick()
+    assert panel._undo.visible and panel._undo.disabled and panel._undo.label == "Undo"
+    parameters.params = Params().with_values({"ground.sigma": 0.1})
+    parameters.tick(5.0)
+    assert panel._undo.visible and not panel._undo.disabled and panel._undo.label == "Undo σ thickness"
+    assert panel._redo.visible and panel._redo.disabled
 
 
 def test_changes_that_wait_for_a_restart_are_named_beside_a_restart_button(parameters: Parameters) -> None:
@@ -196,6 +228,24 @@ def test_a_value_set_in_a_browser_is_sent_although_an_older_snapshot_is_drawn_me
     busy.catch_up()
     assert parameters.sent == [SetParams({"ground.alpha": 33.0})]
     assert parameters.control("ground.alpha").value == 33.0
+
+
+def test_a_slow_drag_is_undone_at_once() -> None:
+    history = ParameterHistory()
+    history.see(Params(), 0.0)
+    for number in range(1, 20):
+        history.see(Params().with_values({"ground.alpha": 25.0 + number}), 10.0 + 2.0 * number)
+    history.see(Params().with_values({"ground.alpha": 44.0, "ground.sigma": 0.1}), 48.5)
+    assert history.change(-1) == {"ground.sigma": Params().ground.sigma}, "another slider, however soon"
+    history.go(-1)
+    assert history.change(-1) == {"ground.alpha": 25.0}
+
+
+def test_a_drag_that_ends_where_it_began_is_no_change() -> None:
+    history = ParameterHistory()
+    for seconds, alpha in zip((0.0, 10.0, 20.0, 21.0), (25.0, 30.0, 60.0, 30.0), strict=True):
+        history.see(Params().with_values({"ground.alpha": alpha}), seconds)
+    assert history.change(-1) == {"ground.alpha": 25.0}
 
 
 def test_changes_are_undone_and_redone_one_by_one_and_a_drag_is_one_change() -> None:

@@ -116,13 +116,12 @@ class Inspector:
         self._go.on_click(by_user(act))
         self._waiting = gui.add_html(panel("quiet", "Waiting for the submaps …"))
         self._share = gui.add_slider(
-            "submaps",
+            "graph to fit",
             0.0,
             1.0,
             0.01,
             1.0,
-            hint="Left: where the graph had them. Right: as they were registered.",
-            marks=((0.0, "graph"), (1.0, "fit")),
+            hint="Left: where the graph had the submaps. Right: as they were registered.",
         )
         self._alone = gui.add_checkbox("these alone", True, hint="Hide the map and the scan behind the two submaps.")
         self._legend = gui.add_html("")
