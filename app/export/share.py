@@ -84,10 +84,9 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: "Resu
         if 0 <= frame < len(trajectory):
             scene.add_label(f"/notes/{number}", text, position=tuple(trajectory[frame]))
     seen = points if len(points) else np.zeros((1, 3), np.float32)
-    low, high = seen.min(axis=0), seen.max(axis=0)
+    low, high = np.percentile(seen, [1, 99], axis=0)  # a few far points would make the rest small
     _add_scale_and_arrow(server, low, high, results)
-    most_low, most_high = np.percentile(seen, [1, 99], axis=0)  # a few far points would make the rest small
-    center, size = (most_low + most_high) / 2, float(np.linalg.norm((most_high - most_low)[:2])) + 1.0
+    center, size = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) + 1.0
     server.initial_camera.position = tuple(center + size * np.array([-0.26, -0.42, 0.45]))
     server.initial_camera.look_at = tuple(center)
 
@@ -126,15 +125,15 @@ def _loops(g2o: str, keyframes: int) -> np.ndarray:
     return np.array([pair for pair in pairs if max(pair) < keyframes], np.int64).reshape(-1, 2)
 
 
-def _add_scale_and_arrow(server: viser.ViserServer, low: F32, high: F32, results: "Results") -> None:
-    """Beside the map, at its lower left corner."""
+def _add_scale_and_arrow(server: viser.ViserServer, low: F64, high: F64, results: "Results") -> None:
+    """On the left of the first picture, beside nearly all of the map."""
     width = float(max((high - low)[:2].max(), 1.0))
     decade = 10.0 ** math.floor(math.log10(width / 4))
     length = next(step * decade for step in (5, 2, 1) if step * decade <= width / 4 * 1.0001)
-    corner = np.array([low[0], low[1] - 0.06 * width, low[2]], np.float64)
-    end, foot = corner + np.array([length, 0, 0]), corner - np.array([0, 0.04 * width, 0])
-    _lines(server, "/scale", np.array([[corner, end]]), PATH)
-    server.scene.add_label("/scale/text", f"{length:g} m", position=tuple((corner + end) / 2))
+    begin = np.array([low[0] - 0.05 * width, (low[1] + high[1]) / 2, low[2]])
+    end, foot = begin + np.array([0, length, 0]), begin + np.array([0, 1.5 * length + 0.03 * width, 0])
+    _lines(server, "/scale", np.array([[begin, end]]), PATH)
+    server.scene.add_label("/scale/text", f"{length:g} m", position=tuple((begin + end) / 2))
     toward = np.array([1.0, 0, 0]) if results.where is None else np.array(results.where.rotation)[1]
     tip = foot + toward * length / 2
     _lines(server, "/arrow", np.array([[foot, tip]]), ARROW)

@@ -8,6 +8,7 @@ import io
 import os
 import time
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import zstandard
@@ -63,6 +64,20 @@ def test_a_shared_page_opens_from_the_disk_without_a_complaint(chromium: Browser
     of_the_renderer = ("THREE.Clock: ", "GL Driver Message", "Canvas2D: Multiple readback")
     assert not [text for text in said if not text.startswith(of_the_renderer) and "GL Driver" not in text]
     page.close()
+
+
+def test_scale_and_arrow_are_in_the_first_picture_also_if_some_points_are_far() -> None:
+    points = np.random.default_rng(1).uniform((-30, -20, 0), (30, 25, 5), (2000, 3)).astype(np.float32)
+    points[:5] += np.float32([300, -300, 0])
+    server = MagicMock()
+    share._draw(server, points, np.empty((0, 3)), plaza(2))
+    eye, aim = np.array(server.initial_camera.position), np.array(server.initial_camera.look_at)
+    ahead = (aim - eye) / np.linalg.norm(aim - eye)
+    right = np.cross(ahead, [0, 0, 1]) / np.hypot(*ahead[:2])
+    labels = {call.args[0]: np.array(call.kwargs["position"]) - eye for call in server.scene.add_label.call_args_list}
+    for name in ("/scale/text", "/arrow/text"):
+        across, up = (labels[name] @ axis / (labels[name] @ ahead) for axis in (right, np.cross(right, ahead)))
+        assert abs(up) < np.tan(np.radians(37.5)) and abs(across) < 4 / 3 * np.tan(np.radians(37.5))  # viser's 75°
 
 
 def test_measures_are_named_with_their_distance_and_notes_stand_where_they_were_taken(tmp_path: Path) -> None:
