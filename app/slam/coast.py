@@ -22,6 +22,9 @@ CHANGES = (1.0, 3.0)
 """rad/s and m/s²: change of the rate of turn from a scan to the next, and acceleration, of a walking person's hand."""
 FIRST_SPEED, FIRST_RATE = 1.5, 1.0
 """m/s, rad/s: standard deviations before the first two scans are compared."""
+ADRIFT = 0.6
+"""m/s: standard deviation of the speed along a direction that four scans in a row have left open. A scan that holds all
+directions leaves half of that."""
 KNOT_S, LONGEST_S = 0.0025, 1.0
 """How far poses in between are apart, and how long a scan lasts at most: a gap before it needs none."""
 GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
@@ -116,6 +119,11 @@ def propagate(belief: Belief, end_ns: int, course: Course, changes: tuple[float,
     p = state.p_odom_imu + v * dt - R @ course.swayed[0]
     moved = replace(state, stamp_ns=end_ns, R_odom_imu=R, p_odom_imu=p, v_odom_imu=v)
     return Belief(moved, F @ belief.covariance @ F.T + Q)
+
+
+def is_adrift(belief: Belief) -> bool:
+    """Whether nothing measures the speed in some direction any more, so that the position along it is a guess."""
+    return bool(np.linalg.eigvalsh(belief.covariance[VEL, VEL])[-1] > ADRIFT**2)
 
 
 def deskew(scan: Scan, state: NavState, course: Course) -> F32:

@@ -119,7 +119,7 @@ class Engine:
         watch.lap("downsample")
 
         # paper 2.3, eq. 5-7
-        posterior, registration = predicted, _NOT_REGISTERED
+        posterior, registration, adrift = predicted, _NOT_REGISTERED, False
         if self._map.voxels:
             if len(samples):
                 chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
@@ -130,9 +130,12 @@ class Engine:
                 posterior, registration = self._update(belief, predicted, fuse)
                 # the prediction was no measurement that the scan could contradict
                 registration = replace(registration, predicted_change=np.nan, correction=np.nan)
+                if registration.degenerate and coast.is_adrift(posterior):
+                    adrift = True
+                    registration = replace(registration, reason=f"{registration.reason}, and there is no IMU")
                 points = coast.deskew(scan, posterior.state, course)
                 sampled = replace(sampled, points=points[source])
-        status = _status(waiting, self._map.voxels > 0, registration)
+        status = FrameStatus.LOST if adrift else _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 
         here, last = posterior.state.T_odom_imu, before.T_odom_keyframe

@@ -14,8 +14,8 @@ from app.slam.engine import Engine
 from app.slam.iekf import boxminus, boxplus
 from app.slam.imu import DIM, Belief
 from app.slam.types import FrameStatus, ImuSamples, NavState, Scan
-from tests.slam.engine_runs import run, worst
-from tests.slam.scenes import FORWARD, UPRIGHT, Rig, Walk, furnished_room, measurements, params_for, sweep
+from tests.slam.engine_runs import ALONG, run, worst
+from tests.slam.scenes import FORWARD, UPRIGHT, Rig, Walk, corridor, furnished_room, measurements, params_for, sweep
 
 NOTHING = ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))
 
@@ -92,6 +92,14 @@ def test_a_walk_in_a_room_is_followed_by_the_lidar_alone(device: np.ndarray) -> 
     assert degrees < 0.5
     assert results[-1].status is FrameStatus.TRACKING
     assert "no IMU" in results[0].notices[0]
+
+
+def test_in_a_bare_corridor_the_lidar_alone_is_lost_and_says_so() -> None:
+    """Nothing there measures the way along it."""
+    bare = [replace(e, imu=NOTHING) for e in measurements(corridor(150.0, pillars=False), ALONG, Rig(), 40)]
+    results = run(Engine(params_for(Rig())), iter(bare))
+    assert {result.status for result in results[20:]} == {FrameStatus.LOST}
+    assert any("one direction unobserved, and there is no IMU" in notice for r in results for notice in r.notices)
 
 
 def test_going_back_without_an_imu_repeats_the_walk_to_the_last_bit() -> None:
