@@ -74,9 +74,11 @@ def test_a_loop_is_rejected_undone_and_rejected_again(bench: Bench) -> None:
     reject.evaluate("(button) => button.scrollIntoView({block: 'start'})")
     reject.click()
     expect(page.get_by_text("Keyframes would move by up to")).to_be_visible()
-    for name in ("Commit", "Cancel"):
+    for name in ("Apply", "Cancel"):
         expect(page.get_by_role("button", name=name)).to_be_in_viewport(ratio=1)
-    page.get_by_role("button", name="Commit").click()
+    page.get_by_role("button", name="Apply").click()
+    expect(page.get_by_text("Rejected 12–89; keyframes moved by up to")).to_be_visible()
+    expect(page.get_by_role("button", name="Undo", exact=True)).to_be_in_viewport(ratio=1)
     expect(page.get_by_role("button", name="Undo: reject 12–89")).to_be_visible()
     bench.eventually(lambda: EditLoop(Reject(*GOOD)) in bench.engine.sent)
     assert bench.engine.sent[0] == TryLoop(Reject(*GOOD))

@@ -1,4 +1,4 @@
-"""Editing loops: an edit is proposed, shown as a ghost, then committed or cancelled; undo, redo, files."""
+"""Editing loops: an edit is proposed, shown as a ghost, then applied or cancelled; undo, redo, files."""
 
 from collections.abc import Callable
 from typing import Final
@@ -14,7 +14,7 @@ from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.html import panel
-from app.ui.loops.words import describe_edit, forecast, headline
+from app.ui.loops.words import describe_edit, forecast, headline, what_happened
 from app.ui.nodes import add_lines, clear, segments
 from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, notify_error, poses_of, show
 
@@ -52,35 +52,47 @@ class Ghost:
 
 
 class Proposal:
-    """What the edit under consideration would change, with Commit and Cancel."""
+    """What the edit under consideration would change, with Apply and Cancel; then what it did, with Undo."""
 
-    def __init__(self, page: Page, committed: Callable[[LoopEdit], None]) -> None:
+    def __init__(self, page: Page, applied: Callable[[LoopEdit], None]) -> None:
         gui = page.gui
-        self._send, self._snapshot, self._committed = page.send, page.snapshot, committed
+        self._send, self._snapshot, self._applied = page.send, page.snapshot, applied
         self._ghost = Ghost(page.scene)
         self._folder = gui.add_folder("Before you decide", visible=False)
         with self._folder:
             self._words = gui.add_html("")
-            self._commit = gui.add_button("Commit", icon=viser.Icon.CHECK)
+            self._apply = gui.add_button("Apply", icon=viser.Icon.CHECK)
             cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
+        self._done = gui.add_folder("Last edit", visible=False)
+        with self._done:
+            self._happened = gui.add_html("")
+            self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray", hint="Ctrl Z")
+        self._undo.on_click(by_user(lambda _, __: self._send(UndoLoop())))
         self.command: LoopEdit | None = None
+        self._last: LoopEdit | None = None  # applied, until it is undone or another edit follows
+        self._arrived = False  # whether a snapshot has had it
         self._last_notice = 0
         self._changes = Changes()
-        self._commit.on_click(by_user(lambda _, __: self.commit()))
+        self._apply.on_click(by_user(lambda _, __: self.apply()))
         cancel.on_click(by_user(lambda _, __: self.cancel()))
 
     def propose(self, command: LoopEdit) -> None:
         notices = self._snapshot().notices
         self._last_notice = notices[-1].number if notices else 0
-        self.command = command
+        self.command, self._last = command, None
         self._send(TryLoop(command))
 
-    def commit(self) -> None:
+    def apply(self) -> None:
         command, self.command = self.command, None
         if command is not None:
+            snapshot = self._snapshot()
+            tried = snapshot.loops.tried
+            preview = tried[1] if tried is not None and tried[0] == command else None
+            self._last, self._arrived = command, False
+            self._happened.content = what_happened(command, preview, poses_of(snapshot)) + panel("into_view")
             self._send(EditLoop(command))
             self._send(TryLoop(None))
-            self._committed(command)
+            self._applied(command)
 
     def cancel(self) -> None:
         if self.command is not None:
@@ -88,6 +100,7 @@ class Proposal:
             self._send(TryLoop(None))
 
     def draw(self, snapshot: Snapshot) -> None:
+        self._draw_done(snapshot)
         command, tried = self.command, snapshot.loops.tried
         preview = tried[1] if tried is not None and tried[0] == command else None
         poses = poses_of(snapshot)
@@ -97,9 +110,17 @@ class Proposal:
             return
         self._folder.visible = command is not None
         if command is not None:
-            self._commit.disabled = preview is None
+            self._apply.disabled = preview is None
             words = forecast(command, preview, poses, snapshot.loops.residuals, problem)
             self._words.content = words + panel("into_view")
+
+    def _draw_done(self, snapshot: Snapshot) -> None:
+        edits = snapshot.loops.undo
+        there = bool(edits) and edits[-1] == self._last
+        if self._arrived and not there:
+            self._last = None
+        self._arrived = there
+        self._done.visible = self._last is not None
 
     def _problem(self, snapshot: Snapshot) -> str:
         """The engine's newest error since the edit was proposed."""

@@ -18,7 +18,7 @@ from app.ui.colours import TABLES
 from app.ui.html import heading, panel
 from app.ui.loops.words import NEWER, OLDER, evidence
 from app.ui.nodes import add_exact_points, place
-from app.ui.widgets import ROOT, Changes, Page, View, by_user, chart, poses_of
+from app.ui.widgets import ROOT, Changes, Page, View, by_user, chart, poses_of, show
 
 FLY, SEEK, CLOSE = "fly there", "frame", "close"
 UNSEEN: Final = (104, 108, 116)
@@ -109,6 +109,7 @@ class Inspector:
         self._pairing: Pairing | None = None
         self._clouds: tuple[LoopDetail, bool, F32, F32] | None = None
         self._changes = Changes()
+        self._map_again = False
         self._evidence = gui.add_html("")
         self._go = gui.add_button_group(
             "go", (FLY, SEEK, CLOSE), hint="Fly to the loop, seek to the frame at which it was decided, or close it."
@@ -145,6 +146,17 @@ class Inspector:
             self._residuals_title,
             self._residuals,
         )
+
+    def show_map(self) -> None:
+        """Show what became of the map, until another loop is chosen."""
+        self._map_again = self._alone.value
+        show(self._alone, False)
+
+    def hide_map(self) -> None:
+        """As the user had it before `show_map`."""
+        if self._map_again:
+            show(self._alone, True)
+        self._map_again = False
 
     @property
     def alone(self) -> bool:

@@ -64,7 +64,7 @@ class LoopsPanel:
         self._edges = LoopEdges(page.scene, f"{ROOT}/loops")
         self._bridge = Bridge(gui, BRIDGE, self._act)
         self._table = gui.add_html(panel("quiet", _NONE_YET))
-        self._proposal = Proposal(page, self._committed)
+        self._proposal = Proposal(page, self._applied)
         self._folder = gui.add_folder("The chosen loop", visible=False)
         with self._folder:
             self._verdict = VerdictPanel(page, self._proposal.propose)
@@ -105,6 +105,7 @@ class LoopsPanel:
         """Show everything about a loop; None: about none."""
         if pair != self._chosen:
             self._chosen = pair
+            self._inspector.hide_map()
             if self._proposal.command is not None and not self._add_loop.nudging:
                 self._proposal.cancel()
             if pair is not None:
@@ -211,8 +212,9 @@ class LoopsPanel:
         self._look_freely(client)
         fly(client, place + self._page.offset(), distance)
 
-    def _committed(self, command: LoopEdit) -> None:
+    def _applied(self, command: LoopEdit) -> None:
         self._add_loop.done()
+        self._inspector.show_map()
         if (pair := command.pair) is not None:
             self._chosen = self._coming = pair  # a loop added manually arrives later
 

@@ -81,6 +81,14 @@ def describe_edit(command: LoopEdit) -> str:
             return f"reject {pair}"
 
 
+def what_happened(command: LoopEdit, preview: Preview | None, poses: F64) -> str:
+    """A sentence on an edit that was applied, from what it was seen to change, with (k, 4, 4) the poses before it."""
+    verb, _, rest = describe_edit(command).partition(" ")
+    past = {"add": "Added", "solve": "Solved"}.get(verb, f"{verb.capitalize()}ed")
+    moves = _moves(preview.poses, poses) if preview is not None else None
+    return panel("loops.happened", f"{past} {rest}", moves)
+
+
 def headline(edge: LoopEdge) -> str:
     """Verdict and reason; loops that contradict it can be clicked, as rows of the table."""
     return panel("bridged", BRIDGE, panel("loops.headline", edge, kind_of(edge).colour))

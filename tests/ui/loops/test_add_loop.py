@@ -77,7 +77,7 @@ def test_a_loop_added_by_hand_is_chosen_once_it_arrives(page: Page) -> None:
     page.loops._add_loop.suggest_pair((20, 97))
     page.loops._add_loop.suggest()
     page.draw()
-    user_clicks(page.loops._proposal._commit)
+    user_clicks(page.loops._proposal._apply)
     page.draw()
     page.draw()
     assert page.loops.chosen == (20, 97) and page.engine.sent[-1] == InspectLoop((20, 97))

@@ -1,4 +1,4 @@
-"""The user's word on a loop: proposed, seen as a ghost, committed, undone, saved and given again."""
+"""The user's word on a loop: proposed, seen as a ghost, applied, undone, saved and given again."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -24,7 +24,7 @@ def test_a_rejected_loop_is_accepted_in_two_steps_with_a_ghost_between(page: Pag
     assert tried is not None
     assert np.allclose(page.node("/map/ghost/path").points[:, 0], tried[1].poses[:-1, :3, 3], atol=1e-5)
     assert page.edge(pair).verdict is Verdict.REJECTED
-    user_clicks(page.loops._proposal._commit)
+    user_clicks(page.loops._proposal._apply)
     page.draw()
     assert page.engine.sent[1:3] == [EditLoop(Accept(*pair)), TryLoop(None)]
     assert page.edge(pair).verdict is Verdict.ACCEPTED
@@ -32,6 +32,29 @@ def test_a_rejected_loop_is_accepted_in_two_steps_with_a_ghost_between(page: Pag
     assert page.node("/map/loops/edited-in") is None  # it is the chosen one, drawn in white
     page.choose(None)
     assert page.node("/map/loops/edited-in").points.shape == (2, 2, 3)
+
+
+def test_after_an_edit_the_map_is_shown_and_a_sentence_says_what_moved_beside_undo(page: Page) -> None:
+    proposal, inspector = page.loops._proposal, page.loops._inspector
+    page.choose(GOOD)
+    page.draw()
+    assert inspector.alone
+    user_clicks(page.loops._verdict._reject)
+    page.draw()
+    user_clicks(proposal._apply)
+    for _ in range(2):
+        page.draw()
+        assert proposal._done.visible and "Rejected 12–89" in proposal._happened.content
+    assert "keyframes moved by up to" in proposal._happened.content
+    assert not inspector.alone and page.loops.chosen == GOOD
+    user_clicks(proposal._undo)
+    page.draw()
+    assert UndoLoop() in page.engine.sent
+    page.draw()
+    assert not proposal._done.visible
+    page.choose(WAITING)
+    page.draw()
+    assert inspector.alone
 
 
 def test_cancelling_leaves_all_as_it_was(page: Page) -> None:
@@ -61,18 +84,18 @@ def test_before_a_decision_the_page_says_how_far_keyframes_move_and_which_factor
         assert f"loop {worst.pair[0]}–{worst.pair[1]}</td><td>{worst.sigmas:.2f}" in words
 
 
-def test_nothing_can_be_committed_before_its_effect_is_known(page: Page) -> None:
+def test_nothing_can_be_applied_before_its_effect_is_known(page: Page) -> None:
     page.choose(GOOD)
     page.loops._proposal.command = Reject(*GOOD)  # asked, and the engine is still at it
     page.draw()
-    assert page.loops._proposal._commit.disabled and "computes" in page.loops._proposal._words.content
+    assert page.loops._proposal._apply.disabled and "computes" in page.loops._proposal._words.content
 
 
 def test_the_engine_s_refusal_is_shown_in_the_proposal(page: Page) -> None:
     page.loops._proposal.propose(Accept(0, 3))
     page.draw()
     assert "There is no loop candidate of keyframes 0 and 3" in page.loops._proposal._words.content
-    assert page.loops._proposal._commit.disabled
+    assert page.loops._proposal._apply.disabled
 
 
 def test_the_weight_is_tried_when_the_hand_rests(page: Page) -> None:
@@ -84,7 +107,7 @@ def test_the_weight_is_tried_when_the_hand_rests(page: Page) -> None:
     assert page.engine.sent == []
     page.draw(0.5)
     assert page.engine.sent == [TryLoop(SetWeight(*GOOD, 4.0))]
-    user_clicks(page.loops._proposal._commit)
+    user_clicks(page.loops._proposal._apply)
     page.draw()
     assert page.edge(GOOD).weight == 4.0 and page.loops._verdict._weight.value == 4.0
 

@@ -37,7 +37,7 @@ def test_all_is_solved_at_once_in_two_steps_with_cost_and_change_said_between(pa
     assert f"move by up to <b>{moved:.1f} cm</b>" in words
     assert f"cost goes from <b>{costs[0]:.4g}</b> to <b>{costs[1]:.4g}</b>" in words and "% less" in words
     assert page.node("/map/ghost/path") is not None
-    user_clicks(proposal._commit)
+    user_clicks(proposal._apply)
     page.draw()
     assert page.engine.sent[1:] == [EditLoop(Solve()), TryLoop(None)]
     assert page.loops.chosen == GOOD, "it is of no loop in particular"
