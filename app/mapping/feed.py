@@ -30,7 +30,7 @@ class FeedInfo:
         duration_s: of the whole recording. frames: scans expected in the part that is processed. Both are None if the
             source has no end yet.
         start_s, part_s: start and length of the part that is processed (None: to the end).
-        findings: what is unusual about the source.
+        findings: what is unusual about the source. fixes: whether it holds satellite fixes.
     """
 
     path: Path
@@ -40,6 +40,7 @@ class FeedInfo:
     start_s: float = 0.0
     part_s: float | None = None
     findings: tuple[Finding, ...] = field(default=())
+    fixes: bool = False
 
 
 class Feed(Protocol):
@@ -129,6 +130,7 @@ class FileFeed(Feed):
             start_s=start_s,
             part_s=duration_s,
             findings=recording.findings,
+            fixes=bool(recording.gnss_topic),
         )
         self._measurements = self._read(None)
         self._ahead = _Ahead(self._measurements) if read_ahead else None

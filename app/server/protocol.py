@@ -204,6 +204,8 @@ class OpenedRecording:
     truth_positions: F64 | None = None
     """(m, 3) positions of the IMU, in the truth's own frame."""
     truth: Path | None = None
+    fixes: bool = False
+    """Whether it holds satellite fixes."""
 
 
 @dataclass(frozen=True, slots=True)

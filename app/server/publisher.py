@@ -41,6 +41,7 @@ def opened_recording(session: Session) -> OpenedRecording:
         truth_stamps_ns=truth.stamps_ns if truth else None,
         truth_positions=truth.positions if truth else None,
         truth=session.truth_path,
+        fixes=info.fixes,
     )
 
 

@@ -46,6 +46,7 @@ class GeoreferencePanel:
         self._page, self._folders, self._measure = page, folders, measure
         self._changes, self._scene_changes = Changes(), Changes()
         self._shown: Survey | None = None  # what the widgets were last set to
+        self._open: Path | None = None  # the recording for which that was
         self._file: Path | None = None
         self._control = ""
         self._nodes: list[Any] = []
@@ -141,11 +142,11 @@ class GeoreferencePanel:
         self._control = text
         self._show_widgets()
 
-    def _show(self, survey: Survey | None) -> None:
-        """Set the widgets to what the session holds."""
+    def _show(self, survey: Survey | None, otherwise: str) -> None:
+        """Set the widgets to what the session holds; otherwise: what to offer if that is nothing."""
         self._shown = survey
         if survey is None:
-            show(self._by, NOTHING)
+            show(self._by, otherwise)
         else:
             self._file, self._control = survey.gnss, survey.control
             show(self._by, CONTROL if survey.control else FILE if survey.gnss else RECORDED)
@@ -196,9 +197,12 @@ class GeoreferencePanel:
     # --- what came of it -------------------------------------------------------------------------
     def draw(self, current: Snapshot) -> None:
         """Show what the session holds and how it lies."""
-        earth = current.earth
-        if earth.survey != self._shown:
-            self._show(earth.survey)
+        earth, recording = current.earth, current.recording
+        opened = recording.path if recording is not None else None
+        if earth.survey != self._shown or opened != self._open:
+            new = opened != self._open and recording is not None and recording.fixes
+            self._open = opened
+            self._show(earth.survey, RECORDED if new else NOTHING)
         edits = (current.loops.undo, current.loops.redo)
         if self._changes(earth, *edits, current.session):
             self._html.content = self._bridge.live(_result(current)) if earth.survey is not None else ""

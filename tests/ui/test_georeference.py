@@ -13,7 +13,18 @@ from app.georeference.reference import GeoReference
 from app.georeference.survey import Survey
 from app.mapping.kept import Measure, Spot
 from app.server.folders import Folders
-from app.server.protocol import Chunk, Command, Earth, EditLoop, Georeference, LoopsView, RedoLoop, Snapshot, UndoLoop
+from app.server.protocol import (
+    Chunk,
+    Command,
+    Earth,
+    EditLoop,
+    Georeference,
+    LoopsView,
+    OpenedRecording,
+    RedoLoop,
+    Snapshot,
+    UndoLoop,
+)
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Override
@@ -108,6 +119,20 @@ def test_a_session_that_is_reopened_shows_what_it_was_georeferenced_by(paging: P
     assert paging.panel._by.value == RECORDED and paging.lay() == LAID.earth.survey
     paging.show(Snapshot())
     assert paging.panel._by.value == NOTHING and paging.panel._html.content == ""
+
+
+def test_fixes_of_a_recording_that_is_opened_are_offered(paging: Paging) -> None:
+    walk = OpenedRecording(Path("walk.mcap"), 0, 60.0, 600, (), fixes=True)
+    paging.show(Snapshot(recording=walk))
+    assert paging.panel._by.value == RECORDED and paging.lay() == Survey()
+    paging.show(Snapshot(recording=walk, earth=Earth(Survey())))
+    paging.show(Snapshot(recording=walk))  # the user took it back
+    assert paging.panel._by.value == NOTHING
+    choose(paging.panel._by, CONTROL)
+    paging.show(Snapshot(recording=replace(walk, frames=601)))
+    assert paging.panel._by.value == CONTROL
+    paging.show(Snapshot(recording=replace(walk, path=Path("indoors.mcap"), fixes=False)))
+    assert paging.panel._by.value == NOTHING
 
 
 def test_rejected_fixes_come_first_and_a_click_lets_one_count(paging: Paging) -> None:
