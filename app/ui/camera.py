@@ -17,7 +17,7 @@ from app.ui.widgets import Changes, Page, by_user, show
 FOV: Final = float(np.radians(60.0))
 _NARROW: Final = float(np.radians(2.0))
 """viser has no parallel projection: from far away, through a narrow lens, lines stay parallel to the eye."""
-_LEFT_OUT: Final = 0.5
+_LEFT_OUT: Final = 0.1
 """Percent of the points that may lie beyond each edge of a fitted view: few far ones would make the rest small."""
 _LEAST_M: Final = 4.0
 _SOME: Final = 20_000
@@ -27,9 +27,10 @@ _WIDE_PX: Final = 577
 """Height of the scene's lower edge that the transport covers, on pages of at least this width."""
 _FAR: Final = 10.0
 """Things are drawn up to this many times as far away as the middle of the map."""
-FIT, PLAN, TOP, FRONT, SIDE = "fit", "plan", "top", "front", "side"
+FIT, OBLIQUE, PLAN, TOP, FRONT, SIDE = "fit", "3D", "plan", "top", "front", "side"
+"""To fit is to look from the same side as before."""
 _WAYS: Final[dict[str, tuple[float, float, float]]] = {
-    FIT: (-0.55, -0.55, 0.75),
+    OBLIQUE: (-0.55, -0.55, 0.75),
     PLAN: (0.0, -1e-3, 1.0),
     TOP: (0.0, -1e-3, 1.0),
     FRONT: (0.0, -1.0, 0.05),
@@ -82,7 +83,7 @@ NOTHING: Final[F64] = np.array([0.3, 0.2, -0.6]) + 2.5 * np.array(list(product((
 """Looked at before there is a map: around the sensor."""
 
 
-def whole(points: F64, way: str = FIT, picture: Picture = Picture(), axes: F64 = _MAP) -> Stand:
+def whole(points: F64, way: str = OBLIQUE, picture: Picture = Picture(), axes: F64 = _MAP) -> Stand:
     """From where (n, 3) points, all but a few, just fill a picture. axes: (3, 3) columns, those of a way."""
     towards = axes @ _WAYS[way] / np.linalg.norm(_WAYS[way])
     right = np.cross((0.0, 0.0, 1.0), towards)
@@ -116,7 +117,7 @@ class Framing:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self.north = np.array([0.0, 1.0])  # in the map, which is up in plans
-        self._ways: dict[int, str] = {}  # from which side browsers look; FIT unless it was chosen
+        self._ways: dict[int, str] = {}  # from which side browsers look; OBLIQUE unless it was chosen
         self._put: deque[F64] = deque(maxlen=_PUT)
         self._points, self._at_once = NOTHING, False
         self._fitted: dict[tuple[object, ...], Stand] = {}
@@ -152,7 +153,8 @@ class Framing:
 
     def show(self, client: viser.ClientHandle, way: str, offset: F64) -> None:
         """Let a browser look at the whole map from one side, and keep doing so."""
-        self._ways[client.client_id] = way
+        if way != FIT:
+            self._ways[client.client_id] = way
         self._place(client, self._whole(client), offset)
 
     def follow(self) -> None:
@@ -166,14 +168,14 @@ class Framing:
 
     def _begin(self, offset: F64) -> None:
         """Where pages that open later look from."""
-        stand, camera = self._fit(FIT, Picture()), self._server.initial_camera
+        stand, camera = self._fit(OBLIQUE, Picture()), self._server.initial_camera
         position = stand.position + offset
         if not self._put or not np.array_equal(position, camera.position):
             camera.position, camera.look_at = position, stand.look_at + offset
             self._put.append(position)
 
     def _whole(self, client: viser.ClientHandle) -> Stand:
-        return self._fit(self._ways.get(client.client_id, FIT), _picture(client))
+        return self._fit(self._ways.get(client.client_id, OBLIQUE), _picture(client))
 
     def _fit(self, way: str, picture: Picture) -> Stand:
         """The same object while the map is the same."""
@@ -222,10 +224,11 @@ class CameraPanel:
         gui = page.gui
         self._page, self._framing, self._look_freely = page, framing, look_freely
         self._changes = Changes()
+        self._made_parallel = False
         ways = gui.add_button_group(
             "camera",
-            tuple(_WAYS),
-            hint="The whole map, also while it grows; G fits it. A plan is orthographic, north up.",
+            (FIT, *_WAYS),
+            hint="The whole map, also while it grows; G fits it from the same side. A plan is orthographic, north up.",
         )
         ways.on_click(by_user(self.look))
         self._parallel = gui.add_checkbox(
@@ -246,8 +249,12 @@ class CameraPanel:
         """Show the whole map from one side, also as it grows."""
         self._look_freely(client)
         if way == PLAN:
-            show(self._parallel, True)
+            self._make_parallel()
             client.camera.fov = _NARROW
+        elif way != FIT and self._made_parallel:
+            self._made_parallel = False
+            show(self._parallel, False)
+            client.camera.fov = FOV
         self._framing.show(client, way, self._page.offset())
 
     def face(self, client: viser.ClientHandle, middle: F64, size: tuple[float, float], axes: F64 = _MAP) -> None:
@@ -257,9 +264,14 @@ class CameraPanel:
             middle: (3,) m, map. size: m, width and height. axes: (3, 3), its own, as columns.
         """
         self._look_freely(client)
-        show(self._parallel, True)
+        self._make_parallel()
         half = 0.6 * max(size[1], size[0] / _picture(client).shape, 1.0)
         self._go(client, Stand(middle - axes[:, 1] * half / np.tan(FOV / 2), middle))
+
+    def _make_parallel(self) -> None:
+        """Until another side is chosen; where a person chose it, it stays."""
+        self._made_parallel |= not self._parallel.value
+        show(self._parallel, True)
 
     def _stand(self, client: viser.ClientHandle) -> Stand:
         """Where the usual lens would show what this camera shows."""

@@ -15,7 +15,7 @@ from app.server.protocol import Snapshot
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.types import F64
-from app.ui.camera import FIT, CameraPanel
+from app.ui.camera import OBLIQUE, CameraPanel
 from app.ui.clip_maths import FACES, along_line, carried, edges, handle, pulled
 from app.ui.geometry import wxyz
 from app.ui.html import panel
@@ -171,7 +171,7 @@ class ClipPanel:
             low, high = np.percentile(points[:, 2], (1, 99)) if len(points) else (0.0, 1.0)
             self._camera.face(client, np.array([length / 2, 0.0, (low + high) / 2]), (length, high - low))
         else:
-            self._camera.look(FIT, client)
+            self._camera.look(OBLIQUE, client)
 
     # --- a section by two clicks -----------------------------------------------------------------
     def _begin_cut(self, client: viser.ClientHandle) -> None:
