@@ -12,6 +12,7 @@ viser has no events for HTML, no way to run a script, and keys of its own. So th
 * Tooltips have the class `mantine-Tooltip-tooltip`, and the scene is a `<canvas data-engine>`.
 * A phone's panel has its largest height and its width in its style; a folder is a Paper with a border.
 * While the server is not connected, panels are dimmed with a transition of 150 ms and take no clicks.
+* The scene is inset by the width of the docked panel, whose chevron carries `data-dock-region-collapse`.
 * Dock tabs carry `data-dock-tab`; the box of a slider follows its track, with Mantine's class names.
 """
 

@@ -118,6 +118,21 @@ def test_dragging_the_time_slider_seeks(bench: Bench) -> None:
     bench.page.evaluate("document.activeElement.blur()")
 
 
+def test_the_bar_stays_and_works_while_the_panel_is_closed(bench: Bench) -> None:
+    page, scene = bench.page, bench.page.locator("canvas[data-engine]")
+    before = scene.bounding_box()
+    page.get_by_role("button", name="Collapse panel area").click()
+    expect(page.get_by_role("tab", name="Loops")).to_be_hidden()
+    frame = bench.engine.snapshot.transport.frame
+    page.get_by_role("button", name="Step", exact=True).click()
+    expect(page.get_by_text(f"frame {frame + 1} of 400")).to_be_visible()
+    expect(page.locator(".hs-legend").get_by_text("not ground")).to_be_visible()
+    bench.eventually(lambda: (now := scene.bounding_box()) is not None and now["width"] == 1000)
+    page.get_by_role("button", name="Panel").click()
+    expect(page.get_by_role("tab", name="Loops")).to_be_visible()
+    bench.eventually(lambda: scene.bounding_box() == before)
+
+
 def test_the_recording_s_findings_are_in_their_panel(bench: Bench) -> None:
     bench.page.get_by_role("button", name="1 needs attention").click()
     expect(bench.page.get_by_text("--set imu.max_gap=0.4")).to_be_visible()

@@ -206,7 +206,7 @@ def test_to_fit_keeps_the_plan_and_another_side_ends_it(server: viser.ViserServe
     panel = CameraPanel(page_of(server), framing, lambda _: None)
     panel.look(PLAN, browser)  # type: ignore[arg-type]
     plan = browser.camera.position.copy()
-    browser.camera.position = browser.camera.position + [5.0, 0.0, 0.0]
+    browser.camera.position = browser.camera.position + np.array([5.0, 0.0, 0.0])
     panel.look(FIT, browser)  # type: ignore[arg-type]
     assert browser.camera.position == pytest.approx(plan) and browser.camera.fov < 0.1
     panel.look(OBLIQUE, browser)  # type: ignore[arg-type]

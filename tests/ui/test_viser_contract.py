@@ -43,6 +43,14 @@ ASSUMPTIONS = {
         "CommandPalette.tsx",
         "useHotkeys(hotkeyItems);",
     ),
+    "The docked panel is no longer closed by such a chevron: closing it takes the bar off the page.": (
+        "dock/handles.tsx",
+        'attrs={{ "data-dock-region-collapse": edge }}',
+    ),
+    "The scene is no longer inset so: it leaves room for a closed panel.": (
+        "dock/DockManager.tsx",
+        "right: rightInset,",
+    ),
     "Dock tabs no longer carry data-dock-tab: the tabs are no grid.": (
         "dock/TabGroupFrame.tsx",
         "data-dock-tab={paneId}",

@@ -22,6 +22,19 @@ if (!window.hemislamSay) {
     if (tab) sheet.hsSheet = tab.ariaSelected === 'true' && sheet.hsSheet === 'high' ? 'low' : 'high';
   }, true);
 
+  // The panel is closed by hiding it: viser would take all it holds off the page, and the bar with it.
+  document.body.insertAdjacentHTML('beforeend', '<button class="hs-button hs-reopen" title="Show the panel.">« Panel</button>');
+  const reopen = document.body.lastElementChild, chevron = '[data-dock-region-collapse]';
+  const close = (event, closed) => { event?.stopImmediatePropagation(); sheet.hsPanel = closed ? 'closed' : 'open'; };
+  reopen.onclick = () => close(null, false);
+  for (const kind of ['pointerdown', 'mousedown', 'click', 'keydown']) {
+    document.addEventListener(kind, (event) => {
+      if (!event.target.closest(chevron) || (kind === 'keydown' && event.key !== 'Enter')) return;
+      close(event, kind === 'click' || kind === 'keydown');
+      if (sheet.hsPanel === 'closed') reopen.focus();
+    }, true);
+  }
+
   // Show a tab, docked or on a phone.
   window.hemislamOpenTab = (name) => {
     const tab = [...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === name);
@@ -30,6 +43,7 @@ if (!window.hemislamSay) {
     tab.dispatchEvent(new KeyboardEvent('keydown', {key: 'Enter', bubbles: true}));
     tab.scrollIntoView({block: 'nearest'});
     sheet.hsSheet = 'high';
+    sheet.hsPanel = 'open';
   };
 
   // Keys. On its way up an event passes widgets (the page's root), the body, viser's hotkeys (the html element) and
