@@ -8,6 +8,7 @@ where p, R is T_map_imu. The map's z is nearly up: it was levelled by an acceler
 a degree. The map's shape does not change.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
+from app.georeference.drift import drift_deviations
 from app.georeference.fixes import Fixes
 from app.georeference.ground import Ground
 from app.georeference.path import SEARCH_S, PathOverTime
@@ -38,11 +40,9 @@ WORST_YAW, WORST_OFFSET_S, WORST_LEVER_M = np.radians(10.0), 0.1, 0.1
 NOTABLE_SCATTER = 3.0
 """A user is told of more, as a factor on what the fixes report."""
 FEWEST = 8
-PART_S, FEWEST_IN_PART = 20.0, 5
 COARSE_FIXES = 200
 
 _least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
-_minimize: Any = optimize.minimize_scalar
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +55,7 @@ class Alignment:
         distances: (n,) lengths of the residuals in standard deviations. used: (n,) whether a fix counts.
         offset_s: how much later the fixes are stamped than they were measured. lever_arm: m, IMU frame.
         offset_sigma_s, yaw_sigma, lever_sigma: their standard deviations, s, rad and m; nan where a value was given.
+            They count noise of the fixes and drift of the map. offset_drift_s: the part of the first by drift.
         notes: what a user should know, in sentences.
     """
 
@@ -66,6 +67,7 @@ class Alignment:
     used: Mask
     offset_s: float = 0.0
     offset_sigma_s: float = float("nan")
+    offset_drift_s: float = 0.0
     yaw_sigma: float = float("nan")
     lever_arm: Vector = (0.0, 0.0, 0.0)
     lever_sigma: float = float("nan")
@@ -139,7 +141,8 @@ def align(
         solved = problem.solve()
     if offset_s is None and not solved.offset_sigma < WORST_OFFSET_S:
         notes.append("The motion does not determine the clock offset; it is taken as zero.")
-        solved = replace(problem, offset=None).solve()
+        problem = replace(problem, offset=None)
+        solved = problem.solve()
     if not solved.yaw_sigma < WORST_YAW:
         raise HemislamError(
             f"The fixes determine the map's heading only to {np.degrees(solved.yaw_sigma):.0f}°; walk farther outdoors."
@@ -151,6 +154,7 @@ def align(
             f"The fixes are {scatter:,.0f} times as far from the map as they report: the map has drifted, or they are"
             " less accurate than that."
         )
+    solved = problem.with_drift(solved)
     reference = ground.reference(solved.rotation, solved.shift, height)
     return Alignment(
         reference,
@@ -161,6 +165,7 @@ def align(
         solved.used,
         solved.offset + (offset_s or 0.0),
         solved.offset_sigma,
+        solved.offset_drift,
         solved.yaw_sigma,
         (float(solved.lever[0]), float(solved.lever[1]), float(solved.lever[2])),
         solved.lever_sigma,
@@ -175,8 +180,9 @@ def overrides_of(overridden: Mapping[str, bool], names: Sequence[str]) -> F64:
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """As in `Alignment`, with the rotation (3, 3) and shift (3,) from the map to the ground."""
+    """As in `Alignment`, with the unknowns x, and the rotation (3, 3) and shift (3,) from the map to the ground."""
 
+    x: F64
     rotation: F64
     shift: F64
     offset: float
@@ -185,6 +191,7 @@ class _Solved:
     distances: F64
     used: Mask
     offset_sigma: float
+    offset_drift: float
     yaw_sigma: float
     lever_sigma: float
 
@@ -213,7 +220,7 @@ class _Problem:
         late, free = self.offset is not None, self.lever_free
         some = self.overrides != 0
         antenna = self.path.antenna(self.seconds[some] - (self.offset or 0.0), self.lever)
-        yaw, shift, _ = _aligned(antenna, self.places[some])
+        yaw, shift, _ = aligned_robustly(antenna, self.places[some])
         start = np.r_[yaw, shift, 0.0, 0.0, [self.offset] * late, [0.0] * (3 * free)].astype(np.float64)
         x, used = _robust(self._errors, start, self.overrides)
         R, shift, offset, arm = self._model(x)
@@ -222,6 +229,7 @@ class _Problem:
         spread = max(1.0, float((errors[used] ** 2).sum()) / max(3 * int(used.sum()) - len(x), 1))
         sigmas = _deviations(J) * spread**0.5
         return _Solved(
+            x,
             R,
             shift,
             offset,
@@ -230,8 +238,23 @@ class _Problem:
             np.linalg.norm(errors, axis=1),
             used,
             float(sigmas[6]) if late else float("nan"),
+            0.0,
             float(sigmas[0]),
             float(sigmas[-3:].max()) if free else float("nan"),
+        )
+
+    def with_drift(self, solved: _Solved) -> _Solved:
+        """The same with standard deviations that count drift, too."""
+        used, x, residuals = solved.used, solved.x, solved.residuals[solved.used]
+        J = _jacobian(lambda x: _with_level(self._errors(x)[used], x), x)
+        influence = np.linalg.pinv(J).T[:-2].reshape(*residuals.shape, -1) / self.sigmas[used][..., None]
+        drift = drift_deviations(residuals, influence, self.seconds[used])
+        return replace(
+            solved,
+            offset_sigma=math.hypot(solved.offset_sigma, *drift[6:7]),
+            offset_drift=float(drift[6]) if self.offset is not None else 0.0,
+            yaw_sigma=math.hypot(solved.yaw_sigma, drift[0]),
+            lever_sigma=math.hypot(solved.lever_sigma, drift[-3:].max()),
         )
 
     def _model(self, x: F64) -> tuple[F64, F64, float, F64]:
@@ -295,7 +318,7 @@ def _coarse(path: PathOverTime, seconds: F64, places: F64, lever: F64, *, search
         t = seconds[few] - offset
         inside = path.known(t)
         if inside.sum() >= FEWEST and inside.sum() >= 0.5 * path.known(seconds[few]).sum():
-            _, _, off = _aligned(path.antenna(t[inside], lever), places[few][inside])
+            _, _, off = aligned_robustly(path.antenna(t[inside], lever), places[few][inside])
             best = min(best, (float(off.mean()), offset, float(np.median(off))))
     if not np.isfinite(best[0]):
         raise _too_few(path, seconds)
@@ -309,32 +332,7 @@ def _too_few(path: PathOverTime, seconds: F64) -> HemislamError:
     )
 
 
-def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> float:
-    """The clocks' offset (s) near that of an alignment, by stretches of PART_S each aligned separately.
-
-    Drift over the whole walk looks like an offset; within a stretch there is little of it.
-    """
-    path, rows = PathOverTime(trajectory), np.array([int(name) - 1 for name in found.names])
-    seconds: F64 = (fixes.stamps_ns[rows] - path.start_ns).astype(np.float64) * 1e-9
-    places = Ground.in_grid(found.grid, found.reference.crs).places
-    arm, R = np.array(found.lever_arm), np.array(found.reference.rotation)
-    count = max(1, round(float(seconds[-1] - seconds[0]) / PART_S))
-    ends = np.searchsorted(seconds, np.linspace(seconds[0], seconds[-1], count + 1)[1:-1])
-    parts = [part for part in np.split(np.arange(len(rows)), ends) if len(part) >= FEWEST_IN_PART]
-    if not parts:
-        return found.offset_s
-
-    def cost(offset: float) -> float:
-        aligned = (_aligned(path.antenna(seconds[part] - offset, arm) @ R.T, places[part]) for part in parts)
-        return sum(float(off.sum()) for _, _, off in aligned)
-
-    around = found.offset_s + np.linspace(-1.0, 1.0, 41)
-    best = float(around[np.argmin([cost(offset) for offset in around.tolist()])])
-    exact = _minimize(cost, bounds=(best - 0.05, best + 0.05), method="bounded", options={"xatol": 1e-5})
-    return float(exact.x)
-
-
-def _aligned(points: F64, places: F64) -> tuple[float, F64, F64]:
+def aligned_robustly(points: F64, places: F64) -> tuple[float, F64, F64]:
     """The yaw (rad) and shift (3,) that move points (n, 3) onto places with the smallest sum of distances.
 
     Returns also how far each is off, m (n,). By reweighted least squares (Weiszfeld), so that a few wrong ones do not

@@ -8,11 +8,14 @@ graph is: those of some stretches must predict those of the others.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from scipy import optimize
 
-from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, offset_by_parts, overrides_of
+from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, aligned_robustly, overrides_of
 from app.georeference.fixes import Fixes
+from app.georeference.ground import Ground
 from app.georeference.path import PathOverTime
 from app.slam import lie
 from app.slam.arrays import F64, I64, Mask
@@ -27,6 +30,11 @@ STIFFNESS = (1.0, 3e-2, 1e-3, 3e-5)
 """Factors of the graph's covariances that are tried: a good sensor drifts far less than the graph expects."""
 STRETCH_S = 3.0
 """Fixes of every other stretch predict those between them."""
+PART_S, FEWEST_IN_PART = 20.0, 5
+MOST_BY_DRIFT = 0.9
+"""With more of its uncertainty by drift, the clocks' offset is better found in stretches, for all their noise."""
+
+_minimize: Any = optimize.minimize_scalar
 
 
 def bend(
@@ -51,10 +59,12 @@ def bend(
         HemislamError: the solver fails.
     """
     before = PathOverTime(trajectory).poses((keyframe_stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
-    if np.isfinite(found.offset_sigma_s):
+    if found.offset_drift_s > MOST_BY_DRIFT * found.offset_sigma_s:
         offset_s = offset_by_parts(trajectory, fixes, found)
         note = f"Clock offset, estimated in stretches of the trajectory: {offset_s * 1e3:.1f} ms."
-        found = replace(found, offset_s=offset_s, offset_sigma_s=float("nan"), notes=(*found.notes, note))
+        found = replace(
+            found, offset_s=offset_s, offset_sigma_s=float("nan"), offset_drift_s=0.0, notes=(*found.notes, note)
+        )
     priors = _priors(trajectory, keyframe_stamps_ns, before, fixes, found)
     word = overrides_of(overridden, found.names)
     held, barred = np.asarray(word == 1.0), np.asarray(word == 0.0)
@@ -106,6 +116,31 @@ def _stiffened(graph: Sequence[Factor], priors: Sequence[PositionPrior], half: M
             break
         best, kept = score, stiff
     return kept
+
+
+def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> float:
+    """The clocks' offset (s) near that of an alignment, by stretches of PART_S each aligned separately.
+
+    Drift over the whole walk looks like an offset; within a stretch there is little of it, but more noise.
+    """
+    path, rows = PathOverTime(trajectory), np.array([int(name) - 1 for name in found.names])
+    seconds: F64 = (fixes.stamps_ns[rows] - path.start_ns).astype(np.float64) * 1e-9
+    places = Ground.in_grid(found.grid, found.reference.crs).places
+    arm, R = np.array(found.lever_arm), np.array(found.reference.rotation)
+    count = max(1, round(float(seconds[-1] - seconds[0]) / PART_S))
+    ends = np.searchsorted(seconds, np.linspace(seconds[0], seconds[-1], count + 1)[1:-1])
+    parts = [part for part in np.split(np.arange(len(rows)), ends) if len(part) >= FEWEST_IN_PART]
+    if not parts:
+        return found.offset_s
+
+    def cost(offset: float) -> float:
+        aligned = (aligned_robustly(path.antenna(seconds[part] - offset, arm) @ R.T, places[part]) for part in parts)
+        return sum(float(off.sum()) for _, _, off in aligned)
+
+    around = found.offset_s + np.linspace(-1.0, 1.0, 41)
+    best = float(around[np.argmin([cost(offset) for offset in around.tolist()])])
+    exact = _minimize(cost, bounds=(best - 0.05, best + 0.05), method="bounded", options={"xatol": 1e-5})
+    return float(exact.x)
 
 
 def _priors(

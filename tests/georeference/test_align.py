@@ -36,6 +36,20 @@ def test_a_walk_with_a_late_receiver_and_wild_fixes_is_placed_to_centimetres() -
     assert found.reference.scale == pytest.approx(TRUTH.scale, abs=1e-6)
 
 
+@pytest.mark.parametrize("rate", [0.0, 5e-3])
+def test_the_stated_uncertainty_of_the_offset_counts_the_drift_of_the_map(rate: float) -> None:
+    """Over walks that drift by `rate` (m/√s), the errors are as large as stated."""
+    ratios = []
+    for seed in range(6):
+        made, rng = walked(seed=seed, rate_hz=4.0), np.random.default_rng(seed)
+        drift = rate * 0.1**0.5 * rng.normal(size=made.trajectory.positions.shape).cumsum(axis=0)
+        rotations = made.trajectory.rotations.as_quat()
+        drifted = Trajectory(made.trajectory.stamps_ns, made.trajectory.positions + drift, rotations)
+        found = align(drifted, made.fixes, lever=LEVER)
+        ratios.append((found.offset_s - 0.08) / found.offset_sigma_s)
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 2.0
+
+
 @pytest.mark.parametrize("path", [LOOP, LINE])
 def test_a_tilt_that_the_accelerometer_left_is_taken_out_as_far_as_the_walk_shows_it(path: F64) -> None:
     """On a straight line nothing tells how the map is turned about it; then it stays as level as it was."""

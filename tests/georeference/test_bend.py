@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.georeference.align import Alignment, align, offset_by_parts
-from app.georeference.bend import bend
+from app.georeference.align import Alignment, align
+from app.georeference.bend import bend, offset_by_parts
 from app.georeference.ledger import summary
 from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
@@ -48,7 +48,7 @@ def solved(
     ]
     found = align(drifted, made.fixes, grid="EPSG:32632", lever=LEVER)
     if not offset_known:
-        found = replace(found, offset_s=0.0, offset_sigma_s=float("nan"))
+        found = replace(found, offset_s=0.0, offset_sigma_s=float("nan"), offset_drift_s=0.0)
     return *bend(drifted, drifted.stamps_ns[::STEP], graph, made.fixes, found, overridden or {}), found
 
 
@@ -75,6 +75,12 @@ def test_fixes_leave_a_map_that_has_not_drifted_as_it_is(made: Walked) -> None:
     seen, bent = (far @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3] for T in (own, corrections @ own))
     off = after.reference.to_crs(bent.reshape(-1, 3)) - TRUTH.to_crs(seen.reshape(-1, 3))
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.03
+
+
+def test_the_clock_offset_is_found_in_stretches_only_of_a_map_that_drifted(made: Walked, drifted: Trajectory) -> None:
+    (_, kept, whole), (_, again, _) = solved(made, made.trajectory), solved(made, drifted)
+    assert kept.offset_s == whole.offset_s and kept.offset_sigma_s == whole.offset_sigma_s
+    assert np.isnan(again.offset_sigma_s) and "in stretches" in "".join(again.notes)
 
 
 def test_the_users_word_on_a_fix_overrides_the_verdict(made: Walked, drifted: Trajectory) -> None:

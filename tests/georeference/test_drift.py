@@ -1,0 +1,25 @@
+"""The share of drift in uncertainties. Oracle: many random walks, solved by least squares."""
+
+import numpy as np
+
+from app.georeference.drift import drift_deviations
+
+
+def test_drift_moves_a_mean_and_a_slope_as_much_as_stated() -> None:
+    rng, seconds = np.random.default_rng(1), np.arange(0.0, 80.0, 0.2)
+    J = np.stack([np.eye(3)[:, :1] @ np.array([[1.0, t]]) for t in seconds])  # (n, 3, 2), of the first axis
+    influence = np.einsum("kl,nal->nak", np.linalg.inv(np.einsum("nak,nal->kl", J, J)), J)
+    steps = 0.005 * 0.2**0.5 * rng.normal(size=(200, len(seconds), 3))
+    walks = steps.cumsum(axis=1)
+    off = np.einsum("wna,nak->wk", walks - walks[:, :1], influence)
+    noisy = walks + 0.02 * rng.normal(size=walks.shape)
+    stated = np.array([drift_deviations(walk, influence, seconds) for walk in noisy])
+    np.testing.assert_allclose(np.sqrt((stated**2).mean(axis=0)), off.std(axis=0), rtol=0.15)
+
+
+def test_noise_alone_and_too_few_fixes_show_no_drift() -> None:
+    rng = np.random.default_rng(0)
+    seconds, influence = np.arange(0.0, 800.0, 0.2), np.full((4000, 3, 1), 1.0 / 4000)
+    noise = 0.02 * rng.normal(size=(4000, 3))
+    assert drift_deviations(noise, influence, seconds)[0] < 0.03  # m, of a walk of 2 mm/√s
+    assert drift_deviations(noise[:9], influence[:9], 5.0 * seconds[:9] / 0.2) == 0.0
