@@ -102,7 +102,7 @@ def main() -> None:
         httpx.post(f"{url}api/transport", json={"action": "seek", "frame": MIDDLE})
         with opened(browser, url, 1280, 720) as page:
             tab(page, "View")
-            page.get_by_text("light background").click()
+            page.get_by_text("light theme").click()
             tab(page, "Readouts")
             shoot(page, "readouts")
         browser.close()

@@ -90,8 +90,8 @@ def run_loop(
     early: list[Command] = []
     if prepare is not None:
 
-        def progress(name: str, fraction: float) -> None:
-            page.put(progress=Progress(f"Compiling {name}", fraction))
+        def progress(_: str, fraction: float) -> None:
+            page.put(progress=Progress("Preparing the engine, once after installing: about half a minute", fraction))
             early.extend(updates.exchange(0.0))
 
         prepare(progress)

@@ -4,7 +4,7 @@ from typing import Final
 
 import viser
 
-from app.ui.colours import COLOUR_BY, Key, Limits, key, legend
+from app.ui.colours import COLOUR_BY, Key, Limits, Rgb, key, legend
 from app.ui.html import panel
 from app.ui.scale import Looks
 from app.ui.widgets import View, choose_next, show
@@ -44,7 +44,7 @@ class AppearancePanel:
         self._colour_by = gui.add_dropdown(
             "colour by", COLOUR_BY, initial_value=default.colour_by, hint="What colours mean. C: the next."
         )
-        self._light = gui.add_checkbox("light background", False, hint="For bright rooms and for print.")
+        self._light = gui.add_checkbox("light theme", False, hint="For bright rooms and for print.")
         self._light.on_update(lambda _: apply_theme(gui, light=self._light.value))
         self._follow = gui.add_checkbox(
             "follow",
@@ -115,10 +115,16 @@ class AppearancePanel:
             show(self._follow, False)
             client.add_notification("Follow is off", "So the view stays here. F follows the sensor again.")
 
-    def draw(self, view: View, limits: Limits | None, points: int, moving: int, budget: int) -> None:
-        """Explain the colours as drawn and say how many points the page holds, and how many are on what moves."""
+    def draw(
+        self, view: View, limits: Limits | None, lines: list[tuple[Rgb, str]], points: int, moving: int, budget: int
+    ) -> None:
+        """Explain the colours as drawn and say how many points the page holds, and how many are on what moves.
+
+        lines: colours and names of what else is drawn. While neither map nor scan is, their colours need no key.
+        """
         self._limits = limits
-        self._legend.content = panel("legend", legend(view.colour_by, limits, view.ends), view.grid)
+        colours = legend(view.colour_by, limits, view.ends) if view.map or view.scan else ""
+        self._legend.content = panel("legend", colours, lines, view.grid)
         words = f"{points:,} map points in the page, at most {budget:,}: of a larger map, more of what is near."
         about = f" {moving:,} points on moving things are {'shown' if view.moving else 'hidden'}." if moving else ""
         self._count.content = panel("note", f"{words} The engine keeps the whole map.{about}")

@@ -127,7 +127,7 @@ class DoctorPanel:
         self._page = page
         self._changes = Changes()
         self._bridge = Bridge(gui, "doctor", lambda word, _: self._settle(word.removeprefix("settle ")))
-        self._title = gui.add_html(heading("What the doctor found"), visible=False)
+        self._title = gui.add_html(heading("Checks of this recording"), visible=False)
         self._html = gui.add_html("", visible=False)
 
     def draw(self, snapshot: Snapshot) -> None:

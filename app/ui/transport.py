@@ -111,7 +111,11 @@ def where(snapshot: Snapshot) -> str:
     recording, transport = snapshot.recording, snapshot.transport
     if recording is None:
         return panel("quiet", "No recording is open." if snapshot.progress is None else working(snapshot.progress))
-    frame, stamp, rate = f"{transport.frame:,}", _utc(transport.stamp_ns), number(transport.frames_per_second, 1)
+    frame, stamp, rate = (
+        f"{transport.frame:,}",
+        _utc(transport.stamp_ns),
+        number(transport.frames_per_second, 1) if transport.playing else "",
+    )
     if snapshot.live is not None:
         forward = "A live session only goes forward. To go back, record it (--record) and open the file."
         if transport.frame < 0:
@@ -121,7 +125,7 @@ def where(snapshot: Snapshot) -> str:
     if transport.frame < 0:
         return panel("quiet", f"{recording.frames:,} frames, {recording.duration_s:.1f} s")
     seconds = number((transport.stamp_ns - recording.start_ns) * 1e-9)
-    of, duration = f" of {recording.frames:,}", f" of {number(recording.duration_s, 1)} s"
+    of, duration = f" of {recording.frames - 1:,}", f" of {number(recording.duration_s, 1)} s"
     return panel("where", frame, of, seconds, duration, stamp, rate)
 
 

@@ -26,6 +26,7 @@ from app.ui.brush import BrushPanel
 from app.ui.calibration import CalibrationPanel
 from app.ui.camera import CameraPanel
 from app.ui.clip import ClipPanel
+from app.ui.colours import Rgb
 from app.ui.compare import ComparePanel, Sides
 from app.ui.files import FilesPanel, RecentPanel
 from app.ui.georeference import GeoreferencePanel
@@ -34,6 +35,7 @@ from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
 from app.ui.map_compare import MapComparePanel
 from app.ui.measure import MeasurePanel
+from app.ui.nodes import PATH_COLOUR, TRUTH_COLOUR
 from app.ui.notes import NotesPanel
 from app.ui.parameters import ParameterPanel, add_yaml_buttons
 from app.ui.pictures import PicturesPanel
@@ -134,7 +136,7 @@ class Workbench:
                 self._clip = ClipPanel(page, self._measure, self._camera, self._scene.chunks.sample, files.ask_where)
             with gui.add_folder("Distance to another map", expand_by_default=False):
                 self._map_compare = MapComparePanel(page, folders, results, self._appearance.colour_by)
-        with tabs.add_tab("Recording", viser.Icon.STETHOSCOPE):
+        with tabs.add_tab("Recording", viser.Icon.FILE_DATABASE):
             files.add_buttons()
             self._live = LivePanel(gui)
             self._doctor = DoctorPanel(page)
@@ -200,6 +202,12 @@ class Workbench:
             panel.draw(current)
         self._scale.draw()
 
+    def _lines(self, current: Snapshot, view: View) -> list[tuple[Rgb, str]]:
+        """Colours and names of the lines in the scene, and of the submaps of a loop that is looked at."""
+        truth = current.recording is not None and current.recording.truth_positions is not None
+        path = [(PATH_COLOUR, "path")] + [(TRUTH_COLOUR, "truth")] * truth if view.path else []
+        return [*self._loops.keys(current), *path]
+
     def _picks(self, click: viser.SceneClickEvent) -> bool:
         """Whether a click picks a point to measure, or goes to a note."""
         return self._measure.picking or self._notes.points_at(click)
@@ -215,6 +223,8 @@ class Workbench:
                 self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
             self._more += not self._scene.draw(current, view)
             self._drawn = current
-        if self._legend_due(current, view):
+        lines = self._lines(current, view)
+        if self._legend_due(current, view, str(lines)):
             chunks = self._scene.chunks
-            self._appearance.draw(view, chunks.limits.get(view.colour_by), chunks.points, chunks.moving, self._budget)
+            limits = chunks.limits.get(view.colour_by)
+            self._appearance.draw(view, limits, lines, chunks.points, chunks.moving, self._budget)

@@ -82,7 +82,7 @@ COUNTED = """() => {
 @pytest.fixture(autouse=True, scope="module")
 def _some_map(bench: Bench) -> None:
     bench.engine.send(StepFrame(60))
-    bench.eventually(lambda: bench.page.locator(".hs-when").get_by_text("frame 59 of 400").count() == 1)
+    bench.eventually(lambda: bench.page.locator(".hs-when").get_by_text("frame 59 of 399").count() == 1)
 
 
 def open_tab(page: Page, name: str) -> None:
@@ -108,11 +108,11 @@ def test_every_control_is_reached_by_the_tab_key(bench: Bench, name: str) -> Non
 def test_every_text_has_the_contrast_that_readers_need(bench: Bench, light: bool) -> None:
     page = bench.page
     open_tab(page, "View")
-    page.get_by_text("light background").click()
+    page.get_by_text("light theme").click()
     page.get_by_role("button", name="Diagnostics").click()
-    scheme = "light" if page.get_by_role("checkbox", name="light background").is_checked() else "dark"
+    scheme = "light" if page.get_by_role("checkbox", name="light theme").is_checked() else "dark"
     if (scheme == "light") is not light:
-        page.get_by_text("light background").click()
+        page.get_by_text("light theme").click()
     expect(page.locator("html")).to_have_attribute("data-mantine-color-scheme", "light" if light else "dark")
     pale = {}
     for name in TABS:

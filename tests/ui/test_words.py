@@ -80,6 +80,7 @@ def test_a_live_run_waits_for_its_first_scan_and_asks_for_no_button() -> None:
 def test_the_legend_names_limits_and_unit() -> None:
     text = legend("height", Limits(-2.0, 3.0))
     assert ">-2<" in text and ">3<" in text and "height · m" in text
+    assert "Choose the map to compare with" in legend("distance", None) and "Choose" not in legend("density", None)
     assert all(name in legend(LABEL, None) for name in ("ground", "not ground", "seed", "moving"))
 
 

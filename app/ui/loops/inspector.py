@@ -159,8 +159,13 @@ class Inspector:
         self._map_again = False
 
     @property
+    def shown(self) -> bool:
+        """Whether two submaps are in the scene."""
+        return self._pairing is not None
+
+    @property
     def alone(self) -> bool:
-        return self._pairing is not None and self._alone.value
+        return self.shown and self._alone.value
 
     def draw(self, snapshot: Snapshot, edge: LoopEdge | None) -> None:
         """Show the loop `edge`; its details come from the engine a moment later."""

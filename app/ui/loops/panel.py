@@ -12,13 +12,14 @@ from app.server.protocol import InspectLoop, Seek, Snapshot
 from app.slam.loops.edits import LoopEdit, SetWeight, Solve
 from app.slam.loops.types import LoopEdge, Pair
 from app.slam.types import F64
+from app.ui.colours import Rgb
 from app.ui.html import panel
 from app.ui.loops.add_loop import AddLoopPanel
 from app.ui.loops.edges import LoopEdges
 from app.ui.loops.edits import EditsPanel, Proposal, VerdictPanel
 from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
 from app.ui.loops.table import COLUMNS, Order, chips, listed, table
-from app.ui.loops.words import BRIDGE, KINDS, largest_factors
+from app.ui.loops.words import BRIDGE, KINDS, NEWER, OLDER, kind_of, largest_factors
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of
 
@@ -96,6 +97,15 @@ class LoopsPanel:
         """The view, without the map and the scan while two submaps are shown alone."""
         alone = self._inspector.alone or self._add_loop.nudging
         return replace(view, map=False, scan=False, wedge=False, plane=False) if alone else view
+
+    def keys(self, snapshot: Snapshot) -> list[tuple[Rgb, str]]:
+        """Colours and names of what the scene shows of loops."""
+        found = {kind_of(edge).name for edge in snapshot.loops.edges}
+        arches = [(kind.colour, f"{name} loop") for name, kind in KINDS.items() if name in found & self._shown]
+        chosen = self._chosen
+        if chosen is None or not self._inspector.shown:
+            return arches
+        return [(OLDER, f"keyframe {chosen[0]}"), (NEWER, f"keyframe {chosen[1]}"), *arches]
 
     def points_at(self, event: viser.SceneClickEvent) -> bool:
         """Whether a click is for the loops: at an arch, or while keyframes are picked."""

@@ -35,13 +35,21 @@ if (!window.hemislamSay) {
     }, true);
   }
 
-  // Show a tab, docked or on a phone.
-  window.hemislamOpenTab = (name) => {
+  // Escape leaves a dialog, as its last button does.
+  document.addEventListener('keydown', (event) => {
+    if (event.key !== 'Escape' || isBox(event.target) || document.querySelector('.mantine-Combobox-dropdown:not([style*="display: none"])')) return;
+    const modals = document.querySelectorAll('.mantine-Modal-body'), last = modals[modals.length - 1];
+    if (last) [...last.querySelectorAll('button')].findLast((one) => /^(Cancel|Close)$/.test(one.textContent.trim()))?.click();
+  });
+
+  // Show a tab, docked or on a phone, and unfold what is folded in a part of it.
+  window.hemislamOpenTab = (name, unfolded = '') => {
     const tab = [...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === name);
     if (!tab) return;
     tab.click();
     tab.dispatchEvent(new KeyboardEvent('keydown', {key: 'Enter', bubbles: true}));
     tab.scrollIntoView({block: 'nearest'});
+    if (unfolded) setTimeout(() => { for (const one of document.querySelectorAll(unfolded + ' details')) one.open = true; }, 300);
     sheet.hsSheet = 'high';
     sheet.hsPanel = 'open';
   };

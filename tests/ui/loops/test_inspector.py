@@ -99,3 +99,12 @@ def test_a_loop_that_another_is_in_the_graph_for_says_which(page: Page) -> None:
     edge = next(edge for edge in page.engine.snapshot.loops.edges if edge.counts)
     assert "in the graph" not in headline(edge)
     assert "12–340 is in the graph for both" in headline(replace(edge, represented_by=(12, 340)))
+
+
+def test_the_legend_names_the_loops_and_the_two_submaps(page: Page) -> None:
+    page.draw()
+    names = [name for _, name in page.loops.keys(page.engine.snapshot)]
+    assert names == ["accepted loop", "candidate loop"], "rejected ones are hidden at first"
+    page.choose(GOOD)
+    page.draw()
+    assert [name for _, name in page.loops.keys(page.engine.snapshot)][:2] == ["keyframe 12", "keyframe 89"]
