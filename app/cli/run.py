@@ -2,6 +2,7 @@
 
 import contextlib
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -138,8 +139,22 @@ def look_for_mounting(recording: Path, params: "Params") -> str:
     return advice(found, used=False) if found else ""
 
 
+@contextlib.contextmanager
+def _despite_one_interrupt() -> Iterator[None]:
+    def warn(*_: object) -> None:
+        typer.echo("hemislam: saving the results; Ctrl-C again gives them up.", err=True)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = signal.signal(signal.SIGINT, warn)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@_despite_one_interrupt()
 def save(session: "Session", folder: Path, stop: BaseException | None, *, replace: bool) -> None:
-    """Write the results and sum them up.
+    """Write the results and sum them up. Ctrl-C pressed once does not stop this.
 
     Raises:
         BaseException: `stop`, what ended the run early, once the frames so far are saved.

@@ -1,6 +1,7 @@
 """`hemislam run` from the outside: right results, the same bytes again, and nothing lost when it goes wrong."""
 
 import json
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -218,6 +219,22 @@ def test_an_interrupted_run_keeps_what_it_has(monkeypatch: pytest.MonkeyPatch, w
     assert "20 processed" in outcome.output
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == RESULTS
     assert json.loads((tmp_path / "out" / "report.json").read_text())["stopped_early"] == "KeyboardInterrupt"
+
+
+def test_ctrl_c_while_results_are_saved_does_not_lose_them(
+    monkeypatch: pytest.MonkeyPatch, walk: Path, tmp_path: Path
+) -> None:
+    save = Session.save
+
+    def press_and_save(*args: Any, **options: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return save(*args, **options)
+
+    monkeypatch.setattr(Session, "save", press_and_save)
+    outcome = CliRunner().invoke(cli, ["run", str(walk), "--out", str(tmp_path / "out"), "--duration", "2"])
+    assert outcome.exit_code == 0, outcome.output
+    assert "Ctrl-C again" in outcome.stderr
+    assert (tmp_path / "out" / "report.json").exists()
 
 
 def test_a_recording_damaged_on_the_way_gives_what_came_before(
