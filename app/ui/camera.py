@@ -95,7 +95,7 @@ def whole(points: F64, way: str = OBLIQUE, picture: Picture = Picture(), axes: F
     wide, hidden = high * picture.shape, 2 * high * picture.covered
     across, back_x = _between(x, z, wide, wide)
     upwards, back_y = _between(y, z, high, high - hidden)
-    distance = 1.03 * max(back_x, back_y, _LEAST_M / min(high, wide))
+    distance = 1.05 * max(back_x, back_y, _LEAST_M / min(high, wide))
     look_at = middle + across * right + (upwards - hidden / 2 * (distance - back_y)) * up
     return Stand(look_at + distance * towards, look_at)
 

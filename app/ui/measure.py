@@ -23,7 +23,10 @@ POINT, DISTANCE, ANGLE, STOP, PICK = "point", "distance", "angle", "stop", "pick
 _SPOTS: Final = {POINT: 1, DISTANCE: 2, ANGLE: 3}
 _WIDTH: Final = 0.01
 """Largest distance of a point from a click, as a share of the picture's height."""
-_COLOUR: Final = (255, 205, 80)
+_COLOURS: Final = {False: (255, 205, 80), True: (150, 90, 0)}
+"""On a dark and on a light background."""
+_CHOSEN: Final = "● "
+"""Before the tool that clicks are for."""
 _SIZE_M: Final = 0.08
 
 
@@ -42,15 +45,16 @@ class MeasurePanel:
         self._nodes: list[Any] = []
         self._measured: list[tuple[Measure, F64, Numbers]] = []
         self._map: tuple[object, object] = None, None  # chunks and poses that they are of
-        self._name = gui.add_text("name", "", hint="Of the next measure; empty: a number.")
-        kinds = gui.add_button_group("measure", (*_SPOTS, STOP), hint="Then click points of the map.")
-        kinds.on_click(by_user(lambda kind, _: self.begin(kind)))
-        self._snap = gui.add_checkbox(
-            "snap to corners", False, hint="A click near a corner means where the surfaces around meet; else an edge."
-        )
+        self._light = False
+        self._kinds = gui.add_button_group("measure", tuple(_SPOTS), hint="Then click points of the map.")
+        self._kinds.on_click(by_user(lambda kind, _: self.begin(kind.removeprefix(_CHOSEN))))
         self._asked = gui.add_html("", visible=False)
         self._bridge = Bridge(gui, "measures", self._act)
         self._list = gui.add_html("", visible=False)
+        self._name = gui.add_text("name", "", hint="Of the next measure; empty: a number.")
+        self._snap = gui.add_checkbox(
+            "snap to corners", False, hint="A click near a corner means where the surfaces around meet; else an edge."
+        )
         self._save = gui.add_button("Download as CSV", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
         self._save.on_click(by_user(lambda _, client: self._download(client)))
         page.scene.on_click()(self._clicked)
@@ -85,7 +89,10 @@ class MeasurePanel:
         where = [(measure, at) for measure, at in kept if at is not None]
         drawn = str([at.round(3).tolist() for _, at in where])
         self._where = current.earth.found.reference if current.earth.found is not None else None
-        if self._changes(current.measures, self._kind, str(self._spots), drawn, current.session, self._where):
+        later = len(kept) - len(where)
+        due = current.measures, self._kind, str(self._spots), drawn, later, current.session, self._where, view.light
+        if self._changes(*due):
+            self._light = view.light
             map_ = current.chunks, current.keyframe_poses
             same = all(before is now for before, now in zip(self._map, map_, strict=True))
             known = {measure: found for measure, _, found in self._measured} if same else {}
@@ -94,7 +101,7 @@ class MeasurePanel:
                 (measure, at, known.get(measure) or numbers(at, current.chunks, poses)) for measure, at in where
             ]
             self._draw_scene(begun)
-            self._draw_list()
+            self._draw_list(later)
 
     def _take(self, kind: str, spot: Spot, current: Snapshot) -> None:
         if kind == PICK and self.taker is not None:
@@ -112,23 +119,34 @@ class MeasurePanel:
     def _draw_scene(self, begun: F64 | None) -> None:
         clear(self._nodes)
         scene = self._page.scene
+        colour = _COLOURS[self._light]
         every = [(at, f"{measure.name}: {words(at, found).split(': ')[0]}") for measure, at, found in self._measured]
         for number, (at, text) in enumerate([*every, *([(begun, "")] if begun is not None else [])]):
             name, exact = f"{ROOT}/measures/{number}", at.astype(np.float32)
-            colours = np.tile(np.array(_COLOUR, np.uint8), (len(at), 1))
+            colours = np.tile(np.array(colour, np.uint8), (len(at), 1))
             self._nodes.append(add_exact_points(scene, f"{name}/points", exact, colours, _SIZE_M))
             if len(at) > 1:
-                self._nodes.append(add_lines(scene, f"{name}/lines", segments(exact), _COLOUR, 2.5))
+                self._nodes.append(add_lines(scene, f"{name}/lines", segments(exact), colour, 2.5))
             if text:
                 self._nodes.append(scene.add_label(f"{name}/label", text, position=at.mean(axis=0)))
+        for number, place in enumerate(begun if begun is not None else ()):  # a label is seen whatever is before it
+            self._nodes.append(scene.add_label(f"{ROOT}/measures/begun/{number}", f"{number + 1}", position=place))
 
-    def _draw_list(self) -> None:
+    def _draw_list(self, later: int) -> None:
+        """later: how many measures are on a part of the walk that is not here yet."""
         left = _SPOTS.get(self._kind, 0) - len(self._spots)
-        self._asked.content = panel("note", f"Click {left} point{'s' if left > 1 else ''} of the map.") if left else ""
+        self._kinds.options = (
+            *(_CHOSEN + kind if kind == self._kind else kind for kind in _SPOTS),
+            *([STOP] if self.picking else []),
+        )
+        points = f"{left}{' more' if self._spots else ''} point{'s' if left > 1 else ''}"
+        asked = f"{self._kind.capitalize()}: click {points} of the map."
+        self._asked.content = panel("text", asked) if left else ""
         self._asked.visible = bool(left)
         rows = [(measure.name, words(at, found, self._where)) for measure, at, found in self._measured]
-        self._list.content = self._bridge.live(panel("measures", rows)) if rows else ""
-        self._list.visible = self._save.visible = bool(rows)
+        waiting = f"{later} more on a part of the walk that is not here at this frame." if later else ""
+        self._list.content = self._bridge.live(panel("measures", rows, waiting)) if rows or later else ""
+        self._list.visible, self._save.visible = bool(rows or later), bool(rows)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         if self.picking and event.client is not None:

@@ -16,7 +16,7 @@ from app.slam.types import NON_GROUND
 from app.ui.measure import ANGLE, DISTANCE, POINT, STOP, MeasurePanel
 from app.ui.measure_maths import as_csv, height, meet, numbers, places, words
 from app.ui.widgets import View
-from tests.ui.conftest import Wire, page_of
+from tests.ui.conftest import Wire, page_of, user_sets
 
 RANDOM = np.random.default_rng(7)
 SEEN_AT = lie.transform(lie.exp(np.array([0.1, -0.2, 1.0])), np.array([4.0, -1.0, 1.2]))
@@ -149,10 +149,33 @@ def test_a_click_beside_the_map_is_not_taken_and_stop_ends_it(server: viser.Vise
     bench.panel.begin(DISTANCE)
     bench.click(0.0, 0.0)
     bench.click(80.0, 0.0)
-    assert not bench.sent and "Click 1 point " in bench.panel._asked.content
+    assert not bench.sent and "Distance: click 1 more point of the map." in bench.panel._asked.content
     bench.panel.begin(STOP)
     bench.click(1.0, 0.0)
     assert not bench.sent and not bench.panel._asked.visible
+
+
+def test_the_active_tool_and_each_point_clicked_are_marked(server: viser.ViserServer, wire: Wire) -> None:
+    bench = Bench(server)
+    bench.panel.draw(bench.now, View())
+    assert bench.panel._kinds.options == ("point", "distance", "angle")
+    bench.panel.begin(ANGLE)
+    bench.click(0.0, 0.0)
+    bench.click(0.5, 0.0)
+    assert bench.panel._kinds.options == ("point", "distance", "● angle", "stop")
+    assert [m.props.text for m in wire.messages if type(m).__name__ == "LabelMessage"][-2:] == ["1", "2"]
+    user_sets(bench.panel._kinds, "stop")
+    assert not bench.panel.picking
+
+
+def test_a_measure_of_what_is_not_here_yet_is_still_counted(server: viser.ViserServer) -> None:
+    bench = Bench(server)
+    bench.panel.begin(POINT)
+    bench.click(0.0, 0.0)
+    bench.keep()
+    bench.now = replace(bench.now, chunks=(), keyframe_poses=POSES[:0])
+    bench.panel.draw(bench.now, View())
+    assert bench.panel._list.visible and "1 more on a part of the walk" in bench.panel._list.content
 
 
 def test_a_click_that_is_met_while_stop_is_pressed_is_dropped(
