@@ -19,8 +19,8 @@ GROUND, OTHER = "#0f8f7a", "#20262e"
 _GRID, _TEXT = "#c9d0d8", "#4a5560"
 _MARGIN: Final = (90, 40, 40, 60)
 """Pixels at the left, top, right and bottom of a picture, for numbers."""
-_APART: Final = 90
-"""Pixels between two numbers, at least."""
+_APART: Final = 90, 25
+"""Pixels between two numbers, at least: beside and above one another."""
 _MM: Final = 10.0
 """Millimetres of an SVG for each metre: 1:100."""
 
@@ -31,17 +31,17 @@ def write_png(path: Path, results: "Results", section: Slab) -> None:
     left, top, right, bottom = _MARGIN
     picture = Image.new("RGB", (left + columns + right, top + rows + bottom), "white")
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(14)
-    step = _step(_APART * section.cell)
+    steps = [_step(apart * section.cell) for apart in _APART]
 
     def pixel(chainage: float, height: float) -> tuple[float, float]:
         x, y = (np.array([chainage, height]) - section.origin) / section.cell
         return left + x, top + rows - y
 
-    for at in _ticks(section, 0, step):
+    for at in _ticks(section, 0, steps[0]):
         x, _ = pixel(at, 0)
         draw.line((x, top, x, top + rows), _GRID)
         draw.text((x, top + rows + 8), f"{at:g}", _TEXT, font, anchor="mt")
-    for at in _ticks(section, 1, step):
+    for at in _ticks(section, 1, steps[1]):
         _, y = pixel(0, at)
         draw.line((left, y, left + columns, y), _GRID)
         draw.text((left - 8, y), f"{at:g}", _TEXT, font, anchor="rm")
@@ -56,7 +56,7 @@ def write_png(path: Path, results: "Results", section: Slab) -> None:
 
 def write_svg(path: Path, results: "Results", section: Slab) -> None:
     """1:100 on paper: a dot for each cell with points, at their mean to the millimetre, over a grid."""
-    (length, height), step = section.size.tolist(), _step(_APART / 4 / _MM)
+    (length, height), steps = section.size.tolist(), [_step(apart / 4 / _MM) for apart in _APART]
     size = length + 3.0, height + 2.5  # m, with the margins
     root = ElementTree.Element(
         "svg",
@@ -72,12 +72,12 @@ def write_svg(path: Path, results: "Results", section: Slab) -> None:
     )
     x0, y0 = section.origin
     ElementTree.SubElement(root, "title").text = _title(results)
-    lines = [f"M{at:g} {-y0:.3f}v{-height:.3f}" for at in _ticks(section, 0, step)]
-    lines += [f"M{x0:.3f} {-at:g}h{length:.3f}" for at in _ticks(section, 1, step)]
+    lines = [f"M{at:g} {-y0:.3f}v{-height:.3f}" for at in _ticks(section, 0, steps[0])]
+    lines += [f"M{x0:.3f} {-at:g}h{length:.3f}" for at in _ticks(section, 1, steps[1])]
     _path(root, "grid", lines, _GRID, 0.01)
-    for at in _ticks(section, 0, step):
+    for at in _ticks(section, 0, steps[0]):
         _text(root, f"{at:g}", at, -y0 + 0.45, "middle")
-    for at in _ticks(section, 1, step):
+    for at in _ticks(section, 1, steps[1]):
         _text(root, f"{at:g}", x0 - 0.15, -at + 0.1, "end")
     _text(root, _title(results), x0, -y0 - height - 0.4, "start")
     _text(root, f"{_caption(results)}; 1:100", x0, -y0 + 1.0, "start")

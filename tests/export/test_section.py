@@ -85,6 +85,8 @@ def test_a_section_shows_floor_walls_and_table_to_a_millimetre(tmp_path: Path, o
     dots = next(one for one in tree.iter() if one.get("id") == "ground").get("d", "")
     first = np.array(dots.split("h0")[0].removeprefix("M").split(), float)
     np.testing.assert_allclose(first * [1, -1] - [4.0, up], floor[0], atol=6e-4)
+    numbers = [float(one.text) for one in tree.iter() if one.get("text-anchor") == "end" and one.text]
+    assert len(numbers) >= 2 and np.ptp(numbers) <= 2.48, "heights can be read off"
     picture = np.asarray(Image.open(tmp_path / "section.png"))
     assert (picture.sum(axis=2) < 300).any() and picture.shape[1] == 6.02 / 0.02 + 130
 
