@@ -120,7 +120,7 @@ class MeasurePanel:
         clear(self._nodes)
         scene = self._page.scene
         colour = _COLOURS[self._light]
-        every = [(at, f"{measure.name}: {words(at, found).split(': ')[0]}") for measure, at, found in self._measured]
+        every = [(at, _label(measure.name, at, found)) for measure, at, found in self._measured]
         for number, (at, text) in enumerate([*every, *([(begun, "")] if begun is not None else [])]):
             name, exact = f"{ROOT}/measures/{number}", at.astype(np.float32)
             colours = np.tile(np.array(colour, np.uint8), (len(at), 1))
@@ -176,3 +176,8 @@ class MeasurePanel:
         recording = self._page.snapshot().recording
         name = f"{recording.path.stem if recording else 'map'}-measures.csv"
         client.send_file_download(name, as_csv(self._measured, self._where).encode(), save_immediately=True)
+
+
+def _label(name: str, at: F64, found: Numbers) -> str:
+    """In the scene: a distance or angle with its number. The coordinates of a point would cover the map around it."""
+    return name if len(at) == 1 else f"{name}: {words(at, found).split(': ')[0]}"

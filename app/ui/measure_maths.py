@@ -143,7 +143,7 @@ def around(chunks: tuple[Chunk, ...], poses: F64, place: F64, radius: float) -> 
 def words(at: F64, found: Numbers, where: GeoReference | None = None) -> str:
     """What a measure says, in metres and degrees. where: on Earth the map is, if that is known."""
     if len(at) == 1:
-        above = f", {found.height:.2f} m above the ground" if np.isfinite(found.height) else ""
+        above = f", {round(found.height, 2) + 0.0:.2f} m above the ground" if np.isfinite(found.height) else ""
         own = f"x {at[0, 0]:.3f}, y {at[0, 1]:.3f}, z {at[0, 2]:.3f} m{above}"
         if where is None:
             return own

@@ -27,10 +27,11 @@ def length_text(metres: float) -> str:
     return f"{metres:g} m" if metres >= 1 else f"{100 * metres:g} cm"
 
 
-def scale_html(position: F64, look_at: F64, fov: float, north: F64 | None = None) -> str:
+def scale_html(position: F64, look_at: F64, fov: float, north: F64 | None = None, *, needle: bool = True) -> str:
     """Of a camera, in the scene: a bar for what it looks at, and which way north points as it sees it.
 
-    north: (2 or more,), its direction in the map; None: unknown, the map's x stands for it.
+    north: (2 or more,), its direction in the map; None: unknown, the map's x stands for it. needle: whether there are
+    directions at all, which a profile along a bent path has not.
     """
     ahead = look_at - position
     seen_m = 2 * float(np.linalg.norm(ahead)) * float(np.tan(fov / 2))
@@ -39,9 +40,8 @@ def scale_html(position: F64, look_at: F64, fov: float, north: F64 | None = None
     length = bar(seen_m)
     x, y = (1.0, 0.0) if north is None else north[:2]
     turn = float(np.degrees(np.arctan2(ahead[1], ahead[0]) - np.arctan2(y, x)))  # clockwise from up
-    return panel(
-        "scale", f"{100 * length / seen_m:.1f}", length_text(length), round(turn), "x" if north is None else "N"
-    )
+    way = "" if not needle else "x" if north is None else "N"
+    return panel("scale", f"{100 * length / seen_m:.1f}", length_text(length), round(turn), way)
 
 
 class ScaleBars:
@@ -53,13 +53,14 @@ class ScaleBars:
 
     def draw(self) -> None:
         """Called often; sends what differs, at most a few times a second."""
-        clients, found = self._page.server.get_clients(), self._page.snapshot().earth.found
+        current, clients = self._page.snapshot(), self._page.server.get_clients()
+        found, needle = current.earth.found, not current.clip.unrolled
         north = np.array(found.reference.rotation)[1] if found is not None else None
         for gone in self._bars.keys() - clients.keys():
             del self._bars[gone]
         for number, client in clients.items():
             camera = client.camera
-            html = scale_html(np.array(camera.position), np.array(camera.look_at), camera.fov, north)
+            html = scale_html(np.array(camera.position), np.array(camera.look_at), camera.fov, north, needle=needle)
             if number not in self._bars:
                 self._bars[number] = client.gui.add_html(html), Changes(self._page.now, PANEL_PERIOD_S)
             shown, changes = self._bars[number]

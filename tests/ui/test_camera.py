@@ -240,6 +240,8 @@ def test_the_bar_measures_the_middle_of_the_picture_and_the_needle_points_along_
     down = scale_html(np.array([0.0, -1e-3, 50.0]), np.zeros(3), FOV)  # 57.7 m are seen, y is up in the picture
     assert ">5 m<" in down and "width:8.7vh" in down and "rotate(90)" in down
     assert "rotate(0)" in scale_html(np.array([-30.0, 0.0, 1.0]), np.zeros(3), FOV), "looking along x, it is ahead"
+    profile = scale_html(np.array([0.0, -50.0, 0.0]), np.zeros(3), FOV, needle=False)
+    assert ">5 m<" in profile and "svg" not in profile, "a path bends, so that no direction is north"
 
 
 def test_ceilings_go_where_one_looks_from_above_and_come_back_inside() -> None:

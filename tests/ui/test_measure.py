@@ -80,6 +80,7 @@ def test_a_room_of_3_by_4_by_12_metres_has_a_diagonal_of_13_and_right_angles() -
     found = numbers(np.stack([a, b]), (), POSES)
     assert (found.distance, found.horizontal, found.vertical) == pytest.approx((13.0, 5.0, 12.0))
     assert "13.000 m: 5.000 m horizontal, +12.000 m vertical" in words(np.stack([a, b]), found)
+    assert ", 0.00 m above" in words(a[None], replace(found, height=-0.003)), "not -0.00"
     assert numbers(np.stack([a, c, b]), (), POSES).angle == pytest.approx(90.0)
     assert numbers(np.stack([a, b, 2 * b]), (), POSES).angle == pytest.approx(180.0)
 
@@ -166,6 +167,18 @@ def test_the_active_tool_and_each_point_clicked_are_marked(server: viser.ViserSe
     assert [m.props.text for m in wire.messages if type(m).__name__ == "LabelMessage"][-2:] == ["1", "2"]
     user_sets(bench.panel._kinds, "stop")
     assert not bench.panel.picking
+
+
+@pytest.mark.parametrize(("kind", "clicks", "label"), [(POINT, 1, "point 1"), (DISTANCE, 2, "distance 1: 0.517 m")])
+def test_the_label_in_the_scene_is_short(
+    server: viser.ViserServer, wire: Wire, kind: str, clicks: int, label: str
+) -> None:
+    bench = Bench(server)
+    bench.panel.begin(kind)
+    for n in range(clicks):
+        bench.click(0.5 * n, 0.0)
+    bench.keep()
+    assert [m.props.text for m in wire.messages if type(m).__name__ == "LabelMessage"][-1] == label
 
 
 def test_a_measure_of_what_is_not_here_yet_is_still_counted(server: viser.ViserServer) -> None:
