@@ -47,8 +47,8 @@ _COLOURS: Final = LABEL_COLOURS[GROUND], LABEL_COLOURS[SEED]
 _TYPING_S: Final = 0.5
 """A text is sent after this long without a change, and a slider that does not act at once after this long at rest."""
 _MOST_UNDONE: Final = 50
-_DRAG_S: Final = 3.0
-"""Changes of the same parameters that follow each other faster are one: a slow drag."""
+_DRAG_S: Final = 8.0
+"""Changes of the same parameters that follow each other faster are one: a drag, also on a page that draws slowly."""
 _HOLD_S: Final = 1.0
 """A control shows what the user set for this long, whatever older snapshots say."""
 

@@ -234,8 +234,8 @@ def test_a_slow_drag_is_undone_at_once() -> None:
     history = ParameterHistory()
     history.see(Params(), 0.0)
     for number in range(1, 20):
-        history.see(Params().with_values({"ground.alpha": 25.0 + number}), 10.0 + 2.0 * number)
-    history.see(Params().with_values({"ground.alpha": 44.0, "ground.sigma": 0.1}), 48.5)
+        history.see(Params().with_values({"ground.alpha": 25.0 + number}), 10.0 + 7.0 * number)
+    history.see(Params().with_values({"ground.alpha": 44.0, "ground.sigma": 0.1}), 143.5)
     assert history.change(-1) == {"ground.sigma": Params().ground.sigma}, "another slider, however soon"
     history.go(-1)
     assert history.change(-1) == {"ground.alpha": 25.0}
