@@ -355,11 +355,11 @@ def aligned_robustly(points: F64, places: F64) -> tuple[float, F64, F64]:
 def _refuse_unlike(solved: _Solved, places: F64) -> None:
     """Raises HemislamError if the fixes at these places (n, 3) fit the trajectory no better than a point would."""
     path = (places - solved.residuals)[solved.used]
-    extent = float(np.median(np.linalg.norm(path - np.median(path, axis=0), axis=1)))
-    off = float(np.median(np.linalg.norm(solved.residuals[solved.used], axis=1)))
+    extent = float(np.sqrt(((path - path.mean(axis=0)) ** 2).sum(axis=1).mean()))  # not of most: they may stand still
+    off = float(np.sqrt((solved.residuals[solved.used] ** 2).sum(axis=1).mean()))
     if off > 0.5 * extent:
         raise HemislamError(
-            f"The fixes do not follow the trajectory: at best, half of them are {off:.1f} m or more off; check that"
+            f"The fixes do not follow the trajectory: at best, they are {off:.1f} m off (RMS); check that"
             " they are of this walk, in degrees, and that the receiver had reception."
         )
 
