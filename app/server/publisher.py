@@ -196,5 +196,4 @@ class Publisher:
     def saved(self, saved: Saved) -> None:
         self._saved = (*self._saved, saved)[-SAVED_KEPT:]
         self.put(saved=self._saved, urgent=True)
-        if saved.error:
-            self.notice("error", saved.error)
+        self.notice("error" if saved.error else "info", saved.error or f"Saved in {saved.folder}.")

@@ -157,6 +157,9 @@ def test_results_are_written_while_replay_goes_on(tmp_path: Path) -> None:
     while len(snapshot.saved) < 2:
         snapshot = bench.do(StepFrame())
     assert [saved.error for saved in snapshot.saved] == ["", ""]
+    assert [notice.text for notice in snapshot.notices[-2:]] == [
+        f"Saved in {tmp_path / name}." for name in ("out", "short")
+    ]
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
         "trajectory.tum", "timings.csv", "map.ply", "report.json", "session.hemislam",
     }  # fmt: skip
