@@ -4,7 +4,7 @@ from typing import Final
 
 import viser
 
-from app.ui.colours import COLOUR_BY, Key, Limits, Rgb, key, legend
+from app.ui.colours import COLOUR_BY, LABEL, Key, Limits, Rgb, key, legend
 from app.ui.html import panel
 from app.ui.scale import Looks
 from app.ui.widgets import View, choose_next, show
@@ -123,7 +123,8 @@ class AppearancePanel:
         lines: colours and names of what else is drawn. While neither map nor scan is, their colours need no key.
         """
         self._limits = limits
-        colours = legend(view.colour_by, limits, view.ends) if view.map or view.scan else ""
+        by = LABEL if view.tuning else view.colour_by
+        colours = legend(by, limits, view.ends) if view.map or view.scan else ""
         self._legend.content = panel("legend", colours, lines, view.grid)
         words = f"{points:,} map points in the page, at most {budget:,}: of a larger map, more of what is near."
         about = f" {moving:,} points on moving things are {'shown' if view.moving else 'hidden'}." if moving else ""

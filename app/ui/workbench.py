@@ -26,7 +26,7 @@ from app.ui.brush import BrushPanel
 from app.ui.calibration import CalibrationPanel
 from app.ui.camera import CameraPanel
 from app.ui.clip import ClipPanel
-from app.ui.colours import Rgb
+from app.ui.colours import DIMMED, Rgb
 from app.ui.compare import ComparePanel, Sides
 from app.ui.files import FilesPanel, RecentPanel
 from app.ui.georeference import GeoreferencePanel
@@ -206,7 +206,8 @@ class Workbench:
         """Colours and names of the lines in the scene, and of the submaps of a loop that is looked at."""
         truth = current.recording is not None and current.recording.truth_positions is not None
         path = [(PATH_COLOUR, "path")] + [(TRUTH_COLOUR, "truth")] * truth if view.path else []
-        return [*self._loops.keys(current), *path]
+        dimmed = [(DIMMED[view.light], "map, while ground sliders move")] if view.tuning and view.map else []
+        return [*self._loops.keys(current), *path, *dimmed]
 
     def _picks(self, click: viser.SceneClickEvent) -> bool:
         """Whether a click picks a point to measure, or goes to a note."""

@@ -56,7 +56,10 @@ def test_frames_are_sent_at_the_rate_that_eyes_follow(page: Page, wire: Wire) ->
 
 def test_a_ground_slider_dims_the_map_for_a_while_and_another_does_not(page: Page, server: viser.ViserServer) -> None:
     def dimmed() -> bool:
-        return clouds(server)["/map/keyframes/0"].colors.ndim == 1
+        """And the legend says so."""
+        grey = clouds(server)["/map/keyframes/0"].colors.ndim == 1
+        assert ("while ground sliders move" in page.workbench._appearance._legend.content) == grey
+        return grey
 
     page.engine.send(StepFrame(3))
     page.draw(1.0)
