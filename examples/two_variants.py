@@ -23,6 +23,6 @@ if __name__ == "__main__":  # the runs have processes of their own, which import
     )
     subject = Subject(recording.stem, recording, params, truth)
     run = partial(run_jobs, parallel=2)
-    findings, failed = evaluate([subject], variants, folder, run=run, threads=1, duration_s=10.0)
+    findings, failed = evaluate([subject], variants, folder, run=run, duration_s=10.0)
     print(*findings, *failed.values(), sep="\n")
     print((folder / "report.md").read_text())

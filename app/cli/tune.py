@@ -106,7 +106,7 @@ def tune(
     from app.tuning.report import BEST
     from app.tuning.space import parse_dimensions
     from app.tuning.trial import Trial, advice, front
-    from app.tuning.tune import Part, Runs, Search, known_runs
+    from app.tuning.tune import Part, Runs, SearchPlan, known_runs
     from app.tuning.tune import tune as find
 
     dimensions = parse_dimensions(parameters)
@@ -142,7 +142,7 @@ def tune(
             if best := front(so_far, wanted):
                 bar.set_postfix_str(f"best {wanted[0].text(best[0].scores[0])}")
 
-        plan = Search(dimensions, wanted, part, subjects[0].params, rest, search, trials, seed)
+        plan = SearchPlan(dimensions, wanted, part, subjects[0].params, rest, search, trials, seed)
         done, checked = find(runs, plan, out, progress)
     best = front(done, wanted)
     if not best:

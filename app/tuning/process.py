@@ -79,14 +79,14 @@ def _find(owner: Link, wanted: Wanted) -> None:
     from app.tuning.objectives import choose_objectives
     from app.tuning.report import importances
     from app.tuning.space import parse_dimensions
-    from app.tuning.tune import Part, Runs, Search, known_runs, tune
+    from app.tuning.tune import Part, Runs, SearchPlan, known_runs, tune
 
     truth = read_truth(str(wanted.truth)) if wanted.truth is not None else None
     subject = Subject(wanted.recording.stem, wanted.recording, wanted.params, truth, marks=wanted.marks)
     objectives = choose_objectives(wanted.objectives, [subject])
     part = Part(wanted.start_s, wanted.duration_s)
     rest = part.next() if not wanted.marks else None  # marks are on the part itself
-    search = Search(
+    search = SearchPlan(
         parse_dimensions(wanted.parameters), objectives, part, wanted.params, rest, wanted.how, wanted.trials
     )
     count, latest = 0, Tried()

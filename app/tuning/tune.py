@@ -52,7 +52,7 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class SearchPlan:
     """What is tried.
 
     Attributes:
@@ -93,7 +93,7 @@ class Runs:
         self._known, self._run = known, run
         self.hashes = [check_subject(subject) for subject in subjects]
 
-    def asked(self, wanted: Search) -> dict[str, Any]:
+    def asked(self, wanted: SearchPlan) -> dict[str, Any]:
         """What a search was asked for, as its report keeps it."""
         return {
             "recordings": [
@@ -149,7 +149,7 @@ OnTrials = Callable[[Sequence[Trial], optuna.Study], None]
 """Called with all trials so far after each batch."""
 
 
-def tune(runs: Runs, wanted: Search, folder: Path, progress: OnTrials) -> tuple[list[Trial], tuple[Trial, ...]]:
+def tune(runs: Runs, wanted: SearchPlan, folder: Path, progress: OnTrials) -> tuple[list[Trial], tuple[Trial, ...]]:
     """Search, check the best on the part held back, and write the files that `write_results` names into `folder`.
 
     Returns:
@@ -165,7 +165,7 @@ def tune(runs: Runs, wanted: Search, folder: Path, progress: OnTrials) -> tuple[
 
 
 def search(
-    runs: Runs, wanted: Search, progress: OnTrials = lambda so_far, study: None
+    runs: Runs, wanted: SearchPlan, progress: OnTrials = lambda so_far, study: None
 ) -> tuple[list[Trial], optuna.Study]:
     """Try the parameters as given and then the settings. Raises HemislamError as `tune` does for a grid."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -211,7 +211,7 @@ def check(runs: Runs, trials: Sequence[Trial], objectives: Sequence[Objective], 
 Batch = list[tuple[optuna.trial.Trial, Mapping[str, Any]]]
 
 
-def _batches(study: optuna.Study, wanted: Search) -> Iterator[Batch]:
+def _batches(study: optuna.Study, wanted: SearchPlan) -> Iterator[Batch]:
     distributions = {dimension.path: dimension.distribution for dimension in wanted.dimensions}
     if wanted.how == "grid":
         settings = grid(wanted.dimensions, wanted.trials)

@@ -25,7 +25,7 @@ from app.slam.types import F64, GROUND, NON_GROUND, Scan, StepResult
 from app.tuning.objectives import OBJECTIVES
 from app.tuning.space import parse_dimensions
 from app.tuning.trial import front
-from app.tuning.tune import Part, Search, search
+from app.tuning.tune import Part, SearchPlan, search
 from tests.cli.conftest import write_walk
 
 F1 = OBJECTIVES["ground-f1"]
@@ -80,7 +80,7 @@ def test_five_labelled_frames_find_what_a_fine_grid_over_all_others_finds() -> N
         return Frames(scans, downs, drawn)
 
     few, others = frames(BY_HAND), frames(OTHERS)
-    done, _ = search(few, Search(parse_dimensions(VARIED), (F1,), Part(), Params(), trials=48))  # type: ignore[arg-type]
+    done, _ = search(few, SearchPlan(parse_dimensions(VARIED), (F1,), Part(), Params(), trials=48))  # type: ignore[arg-type]
     found = others.f1(front(done, (F1,))[0].values)
     grid = [
         others.f1({"ground.alpha": float(alpha), "ground.sigma": float(sigma)})

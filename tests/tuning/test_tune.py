@@ -25,7 +25,7 @@ from app.tuning.objectives import OBJECTIVES, Objective
 from app.tuning.process import Ended, Tried, Wanted, find
 from app.tuning.space import grid, parse_dimensions
 from app.tuning.trial import Trial, advice, front, proposal
-from app.tuning.tune import Part, Search, check, search
+from app.tuning.tune import Part, SearchPlan, check, search
 from tests.cli.conftest import write_walk
 
 ATE, F1 = OBJECTIVES["ate"], OBJECTIVES["ground-f1"]
@@ -51,7 +51,7 @@ class Bowl:
 
 def found(how: Any, trials: int = 60, seed: int = 0) -> tuple[list[Trial], Bowl]:
     bowl = Bowl()
-    wanted = Search(
+    wanted = SearchPlan(
         parse_dimensions("ground.alpha,ground.sigma"), (ATE,), Part(), Params(), how=how, trials=trials, seed=seed
     )
     done, _ = search(bowl, wanted)  # type: ignore[arg-type]
@@ -122,7 +122,7 @@ def test_what_gives_up_one_objective_for_another_is_not_proposed() -> None:
 
 
 def test_the_search_learns_from_the_parameters_as_given() -> None:
-    wanted = Search(parse_dimensions("ground.alpha"), (ATE,), Part(), Params(), trials=4)
+    wanted = SearchPlan(parse_dimensions("ground.alpha"), (ATE,), Part(), Params(), trials=4)
     done, study = search(Bowl(), wanted)  # type: ignore[arg-type]
     assert study.trials[0].params == {"ground.alpha": Params().ground.alpha}
     assert study.trials[0].values == list(done[0].scores)
