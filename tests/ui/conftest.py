@@ -4,16 +4,19 @@ import asyncio
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 import viser
 from viser._messages import GuiUpdateMessage
 
-from app.server.protocol import Command, Snapshot
+from app.server.protocol import Command, Snapshot, StepFrame
 from app.ui.widgets import Page
 from tests.ui.fake_engine import FakeEngine
+
+if TYPE_CHECKING:
+    from tests.ui.drawn import Drawn
 
 
 class Wire:
@@ -175,3 +178,14 @@ def browser_sends(server: viser.ViserServer, handle: Any, value: Any) -> None:
     """As if a control's new value came in from a browser."""
     message = GuiUpdateMessage(handle._impl.uuid, {"value": value})
     finish(server.gui._handle_gui_updates(0, message))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def drawn(server: viser.ViserServer, wire: Wire, engine: FakeEngine) -> "Drawn":
+    from tests.ui.drawn import Drawn
+
+    drawn = Drawn(server, engine)
+    engine.send(StepFrame(14))
+    drawn.draw()
+    wire.clear()
+    return drawn

@@ -7,56 +7,16 @@ import pytest
 import viser
 
 from app.export.box import Box
-from app.server import chunks as server_chunks
-from app.server.chunks import within_budget
-from app.server.protocol import Seek, SetParams, Snapshot, StepFrame
+from app.server.protocol import SetParams, StepFrame
 from app.slam.types import MOVING
 from app.ui.chunks import MapChunks
-from app.ui.colours import COLOUR_BY, LABEL_COLOURS, Limits
-from app.ui.scene import Scene
+from app.ui.colours import LABEL_COLOURS, Limits
 from app.ui.widgets import View
-from tests.ui.conftest import Cloud, Wire, clouds
+from tests.ui.conftest import Wire, clouds
+from tests.ui.drawn import Drawn, chunk_nodes
 from tests.ui.fake_engine import FakeEngine
 
 SCAN = "/map/sensor/lidar/scan"
-
-
-class Drawn:
-    """A scene that remembers what it shows, as the workbench does; `budget`: most points of the map."""
-
-    def __init__(self, server: viser.ViserServer, engine: FakeEngine, budget: int | None = None) -> None:
-        self.scene = Scene(server)
-        self.budget = budget
-        self.engine = engine
-        self.snapshot: Snapshot | None = None
-        self.view: View | None = None
-
-    def draw(self, view: View | None = None, **changes: object) -> None:
-        view = view or self.view or View()
-        snapshot = replace(self.engine.snapshot, **changes)  # type: ignore[arg-type]
-        if self.budget is not None:
-            known = self.snapshot.chunks if self.snapshot else ()
-            chunks, result = known + snapshot.chunks[len(known) :], snapshot.result
-            assert snapshot.keyframe_poses is not None and result is not None
-            chunks = within_budget(chunks, snapshot.keyframe_poses, result.T_map_imu[:3, 3], self.budget)
-            snapshot = replace(snapshot, chunks=chunks)
-        self.scene.draw(snapshot, view)
-        self.snapshot, self.view = snapshot, view
-
-
-def chunk_nodes(server: viser.ViserServer) -> dict[str, Cloud]:
-    """Keyframes that are seen."""
-    found = clouds(server)
-    return {name: cloud for name, cloud in found.items() if name.startswith("/map/keyframes/") and cloud.visible}
-
-
-@pytest.fixture
-def drawn(server: viser.ViserServer, wire: Wire, engine: FakeEngine) -> Drawn:
-    drawn = Drawn(server, engine)
-    engine.send(StepFrame(14))
-    drawn.draw()
-    wire.clear()
-    return drawn
 
 
 def test_nothing_is_sent_when_nothing_changed(drawn: Drawn, wire: Wire) -> None:
@@ -243,85 +203,6 @@ def test_colours_spread_over_the_chosen_ends_and_saturate_beyond(drawn: Drawn, s
     red = beyond.max(axis=1, keepdims=True)
     assert len(beyond) > 10 and np.ptp(beyond / red, axis=0).max() < 0.03, "one colour, lit differently"
     assert drawn.scene.chunks.limits.get("height") == all_values, "the bar still ends at all values"
-
-
-def test_sessions_that_come_and_go_leave_nothing_behind(drawn: Drawn, wire: Wire, server: viser.ViserServer) -> None:
-    from app.server.protocol import Restart
-
-    kept = []
-    for _ in range(4):
-        drawn.engine.send(Restart())
-        drawn.draw()
-        assert chunk_nodes(server) == {}
-        drawn.engine.send(StepFrame(14))
-        drawn.draw()
-        assert len(chunk_nodes(server)) == 3
-        server._run_garbage_collector(force=True)
-        kept.append(wire.kept)
-    assert kept[0] == kept[-1]
-
-
-def shown(drawn: Drawn, server: viser.ViserServer) -> dict[str, object]:
-    path = {
-        name: handle.points.tobytes()
-        for name, handle in server.scene._handle_from_node_name.items()
-        if name.startswith("/map/trajectory/") and isinstance(handle, viser.LineSegmentsHandle)
-    }
-    map_points = {name: (node.points.tobytes(), node.colors.tobytes()) for name, node in chunk_nodes(server).items()}
-    return {"path": path, "map": map_points, "limits": {by: drawn.scene.chunks.limits.get(by) for by in COLOUR_BY}}
-
-
-@pytest.mark.parametrize("by", ["label", "height"])
-def test_going_back_and_forth_shows_what_was_shown_then(server: viser.ViserServer, engine: FakeEngine, by: str) -> None:
-    drawn, then = Drawn(server, engine), {}
-    for frame in (12, 20, 300):
-        engine.send(Seek(frame))
-        drawn.draw(View(colour_by=by))
-        then[frame] = shown(drawn, server)
-    for frame in (20, 12, 20, 300):
-        engine.send(Seek(frame))
-        drawn.draw()
-        assert shown(drawn, server) == then[frame]
-
-
-def test_going_back_and_forth_leaves_nothing_behind(drawn: Drawn, wire: Wire, server: viser.ViserServer) -> None:
-    kept = []
-    for _ in range(4):
-        drawn.engine.send(Seek(40))
-        drawn.draw()
-        drawn.engine.send(Seek(3))
-        drawn.draw()
-        assert len(chunk_nodes(server)) == 1
-        server._run_garbage_collector(force=True)
-        kept.append(wire.kept)
-    assert kept[0] == kept[-1]
-
-
-def test_a_keyframe_that_another_walk_put_in_place_of_one_is_drawn(drawn: Drawn, server: viser.ViserServer) -> None:
-    first, *rest = drawn.engine.snapshot.chunks
-    other = replace(rest[0], points=rest[0].points + np.float32(1.0))
-    drawn.draw(View(ceilings=True), chunks=(first, other, *rest[1:]))
-    assert np.array_equal(chunk_nodes(server)["/map/keyframes/1"].points, other.points.astype(np.float16))
-
-
-def test_of_keyframes_that_gave_their_points_away_no_node_is_left(
-    drawn: Drawn, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server_chunks, "MOST_SHOWN", 5)
-    first = replace(drawn.engine.snapshot.chunks[0], joined=0)
-    poses = np.tile(np.eye(4), (40, 1, 1))
-    poses[:, 0, 3] = np.arange(40)
-    map_chunks, held = MapChunks(server.scene, "/other"), ()
-    map_chunks.clear(0, 100.0)
-    for index in range(40):
-        held = within_budget((*held, replace(first, index=index)), poses, poses[index, :3, 3], 10**9)
-        map_chunks.draw(held, poses[: index + 1], View(ceilings=True))
-    assert sum(name.startswith("/other/") for name in server.scene._handle_from_node_name) == 5
-    nodes = [cloud for name, cloud in clouds(server).items() if name.startswith("/other/")]
-    assert sorted(node.position for node in nodes) == sorted(
-        tuple((poses[one.index] @ one.T_imu_lidar)[:3, 3]) for one in held if len(one.points)
-    )
-    assert map_chunks.points == 40 * len(first.points)
 
 
 def test_following_keeps_the_sensor_near_the_origin_and_leaves_the_camera_alone(drawn: Drawn, wire: Wire) -> None:

@@ -11,8 +11,8 @@ from app.server.protocol import StepFrame
 from app.slam import lie
 from app.ui.widgets import View
 from tests.ui.conftest import Wire
+from tests.ui.drawn import Drawn, chunk_nodes
 from tests.ui.fake_engine import FakeEngine
-from tests.ui.test_scene import Drawn, chunk_nodes
 
 STEP_M, STEPS = 3e-4, 30
 
