@@ -249,10 +249,11 @@ class _Problem:
         J = _jacobian(lambda x: _with_level(self._errors(x)[used], x), x)
         influence = np.linalg.pinv(J).T[:-2].reshape(*residuals.shape, -1) / self.sigmas[used][..., None]
         drift = drift_deviations(residuals, influence, self.seconds[used])
+        offset_drift = float(drift[6]) if self.offset is not None else 0.0
         return replace(
             solved,
-            offset_sigma=math.hypot(solved.offset_sigma, *drift[6:7]),
-            offset_drift=float(drift[6]) if self.offset is not None else 0.0,
+            offset_sigma=math.hypot(solved.offset_sigma, offset_drift),
+            offset_drift=offset_drift,
             yaw_sigma=math.hypot(solved.yaw_sigma, drift[0]),
             lever_sigma=math.hypot(solved.lever_sigma, drift[-3:].max()),
         )
