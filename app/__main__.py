@@ -157,7 +157,10 @@ def simulate(
     ],
     scene: Annotated[str | None, typer.Argument(metavar="SCENE", help="corridor, outdoor, cloister, ...")] = None,
     suite: Annotated[
-        str | None, typer.Option("--suite", metavar="paper", help="Simulated versions of the paper's six sequences.")
+        str | None,
+        typer.Option(
+            "--suite", metavar="NAME", help="`paper`: twins of its six sequences; `revisits`: six walks that come back."
+        ),
     ] = None,
     short: Annotated[bool, typer.Option("--short", help="Only the first 60 s of each sequence of the suite.")] = False,
     duration: Annotated[float, typer.Option("--duration", metavar="SECONDS", help="Length of the recording.")] = 60.0,

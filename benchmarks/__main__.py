@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 
 from benchmarks import (
-    consistency,
     earth,
     export,
     fed,
@@ -26,7 +25,6 @@ from benchmarks import (
 from benchmarks.record import show
 
 BENCHMARKS = {
-    "consistency": consistency.run,
     "earth": earth.run,
     "export": export.run,
     "fed": fed.run,

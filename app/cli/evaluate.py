@@ -89,7 +89,10 @@ def evaluate(
         ),
     ] = None,
     suite: Annotated[
-        str | None, typer.Option("--suite", metavar="paper", help="The simulated twins of the paper's six sequences.")
+        str | None,
+        typer.Option(
+            "--suite", metavar="NAME", help="`paper`: twins of its six sequences; `revisits`: six walks that come back."
+        ),
     ] = None,
     short: Annotated[bool, typer.Option("--short", help="Only the first 60 s of each sequence of the suite.")] = False,
     seeds: Annotated[list[int] | None, typer.Option("--seed", min=0, help="Seed of the suite. Repeatable.")] = None,

@@ -1,4 +1,4 @@
-"""Makes the paper's suite of simulated recordings behind a progress bar, for `simulate` and `evaluate`."""
+"""Makes a suite of simulated recordings behind a progress bar, for `simulate` and `evaluate`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,7 +33,7 @@ def make_suite(
     recordings = []
     for seed in seeds:
         for twin in twins:
-            with progress_bar(f"{twin.scene}, seed {seed}", unit=" scans") as show:
+            with progress_bar(f"{twin.name}, seed {seed}", unit=" scans") as show:
                 made = make_twin(
                     twin,
                     folder,

@@ -1,4 +1,4 @@
-"""The twins of the paper's sequences: as long as these, the same every time, and one without a loop.
+"""Suites of walks: twins of the paper's sequences, as long as these, and walks that revisit; the same every time.
 
 Tests app/cli/options.py, app/evaluation/paper.py.
 """
@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from app.evaluation.paper import SEQUENCES
 from app.sensors.simulator.scenes import build_scene
 from app.sensors.simulator.simulate import trajectory_through
-from app.sensors.simulator.suite import PAPER, Twin, find_suite, fitting_speed, make_twin
+from app.sensors.simulator.suite import PAPER, REVISITS, Twin, find_suite, fitting_speed, make_twin
 from app.sensors.simulator.trajectory import Walker
 from app.slam.errors import HemislamError
 from app.slam.trajectory import read_tum
@@ -22,9 +22,8 @@ TWINS = {twin.scene: twin for twin in PAPER}
 
 def walked(twin: Twin, seed: int = 0) -> np.ndarray:
     """True positions at 10 Hz of the whole walk."""
-    trajectory = trajectory_through(
-        build_scene(twin.scene, seed), twin.duration_s, seed, Walker(speed=fitting_speed(twin, seed))
-    )
+    walker = Walker(speed=fitting_speed(twin, seed), back=twin.back)
+    trajectory = trajectory_through(build_scene(twin.scene, seed), twin.duration_s, seed, walker)
     return trajectory.poses(np.arange(0.05, twin.duration_s, 0.1))[0]
 
 
@@ -34,7 +33,7 @@ def test_the_suite_is_table_1() -> None:
         twin = TWINS[name]
         assert (twin.frames, twin.length_m) == (sequence.frames, sequence.length_m)
         assert twin.duration_s == pytest.approx(sequence.duration_s, abs=0.1)
-    with pytest.raises(HemislamError, match="no suite `papre`; there is paper"):
+    with pytest.raises(HemislamError, match="no suite `papre`; there is paper, revisits"):
         find_suite("papre")
 
 
@@ -54,6 +53,16 @@ def came_back_within(path: np.ndarray, metres: float) -> bool:
 def test_the_fourth_walk_outdoors_has_no_loop_and_the_first_has() -> None:
     assert not came_back_within(walked(TWINS["outdoor_4"])[::5], 15.0)
     assert came_back_within(walked(TWINS["outdoor_1"])[::5], 2.0)
+
+
+@pytest.mark.parametrize("twin", REVISITS, ids=lambda twin: twin.name)
+def test_walks_of_the_other_suite_come_back_the_same_way_or_the_opposite_one(twin: Twin) -> None:
+    path = walked(twin)[::5, :2]
+    step = np.gradient(path, axis=0)
+    ahead = step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+    pairs = np.array([pair for pair in KDTree(path).query_pairs(2.0) if abs(pair[0] - pair[1]) > 60])  # half a minute
+    same_way = np.einsum("ij,ij->i", ahead[pairs[:, 0]], ahead[pairs[:, 1]])
+    assert (same_way < -0.9).mean() > 0.2 if twin.back else (same_way > 0.9).mean() > 0.2
 
 
 def test_a_twin_is_made_once_and_the_same_every_time(tmp_path: Path) -> None:

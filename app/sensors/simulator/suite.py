@@ -1,7 +1,8 @@
-"""The paper's suite: simulated twins of the six sequences of its Table 1, from one seed.
+"""Suites of simulated walks: twins of the six sequences of the paper's Table 1, and six that revisit.
 
-They have the same number of frames, duration and length; their places are `scenes.paper`. The short form is the first
-minute of each, with fewer firings.
+The twins have the same number of frames, duration and length; their places are `scenes.paper`. The others come back
+to where they were minutes before, in the same and in the opposite direction. The short form is the first minute of
+each, with fewer firings.
 """
 
 import hashlib
@@ -27,11 +28,16 @@ SHORT_EVERY_BLOCK = 3
 
 @dataclass(frozen=True, slots=True)
 class Twin:
-    """One sequence of the paper's Table 1; `scene` is its name here."""
+    """One sequence: so many frames and metres through a scene; `back`: see `Walker`."""
 
     scene: str
     frames: int
     length_m: float
+    back: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.scene + ("_back" if self.back else "")
 
     @property
     def duration_s(self) -> float:
@@ -47,7 +53,15 @@ PAPER: tuple[Twin, ...] = (
     Twin("outdoor_3", 9530, 869.16),
     Twin("outdoor_4", 5667, 573.64),
 )
-SUITES = {"paper": PAPER}
+REVISITS: tuple[Twin, ...] = (
+    Twin("corridor", 2000, 205.0),
+    Twin("corridor", 2000, 205.0, back=True),
+    Twin("museum", 1800, 165.0, back=True),
+    Twin("building", 3600, 400.0),
+    Twin("outdoor", 2400, 265.0),
+    Twin("outdoor", 2400, 265.0, back=True),
+)
+SUITES = {"paper": PAPER, "revisits": REVISITS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +87,7 @@ def make_twin(
 ) -> Made:
     """Simulate one sequence into `folder`, unless it is there already.
 
-    The walker's speed is chosen so that the whole trajectory is as long as the paper's.
+    The walker's speed is chosen so that the whole trajectory has the twin's length.
 
     Args:
         every_block: fire every k-th azimuth only; None: all, or every SHORT_EVERY_BLOCK-th if short.
@@ -81,7 +95,7 @@ def make_twin(
     Raises:
         HemislamError: as `simulate`.
     """
-    name = twin.scene + (f"-seed{seed}" if seed else "") + ("-short" if short else "")
+    name = twin.name + (f"-seed{seed}" if seed else "") + ("-short" if short else "")
     name += "" if imperfections == NONE else "-imperfect"
     out, note = folder / f"{name}.mcap", folder / f"{name}.suite.json"
     every_block = every_block or (SHORT_EVERY_BLOCK if short else 1)
@@ -98,7 +112,7 @@ def make_twin(
         seed=seed,
         rate_hz=RATE_HZ,
         every_block=every_block,
-        walker=Walker(speed=fitting_speed(twin, seed)),
+        walker=Walker(speed=fitting_speed(twin, seed), back=twin.back),
         imperfections=imperfections,
         progress=progress,
     )
@@ -107,12 +121,12 @@ def make_twin(
 
 
 def fitting_speed(twin: Twin, seed: int) -> float:
-    """m/s, with which the whole trajectory is as long as the paper's, to a centimetre or so."""
+    """m/s, with which the whole trajectory has the twin's length, to a centimetre or so."""
     place = build_scene(twin.scene, seed)
     times = np.arange(0.0, twin.duration_s, 1 / RATE_HZ)
     speed = twin.length_m / (twin.duration_s - 4.0)
     for _ in range(6):
-        path = trajectory_through(place, twin.duration_s, seed, Walker(speed=speed)).poses(times)[0]
+        path = trajectory_through(place, twin.duration_s, seed, Walker(speed=speed, back=twin.back)).poses(times)[0]
         length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
         speed *= twin.length_m / length
     return speed

@@ -98,6 +98,7 @@ class Walker:
         bob, sway: m, half the swing up-down (each step) and left-right (each other step).
         pitch, roll, yaw: rad, spread of the hand's slow wandering about each axis.
         wander: m, spread of the slow sideways deviation from the path.
+        back: at the end of the path, turn round and walk it the other way.
     """
 
     speed: float = 1.2
@@ -109,6 +110,7 @@ class Walker:
     roll: float = np.deg2rad(2.0)
     yaw: float = np.deg2rad(5.0)
     wander: float = 0.08
+    back: bool = False
 
 
 def walk(
@@ -134,6 +136,8 @@ def walk(
     speed = walker.speed * walking * (1.0 + 0.1 * _wander(t, rng, (0.05, 0.15)))
     travelled = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2) / _SAMPLE_HZ])
 
+    if walker.back:
+        path = np.vstack([path, path[:1], path[:0:-1]]) if closed else np.vstack([path, path[-2::-1]])
     line, arc = _unrolled(path, closed, travelled[-1] + 5.0)
     if not closed:
         travelled = _brake(travelled, arc[-1])

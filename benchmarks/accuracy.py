@@ -1,0 +1,291 @@
+"""Odometry and loops against the truth, by the real program: how far off, is the covariance right, do loops help?
+
+    python -m benchmarks.accuracy walks/*.mcap
+    python -m benchmarks.accuracy walk.mcap --truth walk.tum --drifting
+
+`hemislam simulate --suite revisits --imperfect --every-block 6 --out walks` makes such walks; `--suite paper` others.
+Exits with 1 if a false loop was accepted, or if a trajectory is worse with loops than without by more than WORSE_M.
+
+The NEES (normalised estimation error squared) of a keyframe is the square of its error in units of the covariance that
+the filter gives it; its mean for each degree of freedom is 1 if the covariance is right, and larger if the filter
+believes itself too much. Errors count from the first keyframe, whose pose defines the odometry frame.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from app.cli.run import process
+from app.mapping.opening import open_session
+from app.mapping.session import Session
+from app.sensors.presets import resolve_params
+from app.slam import lie
+from app.slam.loops.types import OPEN_M, LoopEdge, Verdict
+from app.slam.metrics import ate, interpolate, paired
+from app.slam.params import Params
+from app.slam.trajectory import Trajectory, read_tum, truth_beside
+from app.slam.types import F64, I64
+from app.slam.warmup import compile_kernels
+
+DRIFTING = (
+    "filter.max_points=100", "filter.plane_tilt=20", "map.spacing=0.6", "map.points_per_voxel=10", "map.radius=12",
+    "sensor.max_range=12",
+)  # fmt: skip
+"""So little of each scan that odometry drifts by decimetres, as it would on a worse sensor or a longer walk."""
+SLIP_S, SLIP_DEG, SLIP_M = 5.0, 0.5, 0.2
+"""A slip: so much of an error gained within so many seconds, and kept."""
+KEPT = 10
+"""Frames over which errors are averaged for that: a wrong mounting and a late clock make them swing with every step."""
+FALSE_M, FALSE_DEG = 0.5, 5.0
+"""A loop farther than this from the truth is false: it ties another place, and is not merely inexact."""
+GOOD_M, GOOD_DEG = 0.10, 0.5
+"""A revisit counts as found by a loop this near to the truth."""
+HELD_DEG = 1.0
+"""A loop tells nothing of a rotation whose standard deviation is greater, as of roll and pitch."""
+WITHIN_M, APART_S, ALONG = 2.0, 15.0, 0.7
+"""A revisit: so near to where the walk was so long before, heading the same way or the opposite one (cosine)."""
+WORSE_M = 0.002
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Attributes:
+    odometry: of all frames. trajectory: in the map. T_odom_imu: (k, 4, 4) of keyframes; covariances: (k, 6, 6),
+        rotation first; stamps_ns: (k,). edges: all candidates.
+    """
+
+    odometry: Trajectory
+    trajectory: Trajectory
+    T_odom_imu: F64
+    covariances: F64
+    stamps_ns: I64
+    edges: tuple[LoopEdge, ...]
+
+
+@dataclass(frozen=True)
+class Score:
+    """Attributes:
+    metres: walked. without, beside: ATE, m, of odometry and with loops.
+    gained_m, gained_deg: the largest gains of error within SLIP_S.
+    yaw, position: mean NEES for each degree of freedom.
+    revisits: keyframes at which there is something to find; found: those of them with a loop that is good.
+    errors: (n, 2) of the accepted loops, m and deg. candidates: loops in all.
+    """
+
+    metres: float
+    without: float
+    beside: float
+    gained_m: float
+    gained_deg: float
+    yaw: float
+    position: float
+    candidates: int
+    revisits: int
+    found: int
+    errors: F64
+
+    @property
+    def slipped(self) -> bool:
+        return self.gained_m > SLIP_M or self.gained_deg > SLIP_DEG
+
+    @property
+    def false(self) -> int:
+        return int(((self.errors[:, 0] > FALSE_M) | (self.errors[:, 1] > FALSE_DEG)).sum())
+
+    @property
+    def good(self) -> float:
+        return float(_good(self.errors).mean()) if len(self.errors) else np.nan
+
+    @property
+    def worse(self) -> bool:
+        return self.beside > self.without + WORSE_M
+
+
+def measure(recording: Path, truth_path: Path | None, params: Params) -> Score:
+    """Run with loops, and hold odometry and loops against the truth. Loops do not change the odometry."""
+    truth = truth_path or truth_beside(recording)
+    if truth is None:
+        sys.exit(f"{recording} has no truth beside it; name one with --truth.")
+    work = open_session(recording, params)
+    try:
+        if (stop := process(work)) is not None:
+            raise stop
+        walk = _walk(work)
+    finally:
+        work.close()
+    return score(walk, read_tum(truth))
+
+
+def _walk(work: Session) -> Walk:
+    found = work.loops.results() if work.loops else None
+    odometry = work.log.odometry
+    keyframes = [work.engine.keyframes[index] for index in range(len(work.engine.keyframes))]
+    return Walk(
+        odometry,
+        found.frame.trajectory(odometry) if found else odometry,
+        np.array([keyframe.T_odom_imu for keyframe in keyframes]),
+        np.array([keyframe.covariance for keyframe in keyframes]),
+        np.array([keyframe.stamp_ns for keyframe in keyframes]),
+        found.edges if found else (),
+    )
+
+
+def score(walk: Walk, truth: Trajectory) -> Score:
+    off = ate(walk.odometry, truth)
+    turned, moved, stamps_ns = _errors(walk, truth, off.T_truth_estimate[:3, :3])
+    gained_m, gained_deg = _gains(stamps_ns, turned, moved)
+    _, at, of = np.intersect1d(stamps_ns, walk.stamps_ns, return_indices=True)
+    yaw, position = _nees(turned[at], moved[at], walk.T_odom_imu[of], walk.covariances[of])
+
+    true, covered = interpolate(truth, walk.stamps_ns)
+    there = np.full(len(walk.stamps_ns), -1)
+    there[covered] = np.arange(len(true))
+    T = np.tile(np.eye(4), (len(true), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = true.rotations.as_matrix(), true.positions
+    loops = [e for e in walk.edges if e.verdict is Verdict.ACCEPTED and min(there[e.older], there[e.newer]) >= 0]
+    errors = np.array([_loop_error(e, T[there[e.older]], T[there[e.newer]]) for e in loops]).reshape(-1, 2)
+    good = {there[e.newer] for e, fits in zip(loops, _good(errors), strict=True) if fits}
+    revisits = _revisits(T, true.stamps_ns)
+    return Score(
+        metres=off.distance,
+        without=off.position.rmse,
+        beside=ate(walk.trajectory, truth).position.rmse,
+        gained_m=gained_m,
+        gained_deg=gained_deg,
+        yaw=yaw,
+        position=position,
+        candidates=len(walk.edges),
+        revisits=len(revisits),
+        found=len(good.intersection(revisits)),
+        errors=errors,
+    )
+
+
+def _errors(walk: Walk, truth: Trajectory, R_truth_odom: F64) -> tuple[F64, F64, I64]:
+    """Errors of odometry in yaw (n,) rad and position (n, 3) m since the first keyframe, and their stamps (n,).
+
+    The truth is turned into odom by the alignment of all positions. The first pose alone would not do: an error of
+    the mounting turns the whole walk about it.
+    """
+    ours, theirs = paired(walk.odometry, truth)
+    true = R_truth_odom.T @ theirs.poses[:, :3]
+    begin = int(np.argmax(np.isin(ours.stamps_ns, walk.stamps_ns)))
+    turn = ours.poses[:, :3, :3] @ np.swapaxes(true[:, :, :3], 1, 2)
+    moved = ours.poses[:, :3, 3] - true[:, :, 3]
+    return lie.log(turn @ turn[begin].T)[:, 2], moved - moved[begin], ours.stamps_ns
+
+
+def _nees(turned: F64, moved: F64, poses: F64, covariances: F64) -> tuple[float, float]:
+    """Means for yaw and for position, for each degree of freedom, without the first keyframe."""
+    up = poses[:, 2, :3]
+    yaw = turned**2 / np.einsum("ni,nij,nj->n", up, covariances[:, :3, :3], up)
+    position = np.einsum("ni,nij,nj->n", moved, np.linalg.inv(covariances[:, 3:, 3:]), moved) / 3
+    return float(yaw[1:].mean()), float(position[1:].mean())
+
+
+def _gains(stamps_ns: I64, turned: F64, moved: F64) -> tuple[float, float]:
+    """The largest gains of error within SLIP_S, in m and deg."""
+    mean = np.full(KEPT, 1 / KEPT)
+    turned, stamps_ns = np.convolve(turned, mean, "valid"), stamps_ns[KEPT - 1 :]
+    moved = np.stack([np.convolve(axis, mean, "valid") for axis in moved.T], axis=1)
+    earlier = np.searchsorted(stamps_ns, stamps_ns - round(SLIP_S * 1e9))
+    gained = np.linalg.norm(moved - moved[earlier], axis=1)
+    return float(gained.max()), float(np.degrees(np.abs(turned - turned[earlier]).max()))
+
+
+def _loop_error(edge: LoopEdge, older: F64, newer: F64) -> tuple[float, float]:
+    """m and deg between a loop and the true poses (4, 4) of its ends, in the directions that it holds."""
+    wrong = lie.inverse(lie.inverse(older) @ newer) @ edge.T_older_newer
+    turned = _held(edge.covariance[:3, :3], np.radians(HELD_DEG)) @ lie.log(wrong[:3, :3])
+    moved = _held(edge.covariance[3:, 3:], OPEN_M) @ wrong[:3, 3]
+    return float(np.linalg.norm(moved)), float(np.degrees(np.linalg.norm(turned)))
+
+
+def _held(covariance: F64, most: float) -> F64:
+    """(n, 3) unit directions in which a covariance (3, 3) has a standard deviation of at most so much."""
+    squares, directions = np.linalg.eigh(covariance)
+    return np.asarray(directions[:, squares < most**2].T)
+
+
+def _good(errors: F64) -> npt.NDArray[np.bool_]:
+    return (errors[:, 0] < GOOD_M) & (errors[:, 1] < GOOD_DEG)
+
+
+def _revisits(T: F64, stamps_ns: I64) -> list[int]:
+    """Which of the true poses (n, 4, 4) come back to an earlier one."""
+    ahead = _ahead(T)
+    out = []
+    for k in range(len(T)):
+        near = np.linalg.norm(T[:k, :3, 3] - T[k, :3, 3], axis=1) < WITHIN_M
+        long_ago = stamps_ns[:k] <= stamps_ns[k] - APART_S * 1e9
+        if (near & long_ago & (np.abs(ahead[:k] @ ahead[k]) > ALONG)).any():
+            out.append(k)
+    return out
+
+
+def _ahead(T: F64) -> F64:
+    """(n, 3) unit, the way the walk goes at each pose."""
+    step = np.gradient(T[:, :3, 3], axis=0)
+    return np.asarray(step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9))
+
+
+HEADS = (
+    "recording", "m", "ATE off", "ATE on", "gain m", "gain °", "NEES yaw", "NEES pos", "cand.", "acc.", "false", "good",
+    "revis.", "found", "median m", "p95 m", "max m", "max °",
+)  # fmt: skip
+WIDTHS = (34, 6, 8, 9, 7, 7, 9, 9, 6, 5, 6, 6, 7, 6, 9, 6, 6, 6)
+
+
+def _line(name: str, s: Score) -> str:
+    e = s.errors if len(s.errors) else np.full((1, 2), np.nan)
+    cells = (
+        name, f"{s.metres:.0f}", f"{s.without:.4f}", f"{s.beside:.4f}" + ("!" if s.worse else ""),
+        f"{s.gained_m:.3f}", f"{s.gained_deg:.2f}" + ("!" if s.slipped else ""), f"{s.yaw:.2f}", f"{s.position:.2f}",
+        s.candidates, len(s.errors), s.false, f"{s.good:.2f}", s.revisits,
+        f"{s.found / s.revisits:.2f}" if s.revisits else "–", f"{np.median(e[:, 0]):.3f}",
+        f"{np.percentile(e[:, 0], 95):.3f}", f"{e[:, 0].max():.3f}", f"{e[:, 1].max():.2f}",
+    )  # fmt: skip
+    return " ".join(f"{cell:>{width}}" for cell, width in zip(cells, WIDTHS, strict=True))
+
+
+def _summary(scores: Sequence[Score]) -> str:
+    without, beside = (np.array([getattr(s, name) for s in scores]) for name in ("without", "beside"))
+    metres = np.array([s.metres for s in scores])
+    revisits = sum(s.revisits for s in scores)
+    return (
+        f"{len(scores)} walks: ATE {np.median(without):.3f} m in the median, at most {(without / metres).max():.3%} of"
+        f" the distance; with loops {np.median(beside):.3f} m, {(beside / metres).max():.3%};"
+        f" {sum(s.slipped for s in scores)} slip, {sum(s.worse for s in scores)} are worse with loops;"
+        f" NEES of yaw {np.mean([s.yaw for s in scores]):.2f}, of position {np.mean([s.position for s in scores]):.2f};"
+        f" {sum(s.false for s in scores)} false loops, {sum(s.found for s in scores) / max(revisits, 1):.2f} of"
+        f" {revisits} revisits found."
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING")
+    parser.add_argument("--truth", type=Path, help="of the IMU, TUM; else RECORDING_truth.tum beside it")
+    parser.add_argument("--preset")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
+    parser.add_argument("--drifting", action="store_true", help="odometry from a fraction of each scan")
+    options = parser.parse_args()
+    compile_kernels()
+    print(" ".join(f"{head:>{width}}" for head, width in zip(HEADS, WIDTHS, strict=True)), flush=True)
+    scores = []
+    for recording in options.recordings:
+        settings = [*(DRIFTING if options.drifting else ()), *options.set]
+        scores.append(measure(recording, options.truth, resolve_params(recording, options.preset, None, settings)))
+        print(_line(recording.stem, scores[-1]), flush=True)
+    print(_summary(scores))
+    if any(s.false or s.worse for s in scores):
+        sys.exit("False loops, or worse with loops than without.")
+
+
+if __name__ == "__main__":
+    main()
