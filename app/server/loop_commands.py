@@ -59,7 +59,8 @@ class LoopCommands:
                 case Answered(Inspect(older, newer), LoopDetail() as detail):
                     view = replace(view, inspected=((older, newer), detail))
                 case Answered(TryOut(command), Preview() as preview):
-                    view = replace(view, tried=(command, preview))
+                    poses = session.adjustment.poses(preview.poses)  # level, as the map is shown
+                    view = replace(view, tried=(command, replace(preview, poses=poses)))
                 case Answered(AskResiduals(), tuple() as residuals):
                     view = replace(view, residuals=residuals)
                 case Failure(text):

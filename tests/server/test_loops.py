@@ -179,6 +179,9 @@ def test_a_loop_can_be_looked_at_and_a_command_tried_without_doing_it(walk: Walk
     assert tried.loops.tried is not None and tried.loops.tried[0] == Reject(*edge.pair)
     assert tried.loops.edges == before.loops.edges and not tried.loops.undo
     assert walk.do(TryLoop(None), InspectLoop(None)).loops.tried is None
+    after = walk.do(EditLoop(Reject(*edge.pair)))
+    assert after.keyframe_poses is not None
+    np.testing.assert_allclose(tried.loops.tried[1].poses[:, :3, 3], after.keyframe_poses[:, :3, 3], atol=0.02)
 
 
 def test_what_can_not_be_done_is_said_and_changes_nothing(walk: Walk) -> None:
