@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
-from app.server.protocol import EditLoop, InspectLoop, RedoLoop, TryLoop, UndoLoop
+from app.server.protocol import EditLoop, InspectLoop, RedoLoop, UndoLoop
 from app.slam.loops.edits import Reject
 from tests.browser.conftest import Bench, opened
 from tests.ui.fake_loops import LoopEngine
@@ -33,14 +33,14 @@ def test_chips_rows_and_heads_of_the_table_can_be_clicked(bench: Bench) -> None:
     expect(page.locator("tr[aria-selected]")).to_have_count(9)
     page.get_by_role("button", name="rejected 20").click()
     expect(page.locator("tr[aria-selected]")).to_have_count(29)
-    page.get_by_text("over %").click()
-    expect(page.get_by_text("over %▴")).to_be_visible()
+    page.get_by_role("columnheader", name="overlap").click()
+    expect(page.get_by_text("overlap▴")).to_be_visible()
     page.get_by_role("button", name="rejected 20").click()
     expect(page.locator("tr[aria-selected]")).to_have_count(9)
     page.locator("tr[aria-selected]", has_text="12–89").click()
     expect(page.get_by_text("keyframes 12–89")).to_be_visible()
     expect(page.get_by_text("Points over their distance")).to_be_visible()
-    assert bench.engine.sent == [InspectLoop(GOOD)]
+    assert InspectLoop(GOOD) in bench.engine.sent
     page.locator("tr[aria-selected]", has_text="12–89").press("Enter")
     expect(page.get_by_text("keyframes 12–89")).to_have_count(0)
 
@@ -72,16 +72,12 @@ def test_a_loop_is_rejected_undone_and_rejected_again(bench: Bench) -> None:
     bench.engine.sent.clear()
     reject = page.get_by_role("button", name="Reject it")
     reject.evaluate("(button) => button.scrollIntoView({block: 'start'})")
-    reject.click()
     expect(page.get_by_text("Keyframes would move by up to")).to_be_visible()
-    for name in ("Apply", "Cancel"):
-        expect(page.get_by_role("button", name=name)).to_be_in_viewport(ratio=1)
-    page.get_by_role("button", name="Apply").click()
+    reject.click()
     expect(page.get_by_text("Rejected 12–89; keyframes moved by up to")).to_be_visible()
     expect(page.get_by_role("button", name="Undo", exact=True)).to_be_in_viewport(ratio=1)
     expect(page.get_by_role("button", name="Undo: reject 12–89")).to_be_visible()
     bench.eventually(lambda: EditLoop(Reject(*GOOD)) in bench.engine.sent)
-    assert bench.engine.sent[0] == TryLoop(Reject(*GOOD))
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Control+z")
     expect(page.get_by_role("button", name="Redo: reject 12–89")).to_be_visible()

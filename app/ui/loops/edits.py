@@ -1,4 +1,4 @@
-"""Editing loops: an edit is proposed, shown as a ghost, then applied or cancelled; undo, redo, files."""
+"""Editing loops: what an edit would move is shown as a ghost, and what it moved; undo, redo, files."""
 
 from collections.abc import Callable
 from typing import Final
@@ -10,7 +10,7 @@ from app.server.protocol import EditLoop, RedoLoop, Snapshot, TryLoop, UndoLoop
 from app.slam.errors import HemislamError
 from app.slam.loops import edit_files
 from app.slam.loops.edits import Accept, LoopEdit, Reject, SetWeight
-from app.slam.loops.types import LoopEdge, Pair, Verdict
+from app.slam.loops.types import LoopEdge, Pair, Preview, Verdict
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.html import panel
@@ -21,43 +21,64 @@ from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, notify_error, pos
 _REST_S: Final = 0.3
 _GHOST: Final[Rgb] = (206, 176, 255)
 _STICK: Final[Rgb] = (140, 120, 180)
-_MOVED_M: Final = 0.02
+_LEAST_SHIFT_M: Final = 0.005
+_SEEN: Final = 0.03
+"""Shifts are enlarged until the largest is nearly this share of the walk's extent: real ones are rarely seen."""
+
+
+def enlarged(shifts: F64, extent: float) -> int:
+    """1, 2, 5, 10 … 100 times, as (k, 3) shifts (m) are drawn on a walk of that extent (m); 0: too small to draw."""
+    largest = float(np.linalg.norm(shifts, axis=1).max(initial=0.0))
+    if largest < _LEAST_SHIFT_M:
+        return 0
+    return max((times for times in (1, 2, 5, 10, 20, 50, 100) if times * largest <= _SEEN * extent), default=1)
 
 
 class Ghost:
-    """The trajectory as an edit would make it, tied by sticks to the present one."""
+    """The trajectory as an edit would make it, or as it was before one, tied by sticks to the present one.
+
+    Attributes:
+        key: colour and name of what is drawn, for the legend; none while nothing is.
+    """
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
+        self.key: list[tuple[Rgb, str]] = []
         self._nodes: list[viser.LineSegmentsHandle] = []
         self._changes = Changes()
 
-    def draw(self, tried: F64 | None, present: F64) -> None:
-        """Show (k, 4, 4) poses `tried` beside the present ones; None removes them."""
-        if not self._changes(tried, present if tried is not None else None):
+    def draw(self, other: F64 | None, present: F64, name: str) -> None:
+        """Show (k, 4, 4) poses beside the present ones, its shifts enlarged; None removes them."""
+        if not self._changes(other, present if other is not None else None, name):
             return
         clear(self._nodes)
-        if tried is None or len(tried) < 2:
+        self.key = []
+        if other is None or min(len(other), len(present)) < 2:
             return
-        there = tried[:, :3, 3]
-        self._add("path", segments(there), _GHOST, 3.0)
-        here = present[: len(tried), :3, 3]
-        sticks = np.stack((here, there[: len(here)]), axis=1).astype(np.float32)
-        sticks = sticks[np.linalg.norm(sticks[:, 1] - sticks[:, 0], axis=1) > _MOVED_M]
-        if len(sticks):
-            self._add("moves", sticks, _STICK, 1.0)
+        here, there = present[: len(other), :3, 3], other[: len(present), :3, 3]
+        times = enlarged(there - here, float(np.linalg.norm(np.ptp(here, axis=0))))
+        if times:
+            there = here + times * (there - here)
+            self._add("path", segments(there), _GHOST, 3.0)
+            self._add("moves", np.stack((here, there), axis=1).astype(np.float32), _STICK, 1.0)
+            self.key = [(_GHOST, name + (f", shift × {times}" if times > 1 else ""))]
 
     def _add(self, name: str, lines: F32, colour: Rgb, width: float) -> None:
         self._nodes.append(add_lines(self._scene, f"{ROOT}/ghost/{name}", lines, colour, width))
 
 
 class Proposal:
-    """What the edit under consideration would change, with Apply and Cancel; then what it did, with Undo."""
+    """What the edit under consideration would change, with Apply and Cancel; then what it did, with Undo.
+
+    Attributes:
+        command: the edit under consideration. preview: what the engine says of it, or of the one that is only shown.
+        ghost: the trajectory beside the present one.
+    """
 
     def __init__(self, page: Page, applied: Callable[[LoopEdit], None]) -> None:
         gui = page.gui
         self._send, self._snapshot, self._applied = page.send, page.snapshot, applied
-        self._ghost = Ghost(page.scene)
+        self.ghost = Ghost(page.scene)
         self._folder = gui.add_folder("Before you decide", visible=False)
         with self._folder:
             self._words = gui.add_html("")
@@ -69,42 +90,51 @@ class Proposal:
             self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray", hint="Ctrl Z")
         self._undo.on_click(by_user(lambda _, __: self._send(UndoLoop())))
         self.command: LoopEdit | None = None
+        self.preview: Preview | None = None
+        self._asked: tuple[LoopEdit | None, object] = None, None  # tried, and of which loops
         self._last: LoopEdit | None = None  # applied, until it is undone or another edit follows
-        self._arrived = False  # whether a snapshot has had it
+        self._before: F64 | None = None  # the poses then, until another loop is looked at
+        self._after: tuple[LoopEdge, ...] | None = None  # the loops with it, since a snapshot has had it
         self._last_notice = 0
         self._changes = Changes()
-        self._apply.on_click(by_user(lambda _, __: self.apply()))
+        self._apply.on_click(by_user(lambda _, __: self._apply_it()))
         cancel.on_click(by_user(lambda _, __: self.cancel()))
 
     def propose(self, command: LoopEdit) -> None:
         notices = self._snapshot().notices
         self._last_notice = notices[-1].number if notices else 0
-        self.command, self._last = command, None
-        self._send(TryLoop(command))
+        self.command, self._last, self._before = command, None, None
 
-    def apply(self) -> None:
-        command, self.command = self.command, None
-        if command is not None:
-            snapshot = self._snapshot()
-            tried = snapshot.loops.tried
-            preview = tried[1] if tried is not None and tried[0] == command else None
-            self._last, self._arrived = command, False
-            self._happened.content = what_happened(command, preview, poses_of(snapshot)) + panel("into_view")
-            self._send(EditLoop(command))
-            self._send(TryLoop(None))
-            self._applied(command)
+    def apply(self, command: LoopEdit) -> None:
+        self.command, self._last, self._after = None, command, None
+        self._before = poses_of(self._snapshot())
+        self._send(EditLoop(command))
+        self._applied(command)
+
+    def _apply_it(self) -> None:
+        if self.command is not None:
+            self.apply(self.command)
 
     def cancel(self) -> None:
-        if self.command is not None:
-            self.command = None
-            self._send(TryLoop(None))
+        self.command = self._before = None
 
-    def draw(self, snapshot: Snapshot) -> None:
+    def draw(self, snapshot: Snapshot, looked_at: LoopEdit | None = None) -> None:
+        """looked_at: what is only shown, while nothing is considered."""
         self._draw_done(snapshot)
-        command, tried = self.command, snapshot.loops.tried
-        preview = tried[1] if tried is not None and tried[0] == command else None
-        poses = poses_of(snapshot)
-        self._ghost.draw(preview.poses if command is not None and preview is not None else None, poses)
+        command, loops, poses = self.command, snapshot.loops, poses_of(snapshot)
+        shown = command or looked_at
+        asked = shown, loops.edges if shown is not None else None
+        if asked[0] != self._asked[0] or asked[1] is not self._asked[1]:
+            self._asked = asked
+            self._send(TryLoop(shown))
+        preview = self.preview = (
+            loops.tried[1] if shown is not None and loops.tried and loops.tried[0] == shown else None
+        )
+        if self._last is not None and self._before is not None:
+            self.ghost.draw(self._before if loops.edges is self._after else None, poses, "path before the edit")
+        else:
+            name = f"path if you {describe_edit(shown)}" if shown is not None else ""
+            self.ghost.draw(preview.poses if preview is not None else None, poses, name)
         problem = self._problem(snapshot) if preview is None else ""
         if not self._changes(command, preview, snapshot.loops.residuals, problem):
             return
@@ -115,12 +145,14 @@ class Proposal:
             self._words.content = words + panel("into_view")
 
     def _draw_done(self, snapshot: Snapshot) -> None:
-        edits = snapshot.loops.undo
-        there = bool(edits) and edits[-1] == self._last
-        if self._arrived and not there:
+        edits, command = snapshot.loops.undo, self._last
+        there = bool(edits) and edits[-1] == command
+        if self._after is not None and not there:
             self._last = None
-        self._arrived = there
-        self._done.visible = self._last is not None
+        if there and self._after is None and command is not None and self._before is not None:
+            self._after = snapshot.loops.edges
+            self._happened.content = what_happened(command, self._before, poses_of(snapshot)) + panel("into_view")
+        self._done.visible = self._last is not None and self._after is not None
 
     def _problem(self, snapshot: Snapshot) -> str:
         """The engine's newest error since the edit was proposed."""
@@ -129,30 +161,43 @@ class Proposal:
 
 
 class VerdictPanel:
-    """Accept, reject and weight of the chosen loop."""
+    """Accept, reject and weight of the chosen loop.
 
-    def __init__(self, page: Page, propose: Callable[[LoopEdit], None]) -> None:
+    Args:
+        apply: applies an edit at once; Undo takes it back. propose: shows first what it would change.
+    """
+
+    def __init__(self, page: Page, apply: Callable[[LoopEdit], None], propose: Callable[[LoopEdit], None]) -> None:
         gui = page.gui
-        self._propose, self._now = propose, page.now
+        self._apply, self._propose, self._now = apply, propose, page.now
         self._pair: Pair | None = None
         self._dragged: Edit | None = None
         self._headline = gui.add_html("")
-        self._accept = gui.add_button("Accept it …", icon=viser.Icon.THUMB_UP, color="teal")
-        self._reject = gui.add_button("Reject it …", icon=viser.Icon.THUMB_DOWN, color="red")
+        self._accept = gui.add_button(
+            "Accept it", icon=viser.Icon.THUMB_UP, color="teal", hint="Put it into the graph now; Undo takes that back."
+        )
+        self._reject = gui.add_button(
+            "Reject it",
+            icon=viser.Icon.THUMB_DOWN,
+            color="red",
+            hint="Take it out of the graph now; Undo brings it back.",
+        )
+        self._would = gui.add_html("")
         self._weight = gui.add_slider(
             "weight", 0.1, 10.0, 0.1, 1.0, hint="Divides its covariance in the graph; 1 is as registered."
         )
-        self._accept.on_click(by_user(lambda _, __: self._propose_for_pair(Accept)))
-        self._reject.on_click(by_user(lambda _, __: self._propose_for_pair(Reject)))
+        self._accept.on_click(by_user(lambda _, __: self._decide(Accept)))
+        self._reject.on_click(by_user(lambda _, __: self._decide(Reject)))
         self._weight.on_update(by_user(lambda weight, _: self._drag(weight)))
 
-    def draw(self, edge: LoopEdge | None, weighing: float | None) -> None:
-        """Show the loop's verdict. weighing: the weight under consideration."""
+    def draw(self, edge: LoopEdge | None, weighing: float | None, would: str) -> None:
+        """Show the loop's verdict. weighing: the weight under consideration. would: what the other verdict changes."""
         self._pair = edge.pair if edge is not None else None
         if edge is None:
             self._dragged = None
             return
         self._headline.content = headline(edge)
+        self._would.content = would
         self._accept.visible = edge.verdict is not Verdict.ACCEPTED
         self._reject.visible = edge.verdict is not Verdict.REJECTED
         self._weight.disabled = edge.verdict is not Verdict.ACCEPTED
@@ -167,9 +212,9 @@ class VerdictPanel:
     def _drag(self, weight: float) -> None:
         self._dragged = Edit(weight, self._now())
 
-    def _propose_for_pair(self, verb: type[Accept] | type[Reject]) -> None:
+    def _decide(self, verb: type[Accept] | type[Reject]) -> None:
         if self._pair is not None:
-            self._propose(verb(*self._pair))
+            self._apply(verb(*self._pair))
 
 
 class EditsPanel:

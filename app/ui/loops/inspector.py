@@ -109,7 +109,7 @@ class Inspector:
         self._pairing: Pairing | None = None
         self._clouds: tuple[LoopDetail, bool, F32, F32] | None = None
         self._changes = Changes()
-        self._map_again = False
+        self._alone_before: bool | None = None  # while the map is shown in place of the submaps
         self._evidence = gui.add_html("")
         self._go = gui.add_button_group(
             "go", (FLY, SEEK, CLOSE), hint="Fly to the loop, seek to the frame at which it was decided, or close it."
@@ -148,15 +148,16 @@ class Inspector:
         )
 
     def show_map(self) -> None:
-        """Show what became of the map, until another loop is chosen."""
-        self._map_again = self._alone.value
+        """Show what became of the map in place of the submaps, until another loop is chosen or `alone` is."""
+        if self._alone_before is None:
+            self._alone_before = self._alone.value
         show(self._alone, False)
 
     def hide_map(self) -> None:
         """As the user had it before `show_map`."""
-        if self._map_again:
-            show(self._alone, True)
-        self._map_again = False
+        if self._alone_before is not None:
+            show(self._alone, self._alone_before)
+        self._alone_before = None
 
     @property
     def shown(self) -> bool:
@@ -195,6 +196,8 @@ class Inspector:
     def draw_scene(self, snapshot: Snapshot, chosen: Pair | None, view: View) -> None:
         """Place the submaps in the scene, as far between the two poses as the slider is."""
         detail, poses = _detail(snapshot, chosen), poses_of(snapshot)
+        if self._alone_before is not None and not self._alone.value:
+            detail = None
         if detail is None or chosen is None or chosen[1] >= len(poses):
             self._pairing = None
             self._overlay.draw(None, None, view.point_size)

@@ -9,8 +9,8 @@ import numpy as np
 import viser
 
 from app.server.protocol import InspectLoop, Seek, Snapshot
-from app.slam.loops.edits import LoopEdit, SetWeight, Solve
-from app.slam.loops.types import LoopEdge, Pair
+from app.slam.loops.edits import Accept, LoopEdit, Reject, SetWeight, Solve
+from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.types import F64
 from app.ui.colours import Rgb
 from app.ui.html import panel
@@ -19,7 +19,7 @@ from app.ui.loops.edges import LoopEdges
 from app.ui.loops.edits import EditsPanel, Proposal, VerdictPanel
 from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
 from app.ui.loops.table import COLUMNS, Order, chips, listed, table
-from app.ui.loops.words import BRIDGE, KINDS, NEWER, OLDER, kind_of, largest_factors
+from app.ui.loops.words import BRIDGE, KINDS, NEWER, OLDER, forecast, kind_of, largest_factors
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of
 
@@ -32,7 +32,7 @@ _SOLVE_HINT: Final = (
 )
 _NONE_YET: Final = (
     "No loops yet. They are searched for where the trajectory comes back to a place that it left at least 15 s before; "
-    "the parameters are under Parameters, Loops."
+    "the parameters are under Parameters, Loop search."
 )
 
 
@@ -65,10 +65,15 @@ class LoopsPanel:
         self._edges = LoopEdges(page.scene, f"{ROOT}/loops")
         self._bridge = Bridge(gui, BRIDGE, self._act)
         self._table = gui.add_html(panel("quiet", _NONE_YET))
-        self._proposal = Proposal(page, self._applied)
         self._folder = gui.add_folder("The chosen loop", visible=False)
         with self._folder:
-            self._verdict = VerdictPanel(page, self._proposal.propose)
+            self._verdict = VerdictPanel(
+                page, lambda edit: self._proposal.apply(edit), lambda edit: self._proposal.propose(edit)
+            )
+        # Below the verdict's buttons, so that these stay under the mouse.
+        self._proposal = Proposal(page, self._applied)
+        self._evidence_folder = gui.add_folder("Evidence", visible=False)
+        with self._evidence_folder:
             self._inspector = Inspector(page, self._go)
         with gui.add_folder("Add a loop manually", expand_by_default=False):
             self._add_loop = AddLoopPanel(page, self._proposal.propose, self._fly)
@@ -103,6 +108,7 @@ class LoopsPanel:
         found = {kind_of(edge).name for edge in snapshot.loops.edges}
         arches = [(kind.colour, f"{name} loop") for name, kind in KINDS.items() if name in found & self._shown]
         chosen = self._chosen
+        arches += self._proposal.ghost.key
         if chosen is None or not self._inspector.shown:
             return arches
         return [(OLDER, f"keyframe {chosen[0]}"), (NEWER, f"keyframe {chosen[1]}"), *arches]
@@ -116,7 +122,7 @@ class LoopsPanel:
         if pair != self._chosen:
             self._chosen = pair
             self._inspector.hide_map()
-            if self._proposal.command is not None and not self._add_loop.nudging:
+            if not self._add_loop.nudging:
                 self._proposal.cancel()
             if pair is not None:
                 self._add_loop.suggest_pair(pair)
@@ -131,17 +137,21 @@ class LoopsPanel:
         edge = self._edge(snapshot)
         self._ask(edge)
         command = self._proposal.command
-        self._verdict.draw(edge, command.weight if isinstance(command, SetWeight) else None)
+        other = None if edge is None else (Reject if edge.verdict is Verdict.ACCEPTED else Accept)(*edge.pair)
+        self._proposal.draw(snapshot, other)
+        would = ""
+        if other is not None and command is None:
+            would = forecast(other, self._proposal.preview, poses, snapshot.loops.residuals)
+        self._verdict.draw(edge, command.weight if isinstance(command, SetWeight) else None, would)
         self._edges.draw(snapshot.loops.edges, poses, self._shown, self._chosen)
         self._add_loop.draw_scene(snapshot, view)
         self._inspector.draw_scene(snapshot, None if self._add_loop.nudging else self._chosen, view)
         self._inspector.draw(snapshot, edge)
-        self._proposal.draw(snapshot)
         self._edits.draw(snapshot)
         loops = snapshot.loops
         self._solving.visible = isinstance(command, Solve)
         self._solve.disabled = Solve() in loops.undo or not any(edge.counts for edge in loops.edges)
-        self._folder.visible = edge is not None
+        self._folder.visible = self._evidence_folder.visible = edge is not None
         self._edits_folder.visible = len(poses) > 1
         self._residuals_folder.visible = bool(loops.edges)
         self._draw_tables(snapshot)

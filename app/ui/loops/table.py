@@ -15,10 +15,11 @@ MOST_ROWS: Final = 300
 @dataclass(frozen=True, slots=True)
 class TableColumn:
     """Attributes:
-    title: with its unit, as short as possible. meaning: the long form. key: sorts (nan goes last). text: of a cell.
+    title: its name. unit: of its numbers. meaning: a sentence. key: sorts (nan goes last). text: of a cell.
     """
 
     title: str
+    unit: str
     meaning: str
     key: Callable[[LoopEdge], float]
     text: Callable[[LoopEdge], str]
@@ -26,26 +27,28 @@ class TableColumn:
 
 COLUMNS: Final[dict[str, TableColumn]] = {
     "verdict": TableColumn(
-        "", "Verdict", lambda e: list(KINDS).index(kind_of(e).name) + 0.1 * list(SIGNS).index(e.verdict),
+        "", "", "Verdict: ✓ accepted, ? candidate, ✕ rejected, ✎ by hand.",
+        lambda e: list(KINDS).index(kind_of(e).name) + 0.1 * list(SIGNS).index(e.verdict),
         lambda e: SIGNS[e.verdict] + ("✎" if kind_of(e).name == EDITED else ""),
     ),
     "keyframe": TableColumn(
-        "loop", "Older and newer keyframe", lambda e: e.newer + e.older * 1e-7, lambda e: name(e.pair)
+        "loop", "keyframes", "Numbers of the older and the newer keyframe that it ties together.",
+        lambda e: e.newer + e.older * 1e-7, lambda e: name(e.pair),
     ),
     "context": TableColumn(
-        "ctx", "Distance of the Scan Contexts, 0 (same) to 1",
+        "contexts", "0–1", "Difference of the two Scan Contexts, from 0 (the same) to 1.",
         lambda e: e.evidence.context_distance, lambda e: number(e.evidence.context_distance),
     ),
     "overlap": TableColumn(
-        "over %", "Share of points near both that have a partner in the other submap",
+        "overlap", "%", "Points near both keyframes that have a partner in the other submap, in percent.",
         lambda e: e.evidence.overlap, lambda e: number(100 * e.evidence.overlap, 0),
     ),
     "residual": TableColumn(
-        "res mm", "Residual (RMS), point to plane",
+        "residual", "mm", "Distance of the points to the other submap's planes, RMS in mm.",
         lambda e: e.evidence.residual_rms, lambda e: number(1000 * e.evidence.residual_rms, 0),
     ),
     "mahalanobis": TableColumn(
-        "odo σ", "Mahalanobis distance to what odometry expects, in standard deviations",
+        "odometry", "σ", "Distance to what odometry expects, in its standard deviations (σ).",
         lambda e: e.evidence.mahalanobis, lambda e: number(e.evidence.mahalanobis, 1),
     ),
 }  # fmt: skip
@@ -77,14 +80,19 @@ def listed(edges: tuple[LoopEdge, ...], shown: frozenset[str], order: Order) -> 
 def chips(edges: tuple[LoopEdge, ...], shown: frozenset[str]) -> str:
     """How many there are of each kind; a click shows or hides them. Also the legend of the scene."""
     names = [kind_of(edge).name for edge in edges]
-    return panel("loops.chips", [(kind, names.count(key), key in shown) for key, kind in KINDS.items()])
+    return panel("loops.chips", [(kind, names.count(key), key in shown) for key, kind in KINDS.items() if key in names])
 
 
 def table(edges: list[LoopEdge], order: Order, chosen: Pair | None) -> str:
     """The table of these edges; rows and column heads can be clicked."""
     arrow = "▾" if order.descending else "▴"
     heads = [
-        (key, column.title + (arrow if key == order.column else "" if column.title else "•"), column.meaning)
+        (
+            key,
+            column.title + (arrow if key == order.column else "" if column.title else "•"),
+            column.unit,
+            column.meaning,
+        )
         for key, column in COLUMNS.items()
     ]
     first, *others = COLUMNS.values()
@@ -92,7 +100,7 @@ def table(edges: list[LoopEdge], order: Order, chosen: Pair | None) -> str:
         (edge, first.text(edge), kind_of(edge).colour, [column.text(edge) for column in others], edge.pair == chosen)
         for edge in edges[:MOST_ROWS]
     ]
-    remark = "" if edges else "None of the kinds chosen above."
+    remark = "" if edges else "All are hidden; click a kind above to show it."
     if len(edges) > MOST_ROWS:
         remark = f"The first {MOST_ROWS} of {len(edges):,}; sort by another column or hide a kind to see others."
     return panel("loops.table", heads, rows, source("loop_table.js"), remark)

@@ -14,11 +14,9 @@ from app.ui.colours import Rgb
 from app.ui.html import BAD, GOOD, Tile, number, panel
 
 _LARGEST: Final = 12
-_COMPARED: Final = 3
 _ODOMETRY: Final = "#5b8def"
 _LEAST_MOVE_M: Final = 5e-4
 _LEAST_TURN_DEG: Final = 5e-3
-_NOTHING: Final = ("", "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +79,11 @@ def describe_edit(command: LoopEdit) -> str:
             return f"reject {pair}"
 
 
-def what_happened(command: LoopEdit, preview: Preview | None, poses: F64) -> str:
-    """A sentence on an edit that was applied, from what it was seen to change, with (k, 4, 4) the poses before it."""
+def what_happened(command: LoopEdit, before: F64, after: F64) -> str:
+    """A sentence on an edit that was applied, with (k, 4, 4) the poses before and after it."""
     verb, _, rest = describe_edit(command).partition(" ")
     past = {"add": "Added", "solve": "Solved"}.get(verb, f"{verb.capitalize()}ed")
-    moves = _moves(preview.poses, poses) if preview is not None else None
-    return panel("loops.happened", f"{past} {rest}", moves)
+    return panel("loops.happened", f"{past} {rest}", _moves(after, before))
 
 
 def headline(edge: LoopEdge) -> str:
@@ -141,7 +138,7 @@ def largest_factors(residuals: tuple[FactorResidual, ...]) -> str:
 def forecast(
     command: LoopEdit, preview: Preview | None, poses: F64, residuals: tuple[FactorResidual, ...], problem: str = ""
 ) -> str:
-    """What an edit would change: how far keyframes move, and the factors with the largest residuals now and then.
+    """What an edit would change: how far keyframes move, and the largest residual, if it is another one then.
 
     Args:
         preview: None while the engine computes it. poses: (k, 4, 4) of the present; residuals: likewise.
@@ -150,14 +147,10 @@ def forecast(
     what = describe_edit(command).capitalize()
     if preview is None:
         working = problem or "The engine computes what it would change …"
-        return panel("loops.forecast", what, working, None, None, [], [], ())
-    before, after = (_rows(side) for side in (residuals, preview.residuals))
-    lines = max(len(before), len(after))
-    before, after = (side + [_NOTHING] * (lines - len(side)) for side in (before, after))
-    costs = tuple(f"{_cost(side):.4g}" for side in (residuals, preview.residuals))
+        return panel("loops.forecast", what, working)
+    worst = [_worst(side) for side in (residuals, preview.residuals)]
     change = _cost_change(residuals, preview.residuals) if isinstance(command, Solve) else None
-    moves = _moves(preview.poses, poses)
-    return panel("loops.forecast", what, "", moves, change, before, after, costs)
+    return panel("loops.forecast", what, "", _moves(preview.poses, poses), change, worst if len({*worst}) > 1 else [])
 
 
 def _moves(after: F64, before: F64) -> dict[str, Any] | None:
@@ -187,8 +180,9 @@ def _cost_change(before: tuple[FactorResidual, ...], after: tuple[FactorResidual
     return {"same": same, "before": f"{now:.4g}", "after": f"{then:.4g}", "change": less}
 
 
-def _rows(residuals: tuple[FactorResidual, ...]) -> list[tuple[str, str]]:
-    return [(_what(factor), number(factor.sigmas, 2)) for factor in _largest_first(residuals)[:_COMPARED]]
+def _worst(residuals: tuple[FactorResidual, ...]) -> str:
+    """The factor with the largest residual."""
+    return next((f"{number(f.sigmas, 2)} σ ({_what(f)})" for f in _largest_first(residuals)), "none")
 
 
 def _largest_first(residuals: tuple[FactorResidual, ...]) -> list[FactorResidual]:

@@ -23,6 +23,7 @@ def test_two_keyframes_are_picked_in_the_scene_and_connected_from_where_the_grap
     assert added.pair == (61, 140) and not added.picking
     assert page.node("/map/add_loop/keyframes") is None
     user_clicks(added._try)
+    page.draw()
     assert page.engine.sent == [TryLoop(Add(61, 140))]
 
 
@@ -68,6 +69,7 @@ def test_an_untouched_gizmo_is_the_graph_s_own_guess(page: Page) -> None:
     added._register.value = False
     page.draw()
     added.suggest()
+    page.draw()
     (command,) = [sent.command for sent in page.engine.sent if isinstance(sent, TryLoop)]
     assert isinstance(command, Add) and command.guess is not None and not command.register
     assert np.allclose(command.guess, lie.inverse(poses[20]) @ poses[97], atol=1e-6)
@@ -80,5 +82,5 @@ def test_a_loop_added_by_hand_is_chosen_once_it_arrives(page: Page) -> None:
     user_clicks(page.loops._proposal._apply)
     page.draw()
     page.draw()
-    assert page.loops.chosen == (20, 97) and page.engine.sent[-1] == InspectLoop((20, 97))
+    assert page.loops.chosen == (20, 97) and InspectLoop((20, 97)) in page.engine.sent
     assert page.says("edited 1")

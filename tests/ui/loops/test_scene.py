@@ -66,7 +66,7 @@ def test_a_click_in_the_scene_chooses_the_loop_it_points_at(page: Page) -> None:
     page.click_scene(middle + np.array([2.0, -6.0, 9.0]), middle)
     page.draw()
     assert page.loops.chosen == GOOD
-    assert page.engine.sent == [InspectLoop(GOOD)]
+    assert InspectLoop(GOOD) in page.engine.sent
 
 
 def test_a_click_at_an_arch_is_not_taken_for_a_point_of_the_scan(page: Page) -> None:
