@@ -91,8 +91,8 @@ class BrushPanel:
         if self.painting:
             return "Click points of the scan, or hold Shift and drag a rectangle. Marks belong to this frame only."
         if any_marks:
-            return "Tune uses these marks for Ground F1."
-        return "Mark ground in a few frames, and Tune finds the parameters that label them best."
+            return "Auto-tune uses these marks for Ground F1."
+        return "Mark ground in a few frames, and Auto-tune finds the parameters that label them best."
 
     def _draw_scene(self, result: StepResult | None, found: U8 | None, size: float) -> None:
         clear(self._nodes)

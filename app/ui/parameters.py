@@ -24,6 +24,7 @@ from app.slam.sections import Effect
 from app.slam.types import GROUND, SEED
 from app.ui.colours import LABEL_COLOURS
 from app.ui.html import heading, number, panel, source
+from app.ui.viser_adapter import Bridge
 from app.ui.widgets import PANEL_PERIOD_S, Changes, Edit, Page, as_set, by_user, dialog, show
 
 PRIMARY: Final = {
@@ -35,7 +36,7 @@ PRIMARY: Final = {
 """The paper's parameters, above all others, and their names here."""
 
 MARK: Final[dict[Effect, str]] = {"now": "", "frame": " ▸", "restart": " ↻"}
-_MOST_STEPS: Final = 2000
+_MOST_STEPS: Final = 8000
 """Of a slider with even steps. The IMU's noise spans decades: its usual values would share the first few pixels."""
 _DIGITS: Final = 9
 """Most digits after the point that a box shows and takes."""
@@ -48,16 +49,19 @@ _TYPING_S: Final = 0.5
 """A text is sent after this long without a change, and a slider that does not act at once after this long at rest."""
 _MOST_UNDONE: Final = 50
 _DRAG_S: Final = 8.0
-"""Changes of the same parameters that follow each other faster are one: a drag, also on a page that draws slowly."""
+"""Changes of the same parameters that follow each other faster are one, unless a slider was let go between them."""
 _HOLD_S: Final = 1.0
 """A control shows what the user set for this long, whatever older snapshots say."""
 
 TITLES: Final = {
+    "recording": "Reading the recording",
     "ground": "Ground, more",
     "scan": "Scan voxel",
     "imu": "IMU",
     "map": "Local map",
     "keyframe": "Keyframes",
+    "moving": "Moving things",
+    "loops": "Loop search",
 }
 """Of sections whose own names do not do."""
 
@@ -101,41 +105,48 @@ def add_widgets(gui: viser.GuiApi, leaf: Leaf, value: Any) -> list[Widget]:
     if isinstance(leaf.default, str):
         return [Widget(gui.add_text(text, value, hint=hint))]
     if isinstance(leaf.default, tuple):
-        return [_component(gui, leaf, value, *entry) for entry in enumerate(_COMPONENTS[leaf.path])]
+        names = enumerate(_COMPONENTS[leaf.path])
+        return [widget for index, name in names for widget in _component(gui, leaf, value, index, name)]
+    return _number(gui, leaf, value, text)
+
+
+def _number(gui: viser.GuiApi, leaf: Leaf, value: float, text: str) -> list[Widget]:
+    """A slider over the range, or a box and below it a slider over round values."""
     assert leaf.minimum is not None and leaf.maximum is not None and leaf.step is not None
-    if leaf.maximum - leaf.minimum <= _MOST_STEPS * leaf.step:
-        return [Widget(_slider(gui, leaf, value, text))]
-    box = gui.add_number(text, value, step=leaf.step, hint=hint)  # the engine says what is out of range
-    if not isinstance(leaf.default, int):
-        box.precision = _DIGITS
-    stops = round_values(leaf)
-    at = _nearest(stops, value)
-    # Without a label, so that `viser_adapter.css` hides the slider's own box, which would show a place among the stops.
-    slider = gui.add_slider("", 0, len(stops) - 1, 1, at, hint=hint)
-    return [Widget(box), Widget(slider, lambda value: _nearest(stops, value), lambda place, _: stops[place])]
-
-
-def _slider(gui: viser.GuiApi, leaf: Leaf, value: Any, text: str) -> viser.GuiSliderHandle[Any]:
     kind: Any = int if isinstance(leaf.default, int) else float
-    slider = gui.add_slider(text, kind(leaf.minimum), kind(leaf.maximum), kind(leaf.step), value, hint=leaf.help)
+    handle: Any
+    if leaf.maximum - leaf.minimum <= _MOST_STEPS * leaf.step:
+        handle = gui.add_slider(text, kind(leaf.minimum), kind(leaf.maximum), kind(leaf.step), value, hint=leaf.help)
+    else:
+        handle = gui.add_number(text, value, step=leaf.step, hint=leaf.help)  # the engine says what is out of range
     if kind is float:
-        slider.precision = _DIGITS
-    return slider
+        handle.precision = _DIGITS
+    widgets = [Widget(handle)]
+    if isinstance(handle, viser.GuiNumberHandle):
+        stops = round_values(leaf)
+        # Without a label, so that `viser_adapter.css` hides the slider's own box, which would show a place among stops.
+        slider = gui.add_slider("", 0, len(stops) - 1, 1, _nearest(stops, value), hint=leaf.help)
+        widgets.append(Widget(slider, lambda value: _nearest(stops, value), lambda place, _: stops[place]))
+    return widgets
 
 
-def _component(gui: viser.GuiApi, leaf: Leaf, value: tuple[float, ...], index: int, name: str) -> Widget:
-    """A slider for one number of a vector."""
-    return Widget(
-        _slider(gui, leaf, value[index], label(leaf, name)),
-        lambda vector: vector[index],
-        lambda number, vector: (*vector[:index], number, *vector[index + 1 :]),
-    )
+def _component(gui: viser.GuiApi, leaf: Leaf, vector: tuple[float, ...], index: int, name: str) -> list[Widget]:
+    """The widgets of one number of a vector."""
+
+    def of_vector(one: Widget) -> Widget:
+        return Widget(
+            one.handle,
+            lambda vector: one.shown(vector[index]),
+            lambda shown, vector: (*vector[:index], one.meant(shown, vector[index]), *vector[index + 1 :]),
+        )
+
+    return [of_vector(one) for one in _number(gui, leaf, vector[index], label(leaf, name))]
 
 
 def round_values(leaf: Leaf) -> tuple[float, ...]:
     """1, 2 and 5 times the powers of ten within the range, on either side of zero, ascending."""
     assert leaf.minimum is not None and leaf.maximum is not None and leaf.step is not None
-    kind = type(leaf.default)
+    kind = int if isinstance(leaf.default, int) else float
     least = leaf.minimum if leaf.minimum > 0 else leaf.step
     sizes = [float(f"{digit}e{power}") for power in range(-9, 10) for digit in (1, 2, 5)]
     values = [*(-size for size in reversed(sizes)), 0.0, *sizes]
@@ -150,7 +161,7 @@ def _nearest(ascending: tuple[float, ...], value: float) -> int:
 
 
 class ParameterHistory:
-    """The parameters as they were after each change; a drag is one change, however slow."""
+    """The parameters as they were after each change; a drag is one change, however slow the page draws it."""
 
     def __init__(self) -> None:
         self._states: list[Params] = []
@@ -180,6 +191,10 @@ class ParameterHistory:
 
     def go(self, by: int) -> None:
         self._at += by
+        self.settle()
+
+    def settle(self) -> None:
+        """The next change is one of its own."""
         self._changed_at = -_DRAG_S
 
 
@@ -201,6 +216,8 @@ class ParameterPanel:
             self._sections.setdefault(group, {})[leaf.name] = leaf
         self._names = {leaf.path: spoken(leaf) for leaf in leaves()}
         self._history = ParameterHistory()
+        self._bridge = Bridge(gui, "sliders", lambda *_: self._history.settle())
+        gui.add_html(self._bridge.live(panel("released")))
         self._opened = params
         self._recording: Path | None = None
         gui.add_html(heading("Ground segmentation"))

@@ -3,7 +3,6 @@
 import shlex
 from typing import Final, Literal
 
-import numpy as np
 import viser
 
 from app.sensors.doctor import Finding
@@ -13,7 +12,6 @@ from app.slam.errors import HemislamError
 from app.slam.params import Params, leaves
 from app.slam.types import FrameStatus
 from app.ui.html import BAD, GOOD, QUIET, WARN, heading, panel
-from app.ui.transport import working
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import Changes, Page
 
@@ -46,35 +44,25 @@ def status(snapshot: Snapshot) -> tuple[str, str]:
 
 
 def title(snapshot: Snapshot) -> str:
-    """The recording's name, the status, the doctor's verdicts and, before the first frame, what to do."""
+    """The recording's name, the status and the doctor's verdicts; without a recording, what to do."""
     recording = snapshot.recording
-    hint = first = ""
+    hint = ""
     if not snapshot.engine_alive:
         hint = "dead"
     elif recording is None and snapshot.progress is None:
         hint = "none"
-    elif recording is not None and snapshot.transport.frame < 0 and snapshot.progress is None:
-        first = "live" if snapshot.live is not None and snapshot.transport.playing else "file"
     name = recording.path.name if recording else "hemislam"
-    return panel("header", name, *status(snapshot), hint, verdicts(recording.findings if recording else ()), first)
+    return panel("header", name, *status(snapshot), hint, verdicts(recording.findings if recording else ()))
 
 
 class HeaderPanel:
-    """Title, status and, during long work, what it is and how far it got."""
+    """Title and status. The bar says what long work is and how far it got: here the sliders would jump."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._title = gui.add_html("")
-        self._work = gui.add_html("", visible=False)
-        self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
 
     def draw(self, snapshot: Snapshot) -> None:
         self._title.content = title(snapshot)
-        progress = snapshot.progress
-        self._work.visible = self._bar.visible = progress is not None
-        if progress is not None:
-            known = bool(np.isfinite(progress.fraction))
-            self._work.content = panel("text", working(progress))
-            self._bar.value = 100 * min(max(progress.fraction, 0.0), 1.0) if known else 100.0  # type: ignore[misc]  # mypy overlooks viser's setter
 
 
 def settled(params: Params, option: str) -> Params | None:

@@ -51,8 +51,9 @@ class TransportPanel:
         gui.add_html(self._bridge.live(panel("transport", list(SPEEDS), source("transport.js"))))
         self._state = gui.add_html("")
         gui.add_command("Play or pause", hotkey="space").on_trigger(lambda _: self.toggle())
-        gui.add_command("Step one frame", hotkey="arrowright").on_trigger(lambda _: send(StepFrame()))
-        gui.add_command("Step one frame back", hotkey="arrowleft").on_trigger(lambda _: send(StepFrame(-1)))
+        # Their keys are in `viser_adapter.js`: the list of commands would show them as "arrowright".
+        gui.add_command("Step one frame (→)").on_trigger(lambda _: send(StepFrame()))
+        gui.add_command("Step one frame back (←)").on_trigger(lambda _: send(StepFrame(-1)))
 
     def toggle(self) -> None:
         self._send(Pause() if self._snapshot().transport.playing else Play())
@@ -95,6 +96,7 @@ def state(snapshot: Snapshot) -> dict[str, Any]:
         "last": max(recording.frames - 1, 1) if recording else 1,
         "speed": speed_name(transport.speed),
         "words": where(snapshot),
+        "done": done(snapshot.progress),
     }
 
 
@@ -109,8 +111,10 @@ def speed_name(factor: float) -> str:
 def where(snapshot: Snapshot) -> str:
     """Frame, seconds into the recording, and the stamp in UTC; of a live source, why there is no way back."""
     recording, transport = snapshot.recording, snapshot.transport
+    if snapshot.progress is not None:
+        return panel("quiet", working(snapshot.progress))
     if recording is None:
-        return panel("quiet", "No recording is open." if snapshot.progress is None else working(snapshot.progress))
+        return panel("quiet", "No recording is open.")
     frame, stamp, rate = (
         f"{transport.frame:,}",
         _utc(transport.stamp_ns),
@@ -123,16 +127,23 @@ def where(snapshot: Snapshot) -> str:
         dropped = f"{transport.dropped:,} scans dropped" if transport.dropped else "no scan dropped"
         return panel("where", frame, ", live", "", dropped, stamp, rate, forward)
     if transport.frame < 0:
-        return panel("quiet", f"{recording.frames:,} frames, {recording.duration_s:.1f} s")
+        return panel(
+            "quiet", f"{recording.frames:,} frames, {recording.duration_s:.1f} s. Press Play, or → for one frame."
+        )
     seconds = number((transport.stamp_ns - recording.start_ns) * 1e-9)
-    of, duration = f" of {recording.frames - 1:,}", f" of {number(recording.duration_s, 1)} s"
+    of, duration = f" of 0–{recording.frames - 1:,}", f" of {number(recording.duration_s, 1)} s"
     return panel("where", frame, of, seconds, duration, stamp, rate)
+
+
+def done(progress: Progress | None) -> float:
+    """The share that is done of long work; 0 while that is unknown, or without such work."""
+    known = progress is not None and math.isfinite(progress.fraction)
+    return min(max(progress.fraction, 0.0), 1.0) if progress is not None and known else 0.0
 
 
 def working(progress: Progress) -> str:
     """What takes long, and how far it is."""
-    known = math.isfinite(progress.fraction)
-    return progress.title + (f" · {100 * min(max(progress.fraction, 0.0), 1.0):.0f} %" if known else " …")
+    return progress.title + (f" · {100 * done(progress):.0f} %" if math.isfinite(progress.fraction) else " …")
 
 
 def _utc(stamp_ns: int) -> str:

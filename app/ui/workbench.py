@@ -121,7 +121,7 @@ class Workbench:
                 self._brush = BrushPanel(page, taken=lambda: self._measure.picking)
         with tabs.add_tab("A/B", viser.Icon.GIT_COMPARE):
             self._compare = ComparePanel(page, forks, self._sides)
-        with tabs.add_tab("Tune", viser.Icon.TARGET_ARROW):
+        with tabs.add_tab("Auto-tune", viser.Icon.TARGET_ARROW):
             self._tune = TunePanel(page, forks, self._sides, results / "tuning")
         with tabs.add_tab("View", viser.Icon.EYE):
             self._appearance = AppearancePanel(gui, legend, Looks(server))

@@ -10,7 +10,7 @@ from app.server.chunks import MOST_SHOWN
 from app.server.protocol import StepFrame
 from tests.browser.conftest import Bench
 
-TABS = ("Parameters", "Readouts", "Loops", "Study", "A/B", "Tune", "View", "Recording", "Help")
+TABS = ("Parameters", "Readouts", "Loops", "Study", "A/B", "Auto-tune", "View", "Recording", "Help")
 
 CONTROLS = """() => [...document.querySelectorAll(
   'button,input,select,textarea,[role=slider],[role=tab],[data-hs][tabindex],summary,a[href]')].filter((one) => {
@@ -82,7 +82,7 @@ COUNTED = """() => {
 @pytest.fixture(autouse=True, scope="module")
 def _some_map(bench: Bench) -> None:
     bench.engine.send(StepFrame(60))
-    bench.eventually(lambda: bench.page.locator(".hs-when").get_by_text("frame 59 of 399").count() == 1)
+    bench.eventually(lambda: bench.page.locator(".hs-when").get_by_text("frame 59 of 0–399").count() == 1)
 
 
 def open_tab(page: Page, name: str) -> None:

@@ -142,4 +142,4 @@ def test_labels_that_are_loaded_are_marked(painting: Painting) -> None:
 def test_play_is_not_in_the_way_of_the_panel(painting: Painting) -> None:
     painting.engine.send(Play())
     painting.panel.draw(painting.engine.snapshot, View())
-    assert "Tune finds the parameters" in painting.panel._why.content
+    assert "Auto-tune finds the parameters" in painting.panel._why.content

@@ -67,14 +67,13 @@ def test_every_number_has_a_slider_over_its_whole_range(parameters: Parameters) 
         widgets = parameters.widgets(leaf.path)
         sliders = [widget for widget in widgets if isinstance(widget, viser.GuiSliderHandle)]
         assert widgets[0].precision == (0 if isinstance(number, int) else 9), "its box shows what was typed"
+        assert len(sliders) == (3 if isinstance(leaf.default, tuple) else 1)
         if widgets[0] in sliders:
-            assert len(sliders) == (3 if isinstance(leaf.default, tuple) else 1)
             assert {(one.min, one.max, one.step) for one in sliders} == {(leaf.minimum, leaf.maximum, leaf.step)}
         else:
-            assert len(sliders) == 1
             long.add(leaf.path)
     noise = {f"imu.{name}" for name in ("gyro_noise", "accel_noise", "gyro_bias_walk", "accel_bias_walk")}
-    assert long == noise | {"recording.imu_time_offset", "loops.window"}
+    assert long == noise | {"recording.imu_time_offset", "loops.window", "sensor.translation"}
 
 
 def test_a_slider_over_decades_has_round_values_and_a_box_for_all_others(parameters: Parameters) -> None:
@@ -139,7 +138,7 @@ def test_a_snapshot_s_values_are_shown_and_not_sent_back(parameters: Parameters)
     parameters.tick()
     assert parameters.control("ground.alpha").value == 12.0
     assert parameters.control("imu.max_gap").value == 0.3
-    assert [one.value for one in parameters.widgets("sensor.translation")] == [1, 2, 3]
+    assert [one.value for one in parameters.widgets("sensor.translation")[::2]] == [1, 2, 3]
     assert parameters.sent == []
 
 

@@ -100,7 +100,7 @@ def test_speeds_are_sent_and_shown(transport: Transporting, name: str) -> None:
 def test_the_stamp_is_exact_to_the_millisecond(engine: FakeEngine) -> None:
     engine.send(StepFrame(12))
     text = where(engine.snapshot)
-    assert "frame <b>11</b> of 399" in text and "<b>1.10</b> of 40.0 s" in text
+    assert "frame <b>11</b> of 0–399" in text and "<b>1.10</b> of 40.0 s" in text
     assert "2023-11-14 22:13:21.100 UTC" in text
     assert "frames/s" not in text, "nothing plays"
 

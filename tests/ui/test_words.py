@@ -29,6 +29,7 @@ from app.ui.html import BAD, GOOD, Tile, panel, source
 from app.ui.loops.words import KINDS, LoopKind
 from app.ui.readouts import HISTORY, plotted, stacked_stages
 from app.ui.status import findings_html, log_html, settled, title, verdicts
+from app.ui.transport import where
 from tests.ui.fake_engine import FINDINGS, FakeEngine
 
 
@@ -72,8 +73,8 @@ def test_every_tile_is_explained_in_a_sentence() -> None:
 
 def test_a_live_run_waits_for_its_first_scan_and_asks_for_no_button() -> None:
     recorded = Snapshot(recording=FakeEngine(frames=2).snapshot.recording)
-    assert "Press <b>Play</b>" in title(recorded)
-    live = title(replace(recorded, live=LiveState(), transport=Transport(playing=True)))
+    assert "Press Play" in where(recorded)
+    live = where(replace(recorded, live=LiveState(), transport=Transport(playing=True)))
     assert "first scan" in live and "Press" not in live
 
 

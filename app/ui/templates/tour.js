@@ -1,13 +1,13 @@
 // One minute through the page on the first visit: what is spoken of is outlined, Esc or Skip ends it.
 if (!window.hemislamTour) {
-  const STEPS = [
+  const TAB = '[role=tab][aria-selected=true]', STEPS = [
     ['.hs-steps', '', 'Play, or step', 'Space plays and pauses; ← and → step one frame. When you go back, the map and your edits are kept.'],
     ['.hs-track', '', 'Go anywhere', 'Drag the track. Its marks show loops, notes and trouble; open Diagnostics to see what the trouble was.'],
-    ['[role=slider][aria-valuenow]:not(input)', 'Parameters', 'Tune the ground', 'Move a slider: the map is dimmed and this scan is labelled '
+    ['[role=tabpanel] .mantine-Flex-root:has([role=slider])', 'Parameters', 'Tune the ground', 'Move a slider: the map is dimmed and this scan is labelled '
       + 'again at once. Teal is ground, amber are the seeds its plane is fitted to. Try σ first.'],
-    ['', 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click its green knob or its row, then '
-      + 'Reject it and Apply: a sentence says what moved, with Undo below.'],
-    ['', 'Help', 'That is all', 'Every number says on hover what it is. This tour and all keys are under Help.'],
+    [TAB, 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click its green knob or its row to see '
+      + 'what it rests on, then Reject it: the violet line is the path before, and Undo is below.'],
+    [TAB, 'Help', 'That is all', 'Every number says on hover what it is. This tour and all keys are under Help.'],
   ];
   const seen = () => { try { localStorage.setItem('hemislam-tour', 'seen'); } catch { /* private window */ } };
   window.hemislamTour = () => {

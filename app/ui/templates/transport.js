@@ -3,8 +3,8 @@
 if (!this.isConnected) return; // a copy that the page has dropped already
 const dock = this.parentElement, mover = dock.closest('[data-hs-to]'), home = mover.parentElement;
 const shell = dock.querySelector('.hs-tl'), canvas = shell.querySelector('canvas'), pen = canvas.getContext('2d');
-const bar = dock.querySelector('.hs-transport'), [play, fold] = ['.hs-play', '.hs-fold'].map((c) => bar.querySelector(c));
-const slider = bar.querySelector('input'), speed = bar.querySelector('select'), when = bar.querySelector('.hs-when');
+const bar = dock.querySelector('.hs-transport'), [play, fold, speed] = ['.hs-play', '.hs-fold', '.hs-speed'].map((c) => bar.querySelector(c));
+const slider = bar.querySelector('input'), when = bar.querySelector('.hs-when');
 const marks = bar.querySelector('.hs-track canvas'), ink = marks.getContext('2d');
 mover.home = home;
 window.hemislamDock = mover;
@@ -172,17 +172,19 @@ const show = () => {
   slider.max = now.last;
   if (!held) slider.value = now.frame;
   slider.setAttribute('aria-valuenow', slider.value);
-  if (speed !== document.activeElement) speed.value = now.speed;
+  speed.firstElementChild.textContent = now.speed;
+  bar.style.setProperty('--hs-done', `${100 * now.done}%`);
   play.querySelector('path').setAttribute('d', now.playing ? PAUSE : PLAY);
   play.setAttribute('aria-label', now.playing ? 'Pause' : 'Play');
-  for (const part of bar.querySelectorAll('button,input,select')) part.disabled = !now.open;
+  for (const part of bar.querySelectorAll('button,input')) part.disabled = !now.open;
   fold.disabled = false;
   for (const part of bar.querySelectorAll('.hs-past')) part.hidden = now.live;
 };
 const dragged = (event) => { touched = performance.now(); ask(Number(slider.value), event.type === 'change'); };
 slider.oninput = slider.onchange = dragged;
 slider.onpointerup = () => slider.blur(); // so that space plays again
-speed.onchange = () => { tell('speed ' + speed.value); speed.blur(); };
+speed.addEventListener('click', (event) => { if (event.target.dataset.hs) speed.open = false; });
+addEventListener('pointerdown', (event) => { if (!speed.contains(event.target)) speed.open = false; });
 const unfold = (open) => {
   shell.hidden = !open;
   fold.setAttribute('aria-expanded', open);

@@ -61,12 +61,23 @@ if (!window.hemislamSay) {
     if (sideways(event) && event.target.closest('[role=slider],[role=tab]')) event.stopPropagation();
   });
   document.documentElement.addEventListener('keydown', (event) => {
-    if (sideways(event)) event.stopPropagation();
+    if (!sideways(event)) return;
+    event.stopPropagation();
+    if (event.ctrlKey || event.altKey || event.metaKey || event.target.closest('input,textarea,select')) return;
+    document.querySelector(`body > * .hs-dock [data-hs="step ${event.key === 'ArrowRight' ? 1 : -1}"]`)?.click();
   });
   // Space plays and pauses. Firefox would also click the focused button again when the key comes up.
   document.documentElement.addEventListener('keyup', (event) => {
     if (event.key === ' ' && event.target.closest('button')) event.preventDefault();
   });
+
+  // A slider that is let go ends one step of undo, once its last value has been sent.
+  document.addEventListener('pointerdown', (event) => {
+    if (!event.target.closest('.mantine-Slider-root')) return;
+    addEventListener('pointerup', () => setTimeout(() => {
+      for (const target of document.querySelectorAll('.hs-released')) window.hemislamSay({type: 'click', target});
+    }, 500), {once: true, capture: true});
+  }, true);
 
   // A tooltip stands beside its panel, over the scene: above its control it would hide the one before.
   const beside = (tip) => {
