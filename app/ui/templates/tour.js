@@ -1,13 +1,13 @@
 // One minute through the page on the first visit: what is spoken of is outlined, Esc or Skip ends it.
 if (!window.hemislamTour) {
-  const TAB = '[role=tab][aria-selected=true]', STEPS = [
+  const STEPS = [
     ['.hs-steps', '', 'Play, or step', 'Space plays and pauses; ← and → step one frame. When you go back, the map and your edits are kept.'],
     ['.hs-track', '', 'Go anywhere', 'Drag the track. Its marks show loops, notes and trouble; open Diagnostics to see what the trouble was.'],
-    ['[role=tabpanel] .mantine-Flex-root:has([role=slider])', 'Parameters', 'Tune the ground', 'Move a slider: the map is dimmed and this scan is labelled '
-      + 'again at once. Teal is ground, amber are the seeds its plane is fitted to. Try σ first.'],
-    [TAB, 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click its green knob or its row to see '
+    ['.mantine-Slider-root', 'Parameters', 'Tune the ground', 'Move a slider: the map is dimmed and this scan is labelled '
+      + 'again at once. Teal is ground, amber are the seeds its plane is fitted to. Try σ first.', 2],
+    ['', 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click its green knob or its row to see '
       + 'what it rests on, then Reject it: the violet line is the path before, and Undo is below.'],
-    [TAB, 'Help', 'That is all', 'Every number says on hover what it is. This tour and all keys are under Help.'],
+    ['', 'Help', 'That is all', 'Every number says on hover what it is. This tour and all keys are under Help.'],
   ];
   const seen = () => { try { localStorage.setItem('hemislam-tour', 'seen'); } catch { /* private window */ } };
   window.hemislamTour = () => {
@@ -17,10 +17,10 @@ if (!window.hemislamTour) {
     const end = () => { outlined?.classList.remove('hs-outlined'); box.remove(); seen(); window.removeEventListener('keydown', key); };
     const key = (event) => { if (event.key === 'Escape') end(); };
     const show = () => {
-      const [target, tab, title, text] = STEPS[at];
-      if (tab) window.hemislamOpenTab(tab);
+      const [target, tab, title, text, place = 0] = STEPS[at];
+      const opened = tab && window.hemislamOpenTab(tab);
       outlined?.classList.remove('hs-outlined');
-      outlined = target ? document.querySelector(target) : null;
+      outlined = target ? document.querySelectorAll(target)[place] : opened;
       outlined?.classList.add('hs-outlined');
       box.innerHTML = `<b>${title}</b><p>${text}</p><div class="hs-row"><span class="hs-note">${at + 1} of ${STEPS.length}</span>`
         + '<span><button class="hs-button">Skip</button><button class="hs-button hs-next"></button></span></div>';

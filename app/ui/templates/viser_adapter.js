@@ -52,6 +52,7 @@ if (!window.hemislamSay) {
     if (unfolded) setTimeout(() => { for (const one of document.querySelectorAll(unfolded + ' details')) one.open = true; }, 300);
     sheet.hsSheet = 'high';
     sheet.hsPanel = 'open';
+    return tab;
   };
 
   // Keys. On its way up an event passes widgets (the page's root), the body, viser's hotkeys (the html element) and
