@@ -184,7 +184,7 @@ const dragged = (event) => { touched = performance.now(); ask(Number(slider.valu
 slider.oninput = slider.onchange = dragged;
 slider.onpointerup = () => slider.blur(); // so that space plays again
 speed.addEventListener('click', (event) => { if (event.target.dataset.hs) speed.open = false; });
-addEventListener('pointerdown', (event) => { if (!speed.contains(event.target)) speed.open = false; });
+window.addEventListener('pointerdown', (event) => { if (!speed.contains(event.target)) speed.open = false; });
 const unfold = (open) => {
   shell.hidden = !open;
   fold.setAttribute('aria-expanded', open);

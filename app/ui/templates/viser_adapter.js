@@ -75,7 +75,7 @@ if (!window.hemislamSay) {
   // A slider that is let go ends one step of undo, once its last value has been sent.
   document.addEventListener('pointerdown', (event) => {
     if (!event.target.closest('.mantine-Slider-root')) return;
-    addEventListener('pointerup', () => setTimeout(() => {
+    window.addEventListener('pointerup', () => setTimeout(() => {
       for (const target of document.querySelectorAll('.hs-released')) window.hemislamSay({type: 'click', target});
     }, 500), {once: true, capture: true});
   }, true);
