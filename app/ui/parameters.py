@@ -216,7 +216,8 @@ class ParameterPanel:
             self._sections.setdefault(group, {})[leaf.name] = leaf
         self._names = {leaf.path: spoken(leaf) for leaf in leaves()}
         self._history = ParameterHistory()
-        self._bridge = Bridge(gui, "sliders", lambda *_: self._history.settle())
+        self._released = False  # whether a slider was let go, and its last value may be on its way
+        self._bridge = Bridge(gui, "sliders", lambda *_: setattr(self, "_released", True))
         gui.add_html(self._bridge.live(panel("released")))
         self._opened = params
         self._recording: Path | None = None
@@ -259,6 +260,10 @@ class ParameterPanel:
             for widget in self._widgets[path]:
                 widget.show(snapshot.params.value(path))
         self._history.see(snapshot.params, now)
+        edits = list(self._edits.items())
+        if self._released and all(snapshot.params.value(path) == edit.value for path, edit in edits):
+            self._released = False
+            self._history.settle()
         for button, verb, by in ((self._undo, "Undo", -1), (self._redo, "Redo", 1)):
             names = self._history.change(by)
             button.disabled = not names

@@ -15,7 +15,8 @@ TABS = ("Parameters", "Readouts", "Loops", "Study", "A/B", "Auto-tune", "View", 
 CONTROLS = """() => [...document.querySelectorAll(
   'button,input,select,textarea,[role=slider],[role=tab],[data-hs][tabindex],summary,a[href]')].filter((one) => {
   const box = one.getBoundingClientRect(), style = getComputedStyle(one);
-  return box.width > 0 && box.height > 0 && style.visibility !== 'hidden' && style.pointerEvents !== 'none'
+  return box.width > 0 && box.height > 0 && one.checkVisibility() && style.visibility !== 'hidden'
+    && style.pointerEvents !== 'none'
     && !one.disabled && one.type !== 'hidden' && !one.closest('.mantine-Notification-root,[aria-hidden=true]')
     && !(one.tabIndex < 0 && one.closest('[role=tablist],.mantine-NumberInput-controls,[role=radiogroup]'))
     && !(one.tabIndex < 0 && one.parentElement.closest('button,label,[role=slider]'));

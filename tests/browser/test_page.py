@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, expect
 from app.export.box import Box
 from app.mapping.kept import Clip
 from app.server.keeping import KeepMeasure, SetClip
-from app.server.protocol import CompareWith, OpenRecording, Pause, Play, Seek, SetParams, StepFrame
+from app.server.protocol import CompareWith, OpenRecording, Pause, Play, Seek, SetParams, SetSpeed, StepFrame
 from app.ui.clip_maths import FACES, handle
 from tests.browser.conftest import Bench, new_page
 
@@ -101,6 +101,34 @@ def test_a_focused_slider_takes_the_arrow_for_itself_and_the_scene_is_relabelled
     bench.eventually(lambda: seed_pixels(bench) < many / 2)
     bench.engine.send(SetParams({"ground.alpha": 40.0, "ground.scan_lines": 8}))
     expect(slider).to_have_attribute("aria-valuenow", "40")
+
+
+def test_two_drags_of_a_slider_are_two_steps_of_undo(bench: Bench) -> None:
+    page, slider = bench.page, bench.page.locator(SLIDERS).nth(ALPHA)
+    values = [bench.engine.snapshot.params.ground.alpha]
+    for _ in range(2):
+        box = slider.bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + 15, y, steps=3)
+        page.mouse.up()
+        bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha > values[-1] + 1)
+        page.wait_for_timeout(2000)
+        values.append(bench.engine.snapshot.params.ground.alpha)
+    for value in (values[1], values[0]):
+        page.get_by_role("button", name="Undo α seed angle").click()
+        bench.eventually(lambda value=value: bench.engine.snapshot.params.ground.alpha == value)
+
+
+def test_the_speed_is_chosen_from_a_list_by_mouse(bench: Bench) -> None:
+    page = bench.page
+    page.locator(".hs-speed summary").click()
+    page.get_by_role("button", name="5×", exact=True).click()
+    bench.eventually(lambda: bench.engine.sent[-1] == SetSpeed(5.0))
+    expect(page.locator(".hs-speed summary")).to_have_text("5×")
+    expect(page.get_by_role("button", name="5×", exact=True)).to_be_hidden()
 
 
 def test_dragging_the_time_slider_seeks(bench: Bench) -> None:
@@ -256,6 +284,7 @@ def test_the_first_visit_is_shown_around_once(bench: Bench, chromium: Browser) -
         tour = page.get_by_role("dialog", name="Tour")
         for title in ("Play, or step", "Go anywhere", "Tune the ground", "Judge a loop", "That is all"):
             expect(tour.get_by_text(title)).to_be_visible()
+            expect(page.locator(".hs-outlined")).to_have_count(1)
             tour.locator(".hs-next").click()
         expect(tour).to_have_count(0)
         page.reload()

@@ -182,7 +182,7 @@ def _cost_change(before: tuple[FactorResidual, ...], after: tuple[FactorResidual
 
 def _worst(residuals: tuple[FactorResidual, ...]) -> str:
     """The factor with the largest residual."""
-    return next((f"{number(f.sigmas, 2)} σ ({_what(f)})" for f in _largest_first(residuals)), "none")
+    return next((f"{number(f.sigmas, 1)} σ ({_what(f)})" for f in _largest_first(residuals)), "none")
 
 
 def _largest_first(residuals: tuple[FactorResidual, ...]) -> list[FactorResidual]:

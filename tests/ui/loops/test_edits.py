@@ -30,7 +30,7 @@ def test_a_chosen_loop_shows_what_the_other_verdict_would_move(page: Page) -> No
     assert f"{100 * moved.max():.1f} cm</b> (keyframe {moved.argmax()})" in words
     for residuals in (now.loops.residuals, tried[1].residuals):
         worst = max(residuals, key=lambda factor: factor.sigmas)
-        assert f"{worst.sigmas:.2f} σ (loop {worst.pair[0]}–{worst.pair[1]})" in words
+        assert f"{worst.sigmas:.1f} σ (loop {worst.pair[0]}–{worst.pair[1]})" in words
     (_, name), *_ = page.loops._proposal.ghost.key
     assert name.startswith("path if you reject 12–89")
     assert len(page.node("/map/ghost/path").points) == len(now.keyframe_poses) - 1
