@@ -51,7 +51,10 @@ def georeference(
     height: Annotated[
         str,
         typer.Option(
-            "--height", metavar="TEXT", help="What the heights in the file are measured from; written into the results."
+            "--height",
+            metavar="TEXT",
+            help="What the heights in the file are above: `ellipsoidal`, EPSG:CODE of a system of heights, or other"
+            " words; written into the results.",
         ),
     ] = "",
 ) -> None:

@@ -315,8 +315,9 @@ def _fetch(address: str, job: Job) -> None:
         system.get_file(path, str(part))  # also from servers that give files as a whole only
     except Exception as error:  # each kind of address has its own
         part.unlink(missing_ok=True)
-        # fsspec says "not found" where, say, a certificate is not trusted
-        why = error.__cause__ or ("it is not there" if isinstance(error, FileNotFoundError) else error)
+        # fsspec says "not found" where, say, a certificate is not trusted, and what to install for gs:// or s3://
+        cause = None if isinstance(error, ImportError) else error.__cause__
+        why = cause or ("it is not there" if isinstance(error, FileNotFoundError) else error)
         raise HemislamError(f"The worker cannot fetch {address}: {str(why) or type(why).__name__}") from None
     _settle(job)
 

@@ -35,7 +35,7 @@ class _Writer(pye57.E57):  # type: ignore[misc] # it has no types
     """pye57 leaves the coordinate system empty, and no node can be set twice."""
 
     def __init__(self, path: str, where: GeoReference | None) -> None:
-        self._wkt = "" if where is None else where.wkt("WKT1_GDAL")
+        self._wkt = "" if where is None else where.wkt1()
         super().__init__(path, "w")
 
     def close(self) -> None:

@@ -71,7 +71,7 @@ def _header(where: GeoReference | None) -> laspy.LasHeader:
     header.global_encoding.wkt = True
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     if where is not None:
-        header.vlrs.append(WktCoordinateSystemVlr(where.wkt("WKT1_GDAL")))
+        header.vlrs.append(WktCoordinateSystemVlr(where.wkt1()))
     return header
 
 

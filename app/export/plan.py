@@ -76,16 +76,17 @@ def write_dxf(path: Path, results: "Results") -> None:
 def write_terrain(path: Path, results: "Results") -> None:
     """Mean height of the ground in each cell, m; nan where none was seen."""
     raster = results.raster(on_earth=True, cell=COARSE_CELL)
-    _write_tiff(path, results, raster, raster.height)
+    above = "" if results.where is None else f", {results.where.height}"
+    _write_tiff(path, results, raster, raster.height, f"height of the ground, m{above}")
 
 
 def write_density(path: Path, results: "Results") -> None:
     """Points per square metre."""
     raster = results.raster(on_earth=True, cell=COARSE_CELL)
-    _write_tiff(path, results, raster, (raster.points / raster.cell**2).astype(np.float32))
+    _write_tiff(path, results, raster, (raster.points / raster.cell**2).astype(np.float32), "points per square metre")
 
 
-def _write_tiff(path: Path, results: "Results", raster: Raster, values: npt.NDArray[np.float32]) -> None:
+def _write_tiff(path: Path, results: "Results", raster: Raster, values: npt.NDArray[np.float32], what: str) -> None:
     rows, columns = values.shape
     memory = MemoryFile()  # a disk that fails is no error to GDAL
     with memory.open(
@@ -97,8 +98,9 @@ def _write_tiff(path: Path, results: "Results", raster: Raster, values: npt.NDAr
         nodata=float("nan"),
         compress="deflate",
         transform=_transform(raster),
-        crs=None if results.where is None else results.where.wkt(),
+        crs=None if results.where is None else results.where.raster_crs,
     ) as file:
+        file.set_band_description(1, what)
         file.write(np.flipud(values), 1)
     path.write_bytes(memory.read())
 

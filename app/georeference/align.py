@@ -55,7 +55,7 @@ class Alignment:
         distances: (n,) lengths of the residuals in standard deviations. used: (n,) whether a fix counts.
         offset_s: how much later the fixes are stamped than they were measured. lever_arm: m, IMU frame.
         offset_sigma_s, yaw_sigma, lever_sigma: their standard deviations, s, rad and m; nan where a value was given.
-            They count noise of the fixes and drift of the map. offset_drift_s: the part of the first by drift.
+            They count noise of the fixes and drift of the map.
         notes: what a user should know, in sentences.
     """
 
@@ -67,7 +67,6 @@ class Alignment:
     used: Mask
     offset_s: float = 0.0
     offset_sigma_s: float = float("nan")
-    offset_drift_s: float = 0.0
     yaw_sigma: float = float("nan")
     lever_arm: Vector = (0.0, 0.0, 0.0)
     lever_sigma: float = float("nan")
@@ -165,7 +164,6 @@ def align(
         solved.used,
         solved.offset + (offset_s or 0.0),
         solved.offset_sigma,
-        solved.offset_drift,
         solved.yaw_sigma,
         (float(solved.lever[0]), float(solved.lever[1]), float(solved.lever[2])),
         solved.lever_sigma,
@@ -191,7 +189,6 @@ class _Solved:
     distances: F64
     used: Mask
     offset_sigma: float
-    offset_drift: float
     yaw_sigma: float
     lever_sigma: float
 
@@ -238,7 +235,6 @@ class _Problem:
             np.linalg.norm(errors, axis=1),
             used,
             float(sigmas[6]) if late else float("nan"),
-            0.0,
             float(sigmas[0]),
             float(sigmas[-3:].max()) if free else float("nan"),
         )
@@ -253,7 +249,6 @@ class _Problem:
         return replace(
             solved,
             offset_sigma=math.hypot(solved.offset_sigma, offset_drift),
-            offset_drift=offset_drift,
             yaw_sigma=math.hypot(solved.yaw_sigma, drift[0]),
             lever_sigma=math.hypot(solved.lever_sigma, drift[-3:].max()),
         )

@@ -3,19 +3,19 @@
     g = T_map_imu @ (T_keyframe_then @ lever)        the antenna, carried to the time of the fix by odometry
 
 Fixes that do not fit even a bent map are rejected, unless the user counts them. The fixes also determine how stiff the
-graph is: those of some stretches must predict those of the others.
+graph is: those of some stretches must predict those of the others. The clocks' offset is estimated with the bent map,
+unless it was given.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy import optimize
 
-from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, aligned_robustly, overrides_of
+from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, overrides_of
 from app.georeference.fixes import Fixes
-from app.georeference.ground import Ground
 from app.georeference.path import PathOverTime
 from app.slam import lie
 from app.slam.arrays import F64, I64, Mask
@@ -30,11 +30,10 @@ STIFFNESS = (1.0, 3e-2, 1e-3, 3e-5)
 """Factors of the graph's covariances that are tried: a good sensor drifts far less than the graph expects."""
 STRETCH_S = 3.0
 """Fixes of every other stretch predict those between them."""
-PART_S, FEWEST_IN_PART = 20.0, 5
-MOST_BY_DRIFT = 0.9
-"""With more of its uncertainty by drift, the clocks' offset is better found in stretches, for all their noise."""
+STEP_S, EXACT_S, FARTHEST_S = 2e-3, 1e-5, 2.0
+"""Of the search for the clocks' offset: its first step, its end, and how far from that of the alignment it may end."""
 
-_minimize: Any = optimize.minimize_scalar
+_root: Any = optimize.root_scalar
 
 
 def bend(
@@ -58,111 +57,132 @@ def bend(
     Raises:
         HemislamError: the solver fails.
     """
-    before = PathOverTime(trajectory).poses((keyframe_stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
-    if found.offset_drift_s > MOST_BY_DRIFT * found.offset_sigma_s:
-        offset_s = offset_by_parts(trajectory, fixes, found)
-        note = f"Clock offset, estimated in stretches of the trajectory: {offset_s * 1e3:.1f} ms."
-        found = replace(
-            found, offset_s=offset_s, offset_sigma_s=float("nan"), offset_drift_s=0.0, notes=(*found.notes, note)
-        )
-    priors = _priors(trajectory, keyframe_stamps_ns, before, fixes, found)
+    path = PathOverTime(trajectory)
+    before = path.poses(np.asarray((keyframe_stamps_ns - path.start_ns) * 1e-9, np.float64))
+    problem = _Problem(path, keyframe_stamps_ns, before, graph, fixes, found)
     word = overrides_of(overridden, found.names)
     held, barred = np.asarray(word == 1.0), np.asarray(word == 0.0)
-    chosen = [replace(prior, robust=True) for prior, no in zip(priors, barred, strict=True) if not no]
-    stretches = [int(name) - 1 for name, no in zip(found.names, barred, strict=True) if not no]
-    halves = np.asarray((fixes.stamps_ns[stretches] - fixes.stamps_ns[stretches[0]]) * 1e-9 // STRETCH_S % 2 == 0)
     try:
-        graph = _stiffened(graph, chosen, halves, before)
-        poses = optimise(before[0], [*graph, *chosen], before, free=True)
-        used: Mask = ~barred
+        problem = problem.stiffened(~barred)
+        offset_s, sigma_s, used = found.offset_s, found.offset_sigma_s, ~barred
+        poses = problem.solved(offset_s, before, used, robust=True)
         for _ in range(MOST_ROUNDS):
-            off, distances = _off(priors, poses)
+            _, distances = _off(problem.priors(offset_s), poses)
             scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
-            agree = ((distances < MOST_SIGMAS * scale) | held) & ~barred
-            poses = optimise(before[0], [*graph, *(priors[i] for i in np.flatnonzero(agree))], poses, free=True)
+            agree: Mask = ((distances < MOST_SIGMAS * scale) | held) & ~barred
+            if np.isfinite(found.offset_sigma_s):
+                offset_s, sigma_s = problem.offset(offset_s, poses, agree)
+            poses = problem.solved(offset_s, poses, agree)
             if (agree == used).all():
                 break
             used = agree
     except ArithmeticError as error:
         raise HemislamError(f"The graph cannot be solved with these fixes ({error}).") from error
-    off, distances = _off(priors, poses)
+    off, distances = _off(problem.priors(offset_s), poses)
     moved = float(np.linalg.norm(poses[:, :3, 3] - before[:, :3, 3], axis=1).max())
-    notes = (*found.notes, f"The fixes bend the map: keyframes move by up to {moved:.3f} m.")
-    turned = off @ np.array(found.reference.rotation).T
     return poses @ lie.inverse(before), replace(
-        found, residuals=turned, distances=distances, used=used, notes=notes, yaw_sigma=float("nan")
+        found,
+        residuals=off @ np.array(found.reference.rotation).T,
+        distances=distances,
+        used=used,
+        offset_s=offset_s,
+        offset_sigma_s=sigma_s,
+        yaw_sigma=float("nan"),
+        notes=(*found.notes, f"The fixes bend the map: keyframes move by up to {moved:.3f} m."),
     )
 
 
-def _stiffened(graph: Sequence[Factor], priors: Sequence[PositionPrior], half: Mask, before: F64) -> list[Factor]:
-    """The graph with the smallest factor on its covariances with which fixes predict one another best.
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """A graph and the fixes that bend it.
 
-    Args:
-        half: (n,) which of the priors predict the others, and the other way round. before: (k, 4, 4) to start from.
+    Attributes:
+        path: the trajectory before. stamps_ns: (k,) of the keyframes. keyframes: (k, 4, 4) T_map_imu before.
+        found: the alignment, whose n fixes are meant wherever (n,) stands.
     """
-    best, cap, kept = np.inf, 0.0, list(graph)
-    for factor in STIFFNESS if min(half.sum(), (~half).sum()) >= FEWEST else ():
-        stiff = [replace(one, covariance=one.covariance * factor) for one in graph]
-        missed = []
-        for known in (half, ~half):
-            poses = optimise(
-                before[0], [*stiff, *(priors[i] for i in np.flatnonzero(known).tolist())], before, free=True
-            )
-            missed.append(_off([priors[i] for i in np.flatnonzero(~known).tolist()], poses)[1])
-        distances = np.concatenate(missed)
-        cap = cap or MOST_SIGMAS * max(1.0, float(np.median(distances)) / MEDIAN_SIGMAS)
-        score = float(np.minimum(distances, cap) @ np.minimum(distances, cap))
-        if score > best:
-            break
-        best, kept = score, stiff
-    return kept
 
+    path: PathOverTime
+    stamps_ns: I64
+    keyframes: F64
+    graph: Sequence[Factor]
+    fixes: Fixes
+    found: Alignment
 
-def offset_by_parts(trajectory: Trajectory, fixes: Fixes, found: Alignment) -> float:
-    """The clocks' offset (s) near that of an alignment, by stretches of PART_S each aligned separately.
+    def priors(self, offset_s: float) -> list[PositionPrior]:
+        """(n,) if the fixes are stamped late by this; each on the keyframe nearest in time by the alignment."""
+        found, rows = self.found, self.rows
+        aligned_ns = self.fixes.stamps_ns[rows] - round(found.offset_s * 1e9)
+        after = np.searchsorted(self.stamps_ns, aligned_ns).clip(max=len(self.stamps_ns) - 1)
+        before = np.maximum(after - 1, 0)
+        nearer = np.abs(self.stamps_ns[before] - aligned_ns) <= np.abs(self.stamps_ns[after] - aligned_ns)
+        nearest = np.where(nearer, before, after)  # the same for every offset: a jump between two has no slope
+        stamps_ns = self.fixes.stamps_ns[rows] - round(offset_s * 1e9)
+        then = self.path.poses(np.asarray((stamps_ns - self.path.start_ns) * 1e-9, np.float64))
+        arms = (lie.inverse(self.keyframes[nearest]) @ then @ np.array([*found.lever_arm, 1.0]))[:, :3]
+        places = found.reference.from_crs(found.grid)
+        scatter = np.linalg.norm(found.residuals, axis=1) / np.maximum(found.distances, 1e-9)
+        sigmas = np.where(np.isfinite(self.fixes.sigmas[rows]), self.fixes.sigmas[rows], scatter[:, None])
+        R = np.array(found.reference.rotation)
+        return [
+            PositionPrior(KeyframeId(0, int(keyframe)), place, R.T @ np.diag(sigma**2) @ R, arm)
+            for keyframe, place, sigma, arm in zip(nearest, places, sigmas, arms, strict=True)
+        ]
 
-    Drift over the whole walk looks like an offset; within a stretch there is little of it, but more noise.
-    """
-    path, rows = PathOverTime(trajectory), np.array([int(name) - 1 for name in found.names])
-    seconds: F64 = (fixes.stamps_ns[rows] - path.start_ns).astype(np.float64) * 1e-9
-    places = Ground.in_grid(found.grid, found.reference.crs).places
-    arm, R = np.array(found.lever_arm), np.array(found.reference.rotation)
-    count = max(1, round(float(seconds[-1] - seconds[0]) / PART_S))
-    ends = np.searchsorted(seconds, np.linspace(seconds[0], seconds[-1], count + 1)[1:-1])
-    parts = [part for part in np.split(np.arange(len(rows)), ends) if len(part) >= FEWEST_IN_PART]
-    if not parts:
-        return found.offset_s
+    @property
+    def rows(self) -> I64:
+        """(n,) of the fixes."""
+        return np.array([int(name) - 1 for name in self.found.names])
 
-    def cost(offset: float) -> float:
-        aligned = (aligned_robustly(path.antenna(seconds[part] - offset, arm) @ R.T, places[part]) for part in parts)
-        return sum(float(off.sum()) for _, _, off in aligned)
+    def solved(self, offset_s: float, start: F64, which: Mask, *, robust: bool = False) -> F64:
+        """(k, 4, 4) the optimum of the graph and some of the fixes (n,), from `start`."""
+        priors = self.priors(offset_s)
+        chosen = [replace(priors[i], robust=robust) for i in np.flatnonzero(which).tolist()]
+        return optimise(self.keyframes[0], [*self.graph, *chosen], start, free=True)
 
-    around = found.offset_s + np.linspace(-1.0, 1.0, 41)
-    best = float(around[np.argmin([cost(offset) for offset in around.tolist()])])
-    exact = _minimize(cost, bounds=(best - 0.05, best + 0.05), method="bounded", options={"xatol": 1e-5})
-    return float(exact.x)
+    def offset(self, offset_s: float, start: F64, which: Mask) -> tuple[float, float]:
+        """The clocks' offset with which graph and fixes agree best, and its standard deviation, s.
 
+        The map bends for each offset that is tried. So drift, which looks like an offset to an alignment, does not
+        when it is in the graph.
+        """
+        slopes: list[float] = []
 
-def _priors(
-    trajectory: Trajectory, keyframe_stamps_ns: I64, keyframes: F64, fixes: Fixes, found: Alignment
-) -> list[PositionPrior]:
-    """One for each fix of the alignment."""
-    rows = np.array([int(name) - 1 for name in found.names])
-    stamps_ns = fixes.stamps_ns[rows] - round(found.offset_s * 1e9)
-    after = np.searchsorted(keyframe_stamps_ns, stamps_ns).clip(max=len(keyframe_stamps_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    nearer = np.abs(keyframe_stamps_ns[before] - stamps_ns) <= np.abs(keyframe_stamps_ns[after] - stamps_ns)
-    nearest = np.where(nearer, before, after)
-    then = PathOverTime(trajectory).poses((stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
-    arms = (lie.inverse(keyframes[nearest]) @ then @ np.array([*found.lever_arm, 1.0]))[:, :3]
-    places = found.reference.from_crs(found.grid)
-    scatter = np.linalg.norm(found.residuals, axis=1) / np.maximum(found.distances, 1e-9)
-    sigmas = np.where(np.isfinite(fixes.sigmas[rows]), fixes.sigmas[rows], scatter[:, None])
-    R = np.array(found.reference.rotation)
-    return [
-        PositionPrior(KeyframeId(0, int(keyframe)), place, R.T @ np.diag(sigma**2) @ R, arm)
-        for keyframe, place, sigma, arm in zip(nearest, places, sigmas, arms, strict=True)
-    ]
+        def slope(late: float) -> float:
+            """Of half the sum of squares at its optimum over all poses: poses need not be differentiated."""
+            poses, priors = self.solved(late, start, which), self.priors(late)
+            off, _ = _off(priors, poses)
+            (ahead, _), (behind, _) = (_off(self.priors(late + side), poses) for side in (STEP_S / 4, -STEP_S / 4))
+            weights = np.linalg.inv([prior.covariance for prior in priors])
+            pull = np.einsum("ni,nij,nj->n", (ahead - behind) / (STEP_S / 2), weights, off)
+            slopes.append(float(pull[which].sum()))
+            return slopes[-1]
+
+        end = _root(slope, x0=offset_s, x1=offset_s + STEP_S, method="secant", xtol=EXACT_S, maxiter=20)
+        bend = (slopes[1] - slopes[0]) / STEP_S
+        if not end.converged or abs(end.root - self.found.offset_s) > FARTHEST_S or bend <= 0:
+            return offset_s, float("nan")
+        return float(end.root), bend**-0.5
+
+    def stiffened(self, which: Mask) -> "_Problem":
+        """With the smallest factor on the graph's covariances with which the fixes predict one another best."""
+        seconds = (self.fixes.stamps_ns[self.rows] - self.fixes.stamps_ns[self.rows[which][0]]) * 1e-9
+        half = np.asarray(seconds // STRETCH_S % 2 == 0)
+        parts = half & which, ~half & which
+        priors = self.priors(self.found.offset_s)
+        best, cap, kept = np.inf, 0.0, self
+        for factor in STIFFNESS if min(part.sum() for part in parts) >= FEWEST else ():
+            stiff = replace(self, graph=[replace(one, covariance=one.covariance * factor) for one in self.graph])
+            missed = []
+            for known, asked in (parts, parts[::-1]):
+                poses = stiff.solved(self.found.offset_s, self.keyframes, known, robust=True)
+                missed.append(_off(priors, poses)[1][asked])
+            distances = np.concatenate(missed)
+            cap = cap or MOST_SIGMAS * max(1.0, float(np.median(distances)) / MEDIAN_SIGMAS)
+            score = float(np.minimum(distances, cap) @ np.minimum(distances, cap))
+            if score > best:
+                break
+            best, kept = score, stiff
+        return kept
 
 
 def _off(priors: Sequence[PositionPrior], poses: F64) -> tuple[F64, F64]:

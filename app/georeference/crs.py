@@ -35,6 +35,46 @@ def projected(name: str) -> "pyproj.CRS":
     return crs
 
 
+ELLIPSOIDAL = "ellipsoidal"
+"""Heights above the ellipsoid of a grid."""
+_ELLIPSOIDAL_WKT1 = (
+    'VERT_CS["ellipsoidal height",VERT_DATUM["Ellipsoid",2002],UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Up",UP]]'
+)
+
+
+def vertical(height: str) -> "pyproj.CRS | None":
+    """The system of heights named "EPSG:code"; None if they are named in other words.
+
+    Raises:
+        HemislamError: there is none, or it is not one of heights upwards in metres.
+    """
+    if not height.upper().startswith("EPSG:"):
+        return None
+    import pyproj
+
+    try:
+        crs = pyproj.CRS.from_user_input(height)
+    except pyproj.exceptions.CRSError:
+        raise HemislamError(f"{height} names no coordinate system; give one of heights as EPSG:3855.") from None
+    up = crs.is_vertical and crs.axis_info[0].direction == "up" and crs.axis_info[0].unit_conversion_factor == 1.0
+    if not up or crs.is_compound:
+        raise HemislamError(f"{height} ({crs.name}) is not one of heights in metres; give one such as EPSG:3855.")
+    return crs
+
+
+def wkt1(name: str, height: str) -> str:
+    """A grid and its heights as well-known text of the form that LAS and E57 use; without heights if they have no code.
+
+    WKT1 has no grids in 3-D. Heights above the ellipsoid are a vertical system of type 2002 (OGC 01-009), which PROJ
+    and GDAL take for the third axis of the grid.
+    """
+    grid, heights = projected(name), vertical(height)
+    if heights is None and height != ELLIPSOIDAL:
+        return str(grid.to_wkt("WKT1_GDAL"))
+    up = _ELLIPSOIDAL_WKT1 if heights is None else heights.to_wkt("WKT1_GDAL")
+    return f'COMPD_CS["{grid.name} + {height if heights is None else heights.name}",{grid.to_wkt("WKT1_GDAL")},{up}]'
+
+
 @lru_cache(maxsize=32)
 def transformer(source: str, target: str) -> "pyproj.Transformer":
     """From one system to another; longitude before latitude, easting before northing. It leaves heights alone."""

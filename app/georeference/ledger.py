@@ -47,7 +47,7 @@ def in_rows(alignment: "Alignment", what: str) -> list[tuple[str, str]]:
     east, north, height = where.origin
     turned = _plus(np.degrees(alignment.yaw_sigma), "°", 3)
     rows = [
-        ("Coordinate system", f"{where.crs} ({crs.projected(where.crs).name}), heights {where.height}"),
+        ("Coordinate system", f"{where.crs} ({crs.projected(where.crs).name}), heights {_above(where)}"),
         ("Map origin", f"E {east:.3f} m, N {north:.3f} m, H {height:.3f} m"),
         ("Map x axis", f"{_bearing(alignment):.3f}° from grid north{turned}"),
         ("Tilt taken out", f"{np.degrees(np.arccos(min(where.rotation[2][2], 1.0))):.3f}°"),
@@ -79,6 +79,11 @@ def table(alignment: "Alignment", *, only_rejected: bool = False) -> list[str]:
 def _rows(alignment: "Alignment") -> list[tuple[str, list[float], list[float], float, bool]]:
     columns = (alignment.grid, alignment.residuals, alignment.distances, alignment.used)
     return list(zip(alignment.names, *(column.tolist() for column in columns), strict=True))
+
+
+def _above(where: reference.GeoReference) -> str:
+    system = crs.vertical(where.height)
+    return where.height if system is None else f"{where.height} ({system.name})"
 
 
 def _bearing(alignment: "Alignment") -> float:

@@ -13,7 +13,7 @@ from app.slam.errors import HemislamError
 
 FILE, RESIDUALS, PLOT = "georeference.json", "gnss_residuals.csv", "georeference.svg"
 """Beside the results: itself, the fixes that it is made from, and a drawing of both."""
-ELLIPSOIDAL = "ellipsoidal"
+ELLIPSOIDAL = crs.ELLIPSOIDAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,10 @@ class GeoReference:
         origin: easting, northing and height of the map's origin, m.
         rotation: rows of the (3, 3) rotation from the map's axes to east, north and up of the grid.
         scale: metres of the grid per metre on the ground there; a map keeps its true size, a grid does not.
-        height: "ellipsoidal" or, for example, "orthometric (EGM2008)": what heights are above.
+        height: what heights are above: "ellipsoidal", "EPSG:code" of a system of heights, or other words.
+
+    Raises:
+        HemislamError: the code is not one of heights.
     """
 
     crs: str
@@ -33,6 +36,9 @@ class GeoReference:
     rotation: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     scale: float = 1.0
     height: str = ELLIPSOIDAL
+
+    def __post_init__(self) -> None:
+        crs.vertical(self.height)
 
     def to_crs(self, points_map: F64) -> F64:
         """(n, 3) m in the map to (n, 3) float64 easting, northing, height, m."""
@@ -50,9 +56,14 @@ class GeoReference:
         longitude, latitude = crs.transformer(self.crs, crs.WGS84).transform(east, north)
         return np.column_stack([latitude, longitude, height])
 
-    def wkt(self, version: str = "WKT2_2019") -> str:
-        """The coordinate system as well-known text; `version` as pyproj names them, "WKT1_GDAL" for example."""
-        return str(crs.projected(self.crs).to_wkt(version))
+    def wkt1(self) -> str:
+        """Grid and heights as well-known text; without heights if they are named in other words."""
+        return crs.wkt1(self.crs, self.height)
+
+    @property
+    def raster_crs(self) -> str:
+        """The same for a GeoTIFF, by code or text: GDAL writes no grid with heights above the ellipsoid into one."""
+        return crs.projected(self.crs).to_wkt() if self.height == ELLIPSOIDAL else self.wkt1()
 
     @property
     def _scales(self) -> F64:

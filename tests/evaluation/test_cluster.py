@@ -148,6 +148,9 @@ def test_a_worker_fetches_a_recording_from_a_url(
         cluster._found(gone, f"{tmp_path.as_uri()}/elsewhere")
     with pytest.raises(HemislamError, match="Protocol not known"):
         cluster._found(gone, "cloud9://walks")
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    with pytest.raises(HemislamError, match="install gcsfs"):
+        cluster._found(gone, "gs://walks")
     assert not list(tmp_path.glob("**/*.part-*")), "nothing is left half fetched"
 
 

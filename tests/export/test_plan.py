@@ -3,10 +3,12 @@
 Tests app/export/plan.py, app/export/raster.py.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import ezdxf
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 import yaml
@@ -85,11 +87,18 @@ def test_the_floor_plan_shows_walls_but_no_table(tmp_path: Path, where: GeoRefer
     assert darkest(2.2, 1.02) == darkest(-2.2, -1.02) == darkest(2.2, -1.02) == 255, "and not its mirror images"
 
 
+def test_a_geotiff_names_the_system_of_its_heights(tmp_path: Path) -> None:
+    save_results(tmp_path, room(replace(UTM, height="EPSG:3855")), of_formats(["terrain"]))
+    with rasterio.open(tmp_path / "terrain.tif") as terrain:
+        assert pyproj.CRS(terrain.crs.to_wkt()).equals(pyproj.CRS("EPSG:32632+3855"))
+
+
 def test_geotiffs_give_height_and_density_in_the_coordinate_system(tmp_path: Path) -> None:
     save_results(tmp_path, room(UTM), of_formats(["terrain", "density"]))
     place = UTM.to_crs(np.array([[-1.5, -1.0, FLOOR]]))[0]
     with rasterio.open(tmp_path / "terrain.tif") as terrain, rasterio.open(tmp_path / "density.tif") as density:
         assert terrain.crs.to_epsg() == density.crs.to_epsg() == 32632
+        assert terrain.descriptions == ("height of the ground, m, ellipsoidal",)
         assert next(terrain.sample([place[:2]]))[0] == pytest.approx(place[2], abs=1e-3)
         assert next(density.sample([place[:2]]))[0] == pytest.approx(1 / 0.02**2, rel=0.15)
         corner = (terrain.bounds.left + 0.1, terrain.bounds.bottom + 0.1)  # of the raster; the room stands aslant in it

@@ -43,3 +43,19 @@ def test_what_is_no_grid_in_metres_is_refused(name: str, words: str) -> None:
 def test_utm_is_narrower_than_the_ground_in_the_middle_of_a_zone_and_at_height() -> None:
     assert crs.grid_scale("EPSG:32632", 48.0, 9.0, 0.0) == pytest.approx(0.9996, abs=1e-6)
     assert crs.grid_scale("EPSG:32632", 48.0, 9.0, 1000.0) == pytest.approx(0.9996 * (1 - 1.57e-4), abs=1e-6)
+
+
+def test_heights_stand_in_the_text_of_a_coordinate_system() -> None:
+    text = crs.wkt1("EPSG:32632", crs.ELLIPSOIDAL)
+    assert text.startswith("COMPD_CS") and pyproj.CRS(text).equals(pyproj.CRS("EPSG:32632").to_3d())
+    assert pyproj.CRS(crs.wkt1("EPSG:25832", "EPSG:7837")).equals(pyproj.CRS("EPSG:25832+7837"))
+    assert pyproj.CRS(crs.wkt1("EPSG:32632", "above the door sill")).equals(pyproj.CRS("EPSG:32632"))
+
+
+@pytest.mark.parametrize(
+    ("height", "words"),
+    [("EPSG:1", "names no"), ("EPSG:32632", "not one of heights"), ("EPSG:5715", "not one of heights")],
+)
+def test_what_is_no_system_of_heights_is_refused(height: str, words: str) -> None:
+    with pytest.raises(HemislamError, match=words):
+        crs.vertical(height)
