@@ -72,7 +72,7 @@ STRIPS: Final = (
     Strip("inliers", "inliers", "%", 0, "#6384ff", 100.0, "Points that found a plane in the map.",
           _inliers, worse="low"),
     Strip("uncertain", "degeneracy", "cm", 1, "#ce70dc", 6.0,
-          "How uncertain this scan alone leaves the direction it constrains least; over 5 cm is degenerate.",
+          "How uncertain this scan alone leaves the direction it constrains least; over 10 cm is degenerate.",
           _uncertainty, lambda _: DEGENERATE_CM),
     Strip("ground", "ground", "%", 0, "#34c7aa", 100.0, "Points labelled ground. Red: no plane was found.",
           lambda s: 1e2 * s["ground_share"], lambda _: 1e-9, worse="low"),

@@ -137,8 +137,8 @@ def where(snapshot: Snapshot) -> str:
 
 def done(progress: Progress | None) -> float:
     """The share that is done of long work; 0 while that is unknown, or without such work."""
-    known = progress is not None and math.isfinite(progress.fraction)
-    return min(max(progress.fraction, 0.0), 1.0) if progress is not None and known else 0.0
+    share = progress.fraction if progress is not None else 0.0
+    return min(max(share, 0.0), 1.0) if math.isfinite(share) else 0.0
 
 
 def working(progress: Progress) -> str:

@@ -97,7 +97,7 @@ class Proposal:
         self._after: tuple[LoopEdge, ...] | None = None  # the loops with it, since a snapshot has had it
         self._last_notice = 0
         self._changes = Changes()
-        self._apply.on_click(by_user(lambda _, __: self._apply_it()))
+        self._apply.on_click(by_user(lambda _, __: self.apply(self.command)))
         cancel.on_click(by_user(lambda _, __: self.cancel()))
 
     def propose(self, command: LoopEdit) -> None:
@@ -105,15 +105,13 @@ class Proposal:
         self._last_notice = notices[-1].number if notices else 0
         self.command, self._last, self._before = command, None, None
 
-    def apply(self, command: LoopEdit) -> None:
+    def apply(self, command: LoopEdit | None) -> None:
+        if command is None:
+            return
         self.command, self._last, self._after = None, command, None
         self._before = poses_of(self._snapshot())
         self._send(EditLoop(command))
         self._applied(command)
-
-    def _apply_it(self) -> None:
-        if self.command is not None:
-            self.apply(self.command)
 
     def cancel(self) -> None:
         self.command = self._before = None
