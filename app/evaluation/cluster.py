@@ -8,7 +8,9 @@ time, and each is asked for its version and the recording before it gets work.
 """
 
 import contextlib
+import logging
 import os
+import sys
 import tempfile
 import threading
 import time
@@ -72,7 +74,7 @@ class Cluster:
                 _checked(client, _workers(client))
         except _Gone as gone:  # at first the cluster must be there
             raise HemislamError(str(gone)) from None
-        patient_until = time.monotonic() + self.wait_s
+        patient_until, told = time.monotonic() + self.wait_s, ""
         with tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit=" runs", disable=None) as bar:
             while waiting:
                 try:
@@ -88,6 +90,9 @@ class Cluster:
                             " Finished runs are kept; the same command continues." if len(waiting) < len(jobs) else ""
                         )
                         raise HemislamError(f"{gone}{kept}") from None
+                    if str(gone) != told:
+                        told = str(gone)
+                        tqdm.write(f"{told} Waiting for it up to {self.wait_s:.0f} s …", file=sys.stderr)
                     time.sleep(LOOK_S)
         return errors
 
@@ -127,6 +132,7 @@ class Cluster:
         from distributed import Client
         from distributed.comm import CommClosedError
 
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what it would say comes as a sentence from here
         gone = f"There is no Dask scheduler at {self.address}; start one with `dask scheduler`."
         try:
             client = Client(self.address, timeout=CONNECT_S, set_as_default=False)
