@@ -165,7 +165,7 @@ class ClipPanel:
             show(self._unrolled, False)
             notify_error(client, error)
             return
-        self._send(unrolled=on)
+        self._send(unrolled=on, on=self._page.snapshot().clip.on and not on)  # a section's box would leave little of it
         if on:
             length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
             low, high = np.percentile(points[:, 2], (1, 99)) if len(points) else (0.0, 1.0)
@@ -191,7 +191,7 @@ class ClipPanel:
         if box is None:
             notify_error(self._client, "The two points are one above the other; click two that are apart.")
             return
-        self._send(box=box, on=True)
+        self._send(box=box, on=True, unrolled=False)
         self._face(self._client, box)
 
     # --- in the scene ----------------------------------------------------------------------------

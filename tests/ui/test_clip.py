@@ -229,6 +229,13 @@ def test_a_profile_stands_in_the_place_of_the_map(server: viser.ViserServer) -> 
     assert middle[0] == pytest.approx(10.0) and size[0] == pytest.approx(20.0)
 
 
+def test_a_profile_is_not_cut_off_by_the_box_of_a_section(server: viser.ViserServer) -> None:
+    bench = Bench(server)
+    bench.now = replace(bench.now, clip=Clip(BOX, on=True))
+    bench.panel._unroll(True, bench.client)  # type: ignore[arg-type]
+    assert bench.now.clip == Clip(BOX, on=False, unrolled=True)
+
+
 def test_before_there_is_a_map_nothing_is_clipped_and_that_is_said(server: viser.ViserServer) -> None:
     bench = Bench(server)
     bench.chunks, bench.poses = (), np.empty((0, 4, 4))
