@@ -1,6 +1,7 @@
 """How well a map lies on Earth: simulated walks with a receiver of 2 cm, 80 ms late, a tenth of its fixes 5 m off.
 
-Every point of the map is compared with where it truly is in UTM, by the true poses and the place of the scene. The
+Every point of the map is compared with where it truly is in UTM, by the true poses, the scanner's true mounting and the
+place of the scene. The
 alignment knows only the fixes and the lever arm of 0.5 m.
 """
 
@@ -8,15 +9,20 @@ import numpy as np
 
 from app.cli.run import process
 from app.export.results import Results
+from app.georeference.align import align
 from app.georeference.fixes import Fixes
 from app.georeference.survey import Survey
-from app.mapping.earth import georeference
+from app.mapping.earth import bent, georeference
 from app.mapping.opening import open_session
 from app.sensors.navsat import recorded_fixes
 from app.sensors.presets import resolve_params
-from app.sensors.simulator.gnss import Gnss
-from app.sensors.simulator.imperfections import IMPERFECT, NONE
-from app.sensors.simulator.simulate import simulate
+from app.sensors.simulator.gnss import Gnss, received
+from app.sensors.simulator.imperfections import IMPERFECT, NONE, Imperfections, livelier
+from app.sensors.simulator.scanners import SCANNERS
+from app.sensors.simulator.scenes import build_scene
+from app.sensors.simulator.simulate import START_NS, simulate, trajectory_through, unit_of
+from app.sensors.simulator.trajectory import Walker
+from app.slam import lie
 from app.slam.metrics import interpolate
 from app.slam.trajectory import Trajectory, read_tum, truth_beside
 from app.slam.types import F64
@@ -28,7 +34,7 @@ LEVER = (0.1, -0.2, 0.447)
 GNSS = Gnss(rate=10.0, noise=0.02, offset=0.08, outliers=0.1, wild=5.0, x=LEVER[0], y=LEVER[1], z=LEVER[2])
 WALKS = (("outdoor", False), ("corridor", False), ("outdoor", True))
 """Scenes, and whether scanner and hand have the errors of real ones."""
-SECONDS = 90.0
+SECONDS, SEED, DRAWS = 90.0, 5, 16
 
 
 def run() -> list[Line]:
@@ -40,28 +46,47 @@ def run() -> list[Line]:
 def measure(scene: str, *, imperfect: bool) -> list[Line]:
     name = f"{scene}{'-imperfect' if imperfect else ''}"
     path = FOLDER / f"gnss-{name}.mcap"
+    errors = IMPERFECT if imperfect else NONE
     if not path.exists():
-        errors = IMPERFECT if imperfect else NONE
-        simulate(scene, path, duration_s=SECONDS, seed=5, every_block=6, gnss=GNSS, imperfections=errors)
+        simulate(scene, path, duration_s=SECONDS, seed=SEED, every_block=6, gnss=GNSS, imperfections=errors)
     session = open_session(path, resolve_params(path, None, None, []))
     if (stop := process(session)) is not None:
         raise stop
     beside = truth_beside(path)
     assert beside is not None
     truth, fixes = read_tum(beside), recorded_fixes(path)
-    lines = []
+    mounting = unit_of(IMPERFECT, SEED).mounting if imperfect else np.eye(4)
+    lines, mapped = [], session.results()
     for factors in (False, True):
-        results = georeference(session.results(), Survey(lever=LEVER, factors=factors))
-        lines += compare(results, truth, fixes, f"{name}, {'as factors' if factors else 'align only'}")
+        results = georeference(mapped, Survey(lever=LEVER, factors=factors))
+        lines += compare(results, truth, fixes, f"{name}, {'as factors' if factors else 'align only'}", mounting)
+    lines += offsets(mapped, scene, errors, name)
     session.close()
     return lines
 
 
-def compare(results: Results, truth: Trajectory, fixes: Fixes, on: str) -> list[Line]:
-    """Offset, points of the map and names of wild fixes against the truth."""
+def offsets(results: Results, scene: str, errors: Imperfections, on: str) -> list[Line]:
+    """Errors of the clocks' offset over other draws of the receiver's noise."""
+    walker = livelier(Walker(), errors.hand)
+    walked = trajectory_through(build_scene(scene, SEED), SECONDS, SEED, walker, SCANNERS["bpearl"].R_body_imu)
+    off: dict[str, list[float]] = {"align only": [], "as factors": []}
+    for draw in range(DRAWS):
+        fixes = received(GNSS, walked, SECONDS, START_NS, np.random.default_rng(1000 + draw))
+        aligned = align(results.trajectory, fixes, lever=LEVER)
+        found = bent(results, fixes, aligned, {}).found
+        assert found is not None
+        for use, one in zip(off, (aligned, found), strict=True):
+            off[use].append(abs(one.offset_s - GNSS.offset) * 1e3)
+    what = f"offset of the clocks, error, {DRAWS} draws"
+    rms = [Line.of(f"{what}, RMS", f"{on}, {use}", "ms", [float(np.sqrt(np.square(off[use]).mean()))]) for use in off]
+    return rms + [Line.of(what, f"{on}, {use}", "ms", off[use]) for use in off]
+
+
+def compare(results: Results, truth: Trajectory, fixes: Fixes, on: str, mounting: F64) -> list[Line]:
+    """Offset, points of the map and names of wild fixes against the truth. mounting: (4, 4) T_nominal_lidar."""
     found = results.found
     assert found is not None and results.where is not None
-    off = np.concatenate([_off(results, truth, index) for index in range(len(results.keyframes))])
+    off = np.concatenate([_off(results, truth, index, mounting) for index in range(len(results.keyframes))])
     wild = _wild(fixes, truth)
     left_out = {name for name, used in zip(found.names, found.used, strict=True) if not used}
     told = set(found.names)
@@ -75,17 +100,17 @@ def compare(results: Results, truth: Trajectory, fixes: Fixes, on: str) -> list[
     ]
 
 
-def _off(results: Results, truth: Trajectory, index: int) -> F64:
+def _off(results: Results, truth: Trajectory, index: int, mounting: F64) -> F64:
     """(n,) m, how far each point of a keyframe is from where it truly is."""
     keyframe = results.keyframes[index]
     there, inside = interpolate(truth, np.array([keyframe.stamp_ns]))
     if not inside.all() or results.where is None:
         return np.empty(0)
     (T_scene_imu,) = there.poses
-    own = keyframe.cloud.points.astype(np.float64) @ keyframe.T_imu_lidar[:3, :3].T + keyframe.T_imu_lidar[:3, 3]
-    T_map_imu = results.frame.at(index) @ keyframe.T_odom_imu
-    ours = results.where.to_crs(own @ T_map_imu[:3, :3].T + T_map_imu[:3, 3])
-    true = GNSS.reference.to_crs(own @ T_scene_imu[:3, :3].T + T_scene_imu[:3, 3])
+    points = keyframe.cloud.points.astype(np.float64)
+    ours = lie.moved(results.frame.at(index) @ keyframe.T_odom_imu @ keyframe.T_imu_lidar, points)
+    true = lie.moved(T_scene_imu @ keyframe.T_imu_lidar @ mounting, points)
+    ours, true = results.where.to_crs(ours), GNSS.reference.to_crs(true)
     return np.asarray(np.linalg.norm(ours - true, axis=1))
 
 

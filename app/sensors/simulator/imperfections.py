@@ -12,7 +12,7 @@ from app.sensors.robosense import CHANNELS
 from app.sensors.simulator.raycast import Hits, Mover, Raycaster
 from app.sensors.simulator.scenes.props import person_mesh
 from app.sensors.simulator.trajectory import SmoothTrajectory, Walker, seconds
-from app.slam.lie import exp
+from app.slam.lie import exp, transform
 from app.slam.types import F64, ImuSamples
 from app.slam.user_text import read_numbers
 
@@ -104,6 +104,11 @@ class Unit:
         self._gyro = _matrix(sizes.gyro_scale, skew, rng)
         self._accel = _matrix(sizes.accel_scale, skew, rng)
         self._hum = rng.uniform(*VIBRATION_HZ, (2, 3)), rng.uniform(0, 2 * np.pi, (2, 3))
+
+    @property
+    def mounting(self) -> F64:
+        """(4, 4) T_nominal_lidar: where the scanner truly sits, in the frame in which it should."""
+        return transform(self._turn, self._shift)
 
     def fired(self, directions: F64, levers: F64) -> tuple[F64, F64]:
         """Where the firings really go, in the frame of the written mounting; both (n, 3)."""

@@ -10,7 +10,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from app.sensors.navsat import TOPIC, navsat_message
-from app.sensors.robosense import BPEARL
+from app.sensors.robosense import BPEARL, CHANNELS
 from app.sensors.ros import RecordingWriter
 from app.sensors.simulator.gnss import Gnss, received
 from app.sensors.simulator.imperfections import NONE, Imperfections, Unit, companions, livelier
@@ -121,7 +121,7 @@ def simulate(
     company = companions(imperfections.companions, trajectory, place.height, _random(seed, _PEOPLE))
     caster = Raycaster(place.mesh, (*place.movers, *company))
     turns = device.patterns(rate_hz, every_block, tables)
-    unit = None if imperfections == NONE else Unit(imperfections, _random(seed, _UNIT), turns(0).channels)
+    unit = None if imperfections == NONE else unit_of(imperfections, seed, turns(0).channels)
     lidar = Lidar(
         turns(0),
         device.R_imu_lidar,
@@ -197,6 +197,11 @@ def simulate(
         distance_m=float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
         bytes=out.stat().st_size,
     )
+
+
+def unit_of(imperfections: Imperfections, seed: int, channels: int = CHANNELS) -> Unit:
+    """The scanner with which `simulate` fires."""
+    return Unit(imperfections, _random(seed, _UNIT), channels)
 
 
 def trajectory_through(
