@@ -11,6 +11,7 @@ a degree. The map's shape does not change.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -41,8 +42,11 @@ NOTABLE_SCATTER = 3.0
 """A user is told of more, as a factor on what the fixes report."""
 FEWEST = 8
 COARSE_FIXES = 200
+MOST_STEPS = 50
+"""Of one fit. Sound fixes take up to 30; those that do not follow the trajectory would take hundreds."""
 
 _least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
+_fit = partial(_least_squares, x_scale="jac", max_nfev=MOST_STEPS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,7 +288,7 @@ def _robust(errors: Callable[[F64], F64], start: F64, overrides: F64) -> tuple[F
     used = np.asarray(overrides != 0)
     if used.sum() < FEWEST:
         raise HemislamError(f"Only {used.sum()} fixes are left, {FEWEST} are needed; accept some of them again.")
-    first = _least_squares(lambda x: _with_level(errors(x)[used], x), start, loss="cauchy", f_scale=2.0, x_scale="jac")
+    first = _fit(lambda x: _with_level(errors(x)[used], x), start, loss="cauchy", f_scale=2.0)
     x = np.asarray(first.x)
     for _ in range(10):
         distances = np.linalg.norm(errors(x), axis=1)
@@ -292,7 +296,7 @@ def _robust(errors: Callable[[F64], F64], start: F64, overrides: F64) -> tuple[F
         agree = ((distances < MOST_SIGMAS * scale) | (overrides == 1)) & (overrides != 0)
         if agree.sum() < 3:
             break
-        x = np.asarray(_least_squares(lambda x, w=agree: _with_level(errors(x)[w], x), x, x_scale="jac").x)
+        x = np.asarray(_fit(lambda x, w=agree: _with_level(errors(x)[w], x), x).x)
         if (agree == used).all():
             break
         used = agree

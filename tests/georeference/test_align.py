@@ -112,7 +112,7 @@ def test_fixes_much_worse_than_they_report_are_said_to_be() -> None:
 
 @pytest.mark.parametrize("degrees", [0.0, np.pi / 180])
 def test_a_receiver_that_is_stuck_or_gives_radians_does_not_place_the_map(degrees: float) -> None:
-    made = walked()
+    made = walked(rate_hz=2.0)
     places = made.fixes.places * [degrees, degrees, 1.0] + [0.0 if degrees else 48.0, 0.0 if degrees else 11.0, 0.0]
     with pytest.raises(HemislamError, match="do not follow the trajectory"):
         align(made.trajectory, Fixes.of(made.fixes.stamps_ns, places, made.fixes.sigmas), lever=LEVER)
