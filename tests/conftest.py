@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from app.child import fork_context
 from app.slam.errors import HemislamError
 
 # The same examples on every run, and no verdict by the clock.
@@ -17,6 +18,12 @@ settings.load_profile("hemislam")
 def pytest_configure(config: pytest.Config) -> None:
     """Not in pyproject.toml, since naming it imports numba, which must come after what `app` settles for it."""
     config.addinivalue_line("filterwarnings", "error::numba.core.errors.NumbaWarning")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _fork_server() -> None:
+    """A fork server with every module that forks need; else it has those of the first fork, and other forks import."""
+    fork_context("tests.forked")
 
 
 @pytest.fixture(scope="session")

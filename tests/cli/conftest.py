@@ -4,7 +4,7 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from app.__main__ import cli
 from app.sensors.ros import RecordingWriter
+from app.slam.loops.service import InlineLoops
 from app.slam.trajectory import Trajectory, write_tum
 from app.slam.types import Scan
 
@@ -129,6 +130,15 @@ class Outcome:
 
 
 Call = Callable[..., Outcome]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _loops_in_this_process() -> Iterator[None]:
+    """Each run in this process would start an interpreter for its loops, which takes longer than the run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("app.mapping.loops.LoopProcess", lambda: None)
+        patch.setattr("app.mapping.loops.RestartingLoops", lambda log, first: InlineLoops(log))
+        yield
 
 
 @pytest.fixture(scope="session")

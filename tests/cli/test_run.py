@@ -191,9 +191,9 @@ def test_a_truth_of_another_day_or_none_at_all_or_whose_frame_jumps_is_refused(
     assert not (tmp_path / "runs").exists()
 
 
-def test_results_are_kept_unless_told_otherwise(first: tuple[Any, Path], hemislam_alone: Call, walk: Path) -> None:
+def test_results_are_kept_unless_told_otherwise(first: tuple[Any, Path], hemislam: Call, walk: Path) -> None:
     before = {path.name: path.read_bytes() for path in first[1].iterdir()}
-    assert "--force" in hemislam_alone("run", walk, "--out", first[1]).refused()
+    assert "--force" in hemislam("run", walk, "--out", first[1]).refused()
     assert {path.name: path.read_bytes() for path in first[1].iterdir()} == before
 
 

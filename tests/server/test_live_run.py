@@ -24,6 +24,7 @@ from app.server.keeping import AddNote
 from app.server.protocol import LIVE, Pause, Seek, Snapshot, StepFrame
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
+from app.slam.loops.service import InlineLoops
 from app.slam.params import Params
 from app.slam.types import StepResult
 
@@ -39,7 +40,7 @@ def params() -> Params:
 @pytest.fixture(scope="module")
 def from_file(params: Params) -> dict[int, np.ndarray]:
     """Positions by scan end, as the file gives them."""
-    session = open_session(SAMPLE, params, 0.0, LENGTH_S)
+    session = open_session(SAMPLE, params, 0.0, LENGTH_S, loops=InlineLoops)
     found = {}
     while (result := session.advance()) is not None:
         if isinstance(result, StepResult):

@@ -10,6 +10,7 @@ from app.sensors.presets import resolve_params
 from app.server.protocol import Seek, SetParams
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
+from app.slam.loops.service import InlineLoops
 from app.slam.types import GROUND, StepResult
 
 SAMPLE_DATA = Path(__file__).resolve().parents[2] / "sample_data"
@@ -19,7 +20,7 @@ DURATION_S = 3.0
 def test_the_page_sees_exactly_what_a_headless_run_computes() -> None:
     recording = next(SAMPLE_DATA.glob("*.mcap"))
     params = resolve_params(recording, None, None, [])
-    session = open_session(recording, params, 0.0, DURATION_S)
+    session = open_session(recording, params, 0.0, DURATION_S, loops=InlineLoops)
     positions = []
     while (result := session.advance()) is not None:
         if isinstance(result, StepResult):

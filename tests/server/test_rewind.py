@@ -21,6 +21,7 @@ from app.server.controller import Controller
 from app.server.fold import Fold
 from app.server.protocol import SERIES, Command, EditLabels, Pause, Play, Seek, SetParams, SetSpeed, Snapshot, StepFrame
 from app.server.publisher import Publisher
+from app.slam.loops.service import InlineLoops
 from app.slam.params import Params
 from app.slam.types import DroppedScan
 
@@ -249,11 +250,11 @@ CHANGES = {12: {"ground.sigma": 0.02}, 25: {"filter.max_iterations": 2}, 40: {"s
 
 
 def open_sample(path: Path, truth: Path | None, params: Params, /, *, kilobytes: int = 1 << 20) -> Session:
-    return open_session(path, params, 0.0, LENGTH_S, truth=truth, checkpoint_bytes=kilobytes << 10)
+    return open_session(path, params, 0.0, LENGTH_S, truth=truth, loops=InlineLoops, checkpoint_bytes=kilobytes << 10)
 
 
 def open_whole(path: Path, truth: Path | None, params: Params, part: object = None, /) -> Session:
-    return open_session(path, params, truth=truth, checkpoint_bytes=DEFAULT_BYTES)
+    return open_session(path, params, truth=truth, loops=InlineLoops, checkpoint_bytes=DEFAULT_BYTES)
 
 
 @pytest.fixture(scope="module")

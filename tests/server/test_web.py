@@ -346,7 +346,7 @@ def test_a_sigterm_to_the_whole_group_loses_nothing_that_was_received(tmp_path: 
     packets, imu = f"rsbpearl://127.0.0.1:{msop},{difop}", f"imu-udp://127.0.0.1:{imu_port}"
     record = tmp_path / "live.mcap"
     command = [sys.executable, "-m", "app", "serve", "--live", packets, "--imu", imu, "--record", str(record)]
-    command += ["--port", "0", "--no-browser", "--log-json"]
+    command += ["--port", "0", "--no-browser", "--log-json", "--set", "loops.enabled=false"]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
@@ -355,8 +355,9 @@ def test_a_sigterm_to_the_whole_group_loses_nothing_that_was_received(tmp_path: 
         address = process.stdout.readline().split()[3]
         params = resolve_params(SAMPLE, None, None, [])
         feed(SAMPLE, params, parse_address(packets), parse_address(imu), pace=Pace(2.0), duration_s=4.0)
-        until(lambda: (live := httpx.get(f"{address}api/state").json()["live"]) and live["imu_age_s"] > 1.0)
-        counted = httpx.get(f"{address}api/state").json()["live"]["counters"]
+        with httpx.Client(base_url=address) as client:
+            until(lambda: (live := client.get("api/state").json()["live"]) and live["imu_age_s"] > 1.0)
+            counted = client.get("api/state").json()["live"]["counters"]
         os.killpg(process.pid, signal.SIGTERM)
         _, err = process.communicate(timeout=TIMEOUT_S)
     finally:

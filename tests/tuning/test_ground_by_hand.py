@@ -19,6 +19,7 @@ from app.sensors.simulator.raycast import Raycaster
 from app.sensors.simulator.scenes import build_scene
 from app.sensors.simulator.trajectory import Walker, seconds, walk
 from app.slam import ground
+from app.slam.loops.service import InlineLoops
 from app.slam.metrics import GroundScore
 from app.slam.params import Params
 from app.slam.types import F64, GROUND, NON_GROUND, Scan, StepResult
@@ -100,7 +101,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_is_scored_against_the_marked_points_of_marked_frames_alone(recording: Path, tmp_path: Path) -> None:
     """Marks that repeat the engine's own labels are met to the last point; opposite ones never."""
-    session, seen = open_session(recording, Params(), 0.0, 1.0), dict[int, np.ndarray]()
+    session, seen = open_session(recording, Params(), 0.0, 1.0, loops=InlineLoops), dict[int, np.ndarray]()
     while session.peek() is not None:
         if isinstance(result := session.advance(), StepResult):
             seen[result.stamp_ns] = result.cloud.labels != NON_GROUND
