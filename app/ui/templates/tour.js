@@ -3,7 +3,7 @@ if (!window.hemislamTour) {
   const STEPS = [
     ['.hs-steps', '', 'Play, or step', 'Space plays and pauses; ← and → step one frame. When you go back, the map and your edits are kept.'],
     ['.hs-track', '', 'Go anywhere', 'Drag the track. Its marks show loops, notes and trouble; open Diagnostics to see what the trouble was.'],
-    ['.mantine-Slider-root', 'Parameters', 'Tune the ground', 'Move a slider: the map is dimmed and this scan is labelled '
+    ['[role=slider][aria-valuenow]:not(input)', 'Parameters', 'Tune the ground', 'Move a slider: the map is dimmed and this scan is labelled '
       + 'again at once. Teal is ground, amber are the seeds its plane is fitted to. Try σ first.', 2],
     ['', 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click its green knob or its row to see '
       + 'what it rests on, then Reject it: the violet line is the path before, and Undo is below.'],
