@@ -82,15 +82,18 @@ def _mishaps(recordings: Sequence[Evaluated]) -> list[Claim]:
     """What is missing or went wrong."""
     found = []
     missing: dict[str, list[str]] = {}
+    straight = []
     for recording in recordings:
+        doubts = {one.name: doubt for one in recording.outcomes if (doubt := one.value("accuracy/ate_deg_withheld"))}
+        if doubts:
+            (first, *_) = doubts.values()
+            straight.append(f"{recording.name}: no rotation error of {', '.join(doubts)}. {first}")
         for outcome in recording.outcomes:
             who, run = f"{recording.name}, {outcome.name}", outcome.run or {}
             if outcome.missing:
                 missing.setdefault(f"{outcome.name}: {outcome.missing}", []).append(recording.name)
             elif outcome.unmeasured:
                 found.append(f"{who}: the error cannot be measured. {outcome.unmeasured}")
-            elif doubt := outcome.value("accuracy/ate_deg_withheld"):
-                found.append(f"{who}: no rotation error. {doubt}")
             if run.get("lost"):
                 found.append(f"{who}: lost in {run['lost']} of {run['frames']} frames.")
             if run.get("dropped"):
@@ -98,7 +101,7 @@ def _mishaps(recordings: Sequence[Evaluated]) -> list[Claim]:
     for sentence, names in missing.items():
         text = sentence.rstrip(".")
         found.append(f"{text}." if len(names) == len(recordings) else f"{', '.join(names)}: {text}.")
-    return [Claim(text, np.inf) for text in found]
+    return [Claim(text, np.inf) for text in found] + [Claim(text, 0.0) for text in straight]
 
 
 @dataclass(frozen=True, slots=True)

@@ -111,7 +111,7 @@ def test_the_page_folds_the_same_table(folder: Path) -> None:
 def test_a_rotation_error_that_means_nothing_is_a_dash_with_its_reason(folder: Path) -> None:
     page = (folder / "report.md").read_text()
     assert rows(page, "All errors, RMSE / mean / max")["ATE, rotation (°)"][2] == "–"
-    assert "- walk, Theirs: no rotation error. It lies on one straight line." in page
+    assert "- walk: no rotation error of Theirs. It lies on one straight line." in page
 
 
 def test_the_same_ratios_are_in_the_files_for_machines(folder: Path) -> None:
