@@ -95,7 +95,7 @@ class CalibrationPanel:
         self._values = found.values
         rows = [("", f"{found.contradiction}."), *found.rows] if found.contradiction else found.rows
         self._html.content, self._html.visible = panel("calibration", rows), True
-        self._plot.content, self._plot.visible = found.plot, bool(found.plot)
+        self._plot.content, self._plot.visible = panel("figure", found.plot), bool(found.plot)
         self._offer("Apply", "Set these parameters and read the recording again.")
         self._sentence = ""
         if found.contradiction and found.values:

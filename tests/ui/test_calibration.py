@@ -79,7 +79,7 @@ def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> 
     assert process.closed and not panel._progress.visible and panel._apply.visible
     assert "roll 70.00 ± 0.05 &lt;deg&gt;" in panel._html.content and page.sent == []
     user_clicks(panel._apply)
-    assert page.sent == [SetParams(FOUND), Restart(), Calibrated("")] and panel._plot.content == "<svg/>"
+    assert page.sent == [SetParams(FOUND), Restart(), Calibrated("")] and "<svg/>" in panel._plot.content
     user_clicks(panel._apply)
     assert page.sent[3:] == [SetParams({"sensor.rotation": (0.0, 0.0, 0.0)}), Restart(), Calibrated("")]
 
