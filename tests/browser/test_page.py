@@ -126,7 +126,7 @@ def test_the_speed_is_chosen_from_a_list_by_mouse(bench: Bench) -> None:
     page = bench.page
     page.locator(".hs-speed summary").click()
     page.get_by_role("button", name="5×", exact=True).click()
-    bench.eventually(lambda: bench.engine.sent[-1] == SetSpeed(5.0))
+    bench.eventually(lambda: bench.engine.sent[-1:] == [SetSpeed(5.0)])
     expect(page.locator(".hs-speed summary")).to_have_text("5×")
     expect(page.get_by_role("button", name="5×", exact=True)).to_be_hidden()
 
