@@ -182,6 +182,7 @@ def test_a_loop_can_be_looked_at_and_a_command_tried_without_doing_it(walk: Walk
     after = walk.do(EditLoop(Reject(*edge.pair)))
     assert after.keyframe_poses is not None
     np.testing.assert_allclose(tried.loops.tried[1].poses[:, :3, 3], after.keyframe_poses[:, :3, 3], atol=0.02)
+    walk.do(UndoLoop())
 
 
 def test_what_can_not_be_done_is_said_and_changes_nothing(walk: Walk) -> None:
