@@ -29,24 +29,26 @@ SLOW_MS = 120_000
 """Software rendering on a busy machine; what is expected comes as soon as it comes."""
 expect.set_options(timeout=SLOW_MS)
 OF_OTHERS = ("THREE.Clock: ", "GL Driver Message", "Canvas2D: Multiple readback")
-"""In warnings that viser, the software renderer and the tests themselves cause."""
-SLOWLY = """(() => {
-  const plain = requestAnimationFrame.bind(window), due = new Map();
-  let number = 0, waiting = false;
-  const draw = (time) => {
-    const now = [...due.values()];
-    due.clear();
-    waiting = false;
-    for (const one of now) { try { one(time); } catch (error) { reportError(error); } }
+"""Parts of warnings that viser, the software renderer and the tests themselves cause."""
+AT_TEN_FRAMES_A_SECOND = """(() => {
+  const requestFrame = requestAnimationFrame.bind(window), pending = new Map();
+  let lastId = 0, scheduled = false;
+  const runPending = (time) => {
+    const callbacks = [...pending.values()];
+    pending.clear();
+    scheduled = false;
+    for (const callback of callbacks) {
+      try { callback(time); } catch (error) { reportError(error); }
+    }
   };
-  window.requestAnimationFrame = (one) => {
-    due.set(++number, one);
-    if (!waiting) { waiting = true; setTimeout(() => plain(draw), 100); }
-    return number;
+  window.requestAnimationFrame = (callback) => {
+    pending.set(++lastId, callback);
+    if (!scheduled) { scheduled = true; setTimeout(() => requestFrame(runPending), 100); }
+    return lastId;
   };
-  window.cancelAnimationFrame = (one) => due.delete(one);
+  window.cancelAnimationFrame = (id) => pending.delete(id);
 })()"""
-"""Draws 10 frames a second at most: as many as the machine can would leave no core for what else is tested."""
+"""Limits the page's drawing. Software rendering without a limit would take a whole core from the tests."""
 complaints: list[str] = []
 """Errors and warnings on the browser's consoles, and uncaught exceptions, since the last test."""
 
@@ -120,7 +122,7 @@ def new_page(chromium: Browser, width: int, height: int, *, tour: bool = False) 
     """A page on which an error or a warning of our own fails the test. tour: as on a first visit."""
     page = chromium.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(SLOW_MS)
-    page.add_init_script(SLOWLY)
+    page.add_init_script(AT_TEN_FRAMES_A_SECOND)
     if not tour:
         page.add_init_script("localStorage.setItem('hemislam-tour', 'seen')")
     page.on("pageerror", lambda error: complaints.append(str(error)))

@@ -11,7 +11,7 @@ import viser
 
 from app.server import chunks as server_chunks
 from app.server.chunks import within_budget
-from app.server.protocol import Restart, Seek, StepFrame
+from app.server.protocol import Command, Restart, Seek, StepFrame
 from app.ui.chunks import MapChunks
 from app.ui.colours import COLOUR_BY
 from app.ui.widgets import View
@@ -20,15 +20,16 @@ from tests.ui.drawn import Drawn, chunk_nodes
 from tests.ui.fake_engine import FakeEngine
 
 
-def test_sessions_that_come_and_go_leave_nothing_behind(drawn: Drawn, wire: Wire, server: viser.ViserServer) -> None:
+@pytest.mark.parametrize("steps", [((Restart(), 0), (StepFrame(14), 3)), ((Seek(40), 7), (Seek(3), 1))])
+def test_going_back_and_forth_leaves_nothing_behind(
+    drawn: Drawn, wire: Wire, server: viser.ViserServer, steps: tuple[tuple[Command, int], ...]
+) -> None:
     kept = []
     for _ in range(4):
-        drawn.engine.send(Restart())
-        drawn.draw()
-        assert chunk_nodes(server) == {}
-        drawn.engine.send(StepFrame(14))
-        drawn.draw()
-        assert len(chunk_nodes(server)) == 3
+        for command, chunks in steps:
+            drawn.engine.send(command)
+            drawn.draw()
+            assert len(chunk_nodes(server)) == chunks
         server._run_garbage_collector(force=True)
         kept.append(wire.kept)
     assert kept[0] == kept[-1]
@@ -55,19 +56,6 @@ def test_going_back_and_forth_shows_what_was_shown_then(server: viser.ViserServe
         engine.send(Seek(frame))
         drawn.draw()
         assert shown(drawn, server) == then[frame]
-
-
-def test_going_back_and_forth_leaves_nothing_behind(drawn: Drawn, wire: Wire, server: viser.ViserServer) -> None:
-    kept = []
-    for _ in range(4):
-        drawn.engine.send(Seek(40))
-        drawn.draw()
-        drawn.engine.send(Seek(3))
-        drawn.draw()
-        assert len(chunk_nodes(server)) == 1
-        server._run_garbage_collector(force=True)
-        kept.append(wire.kept)
-    assert kept[0] == kept[-1]
 
 
 def test_a_keyframe_that_another_walk_put_in_place_of_one_is_drawn(drawn: Drawn, server: viser.ViserServer) -> None:
