@@ -10,7 +10,7 @@ from app.slam.kernels import map as kernels
 from app.slam.sections import FilterParams, MapParams
 from app.slam.types import F32, F64, I32, U8
 
-VIEW_M = 50.0
+DRIFT_M = 15.0
 """m: walking this far, odometry drifts by as much as points lie off the map's planes."""
 OLD_M = 0.025
 """m: a surface is old once odometry may have drifted so far since it was last seen."""
@@ -75,7 +75,7 @@ class LocalMap:
         always mapped. residual: RMS of the scan's distances from the map, m.
         """
         if (step := float(np.linalg.norm(position - self._way[:3]))) > 1.0:  # a swaying hand does not walk
-            self._way = np.r_[position, self._way[3] + step / VIEW_M * residual**2]
+            self._way = np.r_[position, self._way[3] + step / DRIFT_M * residual**2]
         if np.linalg.norm(position - self._center) > 0.1 * params.radius:
             self._evict(position, params.radius)
         self._used, refused = self._insert(points, params)
