@@ -11,7 +11,7 @@ from app.slam.sections import FilterParams, MapParams
 from app.slam.types import F32, F64, I32, U8
 
 DRIFT_M = 15.0
-"""m: walking this far, odometry drifts by as much as points lie off the map's planes."""
+"""m: walking this far, odometry is taken to drift by the RMS distance of the scans' points from the map's planes."""
 OLD_M = 0.025
 """m: a surface is old once odometry may have drifted so far since it was last seen."""
 RELAXED = 4.0
