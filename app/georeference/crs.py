@@ -111,6 +111,15 @@ def check_place(name: str, latitude: float, longitude: float) -> None:
         )
 
 
+def place(name: str, east: float, north: float) -> tuple[float, float]:
+    """Latitude and longitude (degrees) of a place in a grid. Raises HemislamError: the grid is not made for it."""
+    longitude, latitude = transformer(name, WGS84).transform(east, north)
+    if not math.isfinite(longitude + latitude):
+        raise HemislamError(f"{name} has no place at E {east:.0f}, N {north:.0f}; check the grid.")
+    check_place(name, latitude, longitude)
+    return latitude, longitude
+
+
 def grid_scale(name: str, latitude: float, longitude: float, height: float) -> float:
     """Metres of the grid per metre on the ground at a place in degrees and m, such as 0.9996 in the middle of UTM."""
     import pyproj

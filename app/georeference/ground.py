@@ -37,12 +37,18 @@ class Ground:
 
     @classmethod
     def in_grid(cls, grid: F64, name: str) -> "Ground":
-        """Of (n, 3) easting, northing and height."""
+        """Of (n, 3) easting, northing and height. Raises HemislamError: the grid is not made for the place."""
         centre = np.round(np.median(grid, axis=0))
-        longitude, latitude = crs.transformer(name, crs.WGS84).transform(*centre[:2])
-        if not np.isfinite(longitude + latitude):
-            raise HemislamError(f"{name} has no place at E {centre[0]:.0f}, N {centre[1]:.0f}; check the grid.")
-        crs.check_place(name, latitude, longitude)
+        east, north = centre[:2].tolist()
+        try:
+            latitude, longitude = crs.place(name, east, north)
+        except HemislamError:
+            if _is_place(name, north, east):
+                raise HemislamError(
+                    f"Easting and northing seem to be swapped: only with them exchanged does {name} fit; exchange the"
+                    " columns."
+                ) from None
+            raise
         scale = crs.grid_scale(name, latitude, longitude, float(centre[2]))
         return cls(name, grid, centre, scale, (grid - centre) / [scale, scale, 1.0])
 
@@ -51,3 +57,12 @@ class Ground:
         east, north, up = (self.centre + shift * [self.scale, self.scale, 1.0]).tolist()
         first, second, third = (tuple(map(float, row)) for row in R_ground_map)
         return GeoReference(self.name, (east, north, up), (first, second, third), self.scale, height)  # type: ignore[arg-type]
+
+
+def _is_place(name: str, east: float, north: float) -> bool:
+    """Whether a grid is made for the place with these coordinates, m."""
+    try:
+        crs.place(name, east, north)
+    except HemislamError:
+        return False
+    return True

@@ -82,6 +82,10 @@ def test_swapped_columns_or_names_are_told_by_the_map_that_they_turn_over(tmp_pa
     swapped.write_text("name,lat,lon,h\n" + "".join(f"{name},{lon},{lat},{h}\n" for name, (lat, lon, h) in rows))
     with pytest.raises(HemislamError, match="latitude and longitude seem to be swapped"):
         laid(swapped, picks)
+    control, picks = written(tmp_path, CORNERS)
+    control.write_text(control.read_text().replace("Name,E,N,H", "Name,N,E,H"))
+    with pytest.raises(HemislamError, match="Easting and northing seem to be swapped"):
+        laid(control, picks, grid="EPSG:32632")
     control, picks = written(tmp_path, {name: CORNERS[name] for name in "ABC"})
     picks.write_text(picks.read_text().replace("A,", "a,").replace("B,", "A,").replace("a,", "B,"))
     with pytest.raises(HemislamError, match="names exchanged"):
