@@ -10,6 +10,8 @@ from app.slam.text_files import csv_text
 if TYPE_CHECKING:  # every run imports this module, and few need the solver
     from app.georeference.align import Alignment
 
+SURE_OFFSET_S = 1e-3
+"""Of a less certain offset, a user is told how to determine it better. On foot, 1 ms is about 1 mm."""
 COLUMNS = (
     "name", "east_m", "north_m", "height_m", "d_east_m", "d_north_m", "d_height_m", "sigmas", "verdict",
 )  # fmt: skip
@@ -62,7 +64,13 @@ def in_rows(alignment: "Alignment", what: str) -> list[tuple[str, str]]:
         rows.append(("Lever arm", f"{x:.3f} {y:.3f} {z:.3f} m{_plus(alignment.lever_sigma, ' m', 3)}"))
     rms = " ".join(f"{axis} {value:.4f} m" for axis, value in zip("ENH", alignment.rms, strict=True))
     rows.append(("Residuals (RMS)", f"{rms}, of {used} of {len(alignment.used)} {what}"))
-    return [*rows, *(("", note) for note in alignment.notes)]
+    notes = list(alignment.notes)
+    if (sigma_s := alignment.offset_sigma_s) > SURE_OFFSET_S:
+        notes.append(
+            f"The clock offset is uncertain by {sigma_s * 1e3:.1f} ms; to determine it better, walk longer and change"
+            " direction and speed often."
+        )
+    return [*rows, *(("", note) for note in notes)]
 
 
 def table(alignment: "Alignment", *, only_rejected: bool = False) -> list[str]:

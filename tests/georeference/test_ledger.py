@@ -3,6 +3,7 @@
 import csv
 import io
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -38,6 +39,14 @@ def test_the_summary_names_units_and_the_rejected_fixes_follow(made: Walked, fou
     rejected = table(found, only_rejected=True)[1:]
     assert {line.split()[0] for line in rejected} >= {str(n) for n in made.outliers if str(n) in found.names}
     assert all("rejected" in line for line in rejected)
+
+
+def test_who_has_an_uncertain_offset_is_told_how_to_determine_it_better(found: Alignment) -> None:
+    def advice(sigma_s: float) -> bool:
+        lines = "\n".join(summary(replace(found, offset_sigma_s=sigma_s), "fixes"))
+        return f"uncertain by {sigma_s * 1e3:.1f} ms; to determine it better, walk longer" in lines
+
+    assert advice(0.0023) and not advice(0.0009) and not advice(float("nan"))
 
 
 def test_the_picture_shows_a_mark_for_every_rejected_fix(made: Walked, found: Alignment) -> None:
