@@ -4,7 +4,7 @@
 
 Fixes that do not fit even a bent map are rejected, unless the user counts them. The fixes also determine how stiff the
 graph is: those of some stretches must predict those of the others. The clocks' offset is estimated with the bent map,
-unless it was given.
+unless it was given, and then the graph is never very stiff: to such a graph, slow drift by millimetres is an offset.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,6 +28,9 @@ from app.slam.trajectory import Trajectory
 MOST_ROUNDS = 5
 STIFFNESS = (1.0, 3e-2, 1e-3, 3e-5)
 """Factors of the graph's covariances that are tried: a good sensor drifts far less than the graph expects."""
+LEAST_FOR_CLOCKS = 1e-2
+"""The smallest of these factors while the clocks' offset is estimated. Fixes cannot show drift of a millimetre in ten
+seconds; along the walk, it looks like an offset of a millisecond."""
 STRETCH_S = 3.0
 """Fixes of every other stretch predict those between them."""
 STEP_S, EXACT_S, FARTHEST_S = 2e-3, 1e-5, 2.0
@@ -63,7 +66,8 @@ def bend(
     word = overrides_of(overridden, found.names)
     held, barred = np.asarray(word == 1.0), np.asarray(word == 0.0)
     try:
-        problem = problem.stiffened(~barred)
+        factor = problem.stiffness(~barred)
+        clocks, problem = problem.scaled(max(factor, LEAST_FOR_CLOCKS)), problem.scaled(factor)
         offset_s, sigma_s, used = found.offset_s, found.offset_sigma_s, ~barred
         poses = problem.solved(offset_s, before, used, robust=True)
         for _ in range(MOST_ROUNDS):
@@ -71,7 +75,7 @@ def bend(
             scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
             agree: Mask = ((distances < MOST_SIGMAS * scale) | held) & ~barred
             if np.isfinite(found.offset_sigma_s):
-                offset_s, sigma_s = problem.offset(offset_s, poses, agree)
+                offset_s, sigma_s = clocks.offset(offset_s, poses, agree)
             poses = problem.solved(offset_s, poses, agree)
             if (agree == used).all():
                 break
@@ -163,16 +167,19 @@ class _Problem:
             return offset_s, float("nan")
         return float(end.root), bend**-0.5
 
-    def stiffened(self, which: Mask) -> "_Problem":
-        """With the smallest factor on the graph's covariances with which the fixes predict one another best."""
+    def scaled(self, factor: float) -> "_Problem":
+        """With all covariances of the graph times a factor."""
+        return replace(self, graph=[replace(one, covariance=one.covariance * factor) for one in self.graph])
+
+    def stiffness(self, which: Mask) -> float:
+        """The smallest factor on the graph's covariances with which the fixes predict one another best."""
         seconds = (self.fixes.stamps_ns[self.rows] - self.fixes.stamps_ns[self.rows[which][0]]) * 1e-9
         half = np.asarray(seconds // STRETCH_S % 2 == 0)
         parts = half & which, ~half & which
         priors = self.priors(self.found.offset_s)
-        best, cap, kept = np.inf, 0.0, self
+        best, cap, kept = np.inf, 0.0, 1.0
         for factor in STIFFNESS if min(part.sum() for part in parts) >= FEWEST else ():
-            stiff = replace(self, graph=[replace(one, covariance=one.covariance * factor) for one in self.graph])
-            missed = []
+            stiff, missed = self.scaled(factor), []
             for known, asked in (parts, parts[::-1]):
                 poses = stiff.solved(self.found.offset_s, self.keyframes, known, robust=True)
                 missed.append(_off(priors, poses)[1][asked])
@@ -181,7 +188,7 @@ class _Problem:
             score = float(np.minimum(distances, cap) @ np.minimum(distances, cap))
             if score > best:
                 break
-            best, kept = score, stiff
+            best, kept = score, factor
         return kept
 
 
