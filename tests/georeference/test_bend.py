@@ -83,9 +83,7 @@ def test_the_clock_offset_is_found_although_the_map_drifts(made: Walked, drifted
     assert abs(before.offset_s - 0.08) > 0.05
     assert abs(after.offset_s - 0.08) < 4 * after.offset_sigma_s < 0.02
     _, after, before = solved(made, made.trajectory)
-    assert (
-        abs(after.offset_s - 0.08) < 4 * after.offset_sigma_s < 0.012
-    )  # it might have drifted, for all the fixes show
+    assert abs(after.offset_s - 0.08) < 4 * after.offset_sigma_s < 0.012, "its drift is not known to be none"
 
 
 def test_the_users_word_on_a_fix_overrides_the_verdict(made: Walked, drifted: Trajectory) -> None:
