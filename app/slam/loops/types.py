@@ -78,8 +78,8 @@ class Evidence:
     def summary(self) -> str:
         """The numbers of a registered candidate, for its reason."""
         return (
-            f"overlap {self.overlap:.2f}, residual {self.residual_rms * 1e3:.0f} mm, slide {self.slide * 1e3:.0f} mm, "
-            f"{self.mahalanobis:.1f} σ from odometry"
+            f"overlap {100 * self.overlap:.0f} %, residual {self.residual_rms * 1e3:.0f} mm, "
+            f"slide {self.slide * 1e3:.0f} mm, {self.mahalanobis:.1f} σ from odometry"
         )
 
 

@@ -93,7 +93,7 @@ def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
     else:
         fit = _place(older, newer, detector, expect(newer, poses, (), Drift.of(params)), params).fit
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
-    reason = f"added manually: overlap {fit.overlap:.2f}, residual {fit.residual_rms * 1e3:.0f} mm"
+    reason = f"added manually: overlap {100 * fit.overlap:.0f} %, residual {fit.residual_rms * 1e3:.0f} mm"
     T = _imu(detector, older, newer, fit.T_target_source) if edit.register else T_older_newer
     sigma = covariance(detector, newer, fit)
     return LoopEdge(older, newer, newer, T, sigma, evidence, Verdict.ACCEPTED, reason, Origin.USER, edited=True)
@@ -124,11 +124,12 @@ def _objection(place: Placement, e: Evidence, p: LoopsParams) -> str:
     if apart > NEAR_M:
         return f"the places are {apart:.1f} m apart (most {NEAR_M:g} m)"
     if e.overlap < p.min_overlap:
-        return f"the submaps overlap by {e.overlap:.2f} (least {p.min_overlap:g})"
+        return f"the submaps overlap by {100 * e.overlap:.0f} % (least {100 * p.min_overlap:.0f} %)"
     if e.residual_rms > p.max_residual:
-        return f"the residual is {e.residual_rms:.3f} m (most {p.max_residual:g} m)"
+        return f"the residual is {1000 * e.residual_rms:.0f} mm (most {1000 * p.max_residual:.0f} mm)"
     if place.loose:
-        return f"it slides in all directions: pushed, it ends {e.slide:.2f} m off (most {p.max_slide:g} m)"
+        most = f"most {1000 * p.max_slide:.0f} mm"
+        return f"it slides in all directions: pushed, it ends {1000 * e.slide:.0f} mm off ({most})"
     if e.ambiguous:
         away = f"{e.alternative_m:.1f} m away"
         return f"it is ambiguous: {away} it fits as well, and odometry (σ {e.gate_m:.2f} m) allows both"
