@@ -21,13 +21,13 @@ HINTS: Final[dict[str, str]] = {
     "dropped": "Scans left out because the engine was behind.",
     # loops
     "overlap": "Points near both keyframes that have a partner in the other submap, in percent.",
-    "slide": "How far registrations from disturbed starts end from one another, in cm.",
+    "slide": "How far registrations from disturbed starts end from one another, in mm.",
     "to odometry": "Distance to what odometry expects, in its standard deviations (σ).",
     "odometry ±": "Standard deviation of what odometry expects, in m.",
     "support": "Loops nearby that agree with this one.",
-    "other place": "Distance in m to another place where it would fit as well.",
-    "condition": "Least over greatest information of the registration, 0 to 1; near 0 it slides.",
-    "contexts": "Difference of the two Scan Contexts, 0 (the same) to 1.",
+    "fits elsewhere": "Whether the submaps fit as well in another place, and how many m away.",
+    "weakest hold": "How firmly walls and ground hold the weakest direction, in percent of the strongest.",
+    "difference": "How differently the two places look from above (Scan Context), 0 (the same) to 1.",
     # A/B
     "A to B": "Distance between the two positions at this frame, in cm.",
     "turned": "Angle between the two orientations at this frame, in degrees.",

@@ -207,7 +207,7 @@ class Workbench:
         truth = current.recording is not None and current.recording.truth_positions is not None
         path = [(PATH_COLOUR, "path")] + [(TRUTH_COLOUR, "truth")] * truth if view.path else []
         dimmed = [(DIMMED[view.light], "map, while ground sliders move")] if view.tuning and view.map else []
-        return [*self._loops.keys(current), *path, *dimmed]
+        return [*self._loops.keys(current, view.light), *path, *dimmed]
 
     def _picks(self, click: viser.SceneClickEvent) -> bool:
         """Whether a click picks a point to measure, or goes to a note."""

@@ -20,7 +20,8 @@ from app.ui.widgets import Changes
 
 _RISE: Final = (0.7, 0.12)
 """Height of a knob above the edge's middle: m, and its share of the edge's length."""
-_CHOSEN: Final[Rgb] = (255, 255, 255)
+CHOSEN: Final[dict[bool, Rgb]] = {False: (255, 255, 255), True: (16, 18, 22)}
+"""Colour of the chosen loop on a dark and on a light background."""
 _CHOSEN_WIDTH: Final = 5.0
 _PICK_RAD: Final = np.radians(1.5)
 _LABEL: Final = np.array([0.0, 0.0, 0.5])
@@ -60,17 +61,19 @@ class LoopEdges:
         self._scene = scene
         self._root = root
         self._nodes: dict[str, list[viser.SceneNodeHandle]] = {}
-        self._drawn: dict[str, tuple[str, F32]] = {}
+        self._drawn: dict[str, tuple[str, Rgb, F32]] = {}
         self._changes = Changes()
         self._pickable: tuple[list[Pair], F32] = ([], np.empty((0, 3, 3), np.float32))
 
-    def draw(self, edges: tuple[LoopEdge, ...], poses: F64, shown: frozenset[str], chosen: Pair | None) -> None:
+    def draw(
+        self, edges: tuple[LoopEdge, ...], poses: F64, shown: frozenset[str], chosen: Pair | None, light: bool
+    ) -> None:
         """Draw the edges of the kinds `shown` and the chosen one, sending what differs.
 
         Args:
             poses: (k, 4, 4) T_map_imu of the keyframes; edges of later ones are left out.
         """
-        if not self._changes(edges, poses, shown, chosen):
+        if not self._changes(edges, poses, shown, chosen, light):
             return
         there = [edge for edge in edges if edge.newer < len(poses)]
         seen = [edge for edge in there if kind_of(edge).name in shown or edge.pair == chosen]
@@ -82,7 +85,7 @@ class LoopEdges:
                 style = _style(kind, inside)
                 self._draw(style, lines[styles == style], kind.colour, width, kind.knob_m)
         label = name(chosen) if chosen is not None else ""
-        self._draw("chosen", lines[styles == "chosen"], _CHOSEN, _CHOSEN_WIDTH, KINDS[EDITED].knob_m, label)
+        self._draw("chosen", lines[styles == "chosen"], CHOSEN[light], _CHOSEN_WIDTH, KINDS[EDITED].knob_m, label)
 
     def pick(self, origin: F64, direction: F64) -> Pair | None:
         """The loop that a ray in the map points at."""
@@ -92,14 +95,14 @@ class LoopEdges:
 
     def _draw(self, style: str, lines: F32, colour: Rgb, width: float, knob_m: float, label: str = "") -> None:
         """Send the nodes of a style, unless they are drawn so already."""
-        text, before = self._drawn.get(style, ("", lines[:0]))
+        text, painted, before = self._drawn.get(style, ("", colour, lines[:0]))
         if (
-            text == label
+            (text, painted) == (label, colour)
             and before.shape == lines.shape
             and (not len(lines) or np.allclose(before, lines, rtol=0.0, atol=STILL_M))
         ):
             return
-        self._drawn[style] = label, lines
+        self._drawn[style] = label, colour, lines
         if not len(lines):
             for node in self._nodes.pop(style, []):
                 node.remove()

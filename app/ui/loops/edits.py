@@ -14,13 +14,14 @@ from app.slam.loops.types import LoopEdge, Pair, Preview, Verdict
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.html import panel
-from app.ui.loops.words import describe_edit, forecast, headline, what_happened
+from app.ui.loops.words import describe_edit, forecast, headline, reason, what_happened, what_was_undone
 from app.ui.nodes import add_lines, clear, segments
 from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, notify_error, poses_of, show
 
 _REST_S: Final = 0.3
-_GHOST: Final[Rgb] = (206, 176, 255)
-_STICK: Final[Rgb] = (140, 120, 180)
+_GHOST: Final[dict[bool, Rgb]] = {False: (255, 240, 120), True: (120, 90, 0)}
+"""On a dark and on a light background: yellow, which every kind of colour vision tells from path and edited loops."""
+_STICK: Final[Rgb] = (150, 140, 100)
 _LEAST_SHIFT_M: Final = 0.005
 _SEEN: Final = 0.03
 """Shifts are enlarged until the largest is nearly this share of the walk's extent: real ones are rarely seen."""
@@ -47,9 +48,9 @@ class Ghost:
         self._nodes: list[viser.LineSegmentsHandle] = []
         self._changes = Changes()
 
-    def draw(self, other: F64 | None, present: F64, name: str) -> None:
+    def draw(self, other: F64 | None, present: F64, name: str, light: bool) -> None:
         """Show (k, 4, 4) poses beside the present ones, its shifts enlarged; None removes them."""
-        if not self._changes(other, present if other is not None else None, name):
+        if not self._changes(other, present if other is not None else None, name, light):
             return
         clear(self._nodes)
         self.key = []
@@ -59,12 +60,17 @@ class Ghost:
         times = enlarged(there - here, float(np.linalg.norm(np.ptp(here, axis=0))))
         if times:
             there = here + times * (there - here)
-            self._add("path", segments(there), _GHOST, 3.0)
+            self._add("path", segments(there), _GHOST[light], 3.0)
             self._add("moves", np.stack((here, there), axis=1).astype(np.float32), _STICK, 1.0)
-            self.key = [(_GHOST, name + (f", shift × {times}" if times > 1 else ""))]
+            self.key = [(_GHOST[light], name + (f", shift × {times}" if times > 1 else ""))]
 
     def _add(self, name: str, lines: F32, colour: Rgb, width: float) -> None:
         self._nodes.append(add_lines(self._scene, f"{ROOT}/ghost/{name}", lines, colour, width))
+
+
+def decided(command: LoopEdit) -> Pair | None:
+    """The loop on whose verdict the edit is."""
+    return command.pair if isinstance(command, Accept | Reject) else None
 
 
 class Proposal:
@@ -73,6 +79,8 @@ class Proposal:
     Attributes:
         command: the edit under consideration. preview: what the engine says of it, or of the one that is only shown.
         ghost: the trajectory beside the present one.
+        last: the edit applied last, until it is undone or another one follows.
+        happened: HTML of what the last edit, or its undo, did. about: the loop whose verdict it was.
     """
 
     def __init__(self, page: Page, applied: Callable[[LoopEdit], None]) -> None:
@@ -92,9 +100,12 @@ class Proposal:
         self.command: LoopEdit | None = None
         self.preview: Preview | None = None
         self._asked: tuple[LoopEdit | None, object] = None, None  # tried, and of which loops
-        self._last: LoopEdit | None = None  # applied, until it is undone or another edit follows
-        self._before: F64 | None = None  # the poses then, until another loop is looked at
+        self.last: LoopEdit | None = None
+        self.happened = ""
+        self.about: Pair | None = None
+        self._before: F64 | None = None  # the poses before it, until another loop is looked at
         self._after: tuple[LoopEdge, ...] | None = None  # the loops with it, since a snapshot has had it
+        self._seen = Snapshot()
         self._last_notice = 0
         self._changes = Changes()
         self._apply.on_click(by_user(lambda _, __: self.apply(self.command)))
@@ -103,22 +114,47 @@ class Proposal:
     def propose(self, command: LoopEdit) -> None:
         notices = self._snapshot().notices
         self._last_notice = notices[-1].number if notices else 0
-        self.command, self._last, self._before = command, None, None
+        self.command, self.last, self._before, self.happened = command, None, None, ""
 
     def apply(self, command: LoopEdit | None) -> None:
         if command is None:
             return
-        self.command, self._last, self._after = None, command, None
+        self.command, self.last, self._after = None, command, None
         self._before = poses_of(self._snapshot())
         self._send(EditLoop(command))
         self._applied(command)
 
     def cancel(self) -> None:
         self.command = self._before = None
+        if self.last is None:
+            self.happened = ""
 
-    def draw(self, snapshot: Snapshot, looked_at: LoopEdit | None = None) -> None:
-        """looked_at: what is only shown, while nothing is considered."""
-        self._draw_done(snapshot)
+    def see(self, snapshot: Snapshot) -> None:
+        """Note what the last edit did, once the snapshot has it, or that it was undone."""
+        seen, self._seen = self._seen, snapshot
+        edits, now, before, poses = seen.loops.undo, snapshot.loops.undo, poses_of(seen), poses_of(snapshot)
+        last = self.last
+        if last is not None and self._after is None and now[-1:] == (last,):
+            self._after = snapshot.loops.edges
+            self.happened, self.about = what_happened(last, before, poses), decided(last)
+        elif edits and now == edits[:-1] and snapshot.session == seen.session:
+            self.last = self._before = None
+            self.happened = what_was_undone(edits[-1], snapshot.loops.edges, before, poses)
+            self.about = decided(edits[-1])
+        elif last is not None and self._after is not None and now[-1:] != (last,):
+            self.last, self.happened = None, ""
+
+    def draw(self, snapshot: Snapshot, looked_at: LoopEdit | None, chosen: Pair | None, light: bool) -> None:
+        """Show the edit under consideration and the one before.
+
+        Args:
+            looked_at: what is only shown, while nothing is considered.
+            chosen: a loop of which `VerdictPanel` says what happened. light: a light background.
+        """
+        self._done.visible = bool(self.happened) and (self.about is None or self.about != chosen)
+        self._undo.visible = self.last is not None
+        if self._done.visible:
+            self._happened.content = self.happened + panel("into_view")
         command, loops, poses = self.command, snapshot.loops, poses_of(snapshot)
         shown = command or looked_at
         asked = shown, loops.edges if shown is not None else None
@@ -128,11 +164,11 @@ class Proposal:
         preview = self.preview = (
             loops.tried[1] if shown is not None and loops.tried and loops.tried[0] == shown else None
         )
-        if self._last is not None and self._before is not None:
-            self.ghost.draw(self._before if loops.edges is self._after else None, poses, "path before the edit")
+        if self.last is not None and self._before is not None:
+            self.ghost.draw(self._before if loops.edges is self._after else None, poses, "path before the edit", light)
         else:
             name = f"path if you {describe_edit(shown)}" if shown is not None else ""
-            self.ghost.draw(preview.poses if preview is not None else None, poses, name)
+            self.ghost.draw(preview.poses if preview is not None else None, poses, name, light)
         problem = self._problem(snapshot) if preview is None else ""
         if not self._changes(command, preview, snapshot.loops.residuals, problem):
             return
@@ -141,16 +177,6 @@ class Proposal:
             self._apply.disabled = preview is None
             words = forecast(command, preview, poses, snapshot.loops.residuals, problem)
             self._words.content = words + panel("into_view")
-
-    def _draw_done(self, snapshot: Snapshot) -> None:
-        edits, command = snapshot.loops.undo, self._last
-        there = bool(edits) and edits[-1] == command
-        if self._after is not None and not there:
-            self._last = None
-        if there and self._after is None and command is not None and self._before is not None:
-            self._after = snapshot.loops.edges
-            self._happened.content = what_happened(command, self._before, poses_of(snapshot)) + panel("into_view")
-        self._done.visible = self._last is not None and self._after is not None
 
     def _problem(self, snapshot: Snapshot) -> str:
         """The engine's newest error since the edit was proposed."""
@@ -172,7 +198,10 @@ class VerdictPanel:
         self._dragged: Edit | None = None
         self._headline = gui.add_html("")
         self._accept = gui.add_button(
-            "Accept it", icon=viser.Icon.THUMB_UP, color="teal", hint="Put it into the graph now; Undo takes that back."
+            "Accept it",
+            icon=viser.Icon.THUMB_UP,
+            color="teal",
+            hint="Put it into the graph now, as a loop of its own; Undo takes that back.",
         )
         self._reject = gui.add_button(
             "Reject it",
@@ -180,7 +209,11 @@ class VerdictPanel:
             color="red",
             hint="Take it out of the graph now; Undo brings it back.",
         )
-        self._would = gui.add_html("")
+        # In the same place, so that the way back is under the mouse. Accepting again would make a loop of its own.
+        self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray", hint="Ctrl Z")
+        self._undo.on_click(by_user(lambda _, __: page.send(UndoLoop())))
+        self._reason = gui.add_html("")
+        self._words = gui.add_html("")
         self._weight = gui.add_slider(
             "weight", 0.1, 10.0, 0.1, 1.0, hint="Divides its covariance in the graph; 1 is as registered."
         )
@@ -188,16 +221,22 @@ class VerdictPanel:
         self._reject.on_click(by_user(lambda _, __: self._decide(Reject)))
         self._weight.on_update(by_user(lambda weight, _: self._drag(weight)))
 
-    def draw(self, edge: LoopEdge | None, weighing: float | None, would: str) -> None:
-        """Show the loop's verdict. weighing: the weight under consideration. would: what the other verdict changes."""
+    def draw(self, edge: LoopEdge | None, weighing: float | None, words: str, undo: bool) -> None:
+        """Show the loop's verdict.
+
+        Args:
+            weighing: the weight under consideration. words: what the last edit did, or the other verdict would do.
+            undo: whether that verdict was the last edit, so that the way back is to undo it.
+        """
         self._pair = edge.pair if edge is not None else None
         if edge is None:
             self._dragged = None
             return
         self._headline.content = headline(edge)
-        self._would.content = would
-        self._accept.visible = edge.verdict is not Verdict.ACCEPTED
-        self._reject.visible = edge.verdict is not Verdict.REJECTED
+        self._reason.content, self._words.content = reason(edge), words
+        self._undo.visible = undo
+        self._accept.visible = not undo and edge.verdict is not Verdict.ACCEPTED
+        self._reject.visible = not undo and edge.verdict is not Verdict.REJECTED
         self._weight.disabled = edge.verdict is not Verdict.ACCEPTED
         dragged = self._dragged
         if dragged is None:

@@ -124,10 +124,12 @@ class Inspector:
             1.0,
             hint="Left: where the graph had the submaps. Right: as they were registered.",
         )
-        self._alone = gui.add_checkbox("these alone", True, hint="Hide the map and the scan behind the two submaps.")
+        self._alone = gui.add_checkbox(
+            "hide the map", True, hint="Show the two submaps alone, without the map and the scan."
+        )
         self._legend = gui.add_html("")
         self._contexts_title = gui.add_html(
-            heading("Scan Contexts from above, the newer one turned to match; grey was never seen")
+            heading("Heights around both keyframes from above, the newer turned to match; grey: never seen")
         )
         self._contexts = gui.add_image(_NO_CONTEXTS, format="png")
         self._shifts_title = gui.add_html("")
@@ -187,7 +189,7 @@ class Inspector:
     def _draw_charts(self, detail: LoopDetail, params: LoopsParams) -> None:
         turn = best_yaw(detail.shift_distances)
         self._contexts.image = contexts_image(detail.older_context, detail.newer_context, turn)
-        title = f"Distance of the Scan Contexts over the turn of the newer one; best at {np.degrees(turn):.0f}°"
+        title = f"Difference of the two over the turn of the newer, in degrees; least at {np.degrees(turn):.0f}°"
         self._shifts_title.content = heading(title)
         self._shifts.data = shift_curve(detail.shift_distances, params.context_distance)
         self._residuals.data = outline = histogram(detail.residuals, params.max_residual)

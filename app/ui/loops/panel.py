@@ -15,11 +15,11 @@ from app.slam.types import F64
 from app.ui.colours import Rgb
 from app.ui.html import panel
 from app.ui.loops.add_loop import AddLoopPanel
-from app.ui.loops.edges import LoopEdges
-from app.ui.loops.edits import EditsPanel, Proposal, VerdictPanel
+from app.ui.loops.edges import CHOSEN, LoopEdges
+from app.ui.loops.edits import EditsPanel, Proposal, VerdictPanel, decided
 from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
 from app.ui.loops.table import COLUMNS, Order, chips, listed, table
-from app.ui.loops.words import BRIDGE, KINDS, NEWER, OLDER, forecast, kind_of, largest_factors
+from app.ui.loops.words import BRIDGE, KINDS, NEWER, OLDER, forecast, kind_of, largest_factors, name
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of
 
@@ -103,13 +103,15 @@ class LoopsPanel:
         alone = self._inspector.alone or self._add_loop.nudging
         return replace(view, map=False, scan=False, wedge=False, plane=False) if alone else view
 
-    def keys(self, snapshot: Snapshot) -> list[tuple[Rgb, str]]:
+    def keys(self, snapshot: Snapshot, light: bool) -> list[tuple[Rgb, str]]:
         """Colours and names of what the scene shows of loops."""
         found = {kind_of(edge).name for edge in snapshot.loops.edges}
-        arches = [(kind.colour, f"{name} loop") for name, kind in KINDS.items() if name in found & self._shown]
-        chosen = self._chosen
+        arches = [(kind.colour, f"{key} loop") for key, kind in KINDS.items() if key in found & self._shown]
         arches += self._proposal.ghost.key
-        if chosen is None or not self._inspector.shown:
+        if (chosen := self._chosen) is None:
+            return arches
+        arches = [(CHOSEN[light], f"chosen loop {name(chosen)}"), *arches]
+        if not self._inspector.shown:
             return arches
         return [(OLDER, f"keyframe {chosen[0]}"), (NEWER, f"keyframe {chosen[1]}"), *arches]
 
@@ -137,13 +139,21 @@ class LoopsPanel:
         edge = self._edge(snapshot)
         self._ask(edge)
         command = self._proposal.command
-        other = None if edge is None else (Reject if edge.verdict is Verdict.ACCEPTED else Accept)(*edge.pair)
-        self._proposal.draw(snapshot, other)
-        would = ""
-        if other is not None and command is None:
-            would = forecast(other, self._proposal.preview, poses, snapshot.loops.residuals)
-        self._verdict.draw(edge, command.weight if isinstance(command, SetWeight) else None, would)
-        self._edges.draw(snapshot.loops.edges, poses, self._shown, self._chosen)
+        self._proposal.see(snapshot)
+        if self._proposal.last is None:
+            self._inspector.hide_map()
+        undo = edge is not None and edge.pair in map(decided, snapshot.loops.undo[-1:])
+        other = None
+        if edge is not None and not undo:
+            other = (Reject if edge.verdict is Verdict.ACCEPTED else Accept)(*edge.pair)
+        self._proposal.draw(snapshot, other, self._chosen, view.light)
+        words = ""
+        if edge is not None and self._proposal.happened and self._proposal.about == edge.pair:
+            words = self._proposal.happened
+        elif other is not None and command is None:
+            words = forecast(other, self._proposal.preview, poses, snapshot.loops.residuals)
+        self._verdict.draw(edge, command.weight if isinstance(command, SetWeight) else None, words, undo)
+        self._edges.draw(snapshot.loops.edges, poses, self._shown, self._chosen, view.light)
         self._add_loop.draw_scene(snapshot, view)
         self._inspector.draw_scene(snapshot, None if self._add_loop.nudging else self._chosen, view)
         self._inspector.draw(snapshot, edge)

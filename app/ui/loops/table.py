@@ -36,7 +36,7 @@ COLUMNS: Final[dict[str, TableColumn]] = {
         lambda e: e.newer + e.older * 1e-7, lambda e: name(e.pair),
     ),
     "context": TableColumn(
-        "contexts", "0–1", "Difference of the two Scan Contexts, from 0 (the same) to 1.",
+        "difference", "0–1", "How differently the two places look from above (Scan Context), 0 (the same) to 1.",
         lambda e: e.evidence.context_distance, lambda e: number(e.evidence.context_distance),
     ),
     "overlap": TableColumn(

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 
 from app.slam import lie
-from app.slam.loops.edits import Accept, Add, LoopEdit, Override, SetWeight, Solve
+from app.slam.loops.edits import Accept, Add, LoopEdit, Override, Reject, SetWeight, Solve
 from app.slam.loops.types import FactorResidual, LoopEdge, Origin, Pair, Preview, Verdict
 from app.slam.sections import LoopsParams
 from app.slam.types import F64
@@ -22,10 +22,12 @@ _LEAST_TURN_DEG: Final = 5e-3
 @dataclass(frozen=True, slots=True)
 class LoopKind:
     """Attributes:
-    width: of an arch that is in the graph, px. out_width: of one that is not. knob_m: diameter of its knob.
+    meaning: a sentence. width: of an arch that is in the graph, px. out_width: of one that is not.
+    knob_m: diameter of its knob.
     """
 
     name: str
+    meaning: str
     colour: Rgb
     width: float
     out_width: float
@@ -38,10 +40,17 @@ EDITED: Final = "edited"
 KINDS: Final[dict[str, LoopKind]] = {
     kind.name: kind
     for kind in (
-        LoopKind("accepted", (62, 207, 154), 3.0, 1.0, 0.1),
-        LoopKind("candidate", (255, 190, 60), 2.0, 2.0, 0.1),
-        LoopKind("rejected", (214, 84, 92), 1.0, 1.0, 0.07),
-        LoopKind(EDITED, (178, 136, 255), 3.5, 1.0, 0.12),
+        LoopKind("accepted", "The search accepted them; they correct the map.", (62, 207, 154), 3.0, 1.0, 0.1),
+        LoopKind("candidate", "They fit, but wait for other loops that agree.", (255, 190, 60), 2.0, 2.0, 0.1),
+        LoopKind("rejected", "The search rejected them; they change nothing.", (214, 84, 92), 1.0, 1.0, 0.07),
+        LoopKind(
+            EDITED,
+            "You accepted, rejected, weighed or added them; they are counted here only.",
+            (178, 136, 255),
+            3.5,
+            1.0,
+            0.12,
+        ),
     )
 }
 """By the search's verdict, or by the fact that a person had the last word; in the order shown."""
@@ -86,29 +95,44 @@ def what_happened(command: LoopEdit, before: F64, after: F64) -> str:
     return panel("loops.happened", f"{past} {rest}", _moves(after, before))
 
 
+def what_was_undone(command: LoopEdit, edges: tuple[LoopEdge, ...], before: F64, after: F64) -> str:
+    """The same of an edit that was undone. edges: without it."""
+    verdicts = {edge.pair: edge.verdict for edge in edges}
+    what = f"Undone: {describe_edit(command)}"
+    if isinstance(command, Accept | Reject) and command.pair in verdicts:
+        what = f"Loop {name(command.pair)} is {verdicts[command.pair]} again"
+    return panel("loops.happened", what, _moves(after, before), "back ")
+
+
 def headline(edge: LoopEdge) -> str:
-    """Verdict and reason; loops that contradict it can be clicked, as rows of the table."""
-    return panel("bridged", BRIDGE, panel("loops.headline", edge, kind_of(edge).colour))
+    """Which loop it is, and its verdict."""
+    return panel("loops.headline", edge, kind_of(edge).colour)
+
+
+def reason(edge: LoopEdge) -> str:
+    """Why it has its verdict; loops that contradict it can be clicked, as rows of the table."""
+    return panel("bridged", BRIDGE, panel("loops.reason", edge, kind_of(edge).colour))
 
 
 def evidence(edge: LoopEdge, params: LoopsParams) -> str:
     """The numbers of a loop, green or red by the present limits."""
     e = edge.evidence
-    alone = "none" if np.isinf(e.alternative_m) and e.alternative_m > 0 else f"{number(e.alternative_m, 1)}"
+    elsewhere = "no" if np.isinf(e.alternative_m) and e.alternative_m > 0 else f"{number(e.alternative_m, 1)}"
     tiles = [
         Tile("overlap", number(100 * e.overlap, 0), "%", f"≥ {100 * params.min_overlap:.0f} %",
              _judged(e.overlap, params.min_overlap, least=True)),
         Tile("residual", number(1000 * e.residual_rms, 0), "mm", f"≤ {1000 * params.max_residual:.0f} mm",
              _judged(e.residual_rms, params.max_residual)),
-        Tile("slide", number(100 * e.slide, 1), "cm", f"≤ {100 * params.max_slide:.0f} cm",
+        Tile("slide", number(1000 * e.slide, 0), "mm", f"≤ {1000 * params.max_slide:.0f} mm",
              _judged(e.slide, params.max_slide)),
         Tile("to odometry", number(e.mahalanobis, 1), "σ", f"≤ {params.max_mahalanobis:g} σ",
              _judged(e.mahalanobis, params.max_mahalanobis)),
         Tile("odometry ±", number(e.gate_m, 2), "m", "1 σ"),
         Tile("support", str(e.support), "", "others agree"),
-        Tile("other place", alone, "m away" if np.isfinite(e.alternative_m) else "", "", BAD if e.ambiguous else ""),
-        Tile("condition", number(e.condition, 3), "", "0: it slides"),
-        Tile("contexts", number(e.context_distance), "", f"≤ {params.context_distance:g}",
+        Tile("fits elsewhere", elsewhere, "m away" if np.isfinite(e.alternative_m) else "", "",
+             BAD if e.ambiguous else ""),
+        Tile("weakest hold", number(100 * e.condition, 0), "%", "0 %: can slide"),
+        Tile("difference", number(e.context_distance), "", f"≤ {params.context_distance:g}",
              _judged(e.context_distance, params.context_distance)),
     ]  # fmt: skip
     return panel("tile_grid", tiles)

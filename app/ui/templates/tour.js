@@ -6,7 +6,7 @@ if (!window.hemislamTour) {
     ['[role=slider][aria-valuenow]:not(input)', 'Parameters', 'Tune the ground', 'Move a slider: the map is dimmed and this scan is labelled '
       + 'again at once. Teal is ground, amber are the seeds its plane is fitted to. Try σ first.', 2],
     ['', 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click its green knob or its row to see '
-      + 'what it rests on, then Reject it: the violet line is the path before, and Undo is below.'],
+      + 'what it rests on, then Reject it: the yellow line is the path before, and Undo is in its place.'],
     ['', 'Help', 'That is all', 'Every number says on hover what it is. This tour and all keys are under Help.'],
   ];
   const seen = () => { try { localStorage.setItem('hemislam-tour', 'seen'); } catch { /* private window */ } };

@@ -83,4 +83,4 @@ def test_a_loop_added_by_hand_is_chosen_once_it_arrives(page: Page) -> None:
     page.draw()
     page.draw()
     assert page.loops.chosen == (20, 97) and InspectLoop((20, 97)) in page.engine.sent
-    assert page.says("edited 1")
+    assert page.says("edited by you 1")

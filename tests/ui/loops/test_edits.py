@@ -26,7 +26,7 @@ def test_a_chosen_loop_shows_what_the_other_verdict_would_move(page: Page) -> No
     now, tried = page.engine.snapshot, page.engine.snapshot.loops.tried
     assert tried is not None and tried[0] == Reject(*GOOD) and now.keyframe_poses is not None
     moved = np.linalg.norm(tried[1].poses[:, :3, 3] - now.keyframe_poses[:, :3, 3], axis=1)
-    words = page.loops._verdict._would.content
+    words = page.loops._verdict._words.content
     assert f"{100 * moved.max():.1f} cm</b> (keyframe {moved.argmax()})" in words
     for residuals in (now.loops.residuals, tried[1].residuals):
         worst = max(residuals, key=lambda factor: factor.sigmas)
@@ -65,23 +65,38 @@ def test_after_an_edit_the_map_is_shown_with_the_path_before_it_and_what_moved_b
     user_clicks(page.loops._verdict._reject)
     for _ in range(3):
         page.draw()
-    assert proposal._done.visible
-    assert f"Rejected 12–89</b>; keyframes moved by up to <b>{100 * shift(page, before):.1f} cm" in (
-        proposal._happened.content
-    )
+    verdict, moved = page.loops._verdict, f"{100 * shift(page, before):.1f} cm"
+    assert f"Rejected 12–89</b>; keyframes moved by up to <b>{moved}" in verdict._words.content
+    assert verdict._undo.visible and not (verdict._accept.visible or verdict._reject.visible)
     assert proposal.ghost.key[0][1].startswith("path before the edit")
     assert not inspector.alone and page.node(OLDER) is None and page.loops.chosen == GOOD
     user_sets(inspector._alone, True)
     page.draw()
     assert page.node(OLDER) is not None, "the submaps can be had again"
-    user_clicks(proposal._undo)
-    page.draw()
+    user_sets(inspector._alone, False)
+    user_clicks(verdict._undo)
+    for _ in range(3):
+        page.draw()
     assert UndoLoop() in page.engine.sent
-    page.draw()
-    assert not proposal._done.visible
+    assert f"Loop 12–89 is accepted again</b>; keyframes moved back by up to <b>{moved}" in verdict._words.content
+    assert verdict._reject.visible and not verdict._undo.visible
+    assert inspector.alone and page.node(OLDER) is not None, "its submaps are shown again"
     page.choose(WAITING)
     page.draw()
+    assert "Accept 34–112" in verdict._words.content
     assert inspector.alone and not proposal.ghost.key[0][1].startswith("path before")
+
+
+def test_the_last_edit_can_be_undone_though_another_loop_is_looked_at(page: Page) -> None:
+    page.choose(GOOD)
+    user_clicks(page.loops._verdict._reject)
+    page.draw()
+    page.choose(WAITING)
+    page.draw()
+    assert page.loops._proposal._done.visible and not page.loops._verdict._undo.visible
+    user_clicks(page.loops._proposal._undo)
+    page.draw()
+    assert page.edge(GOOD).verdict is Verdict.ACCEPTED
 
 
 def test_cancelling_leaves_all_as_it_was(page: Page) -> None:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from app.server.protocol import InspectLoop, Seek, TryLoop
 from app.ui.loops.inspector import CLOSE, SEEK
-from app.ui.loops.words import headline
+from app.ui.loops.words import reason
 from tests.ui.conftest import SOMEONE, Wire, user_clicks, user_sets
 from tests.ui.loops.conftest import GOOD, NEWER, OLDER, Page
 
@@ -63,11 +63,11 @@ def test_numbers_have_units_and_are_red_beyond_their_limits(page: Page) -> None:
     pair = next(e.pair for e in page.engine.snapshot.loops.edges if e.evidence.slide > 0.5)
     page.choose(pair)
     shown = page.loops._inspector._evidence.content
-    assert "84.0<small>cm</small>" in shown and "19<small>mm</small>" in shown and "61<small>%</small>" in shown
-    slide = shown.split("slide</div>")[1].split("84.0")[0]
+    assert "840<small>mm</small>" in shown and "19<small>mm</small>" in shown and "61<small>%</small>" in shown
+    slide = shown.split("slide</div>")[1].split("840")[0]
     overlap = shown.split("overlap</div>")[1].split("61")[0]
     assert "--hs-bad" in slide and "--hs-good" in overlap
-    assert "slides by 84 cm along the corridor" in page.loops._verdict._headline.content
+    assert "slides by 84 cm along the corridor" in page.loops._verdict._reason.content
 
 
 def test_the_loop_s_frame_is_that_at_which_it_was_decided(page: Page) -> None:
@@ -97,14 +97,18 @@ def test_a_page_with_a_chosen_loop_and_a_ghost_at_rest_sends_nothing(page: Page,
 
 def test_a_loop_that_another_is_in_the_graph_for_says_which(page: Page) -> None:
     edge = next(edge for edge in page.engine.snapshot.loops.edges if edge.counts)
-    assert "in the graph" not in headline(edge)
-    assert "12–340 is in the graph for both" in headline(replace(edge, represented_by=(12, 340)))
+    assert "corrects the map" not in reason(edge)
+    assert "loop 12–340 close by corrects the map for both" in reason(replace(edge, represented_by=(12, 340)))
 
 
 def test_the_legend_names_the_loops_and_the_two_submaps(page: Page) -> None:
     page.draw()
-    names = [name for _, name in page.loops.keys(page.engine.snapshot)]
+    names = [name for _, name in page.loops.keys(page.engine.snapshot, light=False)]
     assert names == ["accepted loop", "candidate loop"], "rejected ones are hidden at first"
     page.choose(GOOD)
     page.draw()
-    assert [name for _, name in page.loops.keys(page.engine.snapshot)][:2] == ["keyframe 12", "keyframe 89"]
+    assert [name for _, name in page.loops.keys(page.engine.snapshot, light=False)][:3] == [
+        "keyframe 12",
+        "keyframe 89",
+        "chosen loop 12–89",
+    ]

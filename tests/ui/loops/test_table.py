@@ -65,5 +65,5 @@ def test_the_engine_s_words_are_text_and_never_html(page: Page) -> None:
     edge = replace(page.edge(GOOD), reason="<script>alert(1)</script>")
     page.engine.publish(loops=LoopsView(edges=(edge,)))
     page.choose(GOOD)
-    assert "<script>" not in page.loops._table.content + page.loops._verdict._headline.content
-    assert "&lt;script&gt;" in page.loops._verdict._headline.content
+    assert "<script>" not in page.loops._table.content + page.loops._verdict._reason.content
+    assert "&lt;script&gt;" in page.loops._verdict._reason.content
