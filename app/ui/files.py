@@ -36,8 +36,6 @@ def _titles() -> dict[str, str]:
 
 
 _FORMATS: Final = _titles()
-_EARLY: Final = 100
-"""Before this frame the last session is offered."""
 
 
 def size_text(size: int) -> str:
@@ -57,7 +55,7 @@ def result_folder_name(recording: Path, now: datetime) -> str:
 
 
 class RecentPanel:
-    """What to go on with, while the session has hardly begun: the last one, and recordings opened before.
+    """What to go on with: the last session and, while none is open, recordings opened before.
 
     Args:
         kept: folder of the session files. browse: asks for a recording.
@@ -69,13 +67,20 @@ class RecentPanel:
         self._send, self._folders, self._kept = page.send, folders, kept
         self._sessions: list[tuple[Path, SavedSession]] = []
         self._changes = Changes()
+        self._gui = page.gui
         self._browse = page.gui.add_button("Open a recording…", icon=viser.Icon.FOLDER_OPEN, visible=False)
         self._browse.on_click(by_user(browse))
         icons = (viser.Icon.HISTORY, *[viser.Icon.FILE_DATABASE] * _RECENT)
         self._buttons = [page.gui.add_button("", icon=icon, color="gray", visible=False) for icon in icons]
+        self._restore: viser.GuiButtonHandle | None = None
         self._offers: list[tuple[str, Path]] = []
         for number, button in enumerate(self._buttons):
             button.on_click(by_user(partial(self._open, number)))
+
+    def add_restore(self) -> None:
+        """Add a button to the present container that is always there: it would move what is below it."""
+        self._restore = self._gui.add_button("Restore last session", icon=viser.Icon.HISTORY, color="gray")
+        self._restore.on_click(by_user(partial(self._open, 0)))
 
     def draw(self, snapshot: Snapshot) -> None:
         recording = snapshot.recording
@@ -89,16 +94,18 @@ class RecentPanel:
                 if (present is None or path.resolve() != present.resolve()) and own in (None, saved.opened.recording)
             ]
         before = self._sessions
-        early = snapshot.transport.frame < _EARLY and snapshot.live is None and snapshot.progress is None
-        offers = [("Restore last session", before[0][0])] if early and before else []
-        if offers:
-            self._buttons[0].hint = session_text(before[0][1])
-        if early and recording is None:
+        idle = snapshot.live is None and snapshot.progress is None
+        offers = [("Restore last session", before[0][0])] if idle and before else []
+        hint = session_text(before[0][1]) if offers else "No earlier session of this recording was kept."
+        self._buttons[0].hint = hint
+        if self._restore is not None:
+            self._restore.disabled, self._restore.hint = not offers, hint
+        if idle and recording is None:
             recent = dict.fromkeys(saved.opened.recording for _, saved in before)
             offers += [(f"Open {path.name}", path) for path in list(recent)[:_RECENT]]
         self._offers = offers
         for button, offer in itertools.zip_longest(self._buttons, offers):
-            button.visible = offer is not None
+            button.visible = offer is not None and recording is None
             if offer is not None:
                 button.label = offer[0]
 

@@ -1,4 +1,4 @@
-"""The last session is offered while a new one has hardly begun.
+"""The last session and recordings of before are offered.
 
 Tests app/ui/files.py, app/server/folders.py.
 """
@@ -41,23 +41,24 @@ def opened(path: Path, frame: int) -> Snapshot:
     return Snapshot(session=1, recording=recording, transport=Transport(frame=frame))
 
 
-def test_the_last_session_of_the_recording_is_offered_until_this_one_has_begun(
+def test_the_last_session_of_the_recording_is_offered_in_a_button_that_is_always_there(
     server: viser.ViserServer, kept: Path
 ) -> None:
     sent: list[Command] = []
     panel = RecentPanel(page_of(server, sent.append), Folders([kept.parent / "open"]), kept, lambda *_: None)
+    panel.add_restore()
+    restore = panel._restore
+    assert restore is not None
     start = opened(kept.parent / "open/walk.mcap", 0)
     panel.draw(start)
-    shown = [button for button in panel._buttons if button.visible]
-    assert [(button.label, button.hint) for button in shown] == [
-        ("Restore last session", "walk.mcap, frame 41, 2 loop edits, 1 note")
-    ]
-    user_clicks(shown[0])
+    assert not any(button.visible for button in panel._buttons), "they would move the tabs"
+    assert (restore.disabled, restore.hint) == (False, "walk.mcap, frame 41, 2 loop edits, 1 note")
+    user_clicks(restore)
     assert sent == [OpenRecording(kept / "1.hemislam", None)]
     panel.draw(replace(start, session=2, session_file=kept / "1.hemislam"))
-    assert panel._buttons[0].hint == "walk.mcap, frame 12, 2 loop edits, 1 note", "not the one that is open"
-    panel.draw(opened(kept.parent / "open/walk.mcap", 400))
-    assert not any(button.visible for button in panel._buttons)
+    assert restore.hint == "walk.mcap, frame 12, 2 loop edits, 1 note", "not the one that is open"
+    panel.draw(replace(start, session=3, recording=OpenedRecording(kept / "new.mcap", 0, 10.0, 100, ())))
+    assert restore.disabled and restore.visible
 
 
 def test_without_a_recording_those_of_before_are_offered_too(server: viser.ViserServer, kept: Path) -> None:
