@@ -92,7 +92,7 @@ function draw() {
   const top = HEAD + ROW * d.strips.length, mid = top + ROW / 2 - 1, counts = [];
   pen.fillStyle = 'rgba(127,140,160,.09)';
   pen.fillRect(NAME, top, gw, ROW - 2);
-  for (const [verdict, colour, mark] of [['candidate', QUIET, '?'], ['rejected', BAD, '×'], ['accepted', GOOD, '✓']]) {
+  for (const [verdict, colour, mark] of [['candidate', NOTE, '?'], ['rejected', QUIET, '×'], ['accepted', GOOD, '✓']]) {
     const found = d.loops[verdict] || [];
     found.forEach((n, c) => {
       if (!n) return;
@@ -154,14 +154,19 @@ const mark = () => { // above the track: loops, notes and where trouble begins
   marks.width = Math.round(W * ratio); marks.height = Math.round(H * ratio);
   ink.setTransform(ratio, 0, 0, ratio, 0, 0);
   if (!d) return;
-  const tick = (frame, colour, top, high) => {
-    ink.fillStyle = colour; ink.fillRect(edge + (frame + 0.5) / d.frames * (W - 2 * edge) - 1, top, 2, high);
+  const X = (frame) => edge + (frame + 0.5) / d.frames * (W - 2 * edge);
+  const bar = (frame, colour, high) => { ink.fillStyle = colour; ink.fillRect(X(frame) - 1.25, 0, 2.5, high); };
+  const lines = (colour, points, fill) => { // told apart by shape as well as by colour
+    ink.beginPath();
+    points.forEach(([x, y, move], i) => { if (i && !move) ink.lineTo(x, y); else ink.moveTo(x, y); });
+    if (fill) { ink.fillStyle = colour; ink.fill(); } else { ink.strokeStyle = colour; ink.lineWidth = 1.5; ink.stroke(); }
   };
   const bad = d.starts.map((_, c) => d.strips.some((s) => s.name !== 'frame time' && beyond(s, s.data[s.low ? c : d.starts.length + c])));
-  d.starts.forEach((start, c) => { if (bad[c] && !bad[c - 1]) tick(start, BAD, H - 6, 6); });
-  for (const [verdict, colour] of [['rejected', BAD], ['accepted', GOOD]])
-    (d.loops[verdict] || []).forEach((n, c) => { if (n) tick(d.starts[c], colour, 0, 6); });
-  for (const [frame] of d.notes) tick(frame, NOTE, 0, H);
+  d.starts.forEach((start, c) => { if (bad[c] && !bad[c - 1]) lines(BAD, [[X(start) - 5, H], [X(start) + 5, H], [X(start), H - 8]], true); });
+  const each = (verdict, draw) => (d.loops[verdict] || []).forEach((n, c) => { if (n) draw(d.starts[c]); });
+  each('rejected', (frame) => { const x = X(frame); lines(QUIET, [[x - 3, 1], [x + 3, 7], [x - 3, 7, 1], [x + 3, 1]]); });
+  each('accepted', (frame) => bar(frame, GOOD, 8));
+  for (const [frame] of d.notes) bar(frame, NOTE, H);
 };
 const PAUSE = 'M6 5h4v14H6zM14 5h4v14h-4z', PLAY = play.querySelector('path').getAttribute('d');
 const show = () => {
@@ -182,7 +187,7 @@ const show = () => {
 };
 const dragged = (event) => { touched = performance.now(); ask(Number(slider.value), event.type === 'change'); };
 slider.oninput = slider.onchange = dragged;
-slider.onpointerup = () => slider.blur(); // so that space plays again
+bar.onpointerup = () => setTimeout(() => document.activeElement.blur()); // so that keys act on the scene, without a ring
 speed.addEventListener('click', (event) => { if (event.target.dataset.hs) speed.open = false; });
 window.addEventListener('pointerdown', (event) => { if (!speed.contains(event.target)) speed.open = false; });
 const unfold = (open) => {
