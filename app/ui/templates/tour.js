@@ -14,7 +14,14 @@ if (!window.hemislamTour) {
     document.querySelector('.hs-tour')?.remove();
     const box = document.createElement('div');
     let at = 0, outlined = null;
-    const end = () => { outlined?.classList.remove('hs-outlined'); box.remove(); seen(); window.removeEventListener('keydown', key); };
+    const playing = () => { const now = JSON.parse(document.querySelector('.hs-state').dataset.state); return now.playing && !now.live; };
+    const toggle = () => document.querySelector('body > * .hs-play')?.click();
+    const held = playing(); // nothing runs on behind what is read
+    if (held) toggle();
+    const end = () => {
+      outlined?.classList.remove('hs-outlined'); box.remove(); seen(); window.removeEventListener('keydown', key);
+      if (held && !playing()) toggle();
+    };
     const key = (event) => { if (event.key === 'Escape') end(); };
     const show = () => {
       const [target, tab, title, text, place = 0] = STEPS[at];
@@ -34,6 +41,8 @@ if (!window.hemislamTour) {
     box.setAttribute('role', 'dialog');
     box.setAttribute('aria-label', 'Tour');
     window.addEventListener('keydown', key); // not this image's own
+    const scene = document.querySelector('canvas[data-engine]').getBoundingClientRect();
+    box.style.right = innerWidth - scene.right + 12 + 'px'; // in the scene's corner, beside what is outlined
     document.body.append(box);
     show();
   };
