@@ -111,14 +111,21 @@ class GroundParams(Section):
 
     enabled: bool = _at_once(True, "Segment the ground, and downsample it before the filter.")
     scan_lines: int = _at_once(
-        8, "Number of outermost scan lines on which seeds of the ground are searched.", (1, 128, 1), symbol="M"
+        8,
+        "Outermost scan lines on which seeds of the ground are searched; more of them give more seeds.",
+        (1, 128, 1),
+        symbol="M",
     )
     alpha: float = _at_once(
-        25.0, "Largest angle between a seed of the ground and straight down.", (1, 90, 1), "deg", symbol="α"
+        25.0,
+        "Largest angle between a seed of the ground and straight down; a larger one gives more seeds.",
+        (1, 90, 1),
+        "deg",
+        symbol="α",
     )
     sigma: float = _at_once(
         0.025,
-        "A point is ground if it is nearer to the ground plane than this, per metre of range.",
+        "A point is ground if it is nearer to the ground plane than this, per metre of range; more gives more ground.",
         (0.001, 0.2, 0.001),
         "m/m",
         symbol="σ",

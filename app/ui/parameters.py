@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import viser
 
 from app.server.fork import engine_number
@@ -50,6 +51,8 @@ _TYPING_S: Final = 0.5
 _MOST_UNDONE: Final = 50
 _DRAG_S: Final = 8.0
 """Changes of the same parameters that follow each other faster are one, unless a slider was let go between them."""
+_NOTHING: Final = ("nothing changed",)
+"""What `reset` offers then: it stays, so that nothing below it moves."""
 _HOLD_S: Final = 1.0
 """A control shows what the user set for this long, whatever older snapshots say."""
 
@@ -225,6 +228,7 @@ class ParameterPanel:
         for path in PRIMARY:
             self._add(self._sections["primary"][path.partition(".")[2]])
         self._ground = gui.add_html("")
+        self._share_before = float("nan")  # percent of ground in the scan shown before the sliders moved
         self._ground_changes = Changes(page.now, PANEL_PERIOD_S)
         # Below the sliders and always there, so that nothing moves under the mouse.
         self._undo, self._redo = (
@@ -244,7 +248,8 @@ class ParameterPanel:
                 self._add_reset(section)
         gui.add_html(panel("quiet", "▸ acts from the next frame · ↻ acts on restart"))
 
-    def draw(self, snapshot: Snapshot) -> None:
+    def draw(self, snapshot: Snapshot, tuning: bool = False) -> None:
+        """Bring the controls up to a snapshot. tuning: whether its scan shows what the ground sliders do."""
         now = self._now()
         if engine_number(snapshot) != self._engine:  # what was set was meant for the other engine
             self._engine = engine_number(snapshot)
@@ -271,18 +276,21 @@ class ParameterPanel:
         if (recording := snapshot.recording.path if snapshot.recording else None) != self._recording:
             self._recording, self._opened = recording, snapshot.params
         self._show_resets(snapshot.params)
-        self._show_ground(snapshot)
+        self._show_ground(snapshot, tuning)
         self._pending.visible = self._restart.visible = bool(snapshot.pending_restart)
         self._pending.content = panel("pending", snapshot.pending_restart)
 
-    def _show_ground(self, snapshot: Snapshot) -> None:
+    def _show_ground(self, snapshot: Snapshot, tuning: bool) -> None:
         """What the four sliders made of the present scan."""
-        result = snapshot.result
-        if self._ground_changes(result, at_once=not snapshot.transport.playing):
-            ground = result.ground if result is not None else None
-            numbers = (number(100 * ground.share, 1), f"{ground.seeds:,}") if ground is not None else ("–", "–")
+        ground = snapshot.result.ground if snapshot.result is not None else None
+        if not tuning:
+            self._share_before = 100 * ground.share if ground is not None else float("nan")
+        if self._ground_changes(snapshot.result, tuning, at_once=not snapshot.transport.playing):
+            share = number(100 * ground.share, 1) if ground is not None else "–"
+            seeds = f"{ground.seeds:,}" if ground is not None else "–"
+            was = number(self._share_before, 1) if tuning and np.isfinite(self._share_before) else ""
             why = ground.reason if ground is not None and not ground.found else ""
-            self._ground.content = panel("ground_now", _COLOURS, *numbers, why)
+            self._ground.content = panel("ground_now", _COLOURS, share, was, seeds, why)
 
     def _step(self, by: int) -> None:
         """Undo or redo the last change of parameters."""
@@ -323,7 +331,7 @@ class ParameterPanel:
     def _add_reset(self, group: str) -> None:
         """A button for each parameter of the group that was changed since the recording was opened, and one for all."""
         buttons = self._gui.add_button_group(
-            "reset", ("all",), visible=False, hint="Back to the value it had when the recording was opened."
+            "reset", _NOTHING, hint="Back to the value it had when the recording was opened."
         )
         self._resets[group] = buttons
 
@@ -333,7 +341,8 @@ class ParameterPanel:
             values = {leaf.path: self._opened.value(leaf.path) for leaf in leafs}
             for path in values:
                 self._edits.pop(path, None)
-            self._send(SetParams(values))
+            if values:
+                self._send(SetParams(values))
 
         buttons.on_click(by_user(reset))
 
@@ -341,9 +350,8 @@ class ParameterPanel:
         for group, buttons in self._resets.items():
             leafs = self._sections[group].values()
             changed = [spoken(leaf) for leaf in leafs if params.value(leaf.path) != self._opened.value(leaf.path)]
-            options = (*changed, "all") if len(changed) != 1 else (changed[0],)
-            buttons.visible = bool(changed)
-            if changed and buttons.options != options:
+            options = (*changed, "all") if len(changed) > 1 else tuple(changed) or _NOTHING
+            if buttons.options != options:
                 buttons.options = options
 
 

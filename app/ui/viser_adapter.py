@@ -13,7 +13,8 @@ viser has no events for HTML, no way to run a script, and keys of its own. So th
 * A phone's panel has its largest height and its width in its style; a folder is a Paper with a border.
 * While the server is not connected, panels are dimmed with a transition of 150 ms and take no clicks.
 * The scene is inset by the width of the docked panel, whose chevron carries `data-dock-region-collapse`.
-* Dock tabs carry `data-dock-tab`; the box of a slider follows its track, with Mantine's class names.
+* Dock tabs carry `data-dock-tab`; the tab that is shown has `aria-selected`. The two buttons beside the title have the
+  icons list-search and adjustments. The box of a slider follows its track, with Mantine's class names.
 """
 
 from collections.abc import Callable
@@ -49,3 +50,8 @@ class Bridge:
     def live(self, html: str) -> str:
         """HTML whose elements with `data-hs` can be clicked."""
         return panel("bridged", self._name, html)
+
+
+def add_opened(gui: viser.GuiApi, act: Callable[[str], None]) -> None:
+    """Call `act` with the name of each tab that a browser opens, and with "" for Escape outside a dialog."""
+    gui.add_html(Bridge(gui, "opened", lambda tab, _: act(tab)).live(panel("opened")))

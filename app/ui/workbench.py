@@ -47,13 +47,13 @@ from app.ui.study import StudyPanel
 from app.ui.timeline import TimelinePanel
 from app.ui.transport import BreakpointPanel, TransportPanel
 from app.ui.tune import TunePanel
-from app.ui.viser_adapter import prepare_page
+from app.ui.viser_adapter import add_opened, prepare_page
 from app.ui.widgets import PANEL_PERIOD_S, SCENE_PERIOD_S, Changes, Page, View
 
 log = logging.getLogger(__name__)
 
 _TUNING_S: Final = 8.0
-"""After a change of a ground parameter the map is dimmed behind the present scan for this long."""
+"""After a change of a ground parameter the map is dimmed behind the present scan for at least this long."""
 _TICK_S: Final = 0.04
 """How long the drawing thread waits for a snapshot before it looks at the page's own controls."""
 
@@ -98,6 +98,7 @@ class Workbench:
         legend = gui.add_html("")
         files = FilesPanel(page, folders, results)
         self._recent = RecentPanel(page, folders, results / "sessions", files.browse)
+        add_opened(gui, self._opened)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS_HORIZONTAL):
             self._sides = Sides(gui, forks)
@@ -138,6 +139,7 @@ class Workbench:
                 self._map_compare = MapComparePanel(page, folders, results, self._appearance.colour_by)
         with tabs.add_tab("Recording", viser.Icon.FILE_DATABASE):
             files.add_buttons()
+            self._recent.add_restore()
             self._live = LivePanel(gui)
             self._doctor = DoctorPanel(page)
             with gui.add_folder("Calibration", expand_by_default=False):
@@ -159,6 +161,7 @@ class Workbench:
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
         self._tuned_at = -_TUNING_S
+        self._tuned: tuple[int, View] | None = None  # frame and look since then: the map stays dimmed with these
         self._more = 0
         self._now = now
         self._stop = threading.Event()
@@ -191,8 +194,8 @@ class Workbench:
         view = self._study.seen(self._loops.seen(self._appearance.view))
         self._compare.draw(current, view)
         view = self._clip.seen(current, self._map_compare.seen(current, self._compare.seen(view)))
-        self._draw_scene(current, view)
-        self._parameters.draw(self._sides.tuned(current))
+        view = self._draw_scene(current, view)
+        self._parameters.draw(self._sides.tuned(current), view.tuning)
         self._loops.draw(current, view)
         self._study.draw(current, view)
         self._measure.draw(current, view)
@@ -213,12 +216,23 @@ class Workbench:
         """Whether a click picks a point to measure, or goes to a note."""
         return self._measure.picking or self._notes.points_at(click)
 
-    def _draw_scene(self, current: Snapshot, view: View) -> None:
+    def _opened(self, tab: str) -> None:
+        """Another tab, or "" for Escape, ends what was looked at under the one before. View changes only looks."""
+        if tab not in ("Loops", "View"):
+            self._loops.choose(None)
+        if tab != "Parameters":
+            self._tuned_at, self._tuned = -_TUNING_S, None
+
+    def _draw_scene(self, current: Snapshot, view: View) -> View:
+        """Returns the view as drawn."""
         drawn = self._drawn
         tuned = drawn is None or drawn.params != current.params
         if drawn is not None and drawn.session == current.session and drawn.params.ground != current.params.ground:
             self._tuned_at = self._now()
-        view = replace(view, tuning=self._now() - self._tuned_at < _TUNING_S)
+        look = current.transport.frame, view
+        if self._now() - self._tuned_at < _TUNING_S:
+            self._tuned = look
+        view = replace(view, tuning=look == self._tuned)
         if self._scene_due(current, view, self._more, self._scene.framing.pictures, self._scene.eyes, at_once=tuned):
             if current.result is not None and (drawn is None or drawn.result is None):
                 self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
@@ -229,3 +243,4 @@ class Workbench:
             chunks = self._scene.chunks
             limits = chunks.limits.get(view.colour_by)
             self._appearance.draw(view, limits, lines, chunks.points, chunks.moving, self._budget)
+        return view

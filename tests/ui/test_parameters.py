@@ -165,7 +165,9 @@ def test_changed_parameters_can_be_reset_one_by_one_or_all(parameters: Parameter
     recording = engine.snapshot.recording
     parameters.params = Params().with_values({"ground.voxel_size": 0.3})  # as its own parameters have it
     parameters.tick(recording=recording)
-    assert not resets.visible, "the user changed nothing"
+    assert resets.visible and resets.options == ("nothing changed",)
+    user_sets(resets, "nothing changed")
+    assert parameters.sent == []
     opened = parameters.params
     parameters.params = opened.with_values({"ground.alpha": 12.0, "ground.sigma": 0.1})
     parameters.tick(recording=recording)
@@ -188,6 +190,23 @@ def test_what_the_ground_sliders_made_of_the_scan_stands_below_them(parameters: 
     ground = replace(result.ground, found=False, reason="only 2 seed points")
     parameters.tick(result=replace(result, ground=ground))
     assert "No ground plane: only 2 seed points." in parameters.panel._ground.content
+
+
+def test_while_a_ground_slider_moves_the_share_before_stands_beside_it(
+    parameters: Parameters, engine: FakeEngine
+) -> None:
+    engine.send(StepFrame())
+    result = engine.snapshot.result
+    assert result is not None
+    before, more = f"(was {100 * result.ground.share:.1f} %)", replace(result.ground, share=result.ground.share + 0.1)
+    panel, snapshot = parameters.panel, replace(engine.snapshot, result=result)
+    panel.draw(snapshot)
+    assert "was" not in panel._ground.content
+    for _ in range(2):
+        panel.draw(replace(snapshot, result=replace(result, ground=more)), tuning=True)
+        assert before in panel._ground.content
+    panel.draw(replace(snapshot, result=replace(result, ground=more)))
+    assert "was" not in panel._ground.content
 
 
 def test_each_ground_slider_says_that_it_is_about_the_ground(parameters: Parameters) -> None:

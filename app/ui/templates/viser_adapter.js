@@ -40,7 +40,27 @@ if (!window.hemislamSay) {
     if (event.key !== 'Escape' || isBox(event.target) || document.querySelector('.mantine-Combobox-dropdown:not([style*="display: none"])')) return;
     const modals = document.querySelectorAll('.mantine-Modal-body'), last = modals[modals.length - 1];
     if (last) [...last.querySelectorAll('button')].findLast((one) => /^(Cancel|Close)$/.test(one.textContent.trim()))?.click();
+    else opened('');
   });
+
+  // The server is told which tab is opened, and of Escape.
+  const opened = (word) => {
+    const target = document.querySelector('.hs-opened');
+    if (target) { target.dataset.hs = word; window.hemislamSay({type: 'click', target}); }
+  };
+  new MutationObserver((changes) => {
+    for (const {target: tab} of changes) if (tab.role === 'tab' && tab.ariaSelected === 'true') opened(tab.textContent.trim());
+  }).observe(document.body, {subtree: true, attributeFilter: ['aria-selected']});
+
+  // viser's own buttons beside the title have icons only.
+  const named = {'list-search': 'All commands (Ctrl K)', 'adjustments': 'Connection and scene, as viser has them'};
+  setInterval(() => {
+    for (const [icon, name] of Object.entries(named)) {
+      for (const button of document.querySelectorAll(`button:not([title]):has(.tabler-icon-${icon})`)) {
+        button.title = name; button.setAttribute('aria-label', name);
+      }
+    }
+  }, 1000);
 
   // Show a tab, docked or on a phone, and unfold what is folded in a part of it.
   window.hemislamOpenTab = (name, unfolded = '') => {
