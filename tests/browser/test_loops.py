@@ -73,10 +73,12 @@ def test_a_loop_is_rejected_undone_and_rejected_again(bench: Bench) -> None:
     reject = page.get_by_role("button", name="Reject it")
     reject.evaluate("(button) => button.scrollIntoView({block: 'start'})")
     expect(page.get_by_text("Keyframes would move by up to")).to_be_visible()
+    before = reject.bounding_box()
     reject.click()
     expect(page.get_by_text("Rejected 12–89; keyframes moved by up to")).to_be_visible()
     expect(page.get_by_role("button", name="Undo: reject 12–89")).to_be_visible()
     expect(page.get_by_role("button", name="Undo", exact=True)).to_be_in_viewport(ratio=1)
+    assert page.get_by_role("button", name="Undo", exact=True).bounding_box() == before, "the way back is in its place"
     bench.eventually(lambda: EditLoop(Reject(*GOOD)) in bench.engine.sent)
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Control+z")
@@ -84,6 +86,14 @@ def test_a_loop_is_rejected_undone_and_rejected_again(bench: Bench) -> None:
     page.keyboard.press("Control+Shift+Z")
     expect(page.get_by_role("button", name="Undo: reject 12–89")).to_be_visible()
     assert bench.engine.sent.count(UndoLoop()) == bench.engine.sent.count(RedoLoop()) == 1
+
+
+def test_the_tabs_stay_in_view_while_the_panel_is_scrolled(bench: Bench) -> None:
+    page = bench.page
+    page.get_by_text("Graph residuals").scroll_into_view_if_needed()
+    expect(page.get_by_text("hall_bpearl.mcap")).not_to_be_in_viewport()
+    for name in ("Parameters", "Help"):
+        expect(page.get_by_role("tab", name=name)).to_be_in_viewport(ratio=1)
 
 
 def test_edits_are_downloaded_as_the_command_line_takes_them(bench: Bench) -> None:
@@ -108,3 +118,17 @@ def test_flying_to_a_loop_brings_its_submaps_before_the_camera(bench: Bench) -> 
     if folder := os.environ.get("HEMISLAM_SCREENSHOTS"):
         page.wait_for_timeout(1500)
         page.screenshot(path=f"{folder}/loops.png")
+
+
+def test_another_tab_or_escape_closes_the_chosen_loop_and_the_look_of_things_does_not(bench: Bench) -> None:
+    page, loops = bench.page, bench.workbench._loops
+    page.get_by_role("tab", name="View").click()
+    page.wait_for_timeout(500)
+    assert loops.chosen == GOOD
+    page.get_by_role("tab", name="Readouts").click()
+    bench.eventually(lambda: loops.chosen is None)
+    page.get_by_role("tab", name="Loops").click()
+    page.locator("tr[aria-selected]", has_text="12–89").click()
+    bench.eventually(lambda: loops.chosen == GOOD)
+    page.keyboard.press("Escape")
+    bench.eventually(lambda: loops.chosen is None)

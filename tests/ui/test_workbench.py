@@ -54,7 +54,9 @@ def test_frames_are_sent_at_the_rate_that_eyes_follow(page: Page, wire: Wire) ->
     assert 10 <= len(scans) <= 16
 
 
-def test_a_ground_slider_dims_the_map_until_something_else_is_done_and_another_does_not(page: Page, server: viser.ViserServer) -> None:
+def test_a_ground_slider_dims_the_map_until_something_else_is_done_and_another_does_not(
+    page: Page, server: viser.ViserServer
+) -> None:
     def dimmed() -> bool:
         """And the legend says so."""
         grey = clouds(server)["/map/keyframes/0"].colors.ndim == 1
