@@ -80,6 +80,7 @@ def test_space_plays_and_pauses(bench: Bench) -> None:
 def test_space_after_a_click_on_a_button_does_not_click_it_again(bench: Bench) -> None:
     bench.page.get_by_role("button", name="Step", exact=True).click()
     bench.eventually(lambda: bench.engine.sent == [StepFrame()])
+    assert bench.page.evaluate("document.activeElement === document.body"), "no ring stays"
     bench.page.keyboard.press("Space")
     bench.eventually(lambda: bench.engine.snapshot.transport.playing)
     bench.page.keyboard.press("Space")
@@ -279,14 +280,18 @@ def test_the_page_reaches_out_to_nobody(bench: Bench, chromium: Browser) -> None
 
 def test_the_first_visit_is_shown_around_once(bench: Bench, chromium: Browser) -> None:
     page = new_page(chromium, 1000, 620, tour=True)
+    bench.engine.send(Play())
     try:
         page.goto(bench.url)
         tour = page.get_by_role("dialog", name="Tour")
+        bench.eventually(lambda: not bench.engine.snapshot.transport.playing)  # while it is read
         for title in ("Play, or step", "Go anywhere", "Tune the ground", "Judge a loop", "That is all"):
             expect(tour.get_by_text(title)).to_be_visible()
             expect(page.locator(".hs-outlined")).to_have_count(1)
             tour.locator(".hs-next").click()
         expect(tour).to_have_count(0)
+        bench.eventually(lambda: bench.engine.snapshot.transport.playing)
+        bench.engine.send(Pause())
         page.reload()
         expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
         page.wait_for_timeout(3000)
