@@ -19,7 +19,7 @@ from app.ui.nodes import add_lines, clear, segments
 from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, notify_error, poses_of, show
 
 _REST_S: Final = 0.3
-_GHOST: Final[dict[bool, Rgb]] = {False: (255, 240, 120), True: (120, 90, 0)}
+_GHOST: Final[dict[bool, Rgb]] = {False: (255, 232, 70), True: (120, 90, 0)}
 """On a dark and on a light background: yellow, which every kind of colour vision tells from path and edited loops."""
 _STICK: Final[Rgb] = (150, 140, 100)
 _LEAST_SHIFT_M: Final = 0.005

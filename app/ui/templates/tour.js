@@ -41,8 +41,6 @@ if (!window.hemislamTour) {
     box.setAttribute('role', 'dialog');
     box.setAttribute('aria-label', 'Tour');
     window.addEventListener('keydown', key); // not this image's own
-    const scene = document.querySelector('canvas[data-engine]').getBoundingClientRect();
-    box.style.right = innerWidth - scene.right + 12 + 'px'; // in the scene's corner, beside what is outlined
     document.body.append(box);
     show();
   };

@@ -212,7 +212,7 @@ const settle = () => {
     const sheet = phone && document.querySelector('[style*="max-height: 60%"]'), high = bar.offsetHeight;
     const style = document.documentElement.style;
     const put = (name, pixels) => { if (style.getPropertyValue(name) !== pixels + 'px') style.setProperty(name, pixels + 'px'); };
-    put('--hs-bar', high); put('--hs-under', high + (sheet ? sheet.offsetHeight : 0));
+    put('--hs-beside', innerWidth - box.right); put('--hs-bar', high); put('--hs-under', high + (sheet ? sheet.offsetHeight : 0));
   }
   setTimeout(settle, 300);
 };
