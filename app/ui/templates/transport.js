@@ -187,7 +187,7 @@ const show = () => {
 };
 const dragged = (event) => { touched = performance.now(); ask(Number(slider.value), event.type === 'change'); };
 slider.oninput = slider.onchange = dragged;
-bar.onpointerup = () => setTimeout(() => document.activeElement.blur()); // so that keys act on the scene, without a ring
+bar.onpointerup = () => document.activeElement.blur(); // so that keys act on the scene, without a ring
 speed.addEventListener('click', (event) => { if (event.target.dataset.hs) speed.open = false; });
 window.addEventListener('pointerdown', (event) => { if (!speed.contains(event.target)) speed.open = false; });
 const unfold = (open) => {
