@@ -11,30 +11,35 @@ if (!window.hemislamTour) {
   ];
   const seen = () => { try { localStorage.setItem('hemislam-tour', 'seen'); } catch { /* private window */ } };
   window.hemislamTour = () => {
-    document.querySelector('.hs-tour')?.remove();
+    if (document.querySelector('.hs-tour')) return;
     const box = document.createElement('div');
-    let at = 0, outlined = null;
+    let at = 0, outlined = null, opened = null;
+    const outline = () => { // again and again: viser may make again what is outlined
+      const [target, , , , place = 0] = STEPS[at], found = target ? document.querySelectorAll(target)[place] : opened;
+      if (found !== outlined) outlined?.classList.remove('hs-outlined');
+      outlined = found;
+      outlined?.classList.add('hs-outlined');
+    };
+    const timer = setInterval(outline, 500);
     const playing = () => { const now = JSON.parse(document.querySelector('.hs-state').dataset.state); return now.playing && !now.live; };
     const toggle = () => document.querySelector('body > * .hs-play')?.click();
     const held = playing(); // nothing runs on behind what is read
     if (held) toggle();
     const end = () => {
-      outlined?.classList.remove('hs-outlined'); box.remove(); seen(); window.removeEventListener('keydown', key);
+      clearInterval(timer); outlined?.classList.remove('hs-outlined'); box.remove(); seen(); window.removeEventListener('keydown', key);
       if (held && !playing()) toggle();
     };
     const key = (event) => { if (event.key === 'Escape') end(); };
     const show = () => {
-      const [target, tab, title, text, place = 0] = STEPS[at];
-      const opened = tab && window.hemislamOpenTab(tab);
-      outlined?.classList.remove('hs-outlined');
-      outlined = target ? document.querySelectorAll(target)[place] : opened;
-      outlined?.classList.add('hs-outlined');
+      const [, tab, title, text] = STEPS[at];
+      opened = tab && window.hemislamOpenTab(tab);
+      outline();
       box.innerHTML = `<b>${title}</b><p>${text}</p><div class="hs-row"><span class="hs-note">${at + 1} of ${STEPS.length}</span>`
         + '<span><button class="hs-button">Skip</button><button class="hs-button hs-next"></button></span></div>';
       const [skip, next] = box.querySelectorAll('button');
       next.textContent = at + 1 < STEPS.length ? 'Next' : 'Done';
       skip.onclick = end;
-      next.onclick = () => { at += 1; if (at < STEPS.length) show(); else { end(); window.hemislamOpenTab('Parameters'); } };
+      next.onclick = () => { if (at + 1 < STEPS.length) { at += 1; show(); } else { end(); window.hemislamOpenTab('Parameters'); } };
       next.focus();
     };
     box.className = 'hs-tour hs';
