@@ -18,6 +18,7 @@ from app.slam.errors import HemislamError
 from app.slam.trajectory import truth_beside
 from app.ui.html import panel
 from app.ui.nodes import clear
+from app.ui.viser_adapter import Bridge
 from app.ui.widgets import Changes, Page, by_user, dialog
 
 _MOST_ENTRIES: Final = 60
@@ -67,24 +68,20 @@ class RecentPanel:
         self._send, self._folders, self._kept = page.send, folders, kept
         self._sessions: list[tuple[Path, SavedSession]] = []
         self._changes = Changes()
-        self._gui = page.gui
+        self._bridge = Bridge(page.gui, "last", lambda *_: self._open(self._sessions[0][0]))
+        self._last = page.gui.add_html("")  # it stays as long as the recording is open, so that nothing below moves
         self._browse = page.gui.add_button("Open a recording…", icon=viser.Icon.FOLDER_OPEN, visible=False)
         self._browse.on_click(by_user(browse))
         icons = (viser.Icon.HISTORY, *[viser.Icon.FILE_DATABASE] * _RECENT)
         self._buttons = [page.gui.add_button("", icon=icon, color="gray", visible=False) for icon in icons]
-        self._restore: viser.GuiButtonHandle | None = None
         self._offers: list[tuple[str, Path]] = []
         for number, button in enumerate(self._buttons):
-            button.on_click(by_user(partial(self._open, number)))
-
-    def add_restore(self) -> None:
-        """Add a button to the present container that is always there: it would move what is below it."""
-        self._restore = self._gui.add_button("Restore last session", icon=viser.Icon.HISTORY, color="gray")
-        self._restore.on_click(by_user(partial(self._open, 0)))
+            button.on_click(by_user(partial(self._pick, number)))
 
     def draw(self, snapshot: Snapshot) -> None:
         recording = snapshot.recording
-        self._browse.visible = recording is None and snapshot.progress is None and snapshot.engine_alive
+        nothing = recording is None and snapshot.progress is None
+        self._browse.visible = nothing and snapshot.engine_alive
         if self._changes(snapshot.session, snapshot.session_file):
             present, found = snapshot.session_file, self._folders.sessions(self._kept)
             own = recording.path.resolve() if recording is not None else None
@@ -94,25 +91,25 @@ class RecentPanel:
                 if (present is None or path.resolve() != present.resolve()) and own in (None, saved.opened.recording)
             ]
         before = self._sessions
-        idle = snapshot.live is None and snapshot.progress is None
-        offers = [("Restore last session", before[0][0])] if idle and before else []
-        hint = session_text(before[0][1]) if offers else "No earlier session of this recording was kept."
-        self._buttons[0].hint = hint
-        if self._restore is not None:
-            self._restore.disabled, self._restore.hint = not offers, hint
-        if idle and recording is None:
+        here = recording is not None and before and snapshot.live is None
+        self._last.content = self._bridge.live(panel("last_session", session_text(before[0][1]))) if here else ""
+        self._offers = []
+        if nothing and before:
+            self._buttons[0].hint = session_text(before[0][1])
             recent = dict.fromkeys(saved.opened.recording for _, saved in before)
-            offers += [(f"Open {path.name}", path) for path in list(recent)[:_RECENT]]
-        self._offers = offers
-        for button, offer in itertools.zip_longest(self._buttons, offers):
-            button.visible = offer is not None and recording is None
+            self._offers = [("Restore last session", before[0][0])]
+            self._offers += [(f"Open {path.name}", path) for path in list(recent)[:_RECENT]]
+        for button, offer in itertools.zip_longest(self._buttons, self._offers):
+            button.visible = offer is not None
             if offer is not None:
                 button.label = offer[0]
 
-    def _open(self, number: int, _value: Any, _client: viser.ClientHandle) -> None:
+    def _pick(self, number: int, _value: Any, _client: viser.ClientHandle) -> None:
         if number < len(self._offers):
-            path = self._offers[number][1]
-            self._send(OpenRecording(path, truth_beside(path)))
+            self._open(self._offers[number][1])
+
+    def _open(self, path: Path) -> None:
+        self._send(OpenRecording(path, truth_beside(path)))
 
 
 def session_text(saved: SavedSession) -> str:

@@ -139,7 +139,6 @@ class Workbench:
                 self._map_compare = MapComparePanel(page, folders, results, self._appearance.colour_by)
         with tabs.add_tab("Recording", viser.Icon.FILE_DATABASE):
             files.add_buttons()
-            self._recent.add_restore()
             self._live = LivePanel(gui)
             self._doctor = DoctorPanel(page)
             with gui.add_folder("Calibration", expand_by_default=False):

@@ -17,7 +17,7 @@ from app.server.protocol import Command, OpenedRecording, OpenRecording, Snapsho
 from app.slam.loops.edits import Reject
 from app.slam.params import Params
 from app.ui.files import RecentPanel
-from tests.ui.conftest import page_of, user_clicks
+from tests.ui.conftest import page_of, user_clicks, user_sets
 
 STATE = State(Params(), edits=(Reject(3, 9), Reject(4, 9)), notes=(Note(4, "a door"),))
 
@@ -41,24 +41,22 @@ def opened(path: Path, frame: int) -> Snapshot:
     return Snapshot(session=1, recording=recording, transport=Transport(frame=frame))
 
 
-def test_the_last_session_of_the_recording_is_offered_in_a_button_that_is_always_there(
+def test_the_last_session_of_the_recording_is_offered_as_long_as_that_is_open(
     server: viser.ViserServer, kept: Path
 ) -> None:
     sent: list[Command] = []
     panel = RecentPanel(page_of(server, sent.append), Folders([kept.parent / "open"]), kept, lambda *_: None)
-    panel.add_restore()
-    restore = panel._restore
-    assert restore is not None
     start = opened(kept.parent / "open/walk.mcap", 0)
-    panel.draw(start)
+    for frame in (0, 99):
+        panel.draw(replace(start, transport=Transport(frame=frame)))
+        assert "Open it again: walk.mcap, frame 41, 2 loop edits, 1 note." in panel._last.content
     assert not any(button.visible for button in panel._buttons), "they would move the tabs"
-    assert (restore.disabled, restore.hint) == (False, "walk.mcap, frame 41, 2 loop edits, 1 note")
-    user_clicks(restore)
+    user_sets(panel._bridge._field, "restore #1")
     assert sent == [OpenRecording(kept / "1.hemislam", None)]
     panel.draw(replace(start, session=2, session_file=kept / "1.hemislam"))
-    assert restore.hint == "walk.mcap, frame 12, 2 loop edits, 1 note", "not the one that is open"
+    assert "frame 12" in panel._last.content, "not the one that is open"
     panel.draw(replace(start, session=3, recording=OpenedRecording(kept / "new.mcap", 0, 10.0, 100, ())))
-    assert restore.disabled and restore.visible
+    assert not panel._last.content
 
 
 def test_without_a_recording_those_of_before_are_offered_too(server: viser.ViserServer, kept: Path) -> None:
