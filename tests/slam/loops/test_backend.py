@@ -65,7 +65,7 @@ def test_every_candidate_says_why(walked: Walked) -> None:
         if edge.verdict is Verdict.ACCEPTED:
             assert edge.evidence.support >= PARAMS.support
             assert edge.evidence.mahalanobis <= PARAMS.max_mahalanobis or "outvote odometry" in edge.reason
-            assert f"{edge.evidence.overlap:.2f}" in edge.reason
+            assert f"overlap {100 * edge.evidence.overlap:.0f} %" in edge.reason
         np.linalg.cholesky(edge.covariance)
 
 
