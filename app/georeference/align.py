@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-from app.georeference.drift import drift_deviations
+from app.georeference.drift import constants_despite_drift, drift_deviations
 from app.georeference.fixes import Fixes
 from app.georeference.ground import Ground
 from app.georeference.path import SEARCH_S, PathOverTime
@@ -244,17 +244,36 @@ class _Problem:
         )
 
     def with_drift(self, solved: _Solved) -> _Solved:
-        """The same with standard deviations that count drift, too."""
+        """The same, with standard deviations that count drift, and constants of the receiver that it hardly pulls."""
         used, x, residuals = solved.used, solved.x, solved.residuals[solved.used]
         J = _jacobian(lambda x: _with_level(self._errors(x)[used], x), x)
-        influence = np.linalg.pinv(J).T[:-2].reshape(*residuals.shape, -1) / self.sigmas[used][..., None]
-        drift = drift_deviations(residuals, influence, self.seconds[used])
-        offset_drift = float(drift[6]) if self.offset is not None else 0.0
-        return replace(
+        sigmas, seconds = self.sigmas[used], self.seconds[used]
+        influence = np.linalg.pinv(J).T[:-2].reshape(*residuals.shape, -1) / sigmas[..., None]
+        drift = drift_deviations(residuals, influence, seconds)
+        found = replace(
             solved,
-            offset_sigma=math.hypot(solved.offset_sigma, offset_drift),
             yaw_sigma=math.hypot(solved.yaw_sigma, drift[0]),
             lever_sigma=math.hypot(solved.lever_sigma, drift[-3:].max()),
+        )
+        if self.offset is None:
+            return found
+        but_shift = np.r_[0, 4 : len(x)]  # drift takes its place
+        per_unit = J[:-2].reshape(*residuals.shape, -1)[..., but_shift] * sigmas[..., None]
+        change, covariance = constants_despite_drift(residuals, per_unit, seconds, sigmas)
+        offset, arm = solved.offset + float(change[3]), solved.lever.copy()
+        if self.lever_free:
+            arm += change[4:]
+        there = replace(self, seconds=self.seconds - offset, offset=None, lever=arm, lever_free=False).solve()
+        return replace(
+            found,
+            rotation=there.rotation,
+            shift=there.shift,
+            residuals=there.residuals,
+            distances=there.distances,
+            used=there.used,
+            offset=offset,
+            offset_sigma=float(covariance[3, 3] ** 0.5),
+            lever=arm,
         )
 
     def _model(self, x: F64) -> tuple[F64, F64, float, F64]:

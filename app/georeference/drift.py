@@ -1,4 +1,4 @@
-"""What slow drift adds to the uncertainty of what fixes determine: it is the same in fixes that follow one another.
+"""What slow drift does to what fixes determine: it is the same in fixes that follow one another.
 
 Drift of the map, and of the receiver, is taken for a random walk. Its rate is what the means of the residuals over
 stretches differ from one to the next beyond their noise.
@@ -7,12 +7,41 @@ stretches differ from one to the next beyond their noise.
 from typing import Final
 
 import numpy as np
+from scipy.linalg import solveh_banded
 
 from app.slam.arrays import F64
 
 _STRETCH_S: Final = 8.0
 _FEWEST: Final = 3
 """Fixes of a stretch."""
+_USUAL_RATE: Final = 3e-3**2
+"""m²/s, of a map by a real sensor. Assumed at least for what is constant: drift by millimetres hardly shows in fixes of
+centimetres, and one millimetre along the walk looks like a clock offset of one millisecond."""
+
+
+def constants_despite_drift(residuals: F64, J: F64, seconds: F64, sigmas: F64) -> tuple[F64, F64]:
+    """Least squares with drift among the unknowns, free in each fix, so that only what repeats is a constant.
+
+    Args:
+        residuals: (n, 3) m, at these seconds (n,), ascending. J: (n, 3, k) their change with the constants.
+        sigmas: (n, 3) m, noise of the fixes; if they differ more from one to the next, the noise is that.
+
+    Returns:
+        (k,) change of the constants, and its covariance (k, k).
+    """
+    noise = max(1.0, float(np.sqrt((np.diff(residuals / sigmas, axis=0) ** 2).mean() / 2)))
+    stiff = 1.0 / (max(_rate(residuals, seconds), _USUAL_RATE) * np.maximum(np.diff(seconds), 1e-3))
+    between = np.r_[0.0, stiff] + np.r_[stiff, 0.0]  # the precision of a random walk has three diagonals
+    information, pull = np.zeros((J.shape[2], J.shape[2])), np.zeros(J.shape[2])
+    for axis in range(3):
+        weights = (noise * sigmas[:, axis]) ** -2
+        known = np.column_stack([J[:, axis], residuals[:, axis]]) * weights[:, None]
+        drift = solveh_banded(np.array([np.r_[0.0, -stiff], between + weights]), known)
+        rest = known - weights[:, None] * drift
+        information += J[:, axis].T @ rest[:, :-1]
+        pull += J[:, axis].T @ rest[:, -1]
+    covariance: F64 = np.asarray(np.linalg.inv(information), np.float64)
+    return -covariance @ pull, covariance
 
 
 def drift_deviations(residuals: F64, influence: F64, seconds: F64) -> F64:

@@ -1,8 +1,8 @@
-"""The share of drift in uncertainties. Oracle: many random walks, solved by least squares."""
+"""What drift does to what fixes determine. Oracles: many random walks, solved by least squares; dense covariances."""
 
 import numpy as np
 
-from app.georeference.drift import drift_deviations
+from app.georeference.drift import constants_despite_drift, drift_deviations
 
 
 def test_drift_moves_a_mean_and_a_slope_as_much_as_stated() -> None:
@@ -23,3 +23,19 @@ def test_noise_alone_and_too_few_fixes_show_no_drift() -> None:
     noise = 0.02 * rng.normal(size=(4000, 3))
     assert drift_deviations(noise, influence, seconds)[0] < 0.03  # m, of a walk of 2 mm/√s
     assert drift_deviations(noise[:9], influence[:9], 5.0 * seconds[:9] / 0.2) == 0.0
+
+
+def test_constants_are_those_of_least_squares_with_the_covariance_of_a_random_walk() -> None:
+    """From anywhere: so the mean of each axis is among the unknowns of the oracle."""
+    rng, n, rate = np.random.default_rng(4), 60, 3e-3**2
+    seconds, J = np.sort(rng.uniform(0.0, 9.0, n)), rng.normal(size=(n, 3, 2))
+    sigmas, residuals = rng.uniform(0.01, 0.03, (n, 3)), 1e-3 * rng.normal(size=(n, 3))
+    change, covariance = constants_despite_drift(residuals, J, seconds, sigmas)
+    information, pull = np.zeros((5, 5)), np.zeros(5)
+    for axis in range(3):
+        dense = np.diag(sigmas[:, axis] ** 2) + rate * np.minimum.outer(seconds - seconds[0], seconds - seconds[0])
+        columns = np.column_stack([J[:, axis], np.tile(np.eye(3)[axis], (n, 1))])
+        information += columns.T @ np.linalg.solve(dense, columns)
+        pull += columns.T @ np.linalg.solve(dense, residuals[:, axis])
+    np.testing.assert_allclose(covariance, np.linalg.inv(information)[:2, :2], rtol=1e-6)
+    np.testing.assert_allclose(change, -np.linalg.solve(information, pull)[:2], rtol=1e-6)
