@@ -259,7 +259,9 @@ class _Problem:
             return found
         but_shift = np.r_[0, 4 : len(x)]  # drift takes its place
         per_unit = J[:-2].reshape(*residuals.shape, -1)[..., but_shift] * sigmas[..., None]
-        change, covariance = constants_despite_drift(residuals, per_unit, seconds, sigmas)
+        expected = np.full(len(but_shift), np.inf)
+        expected[1:3] = LEVEL
+        change, covariance = constants_despite_drift(residuals, per_unit, seconds, sigmas, x[but_shift], expected)
         offset, arm = solved.offset + float(change[3]), solved.lever.copy()
         if self.lever_free:
             arm += change[4:]

@@ -19,12 +19,15 @@ _USUAL_RATE: Final = 3e-3**2
 centimetres, and one millimetre along the walk looks like a clock offset of one millisecond."""
 
 
-def constants_despite_drift(residuals: F64, J: F64, seconds: F64, sigmas: F64) -> tuple[F64, F64]:
+def constants_despite_drift(
+    residuals: F64, J: F64, seconds: F64, sigmas: F64, values: F64, expected: F64
+) -> tuple[F64, F64]:
     """Least squares with drift among the unknowns, free in each fix, so that only what repeats is a constant.
 
     Args:
         residuals: (n, 3) m, at these seconds (n,), ascending. J: (n, 3, k) their change with the constants.
         sigmas: (n, 3) m, noise of the fixes; if they differ more from one to the next, the noise is that.
+        values: (k,) of the constants so far. expected: (k,) how far from zero they may be, inf if anywhere.
 
     Returns:
         (k,) change of the constants, and its covariance (k, k).
@@ -32,7 +35,7 @@ def constants_despite_drift(residuals: F64, J: F64, seconds: F64, sigmas: F64) -
     noise = max(1.0, float(np.sqrt((np.diff(residuals / sigmas, axis=0) ** 2).mean() / 2)))
     stiff = 1.0 / (max(_rate(residuals, seconds), _USUAL_RATE) * np.maximum(np.diff(seconds), 1e-3))
     between = np.r_[0.0, stiff] + np.r_[stiff, 0.0]  # the precision of a random walk has three diagonals
-    information, pull = np.zeros((J.shape[2], J.shape[2])), np.zeros(J.shape[2])
+    information, pull = np.diag(expected**-2.0), expected**-2.0 * values
     for axis in range(3):
         weights = (noise * sigmas[:, axis]) ** -2
         known = np.column_stack([J[:, axis], residuals[:, axis]]) * weights[:, None]

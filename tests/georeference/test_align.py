@@ -190,6 +190,19 @@ def test_the_users_word_on_a_fix_overrides_the_residuals() -> None:
         align(made.trajectory, made.fixes, lever=LEVER, overridden=few)
 
 
+def test_a_line_at_uneven_pace_shows_the_offset_although_the_tilt_about_it_stays_open() -> None:
+    made = walked(path=LINE)
+    times = (made.trajectory.stamps_ns - made.trajectory.stamps_ns[0]) * 1e-9
+    positions = np.column_stack([times + 3.0 * np.sin(0.5 * times), 0.0 * times, 0.0 * times])
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
+    even = Trajectory(made.trajectory.stamps_ns, positions, level)
+    stamps_ns = made.trajectory.stamps_ns[5:-5]
+    places = TRUTH.to_geographic(positions[5:-5])
+    fixes = Fixes.of(stamps_ns + 80_000_000, places, np.full(places.shape, 0.02))
+    found = align(even, fixes, lever=(0.0, 0.0, 0.0))
+    assert abs(found.offset_s - 0.08) < 0.002 and 1e-4 < found.offset_sigma_s < 0.01
+
+
 def test_a_clock_offset_that_is_given_is_used_and_not_looked_for() -> None:
     made = walked(offset_s=0.08)
     right, wrong = (align(made.trajectory, made.fixes, lever=LEVER, offset_s=offset) for offset in (0.08, -0.4))

@@ -30,8 +30,10 @@ def test_constants_are_those_of_least_squares_with_the_covariance_of_a_random_wa
     rng, n, rate = np.random.default_rng(4), 60, 3e-3**2
     seconds, J = np.sort(rng.uniform(0.0, 9.0, n)), rng.normal(size=(n, 3, 2))
     sigmas, residuals = rng.uniform(0.01, 0.03, (n, 3)), 1e-3 * rng.normal(size=(n, 3))
-    change, covariance = constants_despite_drift(residuals, J, seconds, sigmas)
+    values, expected = np.array([0.002, 0.3]), np.array([1e-3, np.inf])
+    change, covariance = constants_despite_drift(residuals, J, seconds, sigmas, values, expected)
     information, pull = np.zeros((5, 5)), np.zeros(5)
+    information[0, 0], pull[0] = 1e6, 2e3
     for axis in range(3):
         dense = np.diag(sigmas[:, axis] ** 2) + rate * np.minimum.outer(seconds - seconds[0], seconds - seconds[0])
         columns = np.column_stack([J[:, axis], np.tile(np.eye(3)[axis], (n, 1))])
