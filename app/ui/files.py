@@ -68,7 +68,7 @@ class RecentPanel:
         self._send, self._folders, self._kept = page.send, folders, kept
         self._sessions: list[tuple[Path, SavedSession]] = []
         self._changes = Changes()
-        self._bridge = Bridge(page.gui, "last", self._restore)
+        self._bridge = Bridge(page.gui, "last", self._open_last)
         self._last = page.gui.add_html("")  # it stays as long as the recording is open, so that nothing below moves
         self._browse = page.gui.add_button("Open a recording…", icon=viser.Icon.FOLDER_OPEN, visible=False)
         self._browse.on_click(by_user(browse))
@@ -104,7 +104,7 @@ class RecentPanel:
             if offer is not None:
                 button.label = offer[0]
 
-    def _restore(self, _word: str, _client: viser.ClientHandle) -> None:
+    def _open_last(self, _word: str, _client: viser.ClientHandle) -> None:
         if self._sessions:
             self._open(self._sessions[0][0])
 
