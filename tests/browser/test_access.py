@@ -62,6 +62,10 @@ CONTRASTS = """() => {
 }"""
 """Texts whose contrast to what is behind them is less than WCAG 2 AA asks for."""
 
+STILL = """() => document.getAnimations().every((one) => one.playState !== 'running'
+  || one.effect.getComputedTiming().endTime === Infinity)"""
+"""Whether all that fades or glides has come to its end."""
+
 COUNTED = """() => {
   const canvas = document.querySelector('canvas[data-engine]');
   const gl = canvas.getContext('webgl2');
@@ -87,8 +91,12 @@ def _some_map(bench: Bench) -> None:
 
 
 def open_tab(page: Page, name: str) -> None:
-    page.get_by_role("tab", name=name, exact=True).click()
-    page.wait_for_timeout(600)
+    """Until nothing moves or fades any more; what turns for ever may turn."""
+    tab = page.get_by_role("tab", name=name, exact=True)
+    tab.click()
+    expect(tab).to_have_attribute("aria-selected", "true")
+    page.wait_for_timeout(200)  # two frames
+    page.wait_for_function(STILL)
 
 
 @pytest.mark.parametrize("name", TABS)
