@@ -90,6 +90,7 @@ class Engine:
             scan = channels.bent(scan, -lines.errors[:, 1], -lines.errors[:, 0])
         clock = before.clock if p.imu.learn_clock else ClockOffset()
         samples = clock.set_right(samples)
+        gap_s = float(np.diff(samples.stamps_ns).max(initial=0)) * 1e-9
 
         belief, still, waiting = before.belief, before.still, False
         if belief is None and not len(samples):
@@ -123,7 +124,8 @@ class Engine:
         if self._map.voxels:
             if len(samples):
                 chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
-                posterior, registration = self._update(belief, predicted, partial(iekf.update, predicted, chosen))
+                fuse = partial(iekf.update, predicted, chosen, steady=gap_s <= p.imu.max_gap)
+                posterior, registration = self._update(belief, predicted, fuse)
             else:  # the points themselves, since centroids have no time
                 source = reduced.source[sampled.source]
                 fuse = partial(coast.update, predicted, scan.part(source), course)
@@ -176,7 +178,7 @@ class Engine:
             keyframe=keyframe,
             notices=tuple(notices),
             truth_ground=scan.truth_ground,
-            imu_gap_s=float(np.diff(samples.stamps_ns).max(initial=0)) * 1e-9,
+            imu_gap_s=gap_s,
             clock_late_s=clock.late,
         )
         T_odom_keyframe = before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu

@@ -22,13 +22,12 @@ def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundRe
     Args:
         points: (n, 3) float32 m, LiDAR frame.
         ring: (n,) rank of each point's scan line by elevation; 0 is the outermost.
-        down: (3,) direction of gravity in the LiDAR frame.
+        down: (3,) unit, direction of gravity in the LiDAR frame.
 
     Returns:
         Labels and the plane. Without an acceptable plane every label is NON_GROUND, and `reason` says why.
     """
     labels = np.zeros(len(points), dtype=np.uint8)
-    down = down / np.linalg.norm(down)
     none = GroundResult(
         labels=labels,
         found=False,

@@ -66,18 +66,23 @@ def enough_planes(points: int, speed: float) -> float:
     return max(ENOUGH_PLANES, ENOUGH_SHARE * points) if speed > WALKING else ENOUGH_PLANES
 
 
-def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams) -> tuple[Belief, Registration]:
+def update(
+    prior: Belief, points: F32, local_map: LocalMap, params: FilterParams, steady: bool = True
+) -> tuple[Belief, Registration]:
     """Fuse one scan: minimise eq. 7 from the predicted belief.
 
     Args:
         prior: belief at the scan's end, from propagation.
         points: (n, 3) float32 m, LiDAR frame, deskewed to the scan's end.
+        steady: whether the IMU saw the whole motion. If not, points are not where deskewing puts them, and the
+            extrinsics stay as they are.
 
     Returns:
         The posterior belief, or the unchanged prior if too few points found a plane; and how the update went.
     """
     n = len(points)
-    free = DIM if params.estimate_extrinsics else NAVIGATION
+    extrinsics = params.estimate_extrinsics and steady
+    free = DIM if extrinsics else NAVIGATION
     information = np.linalg.inv(prior.covariance[:free, :free])
     world, residuals = np.empty((n, 3)), np.empty(n)
     H, b, stats = np.empty((12, 12)), np.empty(12), np.zeros(2)
@@ -98,7 +103,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
             since_search[:] = 0.0
         kernels.normal_equations(
             points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,
-            params.gate, params.estimate_extrinsics, H, b, stats, residuals,
+            params.gate, extrinsics, H, b, stats, residuals,
         )  # fmt: skip
         if stats[0] < MIN_INLIERS:
             return prior, too_few(iteration, n, int(stats[0]), matches(points, residuals, planes))

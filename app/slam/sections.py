@@ -205,7 +205,7 @@ class FilterParams(Section):
     neighbour_distance: float = _next_frame(
         1.0, "Map points farther than this from a point are not its neighbours.", (0.2, 5, 0.1), "m"
     )
-    estimate_extrinsics: bool = _next_frame(False, "Estimate the LiDAR's pose on the IMU while mapping.")
+    estimate_extrinsics: bool = _next_frame(True, "Refine the LiDAR's pose on the IMU while mapping.")
     learn_lines: bool = _next_frame(True, "Learn each scan line's range and elevation errors and correct them.")
 
 
@@ -216,7 +216,7 @@ class MapParams(Section):
         1.0, "Edge of a map voxel. Neighbours are searched within one edge at most.", (0.1, 3, 0.05), "m"
     )
     spacing: float = _next_frame(
-        0.2, "Least distance between two points of a voxel: at rest the map does not grow.", (0, 1, 0.05), "m"
+        0.15, "Least distance between two points of a voxel: at rest the map does not grow.", (0, 1, 0.05), "m"
     )
     points_per_voxel: int = _on_restart(40, "Most points in one voxel.", (1, 50, 1))
     radius: float = _next_frame(100.0, "Voxels farther than this from the sensor are dropped.", (10, 500, 5), "m")

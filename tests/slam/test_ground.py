@@ -325,14 +325,6 @@ def test_lines_are_ranked_among_those_that_are_there() -> None:
     np.testing.assert_array_equal(spread.labels, dense.labels)
 
 
-def test_the_length_of_down_does_not_matter() -> None:
-    scan = seen(furnished_room(), FORWARD)
-    unit = segment(scan, FORWARD)
-    long = ground.segment(scan.points, scan.ring, FORWARD.T @ [0.0, 0.0, -9.81], GroundParams())
-    np.testing.assert_array_equal(long.labels, unit.labels)
-    np.testing.assert_allclose(long.down, FORWARD.T @ [0, 0, -1], atol=1e-12)
-
-
 def test_points_and_rings_are_left_as_they_were() -> None:
     scan = seen(furnished_room(), FORWARD)
     points, ring = scan.points.copy(), scan.ring.copy()

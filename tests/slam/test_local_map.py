@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from app.slam.kernels.map import BINS, LEAST_SCATTER, MOST, MOST_HITS, OLD, SHARED, SURE_TILT
+from app.slam.kernels.map import BINS, LEAST_SCATTER, MOST, MOST_HITS, OLD, PLANE_FREEDOM, SHARED, SURE_TILT
 from app.slam.local_map import RELAXED, LocalMap, MapState, Planes
 from app.slam.sections import FilterParams, MapParams
 
@@ -98,16 +98,17 @@ def test_standing_still_piles_up_nothing() -> None:
 
 # --- planes --------------------------------------------------------------------------------------
 def expected_plane(
-    query: np.ndarray, near: np.ndarray, p: FilterParams, reach: float
+    query: np.ndarray, near: np.ndarray, hits: np.ndarray, p: FilterParams, reach: float
 ) -> tuple[np.ndarray, np.ndarray, float] | str | None:
-    """Normal, centre and a point's variance by numpy, from neighbours sorted exactly; None: no plane.
+    """Normal, centre and a point's variance by numpy, from neighbours (n, 3) and their hits (n,), sorted exactly; None:
+    no plane.
 
     "ambiguous" where the map's ranking in bins of squared distance may take others than the nearest,
     or where a decision hangs on the last digits.
     """
     squares = np.sum((near - query) ** 2, axis=1)
     order = np.argsort(squares)
-    near, bins = near[order], (squares[order] * (BINS / reach**2)).astype(int)
+    near, hits, bins = near[order], hits[order], (squares[order] * (BINS / reach**2)).astype(int)
     n = min(len(near), MOST)
     k = p.neighbours
     while k <= n:
@@ -115,7 +116,9 @@ def expected_plane(
             return "ambiguous"
         patch = near[:k]
         values, vectors = np.linalg.eigh(np.cov(patch.T, bias=True))
-        certain = max(values[0], (LEAST_SCATTER * p.point_noise) ** 2) / (np.radians(p.plane_tilt) ** 2 * k * values[1])
+        scatter = np.sum(((patch - patch.mean(axis=0)) @ vectors[:, 0]) ** 2) / (k - PLANE_FREEDOM)
+        least = np.mean((LEAST_SCATTER * p.point_noise) ** 2 / hits[:k])
+        certain = max(scatter, least) / (np.radians(p.plane_tilt) ** 2 * k * values[1])
         if abs(certain - 1) < 1e-3:
             return "ambiguous"
         if certain < 1:
@@ -123,7 +126,7 @@ def expected_plane(
             if abs(off - p.plane_threshold) < 1e-4:
                 return "ambiguous"
             tilt = certain * np.radians(p.plane_tilt) ** 2 / SURE_TILT**2
-            variance = (p.point_noise**2 + SHARED * values[0]) * max(1.0, tilt)
+            variance = (p.point_noise**2 + SHARED * scatter) * max(1.0, tilt)
             return None if off > p.plane_threshold else (vectors[:, 0], patch.mean(axis=0), variance)
         if k == n:
             break
@@ -136,14 +139,14 @@ def expected_plane(
 def test_planes_are_those_through_the_nearest_neighbours(tilt: float, reach: float) -> None:
     params = FilterParams(plane_tilt=tilt, neighbour_distance=reach)
     local_map = filled(surface(3))
-    points = stored(local_map)
+    points, hits = stored(local_map), local_map.checkpoint().points[:, 3].astype(float)
     tree = cKDTree(points)
     queries = surface(5, 1500, noise=0.05)
     planes = local_map.planes(queries, params)[0]
     compared = {"plane": 0, "none": 0}
     for j, query in enumerate(queries):
-        near = points[sorted(tree.query_ball_point(query, reach))]
-        expected = expected_plane(query, near, params, reach)
+        near = sorted(tree.query_ball_point(query, reach))
+        expected = expected_plane(query, points[near], hits[near], params, reach)
         if isinstance(expected, str):
             continue
         if expected is None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.slam import imu, rest, start
-from app.slam.imu import BA, DIM, GRAV, POS, VEL, Belief
+from app.slam.imu import BA, DIM, GRAV, POS, ROT, VEL, Belief
 from app.slam.kernels import manifold
 from app.slam.lie import hat
 from app.slam.params import Params
@@ -62,6 +62,7 @@ def test_a_rest_shows_the_bias_along_gravity_but_not_across() -> None:
     assert all(sigma_of(axis, belief) > 0.03 for axis in across)
 
     state, H = belief.state, np.zeros((3, DIM))
+    H[:, ROT] = hat(-state.R_odom_imu.T @ state.g_odom)
     H[:, BA] = np.eye(3)
     H[:, GRAV] = state.R_odom_imu.T @ hat(state.g_odom) @ manifold.tangent_basis(state.g_odom)
     of_the_sum = np.sqrt(np.diag(H @ belief.covariance @ H.T))

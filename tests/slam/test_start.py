@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from app.slam import rest, start
-from app.slam.imu import BG, GRAV, ROT, VEL
+from app.slam.imu import BG, EXT_ROT, GRAV, ROT, VEL
 from app.slam.params import Params
 from app.slam.types import Scan
 
@@ -92,7 +92,9 @@ def test_a_moving_start_says_so_and_claims_little() -> None:
     moving, standing = outcome.belief.covariance, run(RESTING, Params(), 30)[-1].belief.covariance
     for part in (VEL, BG, GRAV):
         assert np.all(np.diag(moving)[part] > 10 * np.diag(standing)[part])
-    assert np.all(np.diag(moving)[ROT] < 1e-6)  # odom is defined by this pose, moving or not
+    fixed = run(MOVING, Params().with_values({"filter.estimate_extrinsics": False}), 1)[0].belief.covariance
+    assert np.all(np.diag(fixed)[ROT] < 1e-6)  # odom is defined by this pose, moving or not
+    assert np.allclose(np.diag(moving)[ROT] - np.diag(fixed)[ROT], np.diag(moving)[EXT_ROT])  # or by the LiDAR's
     assert outcome.belief.state.stamp_ns == START_NS  # the path reaches back over the whole scan
 
 

@@ -23,7 +23,7 @@ def _find(table, cells, a, b, c):
         h = (h + 1) & mask
 
 
-MOST_HITS = 4
+MOST_HITS = 8
 """Hits that count. A point that went on following the scans would let the map drift with them."""
 
 
@@ -124,8 +124,12 @@ BINS = 64
 """Steps of squared distance by which neighbours are ranked. Exact sorting takes three times as long."""
 SURE_TILT = math.radians(1.5)
 """A plane whose normal is less certain than this counts for less, in proportion to the variance of its normal."""
-LEAST_SCATTER = 2.0
-"""Least scatter assumed of a plane's points, as a multiple of the point noise: a few points lie flat by chance."""
+PLANE_FREEDOM = 3
+"""Degrees of freedom of a plane. The squared distances of k points from it are averaged over k - 3, since a
+few points lie flat by chance."""
+LEAST_SCATTER = 1.5
+"""Least scatter assumed of a plane's points, in standard deviations of a map point: one scan's points share errors, and
+the first scan has no other point beside them."""
 SHARED = 4.0
 """Weight of a plane's variance beside the point's own: points on the same patch share its error, so it does not
 average out between them."""
@@ -190,7 +194,7 @@ def _fit(x, y, z, places, order, n, first, flat, tilts, noise, normal, j, normal
     Out, in row j of each tilt: normals, unit; centers, m, relative to the query; variances, m² or -1. Scratch: normal.
     """
     variances[:, j] = -1.0
-    sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
+    sx = sy = sz = xx = xy = xz = yy = yz = zz = inverse_hits = 0.0
     done, take, level = 0, first, 0
     while take <= n:
         for i in range(done, take):
@@ -205,6 +209,7 @@ def _fit(x, y, z, places, order, n, first, flat, tilts, noise, normal, j, normal
             yy += ey * ey
             yz += ey * ez
             zz += ez * ez
+            inverse_hits += 1.0 / places[k, 3]
         done = take
         s = 1.0 / take
         mx, my, mz = sx * s, sy * s, sz * s
@@ -212,7 +217,10 @@ def _fit(x, y, z, places, order, n, first, flat, tilts, noise, normal, j, normal
             xx * s - mx * mx, xy * s - mx * my, xz * s - mx * mz,
             yy * s - my * my, yz * s - my * mz, zz * s - mz * mz, normal,
         )  # fmt: skip
-        scatter = max(l3, LEAST_SCATTER * LEAST_SCATTER * noise * noise)
+        l3 *= take / (take - PLANE_FREEDOM)
+        # the mean of h hits has a variance of noise² / h
+        least = LEAST_SCATTER * LEAST_SCATTER * noise * noise * s * inverse_hits
+        scatter = max(l3, least)
         begin = level
         while level < len(tilts) and scatter < tilts[level] * tilts[level] * take * l2:
             level += 1
