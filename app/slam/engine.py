@@ -124,7 +124,7 @@ class Engine:
         if self._map.voxels:
             if len(samples):
                 chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
-                fuse = partial(iekf.update, predicted, chosen, steady=gap_s <= p.imu.max_gap)
+                fuse = partial(iekf.update, predicted, chosen, gapless=gap_s <= p.imu.max_gap)
                 posterior, registration = self._update(belief, predicted, fuse)
             else:  # the points themselves, since centroids have no time
                 source = reduced.source[sampled.source]

@@ -67,21 +67,21 @@ def enough_planes(points: int, speed: float) -> float:
 
 
 def update(
-    prior: Belief, points: F32, local_map: LocalMap, params: FilterParams, steady: bool = True
+    prior: Belief, points: F32, local_map: LocalMap, params: FilterParams, gapless: bool = True
 ) -> tuple[Belief, Registration]:
     """Fuse one scan: minimise eq. 7 from the predicted belief.
 
     Args:
         prior: belief at the scan's end, from propagation.
         points: (n, 3) float32 m, LiDAR frame, deskewed to the scan's end.
-        steady: whether the IMU saw the whole motion. If not, points are not where deskewing puts them, and the
+        gapless: whether the IMU saw the whole motion. If not, points are not where deskewing puts them, and the
             extrinsics stay as they are.
 
     Returns:
         The posterior belief, or the unchanged prior if too few points found a plane; and how the update went.
     """
     n = len(points)
-    extrinsics = params.estimate_extrinsics and steady
+    extrinsics = params.estimate_extrinsics and gapless
     free = DIM if extrinsics else NAVIGATION
     information = np.linalg.inv(prior.covariance[:free, :free])
     world, residuals = np.empty((n, 3)), np.empty(n)

@@ -295,11 +295,11 @@ def test_the_residual_reported_is_that_of_the_inliers(room: LocalMap) -> None:
     assert registration.used == len(points)
 
 
-@pytest.mark.parametrize(("estimated", "steady"), [(False, True), (True, False)])
-def test_extrinsics_stay_unless_they_are_estimated(room: LocalMap, estimated: bool, steady: bool) -> None:
+@pytest.mark.parametrize(("estimated", "gapless"), [(False, True), (True, False)])
+def test_extrinsics_stay_unless_they_are_estimated(room: LocalMap, estimated: bool, gapless: bool) -> None:
     """And while the IMU has a gap."""
     prior, points = correlated_prior(5e-3), points_of(furnished_room())
-    kept, _ = iekf.update(prior, points, room, FilterParams(estimate_extrinsics=estimated), steady)
+    kept, _ = iekf.update(prior, points, room, FilterParams(estimate_extrinsics=estimated), gapless)
     np.testing.assert_array_equal(kept.state.R_imu_lidar, prior.state.R_imu_lidar)
     np.testing.assert_array_equal(kept.state.p_imu_lidar, prior.state.p_imu_lidar)
     np.testing.assert_array_equal(kept.covariance[17:, 17:], prior.covariance[17:, 17:])
