@@ -14,9 +14,10 @@ from app.slam.arrays import F64
 _STRETCH_S: Final = 8.0
 _FEWEST: Final = 3
 """Fixes of a stretch."""
-_USUAL_RATE: Final = 3e-3**2
-"""m²/s, of a map by a real sensor. Assumed at least for what is constant: drift by millimetres hardly shows in fixes of
-centimetres, and one millimetre along the walk looks like a clock offset of one millisecond."""
+_LEAST_RATE: Final = 1e-3**2
+"""m²/s. Assumed at least for what is constant: drift by millimetres hardly shows in fixes of centimetres, and one
+millimetre along the walk looks like a clock offset of one millisecond. Maps by a clean sensor outdoors drift by a
+quarter of it, others by up to 3 mm/√s, which shows."""
 
 
 def constants_despite_drift(
@@ -33,7 +34,7 @@ def constants_despite_drift(
         (k,) change of the constants, and its covariance (k, k).
     """
     noise = max(1.0, float(np.sqrt((np.diff(residuals / sigmas, axis=0) ** 2).mean() / 2)))
-    stiff = 1.0 / (max(_rate(residuals, seconds), _USUAL_RATE) * np.maximum(np.diff(seconds), 1e-3))
+    stiff = 1.0 / (max(_rate(residuals, seconds), _LEAST_RATE) * np.maximum(np.diff(seconds), 1e-3))
     between = np.r_[0.0, stiff] + np.r_[stiff, 0.0]  # the precision of a random walk has three diagonals
     information, pull = np.diag(expected**-2.0), expected**-2.0 * values
     for axis in range(3):

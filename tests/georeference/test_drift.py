@@ -27,7 +27,7 @@ def test_noise_alone_and_too_few_fixes_show_no_drift() -> None:
 
 def test_constants_are_those_of_least_squares_with_the_covariance_of_a_random_walk() -> None:
     """From anywhere: so the mean of each axis is among the unknowns of the oracle."""
-    rng, n, rate = np.random.default_rng(4), 60, 3e-3**2
+    rng, n, rate = np.random.default_rng(4), 60, 1e-3**2
     seconds, J = np.sort(rng.uniform(0.0, 9.0, n)), rng.normal(size=(n, 3, 2))
     sigmas, residuals = rng.uniform(0.01, 0.03, (n, 3)), 1e-3 * rng.normal(size=(n, 3))
     values, expected = np.array([0.002, 0.3]), np.array([1e-3, np.inf])
