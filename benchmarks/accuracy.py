@@ -25,7 +25,7 @@ from app.mapping.opening import open_session
 from app.mapping.session import Session
 from app.sensors.presets import resolve_params
 from app.slam import lie
-from app.slam.loops.types import OPEN_M, LoopEdge, Verdict
+from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.metrics import ate, interpolate, paired
 from app.slam.params import Params
 from app.slam.trajectory import Trajectory, read_tum, truth_beside
@@ -45,8 +45,9 @@ FALSE_M, FALSE_DEG = 0.5, 5.0
 """A loop farther than this from the truth is false: it ties another place, and is not merely inexact."""
 GOOD_M, GOOD_DEG = 0.10, 0.5
 """A revisit counts as found by a loop this near to the truth."""
-HELD_DEG = 1.0
-"""A loop tells nothing of a rotation whose standard deviation is greater, as of roll and pitch."""
+CLAIMED_M, CLAIMED_DEG = 0.2, 1.0
+"""A loop claims a direction, or an axis, if its standard deviation there is at most this: along a bare corridor it says
+itself that it may be off by decimetres, and roll and pitch are left to gravity."""
 WITHIN_M, APART_S, ALONG = 2.0, 15.0, 0.7
 """A revisit: so near to where the walk was so long before, heading the same way or the opposite one (cosine)."""
 WORSE_M = 0.002
@@ -55,13 +56,14 @@ WORSE_M = 0.002
 @dataclass(frozen=True)
 class Walk:
     """Attributes:
-    odometry: of all frames. trajectory: in the map. T_odom_imu: (k, 4, 4) of keyframes; covariances: (k, 6, 6),
-        rotation first; stamps_ns: (k,). edges: all candidates.
+    odometry: of all frames. trajectory: in the map. T_odom_imu, T_imu_lidar: (k, 4, 4) of keyframes; covariances:
+        (k, 6, 6), rotation first; stamps_ns: (k,). edges: all candidates.
     """
 
     odometry: Trajectory
     trajectory: Trajectory
     T_odom_imu: F64
+    T_imu_lidar: F64
     covariances: F64
     stamps_ns: I64
     edges: tuple[LoopEdge, ...]
@@ -129,7 +131,8 @@ def _walk(work: Session) -> Walk:
         odometry,
         found.frame.trajectory(odometry) if found else odometry,
         np.array([keyframe.T_odom_imu for keyframe in keyframes]),
-        np.array([keyframe.covariance for keyframe in keyframes]),
+        np.array([keyframe.T_imu_lidar for keyframe in keyframes]),
+        np.array([keyframe.covariance + keyframe.drift for keyframe in keyframes]),
         np.array([keyframe.stamp_ns for keyframe in keyframes]),
         found.edges if found else (),
     )
@@ -137,8 +140,9 @@ def _walk(work: Session) -> Walk:
 
 def score(walk: Walk, truth: Trajectory) -> Score:
     off = ate(walk.odometry, truth)
-    turned, moved, stamps_ns = _errors(walk, truth, off.T_truth_estimate[:3, :3])
-    gained_m, gained_deg = _gains(stamps_ns, turned, moved)
+    R_truth_odom = off.T_truth_estimate[:3, :3]
+    gained_m, gained_deg = _gains(*_errors(_by_the_last_mounting(walk), truth, walk.stamps_ns[0], R_truth_odom))
+    stamps_ns, turned, moved = _errors(walk.odometry, truth, walk.stamps_ns[0], R_truth_odom)
     _, at, of = np.intersect1d(stamps_ns, walk.stamps_ns, return_indices=True)
     yaw, position = _nees(turned[at], moved[at], walk.T_odom_imu[of], walk.covariances[of])
 
@@ -166,18 +170,29 @@ def score(walk: Walk, truth: Trajectory) -> Score:
     )
 
 
-def _errors(walk: Walk, truth: Trajectory, R_truth_odom: F64) -> tuple[F64, F64, I64]:
-    """Errors of odometry in yaw (n,) rad and position (n, 3) m since the first keyframe, and their stamps (n,).
+def _by_the_last_mounting(walk: Walk) -> Trajectory:
+    """Odometry with the IMU where the last mounting puts it on the LiDAR.
+
+    While the mounting is learnt, the IMU's pose turns with it, and no point of the map moves.
+    """
+    last = np.searchsorted(walk.stamps_ns, walk.odometry.stamps_ns, side="right") - 1
+    T_imu_lidar = walk.T_imu_lidar[np.maximum(last, 0)]
+    T = walk.odometry.poses @ T_imu_lidar @ lie.inverse(walk.T_imu_lidar[-1])
+    return Trajectory.from_poses(walk.odometry.stamps_ns, T)
+
+
+def _errors(odometry: Trajectory, truth: Trajectory, first_ns: int, R_truth_odom: F64) -> tuple[I64, F64, F64]:
+    """Stamps (n,) and errors in yaw (n,) rad and position (n, 3) m since the first keyframe.
 
     The truth is turned into odom by the alignment of all positions. The first pose alone would not do: an error of
     the mounting turns the whole walk about it.
     """
-    ours, theirs = paired(walk.odometry, truth)
+    ours, theirs = paired(odometry, truth)
     true = R_truth_odom.T @ theirs.poses[:, :3]
-    begin = int(np.argmax(np.isin(ours.stamps_ns, walk.stamps_ns)))
+    begin = int(np.argmax(ours.stamps_ns >= first_ns))
     turn = ours.poses[:, :3, :3] @ np.swapaxes(true[:, :, :3], 1, 2)
     moved = ours.poses[:, :3, 3] - true[:, :, 3]
-    return lie.log(turn @ turn[begin].T)[:, 2], moved - moved[begin], ours.stamps_ns
+    return ours.stamps_ns, lie.log(turn @ turn[begin].T)[:, 2], moved - moved[begin]
 
 
 def _nees(turned: F64, moved: F64, poses: F64, covariances: F64) -> tuple[float, float]:
@@ -189,24 +204,27 @@ def _nees(turned: F64, moved: F64, poses: F64, covariances: F64) -> tuple[float,
 
 
 def _gains(stamps_ns: I64, turned: F64, moved: F64) -> tuple[float, float]:
-    """The largest gains of error within SLIP_S, in m and deg."""
+    """The largest gains of error within SLIP_S, in m and deg. What ends nearer to the truth is a correction."""
     mean = np.full(KEPT, 1 / KEPT)
-    turned, stamps_ns = np.convolve(turned, mean, "valid"), stamps_ns[KEPT - 1 :]
-    moved = np.stack([np.convolve(axis, mean, "valid") for axis in moved.T], axis=1)
+    errors = [np.stack([np.convolve(axis, mean, "valid") for axis in e.T], axis=1) for e in (moved, turned[:, None])]
+    stamps_ns = stamps_ns[KEPT - 1 :]
     earlier = np.searchsorted(stamps_ns, stamps_ns - round(SLIP_S * 1e9))
-    gained = np.linalg.norm(moved - moved[earlier], axis=1)
-    return float(gained.max()), float(np.degrees(np.abs(turned - turned[earlier]).max()))
+    gained_m, gained = (
+        float(np.where(off > off[earlier], np.linalg.norm(e - e[earlier], axis=1), 0.0).max())
+        for e, off in ((e, np.linalg.norm(e, axis=1)) for e in errors)
+    )
+    return gained_m, float(np.degrees(gained))
 
 
 def _loop_error(edge: LoopEdge, older: F64, newer: F64) -> tuple[float, float]:
-    """m and deg between a loop and the true poses (4, 4) of its ends, in the directions that it holds."""
+    """m and deg between a loop and the true poses (4, 4) of its ends, in the directions that it claims."""
     wrong = lie.inverse(lie.inverse(older) @ newer) @ edge.T_older_newer
-    turned = _held(edge.covariance[:3, :3], np.radians(HELD_DEG)) @ lie.log(wrong[:3, :3])
-    moved = _held(edge.covariance[3:, 3:], OPEN_M) @ wrong[:3, 3]
+    turned = _claimed(edge.covariance[:3, :3], np.radians(CLAIMED_DEG)) @ lie.log(wrong[:3, :3])
+    moved = _claimed(edge.covariance[3:, 3:], CLAIMED_M) @ wrong[:3, 3]
     return float(np.linalg.norm(moved)), float(np.degrees(np.linalg.norm(turned)))
 
 
-def _held(covariance: F64, most: float) -> F64:
+def _claimed(covariance: F64, most: float) -> F64:
     """(n, 3) unit directions in which a covariance (3, 3) has a standard deviation of at most so much."""
     squares, directions = np.linalg.eigh(covariance)
     return np.asarray(directions[:, squares < most**2].T)

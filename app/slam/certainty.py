@@ -1,63 +1,80 @@
 """How certain a pose is since the walk began, counting errors that repeat from frame to frame.
 
 The filter takes the map and the mounting of the LiDAR as exact, so its covariance shows how well a scan fits the map,
-and stays at millimetres however long the walk is. Two errors are left out, and neither averages out:
+and stays at millimetres however long the walk is. Three errors are left out, and none averages out:
 
 - The map lies where the filter put it. Each new view is mapped with an error of its own, as large as the filter's at
   that time. These errors add up to a random walk, and its rotations move all that follows.
 - The tilt caused by a wrong mounting changes direction as the device turns, and so do the errors of the IMU's poses.
+- While the mounting is learnt, the IMU's poses become right; the first one, which defines odom, stays wrong.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from app.slam import lie
-from app.slam.imu import EXT_POS, EXT_ROT, Belief
-from app.slam.types import F64
+from app.slam.imu import DIM, EXT, POSE, Belief, mounting_to_pose
+from app.slam.types import F64, NavState
 
-VIEW_M = 50.0
-"""After walking this far, the view has changed and new surfaces are mapped."""
+VIEW_M = 5.0
+"""After walking this far, the view has changed and new surfaces are mapped: about a room, or from door to door."""
 
 
 @dataclass(frozen=True, slots=True)
 class Certainty:
     """Attributes:
-    first: (3, 3) R_odom_imu when the walk began. here: (3,) m, p_odom_imu up to which drift was added.
+    refined: whether the filter refines the mounting: the errors of its poses then include those of the mounting.
+    first: (6, 6) change of the first pose by the mounting's error. mounting: (6, 6) covariance of that error then.
+    here: (3,) m, p_odom_imu up to which drift was added.
     drift: (6, 6) covariance of the map's error there, rotation then translation, odom axes.
     """
 
+    refined: bool
     first: F64
+    mounting: F64
     here: F64
     drift: F64
 
     @classmethod
-    def begin(cls, belief: Belief) -> "Certainty":
-        return cls(belief.state.R_odom_imu, belief.state.p_odom_imu, np.zeros((6, 6)))
+    def begin(cls, belief: Belief, *, refined: bool) -> "Certainty":
+        state, mounting = belief.state, belief.covariance[EXT, EXT]
+        return cls(refined, _in_odom(state) @ mounting_to_pose(state), mounting, state.p_odom_imu, np.zeros((6, 6)))
 
     def moved(self, belief: Belief) -> "Certainty":
         """With the drift of the way from `here` to the belief's position. At rest there is none."""
         step = belief.state.p_odom_imu - self.here
         carry = np.eye(6)
         carry[3:, :3] = -lie.hat(step)
-        added = float(np.linalg.norm(step)) / VIEW_M * _in_odom(belief)
-        return Certainty(self.first, belief.state.p_odom_imu, carry @ self.drift @ carry.T + added)
+        added = float(np.linalg.norm(step)) / VIEW_M * self._seen(belief)[:6, :6]
+        return replace(self, here=belief.state.p_odom_imu, drift=carry @ self.drift @ carry.T + added)
+
+    def in_map(self, belief: Belief) -> F64:
+        """(6, 6) of the belief's pose against the local map, rotation (IMU frame) then translation (odom)."""
+        turn = _in_odom(belief.state)
+        return np.asarray(turn.T @ self._seen(belief)[:6, :6] @ turn)
 
     def covariance(self, belief: Belief) -> F64:
         """(6, 6) of the belief's pose since the walk began, rotation (IMU frame) then translation (odom)."""
-        R, P = belief.state.R_odom_imu, belief.covariance
-        total = _in_odom(belief) + self.drift
-        leaning = R - self.first
-        mounting = belief.state.R_imu_lidar @ P[EXT_ROT, EXT_ROT] @ belief.state.R_imu_lidar.T
-        total[:3, :3] += leaning @ mounting @ leaning.T
-        total[3:, 3:] += leaning @ P[EXT_POS, EXT_POS] @ leaning.T
-        total[:3] = R.T @ total[:3]
-        total[:, :3] = total[:, :3] @ R
+        state = belief.state
+        turn = _in_odom(state)
+        since = np.hstack([np.eye(6), turn @ mounting_to_pose(state) - self.first])
+        learnt = self.mounting - belief.covariance[EXT, EXT]
+        total = since @ self._seen(belief) @ since.T + self.first @ learnt @ self.first.T + self.drift
+        total = turn.T @ total @ turn
         return np.asarray(0.5 * (total + total.T))
 
+    def _seen(self, belief: Belief) -> F64:
+        """(12, 12) of the LiDAR's pose against the map, moved to the IMU, and of the mounting; odom axes."""
+        change = np.zeros((12, DIM))
+        change[:6, POSE], change[6:, EXT] = _in_odom(belief.state), np.eye(6)
+        if self.refined:
+            change[:6, EXT] = -_in_odom(belief.state) @ mounting_to_pose(belief.state)
+        return np.asarray(change @ belief.covariance @ change.T)
 
-def _in_odom(belief: Belief) -> F64:
-    """(6, 6) of the pose against the map, rotation then translation, odom axes."""
+
+def _in_odom(state: NavState) -> F64:
+    """(6, 6) turns rotation errors from the IMU's frame into odom axes, and leaves translations."""
     turn = np.eye(6)
-    turn[:3, :3] = belief.state.R_odom_imu
-    return np.asarray(turn @ belief.covariance[:6, :6] @ turn.T)
+    turn[:3, :3] = state.R_odom_imu
+    return turn

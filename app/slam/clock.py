@@ -14,8 +14,13 @@ from app.slam.types import F64, ImuSamples, NavState
 
 USUAL_S = 5e-3
 """s, prior standard deviation of an unknown clock offset."""
+JITTER_S = 0.5e-3
+"""s, standard deviation of single stamps, however long the offset is learnt."""
 TURN_RAD = 3e-3
 """Standard deviation of a scan's correction of a turn."""
+
+PRIOR = (TURN_RAD / USUAL_S) ** 2
+"""(rad/s)², changes of the rate that would tell as much as the prior."""
 LARGEST_TURN, LARGEST_CHANGE = 0.05, 10.0
 """rad, rad/s: larger corrections or changes of the rate have another cause and are ignored."""
 
@@ -33,6 +38,11 @@ class ClockOffset:
     seen: float = 0.0
     moment: float = 0.0
 
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of a stamp once it is set right, s."""
+        return float(np.hypot(JITTER_S, TURN_RAD / np.sqrt(self.seen + PRIOR)))
+
     def set_right(self, samples: ImuSamples) -> ImuSamples:
         return replace(samples, stamps_ns=samples.stamps_ns - round(self.late * 1e9))
 
@@ -45,4 +55,4 @@ class ClockOffset:
             return replace(self, rate=rate)
         turn = correction + self.late * change
         seen, moment = self.seen + float(change @ change), self.moment + float(change @ turn)
-        return ClockOffset(moment / (seen + (TURN_RAD / USUAL_S) ** 2), rate, seen, moment)
+        return ClockOffset(moment / (seen + PRIOR), rate, seen, moment)

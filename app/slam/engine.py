@@ -101,7 +101,7 @@ class Engine:
             belief, still, waiting = started.belief, started.still, started.waiting
             notices += [started.notice] if started.notice else []
         if len(samples):
-            predicted, path = imu.propagate(belief, samples, end_ns, p.imu)
+            predicted, path = imu.propagate(belief, samples, end_ns, p.imu, clock.sigma)
             predicted = rest.hold(predicted, samples)
             watch.lap("propagate")
             points = imu.deskew(scan, path, predicted.state)
@@ -156,7 +156,7 @@ class Engine:
             array.setflags(write=False)
         keyframe, certainty = None, before.certainty
         if due:
-            certainty = (certainty or Certainty.begin(posterior)).moved(posterior)
+            certainty = (certainty or Certainty.begin(posterior, refined=p.filter.estimate_extrinsics)).moved(posterior)
             keyframe = self._keyframe(posterior, cloud, certainty)
         watch.lap("keyframe")
 
@@ -235,14 +235,16 @@ class Engine:
 
     def _keyframe(self, belief: Belief, cloud: Cloud, certainty: Certainty) -> Keyframe:
         state = belief.state
+        covariance = certainty.in_map(belief)
         keyframe = Keyframe(
             index=len(self.keyframes),
             frame=self._progress.frame,
             stamp_ns=state.stamp_ns,
             T_odom_imu=state.T_odom_imu,
             T_imu_lidar=state.T_imu_lidar,
-            covariance=certainty.covariance(belief),
+            covariance=covariance,
             cloud=cloud,
+            drift=certainty.covariance(belief) - covariance,
         )
         self.keyframes.append(keyframe)
         return keyframe

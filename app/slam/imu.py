@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam import lie
+from app.slam.clock import USUAL_S
 from app.slam.kernels import manifold, motion
 from app.slam.sections import ImuParams
 from app.slam.types import F32, F64, ImuSamples, NavState, Scan
@@ -15,15 +16,14 @@ ROT, POS, VEL, BG, BA, GRAV, EXT_ROT, EXT_POS = (
 )  # fmt: skip
 """Order of the 23 error dimensions: rotation (IMU frame), position, velocity (odom), gyro bias, accel
 bias, gravity (2, tangent of S²), extrinsic rotation (LiDAR frame), extrinsic translation (IMU frame)."""
+POSE, EXT = slice(0, 6), slice(17, 23)
 
 MAX_KNOT_STEP = 0.0025
 """s; poses in between are interpolated linearly."""
 LONG_GAP = 0.4
 """s, half the time of a step. Over a longer gap the accelerations at both ends do not determine the velocity."""
-CLOCK_ERROR, TURN_ERROR = 0.006, 0.0134
-"""Possible error of the IMU's clock in s, and of its turns as a share: the gyroscope's scale (0.6 %) and a
-mounting 0.7° off (1.2 %, across the turn). Their effect grows with the motion; at rest both are harmless, and only the
-noise of the data sheet remains."""
+GYRO_SCALE = 0.006
+"""Possible error of the gyroscope's turns, as a share: of scale and between its axes."""
 GAP_NOISE = (0.5, 3.0)
 """Noise densities (rad/s/√Hz, m/s²/√Hz) for bridging a gap: those of walking and turning."""
 
@@ -49,11 +49,22 @@ class Path:
     poses: F64
 
 
-def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -> tuple[Belief, Path]:
+def mounting_to_pose(state: NavState) -> F64:
+    """(6, 6) error of the IMU's pose for each error of the extrinsics, if the LiDAR's pose is right."""
+    follows = np.zeros((6, 6))
+    follows[:3, :3] = -state.R_imu_lidar
+    follows[3:, :3] = -state.R_odom_imu @ lie.hat(state.p_imu_lidar) @ state.R_imu_lidar
+    follows[3:, 3:] = -state.R_odom_imu
+    return follows
+
+
+def propagate(
+    belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams, clock_sigma: float = USUAL_S
+) -> tuple[Belief, Path]:
     """Carry the belief forward to `end_ns` through the samples that cover the time from its stamp.
 
     Rates are linear between samples, and constant before the first and after the last one. Through a long gap the
-    velocity is constant.
+    velocity is constant. clock_sigma: s, how well the offset of the IMU's clock is known.
 
     Returns the predicted belief and the path in between.
     """
@@ -65,7 +76,7 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -
     R, p, v = state.R_odom_imu.copy(), state.p_odom_imu.copy(), state.v_odom_imu.copy()
     P = belief.covariance.copy()
     noise = np.array([params.gyro_noise, params.accel_noise, params.gyro_bias_walk, params.accel_bias_walk, *GAP_NOISE])
-    noise[:2] = np.hypot(noise[:2], _unsteady(times, gyro - state.b_gyro, accel))
+    noise[:2] = np.hypot(noise[:2], _unsteady(times, gyro - state.b_gyro, accel, clock_sigma, _turn_error(belief)))
     knots = int(np.sum(np.ceil(np.maximum(np.diff(times), 0) / MAX_KNOT_STEP))) + 2 * len(times)
     knot_t, knot_T = np.empty(knots), np.empty((knots, 3, 4))
     basis = manifold.tangent_basis(state.g_odom)
@@ -84,15 +95,22 @@ def propagate(belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams) -
     return Belief(moved, P), Path(knot_t[:n] - times[-1], knot_T[:n])
 
 
-def _unsteady(times: F64, rates: F64, forces: F64) -> F64:
-    """Noise densities (2,) (rad/s/√Hz, m/s²/√Hz) that have the effect of clock and scale errors over these (k,) s.
+def _turn_error(belief: Belief) -> float:
+    """Share by which a turn may be wrong: by the gyroscope, or by the mounting, which tilts the axis of the turn."""
+    across = 2.0 / 3.0 * float(np.trace(belief.covariance[EXT_ROT, EXT_ROT]))
+    return float(np.sqrt(GYRO_SCALE**2 + across))
 
-    rates, forces (k, 3) rad/s, m/s². A clock late by c gives an angle wrong by c times the change of the rate.
+
+def _unsteady(times: F64, rates: F64, forces: F64, clock_sigma: float, turn_error: float) -> F64:
+    """Noise densities (2,) (rad/s/√Hz, m/s²/√Hz) that have the effect of clock and turn errors over these (k,) s.
+
+    rates, forces (k, 3) rad/s, m/s². A clock late by c gives an angle wrong by c times the change of the rate. At rest
+    both errors are harmless, and only the noise of the data sheet remains.
     """
     lasting = max(times[-1] - times[0], 1e-3)
     turn = np.linalg.norm(rates.mean(axis=0))
     jerked = [np.abs(values - values.mean(axis=0)).max() / np.sqrt(lasting) for values in (rates, forces)]
-    return np.hypot(CLOCK_ERROR * np.array(jerked), [TURN_ERROR * turn * np.sqrt(lasting), 0.0])
+    return np.hypot(clock_sigma * np.array(jerked), [turn_error * turn * np.sqrt(lasting), 0.0])
 
 
 def deskew(scan: Scan, path: Path, state: NavState) -> F32:

@@ -24,6 +24,7 @@ _HEAD = np.dtype(
         ("T_odom_imu", "<f8", (4, 4)),
         ("T_imu_lidar", "<f8", (4, 4)),
         ("covariance", "<f8", (6, 6)),
+        ("drift", "<f8", (6, 6)),
         ("points", "<i8"),
     ]
 )
@@ -99,6 +100,7 @@ class KeyframeStore:
             T_imu_lidar=head["T_imu_lidar"].copy(),
             covariance=head["covariance"].copy(),
             cloud=Cloud(**columns),
+            drift=head["drift"].copy(),
         )
 
     def when(self, index: int) -> tuple[int, int]:
@@ -113,7 +115,7 @@ class KeyframeStore:
     def append(self, keyframe: Keyframe) -> None:
         cloud = keyframe.cloud
         head = np.zeros((), dtype=_HEAD)
-        for name in ("frame", "stamp_ns", "T_odom_imu", "T_imu_lidar", "covariance"):
+        for name in ("frame", "stamp_ns", "T_odom_imu", "T_imu_lidar", "covariance", "drift"):
             head[name] = getattr(keyframe, name)
         head["points"] = len(cloud)
         begin = self._ends[self._count - 1] if self._count else 0

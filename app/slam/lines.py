@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.slam.certainty import VIEW_M
 from app.slam.imu import Belief
 from app.slam.kernels import lines as kernels
 from app.slam.kernels import registration
@@ -28,6 +27,8 @@ DOUBT = np.array([0.003, np.radians(0.03)])
 """m, rad: apparent errors caused by the map's own inexactness. A scanner with no larger ones is left uncorrected."""
 POINTS = 500
 """Points of a scan that are looked up (every k-th). They are few, so that two rarely meet the same patch of the map."""
+FADES_M = 50.0
+"""Evidence this far back counts 1/e."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ class LineErrors:
     ) -> "LineErrors":
         """These errors, updated with a scan at `belief` before it enters the map.
 
-        Earlier evidence fades over VIEW_M walked, because the next view has different map errors. The mean range error
+        Earlier evidence fades over FADES_M walked, because the next view has different map errors. The mean range error
         of all lines is set to zero: scans cannot determine it, since a slightly larger map fits them as well. All
         errors are then shrunk towards zero, fully for a good scanner (James and Stein 1961, positive part).
 
@@ -63,7 +64,7 @@ class LineErrors:
         world = np.empty((len(points), 3))
         registration.to_world(points, state.R_odom_imu, state.p_odom_imu, state.R_imu_lidar, state.p_imu_lidar, world)
         _, planes = local_map.planes(world, params)
-        kept = np.exp(-walked / VIEW_M)
+        kept = np.exp(-walked / FADES_M)
         information, moment = kept * self.information, kept * self.moment
         kernels.observe(
             points, rings, world, state.R_odom_imu @ state.R_imu_lidar, planes.normals, planes.centers,

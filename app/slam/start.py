@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.slam import lie, rest
-from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
+from app.slam.imu import BA, BG, DIM, EXT, EXT_POS, EXT_ROT, GRAV, POS, POSE, ROT, VEL, Belief, mounting_to_pose
 from app.slam.params import Params
 from app.slam.types import F64, ImuSamples, NavState, Scan
 
@@ -103,10 +103,7 @@ def _seen_from_the_lidar(state: NavState, covariance: F64) -> F64:
     """The covariance (23, 23) if the LiDAR's first pose defines odom: the IMU's pose is then as uncertain as the
     extrinsics between the two."""
     follows = np.eye(DIM)
-    R_odom_imu, R_imu_lidar = state.R_odom_imu, state.R_imu_lidar
-    follows[ROT, EXT_ROT] = -R_imu_lidar
-    follows[POS, EXT_ROT] = -R_odom_imu @ lie.hat(state.p_imu_lidar) @ R_imu_lidar
-    follows[POS, EXT_POS] = -R_odom_imu
+    follows[POSE, EXT] = mounting_to_pose(state)
     return np.asarray(follows @ covariance @ follows.T)
 
 

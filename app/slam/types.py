@@ -256,8 +256,9 @@ class Keyframe:
     Attributes:
         index: 0, 1, 2, ... frame: index of the frame it was taken from. stamp_ns: scan end.
         T_odom_imu: (4, 4) pose by odometry. T_imu_lidar: (4, 4) at that moment.
-        covariance: (6, 6) of the pose since the first keyframe, rotation (IMU frame) then translation (odom).
+        covariance: (6, 6) of the pose against the local map, rotation (IMU frame) then translation (odom).
         cloud: in the LiDAR frame at `stamp_ns`.
+        drift: (6, 6) what adds to it since the first keyframe.
     """
 
     index: int
@@ -267,6 +268,7 @@ class Keyframe:
     T_imu_lidar: F64
     covariance: F64
     cloud: Cloud
+    drift: F64 = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 class FrameStatus(StrEnum):

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from app.slam.certainty import VIEW_M, Certainty
-from app.slam.imu import BG, DIM, EXT_POS, EXT_ROT, POS, ROT, Belief
+from app.slam.imu import BG, DIM, EXT, EXT_POS, EXT_ROT, POS, POSE, ROT, Belief, mounting_to_pose
 from app.slam.params import Params
 from app.slam.start import standing
 from app.slam.types import ImuSamples
@@ -26,7 +26,7 @@ def belief(x: float = 0.0, yaw: float = 0.0, tilt: float = 0.0, *, exact_mountin
 
 
 def walked(metres: float, steps: int) -> np.ndarray:
-    certainty = Certainty.begin(belief())
+    certainty = Certainty.begin(belief(), refined=False)
     for x in np.linspace(0.0, metres, steps + 1)[1:]:
         certainty = certainty.moved(belief(x))
     return certainty.covariance(belief(metres))
@@ -34,7 +34,7 @@ def walked(metres: float, steps: int) -> np.ndarray:
 
 def test_at_the_first_keyframe_the_filter_says_it_all() -> None:
     here = belief(exact_mounting=False)
-    np.testing.assert_allclose(Certainty.begin(here).covariance(here), here.covariance[:6, :6])
+    np.testing.assert_allclose(Certainty.begin(here, refined=False).covariance(here), here.covariance[:6, :6])
 
 
 def test_drift_grows_with_the_walk_as_a_random_walk_does() -> None:
@@ -53,7 +53,7 @@ def test_how_finely_a_walk_is_cut_into_keyframes_hardly_matters() -> None:
 
 
 def test_a_rest_adds_no_drift() -> None:
-    certainty = Certainty.begin(belief()).moved(belief(10.0))
+    certainty = Certainty.begin(belief(), refined=False).moved(belief(10.0))
     still = certainty
     for _ in range(1000):
         still = still.moved(belief(10.0))
@@ -63,7 +63,8 @@ def test_a_rest_adds_no_drift() -> None:
 def test_a_wrong_mounting_leans_to_the_other_side_after_half_a_turn() -> None:
     """Its tilt was levelled out at the start; turned round, it is there twice, while heading stays right."""
     there = belief(yaw=180.0, exact_mounting=False)
-    extra = Certainty.begin(belief()).covariance(there) - there.covariance[:6, :6]
+    begin = Certainty.begin(belief(exact_mounting=False), refined=False)
+    extra = begin.covariance(there) - there.covariance[:6, :6]
     mounting = there.covariance[EXT_ROT, EXT_ROT]
     np.testing.assert_allclose(np.diag(extra)[:3], [4 * mounting[0, 0], 4 * mounting[1, 1], 0.0], atol=1e-12)
     np.testing.assert_allclose(np.diag(extra)[3:], [4e-4, 4e-4, 0.0], atol=1e-12)
@@ -75,7 +76,21 @@ def test_rotation_errors_are_given_in_the_imus_frame(tilt: float) -> None:
     drift = np.zeros((6, 6))
     drift[2, 2] = 1e-4
     there = belief(tilt=tilt)
-    certainty = Certainty(there.state.R_odom_imu, np.zeros(3), drift)
+    certainty = replace(Certainty.begin(there, refined=False), here=np.zeros(3), drift=drift)
     extra = certainty.covariance(there) - there.covariance[:6, :6]
     up = there.state.R_odom_imu[2]
     np.testing.assert_allclose(extra[:3, :3], 1e-4 * np.outer(up, up), atol=1e-15)
+
+
+def test_a_mounting_that_is_learnt_leaves_the_first_pose_as_wrong_as_it_was() -> None:
+    """The filter's pose becomes right, but it counts from the first one."""
+    begin, end = belief(exact_mounting=False), belief(x=1.0)
+    follows, P = mounting_to_pose(begin.state), begin.covariance.copy()
+    P[POSE, POSE] += follows @ P[EXT, EXT] @ follows.T
+    P[POSE, EXT] = follows @ P[EXT, EXT]
+    P[EXT, POSE] = P[POSE, EXT].T
+    certainty = Certainty.begin(Belief(begin.state, P), refined=True)
+    own = begin.covariance[POSE, POSE]
+    np.testing.assert_allclose(certainty.covariance(Belief(begin.state, P)), own, atol=1e-12)  # both are as wrong
+    np.testing.assert_allclose(certainty.in_map(Belief(begin.state, P)), own, atol=1e-12)
+    np.testing.assert_allclose(certainty.covariance(end), own + follows @ P[EXT, EXT] @ follows.T, atol=1e-12)

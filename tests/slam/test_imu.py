@@ -353,18 +353,24 @@ def test_the_scenes_samples_are_the_walks_derivatives() -> None:
     assert PERIOD_S * 200 == 20
 
 
-def test_at_rest_the_noise_is_that_of_the_data_sheet_and_motion_adds_what_a_late_clock_does() -> None:
+@pytest.mark.parametrize(("clock", "mounting"), [(0.004, 0.0), (0.001, 0.01)])
+def test_at_rest_the_noise_is_that_of_the_data_sheet_and_motion_adds_what_is_not_known(
+    clock: float, mounting: float
+) -> None:
     """Growth of the heading's uncertainty over 0.1 s: still, turning steadily, and turning ever faster."""
+    P = np.zeros((DIM, DIM))
+    P[imu.EXT_ROT, imu.EXT_ROT] = mounting**2 * np.eye(3)
+    turn = 0.1 * np.hypot(imu.GYRO_SCALE, np.sqrt(2.0) * mounting)  # rad, of a turn by 0.1
     grown = []
     for first, last in ((0.0, 0.0), (1.0, 1.0), (0.0, 2.0)):
         gyro = np.zeros((21, 3))
         gyro[:, 2] = np.linspace(first, last, 21)
         samples = ImuSamples(np.arange(21, dtype=np.int64) * 5_000_000, gyro, np.tile([0.0, 0.0, 9.81], (21, 1)))
         state = NavState(0, np.eye(3), *np.zeros((4, 3)), np.array([0.0, 0.0, -9.81]), np.eye(3), np.zeros(3))
-        after, _ = imu.propagate(Belief(state, np.zeros((DIM, DIM))), samples, 100_000_000, ImuParams())
+        after, _ = imu.propagate(Belief(state, P), samples, 100_000_000, ImuParams(), clock)
         grown.append(np.sqrt(after.covariance[2, 2]))
     sheet = ImuParams().gyro_noise * np.sqrt(0.1)
     assert grown[0] == pytest.approx(sheet, rel=0.01)
-    assert grown[1] == pytest.approx(np.hypot(sheet, imu.TURN_ERROR * 0.1), rel=0.01)
-    farthest = imu.CLOCK_ERROR * 1.0  # the rate is at most 1 rad/s from its mean
-    assert grown[2] == pytest.approx(np.sqrt(sheet**2 + farthest**2 + (imu.TURN_ERROR * 0.1) ** 2), rel=0.01)
+    assert grown[1] == pytest.approx(np.hypot(sheet, turn), rel=0.01)
+    farthest = clock * 1.0  # the rate is at most 1 rad/s from its mean
+    assert grown[2] == pytest.approx(np.sqrt(sheet**2 + farthest**2 + turn**2), rel=0.01)

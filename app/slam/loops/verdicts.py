@@ -19,7 +19,7 @@ from app.slam.types import F64
 
 SURE_M = 0.1
 """If odometry knows its position better than this (standard deviation), places are not searched beside its guess."""
-OPEN_M = 10.0
+LOOSE_M = 10.0
 """Standard deviation of a registration along a direction that nothing holds."""
 FLOOR_M, FLOOR_YAW, FLOOR_TILT = 0.04, np.radians(0.5), np.radians(1.5)
 """Least standard deviations of a registration, however many points it has. A mounting error tilts clouds differently at
@@ -108,7 +108,7 @@ def covariance(detector: Detector, newer: int, fit: Fit, along: F64 | None = Non
     information = fit.information * (INDEPENDENT / POINT_M**2)
     level = np.linalg.pinv(information) + np.diag([FLOOR_TILT**2] * 2 + [FLOOR_YAW**2] + [FLOOR_M**2] * 3)
     if along is not None:
-        level[3:, 3:] += OPEN_M**2 * np.outer(along, along)
+        level[3:, 3:] += LOOSE_M**2 * np.outer(along, along)
     R = (fit.T_target_source @ detector.T_level_imu(newer))[:3, :3]
     turn = np.kron(np.eye(2), R.T)
     out = turn @ level @ turn.T
