@@ -57,11 +57,13 @@ def measure(scene: str, seconds: float, *, imperfect: bool) -> list[Line]:
     beside = truth_beside(path)
     assert beside is not None
     truth, fixes = read_tum(beside), recorded_fixes(path)
-    mounting = unit_of(IMPERFECT, SEED).mounting if imperfect else np.eye(4)
+    sensor = session.params.sensor
+    T_imu_lidar = lie.transform(lie.from_rpy_degrees(sensor.rotation), np.array(sensor.translation))
+    T_imu_lidar = T_imu_lidar @ (unit_of(IMPERFECT, SEED).mounting if imperfect else np.eye(4))
     lines, mapped = [], session.results()
     for factors in (False, True):
         results = georeference(mapped, Survey(lever=LEVER, factors=factors))
-        lines += compare(results, truth, fixes, f"{name}, {'as factors' if factors else 'align only'}", mounting)
+        lines += compare(results, truth, fixes, f"{name}, {'as factors' if factors else 'align only'}", T_imu_lidar)
     walked = trajectory_through(
         build_scene(scene, SEED), seconds, SEED, livelier(Walker(), errors.hand), SCANNERS["bpearl"].R_body_imu
     )
@@ -100,11 +102,11 @@ def offsets(results: Results, walked: SmoothTrajectory, seconds: float, on: str)
     return lines
 
 
-def compare(results: Results, truth: Trajectory, fixes: Fixes, on: str, mounting: F64) -> list[Line]:
-    """Offset, points of the map and names of wild fixes against the truth. mounting: (4, 4) T_nominal_lidar."""
+def compare(results: Results, truth: Trajectory, fixes: Fixes, on: str, T_imu_lidar: F64) -> list[Line]:
+    """Offset, points of the map and names of wild fixes against the truth. T_imu_lidar: (4, 4), the true one."""
     found = results.found
     assert found is not None and results.where is not None
-    off = np.concatenate([_off(results, truth, index, mounting) for index in range(len(results.keyframes))])
+    off = np.concatenate([_off(results, truth, index, T_imu_lidar) for index in range(len(results.keyframes))])
     wild = _wild(fixes, truth)
     left_out = {name for name, used in zip(found.names, found.used, strict=True) if not used}
     told = set(found.names)
@@ -118,7 +120,7 @@ def compare(results: Results, truth: Trajectory, fixes: Fixes, on: str, mounting
     ]
 
 
-def _off(results: Results, truth: Trajectory, index: int, mounting: F64) -> F64:
+def _off(results: Results, truth: Trajectory, index: int, T_imu_lidar: F64) -> F64:
     """(n,) m, how far each point of a keyframe is from where it truly is."""
     keyframe = results.keyframes[index]
     there, inside = interpolate(truth, np.array([keyframe.stamp_ns]))
@@ -127,7 +129,7 @@ def _off(results: Results, truth: Trajectory, index: int, mounting: F64) -> F64:
     (T_scene_imu,) = there.poses
     points = keyframe.cloud.points.astype(np.float64)
     ours = lie.moved(results.frame.at(index) @ keyframe.T_odom_imu @ keyframe.T_imu_lidar, points)
-    true = lie.moved(T_scene_imu @ keyframe.T_imu_lidar @ mounting, points)
+    true = lie.moved(T_scene_imu @ T_imu_lidar, points)
     ours, true = results.where.to_crs(ours), GNSS.reference.to_crs(true)
     return np.asarray(np.linalg.norm(ours - true, axis=1))
 
