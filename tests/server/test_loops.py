@@ -42,7 +42,7 @@ from app.slam.params import Params
 
 FILES = ("trajectory.tum", *(export.name for export in BY_RUN if export.of_loops))
 LENGTH_S, LAST = 41.0, 409
-"""So far the walk has come back once, through a passage in which odometry drifts by 0.4 m, and its last frame."""
+"""So far the walk has come back once, through a passage in which odometry drifts by 0.2 m, and its last frame."""
 
 LEVELLED = 0.01
 """rad, m: what levelling by gravity may turn the map."""
