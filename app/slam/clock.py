@@ -18,7 +18,6 @@ JITTER_S = 0.5e-3
 """s, standard deviation of single stamps, however long the offset is learnt."""
 TURN_RAD = 3e-3
 """Standard deviation of a scan's correction of a turn."""
-
 PRIOR = (TURN_RAD / USUAL_S) ** 2
 """(rad/s)², changes of the rate that would tell as much as the prior."""
 LARGEST_TURN, LARGEST_CHANGE = 0.05, 10.0
