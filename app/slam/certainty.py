@@ -39,7 +39,7 @@ class Certainty:
     @classmethod
     def begin(cls, belief: Belief, *, refined: bool) -> "Certainty":
         state, mounting = belief.state, belief.covariance[EXT, EXT]
-        return cls(refined, _in_odom(state) @ mounting_to_pose(state), mounting, state.p_odom_imu, np.zeros((6, 6)))
+        return cls(refined, _by_mounting(state), mounting, state.p_odom_imu, np.zeros((6, 6)))
 
     def moved(self, belief: Belief) -> "Certainty":
         """With the drift of the way from `here` to the belief's position. At rest there is none."""
@@ -58,7 +58,7 @@ class Certainty:
         """(6, 6) of the belief's pose since the walk began, rotation (IMU frame) then translation (odom)."""
         state = belief.state
         turn = _in_odom(state)
-        since = np.hstack([np.eye(6), turn @ mounting_to_pose(state) - self.first])
+        since = np.hstack([np.eye(6), _by_mounting(state) - self.first])
         learnt = self.mounting - belief.covariance[EXT, EXT]
         total = since @ self._seen(belief) @ since.T + self.first @ learnt @ self.first.T + self.drift
         total = turn.T @ total @ turn
@@ -69,8 +69,13 @@ class Certainty:
         change = np.zeros((12, DIM))
         change[:6, POSE], change[6:, EXT] = _in_odom(belief.state), np.eye(6)
         if self.refined:
-            change[:6, EXT] = -_in_odom(belief.state) @ mounting_to_pose(belief.state)
+            change[:6, EXT] = -_by_mounting(belief.state)
         return np.asarray(change @ belief.covariance @ change.T)
+
+
+def _by_mounting(state: NavState) -> F64:
+    """(6, 6) change of the IMU's pose by the mounting's error, odom axes."""
+    return np.asarray(_in_odom(state) @ mounting_to_pose(state))
 
 
 def _in_odom(state: NavState) -> F64:

@@ -50,7 +50,10 @@ class Path:
 
 
 def mounting_to_pose(state: NavState) -> F64:
-    """(6, 6) error of the IMU's pose for each error of the extrinsics, if the LiDAR's pose is right."""
+    """(6, 6) error of the IMU's pose for each error of the extrinsics, if the LiDAR's pose is right.
+
+    Rows: rotation (IMU frame), position (odom). Columns: rotation (LiDAR frame), translation (IMU frame).
+    """
     follows = np.zeros((6, 6))
     follows[:3, :3] = -state.R_imu_lidar
     follows[3:, :3] = -state.R_odom_imu @ lie.hat(state.p_imu_lidar) @ state.R_imu_lidar
