@@ -30,6 +30,8 @@ SURE = 3.0
 """Standard deviations by which two values must differ to be different."""
 APART_ROTATION, APART_PLACE = np.radians(3.0), 0.1
 """rad, m: a mounting that is off by more than this spoils a map."""
+POSED = "sensor.rotation", "sensor.translation", "recording.imu_time_offset"
+"""Parameters that say where the LiDAR is on the IMU, and when."""
 
 Report = Callable[[float], None]
 """Is called with the fraction done, 0-1."""
@@ -85,7 +87,8 @@ class Calibration:
         }
 
     def found(self) -> dict[str, Any]:
-        """Parameters that the recording determines, by dotted name."""
+        """Parameters to take from now on, by dotted name: what the recording determines, and what was given of
+        mounting and clock beside it, so that a file of them needs no other. {} if it determines nothing."""
         observed = self.observed
         values: dict[str, Any] = {}
         if observed["rotation"]:
@@ -95,7 +98,9 @@ class Calibration:
         if observed["offset"] and abs(self.turned.late) > max(0.001, SURE * float(self.sigmas["offset"][0])):
             late = self.params.recording.imu_time_offset + self.turned.late
             values["recording.imu_time_offset"] = round(late, 4)
-        return {**values, **self.lines.found()}
+        values |= self.lines.found()
+        given = Params().changed(self.params)
+        return {path: given[path] for path in POSED if path in given} | values if values else {}
 
     @property
     def apart(self) -> float:
@@ -106,15 +111,15 @@ class Calibration:
     def contradiction(self) -> str:
         """What is wrong with the mounting or the clock taken so far, in a sentence; "" if nothing is, or if
         that cannot be determined."""
-        found, parts = self.found(), []
-        if "sensor.rotation" in found and self.apart > APART_ROTATION:
+        observed, parts = self.observed, []
+        if observed["rotation"] and self.apart > APART_ROTATION:
             angles = ", ".join(f"{round(angle)}°" for angle in self.rotation)
             parts.append(f"the LiDAR seems to be rotated by {angles} on the IMU")
         off = self.moved.p_imu_lidar - self.params.sensor.translation
-        if "sensor.translation" in found and np.linalg.norm(off) > APART_PLACE:
+        if observed["translation"] and np.linalg.norm(off) > APART_PLACE:
             place = ", ".join(f"{x:.2f}" for x in self.moved.p_imu_lidar)
             parts.append(f"it seems to be at {place} m on the IMU")
-        if "recording.imu_time_offset" in found and abs(self.turned.late) > 5 * LARGEST_OFFSET:
+        if observed["offset"] and abs(self.turned.late) > 5 * LARGEST_OFFSET:
             late = -self.turned.late * 1e3
             parts.append(f"the IMU's clock seems to be {abs(late):.0f} ms {'late' if late > 0 else 'early'}")
         text = ", and ".join(parts)

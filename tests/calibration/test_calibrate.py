@@ -113,6 +113,17 @@ def test_a_mounting_that_agrees_with_the_parameters_is_no_contradiction(tmp_path
     assert "turned" not in found.contradiction() and "ms" in found.contradiction()
 
 
+def test_what_was_given_is_saved_with_what_was_found(tmp_path: Path) -> None:
+    """Calibrating twice keeps the clock of the first time, and a saved file needs no preset beside it."""
+    recording = tmp_path / "walk.mcap"
+    first = resolve_params(write_beside(known(recording)).with_name("walk.mcap"), None, None, [])
+    again = known(recording, params=first)
+    again = replace(again, turned=replace(again.turned, late=0.0), moved=replace(again.moved, covariance=np.eye(6)))
+    params = resolve_params(write_beside(again).with_name("walk.mcap"), None, None, [])
+    assert params.recording.imu_time_offset == pytest.approx(0.02)
+    assert np.allclose(params.sensor.translation, MID360, atol=1e-4)
+
+
 def test_numbers_for_programs_are_json_and_the_plot_is_an_image(tmp_path: Path) -> None:
     found = known(tmp_path / "walk.mcap")
     assert json.loads(json.dumps(as_json(found)))["observed"]["rotation"] is True
