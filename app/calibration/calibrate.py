@@ -19,6 +19,7 @@ from app.sensors.recording import open_recording
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.params import Params
+from app.slam.start import DRAWN
 from app.slam.types import F64
 
 ROUNDS = 3
@@ -86,15 +87,29 @@ class Calibration:
             "offset": bool((s["offset"] < LARGEST_OFFSET).all()),
         }
 
+    @property
+    def mounting(self) -> tuple[F64, F64]:
+        """R_imu_lidar (3, 3) and p_imu_lidar (3,) to take from now on: the mean of what was given and what was found,
+        weighted by their variances. What was found counts alone if nothing was given, or if that is surely wrong."""
+        sensor, parts = self.params.sensor, []
+        R, p = lie.from_rpy_degrees(sensor.rotation), np.array(sensor.translation)
+        off = lie.log(R.T @ self.turned.R_imu_lidar), self.moved.p_imu_lidar - p
+        for name, apart, drawn in zip(("rotation", "translation"), off, DRAWN, strict=True):
+            variance = self.sigmas[name] ** 2
+            wrong = (np.abs(apart) > SURE * np.sqrt(variance + drawn**2)).any()
+            alone = wrong or not any(sensor.rotation + sensor.translation)
+            parts.append(apart if alone else apart * drawn**2 / (variance + drawn**2))
+        return R @ lie.exp(parts[0]), p + parts[1]
+
     def found(self) -> dict[str, Any]:
         """Parameters to take from now on, by dotted name: what the recording determines, and what was given of
         mounting and clock beside it, so that a file of them needs no other. {} if it determines nothing."""
-        observed = self.observed
+        (R, p), observed = self.mounting, self.observed
         values: dict[str, Any] = {}
         if observed["rotation"]:
-            values["sensor.rotation"] = [round(angle, 3) for angle in self.rotation]
+            values["sensor.rotation"] = [round(angle, 3) for angle in lie.rpy_degrees(R)]
         if observed["translation"]:
-            values["sensor.translation"] = [round(float(x), 4) for x in self.moved.p_imu_lidar]
+            values["sensor.translation"] = [round(float(x), 4) for x in p]
         if observed["offset"] and abs(self.turned.late) > max(0.001, SURE * float(self.sigmas["offset"][0])):
             late = self.params.recording.imu_time_offset + self.turned.late
             values["recording.imu_time_offset"] = round(late, 4)
@@ -102,21 +117,15 @@ class Calibration:
         given = Params().changed(self.params)
         return {path: given[path] for path in POSED if path in given} | values if values else {}
 
-    @property
-    def apart(self) -> float:
-        """rad, between the rotation found and the one taken so far."""
-        given = lie.from_rpy_degrees(self.params.sensor.rotation)
-        return float(np.linalg.norm(lie.log(given.T @ self.turned.R_imu_lidar)))
-
     def contradiction(self) -> str:
         """What is wrong with the mounting or the clock taken so far, in a sentence; "" if nothing is, or if
         that cannot be determined."""
-        observed, parts = self.observed, []
-        if observed["rotation"] and self.apart > APART_ROTATION:
+        (R, p), sensor, observed, parts = self.mounting, self.params.sensor, self.observed, []
+        turned = np.linalg.norm(lie.log(lie.from_rpy_degrees(sensor.rotation).T @ R))
+        if observed["rotation"] and turned > APART_ROTATION:
             angles = ", ".join(f"{round(angle)}°" for angle in self.rotation)
             parts.append(f"the LiDAR seems to be rotated by {angles} on the IMU")
-        off = self.moved.p_imu_lidar - self.params.sensor.translation
-        if observed["translation"] and np.linalg.norm(off) > APART_PLACE:
+        if observed["translation"] and np.linalg.norm(p - sensor.translation) > APART_PLACE:
             place = ", ".join(f"{x:.2f}" for x in self.moved.p_imu_lidar)
             parts.append(f"it seems to be at {place} m on the IMU")
         if observed["offset"] and abs(self.turned.late) > 5 * LARGEST_OFFSET:
@@ -129,8 +138,7 @@ class Calibration:
 def calibrate(
     path: Path, params: Params, duration_s: float = LONGEST_S, progress: Report = lambda fraction: None
 ) -> Calibration:
-    """Find the mounting, the clock offset and the biases from the recording alone; `sensor.rotation` and
-    `sensor.translation` are not used.
+    """Find the mounting, the clock offset and the biases from the recording alone.
 
     Args:
         duration_s: how much of it to use. progress: called with the fraction done, 0-1.

@@ -30,9 +30,9 @@ def calibrate(
 ) -> None:
     """Find the pose of the LiDAR on the IMU, the offset of their clocks and the errors of each scan line.
 
-    Only the recording is used: `sensor.rotation` and `sensor.translation` are ignored. The LiDAR is tracked by its
-    scans alone, and its motion is compared with the IMU's. Walk and turn the scanner about all axes; values that the
-    motion does not determine are reported as such.
+    The LiDAR is tracked by its scans alone, and its motion is compared with the IMU's. Walk and turn the scanner about
+    all axes; values that the motion does not determine are reported as such. If a mounting is given (--preset,
+    `sensor.rotation`, `sensor.translation`), the mean of both is saved.
 
     \b
     Examples:

@@ -113,6 +113,19 @@ def test_a_mounting_that_agrees_with_the_parameters_is_no_contradiction(tmp_path
     assert "turned" not in found.contradiction() and "ms" in found.contradiction()
 
 
+def test_a_given_mounting_counts_as_much_as_a_drawing_unless_it_is_surely_wrong(tmp_path: Path) -> None:
+    found = known(tmp_path / "walk.mcap")
+    given = Params().merged({"sensor": {"translation": list(MID360 + 0.01), "rotation": [70.0, -50.0, 104.5]}})
+    rough = replace(found.moved, covariance=np.eye(6) * 0.015**2)  # three times that of a drawing
+    near = replace(found, params=given, moved=rough)
+    assert np.allclose(near.mounting[0], TURN, atol=5e-4)
+    assert np.allclose(near.mounting[1], MID360 + 0.009, atol=1e-6)
+    assert np.allclose(near.found()["sensor.translation"], MID360 + 0.009, atol=1e-4)
+    assert np.allclose(replace(near, params=Params()).mounting[1], MID360)
+    far = replace(near, moved=replace(rough, p_imu_lidar=MID360 + 0.2))
+    assert np.allclose(far.mounting[1], MID360 + 0.2) and "0.19, 0.18, 0.24 m" in far.contradiction()
+
+
 def test_what_was_given_is_saved_with_what_was_found(tmp_path: Path) -> None:
     """Calibrating twice keeps the clock of the first time, and a saved file needs no preset beside it."""
     recording = tmp_path / "walk.mcap"
