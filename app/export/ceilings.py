@@ -15,8 +15,8 @@ _FLATNESS_M: Final = 0.12
 _MARGIN_M: Final = 0.25
 
 
-def below_ceiling(points: F32, labels: U8, up: F64) -> npt.NDArray[np.bool_] | None:
-    """Which points stay when the ceiling above a keyframe is hidden; None where nothing flat is overhead.
+def below_ceiling(points: F32, labels: U8, up: F64) -> npt.NDArray[np.bool_]:
+    """Which points stay when the ceiling above a keyframe is hidden: all where nothing flat is overhead.
 
     Points labelled ground always stay: a ceiling mistaken for ground must be visible.
 
@@ -26,8 +26,8 @@ def below_ceiling(points: F32, labels: U8, up: F64) -> npt.NDArray[np.bool_] | N
     height = points @ up.astype(np.float32)
     overhead = height[height > _CONE * np.linalg.norm(points, axis=1)]
     if len(overhead) < max(30.0, _LEAST_SHARE * len(points)):
-        return None
+        return np.ones(len(points), np.bool_)
     ceiling = float(np.median(overhead))
     if ceiling > _HIGHEST_M or float(np.median(np.abs(overhead - ceiling))) > _FLATNESS_M:
-        return None
+        return np.ones(len(points), np.bool_)
     return np.asarray((height < ceiling - _MARGIN_M) | is_ground(labels))

@@ -7,7 +7,7 @@ because someone looks from elsewhere (`app.ui.detail`). Of a huge map snapshots 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -37,8 +37,6 @@ _AT_ONCE: Final = 300_000
 """Most points by which known keyframes grow at once: what is nearest comes first."""
 _SAMPLE: Final = 200
 """Points of each keyframe that say how large the map is."""
-Chosen: TypeAlias = npt.NDArray[np.bool_] | slice
-"""Which points of a chunk."""
 
 
 @dataclass(slots=True)
@@ -47,7 +45,7 @@ class _Drawn:
 
     Attributes:
         limits: ends of the colour maps with this keyframe and those before it. light: (n,) of the chunk's points.
-        part: how many of them may be drawn. shown: which of these were sent, `count` of them.
+        part: how many of them may be drawn. shown: (n,) which were sent, `count` of them.
         handle: None while there are none.
     """
 
@@ -55,7 +53,7 @@ class _Drawn:
     limits: dict[str, Limits]
     light: F32
     part: int = 0
-    shown: Chosen = field(default_factory=lambda: slice(None))
+    shown: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
     count: int = 0
     handle: viser.PointCloudHandle | None = None
 
@@ -169,7 +167,7 @@ class MapChunks:
         return moved
 
     def _grown(self, chunk: Chunk, T_map_imu: F64) -> dict[str, Limits]:
-        limits, cloud = self._of_keyframes(), self._cloud(chunk, T_map_imu)
+        limits, cloud = self._of_keyframes(), self._cloud(chunk, T_map_imu, np.ones(len(chunk.points), np.bool_))
         for name, mode in MODES.items():
             of_each = mode.fixed is None and not mode.of_map
             wider = grown(limits.get(name), mode, mode.values(cloud)) if of_each else None
@@ -190,7 +188,7 @@ class MapChunks:
         some = [(T @ drawn.chunk.T_imu_lidar, drawn.chunk.points[:_SAMPLE]) for drawn, T in every]
         return np.concatenate([np.empty((0, 3)), *(lie.moved(T, points) for T, points in some)])
 
-    def _cloud(self, chunk: Chunk, T_map_imu: F64, shown: Chosen = slice(None), light: F32 | None = None) -> PointSet:
+    def _cloud(self, chunk: Chunk, T_map_imu: F64, shown: npt.NDArray[np.bool_], light: F32 | None = None) -> PointSet:
         return PointSet(
             chunk.points[shown],
             chunk.labels[shown],
@@ -206,15 +204,14 @@ class MapChunks:
     def _shown(self, drawn: _Drawn, T_map_imu: F64) -> PointSet:
         return self._cloud(drawn.chunk, T_map_imu, drawn.shown, drawn.light[drawn.shown])
 
-    def _chosen(self, drawn: _Drawn, T_map_imu: F64) -> Chosen:
+    def _chosen(self, drawn: _Drawn, T_map_imu: F64) -> npt.NDArray[np.bool_]:
         T_map_lidar = T_map_imu @ drawn.chunk.T_imu_lidar
         view = self._view
         return shown_points(drawn.chunk, T_map_lidar, view.ceilings, view.clip, drawn.part, moving=view.moving)
 
     def _shows_others(self, drawn: _Drawn, index: int) -> bool:
         """Whether other points of it are to be shown than those that were sent."""
-        now = self._chosen(drawn, self._T_map_imu[index])
-        return not np.array_equal(as_mask(now, len(drawn.light)), as_mask(drawn.shown, len(drawn.light)))
+        return not np.array_equal(self._chosen(drawn, self._T_map_imu[index]), drawn.shown)
 
     def _send(self, drawn: _Drawn, T_map_imu: F64) -> None:
         """Send a keyframe's points in place of those sent before.
@@ -264,30 +261,20 @@ def shown_points(
     part: int | None = None,
     *,
     moving: bool = True,
-) -> Chosen:
-    """The points of a chunk that are drawn: with or without the ceiling above them, only those in the box.
+) -> npt.NDArray[np.bool_]:
+    """Which points of a chunk are drawn: with or without the ceiling above them, only those in the box.
 
     Args:
         part: of how many from the first on; None: of all. moving: with those on what moves.
     """
-    mask = None if ceilings else below_ceiling(chunk.points, chunk.labels, T_map_lidar[2, :3])
-    if not moving and (moves := chunk.labels == MOVING).any():
-        mask = ~moves if mask is None else mask & ~moves
+    mask = np.arange(len(chunk.points)) < (len(chunk.points) if part is None else part)
+    if not ceilings:
+        mask &= below_ceiling(chunk.points, chunk.labels, T_map_lidar[2, :3])
+    if not moving:
+        mask &= chunk.labels != MOVING
     if clip is not None:
-        inside = clip.holds(lie.moved(T_map_lidar, chunk.points))
-        mask = inside if mask is None else mask & inside
-    if mask is None or not len(mask):
-        return slice(part)
-    if part is not None:
-        mask[part:] = False
+        mask &= clip.holds(lie.moved(T_map_lidar, chunk.points))
     return mask
-
-
-def as_mask(chosen: Chosen, count: int) -> npt.NDArray[np.bool_]:
-    """(count,) whether each point is chosen."""
-    if isinstance(chosen, slice):
-        return np.arange(count) < (count if chosen.stop is None else chosen.stop)
-    return chosen
 
 
 def _same(drawn: Chunk, chunk: Chunk) -> bool:

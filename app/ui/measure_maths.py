@@ -14,7 +14,7 @@ from app.slam import lie
 from app.slam.kernels.cells import in_cone
 from app.slam.text_files import csv_text
 from app.slam.types import F32, F64, is_ground
-from app.ui.chunks import as_mask, shown_points
+from app.ui.chunks import shown_points
 
 _GAP_M: Final = 0.2
 """Points that a click meets are of one surface as long as each lies no farther behind the one before it."""
@@ -75,7 +75,7 @@ def meet(
         eye, ahead = T[:3, :3].T @ (origin - T[:3, 3]), T[:3, :3].T @ direction / np.linalg.norm(direction)
         count = in_cone(chunk.points, eye, ahead, width, hits, along, off)
         if count:
-            seen = as_mask(shown_points(chunk, T, ceilings, clip, moving=moving), len(chunk.points))[hits[:count]]
+            seen = shown_points(chunk, T, ceilings, clip, moving=moving)[hits[:count]]
             found.append((along[:count][seen], off[:count][seen], chunk, chunk.points[hits[:count][seen]]))
     every = np.sort(np.concatenate([np.empty(0), *(along for along, *_ in found)]))
     if not len(every):

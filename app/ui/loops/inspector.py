@@ -40,8 +40,7 @@ def on_the_way(T_from: F64, T_to: F64, share: float) -> F64:
 
 def without_ceiling(points: F32) -> F32:
     """(n, 3) points of a submap, z up and its keyframe at the origin, without the ceiling above that."""
-    mask = below_ceiling(points, np.full(len(points), NON_GROUND, np.uint8), np.array([0.0, 0.0, 1.0]))
-    return points if mask is None else points[mask]
+    return points[below_ceiling(points, np.full(len(points), NON_GROUND, np.uint8), np.array([0.0, 0.0, 1.0]))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
