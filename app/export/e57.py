@@ -3,7 +3,7 @@
 import uuid
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pye57
@@ -11,13 +11,11 @@ from pye57 import libe57
 from scipy.spatial.transform import Rotation
 
 from app.export.points import GPS_MINUS_UNIX_S, Block
+from app.export.results import Results
 from app.georeference.reference import GeoReference
 
-if TYPE_CHECKING:
-    from app.export.results import Results
 
-
-def write(path: Path, results: "Results") -> None:
+def write(path: Path, results: Results) -> None:
     """Poses are in the map or, if it is known, in the coordinate system on Earth. Each file has new GUIDs."""
     try:
         file = _Writer(str(path), results.where)

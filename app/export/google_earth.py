@@ -3,7 +3,7 @@
 import io
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -11,16 +11,14 @@ from PIL import Image
 
 from app.export.paths import name_of, utc_text
 from app.export.raster import COARSE_CELL, Raster
-
-if TYPE_CHECKING:
-    from app.export.results import Results
+from app.export.results import Results
 
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 GROUND, REST = (150, 190, 220), (255, 140, 40)
 """Colours of cells with nothing but ground, and of all others."""
 
 
-def write(path: Path, results: "Results") -> None:
+def write(path: Path, results: Results) -> None:
     """Heights lie on Google Earth's ground, since its own heights are not those of a survey."""
     raster = results.raster(on_earth=True, cell=COARSE_CELL)
     ElementTree.register_namespace("", KML)
@@ -33,7 +31,7 @@ def write(path: Path, results: "Results") -> None:
             file.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data, zipfile.ZIP_DEFLATED)
 
 
-def _document(results: "Results", raster: Raster) -> ElementTree.Element:
+def _document(results: Results, raster: Raster) -> ElementTree.Element:
     assert results.where is not None
     root = ElementTree.Element(f"{{{KML}}}kml")
     document = _add(root, "Document")
@@ -72,13 +70,13 @@ def _add(parent: ElementTree.Element, name: str, text: str | None = None, **attr
     return element
 
 
-def _places(results: "Results", points: Any) -> str:
+def _places(results: Results, points: Any) -> str:
     """`longitude,latitude,height` of points (n, 3) m in the map."""
     assert results.where is not None
     return " ".join(f"{lon:.9f},{lat:.9f},{height:.3f}" for lat, lon, height in results.where.to_geographic(points))
 
 
-def _corners(results: "Results", raster: Raster) -> str:
+def _corners(results: Results, raster: Raster) -> str:
     """Of the picture, anticlockwise from the lower left."""
     assert results.where is not None
     rows, columns = raster.points.shape

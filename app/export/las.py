@@ -2,7 +2,7 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import laspy
 import lazrs
@@ -11,11 +11,9 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from app import __version__
 from app.export.points import GPS_MINUS_UNIX_S, Block
+from app.export.results import Results
 from app.georeference.reference import GeoReference
 from app.slam.types import F64, MOVING
-
-if TYPE_CHECKING:
-    from app.export.results import Results
 
 SCALE = 0.001
 """m."""
@@ -29,17 +27,17 @@ ADJUSTED_S = GPS_MINUS_UNIX_S - 1_000_000_000
 """From Unix time to "adjusted standard GPS time"."""
 
 
-def write_las(path: Path, results: "Results") -> None:
+def write_las(path: Path, results: Results) -> None:
     """Uncompressed."""
     _write(path, results, compressed=False)
 
 
-def write_laz(path: Path, results: "Results") -> None:
+def write_laz(path: Path, results: Results) -> None:
     """Compressed by lazrs on all cores."""
     _write(path, results, compressed=True)
 
 
-def _write(path: Path, results: "Results", *, compressed: bool) -> None:
+def _write(path: Path, results: Results, *, compressed: bool) -> None:
     header, where = _header(results.where), results.where
     if len(results.keyframes):
         header.creation_date = datetime.fromtimestamp(results.keyframes[0].stamp_ns // 10**9, UTC).date()

@@ -2,22 +2,19 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
+from app.export.results import Results
 from app.slam.trajectory import tum_lines
 
-if TYPE_CHECKING:
-    from app.export.results import Results
 
-
-def write_kitti(path: Path, results: "Results") -> None:
+def write_kitti(path: Path, results: Results) -> None:
     """The upper three rows of each T_map_imu in one line, without stamps."""
     rows = results.trajectory.poses[:, :3].reshape(-1, 12) + 0.0
     path.write_text("".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows), encoding="ascii")
 
 
-def write_csv(path: Path, results: "Results") -> None:
+def write_csv(path: Path, results: Results) -> None:
     """Stamp and pose in the map and, if it is known where that is, easting, northing, height, latitude, longitude."""
     columns, places = "stamp_s,x_m,y_m,z_m,qx,qy,qz,qw", [""] * len(results.trajectory)
     if (where := results.where) is not None:
@@ -31,7 +28,7 @@ def write_csv(path: Path, results: "Results") -> None:
     path.write_text("\n".join([columns, *lines, ""]), encoding="ascii")
 
 
-def write_gpx(path: Path, results: "Results") -> None:
+def write_gpx(path: Path, results: Results) -> None:
     """GPX 1.1: one track."""
     assert results.where is not None
     root = ElementTree.Element("gpx", version="1.1", creator="hemislam", xmlns="http://www.topografix.com/GPX/1/1")

@@ -1,15 +1,12 @@
 """The map as binary PCD 0.7, for the Point Cloud Library."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from app.export.results import Results
 from app.slam.ply import pcd_header
 from app.slam.types import MOVING, is_ground
-
-if TYPE_CHECKING:
-    from app.export.results import Results
 
 POINT = np.dtype(
     [
@@ -26,7 +23,7 @@ POINT = np.dtype(
 _COMMENT = "hemislam map, metres, z up"
 
 
-def write(path: Path, results: "Results") -> None:
+def write(path: Path, results: Results) -> None:
     """The number of points enters the header at the end."""
     count = 0
     with path.open("wb") as file:

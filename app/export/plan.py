@@ -1,7 +1,7 @@
 """Plans: an occupancy grid for robots, a floor plan, and the terrain. North or the map's y is up."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import ezdxf
 import numpy as np
@@ -13,9 +13,7 @@ from rasterio.transform import from_origin
 from scipy import ndimage
 
 from app.export.raster import COARSE_CELL, Raster
-
-if TYPE_CHECKING:
-    from app.export.results import Results
+from app.export.results import Results
 
 FREE, WALL, UNKNOWN = 254, 0, 205
 """Grey values that nav2's map_server expects."""
@@ -23,7 +21,7 @@ LEAST_POINTS = 3
 """In a cell, to be a wall; fewer may be a person who walked past."""
 
 
-def write_pgm(path: Path, results: "Results") -> None:
+def write_pgm(path: Path, results: Results) -> None:
     """Walls, what is free by ground labels, and the rest, in the map."""
     raster = results.raster(on_earth=False)
     seen = raster.ground > 0
@@ -34,7 +32,7 @@ def write_pgm(path: Path, results: "Results") -> None:
     path.write_bytes(f"P5\n{columns} {rows}\n255\n".encode("ascii") + np.flipud(grey).tobytes())
 
 
-def write_yaml(path: Path, results: "Results") -> None:
+def write_yaml(path: Path, results: Results) -> None:
     """What nav2's map_server needs beside the image."""
     raster = results.raster(on_earth=False)
     x, y = raster.origin[:2]
@@ -45,21 +43,21 @@ def write_yaml(path: Path, results: "Results") -> None:
     )
 
 
-def write_floor_png(path: Path, results: "Results") -> None:
+def write_floor_png(path: Path, results: Results) -> None:
     """A horizontal slice, black on white; the darker, the more points."""
     cut = results.raster(on_earth=True).cut
     grey = 255 - np.minimum(cut * 32, 255)
     Image.fromarray(np.flipud(grey).astype(np.uint8)).save(path, format="PNG")
 
 
-def write_world_file(path: Path, results: "Results") -> None:
+def write_world_file(path: Path, results: Results) -> None:
     """Where floor.png lies, as GIS programs read it: size and turn of a pixel, middle of the upper left one."""
     at = _transform(results.raster(on_earth=True))
     numbers = (at.a, at.d, at.b, at.e, at.c + at.a / 2, at.f + at.e / 2)
     path.write_text("".join(f"{number:.4f}\n" for number in numbers), encoding="ascii")
 
 
-def write_dxf(path: Path, results: "Results") -> None:
+def write_dxf(path: Path, results: Results) -> None:
     """The outlines of what the slice cuts, in metres, on the layer `walls`."""
     raster = results.raster(on_earth=True)
     walls = (np.flipud(raster.cut) >= LEAST_POINTS).astype(np.uint8)
@@ -73,20 +71,20 @@ def write_dxf(path: Path, results: "Results") -> None:
         drawing.write(file)
 
 
-def write_terrain(path: Path, results: "Results") -> None:
+def write_terrain(path: Path, results: Results) -> None:
     """Mean height of the ground in each cell, m; nan where none was seen."""
     raster = results.raster(on_earth=True, cell=COARSE_CELL)
     above = "" if results.where is None else f", {results.where.height}"
     _write_tiff(path, results, raster, raster.height, f"height of the ground, m{above}")
 
 
-def write_density(path: Path, results: "Results") -> None:
+def write_density(path: Path, results: Results) -> None:
     """Points per square metre."""
     raster = results.raster(on_earth=True, cell=COARSE_CELL)
     _write_tiff(path, results, raster, (raster.points / raster.cell**2).astype(np.float32), "points per square metre")
 
 
-def _write_tiff(path: Path, results: "Results", raster: Raster, values: npt.NDArray[np.float32], what: str) -> None:
+def _write_tiff(path: Path, results: Results, raster: Raster, values: npt.NDArray[np.float32], what: str) -> None:
     rows, columns = values.shape
     memory = MemoryFile()  # a disk that fails is no error to GDAL
     with memory.open(

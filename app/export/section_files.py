@@ -3,17 +3,15 @@
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from app.export.paths import name_of, write_xml
+from app.export.results import Results
 from app.export.section import Slab
-
-if TYPE_CHECKING:
-    from app.export.results import Results
 
 GROUND, OTHER = "#0f8f7a", "#20262e"
 _GRID, _TEXT = "#c9d0d8", "#4a5560"
@@ -25,7 +23,7 @@ _MM: Final = 10.0
 """Millimetres of an SVG for each metre: 1:100."""
 
 
-def write_png(path: Path, results: "Results", section: Slab) -> None:
+def write_png(path: Path, results: Results, section: Slab) -> None:
     """A pixel for each cell: darker with more points, ground in green."""
     rows, columns = section.points.shape
     left, top, right, bottom = _MARGIN
@@ -54,7 +52,7 @@ def write_png(path: Path, results: "Results", section: Slab) -> None:
     picture.save(path, format="PNG")
 
 
-def write_svg(path: Path, results: "Results", section: Slab) -> None:
+def write_svg(path: Path, results: Results, section: Slab) -> None:
     """1:100 on paper: a dot for each cell with points, at their mean to the millimetre, over a grid."""
     (length, height), steps = section.size.tolist(), [_step(apart / 4 / _MM) for apart in _APART]
     size = length + 3.0, height + 2.5  # m, with the margins
@@ -87,7 +85,7 @@ def write_svg(path: Path, results: "Results", section: Slab) -> None:
     write_xml(path, root)
 
 
-def write_dxf(path: Path, results: "Results", section: Slab) -> None:
+def write_dxf(path: Path, results: Results, section: Slab) -> None:
     """A point for each cell with points, at their mean, in metres: x is the chainage, y the height."""
     import ezdxf  # of the extra
 
@@ -111,11 +109,11 @@ def _many(section: Slab) -> float:
     return max(4.0, float(np.percentile(section.points[section.points > 0], 90)))
 
 
-def _title(results: "Results") -> str:
+def _title(results: Results) -> str:
     return name_of(results.info.recording)
 
 
-def _caption(results: "Results") -> str:
+def _caption(results: Results) -> str:
     above = f" ({results.where.height})" if results.where is not None else " in the map"
     return f"Chainage and height{above}, metres"
 

@@ -5,7 +5,6 @@ import html
 import io
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import viser
@@ -13,11 +12,9 @@ import viser
 from app.export.ceilings import below_ceiling
 from app.export.paths import name_of, utc_text
 from app.export.point_sizes import with_point_sizes
+from app.export.results import Results
 from app.slam import lie
 from app.slam.types import F32, F64, U8
-
-if TYPE_CHECKING:
-    from app.export.results import Results
 
 MOST_POINTS = 1_000_000
 TILE = 16.0
@@ -27,7 +24,7 @@ STOPS = np.array([[40, 60, 150], [30, 150, 160], [120, 195, 110], [240, 200, 70]
 PATH, LOOP, MARK, ARROW = (255, 255, 255), (255, 120, 40), (120, 255, 160), (255, 60, 60)
 
 
-def write(path: Path, results: "Results") -> None:
+def write(path: Path, results: Results) -> None:
     """Points to a budget, trajectory, loops, notes, measures, a scale, an arrow to the north, title, credits."""
     points, keyframes = _sample(results)
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints when it starts and stops
@@ -44,21 +41,20 @@ def write(path: Path, results: "Results") -> None:
     path.write_text(before + _overlay(name, len(points), results) + end + after, encoding="utf-8")
 
 
-def _sample(results: "Results") -> tuple[F32, F64]:
+def _sample(results: Results) -> tuple[F32, F64]:
     """(n, 3) m, a fair sample of the chosen points below ceilings, and (k, 3) the keyframes' positions."""
     total, rng = sum(len(block) for block in results.still_blocks()), np.random.default_rng(0)
     taken, keyframes = [np.empty((0, 3), np.float32)], []
     for block in results.still_blocks():
         which = rng.random(len(block)) * total < MOST_POINTS
         up, above = block.T_map_lidar[2, :3], block.points - block.T_map_lidar[:3, 3]
-        below = below_ceiling((above @ block.T_map_lidar[:3, :3]).astype(np.float32), block.labels, up)
-        which &= below if below is not None else True
+        which &= below_ceiling((above @ block.T_map_lidar[:3, :3]).astype(np.float32), block.labels, up)
         taken.append(block.points[which].astype(np.float32))
         keyframes.append(block.T_map_lidar[:3, 3])
     return np.concatenate(taken), np.reshape(keyframes, (-1, 3))
 
 
-def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: "Results") -> None:
+def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: Results) -> None:
     scene, trajectory = server.scene, results.trajectory.positions
     scene.set_up_direction("+z")
     colours = _colours(points[:, 2])
@@ -91,7 +87,7 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: "Resu
     server.initial_camera.look_at = tuple(center)
 
 
-def marked(results: "Results") -> list[tuple[str, F64]]:
+def marked(results: Results) -> list[tuple[str, F64]]:
     """What was measured: name, with the distance of two points, and the (k, 3) m places in the map."""
     found = []
     for name, spots in results.marks:
@@ -125,7 +121,7 @@ def _loops(g2o: str, keyframes: int) -> np.ndarray:
     return np.array([pair for pair in pairs if max(pair) < keyframes], np.int64).reshape(-1, 2)
 
 
-def _add_scale_and_arrow(server: viser.ViserServer, low: F64, high: F64, results: "Results") -> None:
+def _add_scale_and_arrow(server: viser.ViserServer, low: F64, high: F64, results: Results) -> None:
     """On the left of the first picture, beside nearly all of the map."""
     width = float(max((high - low)[:2].max(), 1.0))
     decade = 10.0 ** math.floor(math.log10(width / 4))
@@ -140,7 +136,7 @@ def _add_scale_and_arrow(server: viser.ViserServer, low: F64, high: F64, results
     server.scene.add_label("/arrow/text", "x" if results.where is None else "N", position=tuple(tip))
 
 
-def _overlay(name: str, points: int, results: "Results") -> str:
+def _overlay(name: str, points: int, results: Results) -> str:
     """Title and credits above the map."""
     stamps_ns = results.trajectory.stamps_ns
     facts = [f"{points:,} points", f"{results.trajectory.distance:,.0f} m walked"]
