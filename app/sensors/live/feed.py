@@ -153,15 +153,11 @@ def feed(
     *,
     pace: Pace | None = None,
     duration_s: float | None = None,
-    wait_s: float = math.inf,
 ) -> int:
-    """Play a recording to its end; returns how many packets or messages were sent.
-
-    Args:
-        wait_s: a Foxglove server waits this long for a client that subscribes.
+    """Play a recording to its end, as a Foxglove server once a client subscribes; returns how much was sent.
 
     Raises:
-        HemislamError: the recording cannot be read, or not be played in this way; no client came.
+        HemislamError: the recording cannot be read, or not be played in this way.
     """
     params = params.with_values({"recording.imu_time_offset": 0.0})  # the receiver applies it
     pace = pace or Pace()
@@ -174,7 +170,7 @@ def feed(
     if to.scheme == "foxglove":
         with open_recording(path, params) as recording:
             topics = (recording.lidar_topic, recording.imu_topic)
-        return _feed_foxglove(path, topics, to, pace, duration_s, wait_s)
+        return _feed_foxglove(path, topics, to, pace, duration_s)
     raise HemislamError(f"Play it out to {'://, '.join(DEVICES)}:// or foxglove://.")
 
 
@@ -198,9 +194,7 @@ def _feed_packets(
     return number
 
 
-def _feed_foxglove(
-    path: Path, topics: tuple[str, str], to: Address, pace: Pace, duration_s: float | None, wait_s: float
-) -> int:
+def _feed_foxglove(path: Path, topics: tuple[str, str], to: Address, pace: Pace, duration_s: float | None) -> int:
     host, number = to.host or "127.0.0.1", 0
     with Source(path) as source:
         kinds = {topic.name: topic.type for topic in source.topics}
@@ -208,12 +202,9 @@ def _feed_foxglove(
             Channel(i, topic, "cdr", kinds[topic], ros.definition(kinds[topic])) for i, topic in enumerate(topics)
         ]
         with FoxgloveServer(host, to.ports[0], channels) as server:
-            deadline = time.monotonic() + wait_s
             while not server.wait_for_subscribers(0.2):
                 if pace.stop.is_set():
                     return 0
-                if time.monotonic() > deadline:
-                    raise HemislamError(f"No client subscribed at ws://{host}:{server.port}; start it first.")
             stop_ns = None if duration_s is None else source.start_ns + round(duration_s * 1e9)
             messages = source.messages(topics, None, stop_ns)
             sending = (Sent(log_ns, topics.index(topic), ros.serialised(said)) for topic, log_ns, said in messages)

@@ -44,7 +44,7 @@ def feeding(params: Params, to: str, imu_to: str | None = None, speed: float = 1
     thread = threading.Thread(
         target=feed,
         args=(SAMPLE, params, parse_address(to), parse_address(imu_to) if imu_to else None),
-        kwargs={"pace": Pace(speed, stop), "duration_s": SECONDS, "wait_s": 20.0},
+        kwargs={"pace": Pace(speed, stop), "duration_s": SECONDS},
     )
     thread.start()
     try:
@@ -128,9 +128,6 @@ def test_a_denser_lidars_scan_is_no_mid360s() -> None:
     assert alone, "each point is a firing of its own"
 
 
-def test_no_client_or_no_address_for_the_imu_is_refused(params: Params) -> None:
-    (port,) = ports.free(1)
-    with pytest.raises(HemislamError, match="No client subscribed"):
-        feed(SAMPLE, params, parse_address(f"foxglove://127.0.0.1:{port}"), wait_s=0.1)
+def test_no_address_for_the_imu_is_refused(params: Params) -> None:
     with pytest.raises(HemislamError, match="--imu-to"):
         feed(SAMPLE, params, parse_address("rsbpearl://127.0.0.1:1,2"), pace=Pace(math.inf))
