@@ -1,4 +1,4 @@
-'''IMU samples as UDP datagrams: `imu-udp://:PORT`, for an IMU beside raw LiDAR packets.
+"""IMU samples as UDP datagrams: `imu-udp://:PORT`, for an IMU beside raw LiDAR packets.
 
 A datagram holds one sample or several, each of 64 bytes, little-endian:
 
@@ -9,28 +9,10 @@ A datagram holds one sample or several, each of 64 bytes, little-endian:
     16      3 f64   angular velocity x, y, z, rad/s, IMU frame
     40      3 f64   specific force x, y, z, m/s^2, IMU frame (+9.81 upwards at rest)
 
-A sender, complete:
-
-    import socket, struct, time
-
-    def read_imu():
-        """Replace me: rad/s and m/s^2."""
-        return (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)
-
-    peer = ("127.0.0.1", 6700)
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    number = 0
-    while True:
-        gyro, accel = read_imu()
-        sample = struct.pack("<4sIq6d", b"HIMU", number % 2**32, time.time_ns(), *gyro, *accel)
-        sock.sendto(sample, peer)
-        number += 1
-        time.sleep(0.005)
-
-Stamp each sample when it is measured, not when it is sent, and by the LiDAR's clock if you can.
+docs/guide/live.md has a complete sender.
 
 The samples of an Airy's own IMU (51 bytes, big-endian, counts of its full range) and of a Mid-360's are read as well.
-'''
+"""
 
 import math
 import struct

@@ -8,17 +8,18 @@ import re
 import struct
 import subprocess
 import sys
-import textwrap
 import threading
 import time
+from pathlib import Path
 
-from app.sensors.live import imu_udp
 from app.sensors.live.imu_udp import ImuOrder, ImuSample, read_imu, write_imu
 from app.sensors.live.intake import Intake
 from app.sensors.live.status import Counters
 from app.sensors.live.udp import ImuReceiver
 from app.slam.params import Params
 from tests.sensors.live import ports
+
+GUIDE = Path(__file__).resolve().parents[3] / "docs" / "guide" / "live.md"
 
 
 def sample(number: int) -> ImuSample:
@@ -67,14 +68,14 @@ def test_garbage_is_counted_and_stops_nothing() -> None:
 
 
 def test_the_documented_sender_is_understood() -> None:
-    text = re.search(r"A sender, complete:\n\n((?:    .*\n|\n)+)", imu_udp.__doc__ or "")
+    text = re.search(r"A complete sender:\n\n```python\n(.+?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
     assert text is not None
     (port,) = ports.free(1)
     receiver = ImuReceiver("127.0.0.1", port)
     intake, stop = Intake(Params()), threading.Event()
     thread = threading.Thread(target=receiver, args=(intake, stop))
     thread.start()
-    script = textwrap.dedent(text[1]).replace("6700", str(port))
+    script = text[1].replace("6700", str(port))
     sender = subprocess.Popen([sys.executable, "-c", script])
     try:
         deadline = time.monotonic() + 20.0
