@@ -62,31 +62,19 @@ def run(
       hemislam run walk.mcap --set ground.alpha=30 --start 10 --duration 60 --truth walk.tum
       hemislam run walk.mcap --loops edits.yaml
     """
-    from app.mapping.loops import LoopProcess, RestartingLoops
-
-    params = params_for(recording)
-    first = LoopProcess() if params.loops.enabled else None  # it takes a second to start: meanwhile, go on
-
     from app.evaluation.truth import read_poses
     from app.export.results import prepare_folder
     from app.mapping.opening import open_session
     from app.slam.doubts import doubts
     from app.slam.trajectory import truth_beside
 
+    params = params_for(recording)
     say_calibrated(recording)
     edits = _read_edits(loops) if loops else ()
     params, advised = settle_mounting(recording, params) if calibrate else (params, "")
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
-    session = open_session(
-        recording,
-        params,
-        start,
-        duration,
-        truth=truth_path,
-        loops=lambda log: RestartingLoops(log, first=first),
-        read_ahead=True,
-    )
+    session = open_session(recording, params, start, duration, truth=truth_path, read_ahead=True)
     try:
         if truth_path:
             read_poses(truth_path)  # raises for poses that cannot be true

@@ -48,17 +48,11 @@ class LoopProcess(Child):
 
 
 class RestartingLoops:
-    """A `LoopClient` whose process is replaced when it dies.
+    """A `LoopClient` whose process, which `make` starts, is replaced when it dies."""
 
-    Args:
-        make: starts a process. first: one that was started before.
-    """
-
-    def __init__(
-        self, log: KeyframeLog, make: Callable[[], LoopProcess] = LoopProcess, first: LoopProcess | None = None
-    ) -> None:
+    def __init__(self, log: KeyframeLog, make: Callable[[], LoopProcess] = LoopProcess) -> None:
         self._make, self._log = make, log
-        self._process, self._follower = first or make(), Follower(log)
+        self._process, self._follower = make(), Follower(log)
         self._unsent: deque[Ask] = deque()
         self._sent: deque[Ask | None] = deque()  # None: a keyframe
         self._limit, self._given_up = RestartLimit(MOST_DEATHS), False

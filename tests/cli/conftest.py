@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from app.__main__ import cli
+from app.mapping.opening import open_session
 from app.sensors.ros import RecordingWriter
 from app.slam.loops.service import InlineLoops
 from app.slam.trajectory import Trajectory, write_tum
@@ -136,8 +138,7 @@ Call = Callable[..., Outcome]
 def _loops_in_this_process() -> Iterator[None]:
     """Each run in this process would start an interpreter for its loops, which takes longer than the run."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("app.mapping.loops.LoopProcess", lambda: None)
-        patch.setattr("app.mapping.loops.RestartingLoops", lambda log, first: InlineLoops(log))
+        patch.setattr("app.mapping.opening.open_session", partial(open_session, loops=InlineLoops))
         yield
 
 
