@@ -3,14 +3,11 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.kept import NOTHING_KEPT, Kept
+from app.sensors.live.address import LiveAddress
 from app.slam.params import Params
-
-if TYPE_CHECKING:
-    from app.sensors.live.address import LiveAddress
 
 POINT_BUDGET = 3_000_000
 """Most map points that a page draws."""
@@ -43,7 +40,7 @@ class Setup:
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     point_budget: int = POINT_BUDGET
     checkpoint_bytes: int = 1 << 30
-    live: "LiveAddress | None" = None
+    live: LiveAddress | None = None
     live_folder: Path | None = None
     revive: bool = False
     session_folder: Path | None = None
