@@ -56,14 +56,7 @@ class MapsToCompare:
 
 
 def find(owner: Link, wanted: MapsToCompare) -> None:
-    """Send the share that is done as it grows, and at the end a `Comparison`, or why there is none, in words."""
-    try:
-        owner.send(_find(owner, wanted))
-    except HemislamError as error:
-        owner.send(str(error))
-
-
-def _find(owner: Link, wanted: MapsToCompare) -> Comparison:
+    """Send the share that is done as it grows, then a `Comparison`. Raises HemislamError if there can be none."""
     poses = np.array([scan.T_map_imu for scan in wanted.scans])
     points, sensors = placed(wanted.scans, poses)
     if wanted.by_truth:
@@ -73,10 +66,11 @@ def _find(owner: Link, wanted: MapsToCompare) -> Comparison:
         other = read_points(wanted.other, THIN_M, lambda share: owner.send(_READ * share))
         if wanted.where is not None and np.abs(np.median(other, axis=0)).max() > _OF_A_GRID_M:
             other = wanted.where.from_crs(other)
-    return compare(
+    found = compare(
         points, sensors, other, reach=wanted.reach, fit=wanted.fit,
         progress=lambda share: owner.send(_READ + (1 - _READ) * share),
     )  # fmt: skip
+    owner.send(found)
 
 
 def placed(scans: "tuple[KeyframePoints, ...] | list[KeyframePoints]", poses: F64) -> tuple[F64, F64]:

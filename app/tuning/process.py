@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.child import Link
-from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.provenance import cores
 from app.tuning.trial import SearchMethod, Trial, front
@@ -65,14 +64,7 @@ class Tried:
 
 
 def find(owner: Link, wanted: Wanted) -> None:
-    """Send an `Ended` after each run and a `Tried` after each batch of trials; or why there is none, in words."""
-    try:
-        _find(owner, wanted)
-    except HemislamError as error:
-        owner.send(str(error))
-
-
-def _find(owner: Link, wanted: Wanted) -> None:
+    """Send an `Ended` after each run, a `Tried` after each batch of trials. Raises HemislamError if none can be run."""
     from app.evaluation.evaluate import Subject
     from app.evaluation.runner import run_jobs
     from app.evaluation.truth import read_truth

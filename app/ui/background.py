@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from app.child import Child
+from app.child import Child, Link
+from app.slam.errors import HemislamError
 
 
 class Background:
@@ -18,7 +19,7 @@ class Background:
         return self._child is not None
 
     def begin(self, main: Callable[..., None], *args: Any) -> None:
-        self._child = Child(main, *args, name=self._name, title=self._title, fork=True, grace_s=0.0)
+        self._child = Child(_told, main, *args, name=self._name, title=self._title, fork=True, grace_s=0.0)
 
     def messages(self) -> Iterator[Any]:
         """Those that have come; no more once the work was stopped, by whatever thread."""
@@ -33,3 +34,10 @@ class Background:
         child, self._child = self._child, None
         if child is not None:
             child.close(0.0)
+
+
+def _told(owner: Link, main: Callable[..., None], *args: Any) -> None:
+    try:
+        main(owner, *args)
+    except HemislamError as error:
+        owner.send(str(error))

@@ -13,7 +13,6 @@ from app.child import Link
 from app.sensors.recording import NO_IMU
 from app.server.protocol import LIVE, Calibrated, Restart, Seek, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
-from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.ui.background import Background
 from app.ui.html import panel
@@ -171,14 +170,10 @@ def _has_edits(snapshot: Snapshot) -> bool:
 
 
 def find(owner: Link, recording: Path, params: Params) -> None:
-    """In a process of its own: sends fractions done, then what was found, or a sentence why nothing was."""
+    """In a process of its own: sends fractions done, then what was found."""
     from app.calibration.calibrate import calibrate
     from app.calibration.words import table
     from app.evaluation.calibration_plot import residual_plot
 
-    try:
-        found = calibrate(recording, params, progress=lambda fraction: owner.send(float(fraction)))
-    except HemislamError as error:
-        owner.send(str(error))
-        return
+    found = calibrate(recording, params, progress=lambda fraction: owner.send(float(fraction)))
     owner.send(FoundMounting(table(found), found.found(), residual_plot(found), found.contradiction()))

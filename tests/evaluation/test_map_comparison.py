@@ -11,6 +11,7 @@ from app.evaluation.cloud_distance import Comparison
 from app.evaluation.map_comparison import KeyframePoints, MapsToCompare, find, read_map, sentences
 from app.georeference.reference import GeoReference
 from app.slam import lie
+from app.slam.errors import HemislamError
 from app.slam.ply import header
 from app.slam.trajectory import Trajectory, write_tum
 
@@ -93,8 +94,10 @@ def test_a_scan_off_its_true_pose_is_off_its_true_surface(tmp_path: Path) -> Non
 
 
 def test_why_nothing_can_be_compared_is_said(tmp_path: Path) -> None:
-    assert "cannot be read" in compared(MapsToCompare(SCANS, tmp_path / "gone.laz"))
-    assert "fewer than 3" in compared(MapsToCompare(SCANS[:2], truth(tmp_path / "truth.tum", AT), by_truth=True))
+    with pytest.raises(HemislamError, match="cannot be read"):
+        compared(MapsToCompare(SCANS, tmp_path / "gone.laz"))
+    with pytest.raises(HemislamError, match="fewer than 3"):
+        compared(MapsToCompare(SCANS[:2], truth(tmp_path / "truth.tum", AT), by_truth=True))
 
 
 def test_a_file_is_seen_from_above_and_what_was_moved_is_said(tmp_path: Path) -> None:

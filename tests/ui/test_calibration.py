@@ -32,7 +32,7 @@ OPEN = Snapshot(recording=OpenedRecording(Path("walk.mcap"), 0, 30.0, 300, ()))
 class Process:
     """Stands for the process; the test says what it sends."""
 
-    def __init__(self, main: Any, *args: Any, **_: Any) -> None:
+    def __init__(self, told: Any, main: Any, *args: Any, **_: Any) -> None:
         self.arguments, self.messages, self.closed = args, [], False
 
     def news(self) -> Any:

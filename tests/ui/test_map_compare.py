@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 import viser
 
+from app.child import Link
 from app.evaluation.cloud_distance import Comparison
 from app.server.folders import Folders
 from app.server.protocol import Chunk, OpenedRecording, Snapshot
+from app.slam.errors import HemislamError
 from app.ui import background
 from app.ui.chunks import MapChunks
 from app.ui.colours import DENSITY, DISTANCE, NOTHING, Limits, key
@@ -91,6 +93,20 @@ def test_stop_ends_it_and_a_problem_is_reported(comparing: Comparing) -> None:
     user_clicks(comparing.panel._truth)
     comparing.draw("The maps do not lie on each other.")
     assert comparing.process is None and comparing.modes == []
+
+
+def fail(owner: Link, why: str) -> None:
+    raise HemislamError(why)
+
+
+def test_work_that_cannot_be_done_says_why() -> None:
+    work, found = background.Background("test", "The test"), None
+    work.begin(fail, "The file cannot be read.")
+    deadline = time.monotonic() + 60
+    while found is None and time.monotonic() < deadline:
+        found = next(work.messages(), None)
+    work.stop()
+    assert found == "The file cannot be read." and not work.running
 
 
 def test_a_map_that_has_changed_since_is_said_to_be_old(comparing: Comparing) -> None:
