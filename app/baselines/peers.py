@@ -3,6 +3,8 @@
 Each is imported only when it is made: `app.baselines.systems` puts its folder on the path first.
 """
 
+from typing import Any
+
 import numpy as np
 
 from app.baselines.mounting import levelled, mounting
@@ -21,15 +23,10 @@ class KissIcp:
         config = KISSConfig()
         config.data.max_range, config.data.min_range = params.sensor.max_range, params.sensor.min_range
         config.mapping.voxel_size = config.data.max_range / 100.0  # its own rule
-        self._odometry = KissICP(config)
-        self._world = _World(params)
+        self._icp = _Icp(params, KissICP(config))
 
     def step(self, measurement: Measurement) -> tuple[int, F64]:
-        scan = measurement.scan
-        self._odometry.register_frame(
-            scan.points.astype(np.float64), scan.offsets_ns / max(int(scan.offsets_ns.max()), 1)
-        )
-        return scan.end_ns, self._world.imu(measurement, np.asarray(self._odometry.last_pose))
+        return measurement.scan.end_ns, self._icp.imu(measurement)
 
 
 class GenzIcp:
@@ -42,16 +39,10 @@ class GenzIcp:
         config = GenZConfig()
         config.data.max_range, config.data.min_range = params.sensor.max_range, params.sensor.min_range
         config.data.deskew = True
-        self._odometry = GenZICP(config)
-        self._world = _World(params)
+        self._icp = _Icp(params, GenZICP(config))
 
     def step(self, measurement: Measurement) -> tuple[int, F64]:
-        scan = measurement.scan
-        self._odometry.register_frame(
-            scan.points.astype(np.float64), scan.offsets_ns / max(int(scan.offsets_ns.max()), 1)
-        )
-        middle_ns = (scan.stamp_ns + scan.end_ns) // 2
-        return middle_ns, self._world.imu(measurement, np.asarray(self._odometry.last_pose))
+        return (measurement.scan.stamp_ns + measurement.scan.end_ns) // 2, self._icp.imu(measurement)
 
 
 class RkoLio:
@@ -74,14 +65,18 @@ class RkoLio:
         return scan.end_ns, np.array(self._odometry.pose())
 
 
-class _World:
-    """Turns poses of the LiDAR in a world that begins with it into poses of the IMU in one whose z points up."""
+class _Icp:
+    """An odometry of the LiDAR alone, in a world that begins with it, as poses of the IMU in one whose z points up."""
 
-    def __init__(self, params: Params) -> None:
-        self._T_imu_lidar = mounting(params)
+    def __init__(self, params: Params, odometry: Any) -> None:
+        self._odometry, self._T_imu_lidar = odometry, mounting(params)
         self._T_odom_start: F64 | None = None  # of the LiDAR
 
-    def imu(self, measurement: Measurement, T_start_lidar: F64) -> F64:
+    def imu(self, measurement: Measurement) -> F64:
+        scan = measurement.scan
+        self._odometry.register_frame(
+            scan.points.astype(np.float64), scan.offsets_ns / max(int(scan.offsets_ns.max()), 1)
+        )
         if self._T_odom_start is None:
             self._T_odom_start = levelled(measurement.imu) @ self._T_imu_lidar
-        return np.asarray(self._T_odom_start @ T_start_lidar @ lie.inverse(self._T_imu_lidar))
+        return np.asarray(self._T_odom_start @ np.asarray(self._odometry.last_pose) @ lie.inverse(self._T_imu_lidar))
