@@ -43,7 +43,7 @@ def compare(
     if out is not None:
         _check(out, map_, other)
     points, sensors = read_map(map_)
-    with progress_bar("Comparing", total=1.0, bar_format="{desc}: {percentage:3.0f}% |{bar}| {elapsed}") as show:
+    with progress_bar("Comparing") as show:
         found = cloud_distance.compare(points, sensors, read_map(other)[0], reach=reach, fit=fit, progress=show)
     typer.echo(f"median       {100 * found.median:+7.1f} cm")
     typer.echo(f"half within  {100 * found.typical:7.1f} cm")

@@ -42,8 +42,5 @@ class PathOverTime:
     def antenna(self, t: F64, lever: F64) -> F64:
         """(n, 3) m in the map, of a point `lever` (3,) in the IMU frame."""
         inside = np.clip(t, self._times[0], self._times[-1])
-        places = np.asarray(self._places(inside))
-        if not lever.any():
-            return places
         turns: Rotation = self._turns(inside)
-        return np.asarray(places + turns.apply(lever))
+        return np.asarray(self._places(inside) + turns.apply(lever))

@@ -192,8 +192,7 @@ def value_colours(values: npt.ArrayLike, limits: Limits, table: U8) -> U8:
     scaled = (np.asarray(values, dtype=np.float32) - limits.low) * (255.0 / (limits.high - limits.low))
     known = np.isfinite(scaled)
     found: U8 = table[np.where(known, np.clip(scaled, 0.0, 255.0), 0.0).astype(np.uint8)]
-    if not known.all():
-        found[~known] = NOTHING
+    found[~known] = NOTHING
     return found
 
 

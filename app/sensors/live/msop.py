@@ -8,7 +8,6 @@ divided into two parts with a mark and azimuth of their own.
 import calendar
 import struct
 from datetime import UTC, datetime
-from functools import lru_cache
 
 import numpy as np
 
@@ -117,7 +116,6 @@ def _stamp_bytes(stamp_ns: int, model: Model) -> bytes:
     return utc_bytes(stamp_ns) + b"\x00" + (_TYPE_BPV4 if model is BPV4 else b"\x31\x02")
 
 
-@lru_cache(maxsize=64)
 def _date_ns(date: bytes) -> int | None:
     year, month, day, hour, minute, second = date
     try:
