@@ -15,8 +15,8 @@ from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.edits import Add, Edits, LoopEdit, Override, Solve, apply_edits, check, in_words, rows
 from app.slam.loops.factors import Closing, PositionPrior, residuals
-from app.slam.loops.graph import Graph, failure, optimum
 from app.slam.loops.messages import Target
+from app.slam.loops.pose_graph import Graph, failure, optimum
 from app.slam.loops.search import Search
 from app.slam.loops.solvers import g2o_text
 from app.slam.loops.types import FactorResidual, LoopDetail, LoopEdge, Pair, Preview, Verdict
@@ -65,7 +65,7 @@ class LoopBackend:
         self._made = {key: edge for key, edge in self._made.items() if key[1] < keyframe.index}
         self._search.add(keyframe, params, priors)
         if len(self) < 2:
-            self._begin()
+            self._edited = Graph(self._odometry[0], self._search.start.window)  # from another first keyframe
 
     def finish(self) -> None:
         """The session ends here: look for loops of the last keyframes too. `add` and `go_to` take that back."""
@@ -223,10 +223,6 @@ class LoopBackend:
     def _odometry(self) -> F64:
         """(k, 4, 4) T_odom_imu."""
         return self._search.detector.poses
-
-    def _begin(self) -> None:
-        """Start the graphs again from another first keyframe."""
-        self._edited = Graph(self._odometry[0], self._search.start.window)
 
     def _with_edits(self, edits: Iterable[LoopEdit]) -> dict[Pair, LoopEdge]:
         """The loops found, with the edits applied."""

@@ -16,7 +16,7 @@ from app.slam.loops.detection import Detector
 from app.slam.loops.drift import Drift, Expectation, expect
 from app.slam.loops.edits import apply_edits
 from app.slam.loops.factors import PositionPrior, loosened, odometry_factor
-from app.slam.loops.graph import Graph, Measured
+from app.slam.loops.pose_graph import Graph, Measured
 from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.support import placed, settle
 from app.slam.loops.types import LoopEdge, Pair, Verdict

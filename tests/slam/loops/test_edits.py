@@ -278,7 +278,7 @@ def test_a_graph_that_can_not_be_solved_at_once_stays_as_it_is_and_that_is_said_
     def fail(*_: object) -> None:
         raise ArithmeticError("Indeterminant linear system")
 
-    monkeypatch.setattr("app.slam.loops.graph.optimise", fail)
+    monkeypatch.setattr("app.slam.loops.pose_graph.optimise", fail)
     before = backend.poses
     backend.apply(Solve())
     assert backend.poses.tobytes() == backend.poses.tobytes() == before.tobytes()
