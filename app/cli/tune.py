@@ -106,7 +106,7 @@ def tune(
     from app.tuning.report import BEST
     from app.tuning.space import parse_dimensions
     from app.tuning.trial import Trial, advice, front
-    from app.tuning.tune import Part, Runs, SearchPlan, known_runs
+    from app.tuning.tune import Part, Runs, SearchPlan
     from app.tuning.tune import tune as find
 
     dimensions = parse_dimensions(parameters)
@@ -127,13 +127,7 @@ def tune(
     rest = part.next(held_back) if held_back != 0 and not marks else None
     make_folder(out)
     run = runner(jobs or (1 if timed else cores()), cluster, cluster_data, quiet=True)
-    runs = Runs(
-        subjects,
-        wanted,
-        out / "runs",
-        known=known_runs(out.resolve().parent),
-        run=run,
-    )
+    runs = Runs(subjects, wanted, out, run)
     compile_behind_bar()
     with tqdm(total=trials + 1, desc="Tuning", unit=" trials", disable=None) as bar:
 

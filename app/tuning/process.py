@@ -71,7 +71,7 @@ def find(owner: Link, wanted: Wanted) -> None:
     from app.tuning.objectives import choose_objectives
     from app.tuning.report import importances
     from app.tuning.space import parse_dimensions
-    from app.tuning.tune import Part, Runs, SearchPlan, known_runs, tune
+    from app.tuning.tune import Part, Runs, SearchPlan, tune
 
     truth = read_truth(str(wanted.truth)) if wanted.truth is not None else None
     subject = Subject(wanted.recording.stem, wanted.recording, wanted.params, truth, marks=wanted.marks)
@@ -95,12 +95,7 @@ def find(owner: Link, wanted: Wanted) -> None:
         owner.send(latest)
 
     parallel = 1 if "frame-time" in wanted.objectives else cores()  # runs beside each other would spoil their times
-    runs = Runs(
-        [subject],
-        objectives,
-        wanted.folder / "runs",
-        known=known_runs(wanted.folder.resolve().parent),
-        run=partial(run_jobs, parallel=parallel, quiet=True, ended=ended),
-    )
+    run = partial(run_jobs, parallel=parallel, quiet=True, ended=ended)
+    runs = Runs([subject], objectives, wanted.folder, run)
     _, checked = tune(runs, search, wanted.folder, progress)
     owner.send(replace(latest, held_back=checked, finished=True))

@@ -74,23 +74,17 @@ class Runs:
     """Runs settings on all recordings and scores them.
 
     Args:
-        folder: for runs. known: folders of runs that were finished before, by key. run: as `evaluate`.
+        folder: of the search; finished runs beside it are found again. run: as `evaluate`.
 
     Raises:
         HemislamError: a recording cannot be used.
     """
 
     def __init__(
-        self,
-        subjects: Sequence[Subject],
-        objectives: Sequence[Objective],
-        folder: Path,
-        *,
-        known: Mapping[str, Path],
-        run: RunJobs,
+        self, subjects: Sequence[Subject], objectives: Sequence[Objective], folder: Path, run: RunJobs
     ) -> None:
-        self._subjects, self._objectives, self._folder = subjects, objectives, folder
-        self._known, self._run = known, run
+        self._subjects, self._objectives, self._run = subjects, objectives, run
+        self._folder, self._known = folder / "runs", _known_runs(folder.resolve().parent)
         self.hashes = [check_subject(subject) for subject in subjects]
 
     def asked(self, wanted: SearchPlan) -> dict[str, Any]:
@@ -232,7 +226,7 @@ def _sampler(how: SearchMethod, seed: int) -> optuna.samplers.BaseSampler:
     return optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
 
 
-def known_runs(folder: Path) -> dict[str, Path]:
+def _known_runs(folder: Path) -> dict[str, Path]:
     """Folders of finished runs below `folder`, by their key, so that `tune` runs nothing that `evaluate` ran."""
     known = {}
     for report in sorted(folder.glob("*/runs/*/*/run.json")):
