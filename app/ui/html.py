@@ -1,6 +1,5 @@
 """HTML of the page's panels: templates (`app/ui/templates`) that escape everything put into them."""
 
-from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -28,30 +27,23 @@ class Tile(NamedTuple):
     width: str = ""
 
 
-@cache
-def _environment() -> Environment:
-    found = Environment(loader=FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, undefined=StrictUndefined)
-    found.globals |= {"ONE_PIXEL": ONE_PIXEL, "HINTS": HINTS}
-    return found
-
-
-@cache
-def _macro(name: str, template: str) -> Any:
-    return getattr(_environment().get_template(template).module, name)
+_TEMPLATES: Final = Environment(
+    loader=FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, undefined=StrictUndefined
+)
+_TEMPLATES.globals |= {"ONE_PIXEL": ONE_PIXEL, "HINTS": HINTS}
 
 
 def panel(name: str, *args: Any) -> str:
     """The HTML of a macro: "note" of `panels.html`, "loops.table" of `loops.html`."""
     template, _, macro = name.rpartition(".")
-    return str(_macro(macro, f"{template or 'panels'}.html")(*args))
+    return str(getattr(_TEMPLATES.get_template(f"{template or 'panels'}.html").module, macro)(*args))
 
 
 def render(template: str) -> str:
     """The HTML of a template without parameters."""
-    return _environment().get_template(template).render()
+    return _TEMPLATES.get_template(template).render()
 
 
-@cache
 def source(name: str) -> str:
     """The text of a style sheet or a script among the templates."""
     return (_FOLDER / name).read_text(encoding="utf-8")
