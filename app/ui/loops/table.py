@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from app.slam.loops.types import LoopEdge, Pair
+from app.ui.hints import HINTS
 from app.ui.html import number, panel, source
 from app.ui.loops.words import EDITED, KINDS, SIGNS, kind_of, name
 
@@ -36,11 +37,11 @@ COLUMNS: Final[dict[str, TableColumn]] = {
         lambda e: e.newer + e.older * 1e-7, lambda e: name(e.pair),
     ),
     "context": TableColumn(
-        "difference", "0–1", "How differently the two places look from above (Scan Context), 0 (the same) to 1.",
+        "difference", "0–1", HINTS["difference"],
         lambda e: e.evidence.context_distance, lambda e: number(e.evidence.context_distance),
     ),
     "overlap": TableColumn(
-        "overlap", "%", "Points near both keyframes that have a partner in the other submap, in percent.",
+        "overlap", "%", HINTS["overlap"],
         lambda e: e.evidence.overlap, lambda e: number(100 * e.evidence.overlap, 0),
     ),
     "residual": TableColumn(
@@ -48,7 +49,7 @@ COLUMNS: Final[dict[str, TableColumn]] = {
         lambda e: e.evidence.residual_rms, lambda e: number(1000 * e.evidence.residual_rms, 0),
     ),
     "mahalanobis": TableColumn(
-        "odometry", "σ", "Distance to what odometry expects, in its standard deviations (σ).",
+        "odometry", "σ", HINTS["to odometry"],
         lambda e: e.evidence.mahalanobis, lambda e: number(e.evidence.mahalanobis, 1),
     ),
 }  # fmt: skip
