@@ -15,7 +15,6 @@ from app.ui.colours import Limits
 
 _WAITS: Final = 3.0
 """Between two counts, this many times as long as the last one took passes."""
-_EDGE_M: Final = 0.25
 _SHARE: Final = 98.0
 """Percent of the counts that the colours spread over."""
 
@@ -67,7 +66,7 @@ class Density:
         begin = self._now()
         T = (poses[[chunk.index for chunk in chunks]] @ [chunk.T_imu_lidar for chunk in chunks]).astype(np.float32)
         placed = [lie.moved(t, chunk.points) for chunk, t in zip(chunks, T, strict=True)]
-        counts = density(np.concatenate(placed), _EDGE_M)
+        counts = density(np.concatenate(placed))
         high = float(np.percentile(counts, _SHARE)) if len(counts) else 1.0
         self._found = MapNumbers.split(chunks, counts, Limits(0.0, max(high, 1.0)))
         self._due = self._now() + _WAITS * (self._now() - begin)

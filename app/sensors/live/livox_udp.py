@@ -54,10 +54,9 @@ MID360 = Livox("Mid-360")
 @dataclass(frozen=True, slots=True)
 class LivoxHeader:
     """Attributes:
-    interval_ns: from point to point. count: points. number: of the packet, wraps at 65536. kind: 0 IMU, 1 and 2 points.
+    count: points. number: of the packet, wraps at 65536. kind: 0 IMU, 1 and 2 points.
     """
 
-    interval_ns: int
     count: int
     number: int
     kind: int
@@ -68,11 +67,11 @@ def read_header(packet: bytes) -> LivoxHeader | None:
     """None if it is no datagram of such a sensor: it has no mark, but its lengths must agree."""
     if len(packet) < HEADER_BYTES:
         return None
-    version, length, duration, count, number, _, kind, _, _, stamp = _HEADER.unpack_from(packet)
+    version, length, _, count, number, _, kind, _, _, stamp = _HEADER.unpack_from(packet)
     size = _SAMPLE.size if kind == _IMU_KIND else _MEASURED[kind][0].itemsize if kind in _MEASURED else -1
     if version or length != len(packet) or not count or HEADER_BYTES + count * size != length or stamp >= _FAR_NS:
         return None
-    return LivoxHeader(duration * 100 // count, count, number, kind, stamp)
+    return LivoxHeader(count, number, kind, stamp)
 
 
 def is_points(header: LivoxHeader) -> bool:

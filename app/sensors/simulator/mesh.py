@@ -127,21 +127,14 @@ class MeshBuilder:
         shade = (reflectivity * rng.uniform(0.8, 1.2, count)).astype(np.float32)
         self.add(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), shade)
 
-    def surface(
-        self,
-        x: F64,
-        y: F64,
-        height: Callable[[F64], F64],
-        reflectivity: Callable[[F64], F64],
-        ground: bool = True,
-    ) -> None:
-        """A height field over the grid x by y; `height` and `reflectivity` take (n, 2) and give (n,)."""
+    def surface(self, x: F64, y: F64, height: Callable[[F64], F64], reflectivity: Callable[[F64], F64]) -> None:
+        """Ground as a height field over the grid x by y; `height` and `reflectivity` take (n, 2) and give (n,)."""
         xx, yy = np.meshgrid(x, y, indexing="ij")
         plan = np.column_stack([xx.ravel(), yy.ravel()])
         vertices = np.column_stack([plan, height(plan)])
         faces = _grid_faces(len(x), len(y))
         middles = vertices[faces].mean(axis=1)[:, :2]
-        self.add(vertices, faces, reflectivity(middles).astype(np.float32), ground)
+        self.add(vertices, faces, reflectivity(middles).astype(np.float32), ground=True)
 
     def wall(
         self,
