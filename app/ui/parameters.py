@@ -8,7 +8,6 @@ Browsers and the engine may both change a value. What a user set is sent as a co
 except into a control that was touched a moment ago: an older snapshot must not move the slider under the hand.
 """
 
-from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -158,9 +157,7 @@ def round_values(leaf: Leaf) -> tuple[float, ...]:
 
 def _nearest(ascending: tuple[float, ...], value: float) -> int:
     """The place of the value that is nearest, or of the smaller of the two around it."""
-    place = min(bisect_left(ascending, value), len(ascending) - 1)
-    before = max(place - 1, 0)
-    return place if ascending[place] - value < value - ascending[before] else before
+    return int(np.argmin(np.abs(np.subtract(ascending, value))))
 
 
 class ParameterHistory:
