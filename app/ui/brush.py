@@ -12,7 +12,6 @@ from app.mapping.painted import SUFFIX, UNMARKED, Stroke, marks, read_json, to_j
 from app.server.keeping import Paint, UndoPaint
 from app.server.protocol import Seek, Snapshot
 from app.slam import lie
-from app.slam.errors import HemislamError
 from app.slam.types import GROUND, NON_GROUND, U8, StepResult
 from app.ui.colours import LABEL_COLOURS
 from app.ui.html import panel
@@ -20,7 +19,7 @@ from app.ui.nodes import add_points, clear, place
 from app.ui.sensor import SCAN_POINT_SCALE
 from app.ui.study_maths import nearest_to_ray
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, by_user, notify_error
+from app.ui.widgets import ROOT, Changes, Page, View, by_user
 
 _OFF: Final = "off"
 _MARKS: Final = {"ground": GROUND, "not ground": NON_GROUND, "erase": UNMARKED}
@@ -161,13 +160,8 @@ class BrushPanel:
         name = f"{snapshot.recording.path.stem if snapshot.recording else 'frames'}{SUFFIX}"
         client.send_file_download(name, to_json(snapshot.painted).encode(), save_immediately=True)
 
-    def _read(self, file: Any, client: viser.ClientHandle) -> None:
-        try:
-            strokes = read_json(file.content.decode("utf-8", errors="replace"), Path(file.name).name)
-        except HemislamError as error:
-            notify_error(client, error)
-            return
-        for stroke in strokes:
+    def _read(self, file: Any, _: viser.ClientHandle) -> None:
+        for stroke in read_json(file.content.decode("utf-8", errors="replace"), Path(file.name).name):
             self._page.send(Paint(stroke))
 
 

@@ -80,8 +80,8 @@ class ClipPanel:
             "Save the profile…", icon=viser.Icon.DEVICE_FLOPPY, color="gray", visible=False
         )
         for control in (self._middle, self._size, self._turn):
-            control.on_update(by_user(lambda _, client: self._typed(client)))
-        self._on.on_update(by_user(lambda on, client: self._switch(on, client)))
+            control.on_update(by_user(lambda _, __: self._typed()))
+        self._on.on_update(by_user(lambda on, _: self._switch(on)))
         self._slab.on_update(by_user(lambda slab, _: self._send(slab=slab)))
         self._unrolled.on_update(by_user(self._unroll))
         whole.on_click(by_user(lambda _, client: self._send(box=self._whole())))
@@ -116,13 +116,13 @@ class ClipPanel:
     def _send(self, **changes: Any) -> None:
         self._page.send(SetClip(replace(self._page.snapshot().clip, **changes)))
 
-    def _switch(self, on: bool, client: viser.ClientHandle) -> None:
+    def _switch(self, on: bool) -> None:
         box = self._page.snapshot().clip.box
         try:
             self._send(on=on, box=box or self._whole())
-        except HemislamError as error:
+        except HemislamError:
             show(self._on, False)
-            notify_error(client, error)
+            raise
 
     def _whole(self) -> Box:
         """The box around all of the map but a few far points. Raises HemislamError: there is no map yet."""
@@ -132,11 +132,8 @@ class ClipPanel:
         low, high = np.percentile(points, (0.5, 99.5), axis=0)
         return Box.around((low + high) / 2, np.maximum(high - low, 1.0) + 0.1)
 
-    def _typed(self, client: viser.ClientHandle) -> None:
-        try:
-            self._send(box=Box.around(self._middle.value, self._size.value, self._turn.value))
-        except HemislamError as error:
-            notify_error(client, error)
+    def _typed(self) -> None:
+        self._send(box=Box.around(self._middle.value, self._size.value, self._turn.value))
 
     def _show(self, clip: Clip) -> None:
         show(self._on, clip.on)
@@ -161,10 +158,9 @@ class ClipPanel:
         trajectory, points = self._page.snapshot().trajectory, self._around()
         try:
             path = strides(trajectory[:, :2] if trajectory is not None else np.empty((0, 2)))
-        except HemislamError as error:
+        except HemislamError:
             show(self._unrolled, False)
-            notify_error(client, error)
-            return
+            raise
         self._send(unrolled=on, on=self._page.snapshot().clip.on and not on)  # a section's box would leave little of it
         if on:
             length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())

@@ -30,7 +30,6 @@ from app.ui.widgets import (
     by_user,
     chart,
     dialog,
-    notify_error,
     show,
 )
 
@@ -230,22 +229,17 @@ class ComparePanel:
 
     # --- what is asked for -----------------------------------------------------------------------
     def _act(self, what: Any, client: viser.ClientHandle) -> None:
-        try:
-            match what:
-                case "swap":
-                    self._forks.swap()
-                case "keep":
-                    path = self._forks.keep(self._name.value)
-                    client.add_notification("Kept", f"The fork is saved as {path}; hemislam serve opens it.")
-                case "discard":
-                    self._forks.discard()
-                case Path():
-                    self._forks.open(what)
-                case _:
-                    self._forks.fork(self._name.value)
-                    self._sides.choose("B")
-        except HemislamError as error:
-            notify_error(client, error)
+        match what:
+            case "swap":
+                self._forks.swap()
+            case "keep":
+                path = self._forks.keep(self._name.value)
+                client.add_notification("Kept", f"The fork is saved as {path}; hemislam serve opens it.")
+            case "discard":
+                self._forks.discard()
+            case _:
+                self._forks.fork(self._name.value)
+                self._sides.choose("B")
 
     def _choose(self, client: viser.ClientHandle) -> None:
         kept = self._forks.kept()
@@ -254,12 +248,12 @@ class ComparePanel:
                 client.gui.add_html(panel("text", "This recording has no other session yet; fork, then keep the fork."))
             buttons = [(path, client.gui.add_button(path.stem, color="gray")) for path in kept]
 
-        def chosen(path: Path, _: object) -> None:
+        def chosen(path: Path, _: object, __: viser.ClientHandle) -> None:
             close()
-            self._act(path, client)
+            self._forks.open(path)
 
         for path, button in buttons:
-            button.on_click(partial(chosen, path))
+            button.on_click(by_user(partial(chosen, path)))
 
     def _swap_if_any(self) -> None:
         if self._forks.other is not None:

@@ -20,9 +20,9 @@ from app.ui.georeference_maths import centre_of_sphere, lines_of, names_of, numb
 from app.ui.html import panel
 from app.ui.loops.words import describe_edit
 from app.ui.measure import MeasurePanel
-from app.ui.nodes import add_exact_points, add_lines
+from app.ui.nodes import add_exact_points, add_lines, clear
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, by_user, dialog, notify_error, poses_of, show
+from app.ui.widgets import ROOT, Changes, Page, by_user, dialog, poses_of, show
 
 NOTHING, RECORDED, FILE, CONTROL = "nothing", "fixes of the recording", "fixes of a file", "control points"
 _ALIGN, _FACTORS = "align only", "as factors"
@@ -82,8 +82,8 @@ class GeoreferencePanel:
         self._by.on_update(by_user(lambda _, __: self._show_widgets()))
         self._fit.on_update(by_user(lambda _, __: self._show_widgets()))
         self._choose.on_click(by_user(lambda _, client: self._browse(client)))
-        load.on_upload(lambda event: self._uploaded(event.target.value.content, event.client))
-        self._lay.on_click(by_user(lambda _, client: self._send(client)))
+        load.on_upload(by_user(lambda file, _: self._uploaded(file.content)))
+        self._lay.on_click(by_user(lambda _, __: page.send(Georeference(self.survey()))))
         self._pick.on_click(by_user(lambda _, __: self._begin_pick()))
         self._show_widgets()
 
@@ -111,12 +111,6 @@ class GeoreferencePanel:
             factors=self._use.value == _FACTORS and not by_points,
         )
 
-    def _send(self, client: viser.ClientHandle) -> None:
-        try:
-            self._page.send(Georeference(self.survey()))
-        except HemislamError as error:
-            notify_error(client, error)
-
     def _browse(self, client: viser.ClientHandle) -> None:
         def choose(path: Path) -> None:
             self._file = self._folders.inside(path)
@@ -126,19 +120,12 @@ class GeoreferencePanel:
             nothing = "No logs of fixes (.csv, .nmea, .txt, .log) here."
             FileList(client.gui, self._folders, _FIXES, nothing, choose, close)
 
-    def _uploaded(self, content: bytes, client: viser.ClientHandle | None) -> None:
-        try:
-            if len(content) > _MOST_BYTES:
-                raise HemislamError(f"A table of control points may have at most {_MOST_BYTES >> 10} kB.")
-            text = content.decode("utf-8-sig", errors="replace")
-            if not names_of(text):
-                raise HemislamError(
-                    "The table names no control points; its first line must be, for example, name,E,N,H."
-                )
-        except HemislamError as error:
-            if client is not None:
-                notify_error(client, error)
-            return
+    def _uploaded(self, content: bytes) -> None:
+        if len(content) > _MOST_BYTES:
+            raise HemislamError(f"A table of control points may have at most {_MOST_BYTES >> 10} kB.")
+        text = content.decode("utf-8-sig", errors="replace")
+        if not names_of(text):
+            raise HemislamError("The table names no control points; its first line must be, for example, name,E,N,H.")
         self._control = text
         self._show_widgets()
 
@@ -210,9 +197,7 @@ class GeoreferencePanel:
             self._draw_scene(earth.found, labelled=earth.survey is not None and bool(earth.survey.control))
 
     def _draw_scene(self, found: Alignment | None, *, labelled: bool) -> None:
-        for node in self._nodes:
-            node.remove()
-        self._nodes.clear()
+        clear(self._nodes)
         if found is None:
             return
         scene, name = self._page.scene, f"{ROOT}/fixes"

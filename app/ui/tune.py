@@ -17,7 +17,7 @@ from app.ui.background import Background
 from app.ui.compare import Sides
 from app.ui.html import panel
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, by_user, notify_error
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, by_user
 
 _PARTS: Final = {"5 s from here": 5.0, "20 s from here": 20.0, "60 s from here": 60.0, "the whole recording": None}
 _LABELLED: Final = "the labelled frames"
@@ -70,7 +70,7 @@ class TunePanel:
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._bridge = Bridge(gui, "trials", self._clicked)
         self._plots = gui.add_html("", visible=False)
-        self._start.on_click(by_user(lambda _, client: self._begin(client)))
+        self._start.on_click(by_user(lambda _, __: self._begin()))
         self._stop.on_click(by_user(lambda _, __: self.close()))
         self._go_on.on_click(by_user(lambda _, __: self._run()))
 
@@ -145,7 +145,7 @@ class TunePanel:
                     self.close()
                     self._page.notify_error(sentence)
 
-    def _begin(self, client: viser.ClientHandle) -> None:
+    def _begin(self) -> None:
         snapshot = self._page.snapshot()
         if self._work.running or snapshot.recording is None or snapshot.recording.path == LIVE:
             return
@@ -153,11 +153,9 @@ class TunePanel:
         names = dict.fromkeys(_TITLES[title] for title in (self._first.value, self._second.value) if title != _NONE)
         if snapshot.recording.truth is None and (blind := [one for one in names if OBJECTIVES[one].needs_truth]):
             title = OBJECTIVES[blind[0]].title
-            notify_error(client, f"{title} needs true poses; compare with a truth under Recording, or choose another.")
-            return
+            raise HemislamError(f"{title} needs true poses; compare with a truth under Recording, or choose another.")
         if self._part.value == _LABELLED and not marked:
-            notify_error(client, "No frame is labelled yet; mark ground in a few frames with the brush under Study.")
-            return
+            raise HemislamError("No frame is labelled yet; mark ground in a few frames with the brush under Study.")
         begin, length = self._chosen_part(snapshot, list(marked))
         self._wanted = Wanted(
             snapshot.recording.path,
@@ -191,17 +189,14 @@ class TunePanel:
             self._found, self._runs, self._chosen = Tried(), [], -1
             self._work.begin(find, self._wanted)
 
-    def _clicked(self, word: str, client: viser.ClientHandle) -> None:
+    def _clicked(self, word: str, _: viser.ClientHandle) -> None:
         """What the plots send: "trial 12". Opens it beside the present parameters; B's are then on the sliders."""
         number = int(word.removeprefix("trial "))
         if not 0 <= number < len(self._found.trials):
             return
         self._chosen = number
-        try:
-            if self._forks.names[1].startswith(_FORK):
-                self._forks.discard()
-            if number:
-                self._forks.fork(f"{_FORK}{number}", self._found.trials[number].values)
-                self._sides.choose("B")
-        except HemislamError as error:
-            notify_error(client, error)
+        if self._forks.names[1].startswith(_FORK):
+            self._forks.discard()
+        if number:
+            self._forks.fork(f"{_FORK}{number}", self._found.trials[number].values)
+            self._sides.choose("B")

@@ -13,6 +13,7 @@ import viser
 from app.export.box import Box
 from app.server.protocol import Command, Snapshot
 from app.slam import lie
+from app.slam.errors import HemislamError
 from app.slam.types import F64
 from app.ui.colours import LOOK, Limits
 from app.ui.map_numbers import MapNumbers
@@ -182,13 +183,16 @@ def notify_error(client: viser.ClientHandle, error: object) -> None:
 def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callable[[viser.GuiEvent[Any]], None]:
     """A callback that is called with the new value and the browser, and only when a person changed it.
 
-    viser also calls back when code sets a value. Sending those on would make the page and the engine
-    answer each other for ever.
+    A HemislamError that it raises is shown in that browser. viser also calls back when code sets a value. Sending those
+    on would make the page and the engine answer each other for ever.
     """
 
     def callback(event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:
-            act(event.target.value, event.client)
+            try:
+                act(event.target.value, event.client)
+            except HemislamError as error:
+                notify_error(event.client, error)
 
     return callback
 

@@ -16,6 +16,7 @@ from app.mapping.kept import Clip, Spot
 from app.server.keeping import SetClip
 from app.server.protocol import Chunk, Command, Snapshot
 from app.slam import lie
+from app.slam.errors import HemislamError
 from app.slam.types import NON_GROUND
 from app.ui.chunks import MapChunks
 from app.ui.clip import ClipPanel
@@ -189,7 +190,7 @@ class Bench:
 
 def test_switched_on_it_holds_the_map_and_shows_its_handles(server: viser.ViserServer, wire: Wire) -> None:
     bench = Bench(server)
-    bench.panel._switch(True, bench.client)  # type: ignore[arg-type]
+    bench.panel._switch(True)
     bench.draw()
     box = bench.now.clip.hiding
     assert box is not None and box.holds(in_map(bench.chunks, bench.poses)).mean() > 0.9
@@ -241,6 +242,8 @@ def test_before_there_is_a_map_nothing_is_clipped_and_that_is_said(server: viser
     bench.chunks, bench.poses = (), np.empty((0, 4, 4))
     bench.panel._around = lambda: np.empty((0, 3))
     bench.now = Snapshot()
-    bench.panel._switch(True, bench.client)  # type: ignore[arg-type]
-    bench.panel._unroll(True, bench.client)  # type: ignore[arg-type]
-    assert bench.now.clip == Clip() and "no map yet" in bench.asked[0] and "walked path" in bench.asked[1]
+    with pytest.raises(HemislamError, match="no map yet"):
+        bench.panel._switch(True)
+    with pytest.raises(HemislamError, match="walked path"):
+        bench.panel._unroll(True, bench.client)  # type: ignore[arg-type]
+    assert bench.now.clip == Clip()

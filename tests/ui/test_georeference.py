@@ -103,7 +103,7 @@ def test_the_widgets_say_what_the_map_is_georeferenced_by(paging: Paging, tmp_pa
     assert paging.lay() == replace(given, gnss=tmp_path / "rover.nmea")
     choose(panel._by, CONTROL)
     assert panel._table.visible and not panel._pick.visible
-    panel._uploaded(TABLE.encode(), None)
+    panel._uploaded(TABLE.encode())
     assert panel._pick.visible
     assert paging.lay() == Survey(control=TABLE, crs="EPSG:25832")
 
@@ -221,6 +221,7 @@ def test_a_measured_point_has_its_coordinates_on_earth_too() -> None:
 
 def test_a_table_that_names_no_points_is_refused(paging: Paging) -> None:
     assert names_of(TABLE) == ("P1", "P2", "P3") and names_of("a,b\n1,2\n") == ()
-    paging.panel._uploaded(b"a,b\n1,2\n", None)
-    paging.panel._uploaded(b"x" * 70_000, None)
+    for text, why in ((b"a,b\n1,2\n", "names no control points"), (b"x" * 70_000, "at most 64 kB")):
+        with pytest.raises(HemislamError, match=why):
+            paging.panel._uploaded(text)
     assert paging.panel._control == ""

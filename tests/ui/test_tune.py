@@ -12,7 +12,7 @@ from app.server.protocol import OpenedRecording, Snapshot, StepFrame, Transport
 from app.tuning.objectives import OBJECTIVES
 from app.tuning.process import Ended, Tried
 from app.tuning.trial import Trial
-from app.ui import background, tune
+from app.ui import background, widgets
 from app.ui import tune_maths as maths
 from app.ui.compare import Sides
 from app.ui.tune import TunePanel
@@ -61,7 +61,7 @@ class Tuning:
 @pytest.fixture
 def tuning(server: viser.ViserServer, engine: FakeEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tuning:
     monkeypatch.setattr(background, "Child", Process)
-    monkeypatch.setattr(tune, "notify_error", lambda client, error: told.append(str(error)))
+    monkeypatch.setattr(widgets, "notify_error", lambda client, error: told.append(str(error)))
     told.clear()
     return Tuning(server, engine, tmp_path)
 
@@ -128,7 +128,7 @@ def test_a_click_never_discards_a_fork_that_was_made_by_hand(tuning: Tuning) -> 
     user_clicks(tuning.panel._start)
     tuning.draw(Tried(TRIALS, (3,)))
     tuning.forks.fork("mine")
-    tuning.panel._clicked("trial 3", None)  # type: ignore[arg-type]
+    user_sets(tuning.panel._bridge._field, "trial 3 #1")
     assert tuning.forks.names[1] == "mine" and "already" in told[0]
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import viser
 
 from app.server.protocol import EditLoop, RedoLoop, Snapshot, TryLoop, UndoLoop
-from app.slam.errors import HemislamError
 from app.slam.loops import edit_files
 from app.slam.loops.edits import Accept, LoopEdit, Reject, SetWeight
 from app.slam.loops.types import LoopEdge, Pair, Preview, Verdict
@@ -16,7 +15,7 @@ from app.ui.colours import Rgb
 from app.ui.html import panel
 from app.ui.loops.words import describe_edit, forecast, headline, reason, what_happened, what_was_undone
 from app.ui.nodes import add_lines, clear, segments
-from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, notify_error, poses_of, show
+from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, poses_of, show
 
 _REST_S: Final = 0.3
 _GHOST: Final[dict[bool, Rgb]] = {False: (255, 232, 70), True: (120, 90, 0)}
@@ -271,7 +270,7 @@ class EditsPanel:
         self._undo.on_click(by_user(lambda _, __: send(UndoLoop())))
         self._redo.on_click(by_user(lambda _, __: send(RedoLoop())))
         self._save.on_click(by_user(lambda _, client: self._download(client)))
-        load.on_upload(lambda event: self._load(event.target.value.content, event.client))
+        load.on_upload(by_user(lambda file, _: self._load(file.content)))
         gui.add_command("Undo the last edit of a loop", hotkey="Z", modifier="cmd/ctrl").on_trigger(
             lambda _: send(UndoLoop())
         )
@@ -295,12 +294,6 @@ class EditsPanel:
         text = edit_files.write(self._snapshot().loops.undo)
         client.send_file_download("edits.yaml", text.encode(), save_immediately=True)
 
-    def _load(self, content: bytes, client: viser.ClientHandle | None) -> None:
-        try:
-            commands = edit_files.read(content.decode(errors="replace"), "The file")
-        except HemislamError as error:
-            if client is not None:
-                notify_error(client, error)
-            return
-        for command in commands:
+    def _load(self, content: bytes) -> None:
+        for command in edit_files.read(content.decode(errors="replace"), "The file"):
             self._send(EditLoop(command))

@@ -4,8 +4,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from app.server.protocol import EditLoop, RedoLoop, TryLoop, UndoLoop
+from app.slam.errors import HemislamError
 from app.slam.loops import edit_files
 from app.slam.loops.edits import Accept, Add, Reject, SetWeight
 from app.slam.loops.types import Verdict
@@ -174,12 +176,11 @@ def test_edits_are_saved_and_loaded_again(page: Page) -> None:
     page.loops._edits._download(browser)
     assert edit_files.read(files["edits.yaml"].decode()) == commands
     page.engine.sent.clear()
-    page.loops._edits._load(files["edits.yaml"], None)
+    page.loops._edits._load(files["edits.yaml"])
     assert page.engine.sent == [EditLoop(command) for command in commands]
 
 
 def test_a_file_that_can_not_be_used_changes_nothing_and_says_why(page: Page) -> None:
-    told: list[str] = []
-    browser: Any = SimpleNamespace(add_notification=lambda title, text, **_: told.append(text))
-    page.loops._edits._load(b"- accept: [1, 2]\n- acept: [3, 4]\n", browser)
-    assert page.engine.sent == [] and "entry 2" in told[0]
+    with pytest.raises(HemislamError, match="entry 2"):
+        page.loops._edits._load(b"- accept: [1, 2]\n- acept: [3, 4]\n")
+    assert page.engine.sent == []
