@@ -21,6 +21,9 @@ TAKEN_BACK, NOISE = 0.07, 0.05
 """Share of the velocity's change by the IMU that the scans may take back, beside NOISE m/s. A clean sensor leaves 0.01
 to 0.02, one with all the errors that data sheets admit 0.05; exchanged axes, a mounting off by 5 deg or a clock off by
 20 ms leave 0.07 to 0.4."""
+SURPRISING, OFTEN = 4.0, 3
+"""Surprise of a frame (`Registration`), and how many such frames it takes. Clean sensors stay below 0.3, imperfect ones
+below 3 but for single frames of 4; where scans show little but people and false points, it reaches 38 to 97."""
 LATE_S = 0.01
 """How late or early the IMU's clock may seem to be: data sheets and links admit 6 ms, and the estimate is off by 1."""
 
@@ -42,7 +45,7 @@ def doubts(log: RunLog) -> tuple[str, ...]:
     if dropped > MOST_DROPPED * (total + dropped):
         reason, _ = log.dropped.most_common(1)[0]
         found.append(f"{dropped} of {total + dropped} scans were dropped, mostly because {reason}.")
-    return (*found, *_of_clock(log), *_of_imu(log))
+    return (*found, *_of_clock(log), *(_of_imu(log) or _of_surprise(log, times)))
 
 
 def _of_clock(log: RunLog) -> list[str]:
@@ -68,6 +71,18 @@ def _of_imu(log: RunLog) -> list[str]:
     return [
         f"The scans contradict the IMU: of the changes of velocity that it measures they take {share:.0%} back. "
         "Check its units, axes and clock, and the mounting of the LiDAR on it: `hemislam calibrate` finds the last two."
+    ]
+
+
+def _of_surprise(log: RunLog, times: F64) -> list[str]:
+    """Whether scans put the scanner elsewhere than the IMU, by more than the uncertainty of both."""
+    surprising = log.readout("surprise") > SURPRISING
+    if np.count_nonzero(surprising) < OFTEN:
+        return []
+    return [
+        f"In {np.count_nonzero(surprising)} frames the scan and the IMU contradict each other about the motion"
+        f"{_since(times, surprising)}. The scans may show little but people or false points there, and the map may be "
+        "metres off from then on. If it is, add a loop by hand."
     ]
 
 

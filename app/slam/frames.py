@@ -14,12 +14,13 @@ READOUTS = (
     "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "loops_ms",
     "total_ms",
     "iterations", "used", "inliers", "residual_rms", "degeneracy", "predicted_change", "correction",
-    "imu_gap_s", "dropped", "clock_late_s", "speed", "gyro_bias", "accel_bias", "turn_x", "turn_y", "turn_z",
+    "surprise", "imu_gap_s", "dropped", "clock_late_s", "speed", "gyro_bias", "accel_bias",
+    "turn_x", "turn_y", "turn_z",
 )  # fmt: skip
 """Numbers of one frame, nan where there is none. `used` points were looked up in the map. `degeneracy` is the smallest
 eigenvalue of the pose information. `predicted_change` and `correction`, of the velocity by the IMU and by the update,
-are in m/s. `imu_gap_s`, `dropped` and `clock_late_s` are as in `StepResult`. `speed` is in m/s. The biases are norms.
-`turn_*` is the rotation vector (rad) of R_odom_imu."""
+are in m/s. `surprise` is as in `Registration`; `imu_gap_s`, `dropped` and `clock_late_s` are as in `StepResult`.
+`speed` is in m/s. The biases are norms. `turn_*` is the rotation vector (rad) of R_odom_imu."""
 
 FRAME = np.dtype(
     [
@@ -95,6 +96,7 @@ def _readouts(result: StepResult) -> F64:
         "residual_rms": registration.residual_rms,
         "predicted_change": registration.predicted_change,
         "correction": registration.correction,
+        "surprise": registration.surprise,
         "degeneracy": registration.eigenvalues[0] if len(registration.eigenvalues) else np.nan,
         "imu_gap_s": result.imu_gap_s,
         "dropped": result.dropped,

@@ -5,6 +5,8 @@ State on SO(3) x R3 x R3 x R3 x R3 x S² x SO(3) x R3, 23 error dimensions in th
 state's size and not by the number of points; each iteration is one Gauss-Newton step of eq. 7.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from app.slam.imu import DIM, POS, ROT, Belief
@@ -115,13 +117,17 @@ def update(
             break
 
     assert planes is not None
-    registration = outcome(points, H[:6, :6], converged, iteration, stats, matches(points, residuals, planes))
+    correction = np.empty(DIM)
+    manifold.boxminus(x, begin, correction)
+    correction = correction[:free]
+    surprise = correction @ information @ correction / (free - np.trace(information @ covariance))
+    found = outcome(points, H[:6, :6], converged, iteration, stats, matches(points, residuals, planes))
     posterior = prior.covariance.copy()
     posterior[:free, :free] = covariance
     # states that are not estimated keep their variance, and their correlations shrink with the rest (Schmidt 1966)
     posterior[:free, free:] = covariance @ information @ prior.covariance[:free, free:]
     posterior[free:, :free] = posterior[:free, free:].T
-    return Belief(_unpacked(x, prior.state.stamp_ns), posterior), registration
+    return Belief(_unpacked(x, prior.state.stamp_ns), posterior), replace(found, surprise=float(surprise))
 
 
 def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Registration:

@@ -234,6 +234,8 @@ class Registration:
         matches: by point; None if nothing was looked up.
         predicted_change, correction: m/s, how much the IMU changed the velocity since the last frame, and how much of
             that, or in addition, the update changed.
+        surprise: square of the update's correction in units of the predicted covariance, for each degree of freedom
+            that the scan determines: about 1, or less, if neither scan nor prediction is wrong.
     """
 
     converged: bool
@@ -247,6 +249,7 @@ class Registration:
     matches: Matches | None = None
     predicted_change: float = float("nan")
     correction: float = float("nan")
+    surprise: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True)

@@ -71,6 +71,14 @@ def test_a_cart_that_hardly_changes_its_velocity_raises_no_doubt() -> None:
     assert doubts(log(WALK, predicted_change=0.004, correction=0.003)) == ()
 
 
+def test_scans_that_contradict_the_predicted_motion_in_a_few_frames_are_reported() -> None:
+    assert doubts(log(WALK, surprise=2.7)) == ()
+    calm, surprised = (log(WALK, surprise=value).frames for value in (0.5, 9.0))
+    assert doubts(RunLog([*calm[:50], *surprised[50:52], *calm[52:]])) == ()
+    (doubt,) = doubts(RunLog([*calm[:50], *surprised[50:59], *calm[59:]]))
+    assert "In 9 frames the scan and the IMU contradict each other about the motion, first at 5.0 s." in doubt
+
+
 @pytest.mark.parametrize(("late", "told"), [(0.006, ""), (0.053, "53 ms late"), (-0.02, "20 ms early")])
 def test_a_clock_that_is_far_off_is_reported_though_it_was_corrected(late: float, told: str) -> None:
     found = doubts(log(WALK, clock_late_s=late))

@@ -107,6 +107,15 @@ def test_the_posterior_is_more_certain_than_the_prior(room: LocalMap) -> None:
     assert np.sqrt(np.diag(posterior.covariance)[:6]).max() < 0.01
 
 
+def test_a_scan_far_from_where_the_prediction_is_sure_to_be_is_a_surprise(room: LocalMap) -> None:
+    """15 cm off, sure to 1 cm: the square of 15 for one of the six degrees of freedom."""
+    points, sure, off = points_of(furnished_room()), uncertain(1e-3, 1e-2), np.zeros(DIM)
+    off[POS][0] = 0.15
+    _, expected = iekf.update(Belief(truth(), sure), points, room, FilterParams())
+    _, surprising = iekf.update(Belief(boxplus(truth(), off), sure), points, room, FilterParams())
+    assert expected.surprise < 1.0 and 15**2 / 12 < surprising.surprise < 15**2
+
+
 def test_what_is_correlated_with_the_pose_is_corrected_with_it(room: LocalMap) -> None:
     """A wrong velocity carried the position astray; seeing the position tells the velocity."""
     error = np.array([0.05, -0.04, 0.03])
