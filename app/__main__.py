@@ -126,7 +126,7 @@ def info(
       hemislam info walk.mcap
       hemislam info indoor1.bag --preset h2lid
     """
-    from app.calibration.on_opening import is_mounting_unknown
+    from app.calibration.calibrate import is_mounting_unknown
     from app.cli.run import look_for_mounting
     from app.sensors.doctor import DAMAGE, examine
 

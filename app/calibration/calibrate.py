@@ -38,6 +38,10 @@ Report = Callable[[float], None]
 """Is called with the fraction done, 0-1."""
 
 
+def is_mounting_unknown(params: Params) -> bool:
+    return not any(params.sensor.translation + params.sensor.rotation)
+
+
 @dataclass(frozen=True, slots=True)
 class Calibration:
     """What a recording shows about its sensors. `params` are those that it was opened with.
@@ -97,7 +101,7 @@ class Calibration:
         for name, apart, drawn in zip(("rotation", "translation"), off, DRAWN, strict=True):
             variance = self.sigmas[name] ** 2
             wrong = (np.abs(apart) > SURE * np.sqrt(variance + drawn**2)).any()
-            alone = wrong or not any(sensor.rotation + sensor.translation)
+            alone = wrong or is_mounting_unknown(self.params)
             parts.append(apart if alone else apart * drawn**2 / (variance + drawn**2))
         return R @ lie.exp(parts[0]), p + parts[1]
 

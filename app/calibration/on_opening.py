@@ -9,10 +9,6 @@ from app.slam.params import Params
 USED_S = 60.0
 
 
-def is_mounting_unknown(params: Params) -> bool:
-    return not any(params.sensor.translation + params.sensor.rotation)
-
-
 def contradicted(path: Path, params: Params, progress: Report = lambda fraction: None) -> Calibration | None:
     """The calibration, if mounting or clock differ from the parameters; None if they do not, or if that is unknown."""
     try:

@@ -106,7 +106,8 @@ def run(
 
 def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
     """The parameters, with the mounting found in the recording if none is given; and that, in a sentence."""
-    from app.calibration.on_opening import advice, contradicted, is_mounting_unknown
+    from app.calibration.calibrate import is_mounting_unknown
+    from app.calibration.on_opening import advice, contradicted
 
     if not is_mounting_unknown(params):
         return params, ""

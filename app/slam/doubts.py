@@ -45,7 +45,8 @@ def doubts(log: RunLog) -> tuple[str, ...]:
     if dropped > MOST_DROPPED * (total + dropped):
         reason, _ = log.dropped.most_common(1)[0]
         found.append(f"{dropped} of {total + dropped} scans were dropped, mostly because {reason}.")
-    return (*found, *_of_clock(log), *(_of_imu(log) or _of_surprise(log, times)))
+    of_sensors = _of_imu(log) or _of_surprise(log, times)  # a wrong mounting surprises as well
+    return (*found, *_of_clock(log), *of_sensors)
 
 
 def _of_clock(log: RunLog) -> list[str]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.calibration.on_opening import is_mounting_unknown
+from app.calibration.calibrate import is_mounting_unknown
 from app.child import Link
 from app.sensors.recording import NO_IMU
 from app.server.protocol import LIVE, Calibrated, Restart, Seek, SetParams, Snapshot
