@@ -155,7 +155,7 @@ def update(
         points = deskew(scan, here, course)
         arms = points @ here.R_imu_lidar.T + here.p_imu_lidar
         world = arms @ here.R_odom_imu.T + here.p_odom_imu
-        good, poor = local_map.planes(world, params)
+        good, poor = local_map.planes(world, here.p_odom_lidar, params)
         planes = good if np.count_nonzero(good.variances >= 0) >= enough else poor
         found = np.flatnonzero(planes.variances >= 0)  # nothing was written elsewhere
         at, spread = planes.normals[found], np.sqrt(planes.variances[found])

@@ -99,7 +99,7 @@ def update(
         R, p, R_il, p_il = x[0:9].reshape(3, 3), x[9:12], x[24:33].reshape(3, 3), x[33:36]
         if planes is None or _over(since_search, RESEARCH_ROTATION, RESEARCH_TRANSLATION):
             kernels.to_world(points, R, p, R_il, p_il, world)
-            planes, poorer = local_map.planes(world, params)
+            planes, poorer = local_map.planes(world, R @ p_il + p, params)
             poor = poor or bool(np.count_nonzero(planes.variances >= 0.0) < enough)
             planes = poorer if poor else planes
             since_search[:] = 0.0

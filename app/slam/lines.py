@@ -63,7 +63,7 @@ class LineErrors:
         points, rings, state = np.ascontiguousarray(points[::step]), np.ascontiguousarray(rings[::step]), belief.state
         world = np.empty((len(points), 3))
         registration.to_world(points, state.R_odom_imu, state.p_odom_imu, state.R_imu_lidar, state.p_imu_lidar, world)
-        _, planes = local_map.planes(world, params)
+        _, planes = local_map.planes(world, state.p_odom_lidar, params)
         kept = np.exp(-walked / FADES_M)
         information, moment = kept * self.information, kept * self.moment
         kernels.observe(

@@ -24,7 +24,7 @@ class MapState:
 
     Attributes:
         cells: (v, 3) indices of the voxels, in order of insertion. counts: (v,) points in each.
-        points: (sum of counts, 5) x, y, z in m, hits, and drift when last seen, voxel by voxel.
+        points: (sum of counts, 8), voxel by voxel: as in the store of `kernels.map.insert`.
         center: (3,) m, the sensor at the last eviction. way: (4,), the sensor in m where drift was last added, and the
             variance of odometry's drift up to there, m².
     """
@@ -59,7 +59,7 @@ class LocalMap:
         self._table = np.full(1 << int(np.ceil(np.log2(2 * size))), -1, dtype=np.int32)
         self._cells = np.zeros((size, 3), dtype=np.int32)
         self._counts = np.zeros(size, dtype=np.uint8)
-        self._store = np.zeros((size, params.points_per_voxel, 5), dtype=np.float32)
+        self._store = np.zeros((size, params.points_per_voxel, 8), dtype=np.float32)
         self._used = 0
         self._center = np.zeros(3)
         self._way = np.zeros(4)
@@ -78,17 +78,17 @@ class LocalMap:
             self._way = np.r_[position, self._way[3] + step / DRIFT_M * residual**2]
         if np.linalg.norm(position - self._center) > 0.1 * params.radius:
             self._evict(position, params.radius)
-        self._used, refused = self._insert(points, params)
+        self._used, refused = self._insert(points, position, params)
         radius = params.radius
         while refused and radius > 1.0:
             radius *= 0.8
             self._evict(position, radius)
             points = points[np.linalg.norm(points - position, axis=1) < radius]
-            self._used, refused = self._insert(points, params)
+            self._used, refused = self._insert(points, position, params)
 
-    def _insert(self, points: F32, params: MapParams) -> tuple[int, int]:
+    def _insert(self, points: F32, position: F64, params: MapParams) -> tuple[int, int]:
         used, refused = kernels.insert(
-            points, self._voxel, params.spacing, self._way[3], self._way[3] - OLD_M**2,
+            points, position, self._voxel, params.spacing, self._way[3], self._way[3] - OLD_M**2,
             self._table, self._cells, self._counts, self._store, self._used,
         )  # fmt: skip
         return int(used), int(refused)
@@ -99,8 +99,8 @@ class LocalMap:
         )
         self._center = np.array(center)
 
-    def planes(self, queries: F64, params: FilterParams) -> tuple[Planes, Planes]:
-        """Good and poor planes for (n, 3) odom points, see `kernels.map.planes`.
+    def planes(self, queries: F64, position: F64, params: FilterParams) -> tuple[Planes, Planes]:
+        """Good and poor planes for (n, 3) odom points seen from `position` (3,), see `kernels.map.planes`.
 
         The normal of a poor one may be RELAXED times as uncertain as that of a good one.
         """
@@ -108,9 +108,9 @@ class LocalMap:
         normals, centers, variances = np.empty((2, n, 3)), np.zeros((2, n, 3)), np.empty((2, n))
         reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(params.plane_tilt)
         kernels.planes(
-            queries, self._voxel, reach, params.neighbours, params.plane_threshold, np.array([RELAXED * tilt, tilt]),
-            params.point_noise, self._way[3] - OLD_M**2, self._table, self._cells, self._counts, self._store,
-            normals, centers, variances,
+            queries, position, self._voxel, reach, params.neighbours, params.plane_threshold,
+            np.array([RELAXED * tilt, tilt]), params.point_noise, self._way[3] - OLD_M**2,
+            self._table, self._cells, self._counts, self._store, normals, centers, variances,
         )  # fmt: skip
         poor, good = (Planes(*parts) for parts in zip(normals, centers, variances, strict=True))
         return good, poor

@@ -159,6 +159,10 @@ class NavState:
         T[:3, 3] = self.p_imu_lidar
         return T
 
+    @property
+    def p_odom_lidar(self) -> F64:
+        return self.R_odom_imu @ self.p_imu_lidar + self.p_odom_imu
+
 
 @dataclass(frozen=True, slots=True)
 class Cloud:

@@ -49,7 +49,7 @@ def surveyed(scene: Scene) -> LocalMap:
         ranges, _ = scene.cast(np.tile(origin, (len(directions), 1)), directions)
         near = ranges < 30
         points = np.array(origin) + directions[near] * (ranges + rng.normal(scale=0.002, size=len(ranges)))[near, None]
-        local_map.insert(points.astype(np.float32), np.zeros(3), params)
+        local_map.insert(points.astype(np.float32), np.array(origin), params)
     return local_map
 
 
@@ -196,7 +196,7 @@ class Problem:
 
     def __init__(self, room: LocalMap, prior: Belief, points: np.ndarray, params: FilterParams) -> None:
         self.prior, self.points, self.params = prior, points.astype(np.float64), params
-        planes = room.planes(self._world(prior.state), params)[0]
+        planes = room.planes(self._world(prior.state), prior.state.p_odom_lidar, params)[0]
         self.normals, self.centers = planes.normals, planes.centers
         ranges = np.linalg.norm(self.points, axis=1)
         all_distances = self._all_distances(prior.state)
@@ -334,7 +334,7 @@ def test_points_along_the_cone_of_a_scan_line_do_not_hold_the_heading(room: Loca
         truth(), R_odom_imu=np.eye(3), p_odom_imu=np.zeros(3), R_imu_lidar=np.eye(3), p_imu_lidar=np.zeros(3)
     )
     seen = cone[:500].astype(np.float32)
-    assert np.count_nonzero(local_map.planes(seen.astype(float), FilterParams())[0].variances >= 0) > 100
+    assert np.count_nonzero(local_map.planes(seen.astype(float), np.zeros(3), FilterParams())[0].variances >= 0) > 100
     _, registration = iekf.update(Belief(level, uncertain(1e-2, 1e-2)), seen, local_map, FilterParams())
     assert registration.inliers == 0
 
@@ -365,7 +365,7 @@ def test_poor_planes_are_used_where_good_ones_are_few_but_only_under_way(speed: 
         **{"R_odom_imu": np.eye(3), "R_imu_lidar": np.eye(3), "p_odom_imu": np.zeros(3), "p_imu_lidar": np.zeros(3)},
         v_odom_imu=np.array([speed, 0.0, 0.0]),
     )
-    good = np.count_nonzero(floor.planes(points, FilterParams())[0].variances >= 0)
+    good = np.count_nonzero(floor.planes(points, np.zeros(3), FilterParams())[0].variances >= 0)
     assert iekf.ENOUGH_PLANES < good < iekf.ENOUGH_SHARE * len(points)
     _, registration = iekf.update(
         Belief(level, uncertain(1e-2, 1e-2)), points.astype(np.float32), floor, FilterParams()

@@ -142,7 +142,7 @@ def test_planes_are_those_through_the_nearest_neighbours(tilt: float, reach: flo
     points, hits = stored(local_map), local_map.checkpoint().points[:, 3].astype(float)
     tree = cKDTree(points)
     queries = surface(5, 1500, noise=0.05)
-    planes = local_map.planes(queries, params)[0]
+    planes = local_map.planes(queries, HERE, params)[0]
     compared = {"plane": 0, "none": 0}
     for j, query in enumerate(queries):
         near = sorted(tree.query_ball_point(query, reach))
@@ -165,8 +165,8 @@ def test_planes_are_those_through_the_nearest_neighbours(tilt: float, reach: flo
 def test_poor_planes_are_the_good_ones_of_a_looser_tilt() -> None:
     """One pass finds both, each as if it had been looked for alone."""
     local_map, queries = filled(surface(3, 1000)), surface(5, 500, noise=0.05)
-    good, poor = local_map.planes(queries, FilterParams(plane_tilt=2.0))
-    assert equal(poor, local_map.planes(queries, FilterParams(plane_tilt=2.0 * RELAXED))[0])
+    good, poor = local_map.planes(queries, HERE, FilterParams(plane_tilt=2.0))
+    assert equal(poor, local_map.planes(queries, HERE, FilterParams(plane_tilt=2.0 * RELAXED))[0])
     assert np.count_nonzero(poor.variances >= 0) > np.count_nonzero(good.variances >= 0) > 0
 
 
@@ -175,7 +175,7 @@ def test_a_plane_is_found_across_the_borders_of_voxels() -> None:
     rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(-3, 3, (3000, 2)), rng.normal(scale=0.002, size=3000)])
     queries = np.column_stack([rng.uniform(-2, 2, (200, 2)), np.zeros(200)])
-    planes = filled(floor).planes(queries, FilterParams())[0]
+    planes = filled(floor).planes(queries, HERE, FilterParams())[0]
     assert np.all(planes.variances >= 0)
     assert np.abs(planes.normals[:, 2]).min() > np.cos(np.radians(2.0))
     assert np.abs(planes.centers[:, 2]).max() < 0.005
@@ -191,7 +191,7 @@ def test_points_along_one_scan_line_make_no_plane(noise: float) -> None:
     rng = np.random.default_rng(1)
     params = MapParams(spacing=0.02, max_voxels=1000)
     local_map = filled(line(0.0) + rng.normal(scale=noise, size=(200, 3)), params)
-    planes = local_map.planes(line(0.01, 50), FilterParams())[0]
+    planes = local_map.planes(line(0.01, 50), HERE, FilterParams())[0]
     assert np.all(planes.variances < 0)
 
 
@@ -199,7 +199,7 @@ def test_a_second_scan_line_makes_them_a_plane() -> None:
     rng = np.random.default_rng(1)
     points = np.concatenate([line(0.0), line(0.4)]) + rng.normal(scale=0.003, size=(400, 3))
     local_map = filled(points, MapParams(spacing=0.05, max_voxels=1000))
-    planes = local_map.planes(line(0.2, 30)[5:-5], FilterParams())[0]
+    planes = local_map.planes(line(0.2, 30)[5:-5], HERE, FilterParams())[0]
     assert np.all(planes.variances >= 0)
     assert np.abs(planes.normals[:, 2]).min() > np.cos(np.radians(3.0))
 
@@ -210,23 +210,25 @@ def test_a_corner_is_no_plane() -> None:
     a, b = rng.uniform(0, 1, (2, 1500))
     edge = np.concatenate([np.column_stack([a, b, 0 * a]), np.column_stack([0 * a, b, a])])
     queries = np.column_stack([np.zeros(20), np.linspace(0.3, 0.7, 20), np.zeros(20)]) + 0.3
-    planes = filled(edge).planes(queries, FilterParams(plane_tilt=20, neighbours=20))[0]
+    planes = filled(edge).planes(queries, HERE, FilterParams(plane_tilt=20, neighbours=20))[0]
     flat = planes.variances >= 0
     assert np.all(np.abs(planes.normals[flat]).max(axis=1) > 0.9)  # never the diagonal
 
 
 def test_nothing_near_is_no_plane() -> None:
-    planes = filled(surface(0)).planes(np.array([[50.0, 0, 0], [0, 0, 90.0]]), LOOSE)[0]
+    planes = filled(surface(0)).planes(np.array([[50.0, 0, 0], [0, 0, 90.0]]), HERE, LOOSE)[0]
     assert np.all(planes.variances < 0)
-    assert len(LocalMap(SMALL).planes(np.empty((0, 3)), LOOSE)[0].variances) == 0
-    assert np.all(LocalMap(SMALL).planes(np.zeros((3, 3)), LOOSE)[0].variances < 0)
+    assert len(LocalMap(SMALL).planes(np.empty((0, 3)), HERE, LOOSE)[0].variances) == 0
+    assert np.all(LocalMap(SMALL).planes(np.zeros((3, 3)), HERE, LOOSE)[0].variances < 0)
 
 
 def test_neighbours_are_not_looked_for_beyond_a_voxels_edge() -> None:
     """Whatever the reach asked for, it is cut to where 27 voxels surely hold everything."""
     local_map = filled(surface(3))
     queries = surface(6, 200)
-    far, near = (local_map.planes(queries, FilterParams(neighbour_distance=d))[0] for d in (5.0, SMALL.voxel_size))
+    far, near = (
+        local_map.planes(queries, HERE, FilterParams(neighbour_distance=d))[0] for d in (5.0, SMALL.voxel_size)
+    )
     assert equal(far, near)
     assert np.any(near.variances >= 0)
 
@@ -252,20 +254,20 @@ def test_a_surface_seen_anew_is_not_mixed_with_the_old_one() -> None:
     local_map = gone_round(filled(floor_at(0.30, 1)))
     for seed in (2, 3, 4):
         local_map.insert(floor_at(0.36, seed).astype(np.float32), HERE, SMALL)
-    planes = local_map.planes(QUERIES, FilterParams())[0]
+    planes = local_map.planes(QUERIES, HERE, FilterParams())[0]
     np.testing.assert_allclose(planes.centers[:, 2], 0.36, atol=0.005)
 
 
 def test_old_surfaces_pull_less_where_nothing_new_is_seen() -> None:
     fresh, local_map = filled(floor_at(0.30, 1)), gone_round(filled(floor_at(0.30, 1)))
-    before, old = (m.planes(QUERIES, FilterParams())[0] for m in (fresh, local_map))
+    before, old = (m.planes(QUERIES, HERE, FilterParams())[0] for m in (fresh, local_map))
     assert np.array_equal(before.centers, old.centers)
     np.testing.assert_allclose(old.variances, OLD * before.variances)
 
 
 def test_where_scans_fit_the_map_exactly_nothing_grows_old() -> None:
     fresh, local_map = filled(floor_at(0.30, 1)), gone_round(filled(floor_at(0.30, 1)), residual=0.01)
-    assert equal(local_map.planes(QUERIES, FilterParams())[0], fresh.planes(QUERIES, FilterParams())[0])
+    assert equal(local_map.planes(QUERIES, HERE, FilterParams())[0], fresh.planes(QUERIES, HERE, FilterParams())[0])
 
 
 def test_what_stays_in_view_never_grows_old() -> None:
@@ -274,8 +276,32 @@ def test_what_stays_in_view_never_grows_old() -> None:
         local_map.insert(seen, np.array([x, 0, 0]), SMALL, 0.04)
     fresh = filled(floor_at(0.30, 1))
     assert len(stored(local_map)) < 1.3 * len(stored(fresh))
-    now, then = (m.planes(QUERIES, FilterParams())[0].variances for m in (local_map, fresh))
+    now, then = (m.planes(QUERIES, HERE, FilterParams())[0].variances for m in (local_map, fresh))
     np.testing.assert_allclose(now, then, rtol=0.1)
+
+
+# --- two sides -----------------------------------------------------------------------------------
+def wall(x: float, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.column_stack([np.full(900, x), rng.uniform(-1.5, 1.5, (900, 2))]) + rng.normal(scale=0.005, size=(900, 3))
+
+
+def test_a_face_of_a_thin_wall_is_not_fitted_to_the_other_face() -> None:
+    west, east = np.array([-3.0, 0.5, 0.2]), np.array([3.0, -0.5, 0.1])
+    local_map = LocalMap(SMALL)
+    local_map.insert(wall(0.0, 0).astype(np.float32), west, SMALL)
+    queries = wall(0.1, 1)[::10]
+    assert np.all(local_map.planes(queries, west, FilterParams())[0].variances >= 0), "10 cm off, but the same face"
+    assert np.all(local_map.planes(queries, east, FilterParams())[1].variances < 0), "the face that was never seen"
+
+
+def test_a_floor_is_the_same_from_wherever_it_is_seen() -> None:
+    ahead, behind = np.array([4.0, 0.0, 1.0]), np.array([-4.0, 0.0, 1.0])
+    floor = surface(0)
+    floor = floor[np.abs(floor[:, 2] + 1.3) < 0.05]
+    local_map = LocalMap(SMALL)
+    local_map.insert(floor.astype(np.float32), ahead, SMALL)
+    assert equal(*(local_map.planes(floor[::10], eye, FilterParams())[0] for eye in (ahead, behind)))
 
 
 # --- bounds --------------------------------------------------------------------------------------
@@ -292,14 +318,14 @@ def test_far_voxels_are_dropped_and_near_ones_stay_as_they_are() -> None:
     local_map.insert(surface(1).astype(np.float32), HERE, params)
     local_map.insert(ahead.astype(np.float32), HERE, params)
     queries = ahead[rng.integers(0, len(ahead), 200)]
-    before = local_map.planes(queries, LOOSE)[0]
+    before = local_map.planes(queries, HERE, LOOSE)[0]
     local_map.insert(np.empty((0, 3), np.float32), np.array([21.0, 0, 0]), params)
-    after = local_map.planes(queries, LOOSE)[0]
+    after = local_map.planes(queries, HERE, LOOSE)[0]
     assert equal(after, before)
     assert np.any(after.variances >= 0)
     reach = np.linalg.norm(stored(local_map) - [21.0, 0, 0], axis=1)
     assert reach.max() < 10.0 + np.sqrt(3) / 2 * params.voxel_size
-    assert np.all(local_map.planes(surface(2, 100), LOOSE)[0].variances < 0)
+    assert np.all(local_map.planes(surface(2, 100), HERE, LOOSE)[0].variances < 0)
 
 
 def test_a_walk_of_a_kilometre_needs_no_more_memory_than_its_first_metres() -> None:
@@ -334,7 +360,7 @@ def test_lookups_end_even_if_the_map_is_full_to_the_last_voxel() -> None:
     cells = np.stack(np.meshgrid(*[np.arange(10)] * 3), axis=-1).reshape(-1, 3) * 0.1 + 0.05
     local_map = filled(cells, params)
     assert local_map.voxels == 1000
-    planes = local_map.planes(cells + 1.0, LOOSE)[0]
+    planes = local_map.planes(cells + 1.0, HERE, LOOSE)[0]
     assert len(planes.variances) == 1000
 
 
@@ -361,11 +387,11 @@ def test_a_restored_map_goes_on_to_the_same_bytes(fresh: bool) -> None:
     other = LocalMap(params) if fresh else local_map
     other.restore(checkpoint)
     queries = surface(9, 300, at=18.0)
-    restored = other.planes(queries, LOOSE)[0]
+    restored = other.planes(queries, HERE, LOOSE)[0]
     assert same(walked(other, 10, 25, params).checkpoint(), expected)
     assert same(checkpoint, copy)
     local_map.restore(checkpoint)
-    assert equal(local_map.planes(queries, LOOSE)[0], restored)
+    assert equal(local_map.planes(queries, HERE, LOOSE)[0], restored)
 
 
 def test_a_checkpoint_of_an_empty_map_empties_the_map() -> None:
@@ -373,6 +399,6 @@ def test_a_checkpoint_of_an_empty_map_empties_the_map() -> None:
     local_map = filled(surface(0))
     local_map.restore(empty)
     assert local_map.voxels == 0
-    assert np.all(local_map.planes(surface(0, 50), LOOSE)[0].variances < 0)
+    assert np.all(local_map.planes(surface(0, 50), HERE, LOOSE)[0].variances < 0)
     local_map.insert(surface(0).astype(np.float32), HERE, SMALL)
     assert same(local_map.checkpoint(), filled(surface(0)).checkpoint())

@@ -23,22 +23,31 @@ def _find(table, cells, a, b, c):
         h = (h + 1) & mask
 
 
+@njit(cache=True, inline="always")
+def _begin(point, x, y, z, now, eye):
+    """A row of the store for a first hit at (x, y, z) m; see `insert`."""
+    ex, ey, ez = eye[0] - x, eye[1] - y, eye[2] - z
+    nearer = 1.0 / max(math.sqrt(ex * ex + ey * ey + ez * ez), 1e-6)
+    point[0], point[1], point[2], point[3], point[4] = x, y, z, 1.0, now
+    point[5], point[6], point[7] = ex * nearer, ey * nearer, ez * nearer
+
+
 MOST_HITS = 8
 """Hits that count. A point that went on following the scans would let the map drift with them."""
 
 
 @njit(cache=True, nogil=True)
-def insert(points, voxel, spacing, now, old, table, cells, counts, store, used):
+def insert(points, eye, voxel, spacing, now, old, table, cells, counts, store, used):
     """Add points that are not within `spacing` of a point in their own voxel. Returns (used, refused).
 
     A point within `spacing` is another hit of the nearest there, which becomes the mean of its first MOST_HITS. So
     noise averages out. If the nearest was last seen before `old`, the point takes its place: a mean of both would
     mix the surface as it is seen now with where odometry put it then.
 
-    points (n, 3) f32 m, odom; voxel, spacing m; now, old: drift, m². In and out: table (2^k,) i32, slot by hash or -1;
-    cells (v, 3) i32, voxel indices; counts (v,) u8; store (v, m, 5) f32: x, y, z in m, hits, drift when last seen.
-    The first `used` slots are taken. A full voxel takes no more points, a full store no new voxel; `refused` counts the
-    points that needed one.
+    points (n, 3) f32 m, odom; eye (3,) m, the sensor; voxel, spacing m; now, old: drift, m². In and out: table (2^k,)
+    i32, slot by hash or -1; cells (v, 3) i32, voxel indices; counts (v,) u8; store (v, m, 8) f32: x, y, z in m, hits,
+    drift when last seen, and the unit vector towards the sensor at the first hit. The first `used` slots are taken. A
+    full voxel takes no more points, a full store no new voxel; `refused` counts the points that needed one.
     """
     mask = len(table) - 1
     inverse, near2 = 1.0 / voxel, spacing * spacing
@@ -58,8 +67,7 @@ def insert(points, voxel, spacing, now, old, table, cells, counts, store, used):
                 used += 1
                 table[h] = k
                 cells[k, 0], cells[k, 1], cells[k, 2] = a, b, c
-                store[k, 0, 0], store[k, 0, 1], store[k, 0, 2], store[k, 0, 3] = x, y, z, 1.0
-                store[k, 0, 4] = now
+                _begin(store[k, 0], x, y, z, now, eye)
                 counts[k] = 1
                 break
             if cells[k, 0] == a and cells[k, 1] == b and cells[k, 2] == c:
@@ -81,8 +89,7 @@ def insert(points, voxel, spacing, now, old, table, cells, counts, store, used):
                 elif at >= 0 or n < room:
                     place = n if at < 0 else at
                     counts[k] = max(n, place + 1)
-                    store[k, place, 0], store[k, place, 1], store[k, place, 2] = x, y, z
-                    store[k, place, 3], store[k, place, 4] = 1.0, now
+                    _begin(store[k, place], x, y, z, now, eye)
                 break
             h = (h + 1) & mask
     return used, refused
@@ -106,7 +113,7 @@ def evict(center, radius, voxel, table, cells, counts, store, used):
             for i in range(3):
                 cells[kept, i] = cells[k, i]
             for i in range(n):
-                for c in range(5):
+                for c in range(8):
                     store[kept, i, c] = store[k, i, c]
         kept += 1
     table[:] = -1
@@ -130,6 +137,10 @@ few points lie flat by chance."""
 LEAST_SCATTER = 1.5
 """Least scatter assumed of a plane's points, in standard deviations of a map point: one scan's points share errors, and
 the first scan has no other point beside them."""
+BEHIND = 0.15
+"""Least cosine between a plane's normal and the direction in which a point was seen from behind. A thin wall has two
+faces some centimetres apart, and a scan of one must not be fitted to the other. Closer to edge-on, the side is not
+sure."""
 SHARED = 4.0
 """Weight of a plane's variance beside the point's own: points on the same patch share its error, so it does not
 average out between them."""
@@ -147,7 +158,7 @@ def _outside(u, cell):
 def _nearest(x, y, z, voxel, reach2, old, table, cells, counts, places, room, spots, bins, begin, order):
     """Map points within reach of (x, y, z) m, ranked by distance up to the width of a bin, the present ones first.
 
-    reach2 m²; places (v * room, 5): the store, flat; old: drift, before which a point was last seen if it is old.
+    reach2 m²; places (v * room, 8): the store, flat; old: drift, before which a point was last seen if it is old.
     Returns the numbers of present points and of all. Out: order (m,) i32, their rows in `places`, ranked. Scratch:
     spots, bins (m,) i32, begin (2 BINS + 1,) i32. The inner loop has no branch: the next point overwrites one that is
     out of reach.
@@ -188,7 +199,7 @@ def _nearest(x, y, z, voxel, reach2, old, table, cells, counts, places, room, sp
 
 
 @njit(cache=True, error_model="numpy")
-def _fit(x, y, z, places, order, n, first, flat, tilts, noise, normal, j, normals, centers, variances):
+def _fit(x, y, z, eye, places, order, n, first, flat, tilts, noise, normal, j, normals, centers, variances):
     """Planes through the nearest of n ranked points around (x, y, z), one for each of `tilts` (see `planes`).
 
     Out, in row j of each tilt: normals, unit; centers, m, relative to the query; variances, m² or -1. Scratch: normal.
@@ -224,7 +235,7 @@ def _fit(x, y, z, places, order, n, first, flat, tilts, noise, normal, j, normal
         begin = level
         while level < len(tilts) and scatter < tilts[level] * tilts[level] * take * l2:
             level += 1
-        if level > begin and _is_flat(x, y, z, places, order, take, mx, my, mz, normal, flat):
+        if level > begin and _is_one_side(x, y, z, eye, places, order, take, mx, my, mz, normal, flat):
             doubt = max(1.0, scatter / (SURE_TILT * SURE_TILT * take * l2))
             for i in range(begin, level):
                 normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = normal[0], normal[1], normal[2]
@@ -236,10 +247,16 @@ def _fit(x, y, z, places, order, n, first, flat, tilts, noise, normal, j, normal
 
 
 @njit(cache=True, inline="always")
-def _is_flat(x, y, z, places, order, n, mx, my, mz, normal, flat):
-    """Whether the nearest n points lie within `flat` m of the plane at (mx, my, mz) from (x, y, z)."""
+def _is_one_side(x, y, z, eye, places, order, n, mx, my, mz, normal, flat):
+    """Whether the nearest n points are the side of a surface that `eye` sees: they lie within `flat` m of the plane at
+    (mx, my, mz) from (x, y, z), and none was seen from behind it."""
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    if nx * (eye[0] - x) + ny * (eye[1] - y) + nz * (eye[2] - z) < 0.0:
+        nx, ny, nz = -nx, -ny, -nz
     for i in range(n):
         k = order[i]
+        if nx * places[k, 5] + ny * places[k, 6] + nz * places[k, 7] < -BEHIND:
+            return False
         ex, ey, ez = places[k, 0] - x - mx, places[k, 1] - y - my, places[k, 2] - z - mz
         if abs(ex * normal[0] + ey * normal[1] + ez * normal[2]) > flat:
             return False
@@ -248,22 +265,23 @@ def _is_flat(x, y, z, places, order, n, mx, my, mz, normal, flat):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def planes(
-    queries, voxel, reach, first, flat, tilts, noise, old, table, cells, counts, store, normals, centers, variances
+    queries, eye, voxel, reach, first, flat, tilts, noise, old, table, cells, counts, store, normals, centers, variances
 ):
     """Planes through the nearest map points of each query, one for each of the falling `tilts` (k,) rad.
 
     The `first` nearest points within `reach` m are tried first. The normal of a plane through k points of scatter s is
     uncertain by s / sqrt(k l2) rad. While that exceeds the tilt (neighbours on one scan line do not determine the
     surface across it), the patch is widened to twice as many points, up to MOST. The plane is accepted once it is
-    certain enough and every neighbour lies within `flat` m of it.
+    certain enough, every neighbour lies within `flat` m of it, and none was seen from its other side.
 
     Points last seen before drift was `old` m² are used only where the present ones give no plane, and never with these.
 
-    queries (n, 3) f64 m, odom; noise: of a point, m; the map as in `insert`. Out: normals (k, n, 3) unit, centers
-    (k, n, 3) m, variances (k, n): of a point's distance from its plane in m², negative where there is no plane.
+    queries (n, 3) f64 m, odom; eye (3,) m, the sensor; noise: of a point, m; the map as in `insert`. Out: normals
+    (k, n, 3) unit, centers (k, n, 3) m, variances (k, n): of a point's distance from its plane in m², negative where
+    there is no plane.
     """
     room = store.shape[1]
-    places = store.reshape(-1, 5)
+    places = store.reshape(-1, 8)
     spots, bins, order = np.empty(27 * room, np.int32), np.empty(27 * room, np.int32), np.empty(27 * room, np.int32)
     begin = np.empty(2 * BINS + 1, np.int32)
     normal = np.empty(3)
@@ -273,12 +291,12 @@ def planes(
             x, y, z, voxel, reach * reach, old, table, cells, counts, places, room, spots, bins, begin, order
         )
         _fit(
-            x, y, z, places, order, min(present, MOST), first, flat, tilts, noise, normal, j,
+            x, y, z, eye, places, order, min(present, MOST), first, flat, tilts, noise, normal, j,
             normals, centers, variances,
         )  # fmt: skip
         if variances[0, j] < 0.0 and n > present:
             _fit(
-                x, y, z, places, order[present:], min(n - present, MOST), first, flat, tilts, noise, normal, j,
+                x, y, z, eye, places, order[present:], min(n - present, MOST), first, flat, tilts, noise, normal, j,
                 normals, centers, variances,
             )  # fmt: skip
             for i in range(len(tilts)):
