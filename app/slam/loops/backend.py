@@ -20,7 +20,7 @@ from app.slam.loops.pose_graph import Graph, failure, optimum
 from app.slam.loops.search import Search
 from app.slam.loops.solvers import g2o_text
 from app.slam.loops.types import FactorResidual, LoopDetail, LoopEdge, Pair, Preview, Verdict
-from app.slam.loops.verdicts import by_hand, worth_correcting
+from app.slam.loops.verdicts import by_hand
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe
 
@@ -108,11 +108,10 @@ class LoopBackend:
 
     @property
     def corrections(self) -> F64:
-        """(k, 4, 4) T_map_odom at each keyframe; identity while odometry agrees with the loops."""
-        odometry = self._odometry
+        """(k, 4, 4) T_map_odom at each keyframe; identity while nothing corrects odometry."""
         measured = any(measured.priors for measured in self._search.measured)
-        if measured or Solve() in self.edits.done or worth_correcting(self.edges, odometry):
-            return np.asarray(self.poses @ lie.inverse(odometry))
+        if measured or Solve() in self.edits.done or any(edge.counts for edge in self.edges):
+            return np.asarray(self.poses @ lie.inverse(self._odometry))
         return np.tile(np.eye(4), (len(self), 1, 1))
 
     @property

@@ -1,6 +1,5 @@
 """The evidence for one candidate and the verdict on it alone; `support` compares candidates."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -141,31 +140,3 @@ def _objection(place: Placement, e: Evidence, p: LoopsParams) -> str:
 def _imu(detector: Detector, older: int, newer: int, T_level: F64) -> F64:
     """T_older_newer of the IMU frames from that of the level frames."""
     return np.asarray(lie.inverse(detector.T_level_imu(older)) @ T_level @ detector.T_level_imu(newer))
-
-
-def worth_correcting(edges: Iterable[LoopEdge], poses: F64) -> bool:
-    """Whether the loops that count add information to odometry.
-
-    If odometry agrees with all of them within half their standard deviation (2 cm and 0.25 degrees at best), following
-    them would only add their noise. Edits by the user always count.
-
-    Args:
-        poses: (k, 4, 4) T_odom_imu of all keyframes.
-    """
-    loops = [edge for edge in edges if edge.verdict is Verdict.ACCEPTED]
-    if any(edge.edited or edge.origin is Origin.USER or edge.weight != 1.0 for edge in loops):
-        return True
-    if not loops:
-        return False
-    pairs = np.array([edge.pair for edge in loops])
-    measured = np.array([edge.T_older_newer for edge in loops])
-    missed = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]
-    covariances = np.array([edge.covariance for edge in loops])
-    turned = _mean_square(lie.log(missed[:, :3, :3]), covariances[:, :3, :3])
-    moved = _mean_square(missed[:, :3, 3], covariances[:, 3:, 3:])
-    return max(moved, turned) > 0.5**2
-
-
-def _mean_square(errors: F64, covariances: F64) -> float:
-    """Mean over (n, 3) errors of their squared Mahalanobis length by (n, 3, 3)."""
-    return float(np.mean(np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)))
