@@ -105,10 +105,11 @@ def update(
             since_search[:] = 0.0
         kernels.normal_equations(
             points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,
-            params.gate, extrinsics, H, b, stats, residuals,
+            planes.deviations, params.gate, extrinsics, H, b, stats, residuals,
         )  # fmt: skip
         if stats[0] < MIN_INLIERS:
             return prior, too_few(iteration, n, int(stats[0]), matches(points, residuals, planes))
+        H, b = _nonnegative(H, b)
         here, x = x, np.empty(manifold.SIZE)
         manifold.gauss_newton(here, begin, information, H, b, covariance, step, x)
         since_search += step
@@ -128,6 +129,14 @@ def update(
     posterior[:free, free:] = covariance @ information @ prior.covariance[:free, free:]
     posterior[free:, :free] = posterior[:free, free:].T
     return Belief(_unpacked(x, prior.state.stamp_ns), posterior), replace(found, surprise=float(surprise))
+
+
+def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:
+    """Normal equations without the directions in which normals' errors explain more than all that the points tell."""
+    eigenvalues, axes = np.linalg.eigh(H)
+    told = axes[:, eigenvalues > 0.0]
+    kept = told @ told.T
+    return kept @ H @ kept, kept @ b
 
 
 def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Registration:

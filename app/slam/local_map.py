@@ -43,11 +43,13 @@ class Planes:
     Attributes:
         normals: (n, 3) unit. centers: (n, 3) m, odom.
         variances: (n,) m², of a point's distance from its plane; negative where there is no plane.
+        deviations: (n, 2, 3) rad, two vectors whose outer products sum to the normal's covariance.
     """
 
     normals: F64
     centers: F64
     variances: F64
+    deviations: F64
 
 
 class LocalMap:
@@ -106,13 +108,14 @@ class LocalMap:
         """
         n = len(queries)
         normals, centers, variances = np.empty((2, n, 3)), np.zeros((2, n, 3)), np.empty((2, n))
+        deviations = np.empty((2, n, 2, 3))
         reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(params.plane_tilt)
         kernels.planes(
             queries, position, self._voxel, reach, params.neighbours, params.plane_threshold,
             np.array([RELAXED * tilt, tilt]), params.point_noise, self._way[3] - OLD_M**2,
-            self._table, self._cells, self._counts, self._store, normals, centers, variances,
+            self._table, self._cells, self._counts, self._store, normals, centers, variances, deviations,
         )  # fmt: skip
-        poor, good = (Planes(*parts) for parts in zip(normals, centers, variances, strict=True))
+        poor, good = (Planes(*parts) for parts in zip(normals, centers, variances, deviations, strict=True))
         return good, poor
 
     def checkpoint(self) -> MapState:

@@ -165,7 +165,7 @@ def test_a_person_walking_by_does_not_take_the_map_along() -> None:
         seen = next(iter(measurements(scene, walk, REAL, 1, begin_s=0.05 + k * PERIOD_S)))
         results.append(engine.step(seen.scan, m.imu))
     metres, _ = worst(results, walk)
-    assert metres < 0.05
+    assert metres < 0.06
 
 
 @pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")  # that is the point of these numbers

@@ -142,7 +142,7 @@ BEHIND = 0.15
 faces some centimetres apart, and a scan of one must not be fitted to the other. Closer to edge-on, the side is not
 sure."""
 SHARED = 4.0
-"""Weight of a plane's variance beside the point's own: points on the same patch share its error, so it does not
+"""Weight of a plane's own variance, and of its normal's: points on the same patch share its error, so it does not
 average out between them."""
 OLD = 4.0
 """Weight of an old plane's variance: odometry has drifted since, and the pose is to return to it smoothly."""
@@ -199,10 +199,11 @@ def _nearest(x, y, z, voxel, reach2, old, table, cells, counts, places, room, sp
 
 
 @njit(cache=True, error_model="numpy")
-def _fit(x, y, z, eye, places, order, n, first, flat, tilts, noise, normal, j, normals, centers, variances):
+def _fit(x, y, z, eye, places, order, n, first, flat, tilts, noise, normal, j, normals, centers, variances, deviations):
     """Planes through the nearest of n ranked points around (x, y, z), one for each of `tilts` (see `planes`).
 
-    Out, in row j of each tilt: normals, unit; centers, m, relative to the query; variances, m² or -1. Scratch: normal.
+    Out, in row j of each tilt: normals, unit; centers, m, relative to the query; variances, m² or -1; deviations, rad.
+    Scratch: normal.
     """
     variances[:, j] = -1.0
     sx = sy = sz = xx = xy = xz = yy = yz = zz = inverse_hits = 0.0
@@ -241,9 +242,38 @@ def _fit(x, y, z, eye, places, order, n, first, flat, tilts, noise, normal, j, n
                 normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = normal[0], normal[1], normal[2]
                 centers[i, j, 0], centers[i, j, 1], centers[i, j, 2] = mx, my, mz
                 variances[i, j] = (noise * noise + SHARED * l3) * doubt
+                _deviate(
+                    xx * s - mx * mx, xy * s - mx * my, xz * s - mx * mz, yy * s - my * my, yz * s - my * mz,
+                    zz * s - mz * mz, SHARED * scatter * s, normal, deviations[i, j],
+                )  # fmt: skip
         if level == len(tilts) or take == n:
             break
         take = min(2 * take, n)
+
+
+@njit(cache=True, error_model="numpy")
+def _deviate(xx, xy, xz, yy, yz, zz, scatter, normal, out):
+    """The covariance of a plane's normal: scatter / T, where T is the points' covariance (xx ... zz) in the plane.
+
+    Out: (2, 3), two vectors across the normal whose outer products sum to it (a Cholesky factor).
+    """
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    if abs(nx) < 0.8:
+        ax, ay, az = 0.0, nz, -ny
+    else:
+        ax, ay, az = -nz, 0.0, nx
+    unit = 1.0 / math.sqrt(ax * ax + ay * ay + az * az)
+    ax, ay, az = ax * unit, ay * unit, az * unit
+    bx, by, bz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
+    aa = ax * ax * xx + ay * ay * yy + az * az * zz + 2.0 * (ax * ay * xy + ax * az * xz + ay * az * yz)
+    bb = bx * bx * xx + by * by * yy + bz * bz * zz + 2.0 * (bx * by * xy + bx * bz * xz + by * bz * yz)
+    ab = ax * (bx * xx + by * xy + bz * xz) + ay * (bx * xy + by * yy + bz * yz) + az * (bx * xz + by * yz + bz * zz)
+    scale = scatter / (aa * bb - ab * ab)
+    p = math.sqrt(scale * bb)
+    q = -scale * ab / p
+    r = math.sqrt(max(scale * aa - q * q, 0.0))
+    out[0, 0], out[0, 1], out[0, 2] = p * ax + q * bx, p * ay + q * by, p * az + q * bz
+    out[1, 0], out[1, 1], out[1, 2] = r * bx, r * by, r * bz
 
 
 @njit(cache=True, inline="always")
@@ -265,8 +295,9 @@ def _is_one_side(x, y, z, eye, places, order, n, mx, my, mz, normal, flat):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def planes(
-    queries, eye, voxel, reach, first, flat, tilts, noise, old, table, cells, counts, store, normals, centers, variances
-):
+    queries, eye, voxel, reach, first, flat, tilts, noise, old, table, cells, counts, store,
+    normals, centers, variances, deviations,
+):  # fmt: skip
     """Planes through the nearest map points of each query, one for each of the falling `tilts` (k,) rad.
 
     The `first` nearest points within `reach` m are tried first. The normal of a plane through k points of scatter s is
@@ -278,7 +309,7 @@ def planes(
 
     queries (n, 3) f64 m, odom; eye (3,) m, the sensor; noise: of a point, m; the map as in `insert`. Out: normals
     (k, n, 3) unit, centers (k, n, 3) m, variances (k, n): of a point's distance from its plane in m², negative where
-    there is no plane.
+    there is no plane; deviations (k, n, 2, 3) rad: the outer products of the two sum to the normal's covariance.
     """
     room = store.shape[1]
     places = store.reshape(-1, 8)
@@ -292,12 +323,12 @@ def planes(
         )
         _fit(
             x, y, z, eye, places, order, min(present, MOST), first, flat, tilts, noise, normal, j,
-            normals, centers, variances,
+            normals, centers, variances, deviations,
         )  # fmt: skip
         if variances[0, j] < 0.0 and n > present:
             _fit(
                 x, y, z, eye, places, order[present:], min(n - present, MOST), first, flat, tilts, noise, normal, j,
-                normals, centers, variances,
+                normals, centers, variances, deviations,
             )  # fmt: skip
             for i in range(len(tilts)):
                 variances[i, j] *= OLD
