@@ -22,8 +22,8 @@ TAKEN_BACK, NOISE = 0.07, 0.05
 to 0.02, one with all the errors that data sheets admit 0.05; exchanged axes, a mounting off by 5 deg or a clock off by
 20 ms leave 0.07 to 0.4."""
 SURPRISING, OFTEN = 4.0, 3
-"""Surprise of a frame (`Registration`), and how many such frames it takes. Clean sensors stay below 0.3, imperfect ones
-below 3 but for single frames of 4; where scans show little but people and false points, it reaches 38 to 97."""
+"""Surprise of a frame (`Registration`), and how many such frames it takes. Clean sensors stay below 0.3, imperfect
+ones below 3.5; where scans show little but people and false points, it reaches 5 to 89."""
 LATE_S = 0.01
 """How late or early the IMU's clock may seem to be: data sheets and links admit 6 ms, and the estimate is off by 1."""
 

@@ -253,9 +253,10 @@ def _fit(x, y, z, eye, places, order, n, first, flat, tilts, noise, normal, j, n
 
 @njit(cache=True, error_model="numpy")
 def _deviate(xx, xy, xz, yy, yz, zz, scatter, normal, out):
-    """The covariance of a plane's normal: scatter / T, where T is the points' covariance (xx ... zz) in the plane.
+    """Fill out (2, 3) with two vectors across the normal whose outer products sum to the normal's covariance.
 
-    Out: (2, 3), two vectors across the normal whose outer products sum to it (a Cholesky factor).
+    That covariance is scatter / T, where T is the covariance of the points (xx ... zz) within the plane. The two
+    vectors are its Cholesky factor.
     """
     nx, ny, nz = normal[0], normal[1], normal[2]
     if abs(nx) < 0.8:
