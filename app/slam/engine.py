@@ -11,6 +11,7 @@ import numpy as np
 from app.slam import channels, coast, ground, iekf, imu, keyframes, rest, start
 from app.slam.certainty import Certainty
 from app.slam.clock import ClockOffset
+from app.slam.floor import Floor
 from app.slam.imu import Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
@@ -29,6 +30,7 @@ class EngineProgress:
     Attributes:
         frame: index of the next one. belief: None until the start is over. still: samples of the rest so far.
         T_odom_keyframe: T_odom_imu of the last keyframe. certainty: of its pose; both None before the first.
+        floor: what is known of the floor around a scanner that sees none below itself; None before such a scan.
         lines: estimated errors of the scan lines. clock: estimated offset of the IMU's clock.
     """
 
@@ -38,6 +40,7 @@ class EngineProgress:
     status: FrameStatus = FrameStatus.INITIALISING
     T_odom_keyframe: F64 | None = None
     certainty: Certainty | None = None
+    floor: Floor | None = None
     lines: LineErrors = field(default_factory=LineErrors.unknown)
     clock: ClockOffset = field(default_factory=ClockOffset)
 
@@ -113,7 +116,8 @@ class Engine:
         watch.lap("deskew")
 
         # paper 2.2: the ground, and only the ground, is thinned before the filter's own scan voxel
-        surface = ground.segment(points, scan.ring, _down_in_lidar(predicted), p.ground)
+        T = predicted.state.T_odom_imu @ predicted.state.T_imu_lidar
+        surface = ground.segment(points, scan.ring, _down_in_lidar(predicted), p.ground, before.floor, T)
         watch.lap("ground")
         reduced = self._grid.downsample(points, p.ground.voxel_size, chosen=surface.labels)
         sampled = self._grid.downsample(reduced.points, p.scan.voxel_size)
@@ -183,7 +187,15 @@ class Engine:
         )
         T_odom_keyframe = before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu
         self._progress = EngineProgress(
-            before.frame + 1, None if waiting else posterior, still, status, T_odom_keyframe, certainty, lines, clock
+            frame=before.frame + 1,
+            belief=None if waiting else posterior,
+            still=still,
+            status=status,
+            T_odom_keyframe=T_odom_keyframe,
+            certainty=certainty,
+            floor=surface.floor,
+            lines=lines,
+            clock=clock,
         )
         return result
 
@@ -196,7 +208,7 @@ class Engine:
     def relabel(self, result: StepResult) -> StepResult:
         """The same frame with its ground segmented by the present parameters. Changes nothing else."""
         cloud, p = result.cloud, self.params.ground
-        surface = ground.segment(cloud.points, cloud.ring, result.ground.down, p)
+        surface = ground.segment(cloud.points, cloud.ring, result.ground.down, p, result.ground.floor)
         reduced = self._grid.downsample(cloud.points, p.voxel_size, chosen=surface.labels)
         surface.labels.setflags(write=False)
         return replace(

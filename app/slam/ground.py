@@ -1,28 +1,37 @@
 """Seed-point ground segmentation (paper 2.2, eq. 1-3).
 
-A scanner that sees nothing within alpha of straight down, such as a Mid-360 held upright, takes its seeds farther out:
-where polar cells of its lowest rings are flat.
+A scanner that sees nothing within alpha of straight down, such as a Mid-360 held upright, takes its seeds farther out,
+and from earlier scans: cells of the floor on its lowest plane (`app.slam.floor`).
 """
 
 from dataclasses import replace
 
 import numpy as np
 
+from app.slam.floor import Floor
 from app.slam.kernels import ground as kernels
 from app.slam.sections import GroundParams
-from app.slam.types import F32, F64, NON_GROUND, U16, GroundResult
+from app.slam.types import F32, F64, NON_GROUND, SEED, U16, GroundResult
 
 MIN_SEEDS = 20
 """Least number of seeds for a plane."""
 
 
-def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundResult:
+def segment(
+    points: F32,
+    ring: U16,
+    down: F64,
+    params: GroundParams,
+    floor: Floor | None = None,
+    T_odom_lidar: F64 | None = None,
+) -> GroundResult:
     """Label the ground of one scan.
 
     Args:
         points: (n, 3) float32 m, LiDAR frame.
         ring: (n,) rank of each point's scan line by elevation; 0 is the outermost.
         down: (3,) unit, direction of gravity in the LiDAR frame.
+        floor: what is known of the floor. T_odom_lidar: (4, 4) of this scan; None: the floor has seen this scan.
 
     Returns:
         Labels and the plane. Without an acceptable plane every label is NON_GROUND, and `reason` says why.
@@ -38,38 +47,62 @@ def segment(points: F32, ring: U16, down: F64, params: GroundParams) -> GroundRe
         planarity=float("nan"),
         seeds=0,
         share=0.0,
+        floor=floor,
     )
     if not params.enabled:
         return replace(none, reason="ground segmentation is switched off")
     if len(points) == 0:
         return replace(none, reason="the scan has no points")
 
-    cos_alpha, cos_slope = np.cos(np.radians([params.alpha, params.max_slope]))
-    seeds, steep = kernels.steep_seeds(points, ring, params.scan_lines, down, cos_alpha, labels)
+    seeds, steep = kernels.steep_seeds(points, ring, params.scan_lines, down, np.cos(np.radians(params.alpha)), labels)
     if steep == 0:  # a scanner held upright
-        seeds = kernels.flat_seeds(points, ring, params.scan_lines, down, params.sigma, cos_slope, labels)
+        return _on_floor(points, ring, params, _with_scan(points, ring, params, floor, T_odom_lidar, down), none)
     if seeds < MIN_SEEDS:
         labels[:] = NON_GROUND
         return replace(none, reason=f"only {seeds} seed points; a plane needs {MIN_SEEDS}", seeds=seeds)
     sums = np.zeros(12)
     kernels.moments(points, labels, sums)
-
-    # eq. 1: principal components of the seeds
     mean = sums[3:6] / seeds
     xx, xy, xz, yy, yz, zz = sums[6:] / seeds
     covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - np.outer(mean, mean)
+    result = _plane(replace(none, seeds=seeds), sums[:3] + mean, covariance, params)
+    if result.found:
+        count = kernels.label(points, result.centroid, result.normal, params.sigma, labels)
+        return replace(result, share=count / len(points))
+    labels[:] = NON_GROUND
+    return result
+
+
+def _plane(result: GroundResult, mean: F64, covariance: F64, params: GroundParams) -> GroundResult:
+    """The result with the plane of its seeds (eq. 1), if that is one and not too steep."""
     values, vectors = np.linalg.eigh(covariance)  # ascending: values[0] is lambda3
     planarity = float(max(values[0], 0.0) / values[1]) if values[1] > 0 else 1.0
-    normal = vectors[:, 0] * -np.sign(vectors[:, 0] @ down or -1.0)
-    centroid = sums[:3] + mean
-    result = replace(none, normal=normal, centroid=centroid, planarity=planarity, seeds=seeds)
-    slope = float(np.degrees(np.arccos(np.clip(-normal @ down, -1.0, 1.0))))
+    normal = vectors[:, 0] * -np.sign(vectors[:, 0] @ result.down or -1.0)
+    slope = float(np.degrees(np.arccos(np.clip(-normal @ result.down, -1.0, 1.0))))
+    reason = ""
     if planarity >= params.planarity:
         reason = f"λ3/λ2 of the seeds is {planarity:.2f}, not below {params.planarity:g}: they form no plane"
     elif slope > params.max_slope:
         reason = f"the seeds' plane is {slope:.0f}° steep, over {params.max_slope:g}°"
-    else:
-        count = kernels.label(points, centroid, normal, params.sigma, labels)
-        return replace(result, found=True, share=count / len(points))
-    labels[:] = NON_GROUND
-    return replace(result, reason=reason)
+    return replace(result, found=not reason, reason=reason, normal=normal, centroid=mean, planarity=planarity)
+
+
+def _with_scan(
+    points: F32, ring: U16, params: GroundParams, floor: Floor | None, T_odom_lidar: F64 | None, down: F64
+) -> Floor:
+    if T_odom_lidar is not None:
+        return (floor or Floor.unknown(T_odom_lidar)).with_scan(points, ring, T_odom_lidar, params)
+    return floor or Floor.of_scan(points, ring, down, params)
+
+
+def _on_floor(points: F32, ring: U16, params: GroundParams, floor: Floor, none: GroundResult) -> GroundResult:
+    floor, slack, cells = floor.find(params)
+    none = replace(none, floor=floor)
+    if not len(cells):
+        return replace(none, reason="no seeds: no flat ground is seen around the scanner")
+    result = _plane(none, cells.mean(axis=0), np.cov(cells.T, bias=True), params)
+    if not result.found:
+        return result
+    count = floor.label(points, ring, slack, params, none.labels)
+    seeds = int(np.count_nonzero(none.labels == SEED))
+    return replace(result, share=count / len(points), seeds=seeds)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from app.slam.arrays import F64
 from app.slam.kernels import small
-from app.slam.types import F64
 
 _SMALL = 1e-8
 """Squared angle below which series replace the closed forms (their error is under 1e-16 there)."""

@@ -23,6 +23,7 @@ from app.slam.arrays import U8 as U8
 from app.slam.arrays import U16 as U16
 from app.slam.arrays import Mask as Mask
 from app.slam.arrays import Vector as Vector
+from app.slam.floor import Floor
 from app.slam.loops.types import LoopEdge
 
 NON_GROUND, GROUND, SEED, MOVING = 0, 1, 2, 3
@@ -195,6 +196,7 @@ class GroundResult:
         down: (3,) unit direction of gravity in the LiDAR frame, as used.
         planarity: lambda3 / lambda2 of the seeds (nan without seeds); accepted below the limit.
         seeds: number of seed points. share: ground points over all points, 0-1.
+        floor: what is known of the floor around a scanner that sees none below itself; None before such a scan.
     """
 
     labels: U8
@@ -206,6 +208,7 @@ class GroundResult:
     planarity: float
     seeds: int
     share: float
+    floor: Floor | None = None
 
 
 @dataclass(frozen=True, slots=True)

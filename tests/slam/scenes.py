@@ -287,3 +287,33 @@ def pose_error(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     difference = np.linalg.inv(truth) @ estimate
     angle = Rotation.from_matrix(difference[:3, :3]).magnitude()
     return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(angle))
+
+
+YARD = Scene(
+    box(-30.0, -25.0, -1.3, 35.0, 20.0, 12.0),
+    (box(8.0, 5.0, -1.3, 14.0, 9.0, 2.0), box(-15.0, -12.0, -1.3, -9.0, -8.0, -0.2)),
+)
+"""A yard between walls, with a shed and a low block."""
+
+
+def upright(scene: Scene, position: tuple[float, float] = (0.0, 0.0), tilt: float = 0.0, seed: int = 5) -> Scan:
+    """Seen by a scanner without scan lines, -7 to 52 degrees, held upright; its rings are steps of 2 degrees.
+
+    position: x and y, m. tilt: degrees about y.
+    """
+    rng = np.random.default_rng(seed)
+    azimuth, elevation = rng.uniform([-np.pi, np.radians(-7)], [np.pi, np.radians(52)], (20_000, 2)).T
+    level = np.cos(elevation)
+    directions = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    R = Rotation.from_euler("y", tilt, degrees=True).as_matrix()
+    ranges, floor = scene.cast(np.tile([*position, 0.0], (20_000, 1)), directions @ R.T)
+    hit = np.isfinite(ranges) & (ranges < 70.0)
+    ranges = ranges[hit] + rng.normal(scale=0.01, size=np.count_nonzero(hit))
+    return Scan(
+        stamp_ns=0,
+        points=(directions[hit] * ranges[:, None]).astype(np.float32),
+        offsets_ns=np.zeros(len(ranges), np.int32),
+        intensity=np.zeros(len(ranges), np.float32),
+        ring=((np.degrees(elevation[hit]) + 7) // 2).astype(np.uint16),
+        truth_ground=floor[hit].astype(np.uint8),
+    )

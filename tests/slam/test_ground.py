@@ -97,55 +97,6 @@ def test_a_sensor_that_looks_straight_down_sees_nothing_but_floor_below() -> Non
     assert not np.any((result.labels != NON_GROUND) & (heights(scan, R) > 0))
 
 
-def upright(scene: Scene, tilt: float = 0.0) -> tuple[Scan, np.ndarray]:
-    """Seen by a scanner without scan lines, -7 to 52 degrees, held upright; its rings are steps of 2 degrees."""
-    rng = np.random.default_rng(5)
-    azimuth, elevation = rng.uniform([-np.pi, np.radians(-7)], [np.pi, np.radians(52)], (20_000, 2)).T
-    level = np.cos(elevation)
-    directions = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
-    R = Rotation.from_euler("y", tilt, degrees=True).as_matrix()
-    ranges, floor = scene.cast(np.zeros((20_000, 3)), directions @ R.T)
-    hit = np.isfinite(ranges) & (ranges < 70.0)
-    ranges = ranges[hit] + rng.normal(scale=0.01, size=np.count_nonzero(hit))
-    return Scan(
-        stamp_ns=0,
-        points=(directions[hit] * ranges[:, None]).astype(np.float32),
-        offsets_ns=np.zeros(len(ranges), np.int32),
-        intensity=np.zeros(len(ranges), np.float32),
-        ring=((np.degrees(elevation[hit]) + 7) // 2).astype(np.uint16),
-        truth_ground=floor[hit].astype(np.uint8),
-    ), R
-
-
-YARD = Scene(
-    box(-30.0, -25.0, -1.3, 35.0, 20.0, 12.0),
-    (box(8.0, 5.0, -1.3, 14.0, 9.0, 2.0), box(-15.0, -12.0, -1.3, -9.0, -8.0, -0.2)),
-)
-"""A yard between walls, with a shed and a low block."""
-
-
-@pytest.mark.parametrize("tilt", [-8.0, 0.0, 8.0])
-def test_a_scanner_held_upright_finds_the_ground_far_out(tilt: float) -> None:
-    scan, R = upright(YARD, tilt)
-    result = segment(scan, R)
-    assert result.found, result.reason
-    assert (R @ result.centroid)[2] == pytest.approx(-1.3, abs=0.05)
-    assert np.degrees(np.arccos(np.clip(result.normal @ (R.T @ [0, 0, 1]), -1, 1))) < 0.5
-    labelled, true = result.labels != NON_GROUND, scan.truth_ground == 1
-    assert labelled[true].mean() > 0.85
-    assert true[labelled].mean() > 0.9  # the foot of a wall is in a cell with the wall, which is none of the ground
-
-
-@pytest.mark.parametrize("wall", [3.0, 0.9])
-def test_a_scanner_held_upright_in_a_room_too_small_to_see_the_floor_labels_none(wall: float) -> None:
-    """Of a wall 0.9 m away, only 11 cm are below the scanner."""
-    scan, R = upright(Scene(box(-5.0, -wall, -1.3, 5.0, wall, 1.4)))
-    result = segment(scan, R)
-    assert scan.truth_ground is not None and not scan.truth_ground.any()
-    assert not result.found and not result.labels.any()
-    assert "seed" in result.reason
-
-
 @pytest.mark.parametrize("degrees", [0, 10, 30])
 def test_a_slope_is_ground(degrees: float) -> None:
     up = Rotation.from_euler("xy", [0.3 * degrees, -degrees], degrees=True).apply([0.0, 0.0, 1.0])

@@ -1,0 +1,104 @@
+"""The floor around a scanner that sees none below itself, such as a Mid-360 held upright.
+
+Such a scanner sees the floor only some ten metres ahead, in few points. So the floor is gathered while it walks: in
+square cells of half a metre, from the last scans, and from what earlier ones found to be floor.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from app.slam import lie
+from app.slam.arrays import F32, F64, I64, U8, U16
+from app.slam.kernels import floor as kernels
+from app.slam.kernels.floor import CELLS, EDGE_M
+from app.slam.kernels.ground import last_line
+from app.slam.sections import GroundParams
+
+HALF = 5
+"""Scans until the older half of the last scans is dropped."""
+_NOTHING = np.array([0.0, 0.0, np.inf, -np.inf], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """Cells around the last scan, whose z axis is up.
+
+    Attributes:
+        T_odom_lidar: (4, 4), of the last scan. corner: (2,), index of the first cell; a cell's edge is EDGE_M.
+        scans: number of scans seen.
+        seen: (2, CELLS, CELLS, 4) of the last up to HALF scans and the HALF before: `kernels.COUNT` and so on.
+        known: (CELLS, CELLS, 2): heights (m) that earlier scans found, and the number of scans, 0 if none.
+        found: (CELLS, CELLS): heights that `find` found after the last scan; nan where there is no floor.
+    """
+
+    T_odom_lidar: F64
+    corner: I64
+    scans: int
+    seen: F32
+    known: F32
+    found: F32
+
+    @classmethod
+    def unknown(cls, T_odom_lidar: F64) -> Self:
+        """Around this pose, before any scan."""
+        seen = np.tile(_NOTHING, (2, CELLS, CELLS, 1))
+        found = np.full((CELLS, CELLS), np.nan, np.float32)
+        return cls(T_odom_lidar, _corner(T_odom_lidar), 0, seen, np.zeros((CELLS, CELLS, 2), np.float32), found)
+
+    @classmethod
+    def of_scan(cls, points: F32, ring: U16, down: F64, params: GroundParams) -> Self:
+        """What a lone scan shows. Arguments as `app.slam.ground.segment`."""
+        level = lie.transform(lie.between(down, np.array([0.0, 0.0, -1.0])), np.zeros(3))
+        return cls.unknown(level).with_scan(points, ring, level, params)
+
+    def with_scan(self, points: F32, ring: U16, T_odom_lidar: F64, params: GroundParams) -> Self:
+        """The floor with one more scan: points (n, 3) m, LiDAR frame, and their lines (n,), 0 the lowest."""
+        before, known = self.known.copy(), np.empty_like(self.known)
+        kernels.remember(self.seen, self.found, before)
+        corner = _corner(T_odom_lidar)
+        by = corner - self.corner
+        _move(before, by, np.zeros(2), known)
+        seen = np.empty_like(self.seen)
+        if self.scans % HALF:
+            _move(self.seen[0], by, _NOTHING, seen[0])
+            _move(self.seen[1], by, _NOTHING, seen[1])
+        else:
+            seen[0] = _NOTHING
+            _move(self.seen[0], by, _NOTHING, seen[1])
+        p = T_odom_lidar[:3, 3]
+        kernels.see(points, ring, last_line(ring, params.scan_lines), T_odom_lidar[:3, :3], p, corner, seen[0])
+        return replace(self, T_odom_lidar=T_odom_lidar, corner=corner, scans=self.scans + 1, seen=seen, known=known)
+
+    def find(self, params: GroundParams) -> tuple[Self, F64, F64]:
+        """The floor with its heights; how far a point of each cell may be off them; and the cells of its plane.
+
+        Returns:
+            This with `found`; (CELLS, CELLS) m, 0 where there is no floor; (k, 3) m, LiDAR frame.
+        """
+        found, slack = np.empty((CELLS, CELLS), np.float32), np.empty((CELLS, CELLS))
+        seeds = np.empty((CELLS * CELLS, 3))
+        R, p = self.T_odom_lidar[:3, :3], self.T_odom_lidar[:3, 3]
+        steepest = float(np.cos(np.radians(params.max_slope)))
+        count = kernels.find(self.seen, self.known, self.corner, p, params.sigma, steepest, found, slack, seeds)
+        return replace(self, found=found), slack, seeds[:count] @ R
+
+    def label(self, points: F32, ring: U16, slack: F64, params: GroundParams, labels: U8) -> int:
+        """Label the last scan's points by `found`; the number of points on the floor. See `kernels.label`."""
+        R, p = self.T_odom_lidar[:3, :3], self.T_odom_lidar[:3, 3]
+        last = last_line(ring, params.scan_lines)
+        return int(kernels.label(points, ring, last, R, p, self.corner, self.found, slack, params.sigma, labels))
+
+
+def _corner(T_odom_lidar: F64) -> I64:
+    return np.floor(T_odom_lidar[:2, 3] / EDGE_M).astype(np.int64) - CELLS // 2
+
+
+def _move(cells: F32, by: I64, nothing: F64 | F32, out: F32) -> None:
+    """The cells of a square that lies `by` (2,) cells farther; `nothing` in those that are new."""
+    out[:] = nothing
+    (i, j), (m, n) = np.maximum(by, 0), CELLS - np.abs(by)
+    if min(m, n) > 0:
+        a, b = np.maximum(-by, 0)
+        out[a : a + m, b : b + n] = cells[i : i + m, j : j + n]

@@ -1,0 +1,195 @@
+"""Cells of the floor around a scanner that sees none below itself: what scans show of them, and which are the floor."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+CELLS, EDGE_M = 128, 0.5
+"""Cells along each side of the square, and the length of a cell's edge."""
+COUNT, MEAN, LOWEST, HIGHEST = range(4)
+"""Of the heights (m, odometry's frame) that scans show in a cell. Mean and count are of points on the lowest lines."""
+_HEAD_M = 0.5
+"""Points up to this height above the scanner show a wall too: what a near one has below it is low and looks flat."""
+_FLAT_M = 0.15
+"""Heights within one cell of the floor differ by less."""
+_RISE_M = 0.1
+"""Heights of neighbouring cells of the floor differ by less: a slope of 11 degrees, a low kerb."""
+_FOOT_M = 0.05
+"""At a wall, floor is nearer to the floor beside it than this."""
+_LEAST_POINTS, _MOST_SCANS = 3, 50.0
+"""Points that a cell's height is believed from, and scans that it is averaged over at most."""
+_LEAST_CELLS, _TRIALS, _JUDGES = 8, 200, 400
+"""Cells that make a floor, planes that are tried, and about the number of cells that they are tried on."""
+
+
+@njit(cache=True, nogil=True)
+def see(points, ring, last, R, p, corner, seen):
+    """Add one scan to the cells that it shows.
+
+    points (n, 3) f32 m, LiDAR frame; ring (n,) u16, of which those below `last` are the lowest; R (3, 3) and p (3,) m:
+    LiDAR in odometry's frame; corner (2,) index of the first cell. In and out: seen (CELLS, CELLS, 4) f32.
+    """
+    for k in range(len(points)):
+        i, j, height, _ = _cell(points[k], R, p, corner)
+        if height >= p[2] + _HEAD_M or not (0 <= i < CELLS and 0 <= j < CELLS):
+            continue
+        cell = seen[i, j]
+        cell[LOWEST], cell[HIGHEST] = min(cell[LOWEST], height), max(cell[HIGHEST], height)
+        if height < p[2] and ring[k] < last:
+            cell[COUNT] += 1
+            cell[MEAN] += (height - cell[MEAN]) / cell[COUNT]
+
+
+@njit(cache=True, nogil=True)
+def remember(seen, found, known):
+    """Keep the heights of cells that were found to be the floor, and forget those that scans contradict.
+
+    seen (2, CELLS, CELLS, 4) f32; found (CELLS, CELLS) f32 m, nan where there is no floor. In and out: known (CELLS,
+    CELLS, 2) f32: m, and the number of scans that it is the mean of, 0 where it is not known.
+    """
+    for i in range(CELLS):
+        for j in range(CELLS):
+            if known[i, j, 1] == 0 and np.isnan(found[i, j]):
+                continue
+            count, mean, lowest, highest = _both(seen, i, j)
+            flat = count >= _LEAST_POINTS and highest - lowest < _FLAT_M
+            cell = known[i, j]
+            if cell[1] and (lowest < cell[0] - _RISE_M or (flat and abs(mean - cell[0]) > _RISE_M)):
+                cell[1] = 0
+            elif flat and not np.isnan(found[i, j]):
+                cell[1] = min(cell[1] + 1, _MOST_SCANS)
+                cell[0] = mean if cell[1] == 1 else cell[0] + (mean - cell[0]) / cell[1]
+
+
+@njit(cache=True, nogil=True)
+def find(seen, known, corner, p, sigma, cos_slope, heights, slack, seeds):
+    """Find the floor: the lowest plane that most cells share, and from there on cell by cell.
+
+    A cell is flat if its heights differ little, which a wall's do not. Of planes through three cells that are flat or
+    known, less steep than the slope, the one counts that most cells lie on and fewest below. Cells on it are floor,
+    and so are their neighbours at about the same height, and theirs. A cell beside the floor may be its edge.
+
+    Arguments as `see` and `remember`; sigma m/m; cos_slope of the steepest plane. Out: heights (CELLS, CELLS) f32 m,
+    nan where there is no floor; slack (CELLS, CELLS) f32 m, how far a point of it may be off the height; seeds
+    (CELLS², 3) f64 m, from the LiDAR, odometry's axes: cells on the plane. Returns the number of seeds.
+    """
+    height, cells = np.full((CELLS, CELLS), np.nan), np.empty((CELLS * CELLS, 3))
+    index = np.empty((CELLS * CELLS, 2), np.int64)
+    count = 0
+    for i in range(CELLS):
+        for j in range(CELLS):
+            heights[i, j], slack[i, j] = np.nan, 0.0
+            points, mean, lowest, highest = _both(seen, i, j)
+            if known[i, j, 1] and lowest >= known[i, j, 0] - _RISE_M:
+                height[i, j] = known[i, j, 0]
+            elif points and highest - lowest < _FLAT_M:
+                height[i, j] = mean
+                if points < _LEAST_POINTS:
+                    continue
+            else:
+                continue
+            cells[count, 0] = (i + corner[0] + 0.5) * EDGE_M - p[0]
+            cells[count, 1] = (j + corner[1] + 0.5) * EDGE_M - p[1]
+            cells[count, 2] = height[i, j] - p[2]
+            index[count, 0], index[count, 1] = i, j
+            count += 1
+    chosen, plane = _lowest_plane(cells[:count], sigma, cos_slope)
+    if not plane.any():
+        return 0
+
+    queue = np.empty((CELLS * CELLS, 2), np.int64)
+    found = 0
+    for k in range(count):
+        if abs((cells[k] - chosen) @ plane) < sigma * np.linalg.norm(cells[k]):
+            seeds[found] = cells[k]
+            queue[found] = index[k]
+            heights[index[k, 0], index[k, 1]] = height[index[k, 0], index[k, 1]]
+            found += 1
+    reached, nearest, k = found, np.full((CELLS, CELLS), 3), 0
+    while k < reached:
+        i, j = queue[k]
+        slack[i, j] = _RISE_M
+        for u in range(max(i - 1, 0), min(i + 2, CELLS)):
+            for v in range(max(j - 1, 0), min(j + 2, CELLS)):
+                if np.isnan(heights[u, v]) and abs(height[u, v] - heights[i, j]) < _RISE_M:
+                    heights[u, v] = height[u, v]
+                    queue[reached, 0], queue[reached, 1] = u, v
+                    reached += 1
+        k += 1
+    for k in range(reached):
+        i, j = queue[k]
+        for u in range(max(i - 1, 0), min(i + 2, CELLS)):
+            for v in range(max(j - 1, 0), min(j + 2, CELLS)):
+                distance = abs(u - i) + abs(v - j)
+                if slack[u, v] < _RISE_M and distance < nearest[u, v]:
+                    nearest[u, v], slack[u, v], heights[u, v] = distance, _FOOT_M, heights[i, j]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def label(points, ring, last, R, p, corner, heights, slack, sigma, labels):
+    """Label 1 the points on the floor, 2 those of them on the lowest lines, 0 others. Arguments as `see` and `find`.
+
+    Out: labels (n,) u8. Returns the number of points on the floor.
+    """
+    count = 0
+    for k in range(len(points)):
+        labels[k] = 0
+        i, j, height, distance = _cell(points[k], R, p, corner)
+        if not (0 <= i < CELLS and 0 <= j < CELLS) or slack[i, j] == 0.0:
+            continue
+        if abs(height - heights[i, j]) < min(slack[i, j], sigma * distance):
+            labels[k] = 2 if ring[k] < last else 1
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _cell(point, R, p, corner):
+    """Cell (i, j) of a point of the LiDAR's frame, its height in odometry's frame and its range in m."""
+    x, y, z = float(point[0]), float(point[1]), float(point[2])
+    i = math.floor((R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + p[0]) / EDGE_M) - corner[0]
+    j = math.floor((R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + p[1]) / EDGE_M) - corner[1]
+    return i, j, R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + p[2], math.sqrt(x * x + y * y + z * z)
+
+
+@njit(cache=True)
+def _both(seen, i, j):
+    """Count, mean, lowest and highest of the scans at hand, of both halves of `seen` together."""
+    new, old = seen[0, i, j], seen[1, i, j]
+    count = new[COUNT] + old[COUNT]
+    mean = (new[COUNT] * new[MEAN] + old[COUNT] * old[MEAN]) / max(count, 1.0)
+    return count, mean, min(new[LOWEST], old[LOWEST]), max(new[HIGHEST], old[HIGHEST])
+
+
+@njit(cache=True)
+def _lowest_plane(cells, sigma, cos_slope):
+    """A point and the normal of the plane that most cells lie on and fewest below; zeros if there is none."""
+    best, chosen, plane = 0.5 * _LEAST_CELLS, np.zeros(3), np.zeros(3)
+    if len(cells) < _LEAST_CELLS:
+        return chosen, plane
+    cells = cells[:: 1 + len(cells) // _JUDGES].copy()
+    limits = np.empty(len(cells))
+    for k in range(len(cells)):
+        limits[k] = sigma * np.linalg.norm(cells[k])
+    state = np.uint64(1)
+    corners = np.empty((3, 3))
+    for _ in range(_TRIALS):
+        for k in range(3):
+            state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+            corners[k] = cells[int(state >> np.uint64(33)) % len(cells)]
+        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        size = np.linalg.norm(normal)
+        if size < 1e-6 or abs(normal[2]) < cos_slope * size:
+            continue
+        normal *= np.sign(normal[2]) / size
+        x, y, z = normal
+        through = corners[0, 0] * x + corners[0, 1] * y + corners[0, 2] * z
+        score = 0.0
+        for k in range(len(cells)):
+            above = cells[k, 0] * x + cells[k, 1] * y + cells[k, 2] * z - through
+            score += 1.0 - abs(above) / limits[k] if abs(above) < limits[k] else -2.0 if above < 0 else 0.0
+        if score > best:
+            best, chosen, plane = score, corners[0].copy(), normal
+    return chosen, plane
