@@ -23,6 +23,10 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+import app.evaluation.truth
+import app.export.results
+import app.mapping.opening
+import app.slam.doubts  # noqa: F401
 from app.sensors.cloud_types import read_point_cloud_2
 from app.sensors.live.feed import packets_of
 from app.sensors.live.livox_udp import SLOT_NS, LivoxWriter, write_imu
@@ -36,6 +40,7 @@ from app.slam.metrics import compare
 from app.slam.params import Params
 from app.slam.trajectory import read_tum
 from app.slam.types import Scan
+from app.slam.warmup import compile_kernels
 from benchmarks.fuzz.damage import MESSAGES, Entry, bytes_damaged
 
 FORMATS = ("mcap-livox", "mcap", "mcap-lz4", "mcap-plain", "bag", "bag-bz2", "bag-lz4", "db3", "pcap")
@@ -74,6 +79,7 @@ class Recordings:
     """
 
     def __init__(self) -> None:
+        compile_kernels()  # as the imports above: what is here before the forks, none of them loads again
         self._folder = tempfile.TemporaryDirectory()
         self._path = Path(self._folder.name)
         self.good = self._path / "good.mcap"
