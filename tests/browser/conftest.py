@@ -69,13 +69,19 @@ class Bench:
             assert time.monotonic() < deadline, "it did not come about in time"
             self.page.wait_for_timeout(50)
 
+    def within(self, seconds: float, holds: Callable[[], bool]) -> bool:
+        """Whether it comes about in this time, as soon as it does."""
+        deadline = time.monotonic() + seconds
+        while not (held := holds()) and time.monotonic() < deadline:
+            self.page.wait_for_timeout(50)
+        return held
+
     def press(self, key: str, holds: Callable[[], bool], page: Page | None = None) -> None:
         """Press a key, again if need be: a page that is still busy may drop it."""
 
         def pressed() -> bool:
             (page or self.page).keyboard.press(key)
-            self.page.wait_for_timeout(1500)
-            return holds()
+            return self.within(1.5, holds)
 
         self.eventually(pressed)
 

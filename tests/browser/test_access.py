@@ -109,6 +109,8 @@ def test_every_control_is_reached_by_the_tab_key(bench: Bench, name: str) -> Non
     for _ in range(3 * len(controls) + 20):
         page.keyboard.press("Tab")
         reached.add(page.evaluate(HERE))
+        if reached >= set(range(len(controls))):
+            break
     missed = [html for number, html in enumerate(controls) if number not in reached]
     assert len(controls) > 10 and missed == []
 

@@ -98,8 +98,8 @@ def test_a_focused_slider_takes_the_arrow_for_itself_and_the_scene_is_relabelled
     slider.focus()
     bench.press("ArrowLeft", lambda: 50.0 < bench.engine.snapshot.params.ground.alpha < 60.0)
     bench.press("Home", lambda: bench.engine.snapshot.params.ground.alpha == 1.0)
-    assert not [command for command in bench.engine.sent if isinstance(command, StepFrame)]
     bench.eventually(lambda: seed_pixels(bench) < many / 2)
+    assert not [command for command in bench.engine.sent if isinstance(command, StepFrame)]
     bench.engine.send(SetParams({"ground.alpha": 40.0, "ground.scan_lines": 8}))
     expect(slider).to_have_attribute("aria-valuenow", "40")
 
@@ -321,7 +321,7 @@ def test_a_click_on_the_map_measures_the_point_under_it(bench: Bench) -> None:
     for share in (0.5, 0.55, 0.45, 0.6, 0.4):  # the map has gaps
         if not kept():
             bench.page.mouse.click(scene["x"] + share * scene["width"], scene["y"] + share * scene["height"])
-            bench.page.wait_for_timeout(1500)
+            bench.within(1.5, lambda: bool(kept()))
     (spot,) = kept()[0].measure.spots
     assert np.linalg.norm(spot.at[:2]) < 12.0 and -3.0 < spot.at[2] < 5.0
     bench.page.get_by_role("button", name="stop", exact=True).click()
@@ -335,7 +335,6 @@ def test_on_a_phone_the_scene_has_most_of_the_page_until_a_tab_is_tapped(bench: 
     expect(tab).to_be_visible()
 
     def scene_share() -> float:
-        page.wait_for_timeout(500)
         return float(
             page.evaluate("document.querySelector('canvas[data-engine]').getBoundingClientRect().height / 844")
         )
@@ -345,6 +344,7 @@ def test_on_a_phone_the_scene_has_most_of_the_page_until_a_tab_is_tapped(bench: 
     bench.eventually(lambda: scene_share() < 0.45)
     expect(page.get_by_text("M scan lines")).to_be_in_viewport()
     page.get_by_role("tab", name="Help").first.click()
+    page.wait_for_timeout(500)
     assert scene_share() < 0.45, "another tab keeps it up"
     page.get_by_role("tab", name="Help").first.click()
     bench.eventually(lambda: scene_share() > 0.6)

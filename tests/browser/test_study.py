@@ -43,8 +43,7 @@ def click_goes_to(bench: Bench, frame: int) -> None:
         bench.page.mouse.move(*place_of(bench, frame))
         bench.page.mouse.down()
         bench.page.mouse.up()
-        bench.page.wait_for_timeout(700)
-        return bool(seeks(bench)) and abs(seeks(bench)[-1] - frame) <= 2  # that is less than a pixel
+        return bench.within(0.7, lambda: bool(seeks(bench)) and abs(seeks(bench)[-1] - frame) <= 2)  # less than a pixel
 
     bench.eventually(clicked)
 
