@@ -4,6 +4,10 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+# Before numpy is loaded: threads that share a core with another process of the tests wait for each other. That results
+# do not depend on their number is tested in slam/test_engine_repeats.py and recordings/test_odometry.py.
+os.environ.update({f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")})
+
 import pytest
 from hypothesis import settings
 
