@@ -2,6 +2,7 @@
 
 import bz2
 import struct
+from functools import cache
 from pathlib import Path
 
 import lz4.frame
@@ -20,12 +21,14 @@ from tests.sensors import rig
 ZEROS = bytes(1 << 20)
 
 
+@cache
 def zstd_bomb(megabytes: int, *, says_its_size: bool) -> bytes:
     total = megabytes << 20 if says_its_size else -1
     packer = zstandard.ZstdCompressor(write_content_size=says_its_size).compressobj(size=total)
     return b"".join(packer.compress(ZEROS) for _ in range(megabytes)) + packer.flush()
 
 
+@cache
 def lz4_bomb(megabytes: int) -> bytes:
     packer = lz4.frame.LZ4FrameCompressor()
     return packer.begin() + b"".join(packer.compress(ZEROS) for _ in range(megabytes)) + packer.flush()
