@@ -14,7 +14,7 @@ believes itself too much. Errors count from the first keyframe, whose pose defin
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -152,7 +152,8 @@ def score(walk: Walk, truth: Trajectory) -> Score:
     T = np.tile(np.eye(4), (len(true), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = true.rotations.as_matrix(), true.positions
     loops = [e for e in walk.edges if e.verdict is Verdict.ACCEPTED and min(there[e.older], there[e.newer]) >= 0]
-    errors = np.array([_loop_error(e, T[there[e.older]], T[there[e.newer]]) for e in loops]).reshape(-1, 2)
+    lasting = [_by_the_last_mounting_between(walk, edge) for edge in loops]
+    errors = np.array([_loop_error(e, T[there[e.older]], T[there[e.newer]]) for e in lasting]).reshape(-1, 2)
     good = {there[e.newer] for e, fits in zip(loops, _good(errors), strict=True) if fits}
     revisits = _revisits(T, true.stamps_ns)
     return Score(
@@ -179,6 +180,12 @@ def _by_the_last_mounting(walk: Walk) -> Trajectory:
     T_imu_lidar = walk.T_imu_lidar[np.maximum(last, 0)]
     T = walk.odometry.poses @ T_imu_lidar @ lie.inverse(walk.T_imu_lidar[-1])
     return Trajectory.from_poses(walk.odometry.stamps_ns, T)
+
+
+def _by_the_last_mounting_between(walk: Walk, edge: LoopEdge) -> LoopEdge:
+    """The loop between IMUs where the last mounting puts them. Scans tell the LiDAR's motion, whatever the mounting."""
+    T_lidars = lie.inverse(walk.T_imu_lidar[edge.older]) @ edge.T_older_newer @ walk.T_imu_lidar[edge.newer]
+    return replace(edge, T_older_newer=walk.T_imu_lidar[-1] @ T_lidars @ lie.inverse(walk.T_imu_lidar[-1]))
 
 
 def _errors(odometry: Trajectory, truth: Trajectory, first_ns: int, R_truth_odom: F64) -> tuple[I64, F64, F64]:
