@@ -207,8 +207,8 @@ class Engine:
 
     def relabel(self, result: StepResult) -> StepResult:
         """The same frame with its ground segmented by the present parameters. Changes nothing else."""
-        cloud, p = result.cloud, self.params.ground
-        surface = ground.segment(cloud.points, cloud.ring, result.ground.down, p, result.ground.floor)
+        cloud, before, p = result.cloud, result.ground, self.params.ground
+        surface = ground.segment(cloud.points, cloud.ring, before.down, p, before.known, before.T_odom_lidar)
         reduced = self._grid.downsample(cloud.points, p.voxel_size, chosen=surface.labels)
         surface.labels.setflags(write=False)
         return replace(

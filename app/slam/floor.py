@@ -9,7 +9,6 @@ from typing import Self
 
 import numpy as np
 
-from app.slam import lie
 from app.slam.arrays import F32, F64, I64, U8, U16
 from app.slam.kernels import floor as kernels
 from app.slam.kernels.floor import CELLS, EDGE_M
@@ -46,12 +45,6 @@ class Floor:
         seen = np.tile(_NOTHING, (2, CELLS, CELLS, 1))
         found = np.full((CELLS, CELLS), np.nan, np.float32)
         return cls(T_odom_lidar, _corner(T_odom_lidar), 0, seen, np.zeros((CELLS, CELLS, 2), np.float32), found)
-
-    @classmethod
-    def of_scan(cls, points: F32, ring: U16, down: F64, params: GroundParams) -> Self:
-        """What a lone scan shows. Arguments as `app.slam.ground.segment`."""
-        level = lie.transform(lie.between(down, np.array([0.0, 0.0, -1.0])), np.zeros(3))
-        return cls.unknown(level).with_scan(points, ring, level, params)
 
     def with_scan(self, points: F32, ring: U16, T_odom_lidar: F64, params: GroundParams) -> Self:
         """The floor with one more scan: points (n, 3) m, LiDAR frame, and their lines (n,), 0 the lowest."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from app.slam import lie
 from app.slam.floor import Floor
 from app.slam.kernels import ground as kernels
 from app.slam.sections import GroundParams
@@ -22,7 +23,7 @@ def segment(
     ring: U16,
     down: F64,
     params: GroundParams,
-    floor: Floor | None = None,
+    known: Floor | None = None,
     T_odom_lidar: F64 | None = None,
 ) -> GroundResult:
     """Label the ground of one scan.
@@ -31,7 +32,7 @@ def segment(
         points: (n, 3) float32 m, LiDAR frame.
         ring: (n,) rank of each point's scan line by elevation; 0 is the outermost.
         down: (3,) unit, direction of gravity in the LiDAR frame.
-        floor: what is known of the floor. T_odom_lidar: (4, 4) of this scan; None: the floor has seen this scan.
+        known: the floor by the scans before. T_odom_lidar: (4, 4); None for a lone scan.
 
     Returns:
         Labels and the plane. Without an acceptable plane every label is NON_GROUND, and `reason` says why.
@@ -47,7 +48,9 @@ def segment(
         planarity=float("nan"),
         seeds=0,
         share=0.0,
-        floor=floor,
+        T_odom_lidar=T_odom_lidar,
+        known=known,
+        floor=known,
     )
     if not params.enabled:
         return replace(none, reason="ground segmentation is switched off")
@@ -56,7 +59,7 @@ def segment(
 
     seeds, steep = kernels.steep_seeds(points, ring, params.scan_lines, down, np.cos(np.radians(params.alpha)), labels)
     if steep == 0:  # a scanner held upright
-        return _on_floor(points, ring, params, _with_scan(points, ring, params, floor, T_odom_lidar, down), none)
+        return _on_floor(points, ring, params, none)
     if seeds < MIN_SEEDS:
         labels[:] = NON_GROUND
         return replace(none, reason=f"only {seeds} seed points; a plane needs {MIN_SEEDS}", seeds=seeds)
@@ -87,16 +90,12 @@ def _plane(result: GroundResult, mean: F64, covariance: F64, params: GroundParam
     return replace(result, found=not reason, reason=reason, normal=normal, centroid=mean, planarity=planarity)
 
 
-def _with_scan(
-    points: F32, ring: U16, params: GroundParams, floor: Floor | None, T_odom_lidar: F64 | None, down: F64
-) -> Floor:
-    if T_odom_lidar is not None:
-        return (floor or Floor.unknown(T_odom_lidar)).with_scan(points, ring, T_odom_lidar, params)
-    return floor or Floor.of_scan(points, ring, down, params)
-
-
-def _on_floor(points: F32, ring: U16, params: GroundParams, floor: Floor, none: GroundResult) -> GroundResult:
-    floor, slack, cells = floor.find(params)
+def _on_floor(points: F32, ring: U16, params: GroundParams, none: GroundResult) -> GroundResult:
+    T_odom_lidar = none.T_odom_lidar
+    if T_odom_lidar is None:
+        T_odom_lidar = lie.transform(lie.between(none.down, np.array([0.0, 0.0, -1.0])), np.zeros(3))
+    known = none.known or Floor.unknown(T_odom_lidar)
+    floor, slack, cells = known.with_scan(points, ring, T_odom_lidar, params).find(params)
     none = replace(none, floor=floor)
     if not len(cells):
         return replace(none, reason="no seeds: no flat ground is seen around the scanner")

@@ -196,7 +196,9 @@ class GroundResult:
         down: (3,) unit direction of gravity in the LiDAR frame, as used.
         planarity: lambda3 / lambda2 of the seeds (nan without seeds); accepted below the limit.
         seeds: number of seed points. share: ground points over all points, 0-1.
-        floor: what is known of the floor around a scanner that sees none below itself; None before such a scan.
+        T_odom_lidar: (4, 4) as used; None for a lone scan.
+        known, floor: the floor around a scanner that sees none below itself, before this scan and with it; None if no
+            such scan has come.
     """
 
     labels: U8
@@ -208,6 +210,8 @@ class GroundResult:
     planarity: float
     seeds: int
     share: float
+    T_odom_lidar: F64 | None = None
+    known: Floor | None = None
     floor: Floor | None = None
 
 

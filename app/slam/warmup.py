@@ -1,6 +1,7 @@
 """Compile every kernel once, with progress. It takes a while on the first start of a new installation."""
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 
@@ -60,9 +61,10 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
 
 
 def _run_frames(scan: Scan, samples: ImuSamples, params: Params) -> None:
-    """With arrays that are read-only, and with writable copies once some points are out of range."""
+    """With arrays that are read-only, and with writable copies once some points are out of range; with ground seen
+    straight down, and without."""
     engine = Engine(params)
-    for farthest in (params.sensor.max_range, 4.0):
-        engine.params = params.with_values({"sensor.max_range": farthest})
+    for farthest, alpha in product((params.sensor.max_range, 4.0), (params.ground.alpha, 1.0)):
+        engine.params = params.with_values({"sensor.max_range": farthest, "ground.alpha": alpha})
         engine.relabel(engine.step(scan, samples))
     engine.close()

@@ -12,13 +12,14 @@ from app.slam.floor import Floor
 from app.slam.kernels.floor import CELLS, EDGE_M
 from app.slam.metrics import GroundScore
 from app.slam.sections import GroundParams
-from app.slam.types import NON_GROUND, GroundResult, ImuSamples, Scan
+from app.slam.types import NON_GROUND, GroundResult, ImuSamples, Scan, StepResult
 
 from .scenes import YARD, Rig, Scene, box, corridor, params_for, upright
 
 HEIGHT = 1.3
 """m, of the scanner above the floor."""
 PARAMS = GroundParams()
+RIG = Rig(T_imu_lidar=np.eye(4))
 
 
 def at(x: float, y: float = 0.0, tilt: float = 0.0) -> np.ndarray:
@@ -39,6 +40,13 @@ def walk(scene: Scene, xs: np.ndarray, floor: Floor | None = None) -> tuple[Grou
         result = segment(scan, at(x), floor)
         floor = result.floor
     return result, scan
+
+
+def step(engine: Engine, k: int) -> StepResult:
+    """The k-th frame of a scanner at rest in the yard."""
+    stamps = k * 100_000_000 + np.arange(0, 100_000_001, 5_000_000)
+    samples = ImuSamples(stamps, np.zeros((21, 3)), np.tile([0.0, 0.0, 9.81], (21, 1)))
+    return engine.step(replace(upright(YARD, seed=k), stamp_ns=(k + 1) * 100_000_000), samples)
 
 
 def score(result: GroundResult, scan: Scan) -> GroundScore:
@@ -140,13 +148,20 @@ def test_a_floor_found_once_does_not_change_when_the_next_scan_comes() -> None:
         np.testing.assert_array_equal(value, was)
 
 
-def test_the_engine_carries_the_floor_over_a_checkpoint_and_labels_a_frame_again_as_before() -> None:
-    def step(engine: Engine, k: int) -> object:
-        stamps = k * 100_000_000 + np.arange(0, 100_000_001, 5_000_000)
-        samples = ImuSamples(stamps, np.zeros((21, 3)), np.tile([0.0, 0.0, 9.81], (21, 1)))
-        return engine.step(replace(upright(YARD, seed=k), stamp_ns=(k + 1) * 100_000_000), samples)
+def test_the_ground_can_be_switched_on_while_a_frame_is_looked_at() -> None:
+    engine = Engine(params_for(RIG))
+    for k in range(12):
+        result = step(engine, k)
+    engine.params = params_for(RIG, {"ground.enabled": False})
+    off = step(engine, 12)
+    engine.params = params_for(RIG)
+    assert not off.cloud.labels.any()
+    assert engine.relabel(off).ground.share == pytest.approx(result.ground.share, rel=0.1)
+    engine.close()
 
-    engine = Engine(params_for(Rig(T_imu_lidar=np.eye(4))))
+
+def test_the_engine_carries_the_floor_over_a_checkpoint_and_labels_a_frame_again_as_before() -> None:
+    engine = Engine(params_for(RIG))
     for k in range(14):
         step(engine, k)
     state = engine.checkpoint()
@@ -156,6 +171,7 @@ def test_the_engine_carries_the_floor_over_a_checkpoint_and_labels_a_frame_again
     np.testing.assert_array_equal(again.cloud.labels, result.cloud.labels)
     engine.restore(state)
     np.testing.assert_array_equal(step(engine, 14).cloud.labels, result.cloud.labels)
-    engine.params = engine.params.with_values({"ground.sigma": 0.002})
-    assert engine.relabel(result).ground.share < result.ground.share
+    for name, value in (("sigma", 0.002), ("scan_lines", 1), ("enabled", False)):
+        engine.params = params_for(RIG, {f"ground.{name}": value})
+        assert engine.relabel(result).ground.share < result.ground.share, name
     engine.close()
