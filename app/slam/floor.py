@@ -90,7 +90,8 @@ def _corner(T_odom_lidar: F64) -> I64:
 
 def _move(cells: F32, by: I64, nothing: F64 | F32, out: F32) -> None:
     """The cells of a square that lies `by` (2,) cells farther; `nothing` in those that are new."""
-    out[:] = nothing
+    if by.any():
+        out[:] = nothing
     (i, j), (m, n) = np.maximum(by, 0), CELLS - np.abs(by)
     if min(m, n) > 0:
         a, b = np.maximum(-by, 0)
