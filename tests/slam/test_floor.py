@@ -66,6 +66,9 @@ def test_the_ground_far_out_is_found_in_a_second_of_scans_at_rest(tilt: float) -
         assert np.degrees(np.arccos(np.clip(result.normal @ T[2, :3], -1, 1))) < 0.5
     assert score(result, scan).recall > 0.85
     assert score(result, scan).precision > 0.9
+    assert floor is not None
+    heights = floor.known[floor.known[..., 1] > 0][:, 0]
+    assert (np.abs(heights + HEIGHT) < 0.05).mean() > 0.99  # little beside the floor is remembered
 
 
 @pytest.mark.parametrize("wall", [3.0, 0.9])

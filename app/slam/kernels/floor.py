@@ -57,7 +57,7 @@ def remember(seen, found, known):
             cell = known[i, j]
             if cell[1] and (lowest < cell[0] - _RISE_M or (flat and abs(mean - cell[0]) > _RISE_M)):
                 cell[1] = 0
-            elif flat and not np.isnan(found[i, j]):
+            elif flat and abs(mean - found[i, j]) < _RISE_M:
                 cell[1] = min(cell[1] + 1, _MOST_SCANS)
                 cell[0] = mean if cell[1] == 1 else cell[0] + (mean - cell[0]) / cell[1]
 
@@ -71,7 +71,7 @@ def find(seen, known, corner, p, sigma, cos_slope, heights, slack, seeds):
     and so are their neighbours at about the same height, and theirs. A cell beside the floor may be its edge.
 
     Arguments as `see` and `remember`; sigma m/m; cos_slope of the steepest plane. Out: heights (CELLS, CELLS) f32 m,
-    nan where there is no floor; slack (CELLS, CELLS) f32 m, how far a point of it may be off the height; seeds
+    nan where there is no floor; slack (CELLS, CELLS) f64 m, how far a point of it may be off the height; seeds
     (CELLS², 3) f64 m, from the LiDAR, odometry's axes: cells on the plane. Returns the number of seeds.
     """
     height, cells = np.full((CELLS, CELLS), np.nan), np.empty((CELLS * CELLS, 3))
