@@ -116,8 +116,8 @@ class Engine:
         watch.lap("deskew")
 
         # paper 2.2: the ground, and only the ground, is thinned before the filter's own scan voxel
-        T = predicted.state.T_odom_imu @ predicted.state.T_imu_lidar
-        surface = ground.segment(points, scan.ring, _down_in_lidar(predicted), p.ground, before.floor, T)
+        down, T_odom_lidar = _down_in_lidar(predicted), predicted.state.T_odom_lidar
+        surface = ground.segment(points, scan.ring, down, p.ground, before.floor, T_odom_lidar)
         watch.lap("ground")
         reduced = self._grid.downsample(points, p.ground.voxel_size, chosen=surface.labels)
         sampled = self._grid.downsample(reduced.points, p.scan.voxel_size)
@@ -242,7 +242,7 @@ class Engine:
         return predicted, replace(_NOT_REGISTERED, reason="the update gave no finite pose")
 
     def _insert(self, belief: Belief, points: np.ndarray, residual: float) -> None:
-        T = (belief.state.T_odom_imu @ belief.state.T_imu_lidar).astype(np.float32)
+        T = belief.state.T_odom_lidar.astype(np.float32)
         self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map, residual)
 
     def _keyframe(self, belief: Belief, cloud: Cloud, certainty: Certainty) -> Keyframe:

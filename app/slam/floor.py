@@ -1,7 +1,7 @@
-"""The floor around a scanner that sees none below itself, such as a Mid-360 held upright.
+"""The ground around a scanner that sees none below itself, such as a Mid-360 held upright.
 
-Such a scanner sees the floor only some ten metres ahead, in few points. So the floor is gathered while it walks: in
-square cells of half a metre, from the last scans, and from what earlier ones found to be floor.
+Such a scanner sees the ground only some ten metres ahead, in few points. So cells of half a metre around it keep what
+the last scans show, and which height earlier ones found to be ground. All of these cells together are the floor.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from app.slam.kernels.ground import last_line
 from app.slam.sections import GroundParams
 
 HALF = 5
-"""Scans until the older half of the last scans is dropped."""
+"""Scans in each half of the last scans. When the newer half is full, the older one is dropped."""
 _NOTHING = np.array([0.0, 0.0, np.inf, -np.inf], np.float32)
 
 
@@ -28,7 +28,7 @@ class Floor:
         T_odom_lidar: (4, 4), of the last scan. corner: (2,), index of the first cell; a cell's edge is EDGE_M.
         scans: number of scans seen.
         seen: (2, CELLS, CELLS, 4) of the last up to HALF scans and the HALF before: `kernels.COUNT` and so on.
-        known: (CELLS, CELLS, 2): heights (m) that earlier scans found, and the number of scans, 0 if none.
+        known: (CELLS, CELLS, 2): heights (m) that scans before the last found, and how many did; 0 if none.
         found: (CELLS, CELLS): heights that `find` found after the last scan; nan where there is no floor.
     """
 
@@ -85,11 +85,12 @@ class Floor:
 
 
 def _corner(T_odom_lidar: F64) -> I64:
+    """(2,) index of the first cell of the square around this pose."""
     return np.floor(T_odom_lidar[:2, 3] / EDGE_M).astype(np.int64) - CELLS // 2
 
 
 def _move(cells: F32, by: I64, nothing: F64 | F32, out: F32) -> None:
-    """The cells of a square that lies `by` (2,) cells farther; `nothing` in those that are new."""
+    """Fill `out` with the cells of a square that lies `by` (2,) cells farther; `nothing` where they are new."""
     if by.any():
         out[:] = nothing
     (i, j), (m, n) = np.maximum(by, 0), CELLS - np.abs(by)

@@ -1,7 +1,7 @@
 """Seed-point ground segmentation (paper 2.2, eq. 1-3).
 
-A scanner that sees nothing within alpha of straight down, such as a Mid-360 held upright, takes its seeds farther out,
-and from earlier scans: cells of the floor on its lowest plane (`app.slam.floor`).
+A scanner that sees nothing within alpha of straight down, such as a Mid-360 held upright, takes cells of the floor as
+seeds, farther out and from earlier scans (`app.slam.floor`).
 """
 
 from dataclasses import replace
@@ -91,6 +91,7 @@ def _plane(result: GroundResult, mean: F64, covariance: F64, params: GroundParam
 
 
 def _on_floor(points: F32, ring: U16, params: GroundParams, none: GroundResult) -> GroundResult:
+    """The labels by cells of the floor, and the plane of those that are its seeds. none: without any labels."""
     T_odom_lidar = none.T_odom_lidar
     if T_odom_lidar is None:
         T_odom_lidar = lie.transform(lie.between(none.down, np.array([0.0, 0.0, -1.0])), np.zeros(3))

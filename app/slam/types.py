@@ -161,6 +161,10 @@ class NavState:
         return T
 
     @property
+    def T_odom_lidar(self) -> F64:
+        return self.T_odom_imu @ self.T_imu_lidar
+
+    @property
     def p_odom_lidar(self) -> F64:
         return self.R_odom_imu @ self.p_imu_lidar + self.p_odom_imu
 

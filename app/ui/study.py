@@ -86,7 +86,7 @@ class StudyScene:
         self._plane("patch", patch.center, patch.normal, radius, _NEIGHBOURS)
         matches, i = result.registration.matches, picked.match
         if matches is not None and i >= 0 and matches.normals[i].any():
-            T = lie.inverse(result.state.T_odom_imu @ result.state.T_imu_lidar)
+            T = lie.inverse(result.state.T_odom_lidar)
             center, normal = lie.moved(T, matches.centers[i]), T[:3, :3] @ matches.normals[i]
             self._plane("map_patch", center, normal, radius, _MAP)
 

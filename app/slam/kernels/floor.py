@@ -1,4 +1,4 @@
-"""Cells of the floor around a scanner that sees none below itself: what scans show of them, and which are the floor."""
+"""Cells around a scanner that sees no ground below itself: what scans show in them, and which are the floor."""
 
 import math
 
