@@ -64,24 +64,24 @@ class Floor:
         kernels.see(points, ring, last_line(ring, params.scan_lines), T_odom_lidar[:3, :3], p, corner, seen[0])
         return replace(self, T_odom_lidar=T_odom_lidar, corner=corner, scans=self.scans + 1, seen=seen, known=known)
 
-    def find(self, params: GroundParams) -> tuple[Self, F64, F64]:
-        """The floor with its heights; how far a point of each cell may be off them; and the cells of its plane.
+    def find(self, params: GroundParams) -> tuple[Self, U8, F64]:
+        """The floor with its heights, what each cell is, and the cells of its plane.
 
         Returns:
-            This with `found`; (CELLS, CELLS) m, 0 where there is no floor; (k, 3) m, LiDAR frame.
+            This with `found`; (CELLS, CELLS), `kernels.NONE` and so on; (k, 3) m, LiDAR frame.
         """
-        found, slack = np.empty((CELLS, CELLS), np.float32), np.empty((CELLS, CELLS))
+        found, kinds = np.empty((CELLS, CELLS), np.float32), np.empty((CELLS, CELLS), np.uint8)
         seeds = np.empty((CELLS * CELLS, 3))
         R, p = self.T_odom_lidar[:3, :3], self.T_odom_lidar[:3, 3]
         steepest = float(np.cos(np.radians(params.max_slope)))
-        count = kernels.find(self.seen, self.known, self.corner, p, params.sigma, steepest, found, slack, seeds)
-        return replace(self, found=found), slack, seeds[:count] @ R
+        count = kernels.find(self.seen, self.known, self.corner, p, params.sigma, steepest, found, kinds, seeds)
+        return replace(self, found=found), kinds, seeds[:count] @ R
 
-    def label(self, points: F32, ring: U16, slack: F64, params: GroundParams, labels: U8) -> int:
+    def label(self, points: F32, ring: U16, kinds: U8, params: GroundParams, labels: U8) -> int:
         """Label the last scan's points by `found`; the number of points on the floor. See `kernels.label`."""
         R, p = self.T_odom_lidar[:3, :3], self.T_odom_lidar[:3, 3]
         last = last_line(ring, params.scan_lines)
-        return int(kernels.label(points, ring, last, R, p, self.corner, self.found, slack, params.sigma, labels))
+        return int(kernels.label(points, ring, last, R, p, self.corner, self.found, kinds, params.sigma, labels))
 
 
 def _corner(T_odom_lidar: F64) -> I64:

@@ -96,13 +96,13 @@ def _on_floor(points: F32, ring: U16, params: GroundParams, none: GroundResult) 
     if T_odom_lidar is None:
         T_odom_lidar = lie.transform(lie.between(none.down, np.array([0.0, 0.0, -1.0])), np.zeros(3))
     known = none.known or Floor.unknown(T_odom_lidar)
-    floor, slack, cells = known.with_scan(points, ring, T_odom_lidar, params).find(params)
+    floor, kinds, cells = known.with_scan(points, ring, T_odom_lidar, params).find(params)
     none = replace(none, floor=floor)
     if not len(cells):
         return replace(none, reason="no seeds: no flat ground is seen around the scanner")
     result = _plane(none, cells.mean(axis=0), np.cov(cells.T, bias=True), params)
     if not result.found:
         return result
-    count = floor.label(points, ring, slack, params, none.labels)
+    count = floor.label(points, ring, kinds, params, none.labels)
     seeds = int(np.count_nonzero(none.labels == SEED))
     return replace(result, share=count / len(points), seeds=seeds)

@@ -12,7 +12,7 @@ from app.slam.floor import Floor
 from app.slam.kernels.floor import CELLS, EDGE_M
 from app.slam.metrics import GroundScore
 from app.slam.sections import GroundParams
-from app.slam.types import NON_GROUND, GroundResult, ImuSamples, Scan, StepResult
+from app.slam.types import NON_GROUND, SEED, GroundResult, ImuSamples, Scan, StepResult
 
 from .scenes import YARD, Rig, Scene, box, corridor, params_for, upright
 
@@ -67,6 +67,8 @@ def test_the_ground_far_out_is_found_in_a_second_of_scans_at_rest(tilt: float) -
     assert score(result, scan).recall > 0.85
     assert score(result, scan).precision > 0.9
     assert floor is not None
+    assert 0.5 < np.count_nonzero(result.labels == SEED) / np.count_nonzero(result.labels) < 1.0
+    assert result.seeds == np.count_nonzero(result.labels == SEED)
     heights = floor.known[floor.known[..., 1] > 0][:, 0]
     assert (np.abs(heights + HEIGHT) < 0.05).mean() > 0.99  # little beside the floor is remembered
 

@@ -9,6 +9,8 @@ CELLS, EDGE_M = 128, 0.5
 """Cells along each side of the square, and the length of a cell's edge."""
 COUNT, MEAN, LOWEST, HIGHEST = range(4)
 """Of the heights (m, odometry's frame) that scans show in a cell. Mean and count are of points on the lowest lines."""
+NONE, BESIDE, FLOOR, PLANE = range(4)
+"""What a cell is: nothing, beside the floor, floor, or floor on its plane."""
 _HEAD_M = 0.5
 """Points up to this height above the scanner show a wall too: what a near one has below it is low and looks flat."""
 _FLAT_M = 0.15
@@ -63,7 +65,7 @@ def remember(seen, found, known):
 
 
 @njit(cache=True, nogil=True)
-def find(seen, known, corner, p, sigma, cos_slope, heights, slack, seeds):
+def find(seen, known, corner, p, sigma, cos_slope, heights, kinds, seeds):
     """Find the floor: the lowest plane that most cells share, and from there on cell by cell.
 
     A cell is flat if its heights differ little, which a wall's do not. Of planes through three cells that are flat or
@@ -71,15 +73,15 @@ def find(seen, known, corner, p, sigma, cos_slope, heights, slack, seeds):
     and so are their neighbours at about the same height, and theirs. A cell beside the floor may be its edge.
 
     Arguments as `see` and `remember`; sigma m/m; cos_slope of the steepest plane. Out: heights (CELLS, CELLS) f32 m,
-    nan where there is no floor; slack (CELLS, CELLS) f64 m, how far a point of it may be off the height; seeds
-    (CELLS², 3) f64 m, from the LiDAR, odometry's axes: cells on the plane. Returns the number of seeds.
+    nan where there is no floor; kinds (CELLS, CELLS) u8, NONE to PLANE; seeds (CELLS², 3) f64 m, from the LiDAR,
+    odometry's axes: cells on the plane. Returns the number of seeds.
     """
     height, cells = np.full((CELLS, CELLS), np.nan), np.empty((CELLS * CELLS, 3))
     index = np.empty((CELLS * CELLS, 2), np.int64)
     count = 0
     for i in range(CELLS):
         for j in range(CELLS):
-            heights[i, j], slack[i, j] = np.nan, 0.0
+            heights[i, j], kinds[i, j] = np.nan, NONE
             points, mean, lowest, highest = _both(seen, i, j)
             if known[i, j, 1] and lowest >= known[i, j, 0] - _RISE_M:
                 height[i, j] = known[i, j, 0]
@@ -104,16 +106,16 @@ def find(seen, known, corner, p, sigma, cos_slope, heights, slack, seeds):
         if abs((cells[k] - chosen) @ plane) < sigma * np.linalg.norm(cells[k]):
             seeds[found] = cells[k]
             queue[found] = index[k]
-            heights[index[k, 0], index[k, 1]] = height[index[k, 0], index[k, 1]]
+            i, j = index[k]
+            heights[i, j], kinds[i, j] = height[i, j], PLANE
             found += 1
     reached, nearest, k = found, np.full((CELLS, CELLS), 3), 0
     while k < reached:
         i, j = queue[k]
-        slack[i, j] = _RISE_M
         for u in range(max(i - 1, 0), min(i + 2, CELLS)):
             for v in range(max(j - 1, 0), min(j + 2, CELLS)):
                 if np.isnan(heights[u, v]) and abs(height[u, v] - heights[i, j]) < _RISE_M:
-                    heights[u, v] = height[u, v]
+                    heights[u, v], kinds[u, v] = height[u, v], FLOOR
                     queue[reached, 0], queue[reached, 1] = u, v
                     reached += 1
         k += 1
@@ -122,14 +124,16 @@ def find(seen, known, corner, p, sigma, cos_slope, heights, slack, seeds):
         for u in range(max(i - 1, 0), min(i + 2, CELLS)):
             for v in range(max(j - 1, 0), min(j + 2, CELLS)):
                 distance = abs(u - i) + abs(v - j)
-                if slack[u, v] < _RISE_M and distance < nearest[u, v]:
-                    nearest[u, v], slack[u, v], heights[u, v] = distance, _FOOT_M, heights[i, j]
+                if kinds[u, v] <= BESIDE and distance < nearest[u, v]:
+                    nearest[u, v], kinds[u, v], heights[u, v] = distance, BESIDE, heights[i, j]
     return found
 
 
 @njit(cache=True, nogil=True)
-def label(points, ring, last, R, p, corner, heights, slack, sigma, labels):
-    """Label 1 the points on the floor, 2 those of them on the lowest lines, 0 others. Arguments as `see` and `find`.
+def label(points, ring, last, R, p, corner, heights, kinds, sigma, labels):
+    """Label 1 the points on the floor, 2 those of them on the lowest lines in cells of the plane, 0 others.
+
+    Arguments as `see` and `find`.
 
     Out: labels (n,) u8. Returns the number of points on the floor.
     """
@@ -137,10 +141,11 @@ def label(points, ring, last, R, p, corner, heights, slack, sigma, labels):
     for k in range(len(points)):
         labels[k] = 0
         i, j, height, distance = _cell(points[k], R, p, corner)
-        if not (0 <= i < CELLS and 0 <= j < CELLS) or slack[i, j] == 0.0:
+        if not (0 <= i < CELLS and 0 <= j < CELLS) or kinds[i, j] == NONE:
             continue
-        if abs(height - heights[i, j]) < min(slack[i, j], sigma * distance):
-            labels[k] = 2 if ring[k] < last else 1
+        most = _FOOT_M if kinds[i, j] == BESIDE else _RISE_M
+        if abs(height - heights[i, j]) < min(most, sigma * distance):
+            labels[k] = 2 if kinds[i, j] == PLANE and ring[k] < last else 1
             count += 1
     return count
 
