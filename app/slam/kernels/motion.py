@@ -19,7 +19,7 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
     Out: knots, times knot_t (m,) s and poses knot_T (m, 3, 4), at most `max_step` s apart. Returns their number.
     """
     d = P.shape[0]
-    F = np.zeros((d, d))
+    F = np.zeros((9, d))  # rows of rotation, position and velocity; the other states stay
     dR = np.empty((3, 3))
     Rm = np.empty((3, 3))
     Rn = np.empty((3, 3))
@@ -43,8 +43,6 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
             w[i] = 0.5 * (gyro[s, i] + gyro[s + 1, i]) - bg[i]
             a[i] = 0.5 * (accel[s, i] + accel[s + 1, i]) - ba[i]
         F[:] = 0.0
-        for i in range(d):
-            F[i, i] = 1.0
         rotation(-w[0] * dt, -w[1] * dt, -w[2] * dt, dR)
         rotation(0.5 * w[0] * dt, 0.5 * w[1] * dt, 0.5 * w[2] * dt, Rm)
         Rn[:] = R @ Rm
@@ -53,6 +51,7 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
                 F[i, j] = dR[i, j]
                 F[6 + i, 12 + j] = -Rn[i, j] * dt
             F[i, 9 + i] = -dt
+            F[3 + i, 3 + i] = F[6 + i, 6 + i] = 1.0
             F[3 + i, 6 + i] = dt
             # -R [a]x dt, columns
             F[6 + i, 0] = -(Rn[i, 1] * a[2] - Rn[i, 2] * a[1]) * dt
@@ -62,8 +61,10 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
             cross(B[:, j], g, aw)  # -[g]x b = b x g
             for i in range(3):
                 F[6 + i, 15 + j] = aw[i] * dt
-        T1[:] = F @ P
-        P[:] = T1 @ F.T
+        T1[:] = P
+        T1[:9] = F @ P
+        P[:] = T1
+        P[:, :9] = T1 @ F.T
         ng, na = noise[0], noise[1]
         if bridged[s]:
             ng, na = noise[4], noise[5]
