@@ -15,7 +15,6 @@ import open3d
 from tqdm import tqdm
 
 from app.sensors.simulator.imperfections import IMPERFECT, NONE, Imperfections, Unit, companions, livelier
-from app.sensors.simulator.lidar import Lidar
 from app.sensors.simulator.raycast import Mover, Raycaster
 from app.sensors.simulator.scanners import SCANNERS
 from app.sensors.simulator.scenes import build_scene
@@ -75,10 +74,10 @@ class _Walk:
         caster = Raycaster(place.mesh, tuple(body.mover for body in self._people))
         turns = DEVICE.patterns(RATE_HZ, EVERY_BLOCK, None)
         self._unit = Unit(sizes, _random(seed, 4), turns(0).channels) if sizes != NONE else None
-        lidar = Lidar(turns(0), DEVICE.R_imu_lidar, DEVICE.p_imu_lidar, farthest=DEVICE.farthest, unit=self._unit)
+        lidar = replace(DEVICE.lidar, unit=self._unit)
         starts = np.arange(0.05, DURATION_S - 0.15, 1 / RATE_HZ)
         scans = (
-            replace(lidar, pattern=turns(index)).turn(caster, self._trajectory, at, START_NS, _random(seed, 3, index))
+            lidar.turn(turns(index), caster, self._trajectory, at, START_NS, _random(seed, 3, index))
             for index, at in enumerate(starts)
         )
         self.keyframes = _keyframes([scan for scan in scans if len(scan)], _imu(self._trajectory, self._unit, seed))
@@ -101,7 +100,7 @@ class _Walk:
         if self._unit is not None:  # as the scanner is mounted, not as is written
             points = self._unit.fired(np.ones_like(points), points)[1]
         (p,), (R,) = self._trajectory.poses(seconds(np.array([end])))
-        world = (points @ DEVICE.R_imu_lidar.T + DEVICE.p_imu_lidar) @ R.T + p
+        world = (points @ DEVICE.lidar.R_imu_lidar.T + DEVICE.lidar.p_imu_lidar) @ R.T + p
         times = seconds(end - int(cloud.offsets_ns.max()) + cloud.offsets_ns.astype(np.int64))
         distances = [np.full(len(world), np.inf), *(body.distance(world, times) for body in self._people)]
         return np.asarray(np.min(distances, axis=0), np.float64)
@@ -125,7 +124,7 @@ class _Body:
 
 
 def _keyframes(scans: list[Scan], imu: ImuSamples) -> list[Keyframe]:
-    params = Params().with_values({"sensor.translation": tuple(DEVICE.p_imu_lidar.tolist())})
+    params = Params().with_values({"sensor.translation": tuple(DEVICE.lidar.p_imu_lidar.tolist())})
     engine, ends = Engine(params), [int(imu.stamps_ns[0]), *(scan.end_ns for scan in scans)]
     for scan, (before, end) in zip(scans, pairwise(ends), strict=True):
         first = max(int(np.searchsorted(imu.stamps_ns, before, side="right")) - 1, 0)

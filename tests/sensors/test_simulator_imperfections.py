@@ -19,7 +19,8 @@ from app.slam.errors import HemislamError
 from app.slam.types import F64, ImuSamples, Scan
 
 EPOCH_NS = 1_700_000_000_000_000_000
-EXACT = Lidar(firing_pattern(every_block=12), range_noise=0.0, range_step=0.0, lossless=True)
+PATTERN = firing_pattern(every_block=12)
+EXACT = Lidar(range_noise=0.0, range_step=0.0, lossless=True)
 
 
 def walking() -> SmoothTrajectory:
@@ -41,7 +42,7 @@ def room(pane: bool = False) -> MeshBuilder:
 def fire(errors: Imperfections, mesh: MeshBuilder) -> Scan:
     unit = Unit(errors, np.random.default_rng(1))
     caster = Raycaster(mesh.build())
-    return replace(EXACT, unit=unit).turn(caster, walking(), 0.05, EPOCH_NS, np.random.default_rng(2))
+    return replace(EXACT, unit=unit).turn(PATTERN, caster, walking(), 0.05, EPOCH_NS, np.random.default_rng(2))
 
 
 def away(scan: Scan) -> F64:
@@ -67,7 +68,7 @@ def test_a_biased_channel_is_off_by_the_same_distance_in_every_firing() -> None:
 
 def test_a_channels_elevation_error_bends_its_cone() -> None:
     unit = Unit(Imperfections(elevation=0.12), np.random.default_rng(1))
-    pattern = EXACT.pattern
+    pattern = PATTERN
     bent, _ = unit.fired(pattern.directions, pattern.levers)
     np.testing.assert_allclose(np.linalg.norm(bent, axis=1), 1.0)
     change = np.degrees(np.arcsin(bent[:, 2]) - np.arcsin(pattern.directions[:, 2])).reshape(-1, 32)
@@ -100,7 +101,7 @@ def test_beams_pass_a_pane_and_return_from_behind_it() -> None:
 
 
 def test_the_mounting_differs_by_its_angle_and_distance() -> None:
-    pattern = EXACT.pattern
+    pattern = PATTERN
     unit = Unit(Imperfections(mount_rotation=0.7, mount_translation=0.01), np.random.default_rng(3))
     directions, levers = unit.fired(pattern.directions, pattern.levers)
     R, *_ = np.linalg.lstsq(pattern.directions, directions, rcond=None)

@@ -11,7 +11,7 @@ import pytest
 
 from app.sensors.live.difop import ChannelAngles
 from app.sensors.robosense import BPEARL, BPV4
-from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, firing_pattern
+from app.sensors.simulator.lidar import P_IMU_LIDAR, Lidar, Pattern, firing_pattern
 from app.sensors.simulator.mesh import Mesh, MeshBuilder
 from app.sensors.simulator.raycast import Mover, Raycaster
 from app.sensors.simulator.scenes import SCENES, build_scene
@@ -45,8 +45,10 @@ def wall_at(x: float, reflectivity: float = 0.6) -> Mesh:
     return mesh.build()
 
 
-def fire(lidar: Lidar, mesh: Mesh, trajectory: SmoothTrajectory, *movers: Mover, seed: int = 0) -> Scan:
-    return lidar.turn(Raycaster(mesh, movers), trajectory, 0.05, EPOCH_NS, np.random.default_rng(seed))
+def fire(
+    lidar: Lidar, mesh: Mesh, trajectory: SmoothTrajectory, *movers: Mover, seed: int = 0, pattern: Pattern = COARSE
+) -> Scan:
+    return lidar.turn(pattern, Raycaster(mesh, movers), trajectory, 0.05, EPOCH_NS, np.random.default_rng(seed))
 
 
 def stamps(scan: Scan) -> I64:
@@ -99,7 +101,7 @@ def test_the_azimuth_turns_from_x_towards_minus_y_while_a_block_fires() -> None:
 @pytest.mark.parametrize("step", [0.005, 0.0025])
 def test_a_wall_is_measured_where_it_stands_to_half_a_step(step: float) -> None:
     trajectory = still(yaw=0.3)
-    returns = fire(Lidar(COARSE, range_noise=0.0, range_step=step, lossless=True), wall_at(5.0), trajectory)
+    returns = fire(Lidar(range_noise=0.0, range_step=step, lossless=True), wall_at(5.0), trajectory)
     beam = np.einsum("nij,nj->ni", trajectory.poses(seconds(COARSE.offsets_ns))[1], COARSE.directions)
     hits = 5.0 / np.maximum(beam[:, 0], 1e-9) < 99.0  # every beam that points at it returns
     assert abs(len(returns.points) - hits.sum()) < 0.01 * hits.sum()
@@ -108,7 +110,7 @@ def test_a_wall_is_measured_where_it_stands_to_half_a_step(step: float) -> None:
 
 def test_range_noise_has_the_spread_asked_for() -> None:
     trajectory = still()
-    returns = fire(Lidar(COARSE, range_noise=0.02, range_step=0.0, lossless=True), wall_at(5.0), trajectory)
+    returns = fire(Lidar(range_noise=0.02, range_step=0.0, lossless=True), wall_at(5.0), trajectory)
     off = in_world(returns, trajectory)[:, 0] - 5.0
     beam = returns.points - [0, 0, BPEARL.rz]
     along = off / (beam[:, 2] / np.linalg.norm(beam, axis=1))
@@ -118,9 +120,9 @@ def test_range_noise_has_the_spread_asked_for() -> None:
 
 @pytest.mark.parametrize("rate_hz", [10, 20])
 def test_points_of_a_hurried_turn_lie_on_the_wall_by_their_own_poses_only(rate_hz: int) -> None:
-    lidar = Lidar(firing_pattern(rate_hz=rate_hz, every_block=12), range_noise=0.0, lossless=True)
+    lidar, pattern = Lidar(range_noise=0.0, lossless=True), firing_pattern(rate_hz=rate_hz, every_block=12)
     trajectory = hurried()
-    returns = fire(lidar, wall_at(5.0), trajectory)
+    returns = fire(lidar, wall_at(5.0), trajectory, pattern=pattern)
     assert len(returns.points) > 1000
     assert np.abs(in_world(returns, trajectory)[:, 0] - 5.0).max() < 0.003
     end = np.full(len(returns.points), returns.end_ns)
@@ -128,7 +130,7 @@ def test_points_of_a_hurried_turn_lie_on_the_wall_by_their_own_poses_only(rate_h
 
 
 def test_far_dark_and_grazing_surfaces_return_less() -> None:
-    lidar = Lidar(COARSE)
+    lidar = Lidar()
     near = len(fire(lidar, wall_at(5.0, 0.5), still()).points)
     far = len(fire(lidar, wall_at(60.0, 0.5), still()).points)
     dark = len(fire(lidar, wall_at(5.0, 0.01), still()).points)
@@ -139,7 +141,7 @@ def test_far_dark_and_grazing_surfaces_return_less() -> None:
 
 
 def test_brighter_materials_look_brighter() -> None:
-    lidar = Lidar(COARSE)
+    lidar = Lidar()
     dim, bright = (fire(lidar, wall_at(4.0, r), still()).intensity for r in (0.2, 0.8))
     assert np.median(bright) > 3 * np.median(dim)
     assert bright.max() <= 255 and (bright == np.rint(bright)).all()
@@ -154,9 +156,7 @@ def test_a_moving_plate_is_hit_where_it_is_at_each_firing() -> None:
         return np.column_stack([5.0 - 8.0 * t, zero, zero]), zero
 
     trajectory = still()
-    returns = fire(
-        Lidar(COARSE, range_noise=0.0, lossless=True), wall_at(70.0, 1e-4), trajectory, Mover(plate.build(), pose)
-    )
+    returns = fire(Lidar(range_noise=0.0, lossless=True), wall_at(70.0, 1e-4), trajectory, Mover(plate.build(), pose))
     x = in_world(returns, trajectory)[:, 0]
     struck = x < 6.0
     assert struck.sum() > 1000
@@ -168,10 +168,11 @@ def test_a_moving_plate_is_hit_where_it_is_at_each_firing() -> None:
 def test_a_person_who_walks_is_seen_to_walk() -> None:
     someone = pedestrian(rectangle(2.0, -30.0, 4.0, 30.0), speed=1.4, start=30.0)
     caster = Raycaster(wall_at(200.0), (someone,))
-    lidar, trajectory = Lidar(firing_pattern(every_block=2)), still()
+    lidar, pattern, trajectory = Lidar(), firing_pattern(every_block=2), still()
     middles = []
     for start_s in (0.0, 1.0):
-        seen = in_world(lidar.turn(caster, trajectory, start_s, EPOCH_NS, np.random.default_rng(0)), trajectory)
+        returns = lidar.turn(pattern, caster, trajectory, start_s, EPOCH_NS, np.random.default_rng(0))
+        seen = in_world(returns, trajectory)
         assert len(seen) > 30
         assert seen[:, 2].min() > -0.1 and seen[:, 2].max() < 1.8
         middles.append(seen.mean(axis=0))
@@ -182,8 +183,9 @@ def test_a_person_who_walks_is_seen_to_walk() -> None:
 def test_the_floor_is_labelled_ground_and_nothing_else_is() -> None:
     scene = build_scene("room", seed=2)
     trajectory = walk(scene.path, 4.0, np.random.default_rng(0), walker=Walker())
-    lidar = Lidar(COARSE, range_noise=0.0)
-    returns = lidar.turn(Raycaster(scene.mesh, scene.movers), trajectory, 3.0, EPOCH_NS, np.random.default_rng(0))
+    lidar = Lidar(range_noise=0.0)
+    caster = Raycaster(scene.mesh, scene.movers)
+    returns = lidar.turn(COARSE, caster, trajectory, 3.0, EPOCH_NS, np.random.default_rng(0))
     z = in_world(returns, trajectory)[:, 2]
     ground = returns.truth_ground == 1
     assert 0.1 < ground.mean() < 0.6

@@ -60,8 +60,8 @@ def knee_high_on_slopes() -> tuple[list[Scan], list[F64]]:
     scene = build_scene("outdoor", seed=3)
     walker, rng = Walker(height=0.5), np.random.default_rng(3)
     trajectory = walk(scene.path, 26.0, rng, walker=walker, closed=scene.closed, height=scene.height)
-    lidar, caster = Lidar(firing_pattern(every_block=12)), Raycaster(scene.mesh, scene.movers)
-    scans = [lidar.turn(caster, trajectory, 3.0 + 1.1 * k, 0, np.random.default_rng(k)) for k in range(20)]
+    pattern, caster = firing_pattern(every_block=12), Raycaster(scene.mesh, scene.movers)
+    scans = [Lidar().turn(pattern, caster, trajectory, 3.0 + 1.1 * k, 0, np.random.default_rng(k)) for k in range(20)]
     _, rotations = trajectory.poses(seconds(np.array([scan.end_ns for scan in scans])))
     return scans, [R.T @ np.array([0.0, 0.0, -1.0]) for R in rotations]
 

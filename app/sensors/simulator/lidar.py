@@ -85,7 +85,6 @@ class Lidar:
     unit: the errors of one scanner; None: it has none.
     """
 
-    pattern: Pattern = field(default_factory=firing_pattern)
     R_imu_lidar: F64 = field(default_factory=lambda: np.eye(3))
     p_imu_lidar: F64 = field(default_factory=P_IMU_LIDAR.copy)
     farthest: float = MAX_RANGE_M
@@ -97,15 +96,20 @@ class Lidar:
     unit: Unit | None = None
 
     def turn(
-        self, scene: Raycaster, trajectory: SmoothTrajectory, start_s: float, epoch_ns: int, rng: np.random.Generator
+        self,
+        pattern: Pattern,
+        scene: Raycaster,
+        trajectory: SmoothTrajectory,
+        start_s: float,
+        epoch_ns: int,
+        rng: np.random.Generator,
     ) -> Scan:
-        """One revolution that starts `start_s` after `epoch_ns` (the trajectory's time 0).
+        """The firings of one revolution that starts `start_s` after `epoch_ns` (the trajectory's time 0).
 
         The points come in firing order; the intensity is a whole number, the truth of the ground is given.
         """
-        pattern = self.pattern
         start_ns = round(start_s * 1e9)
-        origins, directions = self._rays(trajectory, start_ns)
+        origins, directions = self._rays(pattern, trajectory, start_ns)
         times = seconds(start_ns + pattern.offsets_ns)
         hits = scene.cast(origins, directions, times)
 
@@ -139,13 +143,12 @@ class Lidar:
             hits.ground[kept],
         )
 
-    def _rays(self, trajectory: SmoothTrajectory, start_ns: int) -> tuple[F64, F64]:
+    def _rays(self, pattern: Pattern, trajectory: SmoothTrajectory, start_ns: int) -> tuple[F64, F64]:
         """Every firing's ray in the world, from the pose at its own time.
 
         Poses are computed at both ends of each block and interpolated between: within 55 us a hand's motion deviates
         from a straight line by nanometres.
         """
-        pattern = self.pattern
         if self.unit is not None:
             directions, levers = self.unit.fired(pattern.directions, pattern.levers)
             pattern = replace(pattern, directions=directions, levers=levers)

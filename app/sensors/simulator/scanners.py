@@ -10,7 +10,7 @@ import numpy as np
 from app.sensors import robosense, ros
 from app.sensors.presets import PRESETS
 from app.sensors.robosense import AIRY
-from app.sensors.simulator.lidar import P_IMU_LIDAR, Pattern, firing_pattern, turning
+from app.sensors.simulator.lidar import Lidar, Pattern, firing_pattern, turning
 from app.sensors.simulator.trajectory import GRAVITY, R_BODY_IMU
 from app.slam import lie
 from app.slam.errors import HemislamError
@@ -34,20 +34,13 @@ class Scanner:
     Attributes:
         patterns: (rate in Hz, fire every k-th block, folder with the maker's tables) -> its firings.
         upright: held with the LiDAR's z up and its x forward; otherwise its z looks forward and its x down.
-        R_imu_lidar, p_imu_lidar: its mounting, p in m.
-        farthest: m. rated: (m, reflectivity) at which half of the beams return.
-        range_noise, coordinate_step: m. rates_hz: at which it can turn.
+        lidar: its mounting, range and noise. rates_hz: at which it can turn.
         layout: of its recordings. accel_unit: m/s² that its driver calls 1.
     """
 
     patterns: Callable[[int, int, Path | None], PatternOfTurn]
+    lidar: Lidar
     upright: bool = False
-    R_imu_lidar: F64 = field(default_factory=lambda: np.eye(3))
-    p_imu_lidar: F64 = field(default_factory=lambda: np.zeros(3))
-    farthest: float = 100.0
-    rated: tuple[float, float] = (30.0, 0.1)
-    range_noise: float = 0.005
-    coordinate_step: float = 0.0
     rates_hz: tuple[int, ...] = (_RATE_HZ,)
     layout: ros.Layout = field(default_factory=ros.Layout)
     accel_unit: float = 1.0
@@ -56,7 +49,7 @@ class Scanner:
     def R_body_imu(self) -> F64:
         """How the IMU lies in the walker's frame: x forward, y left, z up."""
         R_body_lidar = np.eye(3) if self.upright else R_BODY_IMU
-        return np.asarray(R_body_lidar @ self.R_imu_lidar.T)
+        return np.asarray(R_body_lidar @ self.lidar.R_imu_lidar.T)
 
 
 def _bpearl(rate_hz: int, every_block: int, _: Path | None) -> PatternOfTurn:
@@ -116,31 +109,29 @@ def _hesai(scan: Any) -> bytes:
     return ros.serialised(ros.cloud_message(scan, stamp_ns=scan.stamp_ns, frame="hesai_lidar"))
 
 
-def _rotation(preset: str) -> F64:
-    return lie.from_rpy_degrees(PRESETS[preset]["sensor"]["rotation"])
-
-
-def _translation(preset: str) -> F64:
-    return np.array(PRESETS[preset]["sensor"]["translation"])
-
-
 SCANNERS: dict[str, Scanner] = {
-    "bpearl": Scanner(_bpearl, p_imu_lidar=P_IMU_LIDAR, rates_hz=robosense.ROTATION_RATES_HZ),
+    "bpearl": Scanner(_bpearl, Lidar(), rates_hz=robosense.ROTATION_RATES_HZ),
     "airy": Scanner(
         _airy,
-        R_imu_lidar=_rotation("airy"),
+        Lidar(lie.from_rpy_degrees(PRESETS["airy"]["sensor"]["rotation"]), np.zeros(3)),
         layout=ros.AIRY_LAYOUT,
         accel_unit=GRAVITY,
     ),
-    "jt128": Scanner(_jt128, farthest=60.0, layout=ros.Layout("/lidar_points", "/lidar_imu", encode=_hesai)),
+    "jt128": Scanner(
+        _jt128,
+        Lidar(p_imu_lidar=np.zeros(3), farthest=60.0),
+        layout=ros.Layout("/lidar_points", "/lidar_imu", encode=_hesai),
+    ),
     "mid360": Scanner(
         _mid360,
+        Lidar(
+            p_imu_lidar=np.array(PRESETS["mid360"]["sensor"]["translation"]),
+            farthest=70.0,
+            rated=(40.0, 0.1),
+            range_noise=0.01,
+            coordinate_step=0.001,
+        ),
         upright=True,
-        p_imu_lidar=_translation("mid360"),
-        farthest=70.0,
-        rated=(40.0, 0.1),
-        range_noise=0.01,
-        coordinate_step=0.001,
         layout=ros.MID360_LAYOUT,
         accel_unit=GRAVITY,
     ),

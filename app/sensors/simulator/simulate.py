@@ -122,16 +122,8 @@ def simulate(
     caster = Raycaster(place.mesh, (*place.movers, *company))
     turns = device.patterns(rate_hz, every_block, tables)
     unit = None if imperfections == NONE else unit_of(imperfections, seed, turns(0).channels)
-    lidar = Lidar(
-        turns(0),
-        device.R_imu_lidar,
-        device.p_imu_lidar,
-        farthest=device.farthest,
-        rated=device.rated,
-        range_noise=device.range_noise,
-        range_step=range_step,
-        coordinate_step=coordinate_step or device.coordinate_step,
-        unit=unit,
+    lidar = replace(
+        device.lidar, range_step=range_step, coordinate_step=coordinate_step or device.lidar.coordinate_step, unit=unit
     )
     imu_stamps = START_NS + np.arange(round(duration_s * IMU_RATE_HZ) + 1, dtype=np.int64) * _IMU_PERIOD_NS
     imu = measured(trajectory, imu_stamps, START_NS, ImuNoise(), _random(seed, _IMU))
@@ -164,8 +156,8 @@ def simulate(
             recording = RecordingWriter(file, device.layout)
             for index in range(total):
                 start_s = _FIRST_TURN_S + index / rate_hz
-                lidar = replace(lidar, pattern=turns(index))
-                scan = lidar.turn(caster, trajectory, start_s, START_NS, _random(seed, _LIDAR, index))
+                rng = _random(seed, _LIDAR, index)
+                scan = lidar.turn(turns(index), caster, trajectory, start_s, START_NS, rng)
                 if not len(scan):
                     continue
                 points += len(scan)
@@ -179,7 +171,7 @@ def simulate(
             add_fixes(int(imu.stamps_ns[-1]))
             recording.finish()
         _write_truth(truth, trajectory, np.array(ends, np.int64))
-        params.write_text(_SIDECAR + yaml.safe_dump(_settings(device)))
+        params.write_text(_SIDECAR + yaml.safe_dump(_settings(device.lidar)))
         if gnss is not None:
             out.with_name(f"{out.stem}_georeference.json").write_text(gnss.reference.to_json(), encoding="utf-8")
         unfinished.replace(out)
@@ -217,11 +209,11 @@ def trajectory_through(
 _SIDECAR = "# Mounting of the simulated scanner; read with the recording beside it.\n"
 
 
-def _settings(device: Scanner) -> dict[str, Any]:
+def _settings(lidar: Lidar) -> dict[str, Any]:
     """The parameters that a recording of it is read with."""
-    sensor = {"translation": device.p_imu_lidar.tolist()}
-    if not np.array_equal(device.R_imu_lidar, np.eye(3)):
-        sensor["rotation"] = list(lie.rpy_degrees(device.R_imu_lidar))
+    sensor = {"translation": lidar.p_imu_lidar.tolist()}
+    if not np.array_equal(lidar.R_imu_lidar, np.eye(3)):
+        sensor["rotation"] = list(lie.rpy_degrees(lidar.R_imu_lidar))
     return {"sensor": sensor}
 
 

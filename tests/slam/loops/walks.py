@@ -68,11 +68,11 @@ def take(
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     chosen = np.unique(np.searchsorted(walked, np.arange(0.0, walked[-1], spacing_m)))
     caster = Raycaster(place.mesh, place.movers)
-    lidar = Lidar(firing_pattern(every_block=every_block))
+    lidar, pattern = Lidar(), firing_pattern(every_block=every_block)
     keyframes = []
     for index, k in enumerate(chosen.tolist()):
         returns = lidar.turn(
-            caster, _Still(positions[k], rotations[k]), t[k], EPOCH_NS, np.random.default_rng([seed, index])
+            pattern, caster, _Still(positions[k], rotations[k]), t[k], EPOCH_NS, np.random.default_rng([seed, index])
         )  # type: ignore[arg-type]
         count = len(returns.points)
         cloud = Cloud(
