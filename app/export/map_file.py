@@ -30,7 +30,7 @@ KEYFRAME = np.dtype(
     + [(name, "<f8") for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
 )
 """How many of the points are its own, the end of its scan, and T_map_lidar."""
-_COMMENT = "hemislam map, metres, z up"
+COMMENT = "hemislam map, metres, z up"
 
 
 def write(path: Path, blocks: Iterable[Block]) -> tuple[int, int]:
@@ -39,9 +39,9 @@ def write(path: Path, blocks: Iterable[Block]) -> tuple[int, int]:
     """
     keyframes, count, moving = [], 0, 0
     with path.open("wb") as file:
-        file.write(header(VERTEX, 0, _COMMENT, keyframe=KEYFRAME))
+        file.write(header(VERTEX, 0, COMMENT, keyframe=KEYFRAME))
         for block in blocks:
-            file.write(_vertices(block).data)
+            file.write(vertices_of(block, VERTEX).data)
             T = block.T_map_lidar
             pose = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
             keyframes.append((len(block), *divmod(block.stamp_ns, 1_000_000_000), *pose))
@@ -49,12 +49,13 @@ def write(path: Path, blocks: Iterable[Block]) -> tuple[int, int]:
             moving += int(np.count_nonzero(block.labels == MOVING))
         file.write(np.array(keyframes, KEYFRAME).tobytes())
         file.seek(0)
-        file.write(header(VERTEX, count, _COMMENT, keyframe=KEYFRAME, keyframes=len(keyframes)))
+        file.write(header(VERTEX, count, COMMENT, keyframe=KEYFRAME, keyframes=len(keyframes)))
     return count, moving
 
 
-def _vertices(block: Block) -> np.ndarray:
-    vertices = np.empty(len(block), dtype=VERTEX)
+def vertices_of(block: Block, layout: np.dtype) -> np.ndarray:
+    """(n,) points with the columns of `VERTEX`, in the layout of a file."""
+    vertices = np.empty(len(block), layout)
     vertices["x"], vertices["y"], vertices["z"] = block.points.T
     vertices["intensity"], vertices["ring"] = block.intensity, block.ring
     vertices["ground"], vertices["moving"] = is_ground(block.labels), block.labels == MOVING
@@ -84,7 +85,7 @@ class MapFile:
     def _read_ends(self, head: bytes) -> None:
         counts = [int(line.split()[2]) for line in head.split(b"\n") if line.startswith(b"element ")]
         first, second = counts
-        if not head.startswith(begin := header(VERTEX, first, _COMMENT, keyframe=KEYFRAME, keyframes=second)):
+        if not head.startswith(begin := header(VERTEX, first, COMMENT, keyframe=KEYFRAME, keyframes=second)):
             raise ValueError
         self._file.seek(len(begin) + first * VERTEX.itemsize)
         self._keyframes = np.frombuffer(self._file.read(second * KEYFRAME.itemsize), KEYFRAME, count=second)
