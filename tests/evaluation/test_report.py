@@ -1,6 +1,6 @@
 """The report shows every figure that was measured, with its unit, in all of its forms.
 
-Tests app/evaluation/crops.py, app/evaluation/figures.py, app/evaluation/measured.py, app/evaluation/origin.py,
+Tests app/evaluation/crops.py, app/evaluation/figures.py, app/evaluation/measured.py,
 app/evaluation/tables.py.
 """
 
