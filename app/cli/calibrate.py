@@ -60,7 +60,7 @@ def calibrate(
         if contradiction := found.contradiction():
             typer.echo(f"{contradiction}, contrary to the parameters.")
     if plot is not None:
-        from app.evaluation.calibration_plot import residual_plot
+        from app.evaluation.plots import residual_plot
 
         try:
             plot.write_text(residual_plot(found), encoding="utf-8")

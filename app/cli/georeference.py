@@ -145,7 +145,7 @@ def _recording_of(results: Path) -> Path:
 
 
 def _write(results: Path, found: "Alignment", trajectory: "Trajectory") -> None:
-    from app.cli.georeference_plot import georeference_plot
+    from app.evaluation.plots import georeference_plot
     from app.georeference import ledger, reference
     from app.slam.text_files import write_texts
 

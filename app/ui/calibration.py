@@ -173,7 +173,7 @@ def find(owner: Link, recording: Path, params: Params) -> None:
     """In a process of its own: sends fractions done, then what was found."""
     from app.calibration.calibrate import calibrate
     from app.calibration.words import table
-    from app.evaluation.calibration_plot import residual_plot
+    from app.evaluation.plots import residual_plot
 
     found = calibrate(recording, params, progress=lambda fraction: owner.send(float(fraction)))
     owner.send(FoundMounting(table(found), found.found(), residual_plot(found), found.contradiction()))

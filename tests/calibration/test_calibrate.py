@@ -1,5 +1,5 @@
 """Tests app/calibration/excerpt.py, app/calibration/odometry.py, app/calibration/calibrate.py,
-app/calibration/words.py, app/cli/calibrate.py and app/evaluation/calibration_plot.py: where the LiDAR sits on the IMU,
+app/calibration/words.py, app/cli/calibrate.py and app/evaluation/plots.py: where the LiDAR sits on the IMU,
 from a recording alone."""
 
 import json
@@ -19,7 +19,7 @@ from app.calibration.excerpt import Excerpt, read_excerpt
 from app.calibration.lines import Lines
 from app.calibration.odometry import track
 from app.calibration.words import WALK, as_json, params_yaml, table, write_beside
-from app.evaluation.calibration_plot import residual_plot
+from app.evaluation.plots import residual_plot
 from app.sensors.presets import calibrated_beside, resolve_params, sidecar
 from app.sensors.recording import open_recording
 from app.slam import lie

@@ -1,4 +1,4 @@
-"""What is told of each fix. Tests app/georeference/ledger.py and app/cli/georeference_plot.py."""
+"""What is told of each fix. Tests app/georeference/ledger.py and app/evaluation/plots.py."""
 
 import csv
 import io
@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.cli.georeference_plot import georeference_plot
+from app.evaluation.plots import georeference_plot
 from app.georeference.align import Alignment, align
 from app.georeference.ledger import residuals_csv, summary, table
 from tests.georeference.walks import LEVER, Walked, walked

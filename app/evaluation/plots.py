@@ -1,12 +1,16 @@
-"""The residuals of a calibration before and after, as one SVG file."""
+"""The residuals of a calibration, and a georeference, each as one SVG file."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.calibration.calibrate import Calibration
 from app.evaluation.figures import PALETTE, Line, chart
 from app.slam.types import F64
+
+if TYPE_CHECKING:  # who draws one needs nothing of the other
+    from app.calibration.calibrate import Calibration
+    from app.georeference.align import Alignment
 
 _HEIGHT = 300
 _STYLE = (
@@ -15,7 +19,7 @@ _STYLE = (
 )
 
 
-def residual_plot(calibration: Calibration) -> str:
+def residual_plot(calibration: "Calibration") -> str:
     """How much the LiDAR's turns and ways differ from the IMU's, and how far the points of each scan line are from
     planes."""
     turned, moved, lines = calibration.turned, calibration.moved, calibration.lines
@@ -29,10 +33,37 @@ def residual_plot(calibration: Calibration) -> str:
         charts.append(
             _before_and_after(1e3 * np.array([lines.before, lines.after]), "scan line", "points on planes (mm)")
         )
-    return page(charts)
+    return _page(charts)
 
 
-def page(charts: Sequence[str]) -> str:
+def georeference_plot(alignment: "Alignment", positions: F64) -> str:
+    """Two charts, in metres from the map's origin: east against north, and the residual of each fix.
+
+    Args:
+        positions: (n, 3) m of the walked path in the map.
+    """
+    origin = np.array(alignment.reference.origin)
+    path = alignment.reference.to_crs(positions) - origin
+    fixes, used = alignment.grid - origin, alignment.used
+    lines = [
+        Line("fixes that count", PALETTE[2], fixes[used, 0], fixes[used, 1], dashed=True),
+        Line("path", PALETTE[0], path[:, 0], path[:, 1]),
+        *(_cross(place) for place in fixes[~used]),
+    ]
+    at = np.flatnonzero(used).astype(np.float64)
+    over = [
+        Line(name, PALETTE[colour], at, alignment.residuals[used, axis])
+        for axis, (name, colour) in enumerate((("east", 0), ("north", 1), ("height", 2)))
+    ]
+    return _page(
+        [
+            chart(lines, "east (m)", "north (m): fixes green, rejected red", equal=True),
+            chart(over, "fix", "residual (m): east blue, north orange, height green"),
+        ]
+    )
+
+
+def _page(charts: Sequence[str]) -> str:
     """Charts of the usual height below one another, as a file of their own."""
     placed = [
         str(svg).replace("<svg ", f'<svg y="{_HEIGHT * k}" width="560" height="{_HEIGHT}" ', 1)
@@ -50,3 +81,9 @@ def _before_and_after(both: F64, x_label: str, label: str) -> str:
         for name, colour, values in zip(("before", "after"), (PALETTE[4], PALETTE[0]), both, strict=True)
     ]
     return str(chart(lines, x_label, f"{label}, red before, blue after", from_zero=True, height=_HEIGHT))
+
+
+def _cross(place: F64) -> Line:
+    """A rejected fix."""
+    east, north = place[0] + np.array([-0.3, 0.3, 0, 0, 0]), place[1] + np.array([0, 0, 0, 0.3, -0.3])
+    return Line("rejected", PALETTE[4], east, north)
