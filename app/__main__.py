@@ -11,10 +11,10 @@ from typer.core import TyperGroup
 
 from app import TEMPORARY_KERNEL_CACHE, __version__
 from app.cli import options
-from app.cli.calibrate import calibrate as calibrate_command
+from app.cli.calibrate import calibrate
 from app.cli.compare import compare
 from app.cli.evaluate import evaluate
-from app.cli.export import export as export_command
+from app.cli.export import export
 from app.cli.feed import feed
 from app.cli.georeference import georeference
 from app.cli.replay import replay
@@ -92,16 +92,8 @@ def hemislam(
     """
 
 
-cli.command()(serve)
-cli.command()(run)
-cli.command()(replay)
-cli.command("export")(export_command)
-cli.command()(compare)
-cli.command("calibrate")(calibrate_command)
-cli.command()(evaluate)
-cli.command()(georeference)
-cli.command()(tune)
-cli.command()(feed)
+for command in (serve, run, replay, export, compare, calibrate, evaluate, georeference, tune, feed):
+    cli.command()(command)
 
 
 @cli.command()
@@ -156,13 +148,8 @@ def simulate(
         Path, typer.Option("--out", metavar="FILE.mcap", help="The recording to write; with --suite a folder.")
     ],
     scene: Annotated[str | None, typer.Argument(metavar="SCENE", help="corridor, outdoor, cloister, ...")] = None,
-    suite: Annotated[
-        str | None,
-        typer.Option(
-            "--suite", metavar="NAME", help="`paper`: twins of its six sequences; `revisits`: six walks that come back."
-        ),
-    ] = None,
-    short: Annotated[bool, typer.Option("--short", help="Only the first 60 s of each sequence of the suite.")] = False,
+    suite: options.Suite = None,
+    short: options.Short = False,
     duration: Annotated[float, typer.Option("--duration", metavar="SECONDS", help="Length of the recording.")] = 60.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed gives another trajectory.")] = 0,
     rate: Annotated[int, typer.Option("--rate", metavar="HZ", help="Revolutions per second, 10 or 20.")] = 10,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import Duration, Imperfect, ParamsFor, make_folder, with_params
+from app.cli.options import Duration, Imperfect, ParamsFor, Short, Suite, make_folder, with_params
 from app.slam.errors import HemislamError
 from app.slam.provenance import cores
 
@@ -88,13 +88,8 @@ def evaluate(
             help="Another system's trajectory as one more column; with several recordings NAME@RECORDING=FILE.",
         ),
     ] = None,
-    suite: Annotated[
-        str | None,
-        typer.Option(
-            "--suite", metavar="NAME", help="`paper`: twins of its six sequences; `revisits`: six walks that come back."
-        ),
-    ] = None,
-    short: Annotated[bool, typer.Option("--short", help="Only the first 60 s of each sequence of the suite.")] = False,
+    suite: Suite = None,
+    short: Short = False,
     seeds: Annotated[list[int] | None, typer.Option("--seed", min=0, help="Seed of the suite. Repeatable.")] = None,
     imperfect: Imperfect = False,
     jobs: Jobs = None,

@@ -45,6 +45,13 @@ Force = Annotated[bool, typer.Option("--force", help="Replace results that DIR a
 Imperfect = Annotated[
     bool, typer.Option("--imperfect", help="With the errors of a real scanner, a lively hand, and people nearby.")
 ]
+Suite = Annotated[
+    str | None,
+    typer.Option(
+        "--suite", metavar="NAME", help="`paper`: twins of its six sequences; `revisits`: six walks that come back."
+    ),
+]
+Short = Annotated[bool, typer.Option("--short", help="Only the first 60 s of each sequence of the suite.")]
 Calibrate = Annotated[
     bool,
     typer.Option(

@@ -24,9 +24,13 @@ from app.cli.options import (
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
+    from app.calibration.calibrate import Calibration
     from app.mapping.session import Session
     from app.slam.loops.edits import LoopEdit
     from app.slam.params import Params
+
+UNASKED_S = 60.0
+"""How much of a recording is calibrated without being asked."""
 
 
 @with_params
@@ -107,25 +111,37 @@ def run(
 def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
     """The parameters, with the mounting found in the recording if none is given; and that, in a sentence."""
     from app.calibration.calibrate import is_mounting_unknown
-    from app.calibration.on_opening import advice, contradicted
 
     if not is_mounting_unknown(params):
         return params, ""
-    with progress_bar("Estimating the pose of the LiDAR on the IMU") as show:
-        found = contradicted(recording, params, show)
+    found = _contradicted(recording, params, "Estimating the pose of the LiDAR on the IMU")
     if found is None:
         return params, ""
-    typer.echo(advised := advice(found, used=True))
+    advised = f"{found.contradiction()}; this was found in the recording and is used. To save it: {_saving(recording)}"
+    typer.echo(advised)
     return params.with_values(found.found()), advised
 
 
 def look_for_mounting(recording: Path, params: "Params") -> str:
     """What the recording shows about its mounting if the parameters differ, in a sentence; "" if nothing."""
-    from app.calibration.on_opening import advice, contradicted
+    found = _contradicted(recording, params, "Looking for the cause")
+    return f"{found.contradiction()}: {_saving(recording)}" if found else ""
 
-    with progress_bar("Looking for the cause") as show:
-        found = contradicted(recording, params, show)
-    return advice(found, used=False) if found else ""
+
+def _contradicted(recording: Path, params: "Params", why: str) -> "Calibration | None":
+    """The calibration, if mounting or clock differ from the parameters; None if they do not, or if that is unknown."""
+    from app.calibration.calibrate import calibrate
+
+    with progress_bar(why) as show:
+        try:
+            found = calibrate(recording, params, UNASKED_S, show)
+        except HemislamError:  # such as too short a recording; opening it reports what is wrong with it
+            return None
+    return found if found.contradiction() else None
+
+
+def _saving(recording: Path) -> str:
+    return f"hemislam calibrate {recording} --write"
 
 
 @contextlib.contextmanager

@@ -16,16 +16,15 @@ def make_suite(
     folder: Path,
     seeds: list[int],
     *,
-    short: bool = False,
+    short: bool,
+    imperfections: "Imperfections",
     every_block: int | None = None,
-    imperfections: "Imperfections | None" = None,
 ) -> list[Path]:
     """Make the recordings that do not exist yet, and return all of them.
 
     Raises:
         HemislamError: there is no such suite, or the recordings cannot be written.
     """
-    from app.sensors.simulator.imperfections import NONE
     from app.sensors.simulator.suite import find_suite, make_twin
 
     twins = find_suite(name)
@@ -40,7 +39,7 @@ def make_suite(
                     seed=seed,
                     short=short,
                     every_block=every_block,
-                    imperfections=imperfections or NONE,
+                    imperfections=imperfections,
                     progress=show,
                 )
             state = "made" if made.new else "exists already"

@@ -1,4 +1,4 @@
-"""Tests app/calibration/on_opening.py: `run` and `info` where the mounting is not known."""
+"""Tests app/cli/run.py: `run` and `info` where the mounting is not known."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ def rehearsed(monkeypatch: pytest.MonkeyPatch, *, sure: bool = True) -> None:
     def found(path: Path, params: Params, *_: object) -> Calibration:
         return known(path, sure=sure, params=params)
 
-    monkeypatch.setattr("app.calibration.on_opening.calibrate", found)
+    monkeypatch.setattr("app.calibration.calibrate.calibrate", found)
 
 
 def test_an_unknown_mounting_is_found_used_and_reported(
