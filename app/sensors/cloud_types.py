@@ -91,10 +91,6 @@ class CloudType:
     intensities: tuple[str, ...]
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
 
-    def may_be_time(self, field: str) -> bool:
-        """Whether a field may hold the points' times, judged by its name."""
-        return field.lower() in self.times or "time" in field.lower() or "stamp" in field.lower()
-
 
 def read_point_cloud_2(message: Any) -> CloudMessage:
     """sensor_msgs/PointCloud2 of ROS 1 or ROS 2: any order, type, padding and byte order of the fields."""

@@ -219,17 +219,13 @@ class Sway:
         rates = np.stack([np.interp(middle[:, :-1] + step / 2, times, gyro[:, axis]) for axis in range(3)], axis=-1)
         return cls(begin, end, rates * step)
 
-    def turned(self, gyro_unit: float, axes: Axes = AS_IS) -> F64:
-        """(n, 3) m/s^2: gravity at the begin of each span, turned to its end as the gyroscope says."""
+    def error(self, gyro_unit: float, axes: Axes = AS_IS) -> float:
+        """m/s^2, RMS: how far gravity at the end of a span is from where the gyroscope turns it."""
         unit = _matrix(axes) * gyro_unit
         gravity = self.begin[:, None, :]
         for n in range(self.steps.shape[1]):
             gravity = gravity @ Rotation.from_rotvec(self.steps[:, n] @ unit.T).as_matrix()
-        return np.asarray(gravity[:, 0])
-
-    def error(self, gyro_unit: float, gyro: Axes = AS_IS) -> float:
-        """m/s^2, RMS: how far gravity at the end of a span is from where the gyroscope turns it."""
-        return float(np.sqrt(np.mean(np.sum((self.end - self.turned(gyro_unit, gyro)) ** 2, axis=1))))
+        return float(np.sqrt(np.mean(np.sum((self.end - gravity[:, 0]) ** 2, axis=1))))
 
 
 def _matrix(axes: Axes) -> F64:

@@ -89,19 +89,8 @@ class Sequencer:
 
     def tail(self) -> "Sequencer":
         """A sequencer that takes over after this one's last scan, and notices what is missing in between."""
-        return Sequencer(
-            self.limits,
-            self.without_imu,
-            replace(self.counts),
-            _stamps=self._stamps[-1:],
-            _values=self._values[-1:],
-            _last_stamp_ns=self._last_stamp_ns,
-            _last_end_ns=self._last_end_ns,
-            _intervals_ns=self._intervals_ns.copy(),
-            _usual=self._usual.copy(),
-            _begun=self._begun,
-            _same=self._same.copy(),
-        )
+        nothing: dict[str, Any] = {"_waiting": [], "_held": {}, "_notices": [], "_behind": False, "_suspect": None}
+        return replace(self.copy(), _stamps=self._stamps[-1:], _values=self._values[-1:], **nothing)
 
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector) -> None:
         """One IMU sample: rad/s and m/s^2, IMU frame."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Any
 
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -59,24 +59,6 @@ class Mark:
         return cls(mark.read + 1, log_ns, mark.at_log_ns + 1 if mark.log_ns == log_ns else 1)
 
 
-class Stream(Protocol):
-    """One kind of file, opened.
-
-    Attributes:
-        counts: topic -> (type, number of messages). start_ns, end_ns: log times of the first and last message.
-        by_log_time: whether messages come sorted by log time.
-    """
-
-    by_log_time: bool
-    counts: dict[str, tuple[str, int]]
-    start_ns: int
-    end_ns: int
-
-    def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]: ...
-
-    def close(self) -> None: ...
-
-
 class RosbagsStream:
     """What the rosbags library reads: a ROS 1 bag, a ROS 2 folder or single file. See `Stream`."""
 
@@ -121,6 +103,11 @@ class RosbagsStream:
         link = Path(self._links.name) / path.with_suffix(path.suffix.lower()).name
         link.symlink_to(path.resolve())
         return link
+
+
+Stream = RosbagsStream | McapStream | CaptureStream | OusterStream
+"""One kind of file, opened. `counts`: topic -> (type, number of messages). `start_ns`, `end_ns`: log times of the first
+and last message. `by_log_time`: whether messages come sorted by log time."""
 
 
 class Source(AbstractContextManager["Source"]):

@@ -77,9 +77,9 @@ def _candidates(probe: Probe, kind: CloudType, wanted: str) -> list[str]:
         return []
     if wanted != "auto":
         return [wanted]
-    lower = {name.lower(): name for name in probe.cloud.fields if kind.may_be_time(name)}
+    lower = {name.lower(): name for name in probe.cloud.fields}
     usual = [lower[name] for name in kind.times if name in lower]
-    return usual + [name for name in lower.values() if name not in usual]
+    return usual + [lower[name] for name in lower if ("time" in name or "stamp" in name) and lower[name] not in usual]
 
 
 def _settle_unit(
