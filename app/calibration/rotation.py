@@ -123,11 +123,7 @@ def clustered(J: F64, residuals: F64, widest: F64) -> F64:
 
 def _jacobian(function: Callable[[F64], F64], x: F64) -> F64:
     """(w, m, p) by central differences of a function of (p,) that gives (w, k, 3)."""
-    columns = []
-    for axis in range(len(x)):
-        step = np.zeros(len(x))
-        step[axis] = 1e-5
-        columns.append((function(x + step) - function(x - step)) / 2e-5)
+    columns = [(function(x + step) - function(x - step)) / 2e-5 for step in 1e-5 * np.eye(len(x))]
     stacked = np.stack(columns, axis=-1)
     return np.asarray(stacked.reshape(stacked.shape[0], -1, len(x)))
 

@@ -70,8 +70,5 @@ def calibrate(
         path = words.write_beside(found, replace=force)
         typer.echo(f"Saved as {path}; `run`, `serve` and `info` use it. Delete it to undo this.", err=as_json)
     elif not as_json and found.found():
-        typer.echo("Add --write to save this beside the recording, or pass " + _settings(found.found()))
-
-
-def _settings(values: dict[str, object]) -> str:
-    return " ".join(f"--set '{name}={json.dumps(value)}'" for name, value in values.items())
+        settings = " ".join(f"--set '{name}={json.dumps(value)}'" for name, value in found.found().items())
+        typer.echo(f"Add --write to save this beside the recording, or pass {settings}")

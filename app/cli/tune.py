@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -20,9 +20,6 @@ from app.cli.evaluate import (
 from app.cli.options import Duration, ParamsFor, make_folder, with_params
 from app.slam.errors import HemislamError
 from app.slam.provenance import cores
-
-if TYPE_CHECKING:
-    from app.evaluation.evaluate import Subject
 
 
 @with_params
@@ -119,7 +116,8 @@ def tune(
             recordings, name_recordings(recordings), truth_texts(recordings, truths or []), strict=True
         )
     ]
-    wanted = choose_objectives(objectives or [_usual(subjects)], subjects)
+    usual = "ate" if all(subject.truth is not None for subject in subjects) else "entropy"
+    wanted = choose_objectives(objectives or [usual], subjects)
     if held_back and duration is None:
         raise HemislamError("--held-back needs --duration: without it the search sees the whole recording.")
     timed = any(one.name == "frame-time" for one in wanted)  # runs beside each other would spoil it
@@ -151,7 +149,3 @@ def tune(
     if failed:
         typer.echo(f"{len(failed)} of {len(done)} trials failed; the first: {failed[0].error}")
     typer.echo(f"saved in   {out / BEST}, {out / 'tuning.html'}")
-
-
-def _usual(subjects: "list[Subject]") -> str:
-    return "ate" if all(subject.truth is not None for subject in subjects) else "entropy"
