@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.baselines.mounting import mounting
+from app.baselines.poses import mounting
 from app.baselines.systems import FOLDER
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording

@@ -14,7 +14,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from app.baselines.features import extract
 from app.baselines.matching import FeatureMap, PoseFit, register
-from app.baselines.mounting import mounting
+from app.baselines.poses import mounting
 from app.slam import lie, start
 from app.slam.errors import HemislamError
 from app.slam.params import Params

@@ -12,7 +12,7 @@ import numpy as np
 
 from app.baselines.features import Features, extract
 from app.baselines.matching import FeatureMap, LastScan, register
-from app.baselines.mounting import levelled, mounting
+from app.baselines.poses import levelled, mounting
 from app.slam import lie
 from app.slam.params import Params
 from app.slam.types import F64, Measurement

@@ -7,14 +7,35 @@ from typing import Any
 
 import numpy as np
 
-from app.baselines.mounting import levelled, mounting
+from app.baselines.poses import levelled, mounting
 from app.slam import lie
 from app.slam.params import Params
 from app.slam.types import F64, I64, Measurement
 
 
-class KissIcp:
-    """KISS-ICP: Vizzo et al., RA-L 2023. Its poses are those at scan ends."""
+class _Icp:
+    """An odometry of the LiDAR alone, in a world that begins with it, as poses of the IMU in one whose z points up."""
+
+    in_middle = False
+    """Whether its poses are those in the middle of scans, not at their ends."""
+
+    def __init__(self, params: Params, odometry: Any) -> None:
+        self._odometry, self._T_imu_lidar = odometry, mounting(params)
+        self._T_odom_start: F64 | None = None  # of the LiDAR
+
+    def step(self, measurement: Measurement) -> tuple[int, F64]:
+        scan = measurement.scan
+        self._odometry.register_frame(
+            scan.points.astype(np.float64), scan.offsets_ns / max(int(scan.offsets_ns.max()), 1)
+        )
+        if self._T_odom_start is None:
+            self._T_odom_start = levelled(measurement.imu) @ self._T_imu_lidar
+        T = np.asarray(self._T_odom_start @ np.asarray(self._odometry.last_pose) @ lie.inverse(self._T_imu_lidar))
+        return (scan.stamp_ns + scan.end_ns) // 2 if self.in_middle else scan.end_ns, T
+
+
+class KissIcp(_Icp):
+    """KISS-ICP: Vizzo et al., RA-L 2023."""
 
     def __init__(self, params: Params) -> None:
         from kiss_icp.config import KISSConfig
@@ -23,14 +44,13 @@ class KissIcp:
         config = KISSConfig()
         config.data.max_range, config.data.min_range = params.sensor.max_range, params.sensor.min_range
         config.mapping.voxel_size = config.data.max_range / 100.0  # its own rule
-        self._icp = _Icp(params, KissICP(config))
-
-    def step(self, measurement: Measurement) -> tuple[int, F64]:
-        return measurement.scan.end_ns, self._icp.imu(measurement)
+        super().__init__(params, KissICP(config))
 
 
-class GenzIcp:
-    """GenZ-ICP: Lee, Lim and Han, RA-L 2025. Its poses are those in the middle of scans."""
+class GenzIcp(_Icp):
+    """GenZ-ICP: Lee, Lim and Han, RA-L 2025."""
+
+    in_middle = True
 
     def __init__(self, params: Params) -> None:
         from genz_icp.config import GenZConfig
@@ -39,10 +59,7 @@ class GenzIcp:
         config = GenZConfig()
         config.data.max_range, config.data.min_range = params.sensor.max_range, params.sensor.min_range
         config.data.deskew = True
-        self._icp = _Icp(params, GenZICP(config))
-
-    def step(self, measurement: Measurement) -> tuple[int, F64]:
-        return (measurement.scan.stamp_ns + measurement.scan.end_ns) // 2, self._icp.imu(measurement)
+        super().__init__(params, GenZICP(config))
 
 
 class RkoLio:
@@ -63,20 +80,3 @@ class RkoLio:
         stamps: I64 = scan.stamp_ns + scan.offsets_ns.astype(np.int64)
         self._odometry.register_scan(scan.points.astype(np.float64), stamps, self._T_imu_lidar)
         return scan.end_ns, np.array(self._odometry.pose())
-
-
-class _Icp:
-    """An odometry of the LiDAR alone, in a world that begins with it, as poses of the IMU in one whose z points up."""
-
-    def __init__(self, params: Params, odometry: Any) -> None:
-        self._odometry, self._T_imu_lidar = odometry, mounting(params)
-        self._T_odom_start: F64 | None = None  # of the LiDAR
-
-    def imu(self, measurement: Measurement) -> F64:
-        scan = measurement.scan
-        self._odometry.register_frame(
-            scan.points.astype(np.float64), scan.offsets_ns / max(int(scan.offsets_ns.max()), 1)
-        )
-        if self._T_odom_start is None:
-            self._T_odom_start = levelled(measurement.imu) @ self._T_imu_lidar
-        return np.asarray(self._T_odom_start @ np.asarray(self._odometry.last_pose) @ lie.inverse(self._T_imu_lidar))

@@ -24,7 +24,7 @@ from typing import Any
 from tqdm import tqdm
 
 from app import __version__
-from app.evaluation.job import RUN_FILES, Job, clear_remains, code_digest, finished
+from app.evaluation.job import RUN_FILES, Job, all_or_nothing, clear_remains, code_digest, finished
 from app.evaluation.run_job import run_job
 from app.slam.errors import HemislamError
 from app.slam.provenance import hash_input
@@ -329,10 +329,6 @@ def _fetch(address: str, job: Job) -> None:
 
 
 def _keep(job: Job, files: dict[str, bytes]) -> None:
-    """Write a run's files, run.json last: a kill in between leaves no result."""
-    job.folder.mkdir(parents=True, exist_ok=True)
-    (job.folder / "run.json").unlink(missing_ok=True)
-    for name in RUN_FILES:
-        part = job.folder / f".{name}.part"
-        part.write_bytes(files[name])
-        part.replace(job.folder / name)
+    with all_or_nothing(job) as part:
+        for name in RUN_FILES:
+            (part / name).write_bytes(files[name])

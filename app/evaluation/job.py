@@ -6,7 +6,10 @@ of all that the results depend on: a folder with the right key is finished and n
 
 import hashlib
 import json
+import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -99,6 +102,22 @@ def finished(job: Job) -> dict[str, Any] | None:
         return None
     whole = all((job.folder / name).is_file() for name in RUN_FILES)
     return report if whole and report.get("key") == job.key else None
+
+
+@contextmanager
+def all_or_nothing(job: Job) -> Iterator[Path]:
+    """A folder for a run's files. At the end they are moved to their places, run.json last: a kill in between leaves
+    no result."""
+    part = job.folder.with_name(f"{job.folder.name}.part-{os.getpid()}")
+    part.mkdir(parents=True, exist_ok=True)
+    try:
+        yield part
+        job.folder.mkdir(exist_ok=True)
+        (job.folder / "run.json").unlink(missing_ok=True)
+        for name in RUN_FILES:
+            (part / name).replace(job.folder / name)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def clear_remains(folder: Path) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -13,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from app import __version__
-from app.baselines.keyframes import keep_keyframe
+from app.baselines.poses import keep_keyframe
 from app.baselines.systems import find_system
 from app.evaluation import crops, map_sharpness
-from app.evaluation.job import GROUND_RANGES_M, RUN_FILES, Job
+from app.evaluation.job import GROUND_RANGES_M, Job, all_or_nothing
 from app.export.results import timings_csv
 from app.mapping.feed import FeedInfo, FileFeed
 from app.mapping.opening import open_session
@@ -159,8 +158,6 @@ def _write(
 ) -> None:
     """Cut off the lead, measure the map, and write all files.
 
-    They are written beside their places, then moved there, run.json last: a kill in between leaves no result.
-
     Args:
         whole: of all that was read. times: (n, stages, total and CPU), ms. poses: of the keyframes.
 
@@ -181,10 +178,7 @@ def _write(
     measured = map_sharpness.measure(map_sharpness.collect(part_of_map(), poses))
     facts |= {"frames": len(trajectory), "distance_m": trajectory.distance, "map_sharpness": finite(asdict(measured))}
     timings = timings_csv(trajectory.stamps_ns, times[counted, :-1], {"cpu_ms": times[counted, -1]})
-
-    part = job.folder.with_name(f"{job.folder.name}.part-{os.getpid()}")
-    part.mkdir(parents=True, exist_ok=True)
-    try:
+    with all_or_nothing(job) as part:
         write_tum(part / "trajectory.tum", trajectory)
         (part / "timings.csv").write_text(timings, encoding="utf-8")
         centres = {place: _position_at(trajectory, share) for place, share in crops.PLACES.items()}
@@ -194,12 +188,6 @@ def _write(
             **{place: crops.crop(part_of_map(), poses, centre) for place, centre in centres.items()},
         )
         (part / "run.json").write_text(json.dumps(facts, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-        job.folder.mkdir(exist_ok=True)
-        (job.folder / "run.json").unlink(missing_ok=True)
-        for name in RUN_FILES:
-            (part / name).replace(job.folder / name)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _score_ground(scores: list[GroundScore], result: StepResult, marks: dict[int, bytes]) -> None:

@@ -1,6 +1,6 @@
 """LOAM, its features and its matching, in rooms whose every pose is known.
 
-Tests app/baselines/loam.py, app/baselines/features.py, app/baselines/matching.py, app/baselines/mounting.py.
+Tests app/baselines/loam.py, app/baselines/features.py, app/baselines/matching.py, app/baselines/poses.py.
 """
 
 from functools import cache
@@ -11,7 +11,7 @@ import pytest
 from app.baselines.features import FeaturePoints, curvatures, extract, undistorted
 from app.baselines.loam import Loam
 from app.baselines.matching import FeatureMap, Pairs, solve
-from app.baselines.mounting import levelled, mounting
+from app.baselines.poses import levelled, mounting
 from app.slam import lie
 from app.slam.types import F64, ImuSamples, Measurement, Scan
 from tests.slam.scenes import Rig, Walk, furnished_room, measurements, mounted, params_for, pose_error, seconds_of

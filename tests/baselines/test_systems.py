@@ -1,6 +1,6 @@
 """Baselines as `evaluate` runs them, and what it says of those that are not there.
 
-Tests app/baselines/systems.py, app/baselines/keyframes.py, and of app/baselines/peers.py the use of KISS-ICP and
+Tests app/baselines/systems.py, app/baselines/poses.py, and of app/baselines/peers.py the use of KISS-ICP and
 GenZ-ICP, by stand-ins for both. RKO-LIO is not run.
 """
 
@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from app.__main__ import cli
 from app.baselines import systems
-from app.baselines.keyframes import keep_keyframe
+from app.baselines.poses import keep_keyframe
 from app.baselines.systems import SYSTEMS, find_system
 from app.slam import lie
 from app.slam.errors import HemislamError

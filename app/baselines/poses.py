@@ -1,20 +1,31 @@
-"""Keyframes of a baseline, so that its map can be compared with ours: its scans, undistorted by its own poses."""
+"""A baseline's LiDAR on the IMU, the begin of its world, and keyframes, so that its map can be compared with ours."""
 
 import numpy as np
 
 from app.baselines.features import undistorted
-from app.baselines.mounting import mounting
 from app.slam import lie
 from app.slam.keyframes import KeyframeStore, is_due
 from app.slam.params import Params
-from app.slam.types import F64, NON_GROUND, Cloud, Keyframe, Scan
+from app.slam.types import F64, NON_GROUND, Cloud, ImuSamples, Keyframe, Scan
 
 Stamped = tuple[int, F64]
 """A time in ns and T_odom_imu (4, 4) at it."""
 
 
+def mounting(params: Params) -> F64:
+    """T_imu_lidar (4, 4), as the parameters say."""
+    R = lie.from_rpy_degrees(params.sensor.rotation)
+    return lie.transform(R, np.array(params.sensor.translation, np.float64))
+
+
+def levelled(samples: ImuSamples) -> F64:
+    """T_odom_imu (4, 4) of the first pose: at the origin, z against the gravity that the samples feel."""
+    up = samples.accel.mean(axis=0) if len(samples) else np.array([0.0, 0.0, 1.0])
+    return lie.transform(lie.between(up, np.array([0.0, 0.0, 1.0])), np.zeros(3))
+
+
 def keep_keyframe(store: KeyframeStore, scan: Scan, now: Stamped, last: Stamped | None, params: Params) -> None:
-    """Store the scan if the pose is far enough from that of the last keyframe."""
+    """Store the scan, undistorted by these poses, if the pose is far enough from that of the last keyframe."""
     stamp_ns, T_odom_imu = now
     T_last = store[len(store) - 1].T_odom_imu if len(store) else None
     if not is_due(T_last, T_odom_imu, params.keyframe):
