@@ -267,15 +267,11 @@ class _Problem:
             arm += change[4:]
         there = replace(self, seconds=self.seconds - offset, offset=None, lever=arm, lever_free=False).solve()
         return replace(
-            found,
-            rotation=there.rotation,
-            shift=there.shift,
-            residuals=there.residuals,
-            distances=there.distances,
-            used=there.used,
+            there,
             offset=offset,
             offset_sigma=float(covariance[3, 3] ** 0.5),
-            lever=arm,
+            yaw_sigma=found.yaw_sigma,
+            lever_sigma=found.lever_sigma,
         )
 
     def _model(self, x: F64) -> tuple[F64, F64, float, F64]:

@@ -86,7 +86,7 @@ def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64
         degrees = table.numbers("latitude", "longitude", "height")
         every = Fixes.of(np.arange(len(degrees)), degrees).sound(table.source)
         ground = Ground.of(every, grid)
-        grid = ground.name
+        grid = ground.centre.crs
         numbers = np.full(degrees.shape, np.nan)
         numbers[every.stamps_ns] = ground.grid
     else:

@@ -1,6 +1,6 @@
 """Metres on the ground around a place, where a grid's own metres are stretched and its numbers are large."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,15 +16,13 @@ class Ground:
     """Places in true metres on the ground, counted from a point near them.
 
     Attributes:
-        name: of the grid. grid: (n, 3) easting, northing, height, m. centre: (3,) of the grid, whole metres.
-        scale: of the grid there. places: (n, 3) m east, north, up of the centre.
+        grid: (n, 3) easting, northing, height, m. places: (n, 3) m east, north, up of the centre.
+        centre: a level map whose origin is that point: whole metres of the grid, and its scale there.
     """
 
-    name: str
     grid: F64
-    centre: F64
-    scale: float
     places: F64
+    centre: GeoReference
 
     @classmethod
     def of(cls, fixes: Fixes, name: str = "") -> "Ground":
@@ -38,8 +36,7 @@ class Ground:
     @classmethod
     def in_grid(cls, grid: F64, name: str) -> "Ground":
         """Of (n, 3) easting, northing and height. Raises HemislamError: the grid is not made for the place."""
-        centre = np.round(np.median(grid, axis=0))
-        east, north = centre[:2].tolist()
+        east, north, up = np.round(np.median(grid, axis=0)).tolist()
         try:
             latitude, longitude = crs.place(name, east, north)
         except HemislamError:
@@ -49,14 +46,14 @@ class Ground:
                     " columns."
                 ) from None
             raise
-        scale = crs.grid_scale(name, latitude, longitude, float(centre[2]))
-        return cls(name, grid, centre, scale, (grid - centre) / [scale, scale, 1.0])
+        scale = crs.grid_scale(name, latitude, longitude, up)
+        level = GeoReference(name, (east, north, up), scale=scale)
+        return cls(grid, level.from_crs(grid), level)
 
     def reference(self, R_ground_map: F64, shift: F64, height: str) -> GeoReference:
         """Where a map lies whose origin is at `shift` (3,) m from the centre."""
-        east, north, up = (self.centre + shift * [self.scale, self.scale, 1.0]).tolist()
-        first, second, third = (tuple(map(float, row)) for row in R_ground_map)
-        return GeoReference(self.name, (east, north, up), (first, second, third), self.scale, height)  # type: ignore[arg-type]
+        (origin,), rows = self.centre.to_crs(shift).tolist(), map(tuple, R_ground_map.tolist())
+        return replace(self.centre, origin=tuple(origin), rotation=tuple(rows), height=height)  # type: ignore[arg-type]
 
 
 def _is_place(name: str, east: float, north: float) -> bool:
