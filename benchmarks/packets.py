@@ -7,7 +7,7 @@ import numpy as np
 from app.sensors.live.decoder import Decoder
 from app.sensors.live.difop import ChannelAngles, Difop
 from app.sensors.live.frames import Assembler, Revolution
-from app.sensors.live.msop import PacketWriter
+from app.sensors.live.msop import Firings, PacketWriter
 from app.sensors.robosense import AIRY, BPEARL, BPV4, Model
 from app.slam.types import Scan
 from benchmarks.record import Line
@@ -54,5 +54,5 @@ def _turns(model: Model) -> list[list[bytes]]:
     turns = []
     for turn in range(TURNS):
         times = start + (turn * blocks + np.arange(blocks, dtype=np.int64)) * model.block_ns
-        turns.append([packet for _, packet in writer.add(times, azimuth, counts, intensity)])
+        turns.append([packet for _, packet in writer.add(Firings(times, azimuth, counts, intensity))])
     return turns

@@ -83,8 +83,7 @@ class _Sensor:
         packets = PacketWriter(model)
 
         def add(scan: Scan) -> list[tuple[int, bytes]]:
-            firings = firings_of(scan, calibration, model, rate)
-            return packets.add(firings.times_ns, firings.azimuth, firings.counts, firings.intensity)
+            return packets.add(firings_of(scan, calibration, model, rate))
 
         self.add, self.flush = add, packets.flush
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.sensors.live.difop import NOMINAL, ChannelAngles
-from app.sensors.live.msop import TURN
+from app.sensors.live.msop import TURN, Firings
 from app.sensors.robosense import BPEARL, Model
 from app.slam.errors import HemislamError
-from app.slam.types import F64, I64, U8, U16, Scan
+from app.slam.types import F64, I64, Scan
 
 _CENTI = 100.0
 MISFIT_M = 0.05
@@ -24,21 +24,6 @@ _CUT_BLOCKS = 2
 """Ends of a scan at most this far beyond azimuth 0 are moved into the revolution."""
 _LEAST_TURN_DEG = 30.0
 """A shorter part of a turn does not determine its speed."""
-
-
-@dataclass(frozen=True, slots=True)
-class Firings:
-    """The blocks of one revolution.
-
-    Attributes:
-        times_ns: (b,) absolute. azimuth: (b,) 0.01 deg. counts: (b, c) distance in steps of the
-            model, 0 = no return. intensity: (b, c).
-    """
-
-    times_ns: I64
-    azimuth: U16
-    counts: U16
-    intensity: U8
 
 
 def firings_of(scan: Scan, calibration: ChannelAngles = NOMINAL, model: Model = BPEARL, rate_hz: int = 10) -> Firings:

@@ -7,6 +7,7 @@ divided into two parts with a mark and azimuth of their own.
 
 import calendar
 import struct
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
@@ -125,6 +126,21 @@ def _date_ns(date: bytes) -> int | None:
     return calendar.timegm(when.timetuple()) * 1_000_000_000
 
 
+@dataclass(frozen=True, slots=True)
+class Firings:
+    """Blocks of a sensor, two for two returns of one firing.
+
+    Attributes:
+        times_ns: (b,) absolute. azimuth: (b,) 0.01 deg. counts: (b, channels) distance in steps of the model, 0 = no
+            return. intensity: (b, channels).
+    """
+
+    times_ns: I64
+    azimuth: U16
+    counts: U16
+    intensity: U8
+
+
 class PacketWriter:
     """Packs blocks into packets, as the sensor does: a packet may span two revolutions."""
 
@@ -133,15 +149,10 @@ class PacketWriter:
         self._index = 0
         self._blocks: list[tuple[int, int, U16, U8]] = []
 
-    def add(self, times_ns: I64, azimuth: U16, counts: U16, intensity: U8) -> list[tuple[int, bytes]]:
-        """Packets that these blocks complete, each with the time at which the sensor would send it.
-
-        Args:
-            times_ns: (b,) of each block; two returns of one firing are two blocks of one time.
-            azimuth: (b,) 0.01 deg. counts, intensity: (b, channels).
-        """
-        made = []
-        for block in zip(times_ns.tolist(), azimuth.tolist(), counts, intensity, strict=True):
+    def add(self, firings: Firings) -> list[tuple[int, bytes]]:
+        """Packets that these blocks complete, each with the time at which the sensor would send it."""
+        made, times_ns, azimuth = [], firings.times_ns.tolist(), firings.azimuth.tolist()
+        for block in zip(times_ns, azimuth, firings.counts, firings.intensity, strict=True):
             if self._blocks and block[0] - self._blocks[-1][0] > 1.5 * self._model.block_ns:
                 made += self.flush()
             self._blocks.append(block)

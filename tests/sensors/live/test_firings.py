@@ -63,7 +63,7 @@ def scan_of(
 def as_packets(scan: Scan, calibration: ChannelAngles = NOMINAL, model: Model = BPEARL, rate: int = 10) -> Scan:
     """The same scan, had it come as packets. Its points must all be in one revolution, and of different times."""
     firings, writer = firings_of(scan, calibration, model, rate), PacketWriter(model)
-    packets = writer.add(firings.times_ns, firings.azimuth, firings.counts, firings.intensity) + writer.flush()
+    packets = writer.add(firings) + writer.flush()
     assembler, decoder = Assembler(), Decoder(calibration)
     decoder.configure(Difop(rpm=60 * rate))
     frames = [frame for _, packet in packets for frame in assembler.add(packet, 0)]

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from app.sensors.live.decoder import Decoder
 from app.sensors.live.difop import NOMINAL, ChannelAngles, Difop, read_angles, read_difop, write_difop
 from app.sensors.live.frames import Assembler, Revolution
-from app.sensors.live.msop import PacketWriter, stamp_of, write_packet
+from app.sensors.live.msop import Firings, PacketWriter, stamp_of, write_packet
 from app.sensors.robosense import BPEARL, BPV4
 from app.slam.errors import HemislamError
 from app.slam.types import Scan
@@ -166,11 +166,10 @@ def test_packets_run_on_over_the_end_of_a_revolution_but_not_over_a_pause() -> N
     writer = PacketWriter()
     times = sensor.START_NS + 55_520 * np.arange(30)
     empty = np.zeros((30, 32))
-    made = writer.add(times, (np.arange(30) * 20).astype(np.uint16), empty.astype(np.uint16), empty.astype(np.uint8))
+    counts, intensity = empty.astype(np.uint16), empty.astype(np.uint8)
+    made = writer.add(Firings(times, (np.arange(30) * 20).astype(np.uint16), counts, intensity))
     assert len(made) == 2
-    later = writer.add(
-        times[:6] + 10**9, np.zeros(6, np.uint16), empty[:6].astype(np.uint16), empty[:6].astype(np.uint8)
-    )
+    later = writer.add(Firings(times[:6] + 10**9, np.zeros(6, np.uint16), counts[:6], intensity[:6]))
     assert [stamp_of(packet, BPEARL) for _, packet in later] == [sensor.START_NS + 24 * 55_520 // 1000 * 1000]
     assert len(writer.flush()) == 1
 
