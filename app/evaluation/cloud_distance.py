@@ -134,7 +134,7 @@ def compare(
     if not len(theirs):
         raise HemislamError("The maps do not lie on each other; they must be in the same frame, as of one recording.")
     own, them = (sorted_cells(cloud, _EDGE_M) for cloud in (mine, theirs))
-    first, core_of = _voxels(mine, CORE_M)
+    _, first, core_of = np.unique(_keys(mine, CORE_M), return_index=True, return_inverse=True)
     cores, seen_from = mine[first], (sensors - origin).astype(np.float32)[first]
     out = np.empty((len(cores), 2), np.float32)
     for begin in range(0, len(cores), _BATCH):
@@ -151,12 +151,6 @@ def compare(
     about = np.eye(4)
     about[:3, :3], about[:3, 3] = T[:3, :3], T[:3, 3] + origin - T[:3, :3] @ origin
     return Comparison(out[core_of, 0], out[core_of, 1], about)
-
-
-def _voxels(points: F32, edge: float) -> tuple[I64, I64]:
-    """Of (n, 3) points, the first in each voxel, and (n,) which of those is in the voxel of each."""
-    _, first, which = np.unique(_keys(points, edge), return_index=True, return_inverse=True)
-    return first, which.ravel()
 
 
 def _keys(points: F32, edge: float) -> I64:

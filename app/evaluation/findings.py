@@ -48,7 +48,10 @@ def findings(recordings: Sequence[Evaluated]) -> list[str]:
             chosen = [recording for recording in recordings if recording.name.startswith(metric.where)]
             difference = _difference(chosen, name, base, metric)
             if difference is not None:
-                found.append(Claim(_claim(name, base, what, difference, metric), difference.size))
+                text = f"{name} against {base} ({what}): the mean {metric.name} {difference.words}{difference.rest}"
+                surprising = difference.against and metric.promised
+                text += "; this goes against what the paper found." if surprising else "."
+                found.append(Claim(text, difference.size))
     found.sort(key=lambda finding: -finding.size)
     own = [finding for finding in found if finding.own][:MOST_TOLD]
     others = [finding for finding in found if finding not in own]
@@ -175,13 +178,6 @@ def _difference(recordings: Sequence[Evaluated], name: str, base: str, metric: _
         rest = f"; it rises on {where}" if worse else ""
     certain = verdict != _SAME and "chance" not in certainty
     return _Difference(words, abs(ours - theirs) / max(abs(theirs), 1e-9) if certain else 0.0, against, rest)
-
-
-def _claim(name: str, base: str, what: str, difference: _Difference, metric: _Metric) -> str:
-    """What the paper says of `name` and what was found."""
-    sentence = f"{name} against {base} ({what}): the mean {metric.name} {difference.words}{difference.rest}"
-    surprising = difference.against and metric.promised
-    return sentence + ("; this goes against what the paper found." if surprising else ".")
 
 
 def _certainty(pairs: Sequence[tuple[str, float, float]]) -> str:

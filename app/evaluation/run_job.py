@@ -64,7 +64,15 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
         log, frame, keyframes = session.log, session.map_frame, session.engine.keyframes
         poses = frame.poses(np.array([keyframe.T_odom_imu for keyframe in keyframes]).reshape(-1, 4, 4))
         times = np.column_stack([log.timings_ms, cpu_ms])
-        _write(job, info, frame.trajectory(log.odometry), times, keyframes, poses, _facts(job, session, ground))
+        facts = _common(job) | {
+            "lost": log.statuses[FrameStatus.LOST],
+            "dropped": dict(log.dropped.most_common()),
+            "loops": None if session.loops is None else session.loops.accepted,
+            "loop_drift_m": _loop_drift(session),
+            "ground_share": log.ground_share,
+            "ground": [asdict(score) for score in ground] if job.marks or log.ground_score is not None else None,
+        }
+        _write(job, info, frame.trajectory(log.odometry), times, keyframes, poses, facts)
     finally:
         session.close()
 
@@ -124,19 +132,6 @@ def _common(job: Job) -> dict[str, Any]:
         "peak_memory_mb": peak_memory_mb(),
         "load": os.getloadavg()[0],
         "machine": describe_machine(),
-    }
-
-
-def _facts(job: Job, session: Session, ground: list[GroundScore]) -> dict[str, Any]:
-    """What run.json holds of a run of the engine, except what needs the map."""
-    log = session.log
-    return _common(job) | {
-        "lost": log.statuses[FrameStatus.LOST],
-        "dropped": dict(log.dropped.most_common()),
-        "loops": None if session.loops is None else session.loops.accepted,
-        "loop_drift_m": _loop_drift(session),
-        "ground_share": log.ground_share,
-        "ground": [asdict(score) for score in ground] if job.marks or log.ground_score is not None else None,
     }
 
 

@@ -64,8 +64,8 @@ def _add(file: Any, block: Block, where: GeoReference | None) -> None:
         rotation, translation = np.array(where.rotation) @ rotation, where.to_crs(translation[None])[0]
         points = where.to_crs(points)
     own = ((points - translation) @ rotation).astype(np.float32).astype(np.float64)
-    bounds = zip("xyz", own.min(axis=0), own.max(axis=0), strict=True)
-    head = {name: value for axis, low, high in bounds for name, value in _limits(axis, low, high)}
+    limits = (("Minimum", own.min(axis=0)), ("Maximum", own.max(axis=0)))
+    head = {f"{axis}{end}": float(values[k]) for k, axis in enumerate("xyz") for end, values in limits}
     for name, stamp_ns in (("Start", block.stamps_ns.min()), ("End", block.stamps_ns.max())):
         head[f"acquisition{name}_dateTimeValue"] = int(stamp_ns) * 1e-9 + GPS_MINUS_UNIX_S
     file.write_scan_raw(
@@ -75,7 +75,3 @@ def _add(file: Any, block: Block, where: GeoReference | None) -> None:
         translation=translation,
         scan_header=SimpleNamespace(**head),
     )
-
-
-def _limits(axis: str, low: float, high: float) -> list[tuple[str, float]]:
-    return [(f"{axis}Minimum", float(low)), (f"{axis}Maximum", float(high))]

@@ -45,8 +45,10 @@ def write_png(path: Path, results: Results, section: Slab) -> None:
         draw.text((left - 8, y), f"{at:g}", _TEXT, font, anchor="rm")
     draw.text((left, top - 12), _title(results), _TEXT, font, anchor="ls")
     draw.text((left, top + rows + 32), _caption(results), _TEXT, font, anchor="lt")
-    share = np.where(section.points > 0, 90 + 165 * np.minimum(section.points / _many(section), 1.0), 0.0)
-    for colour, which in ((OTHER, ~_is_ground(section)), (GROUND, _is_ground(section))):
+    black = max(4.0, float(np.percentile(section.points[section.points > 0], 90)))  # as many points in a cell
+    share = np.where(section.points > 0, 90 + 165 * np.minimum(section.points / black, 1.0), 0.0)
+    is_ground = 2 * section.ground > section.points
+    for colour, which in ((OTHER, ~is_ground), (GROUND, is_ground)):
         mask = Image.fromarray(np.flipud(np.where(which, share, 0)).astype(np.uint8))
         picture.paste(colour, (left, top), mask)
     picture.save(path, format="PNG")
@@ -98,15 +100,6 @@ def write_dxf(path: Path, results: Results, section: Slab) -> None:
             space.add_point((x, y), dxfattribs={"layer": name})
     with path.open("w", encoding="utf-8") as file:
         drawing.write(file)
-
-
-def _is_ground(section: Slab) -> np.ndarray:
-    return np.asarray(2 * section.ground > section.points)
-
-
-def _many(section: Slab) -> float:
-    """A cell with this many points is drawn black."""
-    return max(4.0, float(np.percentile(section.points[section.points > 0], 90)))
 
 
 def _title(results: Results) -> str:

@@ -47,11 +47,12 @@ def in_rows(alignment: "Alignment", what: str) -> list[tuple[str, str]]:
     """As `summary`, names and texts apart."""
     where, used = alignment.reference, int(alignment.used.sum())
     east, north, height = where.origin
+    bearing = float(np.degrees(np.arctan2(where.rotation[0][0], where.rotation[1][0])) % 360.0)
     turned = _plus(np.degrees(alignment.yaw_sigma), "°", 3)
     rows = [
         ("Coordinate system", f"{where.crs} ({crs.projected(where.crs).name}), heights {_above(where)}"),
         ("Map origin", f"E {east:.3f} m, N {north:.3f} m, H {height:.3f} m"),
-        ("Map x axis", f"{_bearing(alignment):.3f}° from grid north{turned}"),
+        ("Map x axis", f"{bearing:.3f}° from grid north{turned}"),
         ("Tilt taken out", f"{np.degrees(np.arccos(min(where.rotation[2][2], 1.0))):.3f}°"),
         ("Grid scale", f"{where.scale:.7f}"),
     ]
@@ -92,12 +93,6 @@ def _rows(alignment: "Alignment") -> list[tuple[str, list[float], list[float], f
 def _above(where: reference.GeoReference) -> str:
     system = crs.vertical(where.height)
     return where.height if system is None else f"{where.height} ({system.name})"
-
-
-def _bearing(alignment: "Alignment") -> float:
-    """Of the map's x axis, degrees clockwise from grid north, 0 to 360."""
-    (east, *_), (north, *_), _ = alignment.reference.rotation
-    return float(np.degrees(np.arctan2(east, north)) % 360.0)
 
 
 def _plus(sigma: float, unit: str, digits: int) -> str:

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -152,7 +151,7 @@ class Recording(AbstractContextManager["Recording"]):
         Raises:
             HemislamError: where the file is damaged.
         """
-        offset = self._log_after_stamp_ns
+        offset, added = self._log_after_stamp_ns, round(self.params.recording.imu_time_offset * 1e9)
         log_first = None if first_ns is None else first_ns + offset - LOG_MARGIN_NS
         log_stop = None if stop_ns is None else stop_ns + offset + LOG_MARGIN_NS
         topics = tuple(filter(None, (self.lidar_topic, self.imu_topic, self.gnss_topic)))
@@ -162,17 +161,13 @@ class Recording(AbstractContextManager["Recording"]):
             elif topic == self.gnss_topic:
                 yield OtherEntry(log_ns, fix_of(message))
             else:
-                yield self._imu_entry(message, log_ns)
+                stamp = stamp_ns(message.header.stamp) if self._imu_stamped else log_ns
+                yield ImuEntry(log_ns, stamp + added, *self._imu_units.apply(*imu_values(message)))
 
     def fraction_at(self, log_ns: int) -> float:
         """Share of the recording, 0-1, that was logged before."""
         length = self._source.end_ns - self._source.start_ns
         return min(max((log_ns - self._source.start_ns) / length, 0.0), 1.0) if length > 0 else 1.0
-
-    def _imu_entry(self, message: Any, log_ns: int) -> ImuEntry:
-        stamp = stamp_ns(message.header.stamp) if self._imu_stamped else log_ns
-        offset = round(self.params.recording.imu_time_offset * 1e9)
-        return ImuEntry(log_ns, stamp + offset, *self._imu_units.apply(*imu_values(message)))
 
     def _decode_probes(self, probes: list[Probe], findings: list[Finding]) -> tuple[list[Probe], list[Scan]]:
         """The probes that make scans, and the scans. Raises HemislamError if none does (a wrong time unit, say)."""

@@ -43,7 +43,7 @@ class Model:
             the BLOCK's azimuth a.
         elevations_deg: (c,) nominal, by channel. mark: the bytes that its packets begin with. blocks: of a packet.
         part: channels that follow one azimuth in a packet. counted: bits of a distance; others are a flag.
-        index_at, index_bytes: where a packet's number is.
+        index_at: where the four bytes of a packet's number are.
     """
 
     name: str
@@ -58,7 +58,6 @@ class Model:
     part: int = CHANNELS
     counted: int = 0xFFFF
     index_at: int = 1242
-    index_bytes: int = 4
 
     @property
     def channels(self) -> int:
@@ -114,6 +113,5 @@ AIRY = Model(
     part=48,
     counted=0x3FFF,
     index_at=12,
-    index_bytes=4,
 )
 """Its nominal elevations are evenly spaced; each unit states its own."""

@@ -2,7 +2,7 @@
 
 import csv
 import struct
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,10 +39,7 @@ class ChannelAngles:
         return np.argsort(np.argsort(self.elevations_deg, kind="stable")).astype(np.uint16)
 
     def same(self, other: "ChannelAngles") -> bool:
-        return bool(
-            np.array_equal(self.elevations_deg, other.elevations_deg)
-            and np.array_equal(self.horizontal_deg, other.horizontal_deg)
-        )
+        return all(map(np.array_equal, astuple(self), astuple(other)))
 
     @classmethod
     def nominal(cls, model: Model) -> "ChannelAngles":

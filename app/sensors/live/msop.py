@@ -60,7 +60,7 @@ def azimuths_of(packet: bytes, model: Model) -> tuple[int, ...]:
 
 
 def index_of(packet: bytes, model: Model) -> int:
-    return int.from_bytes(packet[model.index_at : model.index_at + model.index_bytes], "big")
+    return int.from_bytes(packet[model.index_at : model.index_at + 4], "big")
 
 
 def write_packet(
@@ -83,8 +83,8 @@ def write_packet(
     channels = parts[:, 4:].reshape(rows, model.part, 3)
     channels[:, :, :2] = counts.astype(">u2").view(np.uint8).reshape(rows, model.part, 2)
     channels[:, :, 2] = intensity.reshape(rows, model.part)
-    number = (index % (1 << 16 if model is AIRY else 1 << 32)).to_bytes(model.index_bytes, "big")
-    packet[model.index_at : model.index_at + model.index_bytes] = np.frombuffer(number, np.uint8)
+    number = (index % (1 << 16 if model is AIRY else 1 << 32)).to_bytes(4, "big")
+    packet[model.index_at : model.index_at + 4] = np.frombuffer(number, np.uint8)
     return packet.tobytes()
 
 
