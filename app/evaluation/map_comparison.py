@@ -11,7 +11,7 @@ from app.evaluation.cloud_distance import REACH_M, THIN_M, Comparison, compare
 from app.evaluation.truth import read_truth
 from app.evaluation.truth_match import match
 from app.export.map_file import MapFile
-from app.export.points import EVERYTHING, Voxels, blocks
+from app.export.points import Choice, blocks
 from app.export.read_points import read_points
 from app.georeference.reference import GeoReference
 from app.slam import lie
@@ -92,10 +92,10 @@ def read_map(path: Path) -> tuple[F64, F64]:
     if not path.is_dir():
         read = read_points(path, THIN_M)
         return read, read + np.array([0.0, 0.0, _ABOVE_M])
-    voxels, points, sensors = Voxels(THIN_M), [np.empty((0, 3))], [np.empty((0, 3))]
-    for block in blocks(MapFile(path / "map.ply"), MapFrame(), EVERYTHING):
-        points.append(block.points[voxels.new(block.points)])
-        sensors.append(np.broadcast_to(block.T_map_lidar[:3, 3], points[-1].shape))
+    points, sensors = [np.empty((0, 3))], [np.empty((0, 3))]
+    for block in blocks(MapFile(path / "map.ply"), MapFrame(), Choice(thin=THIN_M)):
+        points.append(block.points)
+        sensors.append(np.broadcast_to(block.T_map_lidar[:3, 3], block.points.shape))
     return np.concatenate(points), np.concatenate(sensors)
 
 

@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
 
 from app.georeference.fixes import Fixes
 from app.slam.errors import HemislamError
@@ -30,7 +32,7 @@ class Sentences:
     def add(self, line: str) -> None:
         """One line; anything but a whole sentence with the right checksum is ignored."""
         body, star, checksum = line.strip().rpartition("$")[2].partition("*")
-        if not star or not _matches(body, checksum):
+        if not star or checksum[:2].upper() != f"{reduce(xor, body.encode(), 0):02X}":
             return
         kind, *words = body.split(",")
         try:
@@ -83,14 +85,6 @@ def read(lines: Iterable[str], source: str, near_ns: int) -> tuple[Fixes, bool]:
     if not len(fixes):
         raise HemislamError(f"{source} holds no NMEA sentence GGA with a position; switch it on in the receiver.")
     return fixes, sentences.separated
-
-
-def _matches(body: str, checksum: str) -> bool:
-    """Whether the exclusive or of all characters is the checksum (two hexadecimal digits)."""
-    sum_ = 0
-    for character in body.encode():
-        sum_ ^= character
-    return checksum[:2].upper() == f"{sum_:02X}"
 
 
 def _degrees(text: str, side: str) -> float:

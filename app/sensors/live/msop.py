@@ -5,7 +5,6 @@ and intensity u8) and a tail. An RS-Bpearl's has twelve blocks of 32 channels; a
 divided into two parts with a mark and azimuth of their own.
 """
 
-import calendar
 import struct
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -123,7 +122,7 @@ def _date_ns(date: bytes) -> int | None:
         when = datetime(2000 + year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError:
         return None
-    return calendar.timegm(when.timetuple()) * 1_000_000_000
+    return int(when.timestamp()) * 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
