@@ -57,13 +57,12 @@ class PoseFit:
     """Attributes:
     T: (4, 4) T_fixed_moving. information: (6, 6) of it in units of one point's, rotation then translation in the
         fixed frame; nothing of weak directions.
-    pairs: used. weak: directions that kept the prediction.
+    pairs: used.
     """
 
     T: F64
     information: F64
     pairs: int
-    weak: int
 
 
 def joined(*parts: Pairs) -> Pairs:
@@ -79,9 +78,9 @@ def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> Pose
         free: (m, 6) orthonormal, the perturbations that are allowed; None: all.
     """
     free = np.eye(6) if free is None else free
-    information, weak = np.zeros((6, 6)), 6
+    information = np.zeros((6, 6))
     if len(pairs) < 12:
-        return PoseFit(T, information, len(pairs), weak)
+        return PoseFit(T, information, len(pairs))
     for _ in range(steps):
         arms = pairs.points @ T[:3, :3].T
         distances = np.einsum("ni,ni->n", pairs.normals, arms + T[:3, 3] - pairs.anchors)
@@ -90,16 +89,15 @@ def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> Pose
         information = np.einsum("ni,nj,n->ij", J, J, weights)
         lever = np.sqrt(np.mean(np.sum(arms**2, axis=1)))
         gradient = -np.einsum("ni,n,n->i", J, distances, weights)
-        step, information, weak = _step(information, gradient, lever, free)
+        step, information = _step(information, gradient, lever, free)
         T = lie.transform(lie.exp(step[:3]) @ T[:3, :3], T[:3, 3] + step[3:])
         if np.linalg.norm(step[:3]) < 1e-5 and np.linalg.norm(step[3:]) < 1e-4:
             break
-    return PoseFit(T, information, len(pairs), weak)
+    return PoseFit(T, information, len(pairs))
 
 
-def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64, F64, int]:
-    """The step (6,) within `free`, without what the pairs do not determine; the information (6, 6) without that; and
-    how many directions that were.
+def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64, F64]:
+    """The step (6,) within `free` and the information (6, 6), both without what the pairs do not determine.
 
     lever: m, by which rotations are made lengths, so that all directions can be compared.
     """
@@ -109,7 +107,7 @@ def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64
     along = vectors.T @ (basis @ gradient)
     back = np.linalg.pinv(basis) @ vectors[:, seen]
     step = (vectors @ np.where(seen, along / np.where(seen, values, 1.0), 0.0)) @ basis
-    return step, (back * values[seen]) @ back.T, int(np.sum(~seen))
+    return step, (back * values[seen]) @ back.T
 
 
 def register(T: F64, pairs: Callable[[F64], Pairs], rounds: int, free: F64 | None = None) -> PoseFit:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from app.calibration.inertial import Inertial
 from app.calibration.odometry import Track
@@ -87,21 +86,21 @@ def fit_rotation(track: Track, inertial: Inertial, R: F64, late: float, given: F
     x, off = np.zeros(7), differences(np.zeros(7))
     kept = np.ones(len(windows), np.bool_)
 
-    def differ_in(which: npt.NDArray[np.bool_]) -> Callable[[F64], F64]:
-        return lambda y: differences(y)[which]
+    def differences_kept(x: F64) -> F64:
+        return differences(x)[kept]
 
     for _ in range(STEPS):
         size = np.sqrt(np.mean(np.sum(off**2, axis=2), axis=1))
         kept = size < SLIPPED * np.median(size) + 1e-9
         spread = 1.48 * np.median(np.abs(off[kept])) + 1e-9
         root = (1.0 + (off[kept].ravel() / spread) ** 2) ** -0.25  # Barron's "soft L1"
-        J = _jacobian(differ_in(kept), x).reshape(-1, 7)
+        J = _jacobian(differences_kept, x).reshape(-1, 7)
         step = np.linalg.lstsq(J * root[:, None], -off[kept].ravel() * root, rcond=None)[0]
         x = x + step
         off = differences(x)
         if np.abs(step).max() < 1e-6:
             break
-    J = _jacobian(differ_in(kept), x)
+    J = _jacobian(differences_kept, x)
     covariance = clustered(J, off[kept].reshape(np.count_nonzero(kept), -1), WIDEST)
     before = _differences(track, inertial, given, 0.0, np.zeros(3), windows)
     return Turned(R @ lie.exp(x[:3]), late + float(x[3]), x[4:7], covariance, before.reshape(-1, 3), off.reshape(-1, 3))

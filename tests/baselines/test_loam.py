@@ -130,7 +130,7 @@ def test_three_walls_give_the_pose_and_a_corridor_keeps_what_it_leaves_open() ->
 
     np.testing.assert_allclose(solve(np.eye(4), walls((0, 1, 2)), steps=20).T, T, atol=1e-6)
     open_ended = solve(np.eye(4), walls((1, 2)), steps=20)
-    assert open_ended.weak >= 1 and abs(open_ended.T[0, 3]) < 0.02
+    assert np.linalg.matrix_rank(open_ended.information) < 6 and abs(open_ended.T[0, 3]) < 0.02
     assert open_ended.information[3, 3] < 1e-6 * open_ended.information[4, 4], "along it the walls tell nothing"
     np.testing.assert_allclose(open_ended.T[1:3, 3], T[1:3, 3], atol=0.02)
 
