@@ -66,7 +66,7 @@ def run(
       hemislam run walk.mcap --set ground.alpha=30 --start 10 --duration 60 --truth walk.tum
       hemislam run walk.mcap --loops edits.yaml
     """
-    from app.evaluation.truth import read_poses
+    from app.evaluation.truth import check_poses
     from app.export.results import prepare_folder
     from app.mapping.opening import open_session
     from app.slam.doubts import doubts
@@ -81,7 +81,7 @@ def run(
     session = open_session(recording, params, start, duration, truth=truth_path, read_ahead=True)
     try:
         if truth_path:
-            read_poses(truth_path)  # raises for poses that cannot be true
+            check_poses(truth_path)
         if truth:
             session.compare_with(truth)
         elif truth_path:

@@ -99,7 +99,7 @@ def serve(
 
     start_logging(json_lines=log_json)
     fork_context("app.server.engine_process")  # imported there while this process imports the rest
-    from app.evaluation.truth import read_poses
+    from app.evaluation.truth import check_poses
     from app.mapping.session_file import SUFFIX, read_session
     from app.sensors.live.process import LiveProcess
     from app.sensors.recording import open_recording
@@ -128,7 +128,7 @@ def serve(
         opened = session.opened.recording if session else recording
         say_calibrated(opened)
     if truth is not None:
-        read_poses(truth)
+        check_poses(truth)
     elif recording is not None:
         truth = truth_beside(recording)
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from app.sensors.navsat import NAVSAT, fix_of
 from app.sensors.source import Source
 from app.slam.errors import HemislamError
-from app.slam.trajectory import Trajectory, read_tum, time_apart
+from app.slam.trajectory import read_tum, time_apart
 from app.slam.types import F64, I64
 from app.slam.user_text import as_numbers, read_rows
 
@@ -109,11 +109,9 @@ def read_truth(text: str, recording: Path | None = None, lever: tuple[float, flo
     return truth
 
 
-def read_poses(path: Path) -> Trajectory:
-    """A TUM file of poses of the IMU itself. Raises HemislamError as `read_truth`."""
-    poses = read_tum(path)
-    check(TruePoses(f"The truth {path}", "TUM", poses.stamps_ns, poses.positions, poses.quaternions))
-    return poses
+def check_poses(path: Path) -> None:
+    """Raises HemislamError as `read_truth` if this is no TUM file of poses that can be true."""
+    check(_tum(path))
 
 
 def _read_file(path: Path) -> TruePoses:
@@ -129,13 +127,17 @@ def _read_file(path: Path) -> TruePoses:
         raise HemislamError(f"The truth {path} holds no poses; {_FORMATS}.")
     columns = len(rows[0][1])
     if columns == 8:
-        trajectory = read_tum(path)
-        return TruePoses(f"The truth {path}", "TUM", trajectory.stamps_ns, trajectory.positions, trajectory.quaternions)
+        return _tum(path)
     if columns == 12:
         return _kitti(path, as_numbers(path, rows, 12, _FORMATS))
     if columns == GNSS_COLUMNS:
         return _gnss(path, as_numbers(path, rows, GNSS_COLUMNS, _FORMATS))
     raise HemislamError(f"{path}, line {rows[0][0]} has {columns} columns; {_FORMATS}.")
+
+
+def _tum(path: Path) -> TruePoses:
+    poses = read_tum(path)
+    return TruePoses(f"The truth {path}", "TUM", poses.stamps_ns, poses.positions, poses.quaternions)
 
 
 def _kitti(path: Path, table: F64) -> TruePoses:
