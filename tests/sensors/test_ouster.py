@@ -1,4 +1,4 @@
-"""Tests app/sensors/ouster.py and app/sensors/turns.py: packets of an Ouster, decoded as its own library decodes them.
+"""Tests app/sensors/ouster.py: packets of an Ouster, decoded as its own library decodes them.
 
 `ouster_sdk.json` holds what ouster-sdk 1.0.1 gives for the captures in ../shared/data/sensors/ouster: of each scan and
 return the number of points, their sum and every fortieth of them (index, x, y, z in the sensor's frame, time,
@@ -18,11 +18,10 @@ import pytest
 from app.sensors.cloud_types import read_point_cloud_2
 from app.sensors.doctor import examine
 from app.sensors.live.pcap import Capture
-from app.sensors.ouster import IMU_TOPIC, LIDAR_TOPIC, OusterStream, metadata_beside
+from app.sensors.ouster import IMU_TOPIC, LATE, LIDAR_TOPIC, OusterStream, Turns, metadata_beside
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.sensors.ros import stamp_ns
-from app.sensors.turns import LATE, Turns
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import Measurement
